@@ -1,0 +1,93 @@
+"""The one error base of the package: what is wrong, where, what was found, and the cure."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class StageError(Exception):
+    """An error a user can act on.
+
+    Parameters
+    ----------
+    what : str
+        What is wrong, as one clause.
+    where : str, optional
+        The stage type and tag, the file, or the option.
+    found : object, optional
+        The value that was found.
+    cure : str, optional
+        What to do about it.
+    """
+
+    def __init__(
+        self, what: str, *, where: str | None = None, found: object = None, cure: str | None = None
+    ) -> None:
+        self.what = what
+        self.where = where
+        self.found = found
+        self.cure = cure
+        super().__init__(what)
+
+    def __str__(self) -> str:
+        text = f"{self.where}: {self.what}" if self.where else self.what
+        if self.found is not None:
+            text += f" (found {self.found})"
+        text = text.rstrip(".") + "."
+        if self.cure:
+            text += f" {self.cure.rstrip('.')}."
+        return text
+
+    def at(self, where: str) -> StageError:
+        """The same error, with the place named unless it already names one."""
+        if self.where is None:
+            self.where = where
+        return self
+
+    def __reduce__(self):  # keeps the keyword arguments across process borders (Dask)
+        return (_rebuild, (type(self), self.what, self.where, self.found, self.cure))
+
+
+def _rebuild(kind, what, where, found, cure):
+    return kind(what, where=where, found=found, cure=cure)
+
+
+class OptionError(StageError):
+    """A stage option is unknown, of the wrong type, out of range or contradictory."""
+
+
+class DimensionError(StageError):
+    """A dimension that is needed is missing, or one that is created cannot be."""
+
+
+class ModelError(StageError):
+    """A model file cannot be read, is not trustworthy, or does not fit the cloud."""
+
+
+class PipelineError(StageError):
+    """A pipeline cannot be parsed, validated, lowered or run."""
+
+
+class DependencyError(StageError):
+    """An optional program or package is missing."""
+
+
+def suggest(word: str, known: Iterable[str]) -> str:
+    """`` Did you mean 'x'?`` for the nearest known word, or an empty string."""
+    near = difflib.get_close_matches(str(word), list(known), n=1, cutoff=0.6)
+    return f"Did you mean '{near[0]}'? " if near else ""
+
+
+def optional_import(module: str, extra: str, purpose: str):
+    """Import a heavy optional package, or say which extra of ours brings it."""
+    import importlib
+
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise DependencyError(
+            f"{purpose} needs the Python package '{module}'",
+            found=str(error),
+            cure=f"Install it with: pip install 'pdal-stages[{extra}]'",
+        ) from error

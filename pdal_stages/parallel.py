@@ -1,0 +1,99 @@
+"""Threads over blocks of work: as many as the machine offers, stopping at once on Ctrl-C.
+
+Kernels are compiled with ``nogil``, so plain Python threads use every core. numba's own
+parallel loops are not used: its portable threading layer aborts the process when two
+Python threads enter it together, and users do run pipelines in threads.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+from .errors import OptionError
+
+
+def available_threads() -> int:
+    """Cores this process may use: its CPU affinity, bounded by a cgroup quota."""
+    try:
+        cores = len(os.sched_getaffinity(0))
+    except AttributeError:  # not Linux
+        cores = os.cpu_count() or 1
+    try:  # cgroup v2: "max 100000" or "150000 100000"
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
+        if quota != "max":
+            cores = min(cores, max(1, int(quota) // int(period)))
+    except (OSError, ValueError):
+        pass
+    return max(1, cores)
+
+
+def resolve_threads(threads: int | None) -> int:
+    """``None`` or 0: every core on offer; a positive number: that many."""
+    if threads is None or threads == 0:
+        return available_threads()
+    if isinstance(threads, bool) or int(threads) != threads or threads < 0:
+        raise OptionError("'threads' must be a whole number of 0 (all cores) or more", found=threads)
+    return int(threads)
+
+
+def map_blocks(
+    function: Callable[[Any], Any],
+    blocks: Sequence[Any],
+    threads: int | None = None,
+    done: Callable[[Any], None] | None = None,
+    ahead: int = 2,
+) -> Iterator[Any]:
+    """Yield ``function(block)`` for every block, in order, computed by several threads.
+
+    At most ``threads * ahead`` results wait unread, so memory stays bounded when the
+    reader is slower than the workers. An exception (Ctrl-C too) stops handing out blocks
+    and is raised once the blocks in work are finished.
+
+    Parameters
+    ----------
+    function : callable
+        Called with one block, in a worker thread; the work in it should release the GIL.
+    blocks : sequence
+        The pieces of work.
+    threads : int, optional
+        See :func:`resolve_threads`.
+    done : callable, optional
+        Called with the block in the reader's thread after each result (for progress).
+    """
+    count = resolve_threads(threads)
+    if count == 1 or len(blocks) <= 1:
+        for block in blocks:
+            result = function(block)
+            if done is not None:
+                done(block)
+            yield result
+        return
+    stop = Event()
+
+    def guarded(block):
+        return None if stop.is_set() else function(block)
+
+    pool = ThreadPoolExecutor(count, thread_name_prefix="pdal-stages")
+    pending: list[Future] = []
+    try:
+        position = 0
+        while position < len(blocks) or pending:
+            while position < len(blocks) and len(pending) < count * ahead:
+                pending.append(pool.submit(guarded, blocks[position]))
+                position += 1
+            first = position - len(pending)
+            # A bounded wait keeps the main thread answering Ctrl-C.
+            while not pending[0].done():
+                wait([pending[0]], timeout=0.2, return_when=FIRST_COMPLETED)
+            result = pending.pop(0).result()
+            if done is not None:
+                done(blocks[first])
+            yield result
+    finally:
+        stop.set()
+        pool.shutdown(wait=True, cancel_futures=True)

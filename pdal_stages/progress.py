@@ -1,0 +1,92 @@
+"""Progress for anything longer than a few seconds, on stderr, quiet for short work."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from typing import TextIO
+
+
+class Progress:
+    """A line of progress: done, rate, time left.
+
+    Silent until `delay` seconds have passed. On a terminal the line is redrawn; elsewhere
+    (a log) a new line is written every `log_every` seconds. The environment variable
+    ``PDAL_STAGES_PROGRESS=0`` silences it.
+
+    Parameters
+    ----------
+    total : int
+        The number of units of work; 0 where it is not known.
+    label : str
+        What is being done, e.g. the stage type.
+    unit : str
+        The word after the count.
+    """
+
+    def __init__(
+        self,
+        total: int,
+        label: str,
+        unit: str = "points",
+        *,
+        stream: TextIO | None = None,
+        delay: float = 2.0,
+        log_every: float = 15.0,
+        enabled: bool | None = None,
+    ) -> None:
+        self.total, self.label, self.unit = int(total), label, unit
+        # filters.python redirects sys.stdout, never stderr: stderr is always the user's.
+        self.stream = stream if stream is not None else sys.__stderr__
+        self.enabled = os.environ.get("PDAL_STAGES_PROGRESS", "1") != "0" if enabled is None else enabled
+        if self.stream is None:
+            self.enabled = False
+        self.count = 0
+        self.started = time.monotonic()
+        self._terminal = bool(self.enabled and self.stream.isatty())
+        self._every = 0.2 if self._terminal else log_every
+        self._next = self.started + delay
+        self._shown = False
+
+    def update(self, amount: int = 1) -> None:
+        """Add finished work, and draw the line when it is due."""
+        self.count += int(amount)
+        now = time.monotonic()
+        if self.enabled and now >= self._next:
+            self._next = now + self._every
+            self._draw(now)
+
+    def _draw(self, now: float, end: bool = False) -> None:
+        seconds = max(now - self.started, 1e-9)
+        rate = self.count / seconds
+        text = f"{self.label}: {self.count:,}"
+        if self.total:
+            text += f" of {self.total:,} {self.unit} ({100.0 * self.count / self.total:.0f} %)"
+        else:
+            text += f" {self.unit}"
+        text += f", {rate:,.0f} {self.unit}/s"
+        if end:
+            text += f", {seconds:.1f} s"
+        elif self.total and rate > 0:
+            text += f", {max(self.total - self.count, 0) / rate:.0f} s left"
+        try:
+            self.stream.write(f"\r{text}\x1b[K" if self._terminal else f"{text}\n")
+            self.stream.flush()
+        except (OSError, ValueError):  # a closed or full stderr must not stop the work
+            self.enabled = False
+        self._shown = True
+
+    def close(self) -> None:
+        """Draw the last state, if anything was drawn at all."""
+        if self._shown and self.enabled:
+            self._draw(time.monotonic(), end=True)
+            if self._terminal:
+                self.stream.write("\n")
+        self.enabled = False
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *exc) -> None:
+        self.close()
