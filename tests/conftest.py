@@ -1,0 +1,233 @@
+"""Fixtures every test shares, and the rule on skipping.
+
+Fixtures
+    data_dir       folder of the real labelled clouds (skips where absent)
+    pdal_program   path of a ``pdal`` program that has ``filters.python``
+    pdal_module    python-pdal, imported
+    random_cloud   function: ``random_cloud(n, seed=0, ...) -> (n, 3) float64``
+    write_las      function: ``write_las(path, arrays, point_format=3, ...) -> Path``
+
+Markers
+    ``@pytest.mark.pdal``  needs PDAL with ``filters.python``; the test skips (or fails, see below) without it
+    ``@pytest.mark.data``  needs the real clouds; the test skips without them
+    ``@pytest.mark.slow``  more than about ten seconds; ``-m "not slow"`` leaves it out
+
+Environment
+    PDAL_STAGES_DATA     folder of the real clouds; default ``../shared/data`` beside the checkout
+    PDAL_STAGES_REQUIRE  comma-separated: ``pdal`` makes a skip for want of PDAL a failure, ``data`` one
+                         for want of the real clouds (continuous integration sets ``pdal``)
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+REQUIRED = {word.strip() for word in os.environ.get("PDAL_STAGES_REQUIRE", "").split(",") if word.strip()}
+NO_DATA = "real clouds not found"
+
+# A skip reason that names PDAL itself. "PDAL 2.5" or "PDAL >= 2.5" asks for a version, which is another
+# matter, and PDAL_STAGES_DATA is another word.
+WANT_OF_PDAL = re.compile(r"(\bpdal\b(?!\s*(>=|<=|>|<|\d))|filters\.python|readers\.numpy)", re.IGNORECASE)
+
+
+# ---- what is there ---------------------------------------------------------------------------------------
+
+
+@cache
+def find_pdal() -> tuple[Path | None, str]:
+    """Find a ``pdal`` program with ``filters.python``: this environment's own first, then PATH's."""
+    seen = []
+    names = [Path(sys.prefix) / "bin" / "pdal", Path(sys.executable).parent / "pdal", shutil.which("pdal")]
+    for program in dict.fromkeys(Path(name) for name in names if name):
+        if not os.access(program, os.X_OK):
+            continue
+        answer = subprocess.run(
+            [program, "--drivers"], capture_output=True, text=True, timeout=120, stdin=subprocess.DEVNULL
+        )
+        if answer.returncode == 0 and "filters.python" in answer.stdout:
+            return program, ""
+        said = answer.stderr.strip().splitlines()[-1:] or ["no filters.python among its drivers"]
+        seen.append(f"{program}: {said[0]}")
+    return None, "PDAL with filters.python not found (" + ("; ".join(seen) or "no pdal program on PATH") + ")"
+
+
+@cache
+def find_data() -> tuple[Path | None, str]:
+    """Find the folder of real clouds."""
+    named = os.environ.get("PDAL_STAGES_DATA")
+    folder = Path(named) if named else ROOT.parent / "shared" / "data"
+    if folder.is_dir():
+        return folder, ""
+    if named:
+        return None, f"{NO_DATA}: PDAL_STAGES_DATA names {named}, which is no folder"
+    return None, f"{NO_DATA}: set PDAL_STAGES_DATA to their folder"
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip marked tests before their fixtures are built."""
+    if item.get_closest_marker("data") and find_data()[0] is None:
+        pytest.skip(find_data()[1])
+    if item.get_closest_marker("pdal") and find_pdal()[0] is None:
+        pytest.skip(find_pdal()[1])
+
+
+# ---- skips that must not happen --------------------------------------------------------------------------
+
+
+def _forbidden(report) -> str | None:
+    """Return the reason of a skip that PDAL_STAGES_REQUIRE does not allow, else None."""
+    if not report.skipped or hasattr(report, "wasxfail"):
+        return None
+    reason = str(report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr)
+    if reason.startswith(f"Skipped: {NO_DATA}"):
+        return reason if "data" in REQUIRED else None
+    return reason if "pdal" in REQUIRED and WANT_OF_PDAL.search(reason) else None
+
+
+def _fail(report) -> None:
+    reason = _forbidden(report)
+    if reason:
+        report.outcome = "failed"
+        report.longrepr = f"PDAL_STAGES_REQUIRE={','.join(sorted(REQUIRED))} forbids this skip. {reason}"
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport():
+    outcome = yield
+    _fail(outcome.get_result())
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_make_collect_report():
+    outcome = yield
+    _fail(outcome.get_result())
+
+
+def pytest_report_header() -> list[str]:
+    program, why = find_pdal()
+    data, no = find_data()
+    strict = ", ".join(sorted(REQUIRED)) or "nothing"
+    return [f"pdal: {program or why}", f"real clouds: {data or no}", f"must not skip for want of: {strict}"]
+
+
+# ---- fixtures --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """Folder of the real labelled clouds (montpellier/, delft/, oakland/, isprs_filter/, units/)."""
+    folder, why = find_data()
+    if folder is None:
+        pytest.skip(why)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def pdal_program() -> Path:
+    """Path of a ``pdal`` program whose ``filters.python`` runs this interpreter's packages."""
+    program, why = find_pdal()
+    if program is None:
+        pytest.skip(why)
+    return program
+
+
+@pytest.fixture(scope="session")
+def pdal_module(pdal_program):
+    """python-pdal."""
+    return pytest.importorskip("pdal")
+
+
+@pytest.fixture(scope="session")
+def random_cloud():
+    """Return a function that makes uniform random clouds.
+
+    ``random_cloud(n, seed=0, extent=(20, 20, 5), origin=(0, 0, 0), decimals=3) -> (n, 3) float64``;
+    ``origin=(500000, 6000000, 100)`` gives UTM-sized coordinates, ``decimals=None`` leaves them unrounded.
+    """
+
+    def make(n, seed=0, extent=(20.0, 20.0, 5.0), origin=(0.0, 0.0, 0.0), decimals=3):
+        xyz = np.random.default_rng(seed).random((n, 3)) * extent + origin
+        return xyz if decimals is None else np.round(xyz, decimals)
+
+    return make
+
+
+# PDAL's names of LAS dimensions -> laspy's
+LASPY_NAMES = {
+    "Intensity": "intensity",
+    "ReturnNumber": "return_number",
+    "NumberOfReturns": "number_of_returns",
+    "ScanDirectionFlag": "scan_direction_flag",
+    "EdgeOfFlightLine": "edge_of_flight_line",
+    "Classification": "classification",
+    "Synthetic": "synthetic",
+    "KeyPoint": "key_point",
+    "Withheld": "withheld",
+    "Overlap": "overlap",
+    "ScanChannel": "scanner_channel",
+    "UserData": "user_data",
+    "PointSourceId": "point_source_id",
+    "GpsTime": "gps_time",
+    "Red": "red",
+    "Green": "green",
+    "Blue": "blue",
+    "Infrared": "nir",
+}
+
+
+@pytest.fixture(scope="session")
+def write_las():
+    """Return a function that writes LAS or LAZ with laspy, independent of PDAL.
+
+    ``write_las(path, arrays, point_format=3, minor_version=None, scale=0.001, offset=None, wkt=None)``
+    returns the path. ``arrays`` maps PDAL's dimension names (``X``, ``Y``, ``Z``, ``Classification``, ...) to
+    equally long arrays; a name LAS does not know becomes an extra-bytes dimension of the array's type.
+    ``ScanAngleRank`` is in degrees in every format. ``minor_version`` defaults to 2 for formats 0-3, else 4.
+    ``offset`` defaults to the floored minimum. ``wkt`` adds an OGC WKT record and sets the header's WKT bit.
+    A path ending in .laz is compressed.
+    """
+    import laspy
+
+    def write(path, arrays, point_format=3, minor_version=None, scale=0.001, offset=None, wkt=None):
+        arrays = {name: np.asarray(values) for name, values in arrays.items()}
+        if minor_version is None:
+            minor_version = 2 if point_format <= 3 else 4
+        header = laspy.LasHeader(point_format=point_format, version=f"1.{minor_version}")
+        xyz = np.column_stack([arrays.pop(name) for name in "XYZ"]).astype(np.float64)
+        header.scales = np.full(3, scale)
+        if offset is None:
+            offset = np.floor(xyz.min(axis=0)) if len(xyz) else np.zeros(3)
+        header.offsets = np.asarray(offset, dtype=np.float64)
+        if wkt:
+            header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
+            header.global_encoding.wkt = True
+        standard = set(header.point_format.dimension_names)
+        extra = {n: a for n, a in arrays.items() if n not in LASPY_NAMES and n != "ScanAngleRank"}
+        header.add_extra_dims([laspy.ExtraBytesParams(name=n, type=a.dtype) for n, a in extra.items()])
+        las = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(len(xyz), header=header))
+        las.x, las.y, las.z = xyz.T
+        for name, values in arrays.items():
+            if name == "ScanAngleRank" and "scan_angle" in standard:
+                las["scan_angle"] = np.round(values / 0.006)
+            elif name == "ScanAngleRank":
+                las["scan_angle_rank"] = values
+            elif name in extra:
+                las[name] = values
+            elif LASPY_NAMES[name] in standard:
+                las[LASPY_NAMES[name]] = values
+            else:
+                raise ValueError(f"point format {point_format} has no {name}")
+        las.write(str(path))
+        return Path(path)
+
+    return write
