@@ -1,0 +1,132 @@
+"""How kernels are compiled: without the GIL, cached where the user can write, never in the way.
+
+``njit`` here is numba's with the package's defaults and three repairs of numba's cache:
+
+* numba keys cached code by its own source file only, so a changed *device function* in another module
+  leaves stale code behind. The key here is a digest of the source of the kernel and of every kernel it
+  calls; being content, not time of change, it also survives copying an installation.
+* where neither the package's folder nor the user's cache folder is writable numba refuses to compile
+  at all; here a private folder under the system's temporary folder is tried, then no cache.
+* divisions follow NumPy (``error_model="numpy"``): a Python-style check for zero in a loop keeps it
+  from being vectorised.
+
+Compiled code is cached at first use rather than shipped, because it is made for the processor it
+runs on (AVX-512 or not): that is where the speed comes from. ``pdal_stages.features.warmup()`` fills the
+cache ahead of time, e.g. at installation.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.core import config
+
+#: Flags that allow sums to be reordered and contracted, but keep NaN and infinity meaningful.
+FAST = frozenset({"reassoc", "contract", "nsz", "arcp"})
+
+_stamps: dict[Any, frozenset[str]] = {}
+
+
+def njit(function: Callable | None = None, **options):
+    """``numba.njit`` with the package's defaults; see the module's text. Use as ``@njit`` or ``@njit(...)``."""
+    if function is None:
+        return lambda f: njit(f, **options)
+    options = {"nogil": True, "error_model": "numpy", "cache": True, **options}
+    try:
+        dispatcher = numba.njit(**options)(function)
+    except RuntimeError:  # "cannot cache function ...: no locator available"
+        dispatcher = _elsewhere(function, options)
+    _stamp(dispatcher, function)
+    return dispatcher
+
+
+def _elsewhere(function: Callable, options: dict):
+    folder = private_cache_folder()
+    if folder is not None:
+        before, config.CACHE_DIR = config.CACHE_DIR, folder
+        try:
+            return numba.njit(**options)(function)
+        except RuntimeError:
+            pass
+        finally:
+            config.CACHE_DIR = before
+    return numba.njit(**{**options, "cache": False})(function)
+
+
+@lru_cache(maxsize=1)
+def private_cache_folder() -> str | None:
+    """A folder only this user can write, under the system's temporary folder, or ``None``.
+
+    Cached code is executed, so a folder that anybody else owns or may write is refused.
+    """
+    user = os.getuid() if hasattr(os, "getuid") else "user"
+    folder = Path(tempfile.gettempdir()) / f"pdal-stages-cache-{user}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        status = folder.lstat()
+        if not stat.S_ISDIR(status.st_mode):
+            return None
+        if hasattr(os, "getuid") and (status.st_uid != os.getuid() or status.st_mode & 0o022):
+            return None
+        with tempfile.TemporaryFile(dir=folder):
+            return str(folder)
+    except OSError:
+        return None
+
+
+@lru_cache(maxsize=256)
+def _file_digest(path: str) -> str:
+    try:
+        return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16]
+    except OSError:
+        return path
+
+
+def _stamp(dispatcher, function: Callable) -> None:
+    """Key the cached code by the source of this kernel and of every kernel it names."""
+    parts = {_file_digest(function.__code__.co_filename)}
+    for name in function.__code__.co_names:
+        called = function.__globals__.get(name)
+        try:
+            parts |= _stamps.get(called, frozenset())
+        except TypeError:  # a global that cannot be hashed is no kernel
+            continue
+    _stamps[dispatcher] = frozenset(parts)
+    file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    if hasattr(file, "_source_stamp"):
+        file._source_stamp = "-".join(sorted(parts))
+
+
+class CompilationNote:
+    """Say on stderr, once, that kernels are being compiled, if it takes longer than `delay` seconds."""
+
+    def __init__(self, delay: float = 2.0) -> None:
+        self._timer = threading.Timer(delay, self._say)
+        self._timer.daemon = True
+
+    @staticmethod
+    def _say() -> None:
+        stream = sys.__stderr__
+        if stream is not None:
+            try:
+                stream.write("pdal_stages: compiling for this processor, once (about a minute)...\n")
+                stream.flush()
+            except (OSError, ValueError):
+                pass
+
+    def __enter__(self) -> CompilationNote:
+        self._timer.start()
+        return self
+
+    def __exit__(self, *exc) -> None:
+        self._timer.cancel()
