@@ -1,0 +1,461 @@
+"""Accuracy measures against scikit-learn, their algebra, and every way to misuse them."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import warnings
+from collections import Counter
+from importlib.resources import files
+
+import jsonschema
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from sklearn import metrics
+
+from pdal_stages.accuracy import Accuracy, wilson
+from pdal_stages.errors import OptionError, StageError
+from pdal_stages.grading import BINS, Grading
+
+SCHEMA = json.loads(files("pdal_stages").joinpath("schemas/accuracy-1.json").read_text())
+CODES = (0, 1, 2, 5, 6, 64, 255)
+
+
+def labels(n):
+    return hnp.arrays(np.uint8, n, elements=st.sampled_from(CODES))
+
+
+@st.composite
+def label_pairs(draw, smallest=1):
+    n = draw(st.integers(smallest, 60))
+    return draw(labels(n)), draw(labels(n))
+
+
+def town(n=5000, seed=1):
+    """Labels with mistakes, a rejected class, a reliability that means something."""
+    rng = np.random.default_rng(seed)
+    reference = rng.choice([2, 3, 5, 6], n, p=[0.5, 0.05, 0.2, 0.25])
+    reliability = rng.uniform(0.4, 1, n)
+    wrong = rng.random(n) > reliability
+    predicted = np.where(wrong, rng.choice([2, 3, 5, 6], n), reference)
+    predicted[reliability < 0.45] = 1
+    return reference, predicted, reliability
+
+
+# ---- against the oracle ----------------------------------------------------------------------------------
+
+
+@settings(max_examples=150, deadline=None)
+@given(label_pairs())
+def test_all_measures_equal_scikit_learn(pair):
+    reference, predicted = pair
+    a = Accuracy.from_labels(reference, predicted)
+    present = sorted(set(reference.tolist()))
+    everything = present + sorted(set(predicted.tolist()) - set(present))
+    assert list(a.classes) == present
+    assert list(a.columns) == everything
+    full = metrics.confusion_matrix(reference, predicted, labels=everything)
+    np.testing.assert_array_equal(a.matrix, full[: len(present)])
+    assert not full[len(present) :].any()
+
+    assert a.overall_accuracy == pytest.approx(metrics.accuracy_score(reference, predicted))
+    p, r, f, n = metrics.precision_recall_fscore_support(
+        reference, predicted, labels=present, zero_division=0.0
+    )
+    iou = metrics.jaccard_score(reference, predicted, labels=present, average=None, zero_division=0.0)
+    np.testing.assert_allclose(list(a.precision.values()), p)
+    np.testing.assert_allclose(list(a.recall.values()), r)
+    np.testing.assert_allclose(list(a.f1.values()), f)
+    np.testing.assert_allclose(list(a.iou.values()), iou)
+    assert list(a.support.values()) == n.tolist()
+    assert a.mean_class_precision == pytest.approx(p.mean())
+    assert a.mean_class_recall == pytest.approx(r.mean())
+    assert a.mean_f1 == pytest.approx(f.mean())
+    assert a.mean_iou == pytest.approx(iou.mean())
+    if len(everything) == 1:
+        assert a.kappa is None  # chance agrees on everything
+    else:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            assert a.kappa == pytest.approx(metrics.cohen_kappa_score(reference, predicted), abs=1e-12)
+    np.testing.assert_allclose(
+        a.by_reference,
+        metrics.confusion_matrix(reference, predicted, labels=everything, normalize="true")[: len(present)],
+    )
+    np.testing.assert_allclose(
+        a.by_prediction,
+        metrics.confusion_matrix(reference, predicted, labels=everything, normalize="pred")[: len(present)],
+    )
+
+
+def test_published_example():
+    """Congalton & Green's Table: kappa and overall accuracy worked out by hand there."""
+    counts = [[65, 6, 0, 4], [4, 81, 11, 7], [22, 5, 85, 3], [24, 8, 19, 90]]
+    a = Accuracy.from_confusion(counts, [2, 3, 5, 6])
+    assert a.points == 434
+    assert round(a.overall_accuracy, 2) == 0.74
+    assert round(a.kappa, 2) == 0.65
+
+
+def test_grading_equals_scikit_learn():
+    reference, predicted, reliability = town()
+    right = reference == predicted
+    g = Accuracy.from_labels(reference, predicted, reliability=reliability).reliability
+    # The histogram has 1000 bins, so ties within a bin count a half.
+    binned = np.floor(reliability * BINS)
+    assert g.separation() == pytest.approx(metrics.roc_auc_score(right, binned), abs=1e-12)
+    inside = np.digitize(reliability, np.arange(1, 10) / 10)
+    error = sum(
+        abs(reliability[inside == b].mean() - right[inside == b].mean()) * (inside == b).mean()
+        for b in range(10)
+        if (inside == b).any()
+    )
+    assert g.expected_calibration_error() == pytest.approx(error, abs=1e-12)
+    assert g.mean == pytest.approx(reliability.mean())
+
+
+def test_deciles_of_the_margin():
+    rng = np.random.default_rng(3)
+    margin, right = rng.random(20_000), rng.random(20_000) < 0.9
+    deciles = Grading.from_values(margin, right).quantiles()
+    assert len(deciles) == 10
+    order = np.argsort(margin)
+    for i, group in enumerate(deciles):
+        assert group["points"] == pytest.approx(2000, abs=60)
+        exact = ~right[order[i * 2000 : (i + 1) * 2000]]
+        assert group["share_wrong"] == pytest.approx(exact.mean(), abs=0.01)
+    assert sum(d["points"] for d in deciles) == 20_000
+    assert sum(d["right"] for d in deciles) == right.sum()
+
+
+def test_equal_margins_make_one_group():
+    deciles = Grading.from_values(np.full(50, 0.3), np.ones(50)).quantiles()
+    assert [d["points"] for d in deciles] == [50]
+
+
+def test_wilson_interval():
+    # Newcombe 1998, Statistics in Medicine 17, Table I: 81/263 and 0/20
+    np.testing.assert_allclose(wilson(81, 263), (0.2553, 0.3662), atol=5e-5)
+    np.testing.assert_allclose(wilson(0, 20), (0.0, 0.1611), atol=5e-5)
+    assert wilson(0, 0) is None
+
+
+# ---- properties ------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=60, deadline=None)
+@given(label_pairs(), st.randoms())
+def test_point_order_does_not_matter(pair, random):
+    reference, predicted = pair
+    order = list(range(len(reference)))
+    random.shuffle(order)
+    reliability = np.linspace(0, 1, len(reference))
+    a = Accuracy.from_labels(reference, predicted, reliability=reliability)
+    b = Accuracy.from_labels(reference[order], predicted[order], reliability=reliability[order])
+    assert a.table() == b.table()
+    np.testing.assert_array_equal(a.matrix, b.matrix)
+    np.testing.assert_array_equal(a.reliability.right, b.reliability.right)
+
+
+@settings(max_examples=100, deadline=None)
+@given(label_pairs(2), st.integers(0, 60), st.sampled_from([(), (1,), (0, 1, 5)]))
+def test_tiles_add_to_the_whole(pair, cut, ignore):
+    reference, predicted = pair
+    reliability = np.linspace(0, 1, len(reference))
+    cut = min(cut, len(reference))
+
+    def compare(part):
+        return Accuracy.from_labels(
+            reference[part], predicted[part], ignore=ignore, reliability=reliability[part], allow_empty=True
+        )
+
+    whole, tiles = compare(slice(None)), sum([compare(slice(cut)), compare(slice(cut, None))])
+    assert (whole.classes, whole.extra, whole.left_out) == (tiles.classes, tiles.extra, tiles.left_out)
+    np.testing.assert_array_equal(whole.matrix, tiles.matrix)
+    np.testing.assert_array_equal(whole.reliability.count, tiles.reliability.count)
+    np.testing.assert_allclose(whole.reliability.total, tiles.reliability.total)
+    if whole.points:
+        assert whole.table() == tiles.table()
+
+
+@settings(max_examples=60, deadline=None)
+@given(label_pairs())
+def test_perfect_and_worst(pair):
+    reference, _ = pair
+    best = Accuracy.from_labels(reference, reference)
+    assert best.overall_accuracy == best.mean_f1 == best.mean_iou == best.mean_class_recall == 1
+    assert best.kappa in (1.0, None)
+    worst = Accuracy.from_labels(reference, np.full(len(reference), 99))
+    assert worst.overall_accuracy == worst.mean_f1 == worst.mean_class_precision == 0
+    assert worst.extra == (99,)
+    assert worst.extra_points == len(reference)
+    assert worst.kappa == 0
+
+
+@settings(max_examples=60, deadline=None)
+@given(label_pairs())
+def test_swapping_both_sides_transposes(pair):
+    reference, predicted = pair
+    every = sorted(set(reference.tolist()) | set(predicted.tolist()))
+    a = Accuracy.from_labels(reference, predicted, classes=every)
+    b = Accuracy.from_labels(predicted, reference, classes=every)
+    np.testing.assert_array_equal(a.matrix, b.matrix.T)
+    assert a.kappa == b.kappa
+    assert a.iou == b.iou
+
+
+@settings(max_examples=60, deadline=None)
+@given(label_pairs())
+def test_merging_the_matrix_equals_merging_the_labels(pair):
+    reference, predicted = pair
+    merge = {5: [0, 2], 300: [64]}
+    a = Accuracy.from_labels(reference, predicted).merge(merge)
+    b = Accuracy.from_labels(reference, predicted, merge=merge)
+    assert (a.classes, a.extra, a.names) == (b.classes, b.extra, b.names)
+    np.testing.assert_array_equal(a.matrix, b.matrix)
+    assert a.correct >= Accuracy.from_labels(reference, predicted).correct
+
+
+@settings(max_examples=60, deadline=None)
+@given(label_pairs())
+def test_json_fits_the_schema_and_has_no_nan(pair):
+    reference, predicted = pair
+    confidence = np.linspace(1, 0, len(reference))
+    a = Accuracy.from_labels(
+        reference,
+        predicted,
+        classes=[*set(reference.tolist()), 17],
+        reliability=confidence,
+        margin=confidence,
+    )
+    d = json.loads(json.dumps(a.to_dict(), allow_nan=False))
+    jsonschema.validate(d, SCHEMA)
+    assert sum(map(sum, d["confusion"]["counts"])) == d["points"]
+    a.table()
+
+
+# ---- rules -----------------------------------------------------------------------------------------------
+
+
+def test_rejected_points_count_as_errors_in_a_column_of_their_own():
+    a = Accuracy.from_labels([2, 2, 6, 6], [2, 1, 6, 6])
+    assert (a.classes, a.extra, a.extra_points) == ((2, 6), (1,), 1)
+    assert a.overall_accuracy == 0.75
+    assert a.recall == {2: 0.5, 6: 1.0}
+    assert a.precision == {2: 1.0, 6: 1.0}
+    assert "Outside the classes" in a.table()
+    assert "1*" in a.table()
+
+
+def test_absent_classes_are_left_out_of_the_means():
+    a = Accuracy.from_labels([2, 2, 2, 6], [2, 2, 9, 2], classes=[2, 6, 9, 17])
+    assert a.classes == (2, 6, 9, 17)
+    assert a.recall == {2: 2 / 3, 6: 0.0, 9: None, 17: None}
+    assert a.precision == {2: 2 / 3, 6: 0.0, 9: 0.0, 17: None}
+    assert a.mean_class_recall == pytest.approx(1 / 3)
+    assert a.f1[17] is None
+
+
+def test_left_out_points_are_counted_by_class():
+    a = Accuracy.from_labels([0, 1, 1, 2, 6, 26], [2, 2, 1, 2, 2, 2], classes=[2, 6], ignore=[1])
+    assert a.left_out == {0: 1, 1: 2, 26: 1}
+    assert a.left_out_points == 4
+    assert a.points == 2
+    assert "26 Reserved 26: 1" in a.table()
+
+
+def test_predictions_of_left_out_points_make_no_column():
+    assert Accuracy.from_labels([1, 2], [9, 2], ignore=[1]).extra == ()
+
+
+def test_one_class_only():
+    a = Accuracy.from_labels([6, 6, 6], [6, 6, 6])
+    assert a.kappa is None
+    assert a.overall_accuracy == 1
+    assert a.to_dict()["kappa"] is None
+    jsonschema.validate(a.to_dict(), SCHEMA)
+    assert "Cohen's kappa                      -" in a.table()
+
+
+def test_merged_classes_get_a_name_that_says_so():
+    a = Accuracy.from_labels([3, 4, 5, 6], [4, 5, 3, 6], merge={3: 5, 4: 5})
+    assert a.overall_accuracy == 1
+    assert a.name(5) == "Classes 3, 4, 5"
+    assert a.name(6) == "Building"
+    b = Accuracy.from_labels([3, 4], [3, 4], merge={"100": ["3", "4"]}, names={100: "Vegetation"})
+    assert b.name(100) == "Vegetation"
+
+
+def test_confusions_come_largest_first():
+    a = Accuracy.from_confusion([[5, 3, 0], [7, 1, 2]], [2, 6], extra=[1])
+    assert a.confusions() == [(6, 2, 7), (2, 6, 3), (6, 1, 2)]
+    assert a.confusions(1) == [(6, 2, 7)]
+
+
+def test_from_confusion_sorts_its_classes():
+    a = Accuracy.from_confusion([[1, 2, 3], [4, 5, 6]], [6, 2], extra=[1])
+    np.testing.assert_array_equal(a.matrix, [[5, 4, 6], [2, 1, 3]])
+    b = Accuracy.from_labels([2, 6], [2, 6]) + a
+    assert b.points == 23
+
+
+@pytest.mark.parametrize(
+    "dtype", [np.uint8, np.int16, np.uint16, np.int32, np.uint64, np.float32, np.float64]
+)
+def test_every_number_type(dtype):
+    a = Accuracy.from_labels(np.array([2, 6, 6], dtype), np.array([2, 6, 2], dtype))
+    np.testing.assert_array_equal(a.matrix, [[1, 0], [1, 1]])
+
+
+def test_strided_and_list_inputs():
+    table = np.array([[2, 2], [6, 2], [6, 6]])
+    a = Accuracy.from_labels(table[:, 0], table[:, 1])
+    b = Accuracy.from_labels([2, 6, 6], [2, 2, 6])
+    np.testing.assert_array_equal(a.matrix, b.matrix)
+
+
+def test_more_points_than_one_chunk(monkeypatch):
+    reference, predicted, reliability = town(2000)
+    whole = Accuracy.from_labels(reference, predicted, reliability=reliability)
+    monkeypatch.setattr("pdal_stages.accuracy.CHUNK", 7)
+    monkeypatch.setattr("pdal_stages.labels.CHUNK", 7)
+    parts = Accuracy.from_labels(reference, predicted, reliability=reliability)
+    np.testing.assert_array_equal(whole.matrix, parts.matrix)
+    assert whole.table() == parts.table()
+
+
+def test_it_travels_between_processes():
+    a = Accuracy.from_labels(*town()[:2])
+    b = pickle.loads(pickle.dumps(a))
+    assert a.to_dict() == b.to_dict()
+
+
+# ---- the table -------------------------------------------------------------------------------------------
+
+
+def test_table_is_ascii_and_aligned():
+    reference, predicted, reliability = town()
+    a = Accuracy.from_labels(reference, predicted, reliability=reliability, margin=reliability)
+    for kind in ("by_reference", "by_prediction", "counts", "none"):
+        text = a.table(kind)
+        assert text.isascii()
+        assert not any(line.endswith(" ") for line in text.splitlines())
+        assert max(map(len, text.splitlines())) <= 100
+    lines = a.table().splitlines()
+    start = next(i for i, line in enumerate(lines) if "Recall %" in line)
+    assert len({len(line) for line in lines[start : start + 6]}) == 1
+    assert f"{100 * a.recall[6]:.2f}" in lines[start + 5]
+    counts = a.table("counts")
+    for value in a.matrix.ravel():
+        assert f"{value:,}" in counts
+    assert "expected calibration error" in counts
+
+
+def test_table_refuses_an_unknown_matrix():
+    with pytest.raises(OptionError, match="Did you mean 'counts'"):
+        Accuracy.from_labels([2], [2]).table("count")
+
+
+# ---- misuse ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"reference": [], "predicted": []}, "no point to compare.*0 points"),
+        (
+            {"reference": [1, 1], "predicted": [2, 2], "ignore": [1]},
+            "every reference point is left out.*1: 2",
+        ),
+        (
+            {"reference": [2, 6], "predicted": [2, 6], "classes": [5]},
+            "is left out.*2: 1, 6: 1",
+        ),
+        ({"reference": [2, 6], "predicted": [2]}, "another length.*1 and 2"),
+        ({"reference": [2, 6], "predicted": [2, 6], "reliability": [1.0]}, "reliability has another length"),
+        ({"reference": [[2, 6]], "predicted": [2, 6]}, "one label per point"),
+        ({"reference": [2.5], "predicted": [2]}, "no class codes.*2.5"),
+        ({"reference": [2.0, np.nan], "predicted": [2, 2]}, "no class codes.*nan"),
+        ({"reference": [2], "predicted": [-1]}, "prediction has values that are no class codes.*-1"),
+        ({"reference": [2], "predicted": [70000]}, "no class codes.*70000"),
+        ({"reference": ["ground"], "predicted": [2]}, "not a list of class codes"),
+        ({"reference": [2], "predicted": [2], "classes": ["ground"]}, "'classes' has something.*'ground'"),
+        ({"reference": [2], "predicted": [2], "ignore": [2.5]}, "'ignore' has something"),
+        (
+            {"reference": [2], "predicted": [2], "merge": {5: [3], 6: [3]}},
+            "to two others.*class 3 to 5 and 6",
+        ),
+        ({"reference": [2], "predicted": [2], "reliability": [87.0]}, "not between 0 and 1.*87"),
+        ({"reference": [2], "predicted": [2], "margin": [np.nan]}, "1 of 1 values of margin.*nan"),
+        ({"reference": np.arange(300), "predicted": np.zeros(300, int)}, "more different values.*300"),
+    ],
+)
+def test_misuse_is_told(arguments, message):
+    with pytest.raises(StageError, match=message):
+        Accuracy.from_labels(**arguments)
+
+
+def test_confidence_of_points_left_out_is_not_looked_at():
+    a = Accuracy.from_labels([1, 2], [2, 2], ignore=[1], reliability=[np.nan, 0.7])
+    assert a.reliability.points == 1
+
+
+def test_an_empty_tile_adds_but_has_no_figures():
+    empty = Accuracy.from_labels([], [], allow_empty=True)
+    assert empty.points == 0
+    assert "empty" in repr(empty)
+    with pytest.raises(StageError, match="no point was compared"):
+        _ = empty.overall_accuracy
+    full = Accuracy.from_labels([2, 6], [2, 2], reliability=[0.5, 0.6])
+    assert (empty + full).to_dict() == full.to_dict()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"matrix": [[1, 2]], "classes": [2, 6]}, "does not fit"),
+        ({"matrix": [[1, 2], [3, 4]], "classes": [2, 2]}, "twice"),
+        ({"matrix": [[1, 2.5], [3, 4]], "classes": [2, 6]}, "counts"),
+        ({"matrix": [[1, -2], [3, 4]], "classes": [2, 6]}, "counts"),
+        ({"matrix": np.zeros((0, 0)), "classes": []}, "does not fit"),
+    ],
+)
+def test_a_wrong_matrix_is_told(arguments, message):
+    with pytest.raises(StageError, match=message):
+        Accuracy.from_confusion(**arguments)
+
+
+def test_tiles_compared_differently_do_not_add():
+    a = Accuracy.from_labels([1, 2], [1, 2])
+    b = Accuracy.from_labels([1, 2], [1, 2], ignore=[1])
+    with pytest.raises(StageError, match=r"do not add.*class 1"):
+        _ = a + b
+    with pytest.raises(StageError, match=r"left out.*class 2"):
+        b.merge({1: 2})
+
+
+def test_a_curve_of_only_some_points_is_not_kept():
+    a = Accuracy.from_labels([2], [2], reliability=[0.9]) + Accuracy.from_labels([2], [2])
+    assert a.reliability is None
+
+
+# ---- real clouds -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.data
+def test_real_labels(data_dir):
+    import laspy
+
+    reference = np.asarray(laspy.read(data_dir / "montpellier" / "test_77060_627755.laz").classification)
+    rng = np.random.default_rng(0)
+    predicted = np.where(rng.random(len(reference)) < 0.1, rng.choice([2, 5, 6], len(reference)), reference)
+    a = Accuracy.from_labels(reference, predicted, classes=[2, 3, 4, 5, 6])
+    counts = Counter(reference.tolist())
+    assert a.support == {c: counts[c] for c in (2, 3, 4, 5, 6)}
+    assert a.left_out == {c: n for c, n in counts.items() if c not in (2, 3, 4, 5, 6)}
+    inside = np.isin(reference, [2, 3, 4, 5, 6])
+    assert a.overall_accuracy == pytest.approx((reference == predicted)[inside].mean())
+    assert a.merge({5: [3, 4]}).overall_accuracy > a.overall_accuracy
