@@ -1,0 +1,5 @@
+"""A generated town under a simulated flight, with true labels: data for tests, demos and benchmarks."""
+
+from .town import Town, TownOptions, make_town, town_chunks
+
+__all__ = ["Town", "TownOptions", "make_town", "town_chunks"]

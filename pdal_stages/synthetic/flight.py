@@ -1,0 +1,124 @@
+"""The flight: parallel strips, scan lines, pulses; and how close they must be for a wanted density."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+SPEED = 60.0  # metres a second
+TURN = 240.0  # seconds from the end of a strip to the start of the next
+GPS_START = 270_000_000.0  # adjusted standard GPS time: July 2020
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Scan lines ``first`` to ``last`` (excluded) of one strip."""
+
+    strip: int
+    first: int
+    last: int
+
+
+class Flight:
+    """Pulses over a square, as a function of the spacing between them.
+
+    Parameters
+    ----------
+    size, elevation : float
+        Side of the square; mean height of its ground.
+    altitude : float
+        Flying height above that.
+    scan_angle : float
+        Half of the scanner's opening, degrees.
+    overlap : float
+        Share of the swath that the next strip covers again.
+    heading : float
+        Direction of flight in radians from east.
+    spacing : float
+        Metres between scan lines, and between pulses below the sensor.
+    """
+
+    def __init__(self, size, elevation, altitude, scan_angle, overlap, heading, spacing) -> None:
+        self.size, self.elevation, self.altitude = size, elevation, altitude
+        self.half_angle, self.heading = math.radians(scan_angle), heading
+        self.spacing = spacing
+        swath = 2.0 * altitude * math.tan(self.half_angle)
+        c, s = abs(math.cos(heading)), abs(math.sin(heading))
+        self.reach = 0.5 * size * (c + s) + 4.0  # half extent of the square along and across the flight
+        apart = swath * (1.0 - overlap)
+        # At least two strips, so that every town is seen from two sides.
+        self.strips = max(2, math.ceil((2 * self.reach - swath * overlap) / apart))
+        self.across = (np.arange(self.strips) - 0.5 * (self.strips - 1)) * apart
+        self.lines = math.ceil(2 * self.reach / spacing)
+        self.per_line = math.ceil(2 * self.half_angle / (spacing / altitude))
+        self.line_time = spacing / SPEED
+        self.strip_time = 2 * self.reach / SPEED + TURN
+
+    @property
+    def pulses(self) -> int:
+        """Pulses sent, with those outside the square."""
+        return self.strips * self.lines * self.per_line
+
+    def chunks(self, pulses: int) -> list[Chunk]:
+        """The flight in order of time, in pieces of about so many pulses near the square."""
+        seen = min(self.per_line, int(2.2 * self.reach / self.spacing))
+        step = max(1, pulses // max(1, seen))
+        return [
+            Chunk(strip, first, min(first + step, self.lines))
+            for strip in range(self.strips)
+            for first in range(0, self.lines, step)
+        ]
+
+    def fire(self, chunk: Chunk, every: int = 1):
+        """The pulses of a chunk whose beams pass near the square.
+
+        Returns
+        -------
+        origin, direction : (n, 3) float64
+            Local metres; unit vectors.
+        ids : (n,) uint64
+        time, angle : (n,) float64
+            GPS time in seconds; scan angle in degrees, positive to the right of the flight.
+        edge : (n,) bool
+            Last pulse of its scan line.
+        """
+        line = np.repeat(np.arange(chunk.first, chunk.last), self.per_line)
+        step = np.tile(np.arange(self.per_line), chunk.last - chunk.first)
+        if every > 1:
+            ids = (chunk.strip * self.lines + line) * self.per_line + step
+            # A scattered sample: whole numbers times an odd constant, upper bits.
+            mixed = (ids.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(40)
+            keep = mixed % np.uint64(every) == 0
+            line, step = line[keep], step[keep]
+        ids = (chunk.strip * self.lines + line) * self.per_line + step
+        angle = -self.half_angle + (step + 0.5) * (2 * self.half_angle / self.per_line)
+        when = line * self.line_time + step * (self.line_time / self.per_line)
+        # The aircraft rolls, pitches and drifts a little.
+        phase = 1.7 * chunk.strip
+        roll = 0.006 * np.sin(0.9 * when + phase) + 0.002 * np.sin(3.1 * when)
+        pitch = 0.004 * np.sin(0.7 * when + 2.0 * phase)
+        drift = 1.5 * np.sin(0.23 * when + phase)
+        back = chunk.strip % 2 == 1  # strips are flown to and fro
+        along = when * SPEED - self.reach
+        tilt = angle + roll
+        cross = self.across[chunk.strip] + drift
+        # Directions in the flight's frame: along, to the left, up.
+        d_along, d_left, d_up = np.sin(pitch), -np.sin(tilt) * np.cos(pitch), -np.cos(tilt) * np.cos(pitch)
+        if back:
+            along, d_along, d_left = -along, -d_along, -d_left
+        c, s = math.cos(self.heading), math.sin(self.heading)
+        origin = np.empty((line.size, 3))
+        origin[:, 0] = 0.5 * self.size + along * c - cross * s
+        origin[:, 1] = 0.5 * self.size + along * s + cross * c
+        origin[:, 2] = self.elevation + self.altitude
+        direction = np.column_stack([d_along * c - d_left * s, d_along * s + d_left * c, d_up])
+        hit = origin[:, :2] + (self.altitude / -d_up)[:, None] * direction[:, :2]
+        margin = 25.0
+        near = ((hit > -margin) & (hit < self.size + margin)).all(axis=1)
+        time = GPS_START + chunk.strip * self.strip_time + when
+        return (
+            origin[near], np.ascontiguousarray(direction[near]), ids[near].astype(np.uint64), time[near],
+            np.degrees(angle[near]), step[near] == self.per_line - 1,
+        )  # fmt: skip
