@@ -38,6 +38,7 @@ from .labels import (
     lookup,
     mask,
     merging,
+    moved,
     named,
     placed,
     present,
@@ -97,6 +98,8 @@ class Accuracy:
     names : mapping of code to name
     left_out : mapping of code to count
         Reference points that were not compared, by their reference class.
+    merged : mapping of code to code
+        Classes that were taken as another one on both sides.
     reliability, margin : Grading or None
         How well the two confidences tell right from wrong.
     """
@@ -108,6 +111,7 @@ class Accuracy:
     left_out: Mapping[int, int] = field(default_factory=dict)
     reliability: Grading | None = None
     margin: Grading | None = None
+    merged: Mapping[int, int] = field(default_factory=dict)
 
     # ---- making one ----------------------------------------------------------------------------------
 
@@ -198,6 +202,7 @@ class Accuracy:
             left,
             graded.get("reliability"),
             graded.get("margin"),
+            moved(to),
         )
 
     @classmethod
@@ -265,6 +270,7 @@ class Accuracy:
             placed(self.matrix, [to[c] for c in self.classes], [to[c] for c in self.columns], rows, columns),
             named(columns + tuple(left), {**known, **called, **int_keys(names)}),
             left,
+            merged={**{c: int(to[t]) for c, t in self.merged.items()}, **moved(to)},
         )
 
     def __add__(self, other: Accuracy) -> Accuracy:
@@ -282,6 +288,12 @@ class Accuracy:
                 "two accuracies do not add: one compares a class that the other leaves out",
                 found=f"class {clash[0]}",
                 cure="Compare both with the same 'classes' and 'ignore'",
+            )
+        if self.merged != other.merged and self.points and other.points:
+            raise StageError(
+                "two accuracies do not add: they merge different classes",
+                found=f"{dict(self.merged)} and {dict(other.merged)}",
+                cure="Compare both with the same 'merge'",
             )
         graded = {}
         for key in ("reliability", "margin"):
@@ -303,6 +315,7 @@ class Accuracy:
             left,
             graded["reliability"],
             graded["margin"],
+            {**other.merged, **self.merged},
         )
 
     def __radd__(self, other: object) -> Accuracy:

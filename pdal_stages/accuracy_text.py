@@ -36,6 +36,7 @@ def as_dict(accuracy: Accuracy) -> dict[str, Any]:
             "points": accuracy.left_out_points,
             "by_class": {str(c): n for c, n in accuracy.left_out.items()},
         },
+        "merged": {str(c): t for c, t in sorted(accuracy.merged.items())},
         "predicted_outside_reference": {"points": accuracy.extra_points, "classes": named(accuracy.extra)},
         "overall_accuracy": accuracy.overall_accuracy,
         "overall_accuracy_interval": list(accuracy.overall_accuracy_interval),
@@ -104,6 +105,9 @@ def _headline(a: Accuracy) -> str:
     if a.left_out:
         which = ", ".join(f"{code} {a.name(code)}: {n:,}" for code, n in a.left_out.items())
         lines.append(f"Left out              {a.left_out_points:>14,}   (reference class {which})")
+    if a.merged:
+        pairs = ", ".join(f"{c} as {t}" for c, t in sorted(a.merged.items()))
+        lines.append(f"Merged                {pairs:>14}")
     if a.extra:
         which = ", ".join(f"{code} {a.name(code)}" for code in a.extra)
         lines.append(f"Outside the classes   {a.extra_points:>14,}   (counted as errors: {which})")

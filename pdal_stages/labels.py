@@ -101,6 +101,11 @@ def merging(mapping: Mapping[Any, Any] | None) -> tuple[npt.NDArray[np.int64], d
     return to, called
 
 
+def moved(to: npt.NDArray[np.int64]) -> dict[int, int]:
+    """The codes a merge changes, and what they become."""
+    return {int(code): int(to[code]) for code in np.flatnonzero(to != np.arange(len(to)))}
+
+
 def present(
     codes: npt.NDArray[Any], to: npt.NDArray[np.int64], where: Callable | None = None
 ) -> dict[int, int]:

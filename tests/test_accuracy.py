@@ -214,7 +214,7 @@ def test_merging_the_matrix_equals_merging_the_labels(pair):
     merge = {5: [0, 2], 300: [64]}
     a = Accuracy.from_labels(reference, predicted).merge(merge)
     b = Accuracy.from_labels(reference, predicted, merge=merge)
-    assert (a.classes, a.extra, a.names) == (b.classes, b.extra, b.names)
+    assert (a.classes, a.extra, a.names, a.merged) == (b.classes, b.extra, b.names, b.merged)
     np.testing.assert_array_equal(a.matrix, b.matrix)
     assert a.correct >= Accuracy.from_labels(reference, predicted).correct
 
@@ -285,6 +285,8 @@ def test_merged_classes_get_a_name_that_says_so():
     assert a.overall_accuracy == 1
     assert a.name(5) == "Classes 3, 4, 5"
     assert a.name(6) == "Building"
+    assert a.to_dict()["merged"] == {"3": 5, "4": 5}
+    assert "Merged                3 as 5, 4 as 5" in a.table()
     b = Accuracy.from_labels([3, 4], [3, 4], merge={"100": ["3", "4"]}, names={100: "Vegetation"})
     assert b.name(100) == "Vegetation"
 
@@ -433,6 +435,8 @@ def test_tiles_compared_differently_do_not_add():
     b = Accuracy.from_labels([1, 2], [1, 2], ignore=[1])
     with pytest.raises(StageError, match=r"do not add.*class 1"):
         _ = a + b
+    with pytest.raises(StageError, match="merge different classes"):
+        _ = a + Accuracy.from_labels([1, 2], [1, 2], merge={2: 5})
     with pytest.raises(StageError, match=r"left out.*class 2"):
         b.merge({1: 2})
 
