@@ -1,0 +1,84 @@
+"""Patch the sources of python-pdal and pdal-plugins before they are compiled.
+
+    python patch_bindings.py PDAL_SOURCES PLUGINS_SOURCES PDAL_PROGRAM [PLUGIN_FOLDER]
+
+Each patch says how often it must apply, so another release of the sources is refused, not half patched.
+Called by scripts/install-pdal, which chooses the releases.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+
+def substitute(file: Path, pattern: str, replacement: str, times: int) -> None:
+    """Replace ``pattern`` in ``file``; stop unless it is found exactly ``times`` times."""
+    text, found = re.subn(pattern, replacement, file.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    if found != times:
+        raise SystemExit(f"{file}: {pattern!r} found {found} times, not {times}: not the expected release")
+    file.write_text(text, encoding="utf-8")
+
+
+def numpy_2(bindings: Path, plugins: Path) -> None:
+    """Let python-pdal 3.1 and pdal-plugins 1.0 compile with NumPy 2, whose array descriptor is opaque.
+
+    Compiled so, they run with NumPy 1 and 2. Later releases have this.
+    """
+    substitute(bindings / "pdal/PyArray.cpp", r"\bdtype->fields\b", "PyDataType_FIELDS(dtype)", 3)
+    executor = bindings / "pdal/StreamableExecutor.cpp"
+    substitute(executor, r", PyArray_GETPTR1\(", ", (char *)PyArray_GETPTR1(", 1)
+    reader = plugins / "pdal/io/NumpyReader.cpp"
+    substitute(reader, r"\bm_dtype->fields\b", "PyDataType_FIELDS(m_dtype)", 3)
+    substitute(reader, r"\bdt->elsize\b", "PyDataType_ELSIZE(dt)", 1)
+    substitute(plugins / "pdal/plang/Invocation.cpp", r"\bdtype->elsize\b", "PyDataType_ELSIZE(dtype)", 2)
+
+
+def one_program(bindings: Path, program: str) -> None:
+    """Let ``import pdal`` of python-pdal 3.1 ask the PDAL it was compiled for, whatever PATH says, and once.
+
+    It learns the drivers by running ``pdal --drivers`` and ``pdal --options``, the second one twice.
+    """
+    drivers = bindings / "pdal/drivers.py"
+    second = r"^    command = 'pdal --options all --showjson'\n(?:.*\n)*?    options = dict\(.*\)\n"
+    substitute(drivers, second, "", 1)
+    substitute(drivers, r'\["pdal", ', lambda _: f"[{program!r}, ", 2)
+
+
+def plugin_folder(bindings: Path, source: str, folder: str) -> None:
+    """Let ``import pdal`` find the plugins that lie beside it, where PDAL_DRIVER_PATH is not set.
+
+    Set, the variable replaces PDAL's own search, so the folder of PDAL's compiled plugins is added.
+    """
+    init = bindings / source / "__init__.py"
+    value = f"_os.path.dirname(__file__) + {':' + folder!r}" if folder else "_os.path.dirname(__file__)"
+    text = f'import os as _os\n\n_os.environ.setdefault("PDAL_DRIVER_PATH", {value})\n'
+    init.write_text(text + init.read_text(encoding="utf-8"), encoding="utf-8")
+
+
+def exception_references(plugins: Path, source: str) -> None:
+    """Mend a crash when the interpreter ends after a Python step raised.
+
+    PyTuple_SetItem takes over the references to the exception, which are released once more further down.
+    """
+    substitute(
+        plugins / source / "plang/Environment.cpp",
+        r"^ *PyTuple_SetItem\(args, 2, traceback\);",
+        r"\g<0>\n        Py_INCREF(type); Py_INCREF(value); Py_INCREF(traceback);",
+        1,
+    )
+
+
+def main(bindings: str, plugins: str, program: str, folder: str = "") -> None:
+    """Apply what the releases at hand need."""
+    source = "src/pdal" if Path(bindings, "src").is_dir() else "pdal"
+    if source == "pdal":
+        numpy_2(Path(bindings), Path(plugins))
+        one_program(Path(bindings), program)
+    plugin_folder(Path(bindings), source, folder)
+    exception_references(Path(plugins), source)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
