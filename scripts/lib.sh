@@ -45,7 +45,7 @@ step() {
 # explain WHAT: read the failed step's part of the log and say in words what it means
 explain() {
   local part
-  part=$(tac "$LOG" | awk '{ print } /^### / { exit }' | tac)
+  part=$(awk '/^### / { part = "" } { part = part $0 "\n" } END { printf "%s", part }' "$LOG")
   printf '\nThe end of its output (all of it: %s):\n' "$LOG" >&2
   printf '%s\n' "$part" | tail -n 12 | sed 's/^/  | /' >&2
   has() { grep -qiE "$1" <<<"$part"; }
@@ -60,7 +60,11 @@ explain() {
   elif has 'DO NOT MATCH THE HASHES|Hash Sum mismatch'; then
     die "$1: a download is not the file that was expected" \
       "A mirror or proxy gave something else; run this again, or use another mirror."
-  elif has 'Temporary failure|Could not resolve|Could not connect|Failed to establish a new connection|Network is unreachable|Connection (refused|timed out|reset)|Read timed out|Max retries|SSLError|certificate verify failed'; then
+  elif has 'certificate verify failed|CERTIFICATE_VERIFY_FAILED'; then
+    die "$1: a server's certificate is not trusted here" \
+      "Behind a company's proxy, put its certificate where apt and pip look: /usr/local/share/ca-certificates" \
+      "(then update-ca-certificates) and PIP_CERT=/etc/ssl/certs/ca-certificates.crt."
+  elif has 'Temporary failure|Could not resolve|Could not connect|Failed to establish a new connection|Network is unreachable|Connection (refused|timed out|reset)|Read timed out|Max retries'; then
     die "$1: the network, or a server on it, does not answer" \
       "apt uses the mirrors of /etc/apt, pip those of 'pip config list'; both honour http_proxy and https_proxy." \
       "Check these and run this again: what is done is kept."

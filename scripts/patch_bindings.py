@@ -43,7 +43,7 @@ def one_program(bindings: Path, program: str) -> None:
     drivers = bindings / "pdal/drivers.py"
     second = r"^    command = 'pdal --options all --showjson'\n(?:.*\n)*?    options = dict\(.*\)\n"
     substitute(drivers, second, "", 1)
-    substitute(drivers, r'\["pdal", ', lambda _: f"[{program!r}, ", 2)
+    substitute(drivers, r'\["pdal", ', f"[{program!r}, ".replace("\\", r"\\"), 2)
 
 
 def plugin_folder(bindings: Path, source: str, folder: str) -> None:
