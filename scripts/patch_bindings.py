@@ -28,7 +28,7 @@ def numpy_2(bindings: Path, plugins: Path) -> None:
     """
     substitute(bindings / "pdal/PyArray.cpp", r"\bdtype->fields\b", "PyDataType_FIELDS(dtype)", 3)
     executor = bindings / "pdal/StreamableExecutor.cpp"
-    substitute(executor, r", PyArray_GETPTR1\(", ", (char *)PyArray_GETPTR1(", 1)
+    substitute(executor, r", PyArray_GETPTR1\(", ", (char *)PyArray_GETPTR1(", 2)
     reader = plugins / "pdal/io/NumpyReader.cpp"
     substitute(reader, r"\bm_dtype->fields\b", "PyDataType_FIELDS(m_dtype)", 3)
     substitute(reader, r"\bdt->elsize\b", "PyDataType_ELSIZE(dt)", 1)
