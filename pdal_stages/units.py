@@ -1,0 +1,165 @@
+"""Length units of a spatial reference: how many metres one unit of x, y and z is."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from .errors import OptionError, StageError, suggest
+
+#: Names users write, in metres.
+NAMED = {
+    "metre": 1.0,
+    "meter": 1.0,
+    "m": 1.0,
+    "foot": 0.3048,
+    "ft": 0.3048,
+    "us-ft": 1200.0 / 3937.0,
+    "us survey foot": 1200.0 / 3937.0,
+    "centimetre": 0.01,
+    "kilometre": 1000.0,
+}
+
+
+@dataclass(frozen=True)
+class Units:
+    """Metres per unit of x and y (`horizontal`) and of z (`vertical`).
+
+    `assumed` says that the cloud names no spatial reference and metres were assumed.
+    """
+
+    horizontal: float = 1.0
+    vertical: float = 1.0
+    assumed: bool = False
+
+    @property
+    def metric(self) -> bool:
+        """True where coordinates are metres already."""
+        return self.horizontal == 1.0 and self.vertical == 1.0
+
+
+def named_unit(name: str, option: str) -> float:
+    """Metres per unit of a unit's name; :class:`OptionError` where it is not known."""
+    try:
+        return NAMED[name.strip().lower()]
+    except KeyError:
+        raise OptionError(
+            f"'{option}' is no unit of length that is known here",
+            found=repr(name),
+            cure=f"{suggest(name, NAMED)}Known units: {', '.join(NAMED)}",
+        ) from None
+
+
+def units_of_wkt(wkt: str, *, horizontal: str = "", vertical: str = "") -> Units:
+    """The length units of a spatial reference in well-known text (WKT 1 or 2).
+
+    Parameters
+    ----------
+    wkt : str
+        Empty where the cloud has no spatial reference: metres are assumed.
+    horizontal, vertical : str
+        Unit names that overrule the spatial reference. Where it has no vertical part,
+        heights are taken to be in the horizontal unit, as LAS files in feet are.
+
+    Raises
+    ------
+    StageError
+        If x and y are degrees.
+    """
+    across: float | None = named_unit(horizontal, "horizontal_unit") if horizontal else None
+    upward: float | None = named_unit(vertical, "vertical_unit") if vertical else None
+    root = parse_wkt(wkt) if wkt.strip() else None
+    if root is not None:
+        projected = root.find("PROJCS", "PROJCRS", "PROJECTEDCRS", "LOCAL_CS", "ENGCRS")
+        if projected is None and root.find("GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "GEODCRS", "GEODETICCRS"):
+            raise StageError(
+                "the coordinates are geographic (degrees); neighborhoods and grids need metres",
+                found=root.name or wkt[:60],
+                cure="Add a reprojection before this stage, e.g. "
+                '{"type": "filters.reprojection", "out_srs": "EPSG:25832"} with the UTM zone or '
+                "national grid of the area",
+            )
+        if across is None and projected is not None:
+            across = projected.unit()
+        height = root.find("VERT_CS", "VERTCRS", "VERTICALCRS")
+        if upward is None and height is not None:
+            upward = height.unit()
+    assumed = across is None and root is None
+    across = 1.0 if across is None else across
+    return Units(across, across if upward is None else upward, assumed)
+
+
+@dataclass
+class WktNode:
+    """One bracketed element of well-known text."""
+
+    keyword: str
+    values: list[str]
+    children: list[WktNode]
+
+    @property
+    def name(self) -> str:
+        return self.values[0] if self.values else ""
+
+    def find(self, *keywords: str) -> WktNode | None:
+        """The first element, this one included, with one of the keywords."""
+        if self.keyword in keywords:
+            return self
+        for child in self.children:
+            found = child.find(*keywords)
+            if found is not None:
+                return found
+        return None
+
+    def unit(self) -> float | None:
+        """Metres per unit of this coordinate system: its own unit, or its first axis's."""
+        for keyword in ("LENGTHUNIT", "UNIT"):
+            for child in self.children:
+                if child.keyword == keyword:
+                    return child.factor()
+        for child in self.children:  # WKT 2 may put the unit on each axis
+            if child.keyword in ("AXIS", "CS"):
+                found = child.unit()
+                if found is not None:
+                    return found
+        return None
+
+    def factor(self) -> float | None:
+        try:
+            value = float(self.values[1])
+        except (IndexError, ValueError):
+            return None
+        return value if value > 0 else None
+
+
+_TOKEN = re.compile(r'\s*(?:"((?:[^"]|"")*)"|([A-Za-z_0-9.+\-]+)|([\[\](),]))')
+
+
+def parse_wkt(text: str) -> WktNode | None:
+    """Parse well-known text into its elements; None where it is not WKT."""
+    stack = [WktNode("", [], [])]
+    word: str | None = None
+    position = 0
+    while position < len(text):
+        match = _TOKEN.match(text, position)
+        if match is None:
+            break
+        position = match.end()
+        quoted, bare, mark = match.groups()
+        if mark is None:
+            if word is not None:
+                stack[-1].values.append(word)
+            word = quoted if quoted is not None else bare
+        elif mark in "[(":
+            node = WktNode((word or "").upper(), [], [])
+            stack[-1].children.append(node)
+            stack.append(node)
+            word = None
+        else:
+            if word is not None:
+                stack[-1].values.append(word)
+                word = None
+            if mark in "])" and len(stack) > 1:
+                stack.pop()
+    top = stack[0].children
+    return top[0] if top else None
