@@ -1,0 +1,154 @@
+"""Every cylinder and sphere of a block of queries: candidates, moments, features."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .candidates import FAR, LANES, count_candidates, fill_strip, gather, half_widths
+from .jit import njit
+from .moments import BATCH, MOMENTS, WIDTH, add_shared, cylinder_sums, finish, sphere_sums
+
+#: Columns of cells whose queries share one table of where points begin.
+STRIP = 256
+
+#: More than any squared distance, less than the square of the padding's.
+EVERYTHING = 1e290
+
+
+@njit
+def width_table(radii, cell):
+    """:func:`half_widths` of every radius in one (radii, 2, rows) table, and each one's reach in cells."""
+    reaches = np.zeros(len(radii), np.int64)
+    for k in range(len(radii)):
+        reaches[k] = (half_widths(radii[k], cell).shape[1] - 1) // 2
+    table = np.zeros((len(radii), 2, 2 * reaches.max() + 1), np.int64)
+    for k in range(len(radii)):
+        one = half_widths(radii[k], cell)
+        table[k, :, : one.shape[1]] = one
+    return table, reaches
+
+
+@njit
+def count_block(cell_ix, cell_start, row_iy, row_start, iy, ix, width):
+    """Candidates of the radius of `width` for the cells (iy, ix), sorted by row and column."""
+    reach = (width.shape[1] - 1) // 2
+    strip = np.empty((2 * reach + 1, STRIP + 2 * reach + 1), np.int64)
+    counts = np.empty(len(ix), np.int64)
+    line, left, columns = 0, 0, -1
+    for i in range(len(ix)):
+        if columns < 0 or iy[i] != line or ix[i] >= left + reach + STRIP:
+            line, left = iy[i], ix[i] - reach
+            columns = STRIP + 2 * reach
+            fill_strip(cell_ix, cell_start, row_iy, row_start, line, left, reach, columns, strip)
+        counts[i] = count_candidates(strip, reach, width, reach, ix[i] - left)
+    return counts
+
+
+@njit
+def radius_block(grid, cell, qx, qy, qz, copies, radii, widths, reaches, wanted, columns, few, room, out):
+    """Fill the covariance and geometric features of cylinders and spheres for a block of queries.
+
+    Parameters
+    ----------
+    grid : tuple
+        ``Grid.tables()`` of the cloud.
+    cell : float
+        Edge of a grid cell, metres.
+    qx, qy, qz : (m,) float64 arrays
+        Queries, in the order of their cells (row, then column).
+    copies : (m,) int64 array
+        How many queries of the user's each stands for (equal coordinates are computed once).
+    radii : (r,) float64 array
+        Distinct radii, metres.
+    widths, reaches : arrays
+        :func:`width_table` of the radii.
+    wanted : (r, 2) int64 array
+        Number of the cylinder and of the sphere of each radius in `columns`, or -1.
+    columns : (k, 12) int64 array
+        Column of each neighborhood's features in `out`, or -1.
+    few : (k,) int64 array
+        Raised by the number of neighborhoods with fewer than three points.
+    room : int
+        Candidates that the largest radius has at most, of all queries in the block.
+    out : (m, F) float32 array
+    """
+    x, y, z, cell_ix, cell_start, row_iy, row_start = grid
+    reach = reaches.max()
+    strip = np.empty((2 * reach + 1, STRIP + 2 * reach + 1), np.int64)
+    size = room + 4 * LANES
+    px, py, pz = np.empty(size), np.empty(size), np.empty(size)
+    moments = np.empty((len(columns), MOMENTS, WIDTH))
+    inner = np.empty((MOMENTS, 1))
+    line, left, right = 0, 1, 0  # row of the strip, columns of the queries it serves (none yet)
+    for start in range(0, len(qx), BATCH):
+        stop = min(start + BATCH, len(qx))
+        a = start
+        while a < stop:
+            ix, iy = int(math.floor(qx[a] / cell)), int(math.floor(qy[a] / cell))
+            b = a + 1
+            while b < stop and int(math.floor(qx[b] / cell)) == ix and int(math.floor(qy[b] / cell)) == iy:
+                b += 1
+            if iy != line or ix < left or ix > right:
+                line, left, right = iy, ix, _last_column(qx, qy, a, cell, iy, ix + STRIP - 1)
+                columns_ = right - left + 1 + 2 * reach
+                fill_strip(cell_ix, cell_start, row_iy, row_start, iy, left - reach, reach, columns_, strip)
+            for k in range(len(radii)):
+                own = reaches[k]
+                shared, end = gather(x, y, z, strip, reach, widths[k], own, ix - left + reach, px, py, pz)
+                r2 = radii[k] * radii[k]
+                c, s = wanted[k, 0], wanted[k, 1]
+                if c >= 0:
+                    centre = (ix + 0.5) * cell, (iy + 0.5) * cell
+                    cylinders(px, py, pz, shared, end, qx, qy, qz, a, b, r2, centre, inner, moments[c], start)
+                if s >= 0:
+                    sx, sy, sz = px[:end], py[:end], pz[:end]
+                    for j in range(a, b):
+                        sphere_sums(sx, sy, sz, qx[j], qy[j], qz[j], r2, moments[s], j - start)
+            a = b
+        for k in range(len(radii)):
+            r = radii[k]
+            for kind in range(2):
+                number = wanted[k, kind]
+                if number >= 0:
+                    volume = math.pi * r * r if kind == 0 else 4.0 / 3.0 * math.pi * r * r * r
+                    tally = few[number : number + 1]
+                    values = finish(moments[number], stop - start, volume, tally, copies[start:stop])
+                    for f in range(MOMENTS):
+                        column = columns[number, f]
+                        if column >= 0:
+                            for j in range(stop - start):
+                                out[start + j, column] = values[f, j]
+
+
+@njit
+def _last_column(qx, qy, a, cell, iy, limit):
+    """The last column, at most `limit`, of the queries from `a` on that lie in row `iy`."""
+    last = int(math.floor(qx[a] / cell))
+    for j in range(a + 1, len(qx)):
+        column = int(math.floor(qx[j] / cell))
+        if column > limit or int(math.floor(qy[j] / cell)) != iy:
+            break
+        last = column
+    return last
+
+
+@njit
+def cylinders(px, py, pz, shared, end, qx, qy, qz, a, b, r2, centre, inner, out, start):
+    """Moments of one radius' cylinders for the queries a..b of one cell, whose centre is given."""
+    cx, cy = centre
+    cz = 0.0
+    rx, ry, rz = px[shared:end], py[shared:end], pz[shared:end]
+    if shared:
+        n = 0
+        for i in range(shared):  # the mean height: the best point to take moments about
+            if px[i] < FAR:
+                cz += pz[i]
+                n += 1
+        cz /= n
+        cylinder_sums(px[:shared], py[:shared], pz[:shared], cx, cy, cz, EVERYTHING, inner, 0)
+    for j in range(a, b):
+        cylinder_sums(rx, ry, rz, qx[j], qy[j], qz[j], r2, out, j - start)
+        if shared:
+            add_shared(inner, cx - qx[j], cy - qy[j], cz - qz[j], out, j - start)
