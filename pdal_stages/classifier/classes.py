@@ -1,0 +1,225 @@
+"""Which labels become which classes: renaming, merging and dropping, and the two classes of a binary task."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..asprs import NAMES, NOISE, UNLABELLED, class_name
+from ..errors import OptionError, suggest
+
+#: Labels that are no class of their own unless `classes` names them: never classified, unclassified,
+#: noise, and 12, which before LAS 1.4 marked overlap of flight strips, not a kind of object.
+LEFT_OUT = (*UNLABELLED, *NOISE, 12)
+#: The largest code a point can carry.
+MAX_CODE = 255
+
+# Words people use where ASPRS has another.
+_WORDS = {
+    **{name.lower(): code for code, name in NAMES.items()},
+    "other": 1,
+    "low vegetation": 3,
+    "medium vegetation": 4,
+    "vegetation": 5,
+    "tree": 5,
+    "trees": 5,
+    "buildings": 6,
+    "roof": 6,
+    "facade": 6,
+    "noise": 7,
+    "road": 11,
+    "wire": 14,
+    "wires": 14,
+    "power line": 14,
+    "pole": 15,
+    "tower": 15,
+    "bridge": 17,
+}
+_CURE = (
+    "Write classes as a list of codes, [2, 5, 6], or as labels and what they become: "
+    '{"2": "Ground", "3,4,5": "5 Vegetation", "6": 6, "9": "drop"}'
+)
+
+
+@dataclass(frozen=True)
+class ClassMap:
+    """Classes a model tells apart, and the labels each is made of.
+
+    Attributes
+    ----------
+    codes : tuple of int
+        ASPRS codes written to points, ascending.
+    names : tuple of str
+    labels : tuple of tuple of int
+        Labels in the training clouds that become the class.
+    """
+
+    codes: tuple[int, ...]
+    names: tuple[str, ...]
+    labels: tuple[tuple[int, ...], ...]
+
+    @classmethod
+    def parse(cls, spec: Any, found: Iterable[int] = ()) -> ClassMap:
+        """Read the option `classes`.
+
+        Parameters
+        ----------
+        spec : None, str, list of codes or mapping
+            None: every label found as it is, except those in :data:`LEFT_OUT`. A list: those labels
+            as they are. A mapping: labels (``"3,4,5"``, ``"3-5"``) to a code, an ASPRS name, a code with a
+            name (``"5 Trees"``), ``{"code": 5, "name": "Trees"}``, or ``"drop"``. Labels not mentioned are
+            dropped. Text is a comma-separated list, or JSON.
+        found : iterable of int
+            Labels in the training clouds, for None.
+        """
+        if isinstance(spec, str):
+            spec = _from_text(spec)
+        if spec is None:
+            spec = [label for label in sorted(set(map(int, found))) if label not in LEFT_OUT]
+            if any(label > MAX_CODE for label in spec):
+                raise OptionError(
+                    f"labels above {MAX_CODE} cannot be class codes",
+                    found=max(spec),
+                    cure=f"Map them. {_CURE}",
+                )
+        if isinstance(spec, Mapping):
+            pairs = [(_labels(key), value) for key, value in spec.items()]
+        elif isinstance(spec, Iterable):
+            pairs = [((_code(item, "label"),), _code(item, "code")) for item in spec]
+        else:
+            raise OptionError("'classes' must be a list or a mapping", found=repr(spec), cure=_CURE)
+        made: dict[int, tuple[str | None, list[int]]] = {}
+        taken: set[int] = set()
+        for labels, value in pairs:
+            repeated = taken & set(labels)
+            if repeated:
+                raise OptionError("'classes' names a label twice", found=min(repeated), cure=_CURE)
+            taken |= set(labels)
+            target = _target(value, labels)
+            if target is None:
+                continue
+            code, name = target
+            known, members = made.setdefault(code, (name, []))
+            made[code] = (known or name, members)
+            members.extend(labels)
+        codes = tuple(sorted(made))
+        return cls(
+            codes,
+            tuple(made[code][0] or class_name(code) for code in codes),
+            tuple(tuple(sorted(made[code][1])) for code in codes),
+        )
+
+    def binary(self, target: int, background: int) -> ClassMap:
+        """One class against all the others, which become `background`."""
+        if target not in self.codes:
+            raise OptionError(
+                "'target' is none of the classes", found=target, cure=f"Choose one of {list(self.codes)}"
+            )
+        if background == target:
+            raise OptionError("'background' and 'target' are the same code", found=target)
+        i = self.codes.index(target)
+        rest = tuple(sorted(label for k, part in enumerate(self.labels) if k != i for label in part))
+        if not rest:
+            raise OptionError(
+                "nothing is left for the background: 'classes' names the target only", cure=_CURE
+            )
+        both = sorted([(target, self.names[i], self.labels[i]), (background, "Background", rest)])
+        return ClassMap(
+            tuple(c for c, _, _ in both), tuple(n for _, n, _ in both), tuple(m for _, _, m in both)
+        )
+
+    def index(self, labels: npt.NDArray[Any]) -> npt.NDArray[np.int16]:
+        """Position of each label's class in `codes`, -1 where it is dropped."""
+        labels = np.asarray(labels)
+        highest = max((label for part in self.labels for label in part), default=0)
+        table = np.full(highest + 2, -1, np.int16)
+        for position, part in enumerate(self.labels):
+            table[list(part)] = position
+        return table[np.minimum(labels, highest + 1)]
+
+
+def as_labels(labels: npt.ArrayLike, where: str) -> npt.NDArray[Any]:
+    """The labels as a non-negative integer array, or an error naming the cloud."""
+    array = np.asarray(labels)
+    if array.ndim != 1:
+        raise OptionError("labels must be one number per point", where=where, found=f"shape {array.shape}")
+    if array.dtype.kind == "f" and len(array):
+        if not np.all(np.isfinite(array)) or np.any(array != np.floor(array)):
+            raise OptionError("labels must be whole numbers", where=where, cure="Choose a class dimension")
+        array = array.astype(np.int64)
+    elif array.dtype.kind not in "iu" and len(array):
+        raise OptionError("labels must be whole numbers", where=where, found=f"type {array.dtype}")
+    if len(array) and (array.min() < 0 or array.max() > 65535):
+        raise OptionError(
+            "labels must be from 0 to 65535", where=where, found=f"{array.min()} to {array.max()}"
+        )
+    return array.astype(np.uint16)
+
+
+def _from_text(text: str) -> Any:
+    text = text.strip()
+    if text[:1] in ("{", "["):
+        try:
+            return json.loads(text)
+        except ValueError as error:
+            raise OptionError("'classes' is not valid JSON", found=str(error), cure=_CURE) from None
+    return _labels(text)
+
+
+def _labels(text: Any) -> tuple[int, ...]:
+    """``"3,4,5"``, ``"3-5"`` or 3 as labels."""
+    if not isinstance(text, str):
+        return (_code(text, "label"),)
+    labels: list[int] = []
+    for part in text.split(","):
+        span = re.fullmatch(r"\s*(\d{1,5})(?:\s*-\s*(\d{1,5}))?\s*", part)
+        if span is None:
+            raise OptionError("'classes' has a key that is no list of labels", found=repr(text), cure=_CURE)
+        first, last = int(span[1]), int(span[2] or span[1])
+        if last < first or last > 65535:
+            raise OptionError("'classes' has a range of labels that is none", found=part.strip(), cure=_CURE)
+        labels.extend(range(first, last + 1))
+    return tuple(dict.fromkeys(labels))
+
+
+def _code(value: Any, what: str) -> int:
+    limit = MAX_CODE if what == "code" else 65535
+    if isinstance(value, str) and value.strip().isdigit():
+        value = int(value)
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value <= limit:
+        raise OptionError(
+            f"a class {what} must be a whole number from 0 to {limit}", found=repr(value), cure=_CURE
+        )
+    return int(value)
+
+
+def _target(value: Any, labels: tuple[int, ...]) -> tuple[int, str | None] | None:
+    """(code, name) that a mapping's value means; None for dropped."""
+    if value is None or (isinstance(value, str) and value.strip().lower() in ("drop", "")):
+        return None
+    if isinstance(value, Mapping):
+        unknown = set(value) - {"code", "name"}
+        if unknown or "code" not in value:
+            raise OptionError("a class is written with 'code' and 'name'", found=dict(value), cure=_CURE)
+        return _code(value["code"], "code"), str(value["name"]) if value.get("name") else None
+    if not isinstance(value, str):
+        return _code(value, "code"), None
+    match = re.fullmatch(r"\s*(\d{1,5})\s*[:=]?\s*(.*?)\s*", value)
+    if match:
+        return _code(match[1], "code"), match[2] or None
+    word = " ".join(value.split())
+    if word.lower() in _WORDS:
+        return _WORDS[word.lower()], word
+    if len(labels) == 1 and labels[0] <= MAX_CODE:
+        return labels[0], word
+    raise OptionError(
+        f"'{word}' is no ASPRS class, and several labels become it",
+        found=f"labels {list(labels)}",
+        cure=suggest(word.lower(), _WORDS) + f"Say its code too: '5 {word}'",
+    )

@@ -1,0 +1,192 @@
+"""Spatial cross-validation: whole blocks of ground are held out, with a gap around them.
+
+Neighboring points share most of their neighborhood and so nearly all of their features. Points drawn at
+random for validation are therefore half known already, and the score says little about another place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..accuracy import Accuracy
+from ..errors import OptionError
+from ..progress import Progress
+from .growing import TreeOptions, grow
+
+#: A smaller forest is preferred if its mean F1 is within this of the best.
+TOLERANCE = 0.002
+
+
+def block_folds(
+    xy: npt.NDArray[np.float64],
+    label: npt.NDArray[Any],
+    weight: npt.NDArray[Any],
+    folds: int,
+    block_size: float,
+) -> npt.NDArray[np.int16]:
+    """The fold of each sample: blocks of ground, dealt out so that every fold has its share of each class.
+
+    Parameters
+    ----------
+    xy : (n, 2) float64
+        In metres. Blocks are anchored to absolute coordinates: clouds that overlap share them.
+    label, weight : (n,) int
+        Class position of each sample and how often it counts.
+    folds : int
+    block_size : float
+        Metres.
+
+    Returns
+    -------
+    (n,) int16
+    """
+    cell = np.floor(xy / block_size).astype(np.int64)
+    blocks, block = np.unique(cell, axis=0, return_inverse=True)
+    block = block.reshape(-1)
+    if len(blocks) < folds:
+        raise OptionError(
+            f"the samples cover {len(blocks)} block(s) of {block_size:g} m, fewer than the {folds} folds",
+            found=f"block_size {block_size:g}, folds {folds}",
+            cure="Make block_size or folds smaller, or give more training data",
+        )
+    classes = int(label.max()) + 1
+    content = np.zeros((len(blocks), classes))
+    np.add.at(content, (block, label), weight)
+    content /= np.maximum(content.sum(axis=0), 1e-300)
+    held = np.zeros((folds, classes))
+    number = np.zeros(folds, np.int64)
+    fold_of = np.empty(len(blocks), np.int16)
+    # Largest first, each to the fold where it keeps the shares most even.
+    for b in np.lexsort((np.arange(len(blocks)), -content.sum(axis=1))):
+        cost = ((held + content[b]) ** 2).sum(axis=1) - (held**2).sum(axis=1)
+        # An empty fold first, so that none stays empty.
+        best = min(range(folds), key=lambda f: (number[f] > 0, cost[f], f))
+        fold_of[b] = best
+        held[best] += content[b]
+        number[best] += 1
+    return fold_of[block]
+
+
+def split(
+    xy: npt.NDArray[np.float64], fold: npt.NDArray[Any], number: int, gap: float
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
+    """(training mask, validation rows) of one fold; none of the former is within `gap` of the latter."""
+    from scipy.spatial import cKDTree
+
+    held = fold == number
+    train = ~held
+    if gap > 0 and held.any():
+        others = np.flatnonzero(train)
+        distance, _ = cKDTree(xy[held]).query(xy[others], distance_upper_bound=np.nextafter(gap, np.inf))
+        train[others[distance <= gap]] = False
+    return train, np.flatnonzero(held)
+
+
+def search(
+    values: npt.NDArray[np.float32],
+    label: npt.NDArray[Any],
+    weight: npt.NDArray[np.int64],
+    xy: npt.NDArray[np.float64],
+    codes: Sequence[int],
+    candidates: Sequence[TreeOptions],
+    tree_counts: Sequence[int],
+    *,
+    folds: int,
+    block_size: float,
+    gap: float,
+    seed: int,
+    threads: int | None = None,
+    progress: bool = True,
+) -> list[dict[str, Any]]:
+    """Score every candidate by spatial cross-validation.
+
+    One forest of the largest size is grown per fold and candidate; smaller ones are its first trees.
+
+    Returns
+    -------
+    list of dict
+        Per combination: trees, max_depth, min_samples_leaf, overall_accuracy, kappa, mean_f1, f1 by code, and
+        mean_f1_by_fold. Samples count as often as they were drawn, so classes weigh the same.
+    """
+    fold = block_folds(xy, label, weight, folds, block_size)
+    sums = {
+        (c, t): np.zeros((folds, len(codes), len(codes)), np.int64)
+        for c in range(len(candidates))
+        for t in tree_counts
+    }
+    with Progress(
+        folds * len(candidates) * tree_counts[-1],
+        "cross-validation",
+        "trees",
+        enabled=None if progress else False,
+    ) as bar:
+        for number in range(folds):
+            train, rows = split(xy, fold, number, gap)
+            missing = [codes[k] for k in range(len(codes)) if not (weight * train)[label == k].any()]
+            if missing:
+                raise OptionError(
+                    f"without fold {number + 1} and its gap of {gap:g} m a class has no samples left",
+                    found=f"class {missing[0]}",
+                    cure="Make block_size or gap smaller, or give more training data",
+                )
+            for c, candidate in enumerate(candidates):
+                trees = grow(
+                    values,
+                    label,
+                    weight * train,
+                    tree_counts[-1],
+                    candidate,
+                    seed,
+                    score=rows,
+                    threads=threads,
+                    progress=bar,
+                )
+                for t, best in _votes(trees, tree_counts, len(rows), len(codes)):
+                    np.add.at(sums[c, t][number], (label[rows], best), weight[rows])
+    return [_row(candidates[c], t, matrices, codes) for (c, t), matrices in sums.items()]
+
+
+def _votes(trees, counts: Sequence[int], n: int, classes: int) -> Iterator[tuple[int, npt.NDArray[np.int64]]]:
+    total = np.zeros((n, classes))
+    for number, (_, _, shares) in enumerate(trees, 1):
+        total += shares
+        if number in counts:
+            yield number, total.argmax(axis=1)
+
+
+def _row(
+    candidate: TreeOptions, trees: int, matrices: npt.NDArray[np.int64], codes: Sequence[int]
+) -> dict[str, Any]:
+    by_fold = [Accuracy.from_confusion(m, codes).mean_f1 if m.any() else None for m in matrices]
+    return {
+        "trees": trees,
+        "max_depth": candidate.max_depth,
+        "min_samples_leaf": candidate.min_samples_leaf,
+        **figures(matrices.sum(axis=0), codes),
+        "mean_f1_by_fold": by_fold,
+    }
+
+
+def figures(matrix: npt.NDArray[np.int64], codes: Sequence[int]) -> dict[str, Any]:
+    """The measures kept in a model file; rows of the matrix are the truth."""
+    accuracy = Accuracy.from_confusion(matrix, codes)
+    return {
+        "overall_accuracy": accuracy.overall_accuracy,
+        "kappa": accuracy.kappa,
+        "mean_f1": accuracy.mean_f1,
+        "f1": {str(one.code): one.f1 for one in accuracy.per_class},
+    }
+
+
+def choose(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The cheapest combination whose mean F1 is within :data:`TOLERANCE` of the best."""
+    best = max(row["mean_f1"] for row in rows)
+    good = [row for row in rows if row["mean_f1"] >= best - TOLERANCE]
+    return min(
+        good,
+        key=lambda row: (row["trees"], row["max_depth"] or 10**9, -row["min_samples_leaf"], -row["mean_f1"]),
+    )

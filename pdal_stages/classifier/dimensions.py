@@ -1,0 +1,109 @@
+"""Dimensions of the points that serve as features: which are needed, who makes them, are they fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import DimensionError
+
+#: Derived here: ReturnNumber / NumberOfReturns, 1 for a last or only return.
+RETURN_RATIO = "ReturnRatio"
+
+_MAKERS = {
+    "HeightAboveGround": (
+        "Put filters.hag_minima before this stage (or PDAL's filters.hag_nn or filters.hag_delaunay after a "
+        "ground filter; classify with the one that was used for training)"
+    ),
+    "Intensity": "It comes from the reader; this source has none. Use a model trained without it",
+    "ReturnNumber": "It comes from the reader; this source has none. Use a model trained without it",
+    "NumberOfReturns": "It comes from the reader; this source has none. Use a model trained without it",
+}
+
+
+def required(names: Iterable[str]) -> tuple[str, ...]:
+    """Dimensions the cloud must have for these dimension features."""
+    out: dict[str, None] = {}
+    for name in names:
+        out.update(dict.fromkeys(("ReturnNumber", "NumberOfReturns") if name == RETURN_RATIO else (name,)))
+    return tuple(out)
+
+
+def gather(
+    names: Iterable[str],
+    dimensions: Mapping[str, npt.ArrayLike],
+    n: int,
+    rows: npt.NDArray[np.int64] | None = None,
+    where: str | None = None,
+) -> tuple[dict[str, npt.NDArray[Any]], dict[str, int]]:
+    """The values of dimension features at some points.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Dimension features, ``ReturnRatio`` among them or not.
+    dimensions : mapping
+        Name to (n,) values of the whole cloud.
+    n : int
+        Points in the cloud.
+    rows : array of int, optional
+        Points wanted; all by default.
+    where : str, optional
+        The cloud, for error texts.
+
+    Returns
+    -------
+    values : dict of name to (len(rows),) array
+    notes : dict
+        What had to be counted: ``points_without_return_numbers`` (their ratio is taken as 1).
+
+    Raises
+    ------
+    DimensionError
+        A dimension is missing, of another length, or not finite somewhere.
+    """
+    names = tuple(names)
+    picked: dict[str, npt.NDArray[Any]] = {}
+    for name in required(names):
+        if name not in dimensions:
+            cure = _MAKERS.get(name, f"Put the stage that creates {name} before this one")
+            raise DimensionError(f"the dimension {name} is missing", where=where, cure=cure)
+        values = np.asarray(dimensions[name])
+        if values.shape != (n,):
+            raise DimensionError(
+                f"the dimension {name} must have one value per point",
+                where=where,
+                found=f"shape {values.shape}",
+            )
+        if values.dtype.kind not in "fiub":
+            raise DimensionError(f"the dimension {name} is not numeric", where=where, found=str(values.dtype))
+        picked[name] = values if rows is None else values[rows]
+        if values.dtype.kind == "f":
+            bad = int(np.count_nonzero(~np.isfinite(picked[name])))
+            if bad:
+                raise DimensionError(
+                    f"the dimension {name} is not finite at some points",
+                    where=where,
+                    found=f"{bad:,} points",
+                    cure=f"Remove them before this stage. {_MAKERS.get(name, '')}",
+                )
+    notes: dict[str, int] = {}
+    out = {}
+    for name in names:
+        if name != RETURN_RATIO:
+            out[name] = picked[name]
+            continue
+        number, total = picked["ReturnNumber"], picked["NumberOfReturns"]
+        known = (number > 0) & (total > 0)
+        if len(total) and not known.any():
+            raise DimensionError(
+                "ReturnNumber or NumberOfReturns is 0 everywhere, so there is no ReturnRatio",
+                where=where,
+                cure="Use a model trained without ReturnRatio",
+            )
+        notes["points_without_return_numbers"] = int(np.count_nonzero(~known))
+        out[name] = np.where(known, number / np.maximum(total, 1), 1.0)
+    return out, notes

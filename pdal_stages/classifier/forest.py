@@ -1,0 +1,234 @@
+"""A random forest as plain arrays: made from scikit-learn's trees, checked, and applied without scikit-learn.
+
+Trees are stored level by level (root, its children, theirs, ...). The children of the k-th split node of
+a tree (k from 0) are then its nodes 2k+1 and 2k+2, so no child pointers are needed. See docs/model-file.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import ModelError
+from . import walk as kernels
+from .arrays import ArrayRule
+
+#: Levels below the root a tree may have.
+MAX_DEPTH = 10_000
+#: Bytes of feature values that pass over all trees together, about half a core's second level cache.
+_GROUP_BYTES = 1 << 19
+
+_FAULTS = {
+    kernels.TOO_FEW: "a tree ends before all its branches do",
+    kernels.TOO_MANY: "a tree has nodes that are nobody's children",
+    kernels.BAD_FEATURE: "a node asks for a feature that does not exist",
+    kernels.BAD_THRESHOLD: "a threshold is not a finite number",
+    kernels.BAD_LEAVES: "the number of leaves and the leaf table differ",
+    kernels.TOO_DEEP: f"a tree is deeper than {MAX_DEPTH} levels",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Forest:
+    """A random forest; its probabilities are the mean of its trees' leaf frequencies.
+
+    Parameters
+    ----------
+    tree_sizes : (trees,) int32
+        Nodes of each tree.
+    feature : (nodes,) int16 or int32
+        Feature a split node compares, -1 in a leaf. Trees follow each other, each level by level.
+    threshold : (nodes,) float32
+        A row goes to the left child where its value <= threshold. 0 in a leaf.
+    leaf_counts : (leaves, classes) uint32
+        Training samples of each class in each leaf, leaves in the order of their nodes.
+    n_features : int
+
+    Raises
+    ------
+    ModelError
+        If the arrays are not a forest.
+    """
+
+    tree_sizes: npt.NDArray[np.int32]
+    feature: npt.NDArray[Any]
+    threshold: npt.NDArray[np.float32]
+    leaf_counts: npt.NDArray[np.uint32]
+    n_features: int
+    depths: npt.NDArray[np.int32] = field(init=False)
+
+    name: ClassVar[str] = "random_forest"
+    rules: ClassVar[Mapping[str, ArrayRule]] = {
+        "tree_sizes": ArrayRule(("<i4",), 1),
+        "feature": ArrayRule(("<i2", "<i4"), 1),
+        "threshold": ArrayRule(("<f4",), 1),
+        "leaf_counts": ArrayRule(("<u4",), 2),
+    }
+
+    def __post_init__(self) -> None:
+        sizes, nodes = self.tree_sizes, len(self.feature)
+        if not len(sizes) or not nodes or len(self.threshold) != nodes or self.leaf_counts.ndim != 2:
+            raise ModelError("the forest's arrays do not fit each other", found=self._shapes())
+        if int(sizes.min()) < 1 or int(sizes.sum(dtype=np.int64)) != nodes:
+            raise ModelError("the trees' sizes do not add up to the nodes", found=self._shapes())
+        left = np.empty(nodes, np.uint32)
+        depths = np.empty(len(sizes), np.int32)
+        fault, tree, node = kernels.lay_out(
+            sizes.astype(np.int64),
+            self.feature,
+            self.threshold,
+            self.n_features,
+            len(self.leaf_counts),
+            MAX_DEPTH,
+            left,
+            depths,
+        )
+        if fault:
+            raise ModelError(_FAULTS[fault], found=f"tree {tree}, node {node}")
+        totals = self.leaf_counts.sum(axis=1, dtype=np.uint64)
+        if not totals.all():
+            raise ModelError("a leaf holds no samples", found=f"leaf {int(np.argmin(totals))}")
+        leaf = self.feature < 0
+        packed = np.where(leaf, 0, self.feature).astype(np.uint64)
+        packed <<= kernels.SHIFT
+        packed |= left
+        rows = np.cumsum(leaf, dtype=np.int64)
+        rows -= 1
+        set_ = object.__setattr__
+        set_(self, "depths", depths)
+        set_(self, "_sizes", sizes.astype(np.int64))
+        set_(self, "_packed", packed)
+        set_(self, "_limits", np.where(leaf, np.float32(np.inf), self.threshold).astype(np.float32))
+        set_(self, "_leaf_row", rows.astype(np.int32))
+        set_(self, "_leaf_value", self.leaf_counts / totals[:, None].astype(np.float64))
+
+    def _shapes(self) -> str:
+        names = ("tree_sizes", "feature", "threshold", "leaf_counts")
+        return ", ".join(f"{name} {getattr(self, name).shape}" for name in names)
+
+    @property
+    def n_classes(self) -> int:
+        return self.leaf_counts.shape[1]
+
+    @property
+    def n_trees(self) -> int:
+        return len(self.tree_sizes)
+
+    # ---- making one --------------------------------------------------------------------------------------
+
+    @classmethod
+    def from_sklearn(cls, trees: Sequence[Any], n_features: int) -> Forest:
+        """Convert fitted scikit-learn trees.
+
+        Parameters
+        ----------
+        trees : sequence of DecisionTreeClassifier (``forest.estimators_``) or of their ``tree_``
+            Trained on float32 features with whole-number sample weights (bootstrap counts), one output.
+        n_features : int
+        """
+        parts = [_level_order(getattr(tree, "tree_", tree)) for tree in trees]
+        kind = np.int16 if n_features <= np.iinfo(np.int16).max else np.int32
+        return cls(
+            np.array([len(part[0]) for part in parts], np.int32),
+            np.concatenate([part[0] for part in parts]).astype(kind),
+            np.concatenate([part[1] for part in parts]),
+            np.concatenate([part[2] for part in parts]),
+            n_features,
+        )
+
+    @classmethod
+    def from_arrays(
+        cls,
+        arrays: Mapping[str, npt.NDArray[Any]],
+        parameters: Mapping[str, Any],
+        n_features: int,
+        n_classes: int,
+    ) -> Forest:
+        """A forest from a model file's arrays; everything about them is checked."""
+        if arrays["leaf_counts"].shape[1] != n_classes:
+            raise ModelError(
+                "the leaf table and the list of classes differ",
+                found=f"{arrays['leaf_counts'].shape[1]} and {n_classes} classes",
+            )
+        return cls(**{name: arrays[name] for name in cls.rules}, n_features=n_features)
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """The arrays a model file stores."""
+        return {name: getattr(self, name) for name in self.rules}
+
+    def parameters(self) -> dict[str, Any]:
+        """What a model file says about the forest beside its arrays."""
+        return {
+            "trees": self.n_trees,
+            "nodes": len(self.feature),
+            "leaves": len(self.leaf_counts),
+            "deepest": int(self.depths.max()),
+        }
+
+    # ---- applying it -------------------------------------------------------------------------------------
+
+    def predict_proba(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+        """Class probabilities of rows of features; equal to scikit-learn's, bit for bit.
+
+        Thread-safe; holds no lock while it runs.
+
+        Parameters
+        ----------
+        values : (n, features) float32
+
+        Returns
+        -------
+        (n, classes) float64
+        """
+        values = np.ascontiguousarray(values, dtype=np.float32)
+        if values.ndim != 2 or values.shape[1] != self.n_features:
+            raise ModelError(
+                f"the model takes {self.n_features} features per point", found=f"shape {values.shape}"
+            )
+        out = np.zeros((len(values), self.n_classes))
+        rows = _GROUP_BYTES // (4 * self.n_features) // kernels.LANES * kernels.LANES
+        kernels.walk(
+            values.reshape(-1),
+            self._sizes,  # type: ignore[attr-defined]
+            self._limits,  # type: ignore[attr-defined]
+            self._packed,  # type: ignore[attr-defined]
+            self._leaf_row,  # type: ignore[attr-defined]
+            self._leaf_value,  # type: ignore[attr-defined]
+            max(rows, 2 * kernels.LANES),
+            out,
+        )
+        out /= self.n_trees
+        return out
+
+
+def _level_order(tree) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
+    """(feature, threshold, leaf counts) of a scikit-learn ``Tree``, level by level."""
+    left, right = tree.children_left, tree.children_right
+    levels = [np.zeros(1, np.int64)]
+    while True:
+        splits = levels[-1][left[levels[-1]] >= 0]
+        if not len(splits):
+            break
+        levels.append(np.column_stack([left[splits], right[splits]]).reshape(-1))
+    order = np.concatenate(levels)
+    leaf = left[order] < 0
+    feature = np.where(leaf, -1, tree.feature[order])
+    threshold = np.where(leaf, 0.0, float32_at_most(tree.threshold[order])).astype(np.float32)
+    leaves = order[leaf]
+    shares = tree.value[leaves, 0, :]
+    # scikit-learn keeps shares (before 1.3: counts) and the weight of a node; bootstrap weights are whole.
+    exact = shares / shares.sum(axis=1, keepdims=True) * tree.weighted_n_node_samples[leaves][:, None]
+    counts = np.rint(exact)
+    if tree.n_outputs != 1 or np.abs(counts - exact).max(initial=0) > 1e-3 or counts.max() >= 2**32:
+        raise ModelError("these trees were not grown with whole-number sample weights and one output")
+    return feature, threshold, counts.astype(np.uint32)
+
+
+def float32_at_most(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
+    """The largest float32 <= each float64: comparing a float32 with either gives the same answer."""
+    near = values.astype(np.float32)
+    return np.where(near > values, np.nextafter(near, np.float32(-np.inf)), near)

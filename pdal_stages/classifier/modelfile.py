@@ -1,0 +1,285 @@
+"""The model file: one zip of a manifest and arrays, written whole or not at all, read with distrust.
+
+Nothing from a file is ever executed. What a file declares is held against the size of the file itself
+before anything is allocated, so a hostile one costs bounded time and memory. See docs/model-file.md.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import struct
+import zipfile
+import zlib
+from collections.abc import Mapping
+from functools import lru_cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy.typing as npt
+
+from ..errors import ModelError, StageError
+from .arrays import ArrayRule, from_bytes, to_bytes
+
+FORMAT = "pdal-stages model"
+VERSION = 1
+MANIFEST = "manifest.json"
+
+#: A manifest's largest size in bytes, unpacked.
+MANIFEST_LIMIT = 2 << 20
+#: Unpacked bytes allowed per byte of the file (ours have 2 to 15), beside a fixed allowance.
+RATIO_LIMIT, ALLOWANCE = 60, 4 << 20
+#: A file's members, and the largest file.
+MEMBER_LIMIT, FILE_LIMIT = 64, (1 << 32) - 1
+
+_CURE = "Train the model again, or copy the file again if it was damaged on its way"
+_END = struct.Struct("<4s4H2LH")  # zip's end of central directory
+_BAD = (
+    zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError, struct.error,
+    KeyError, OverflowError, OSError,
+)  # fmt: skip
+
+
+# ---- writing -----------------------------------------------------------------------------------------------
+
+
+def write(
+    path: str | os.PathLike, manifest: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]
+) -> None:
+    """Write a model file; an existing one stays as it was until the new one is complete.
+
+    The same model always gives the same bytes: no date, no path and no host is stored.
+
+    Parameters
+    ----------
+    path : path
+    manifest : mapping
+        Everything but ``arrays``, which is added here.
+    arrays : mapping
+        Name to array of numbers.
+    """
+    path = Path(path)
+    members = {f"arrays/{name}.npy": to_bytes(array) for name, array in arrays.items()}
+    table = {
+        name: {
+            "file": file,
+            "dtype": array.dtype.newbyteorder("<").str,
+            "shape": list(array.shape),
+            "sha256": hashlib.sha256(members[file]).hexdigest(),
+        }
+        for (name, array), file in zip(arrays.items(), members, strict=True)
+    }
+    whole = {"format": FORMAT, "version": VERSION, **manifest, "arrays": table}
+    validate(whole)
+    text = json.dumps(whole, indent=1, ensure_ascii=False, allow_nan=False).encode() + b"\n"
+    if len(text) > MANIFEST_LIMIT:
+        raise ModelError("the manifest is too large", found=f"{len(text):,} bytes")
+    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        try:
+            with open(beside, "xb") as stream:
+                with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
+                    for name, data in ((MANIFEST, text), *members.items()):
+                        info = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
+                        info.compress_type = zipfile.ZIP_DEFLATED
+                        info.external_attr = 0o644 << 16
+                        archive.writestr(info, data)
+                stream.flush()
+                if stream.tell() > FILE_LIMIT:
+                    raise ModelError(
+                        "the model is larger than 4 GiB",
+                        cure="Raise min_samples_leaf or lower the number of trees",
+                    )
+                os.fsync(stream.fileno())
+            os.replace(beside, path)
+        finally:
+            beside.unlink(missing_ok=True)
+    except (OSError, zipfile.LargeZipFile) as error:
+        raise ModelError("the model file cannot be written", where=str(path), found=error) from error
+
+
+# ---- reading -----------------------------------------------------------------------------------------------
+
+
+def read(path: str | os.PathLike, rules_of) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
+    """Read a model file.
+
+    Parameters
+    ----------
+    path : path
+    rules_of : function
+        From the manifest's ``algorithm`` to its arrays' rules (name to :class:`ArrayRule`, a name that ends
+        in ``*`` stands for many); raises for an algorithm it does not know.
+
+    Returns
+    -------
+    (manifest, arrays)
+
+    Raises
+    ------
+    ModelError
+        Whatever is wrong with the file; the message names it.
+    """
+    path = Path(path)
+    try:
+        if not path.exists():
+            raise ModelError("there is no such model file", cure="Check the path")
+        if not path.is_file():
+            raise ModelError("the model is not a file", cure="Check the path")
+        with open(path, "rb") as stream:
+            size = _check_end(stream)
+            with zipfile.ZipFile(stream) as archive:
+                return _read(archive, size, rules_of)
+    except StageError as error:
+        raise error.at(str(path)) from error.__cause__
+    except (*_BAD, RecursionError, MemoryError) as error:
+        text = f"{type(error).__name__}: {error}"[:200]
+        raise ModelError("the model file cannot be read", where=str(path), found=text, cure=_CURE) from error
+
+
+def _check_end(stream) -> int:
+    """The file's size, after a look at zip's last record: how long is the list zipfile is about to load?"""
+    size = stream.seek(0, os.SEEK_END)
+    if size < _END.size:
+        raise ModelError("this is not a model file", found=f"{size} bytes", cure=_CURE)
+    if size > FILE_LIMIT:
+        raise ModelError("the model file is larger than 4 GiB", found=f"{size:,} bytes")
+    tail = min(size, _END.size + 20)
+    stream.seek(size - tail)
+    data = stream.read(tail)
+    signature, disk, first, here, total, length, offset, comment = _END.unpack(data[-_END.size :])
+    if signature != b"PK\x05\x06" or comment:
+        raise ModelError("this is not a model file, or it is cut short", cure=_CURE)
+    if data[: -_END.size].startswith(b"PK\x06\x07"):
+        raise ModelError("the model file is a zip of a kind that is not used here", found="zip64", cure=_CURE)
+    if disk or first or here != total or not 1 <= total <= MEMBER_LIMIT or length > MEMBER_LIMIT * 512:
+        raise ModelError(
+            "the model file's list of members is not right", found=f"{total} members", cure=_CURE
+        )
+    if offset + length + _END.size != size:
+        raise ModelError("the model file has bytes that belong to nothing", cure=_CURE)
+    stream.seek(0)
+    return size
+
+
+def _read(
+    archive: zipfile.ZipFile, size: int, rules_of
+) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
+    members: dict[str, zipfile.ZipInfo] = {}
+    for info in archive.infolist():
+        if info.filename in members:
+            raise ModelError("the model file has a member twice", found=repr(info.filename), cure=_CURE)
+        if info.flag_bits & 0x1 or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise ModelError(
+                "a member is packed in a way not used here", found=repr(info.filename), cure=_CURE
+            )
+        members[info.filename] = info
+    declared = sum(info.file_size for info in members.values())
+    if declared > RATIO_LIMIT * size + ALLOWANCE:
+        raise ModelError(
+            "the model file would unpack to far more than a model does",
+            found=f"{declared:,} bytes from {size:,}",
+            cure=_CURE,
+        )
+    if MANIFEST not in members:
+        raise ModelError("this is not a model file", found=f"a zip without {MANIFEST}", cure=_CURE)
+    if members[MANIFEST].file_size > MANIFEST_LIMIT:
+        raise ModelError("the manifest is too large", found=f"{members[MANIFEST].file_size:,} bytes")
+    manifest = parse(_unpack(archive, members[MANIFEST]))
+    rules = rules_of(manifest["algorithm"])
+    table = manifest["arrays"]
+    expected = {MANIFEST, *(entry["file"] for entry in table.values())}
+    if len(expected) != 1 + len(table) or expected != set(members):
+        odd = sorted(expected ^ set(members))
+        raise ModelError(
+            "the members and the manifest's list of arrays differ", found=odd[:3] or None, cure=_CURE
+        )
+    arrays = {}
+    for name, entry in table.items():
+        data = _unpack(archive, members[entry["file"]])
+        if hashlib.sha256(data).hexdigest() != entry["sha256"]:
+            raise ModelError(
+                f"the array '{name}' is not the one that was stored", found="another SHA-256", cure=_CURE
+            )
+        array = from_bytes(data, _rule(rules, name), name)
+        if list(array.shape) != entry["shape"] or array.dtype.newbyteorder("<").str != entry["dtype"]:
+            raise ModelError(
+                f"the array '{name}' is not what the manifest says", found=f"shape {array.shape}"
+            )
+        arrays[name] = array
+    missing = [name for name in rules if not name.endswith("*") and name not in arrays]
+    if missing:
+        raise ModelError("the model file lacks an array", found=missing[0], cure=_CURE)
+    return manifest, arrays
+
+
+def _rule(rules: Mapping[str, ArrayRule], name: str) -> ArrayRule:
+    if name in rules:
+        return rules[name]
+    for pattern, rule in rules.items():
+        if pattern.endswith("*") and name.startswith(pattern[:-1]):
+            return rule
+    raise ModelError("the model file has an array its algorithm does not know", found=repr(name), cure=_CURE)
+
+
+def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
+    with archive.open(info) as stream:
+        data = stream.read(info.file_size + 1)  # never more than was declared; the CRC is checked at the end
+        if len(data) != info.file_size or stream.read(1):
+            raise ModelError("a member has another size than declared", found=repr(info.filename), cure=_CURE)
+    return data
+
+
+# ---- the manifest ----------------------------------------------------------------------------------------
+
+
+def parse(data: bytes) -> dict[str, Any]:
+    """The manifest in `data`, valid by its schema."""
+    try:
+        manifest = json.loads(data.decode("utf-8"), object_pairs_hook=_unique, parse_constant=_constant)
+    except RecursionError:
+        raise ModelError("the manifest is nested too deeply", cure=_CURE) from None
+    except (UnicodeDecodeError, ValueError) as error:
+        raise ModelError("the manifest is not valid JSON", found=str(error)[:200], cure=_CURE) from None
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        raise ModelError("this is not a model file", found="a manifest of something else")
+    if manifest.get("version") != VERSION:
+        raise ModelError(
+            f"the model file has a version this release does not know (it knows {VERSION})",
+            found=f"version {str(manifest.get('version'))[:20]}",
+            cure="Update pdal-stages",
+        )
+    validate(manifest)
+    return manifest
+
+
+def validate(manifest: Mapping[str, Any]) -> None:
+    """Hold a manifest against its JSON Schema."""
+    try:
+        error = next(_validator().iter_errors(manifest), None)
+    except RecursionError:
+        raise ModelError("the manifest is nested too deeply", cure=_CURE) from None
+    if error is not None:
+        place = "/".join(str(part)[:60] for part in error.absolute_path) or "(the whole)"
+        raise ModelError(f"the manifest is not valid at {place}", found=error.message[:200], cure=_CURE)
+
+
+@lru_cache(maxsize=1)
+def _validator():
+    import jsonschema
+
+    text = resources.files("pdal_stages").joinpath(f"schemas/model-{VERSION}.json").read_text("utf-8")
+    return jsonschema.Draft202012Validator(json.loads(text))
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    out = dict(pairs)
+    if len(out) != len(pairs):
+        raise ValueError("a key stands twice in one object")
+    return out
+
+
+def _constant(word: str) -> None:
+    raise ValueError(f"{word} is no number")

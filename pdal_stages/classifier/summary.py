@@ -1,0 +1,126 @@
+"""What a model is, for people: classes, features, samples, scores, importances."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+from ..errors import ModelError, OptionError
+
+if TYPE_CHECKING:
+    from .model import Model
+
+_GEOMETRY = {"Density", "Verticality", "HeightRange", "HeightStd", "Radius"}
+_SHAPE = re.compile(r"(A3|D1|D2|D3|D4)_\d+")
+GROUPINGS = ("column", "feature", "group", "neighborhood", "dimension")
+
+
+def split_name(name: str, suffixes: dict[str, str], dimensions: tuple[str, ...]) -> tuple[str, str, str]:
+    """(feature, group, neighborhood token) of one column, e.g. ``D1_3_c2`` -> (``D1``, ``shape``, ``c2``)."""
+    if name in dimensions:
+        return name, "dimension", "(dimension)"
+    # The longest suffix that fits: c2_5 before 5.
+    for suffix in sorted(suffixes, key=len, reverse=True):
+        if name.endswith("_" + suffix):
+            feature = name[: -len(suffix) - 1]
+            shape = _SHAPE.fullmatch(feature)
+            if shape:
+                return shape[1], "shape", suffixes[suffix]
+            return feature, "geometry" if feature in _GEOMETRY else "covariance", suffixes[suffix]
+    return name, "covariance", "(other)"
+
+
+def importances(model: Model, by: str = "feature") -> dict[str, float]:
+    """See ``Model.importances``."""
+    if by not in GROUPINGS:
+        raise OptionError(
+            "importances are grouped by something unknown", found=by, cure=f"One of {GROUPINGS}"
+        )
+    values = model.info.get("importances")
+    if values is None:
+        raise ModelError("the model file holds no importances")
+    suffixes = {one.suffix: one.token for one in model.plan.neighborhoods}
+    total: dict[str, float] = {}
+    for name, value in zip(model.plan.names, values, strict=True):
+        feature, group, token = split_name(name, suffixes, tuple(model.plan.dimensions))
+        key = {
+            "column": name,
+            "feature": feature,
+            "group": group,
+            "neighborhood": token,
+            "dimension": name if group == "dimension" else "(geometric features)",
+        }[by]
+        total[key] = total.get(key, 0.0) + value
+    return dict(sorted(total.items(), key=lambda item: -item[1]))
+
+
+def describe(model: Model) -> dict[str, Any]:
+    """See ``Model.describe``."""
+    manifest = model.manifest()
+    for bulky in ("shape_bins", "percentiles", "importances"):
+        manifest.pop(bulky, None)
+    manifest["required_dimensions"] = list(model.required_dimensions)
+    if model.info.get("importances") is not None:
+        manifest["importances"] = {
+            by: {key: round(value, 6) for key, value in importances(model, by).items()}
+            for by in GROUPINGS[1:]
+        }
+    return manifest
+
+
+def text(model: Model) -> str:
+    """The model as a page of text."""
+    info = model.info
+    p = model.algorithm.parameters()
+    tokens = " ".join(one.token for one in model.plan.neighborhoods)
+    lines = [
+        f"{model.algorithm.name}: " + ", ".join(f"{v:,} {k}" for k, v in p.items() if isinstance(v, int)),
+        f"features       {len(model.plan.names)}: {tokens}",
+        f"needs          {', '.join(model.required_dimensions) or 'coordinates only'}",
+        f"halo           {model.plan.halo:g} m",
+    ]
+    training = info.get("training", {})
+    if info.get("strategy") == "binary":
+        lines.append(
+            f"strategy       binary, target {info.get('target')}, background {info.get('background')}"
+        )
+    for cloud in training.get("clouds", []):
+        lines.append(f"trained on     {cloud['name']}, {cloud['points']:,} points")
+    lines += ["", f"{'class':<34}{'available':>12}{'samples':>10}{'duplicates':>12}{'F1 out of bag':>15}"]
+    bag = info.get("accuracy", {}).get("out_of_bag") or {}
+    for entry in info.get("classes", []):
+        f1 = (bag.get("f1") or {}).get(str(entry["code"]))
+        lines.append(
+            f"{entry['code']:>3} {entry['name'][:29]:<30}{entry['available']:>12,}{entry['samples']:>10,}"
+            f"{entry['duplicates']:>12,}{_percent(f1):>15}"
+        )
+    lines += ["", *_scores(info.get("accuracy", {}))]
+    if info.get("importances") is not None:
+        for by in ("neighborhood", "group", "feature"):
+            top = list(importances(model, by).items())[:10]
+            lines.append(f"importance by {by:<13}" + ", ".join(f"{k} {100 * v:.1f} %" for k, v in top))
+    return "\n".join(lines)
+
+
+def _scores(accuracy: dict[str, Any]) -> list[str]:
+    lines = []
+    for key, label in (
+        ("cross_validation", "blocks held out"),
+        ("out_of_bag", "out of bag"),
+    ):
+        row = accuracy.get(key)
+        if key == "cross_validation" and row:
+            row = row["chosen"]
+        if row:
+            lines.append(
+                f"{label:<17}overall accuracy {_percent(row['overall_accuracy'])}, "
+                f"kappa {_percent(row['kappa'])}, mean F1 {_percent(row['mean_f1'])}"
+            )
+    if lines:
+        lines.append("(classes weigh the same; out of bag is flattered by neighboring samples)")
+        lines.append("")
+    return lines
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.1f} %"

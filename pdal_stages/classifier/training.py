@@ -1,0 +1,391 @@
+"""Training: sample, compute features for the samples only, search, grow, score."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .. import __version__
+from ..errors import DimensionError, OptionError
+from ..features import FeatureEngine, FeaturePlan
+from ..parallel import map_blocks
+from ..progress import Progress
+from . import crossval
+from .classes import LEFT_OUT, ClassMap, as_labels
+from .dimensions import gather, required
+from .forest import Forest
+from .growing import TreeOptions, grow
+from .model import Model
+from .options import TrainingOptions
+from .sampling import Samples, draw_samples
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingCloud:
+    """A labelled cloud.
+
+    Attributes
+    ----------
+    xyz : (n, 3) float64
+        Coordinates in metres.
+    labels : (n,) int
+    dimensions : mapping
+        Name to (n,) values, as the options' `dimensions` need.
+    name : str
+        For messages and the model file; a path is cut to its last part.
+    mask : (n,) bool, optional
+        Points samples may be drawn from; all points serve as neighbors.
+    """
+
+    xyz: npt.NDArray[np.float64]
+    labels: npt.ArrayLike
+    dimensions: Mapping[str, npt.ArrayLike] = field(default_factory=dict)
+    name: str = "cloud"
+    mask: npt.ArrayLike | None = None
+
+
+def train(
+    clouds: Sequence[TrainingCloud], options: TrainingOptions | None = None, progress: bool = True
+) -> Model:
+    """Train a model.
+
+    Parameters
+    ----------
+    clouds : sequence of TrainingCloud
+        One per file or view. Features see only their own cloud.
+    options : TrainingOptions
+    progress : bool
+        Whether to show progress on stderr.
+
+    Raises
+    ------
+    OptionError, DimensionError
+    """
+    options = options or TrainingOptions()
+    clouds = [clouds] if isinstance(clouds, TrainingCloud) else list(clouds)
+    if not clouds:
+        raise OptionError("no training cloud was given")
+    started = time.perf_counter()
+    plan = FeaturePlan.parse(
+        options.neighborhoods, feature_set=options.feature_set, dimensions=options.dimensions
+    )
+    for cloud in clouds:  # before any work
+        for name in required(plan.dimensions):
+            if name not in cloud.dimensions:
+                gather((name,), cloud.dimensions, len(cloud.xyz), where=cloud.name)
+    classes, samples = _sample(clouds, options)
+    _must_fit(plan, len(samples))
+    values, engine_state = _features(clouds, samples, plan, options, progress)
+    timed = {"features": time.perf_counter() - started}
+    low, high = _percentiles(values, plan, options, samples)
+    xy = np.empty((len(samples), 2))
+    for number, cloud in enumerate(clouds):
+        mine = samples.cloud == number
+        xy[mine] = np.asarray(cloud.xyz, dtype=np.float64)[samples.row[mine], :2]
+
+    chosen, validation = _validate(values, samples, xy, classes, plan, options, progress)
+    started = time.perf_counter()
+    forest, importance, bag = _grow(values, samples, classes, chosen, options, progress)
+    timed["trees"] = time.perf_counter() - started
+    info = {
+        "strategy": options.strategy,
+        "target": options.target,
+        "background": options.background if options.strategy == "binary" else None,
+        "classes": [
+            {"code": code, "name": name, "labels": list(labels), **samples.counts(position)}
+            for position, (code, name, labels) in enumerate(
+                zip(classes.codes, classes.names, classes.labels, strict=True)
+            )
+        ],
+        "training": {
+            "clouds": [{"name": os.path.basename(c.name), "points": len(c.xyz)} for c in clouds],
+            "count": options.count,
+            "seed": options.seed,
+            "samples": len(samples),
+            "max_samples": float(options.max_samples),
+            "max_features": options.max_features,
+            "min_samples_leaf": chosen["min_samples_leaf"],
+            "max_depth": chosen["max_depth"],
+            **engine_state.notes,
+        },
+        "percentiles": {"low": low, "high": high, "limited": options.scale},
+        "accuracy": {"out_of_bag": bag, "cross_validation": validation},
+        "importances": importance,
+        "created_by": _versions(),
+    }
+    return Model(
+        plan,
+        forest,
+        list(zip(classes.codes, classes.names, strict=True)),
+        engine_state.bins,
+        engine_state.copt_threshold,
+        options.seed,
+        info,
+        timed,
+    )
+
+
+# ---- samples -----------------------------------------------------------------------------------------------
+
+
+def _sample(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> tuple[ClassMap, Samples]:
+    usable = []
+    found: dict[int, int] = {}
+    for cloud in clouds:
+        labels = as_labels(cloud.labels, cloud.name)
+        if len(labels) != len(cloud.xyz):
+            raise OptionError(
+                "labels and points differ in number",
+                where=cloud.name,
+                found=f"{len(labels)} and {len(cloud.xyz)}",
+            )
+        mask = None
+        if cloud.mask is not None:
+            mask = np.asarray(cloud.mask)
+            if mask.shape != labels.shape or mask.dtype != np.bool_:
+                raise OptionError("the mask must be one true or false per point", where=cloud.name)
+        number = np.bincount(labels if mask is None else labels[mask])
+        for label in np.flatnonzero(number).tolist():
+            found[label] = found.get(label, 0) + int(number[label])
+        usable.append((labels, mask))
+    listing = ", ".join(f"{label}: {n:,}" for label, n in sorted(found.items())[:20]) or "no points"
+    classes = ClassMap.parse(options.classes, found)
+    if options.strategy == "binary" and options.target is not None:
+        classes = classes.binary(options.target, options.background)
+    for code, name, members in zip(classes.codes, classes.names, classes.labels, strict=True):
+        if not any(found.get(label) for label in members):
+            raise OptionError(
+                f"class {code} ({name}) has no samples",
+                found=f"none of label {' or '.join(map(str, members))}; labels {listing}",
+                cure="Leave the class out of 'classes', or give clouds that have it",
+            )
+    if len(classes.codes) < 2:
+        raise OptionError(
+            "a classifier needs at least two classes",
+            found=f"labels {listing}",
+            cure=f"Labels {', '.join(map(str, LEFT_OUT))} are left out unless 'classes' names them",
+        )
+    inputs = []
+    for cloud, (labels, mask) in zip(clouds, usable, strict=True):
+        position = classes.index(labels)
+        if mask is not None:
+            position[~mask] = -1
+        inputs.append((np.asarray(cloud.xyz, dtype=np.float64), position))
+    return classes, draw_samples(inputs, len(classes.codes), options.count, options.seed)
+
+
+def _must_fit(plan: FeaturePlan, n: int) -> None:
+    """An error where this machine cannot hold the matrix of all samples."""
+    needed = n * len(plan.names) * 4
+    try:
+        there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):
+        return  # a system that does not tell
+    if needed > 0.8 * there:
+        raise OptionError(
+            f"{n:,} samples of {len(plan.names)} features do not fit in this machine's memory",
+            found=f"{needed / 2**30:.1f} GiB needed, {there / 2**30:.1f} GiB there",
+            cure="Lower 'count', or use fewer neighborhoods or features",
+        )
+
+
+# ---- features ----------------------------------------------------------------------------------------------
+
+
+@dataclass
+class _EngineState:
+    bins: Any = None
+    copt_threshold: float | None = None
+    notes: dict[str, Any] = field(default_factory=dict)
+
+
+def _features(
+    clouds: Sequence[TrainingCloud],
+    samples: Samples,
+    plan: FeaturePlan,
+    options: TrainingOptions,
+    progress: bool,
+) -> tuple[npt.NDArray[np.float32], _EngineState]:
+    """The (samples, features) float32 matrix, filled cloud by cloud."""
+    values = np.empty((len(samples), len(plan.names)), np.float32)
+    state = _EngineState()
+    # Histogram thresholds and the curvature threshold are fitted once, on the cloud that gives most samples.
+    share = np.bincount(samples.cloud, minlength=len(clouds))
+    with Progress(len(samples), "features of the samples", enabled=None if progress else False) as bar:
+        for number in np.argsort(-share, kind="stable"):
+            at = np.flatnonzero(samples.cloud == number)
+            if not len(at):
+                continue
+            cloud = clouds[number]
+            at = at[np.argsort(samples.row[at], kind="stable")]
+            rows = samples.row[at]
+            engine = FeatureEngine(
+                np.asarray(cloud.xyz, dtype=np.float64),
+                plan,
+                bins=state.bins,
+                copt_threshold=state.copt_threshold,
+                seed=options.seed,
+                threads=options.threads,
+            )
+            engine.fit()
+            state.bins, state.copt_threshold = engine.bins, engine.copt_threshold
+            fed, notes = gather(plan.dimensions, cloud.dimensions, len(cloud.xyz), rows, cloud.name)
+            for name, n in notes.items():
+                state.notes[name] = state.notes.get(name, 0) + n
+            for part, block in engine.blocks(
+                queries=rows,
+                dimensions=fed,
+                threads=options.threads,
+                memory_mb=options.memory_mb,
+                progress=bar,
+            ):
+                # `part` are rows of the cloud, in the order of the queries.
+                values[at[np.searchsorted(rows, part)]] = block
+    if not np.isfinite(values).all():
+        column = int(np.argmin(np.isfinite(values).all(axis=0)))
+        raise DimensionError(f"the feature {plan.names[column]} is not finite for some samples")
+    return values, state
+
+
+def _percentiles(
+    values: npt.NDArray[np.float32], plan: FeaturePlan, options: TrainingOptions, samples: Samples
+) -> tuple[list[float], list[float]]:
+    """1st and 99th percentile of each geometric feature, the values limited to them if so wanted.
+
+    [B16 3.3] scales features to [0, 1] between the two and cuts off what is beyond. Splits of a tree do not
+    change under scaling, so only the cut is done, on the training values: no threshold can then lie beyond
+    the percentiles, and a value beyond goes the way its limit would. Inference needs neither.
+    """
+    geometric = len(plan.names) - len(plan.dimensions)
+    low = [0.0] * len(plan.names)
+    high = [1.0] * len(plan.names)
+    columns = range(len(plan.names))
+
+    def one(j: int) -> None:
+        column = values[:, j]
+        if j >= geometric:  # dimensions keep their own scale
+            low[j], high[j] = float(column.min()), float(column.max())
+            return
+        first, last = np.percentile(column, [1.0, 99.0]).astype(np.float32)
+        if np.abs(column).min() == 0.0 and first >= 0.0 and column.min() >= 0.0:
+            first = np.float32(0.0)
+        low[j], high[j] = float(first), float(last)
+        if options.scale:
+            np.clip(column, first, last, out=column)
+
+    for _ in map_blocks(one, columns, options.threads):
+        pass
+    return low, high
+
+
+# ---- trees -------------------------------------------------------------------------------------------------
+
+
+def _tree_options(options: TrainingOptions, max_depth: int | None, min_samples_leaf: int) -> TreeOptions:
+    return TreeOptions(max_depth, min_samples_leaf, float(options.max_samples), options.max_features)
+
+
+def _validate(
+    values,
+    samples: Samples,
+    xy,
+    classes: ClassMap,
+    plan: FeaturePlan,
+    options: TrainingOptions,
+    progress: bool,
+) -> tuple[dict[str, Any], dict[str, Any] | None]:
+    """(chosen trees, depth, leaf size; the cross-validation for the manifest or None)."""
+    counts = options.tree_counts()
+    candidates = options.candidates()
+    folds = options.folds or (5 if options.searches else 0)
+    if not folds:
+        return {"trees": counts[-1], **candidates[0]}, None
+    gap = options.gap
+    if gap is None:
+        gap = max((one.reach or 0.0 for one in plan.neighborhoods), default=0.0)
+    rows = crossval.search(
+        values,
+        samples.label,
+        samples.weight,
+        xy,
+        classes.codes,
+        [_tree_options(options, **candidate) for candidate in candidates],
+        counts,
+        folds=folds,
+        block_size=float(options.block_size),
+        gap=float(gap),
+        seed=options.seed,
+        threads=options.threads,
+        progress=progress,
+    )
+    chosen = crossval.choose(rows)
+    return chosen, {
+        "folds": folds,
+        "block_size": float(options.block_size),
+        "gap": float(gap),
+        "tried": rows,
+        "chosen": chosen,
+    }
+
+
+def _grow(
+    values,
+    samples: Samples,
+    classes: ClassMap,
+    chosen: Mapping[str, Any],
+    options: TrainingOptions,
+    progress: bool,
+) -> tuple[Forest, list[float], dict[str, Any] | None]:
+    """(forest, importances, out-of-bag score)."""
+    n, k = len(samples), len(classes.codes)
+    total = np.zeros((n, k))
+    trees = []
+    importance = np.zeros(values.shape[1])
+    setting = _tree_options(options, chosen["max_depth"], chosen["min_samples_leaf"])
+    with Progress(chosen["trees"], "growing", "trees", enabled=None if progress else False) as bar:
+        for tree, rows, shares in grow(
+            values,
+            samples.label,
+            samples.weight,
+            chosen["trees"],
+            setting,
+            options.seed,
+            score="out of bag",
+            threads=options.threads,
+            progress=bar,
+        ):
+            trees.append(tree.tree_)
+            importance += tree.feature_importances_
+            total[rows] += shares
+    scored = total.sum(axis=1) > 0
+    bag = None
+    if scored.any():
+        matrix = np.zeros((k, k), np.int64)
+        np.add.at(matrix, (samples.label[scored], total[scored].argmax(axis=1)), samples.weight[scored])
+        bag = {**crossval.figures(matrix, classes.codes), "samples": int(np.count_nonzero(scored))}
+    whole = importance.sum()
+    return (
+        Forest.from_sklearn(trees, values.shape[1]),
+        (importance / whole if whole else importance).tolist(),
+        bag,
+    )
+
+
+def _versions() -> dict[str, str]:
+    import numba
+    import sklearn
+
+    return {
+        "pdal_stages": __version__,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "scikit-learn": sklearn.__version__,
+        "numba": numba.__version__,
+    }

@@ -1,0 +1,125 @@
+"""Labels to classes: lists, renaming, merging, dropping, binary; and options checked before any work."""
+
+import numpy as np
+import pytest
+
+from pdal_stages.classifier.classes import ClassMap, as_labels
+from pdal_stages.classifier.options import TrainingOptions
+from pdal_stages.errors import OptionError
+
+
+def test_default_takes_every_label_that_names_a_kind_of_object():
+    classes = ClassMap.parse(None, [0, 1, 2, 5, 6, 7, 9, 12, 18, 64])
+    assert classes.codes == (2, 5, 6, 9, 64)
+    assert classes.names[:3] == ("Ground", "High vegetation", "Building")
+
+
+@pytest.mark.parametrize("spec", [[2, 1, 6], "2,1,6", "[2, 1, 6]", ["2", "1", "6"], (1, 2, 6), "1-2,6"])
+def test_lists(spec):
+    assert ClassMap.parse(spec).codes == (1, 2, 6)
+
+
+@pytest.mark.parametrize(
+    "value",
+    ["Vegetation", "5 Vegetation", "5: Vegetation", {"code": 5, "name": "Vegetation"}, "5=Vegetation"],
+)
+def test_mapping_merges_renames_and_drops(value):
+    classes = ClassMap.parse({"2": "Ground", "3-4,5": value, 6: 6, "9": "drop", "17": None})
+    assert classes.codes == (2, 5, 6)
+    assert classes.names == ("Ground", "Vegetation", "Building")
+    assert classes.labels == ((2,), (3, 4, 5), (6,))
+    assert classes.index(np.array([2, 3, 5, 6, 9, 17, 200, 0])).tolist() == [0, 1, 1, 2, -1, -1, -1, -1]
+
+
+def test_two_labels_may_become_one_class():
+    classes = ClassMap.parse({"100": "6 Building", "101": "6", "2": 2})
+    assert classes.codes == (2, 6) and classes.labels == ((2,), (100, 101)) and classes.names[1] == "Building"
+
+
+def test_a_single_label_with_a_name_of_its_own_keeps_its_code():
+    assert ClassMap.parse({"64": "Garden wall", "2": 2}).names == ("Ground", "Garden wall")
+
+
+@pytest.mark.parametrize(
+    ("spec", "text"),
+    [
+        ({"3,4": "Shrubbery"}, "its code too"),
+        ({"3,4": 5, "4": 6}, "twice"),
+        ({"x": 5}, "no list of labels"),
+        ({"5-3": 5}, "range"),
+        ({"2": 256}, "0 to 255"),
+        ({"2": {"nr": 3}}, "'code' and 'name'"),
+        ([True, 2], "whole number"),
+        ([2.5], "whole number"),
+        ("{", "JSON"),
+        (7, "list or a mapping"),
+    ],
+)
+def test_mistakes(spec, text):
+    with pytest.raises(OptionError, match=text):
+        ClassMap.parse(spec)
+
+
+def test_labels_above_a_byte_need_a_mapping():
+    with pytest.raises(OptionError, match="above 255"):
+        ClassMap.parse(None, [2, 1004])
+
+
+def test_binary():
+    classes = ClassMap.parse({"2": 2, "3,4,5": 5, "6": 6}).binary(6, 1)
+    assert classes.codes == (1, 6) and classes.labels == ((2, 3, 4, 5), (6,))
+    assert classes.names == ("Background", "Building")
+    assert ClassMap.parse([2, 6]).binary(2, 40).codes == (2, 40)
+    with pytest.raises(OptionError, match="none of the classes"):
+        classes.binary(9, 1)
+    with pytest.raises(OptionError, match="same code"):
+        classes.binary(6, 6)
+    with pytest.raises(OptionError, match="nothing is left"):
+        ClassMap.parse([6]).binary(6, 1)
+
+
+def test_labels_are_checked():
+    assert as_labels([1.0, 2.0], "a").dtype == np.uint16
+    for bad in ([1.5], [np.nan], [-1], [70000], ["a"], [[1]]):
+        with pytest.raises(OptionError):
+            as_labels(bad, "a")
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"count": 0}, "count"),
+        ({"count": 2.5}, "count"),
+        ({"seed": -1}, "seed"),
+        ({"trees": []}, "trees"),
+        ({"trees": [10, 0]}, "trees"),
+        ({"max_depth": -1}, "max_depth"),
+        ({"folds": 1}, "folds"),
+        ({"strategy": "both"}, "strategy"),
+        ({"strategy": "binary"}, "target"),
+        ({"target": 6}, "binary"),
+        ({"max_samples": 0}, "max_samples"),
+        ({"max_samples": float("nan")}, "max_samples"),
+        ({"max_samples": 1.5}, "max_samples"),
+        ({"max_features": "all"}, "max_features"),
+        ({"max_features": 0.0}, "max_features"),
+        ({"gap": -1.0}, "gap"),
+        ({"threads": -1}, "threads"),
+        ({"scale": "yes"}, "scale"),
+        ({"dimensions": [3]}, "dimensions"),
+        ({"tree": 5}, "Did you mean 'trees'"),
+    ],
+)
+def test_options_are_checked(options, text):
+    with pytest.raises(OptionError, match=text):
+        TrainingOptions.from_dict(options)
+
+
+def test_grid():
+    options = TrainingOptions(
+        trees=[100, 50, 100], max_depth=[None, 10], dimensions="HeightAboveGround, Intensity"
+    )
+    assert options.tree_counts() == [50, 100] and len(options.candidates()) == 2 and options.searches
+    assert options.dimensions == ("HeightAboveGround", "Intensity")
+    assert not TrainingOptions().searches
+    assert TrainingOptions(max_depth=0).candidates()[0]["max_depth"] is None

@@ -1,0 +1,223 @@
+"""The forest in arrays gives scikit-learn's own answers, and refuses arrays that are no forest."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.ensemble import ExtraTreesClassifier, RandomForestClassifier
+from sklearn.tree import DecisionTreeClassifier
+
+from pdal_stages.classifier.forest import MAX_DEPTH, Forest, float32_at_most
+from pdal_stages.classifier.growing import TreeOptions, grow
+from pdal_stages.errors import ModelError
+
+
+def data(n=600, features=17, classes=4, seed=0):
+    random = np.random.default_rng(seed)
+    y = random.integers(0, classes, n)
+    x = random.normal(size=(n, features)) + random.normal(size=(classes, features))[y]
+    return np.ascontiguousarray(x, dtype=np.float32), y
+
+
+def oracle(forest, values):
+    """A slow, obvious walk over the documented layout."""
+    out = np.zeros((len(values), forest.n_classes))
+    start = leaf = 0
+    for size in forest.tree_sizes:
+        feature = forest.feature[start : start + size]
+        splits = np.cumsum(feature >= 0) - 1
+        leaves = leaf + np.cumsum(feature < 0) - 1
+        for r, row in enumerate(values):
+            i = 0
+            while feature[i] >= 0:
+                left = row[feature[i]] <= forest.threshold[start + i]
+                i = 2 * splits[i] + (1 if left else 2)
+            counts = forest.leaf_counts[leaves[i]].astype(float)
+            out[r] += counts / counts.sum()
+        start += size
+        leaf = leaves[-1] + 1
+    return out / len(forest.tree_sizes)
+
+
+@pytest.mark.parametrize("n_rows", [0, 1, 15, 16, 17, 100, 1000])
+@pytest.mark.parametrize("kind", [RandomForestClassifier, ExtraTreesClassifier])
+def test_equals_sklearn_bit_for_bit(kind, n_rows):
+    x, y = data()
+    reference = kind(23, random_state=1, min_samples_leaf=2).fit(x, y)
+    forest = Forest.from_sklearn(reference.estimators_, x.shape[1])
+    rows = data(n_rows, seed=5)[0] if n_rows else np.zeros((0, 17), np.float32)
+    ours = forest.predict_proba(rows)
+    assert ours.shape == (n_rows, 4)
+    if n_rows:
+        theirs = reference.set_params(n_jobs=1).predict_proba(rows)
+        assert np.array_equal(ours, theirs)
+        assert np.array_equal(ours.argmax(axis=1), reference.predict(rows))
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.integers(0, 10**6),
+    st.integers(1, 9),
+    st.integers(1, 300),
+    st.sampled_from([None, 1, 3]),
+    st.integers(1, 20),
+)
+def test_equals_sklearn_on_any_forest(seed, trees, rows, depth, leaf):
+    # Values from a coarse grid: many land exactly on thresholds' neighbors, many leaves tie.
+    random = np.random.default_rng(seed)
+    x = (random.integers(-5, 6, (rows, 3)) / 3).astype(np.float32)
+    y = random.integers(0, 3, rows)
+    reference = RandomForestClassifier(
+        trees, max_depth=depth, min_samples_leaf=leaf, random_state=seed % 1000, n_jobs=1
+    )
+    reference.fit(x, y)
+    forest = Forest.from_sklearn(reference.estimators_, 3)
+    query = np.concatenate([x, (random.integers(-10, 11, (50, 3)) / 6).astype(np.float32)])
+    assert np.array_equal(forest.predict_proba(query), reference.predict_proba(query))
+    assert np.allclose(forest.predict_proba(query), oracle(forest, query), atol=1e-12)
+
+
+def test_values_on_either_side_of_a_threshold():
+    x, y = data(features=3)
+    reference = RandomForestClassifier(5, random_state=0, n_jobs=1).fit(x, y)
+    forest = Forest.from_sklearn(reference.estimators_, 3)
+    limits = np.concatenate([t.tree_.threshold[t.tree_.feature >= 0] for t in reference.estimators_])
+    near = limits.astype(np.float32)
+    query = np.stack(
+        [near, np.nextafter(near, np.float32(np.inf)), np.nextafter(near, np.float32(-np.inf))], axis=1
+    )
+    assert np.array_equal(forest.predict_proba(query), reference.predict_proba(query))
+
+
+def test_float32_at_most():
+    values = np.array([0.1, -0.1, 1 / 3, 1e-50, -1e-50, 1.0, 16777217.0])
+    rounded = float32_at_most(values)
+    assert (rounded.astype(float) <= values).all()
+    assert (np.nextafter(rounded, np.float32(np.inf)).astype(float) > values).all()
+
+
+def test_infinite_and_nan_values_do_not_break_the_walk():
+    x, y = data()
+    forest = Forest.from_sklearn(RandomForestClassifier(5, random_state=0).fit(x, y).estimators_, 17)
+    odd = np.full((40, 17), np.nan, np.float32)
+    odd[:10], odd[10:20] = np.inf, -np.inf
+    assert np.allclose(forest.predict_proba(odd).sum(axis=1), 1.0)
+
+
+def test_wrong_number_of_features_is_an_error():
+    x, y = data()
+    forest = Forest.from_sklearn(RandomForestClassifier(2, random_state=0).fit(x, y).estimators_, 17)
+    with pytest.raises(ModelError, match="17 features"):
+        forest.predict_proba(x[:, :16])
+
+
+def test_fractional_sample_weights_are_refused():
+    x, y = data()
+    tree = DecisionTreeClassifier(max_depth=2).fit(
+        x, y, sample_weight=np.random.default_rng(0).random(len(y))
+    )
+    with pytest.raises(ModelError, match="whole-number"):
+        Forest.from_sklearn([tree], 17)
+
+
+# ---- arrays that are no forest ---------------------------------------------------------------------------
+
+
+def small():
+    x, y = data(200, 5, 3)
+    forest = Forest.from_sklearn(
+        RandomForestClassifier(3, random_state=0, max_depth=4).fit(x, y).estimators_, 5
+    )
+    return {name: array.copy() for name, array in forest.arrays().items()}
+
+
+def broken(change):
+    arrays = small()
+    change(arrays)
+    with pytest.raises(ModelError) as caught:
+        Forest.from_arrays(arrays, {}, 5, 3)
+    return str(caught.value)
+
+
+def test_hostile_arrays():
+    split = int(np.flatnonzero(small()["feature"] >= 0)[1])
+    leaf = int(np.flatnonzero(small()["feature"] < 0)[1])
+
+    def put(name, at, value):
+        return lambda a: a[name].__setitem__(at, value)
+
+    assert "does not exist" in broken(put("feature", split, 5))
+    assert "does not exist" in broken(put("feature", split, -2))
+    assert "finite" in broken(put("threshold", split, np.nan))
+    assert "finite" in broken(put("threshold", split, np.inf))
+    assert "tree" in broken(put("feature", leaf, 0))  # a split more: its children are missing
+    assert "tree" in broken(put("feature", split, -1))  # a split less: nodes nobody reaches
+    assert "no samples" in broken(put("leaf_counts", 0, 0))
+    assert "sizes" in broken(put("tree_sizes", 0, 0))
+    assert "sizes" in broken(put("tree_sizes", 0, -3))
+    assert "leaf" in broken(lambda a: a.update(leaf_counts=a["leaf_counts"][:-1]))
+    assert "classes" in broken(lambda a: a.update(leaf_counts=a["leaf_counts"][:, :2].copy()))
+    assert "fit" in broken(lambda a: a.update(threshold=a["threshold"][:-1]))
+    assert "fit" in broken(lambda a: a.update(tree_sizes=a["tree_sizes"][:0]))
+    moved = broken(lambda a: a["tree_sizes"].__iadd__(np.array([1, -1, 0], np.int32)))
+    assert "tree" in moved or "leaf" in moved
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.lists(st.integers(-3, 6), min_size=1, max_size=40),
+    st.lists(st.integers(-2, 30), min_size=1, max_size=5),
+)
+def test_any_arrays_are_a_forest_or_an_error(feature, sizes):
+    feature = np.array(feature, np.int16)
+    leaves = int((feature < 0).sum())
+    try:
+        forest = Forest(
+            np.array(sizes, np.int32),
+            feature,
+            np.zeros(len(feature), np.float32),
+            np.ones((leaves, 2), np.uint32),
+            5,
+        )
+    except ModelError:
+        return
+    query = np.random.default_rng(0).normal(size=(20, 5)).astype(np.float32)
+    assert np.allclose(forest.predict_proba(query), oracle(forest, query))
+
+
+def test_a_tree_deeper_than_any_real_one_is_refused():
+    n = MAX_DEPTH + 2
+    feature = np.zeros(2 * n + 1, np.int16)
+    feature[1::2] = -1
+    feature[-1] = -1
+    with pytest.raises(ModelError, match="deeper"):
+        Forest(
+            np.array([len(feature)], np.int32),
+            feature,
+            np.zeros(len(feature), np.float32),
+            np.ones((int((feature < 0).sum()), 2), np.uint32),
+            1,
+        )
+
+
+# ---- growing ---------------------------------------------------------------------------------------------
+
+
+def test_growing_does_not_depend_on_threads_and_out_of_bag_rows_are_out():
+    x, y = data(300)
+    weight = np.ones(300, np.int64)
+    weight[:50] = 3
+    weight[290:] = 0
+    runs = [
+        list(grow(x, y, weight, 7, TreeOptions(min_samples_leaf=2), 4, score="out of bag", threads=threads))
+        for threads in (1, 3)
+    ]
+    for (tree_a, rows_a, shares_a), (tree_b, rows_b, shares_b) in zip(*runs, strict=True):
+        assert np.array_equal(tree_a.tree_.threshold, tree_b.tree_.threshold)
+        assert np.array_equal(rows_a, rows_b) and np.array_equal(shares_a, shares_b)
+        assert not (weight[rows_a] == 0).any()
+        assert tree_a.tree_.weighted_n_node_samples[0] == round(0.5 * weight.sum())
+        assert tree_a.tree_.n_node_samples[0] + len(rows_a) == 290
+    forest = Forest.from_sklearn([t for t, _, _ in runs[0]], 17)
+    mean = sum(t.predict_proba(x) for t, _, _ in runs[0]) / 7
+    assert np.array_equal(forest.predict_proba(x), mean)

@@ -1,0 +1,389 @@
+"""The model file: what is written comes back, nothing half-written, and hostile files are refused quickly."""
+
+import io
+import json
+import os
+import struct
+import time
+import tracemalloc
+import zipfile
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.ensemble import RandomForestClassifier
+
+from pdal_stages.classifier import modelfile
+from pdal_stages.classifier.algorithms import algorithm
+from pdal_stages.classifier.arrays import ArrayRule, from_bytes, to_bytes
+from pdal_stages.classifier.forest import Forest
+from pdal_stages.errors import ModelError
+
+FEATURES = 6
+
+
+@cache
+def forest(seed=0, trees=4):
+    random = np.random.default_rng(seed)
+    x = random.normal(size=(300, FEATURES)).astype(np.float32)
+    y = (x[:, 0] > 0).astype(int) + (x[:, 1] > 0.5)
+    reference = RandomForestClassifier(trees, random_state=seed, n_jobs=1).fit(x, y)
+    return Forest.from_sklearn(reference.estimators_, FEATURES), reference, x
+
+
+def manifest(**changes):
+    figures = {"overall_accuracy": 0.9, "kappa": 0.8, "mean_f1": 0.85, "f1": {"2": 0.9, "5": None}}
+    whole = {
+        "algorithm": "random_forest",
+        "parameters": {"trees": 4},
+        "features": {"anything": "the engine writes"},
+        "feature_names": [f"Feature{i}" for i in range(FEATURES)],
+        "dimensions": [],
+        "shape_bins": None,
+        "copt_threshold": None,
+        "feature_seed": 0,
+        "strategy": "multiclass",
+        "target": None,
+        "background": None,
+        "classes": [
+            {"code": c, "name": str(c), "labels": [c], "available": 9, "samples": 9, "duplicates": 0}
+            for c in (2, 5, 6)
+        ],
+        "training": {"clouds": [{"name": "a.laz", "points": 9}], "count": 9, "seed": 0, "samples": 27},
+        "percentiles": {"low": [0.0] * FEATURES, "high": [1.0] * FEATURES, "limited": True},
+        "accuracy": {"out_of_bag": {**figures, "samples": 9}, "cross_validation": None},
+        "importances": [0.0] * FEATURES,
+        "created_by": {"pdal_stages": "0.1.0"},
+    }
+    return {**whole, **changes}
+
+
+def rules(name):
+    return algorithm(name).rules
+
+
+@pytest.fixture
+def good(tmp_path):
+    path = tmp_path / "good.model"
+    modelfile.write(path, manifest(), forest()[0].arrays())
+    return path
+
+
+def members(path):
+    with zipfile.ZipFile(path) as archive:
+        return {info.filename: archive.read(info) for info in archive.infolist()}
+
+
+def pack(path, contents, **options):
+    with zipfile.ZipFile(path, "w", options.pop("compression", zipfile.ZIP_DEFLATED), **options) as archive:
+        for name, data in contents.items() if isinstance(contents, dict) else contents:
+            archive.writestr(name, data)
+    return path
+
+
+def refuse(path, text=".", seconds=10.0, megabytes=100):
+    """Reading must fail with a ModelError that names the file, soon and without much memory."""
+    tracemalloc.start()
+    started = time.process_time()
+    try:
+        with pytest.raises(ModelError, match=text) as caught:
+            modelfile.read(path, rules)
+        assert time.process_time() - started < seconds
+        assert tracemalloc.get_traced_memory()[1] < megabytes * 1e6
+    finally:
+        tracemalloc.stop()
+    assert path.name in str(caught.value)
+    return str(caught.value)
+
+
+# ---- what is written comes back ------------------------------------------------------------------------
+
+
+def test_round_trip_equals_sklearn(tmp_path):
+    made, reference, x = forest()
+    path = tmp_path / "m.model"
+    modelfile.write(path, manifest(), made.arrays())
+    read, arrays = modelfile.read(path, rules)
+    assert {k: v for k, v in read.items() if k not in ("format", "version", "arrays")} == manifest()
+    again = Forest.from_arrays(arrays, read["parameters"], FEATURES, 3)
+    assert np.array_equal(again.predict_proba(x), reference.predict_proba(x))
+    assert np.array_equal(again.predict_proba(x).argmax(axis=1), reference.predict(x))
+
+
+def test_same_model_same_bytes(tmp_path):
+    for name in ("a", "b"):
+        modelfile.write(tmp_path / name, manifest(), forest()[0].arrays())
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, good, monkeypatch):
+    before = good.read_bytes()
+    monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+    with pytest.raises(ModelError, match="disk full"):
+        modelfile.write(good, manifest(), forest(1)[0].arrays())
+    assert good.read_bytes() == before
+    assert os.listdir(tmp_path) == ["good.model"]
+
+
+def test_a_folder_that_is_not_there(tmp_path):
+    with pytest.raises(ModelError, match="cannot be written"):
+        modelfile.write(tmp_path / "no" / "m.model", manifest(), forest()[0].arrays())
+
+
+def test_no_pickle_on_the_way():
+    """Neither pickle nor anything that unpickles is named where a file is read."""
+    folder = Path(modelfile.__file__).parent
+    for name in ("modelfile", "arrays", "forest", "model", "algorithms", "walk"):
+        text = (folder / f"{name}.py").read_text()
+        for word in ("import pickle", "joblib", "skops", "np.load(", "allow_pickle=True", "eval(", "exec("):
+            assert word not in text, (name, word)
+
+
+def test_the_documented_layout_is_enough_to_read_a_file(good):
+    """Zip, JSON, .npy: another program's reader, in a few lines, without this package."""
+    with zipfile.ZipFile(good) as archive:
+        head = json.loads(archive.read("manifest.json"))
+        a = {
+            name: np.load(io.BytesIO(archive.read(entry["file"])), allow_pickle=False)
+            for name, entry in head["arrays"].items()
+        }
+    row = forest()[2][0]
+    share, start, leaf = np.zeros(3), 0, 0
+    for size in a["tree_sizes"]:
+        feature, threshold = a["feature"][start : start + size], a["threshold"][start : start + size]
+        i = 0
+        while feature[i] >= 0:
+            k = np.count_nonzero(feature[:i] >= 0)
+            i = 2 * k + 1 if row[feature[i]] <= threshold[i] else 2 * k + 2
+        counts = a["leaf_counts"][leaf + np.count_nonzero(feature[:i] < 0)]
+        share += counts / counts.sum()
+        start, leaf = start + size, leaf + np.count_nonzero(feature < 0)
+    assert np.allclose(share / len(a["tree_sizes"]), forest()[1].predict_proba(row[None])[0])
+
+
+# ---- files that are none -------------------------------------------------------------------------------
+
+
+def test_missing_folder_and_empty(tmp_path):
+    refuse(tmp_path / "none.model", "no such")
+    (tmp_path / "folder").mkdir()
+    refuse(tmp_path / "folder", "not a file")
+    (tmp_path / "empty").write_bytes(b"")
+    refuse(tmp_path / "empty", "not a model")
+    (tmp_path / "text").write_text("this is text " * 100)
+    refuse(tmp_path / "text", "not a model")
+
+
+def test_cut_short_anywhere(good):
+    data = good.read_bytes()
+    for size in {*range(0, len(data), max(1, len(data) // 60)), len(data) - 1}:
+        good.write_bytes(data[:size])
+        refuse(good)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 10**9), st.integers(1, 255), st.integers(1, 4))
+def test_a_flipped_byte_is_noticed_or_harmless(tmp_path_factory, at, flip, times):
+    """Whatever byte is changed: an error, or exactly the model that was stored."""
+    path = tmp_path_factory.mktemp("flip") / "m.model"
+    modelfile.write(path, manifest(), forest(trees=1)[0].arrays())
+    want = modelfile.read(path, rules)
+    data = bytearray(path.read_bytes())
+    for k in range(times):
+        data[(at * (k + 1)) % len(data)] ^= flip
+    path.write_bytes(bytes(data))
+    try:
+        read, arrays = modelfile.read(path, rules)
+    except ModelError:
+        return
+    assert read == want[0]
+    assert all(np.array_equal(arrays[name], want[1][name]) for name in arrays)
+
+
+def test_members_are_exactly_those_listed(good, tmp_path):
+    stored = members(good)
+    bad = tmp_path / "bad.model"
+    refuse(pack(bad, {**stored, "more.txt": b"x"}), "differ")
+    refuse(pack(bad, {**stored, "../../outside.npy": b"x"}), "differ")
+    refuse(pack(bad, {**stored, "/etc/passwd": b"x"}), "differ")
+    refuse(pack(bad, {k: v for k, v in stored.items() if "threshold" not in k}), "differ")
+    refuse(pack(bad, {k: v for k, v in stored.items() if k != "manifest.json"}), "without manifest")
+    with pytest.warns(UserWarning, match="Duplicate"):
+        pack(bad, [*stored.items(), ("manifest.json", stored["manifest.json"])])
+    refuse(bad, "twice")
+    refuse(pack(bad, stored, compression=zipfile.ZIP_LZMA), "packed in a way")
+    refuse(pack(bad, {f"m{i}": b"" for i in range(100)}), "list of members")
+    good.write_bytes(good.read_bytes() + b"\0" * 10)
+    refuse(good)
+
+
+def changed(path, edit, rehash=True):
+    """The file again with its manifest or arrays edited; checksums put right, as an attacker would."""
+    import hashlib
+
+    stored = members(path)
+    head = json.loads(stored["manifest.json"])
+    edit(head, stored)
+    if rehash and isinstance(head.get("arrays"), dict):
+        for entry in head["arrays"].values():
+            if entry.get("file") in stored:
+                entry["sha256"] = hashlib.sha256(stored[entry["file"]]).hexdigest()
+    stored["manifest.json"] = json.dumps(head).encode()
+    return pack(path, stored)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "text"),
+    [
+        ("format", "something else", "not a model"),
+        ("version", 2, "version"),
+        ("version", "1", "version"),
+        ("algorithm", "magic", "does not know"),
+        ("algorithm", "os.system", "algorithm"),
+        ("algorithm", None, "algorithm"),
+        ("classes", [], "classes"),
+        ("classes", [{"code": 300}] * 3, "classes"),
+        ("feature_names", ["a"] * 6, "feature_names"),
+        ("importances", ["x"], "importances"),
+        ("extra", 1, "extra"),
+        ("arrays", {}, "arrays"),
+        ("feature_seed", 1.5, "feature_seed"),
+    ],
+)
+def test_manifest_is_held_against_its_schema(good, key, value, text):
+    refuse(changed(good, lambda head, _: head.update({key: value})), text)
+
+
+def test_a_key_left_out(good):
+    refuse(changed(good, lambda head, _: head.pop("percentiles")), "percentiles")
+
+
+def test_manifests_that_are_no_manifest(good):
+    stored = members(good)
+    for data, text in (
+        (b"\xff\xfe{}", "JSON"),
+        (b"{", "JSON"),
+        (b"[1, 2]", "something else"),
+        (b'{"a": NaN}', "NaN"),
+        (b'{"a": 1, "a": 2}', "twice"),
+        (b"[" * 200_000 + b"]" * 200_000, "deep"),
+        (b'{"format": "pdal-stages model", "version": 1, "x": ' + b"[" * 900 + b"]" * 900 + b"}", "manifest"),
+        (b"1" * 100_000, "JSON|something else"),
+        (b" " * (modelfile.MANIFEST_LIMIT + 1), "too large"),
+    ):
+        refuse(pack(good, {**stored, "manifest.json": data}), text)
+
+
+def test_checksum(good):
+    def edit(head, stored):
+        name = head["arrays"]["threshold"]["file"]
+        stored[name] = stored[name][:-4] + b"\0\0\x80?"
+
+    refuse(changed(good, edit, rehash=False), "SHA-256")
+
+
+def npy(descr="'<f4'", shape="(4,)", fortran="False", data=b"\0" * 16, magic=b"\x93NUMPY\x01\x00"):
+    head = f"{{'descr': {descr}, 'fortran_order': {fortran}, 'shape': {shape}, }}"
+    head = head + " " * (-(len(head) + 11) % 64) + "\n"
+    return magic + struct.pack("<H", len(head)) + head.encode() + data
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\x93NUMPY",
+        npy(magic=b"\x93NUMPY\x02\x00"),
+        npy(descr="'|O'"),
+        npy(descr="'>f4'"),
+        npy(descr="'<f8'", shape="(2,)"),
+        npy(descr="[('a', '<f4')]"),
+        npy(fortran="True"),
+        npy(shape="(5,)"),
+        npy(shape="(3,)"),
+        npy(shape="(999999999999999,)"),
+        npy(shape="(999999999999999, 999999999999999, 999999999999999)"),
+        npy(shape="(-4,)"),
+        npy(shape="(2, 2)"),
+        npy(shape="()"),
+        npy(shape="(__import__('os').system('true'),)"),
+        npy(descr="'<f4' if 1 else 0"),
+    ],
+)
+def test_hostile_arrays_are_refused(data, good):
+    with pytest.raises(ModelError):
+        from_bytes(data, ArrayRule(("<f4",), 1), "threshold")
+
+    def edit(head, stored):
+        stored[head["arrays"]["threshold"]["file"]] = data
+
+    refuse(changed(good, edit))
+
+
+@pytest.mark.parametrize("shape", [(0,), (5,), (2, 3), (1, 0, 4)])
+@pytest.mark.parametrize("kind", ["<f4", "<i2", "|u1", "<u8", "<f8"])
+def test_arrays_come_back(shape, kind):
+    array = np.arange(np.prod(shape)).reshape(shape).astype(kind)
+    again = from_bytes(to_bytes(array), ArrayRule((kind,)), "a")
+    assert again.dtype == array.dtype and np.array_equal(again, array) and not again.flags.writeable
+    assert np.array_equal(from_bytes(to_bytes(np.asfortranarray(array)), ArrayRule((kind,)), "a"), array)
+
+
+def test_zip_bomb(good):
+    stored = members(good)
+
+    def edit(head, stored):
+        stored[head["arrays"]["threshold"]["file"]] = to_bytes(np.zeros(20_000_000, np.float32))
+        head["arrays"]["threshold"]["shape"] = [20_000_000]
+
+    bomb = changed(good, edit)
+    assert bomb.stat().st_size < 1e6
+    refuse(bomb, "unpack to far more", seconds=2.0, megabytes=20)
+    refuse(pack(good, {**stored, "manifest.json": b" " * 80_000_000}), "far more", 2.0, 20)
+
+
+def test_declared_size_is_not_believed(good):
+    """A member that says it is small but unpacks to much: only what was declared is unpacked."""
+    stored = members(good)
+    stored["arrays/threshold.npy"] = b"\0" * 50_000_000
+    pack(good, stored)
+    data = bytearray(good.read_bytes())
+    real = struct.pack("<L", 50_000_000)
+    assert data.count(real) == 2
+    for _ in range(2):
+        at = data.index(real)
+        data[at : at + 4] = struct.pack("<L", 1000)
+    good.write_bytes(bytes(data))
+    refuse(good, megabytes=20)
+
+
+def test_zip64_and_comments_are_refused(good):
+    with zipfile.ZipFile(good, "a") as archive:
+        archive.comment = b"hello"
+    refuse(good)
+
+
+def test_encrypted_flag(good):
+    data = bytearray(good.read_bytes())
+    at = data.index(b"PK\x01\x02")
+    data[at + 8] |= 1
+    good.write_bytes(bytes(data))
+    refuse(good, "packed in a way")
+
+
+def test_forest_and_manifest_that_disagree(good):
+    def shape(head, _):
+        head["arrays"]["threshold"]["shape"][0] += 1
+
+    whole = good.read_bytes()
+    refuse(changed(good, shape), "not what the manifest says")
+    good.write_bytes(whole)
+
+    def other(head, stored):
+        head["arrays"]["bonus"] = {**head["arrays"]["threshold"], "file": "arrays/bonus.npy"}
+        stored["arrays/bonus.npy"] = stored["arrays/threshold.npy"]
+
+    refuse(changed(good, other), "does not know")
