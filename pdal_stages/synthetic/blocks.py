@@ -1,4 +1,4 @@
-"""What stands in each block of the town and along its streets, canals and railway banks."""
+"""What stands in each block of the town."""
 
 from __future__ import annotations
 
@@ -9,62 +9,10 @@ from collections import OrderedDict
 import numpy as np
 
 from . import plants
-from .buildings import BUILDING, POLE, beside, box, car, church, fence, house, lamp, pylon
-from .plan import (
-    BANK, BANK_CREST, BANK_FOOT, BANK_GAP, BANK_HEIGHT, CANAL, CHURCH, COURT, FIELD, HALL, PARK, PITCH_U,
-    ROW, STREET, VILLA, WATER_HALF, Plan,
-)  # fmt: skip
-from .scene import Parts
-
-WIRE, BRIDGE = 14, 17
-WIRE_RADIUS = 0.05  # what a sub-beam feels of a conductor
-HIGH_LINE_AT = 18.0  # the high-voltage line keeps this far below the railway bank's axis
-HIGH_ARMS = ((16.5, 4.2), (20.5, 3.2))
-
-
-class Block:
-    """One block: places inside it are given in metres from its inner low corner, along u and v."""
-
-    def __init__(self, plan: Plan, i: int, j: int) -> None:
-        self.plan, self.i, self.j = plan, i, j
-        g = plan.ground
-        self.rng = np.random.default_rng([plan.seed, 0xB10C, i - 2 * plan.first_u, j - 2 * plan.first_v])
-        self.parts = Parts()
-        low = {STREET: 6.2, CANAL: 15.0, BANK: 14.0}
-        high = {STREET: 6.2, CANAL: 15.0, BANK: 25.0}
-        self.u0, self.v0 = g.u_lines[i] + 6.2, g.v_lines[j] + low[int(g.v_kind[j])]
-        self.width = g.u_lines[i + 1] - 6.2 - self.u0
-        self.depth = g.v_lines[j + 1] - high[int(g.v_kind[j + 1])] - self.v0
-
-    def at(self, a: float, b: float) -> tuple[float, float, float]:
-        """Local x, y and direction of u, of a place in the block."""
-        return self.plan.place(self.u0 + a, self.v0 + b)
-
-    # Short forms: things at (a, b), turned by `turn` against the block.
-    def house(self, a, b, turn, *args, **options):
-        x, y, angle = self.at(a, b)
-        return house(self.parts, self.plan, self.rng, x, y, angle + turn, *args, **options)
-
-    def plant(self, what, a, b, *args):
-        x, y, _ = self.at(a, b)
-        what(self.parts, self.plan, self.rng, x, y, *args)
-
-    def line(self, what, a0, b0, a1, b1, *args, **options):
-        x0, y0, _ = self.at(a0, b0)
-        x1, y1, _ = self.at(a1, b1)
-        angle, length = math.atan2(y1 - y0, x1 - x0), math.hypot(x1 - x0, y1 - y0)
-        if what is plants.hedge:
-            what(self.parts, self.plan, self.rng, x0, y0, angle, length, *args, **options)
-        else:
-            what(self.parts, self.plan, x0, y0, angle, length, *args, **options)
-
-    def car(self, a, b, turn=0.0):
-        x, y, angle = self.at(a, b)
-        car(self.parts, self.plan, self.rng, x, y, angle + turn)
-
-    def box(self, a, b, turn, *args, **options):
-        x, y, angle = self.at(a, b)
-        box(self.parts, self.plan, x, y, angle + turn, *args, **options)
+from .block import Block
+from .buildings import BUILDING, beside, church, fence, house, lamp
+from .plan import CHURCH, COURT, FIELD, HALL, PARK, ROW, VILLA, Plan
+from .streets import fill_streets
 
 
 def _row(k: Block) -> None:
@@ -80,11 +28,20 @@ def _row(k: Block) -> None:
         while a + 14 < w:
             length = min(rng.uniform(14, 24), w - a - 0.5)
             k.house(
-                a + length / 2, b, 0.0, length / 2, deep, eave, roof, pitch,
-                wall=rng.choice(["brick", "plaster"]), cover=rng.choice(["tile", "slate"]),
-                overhang=rng.uniform(0.2, 0.6), dormers=int(length // 6) if rng.random() < 0.6 else 0,
+                a + length / 2,
+                b,
+                0.0,
+                length / 2,
+                deep,
+                eave,
+                roof,
+                pitch,
+                wall=rng.choice(["brick", "plaster"]),
+                cover=rng.choice(["tile", "slate"]),
+                overhang=rng.uniform(0.2, 0.6),
+                dormers=int(length // 6) if rng.random() < 0.6 else 0,
                 chimneys=int(length // 6),
-            )  # fmt: skip
+            )
             a += length + rng.uniform(2.5, 4.5)
         front = 0.4 if side == 0 else d - 0.4
         for a in np.arange(0.5, w - 6, 7.0):
@@ -101,11 +58,27 @@ def _row(k: Block) -> None:
             if here < 0.4:
                 k.plant(plants.tree, a + 3.5, middle + rng.uniform(-1, 1) * reach, 4, 9)
             elif here < 0.7:
-                k.house(a + 3.5, middle + rng.uniform(-0.5, 0.5) * reach, 0, 1.5, 1.2, 2.1, "shed", 0.25,
-                        wall="brick", cover="slate", overhang=0.15, chimneys=0)  # fmt: skip
+                k.house(
+                    a + 3.5,
+                    middle + rng.uniform(-0.5, 0.5) * reach,
+                    0,
+                    1.5,
+                    1.2,
+                    2.1,
+                    "shed",
+                    0.25,
+                    wall="brick",
+                    cover="slate",
+                    overhang=0.15,
+                    chimneys=0,
+                )
             for _ in range(int(rng.integers(1, 4))):
-                k.plant(plants.shrub, a + rng.uniform(1, 6), middle + rng.uniform(-1, 1) * reach,
-                        rng.uniform(0.4, 1.8))  # fmt: skip
+                k.plant(
+                    plants.shrub,
+                    a + rng.uniform(1, 6),
+                    middle + rng.uniform(-1, 1) * reach,
+                    rng.uniform(0.4, 1.8),
+                )
 
 
 def _court(k: Block) -> None:
@@ -116,18 +89,34 @@ def _court(k: Block) -> None:
     roof = rng.choice(["gable", "mansard", "flat"])
     pitch = rng.uniform(0.55, 0.9)
     for turn, a, b, length in (
-        (0.0, w / 2, half, w / 2), (0.0, w / 2, d - half, w / 2),
-        (math.pi / 2, half, d / 2, d / 2 - 2 * half), (math.pi / 2, w - half, d / 2, d / 2 - 2 * half),
-    ):  # fmt: skip
+        (0.0, w / 2, half, w / 2),
+        (0.0, w / 2, d - half, w / 2),
+        (math.pi / 2, half, d / 2, d / 2 - 2 * half),
+        (math.pi / 2, w - half, d / 2, d / 2 - 2 * half),
+    ):
         if turn and rng.random() < 0.2:
             continue  # an open side
         own = eave + rng.uniform(-1.5, 1.5)
         look = {"wall": rng.choice(["plaster", "brick", "stone"]), "chimneys": int(length // 6)}
         if roof == "flat":
-            k.house(a, b, turn, length, half, own, "flat", cover="flat_roof", clutter=int(length // 5), **look)
+            k.house(
+                a, b, turn, length, half, own, "flat", cover="flat_roof", clutter=int(length // 5), **look
+            )
         else:
-            k.house(a, b, turn, length, half, own, roof, pitch, cover=rng.choice(["tile", "slate"]),
-                    dormers=int(length // 4), overhang=rng.uniform(0.2, 0.5), **look)  # fmt: skip
+            k.house(
+                a,
+                b,
+                turn,
+                length,
+                half,
+                own,
+                roof,
+                pitch,
+                cover=rng.choice(["tile", "slate"]),
+                dormers=int(length // 4),
+                overhang=rng.uniform(0.2, 0.5),
+                **look,
+            )
         # Bays and balconies on the street side.
         out = half + 0.45
         front = -1 if (b < d / 2 if not turn else a > w / 2) else 1
@@ -136,8 +125,18 @@ def _court(k: Block) -> None:
             x, y, angle = k.at(a, b)
             px, py = beside(x, y, angle + turn, s, front * out)
             z = k.plan.height(px, py)
-            k.parts.prism(px, py, angle + turn, 0.9, 0.5, z + 3.2, z + own - rng.uniform(1, 4), BUILDING,
-                          "plaster", "plaster")  # fmt: skip
+            k.parts.prism(
+                px,
+                py,
+                angle + turn,
+                0.9,
+                0.5,
+                z + 3.2,
+                z + own - rng.uniform(1, 4),
+                BUILDING,
+                "plaster",
+                "plaster",
+            )
     for _ in range(int(rng.integers(2, 5))):
         k.plant(plants.tree, rng.uniform(13, w - 13), rng.uniform(13, d - 13), 5, 11)
         k.plant(plants.shrub, rng.uniform(12, w - 12), rng.uniform(12, d - 12), rng.uniform(0.5, 1.8))
@@ -188,13 +187,37 @@ def _villa(k: Block) -> None:
             look = {"wall": rng.choice(["plaster", "brick"]), "cover": rng.choice(["tile", "slate"])}
             if roof == "flat":
                 look["cover"] = "flat_roof"
-            k.house(a, b, turn, hl, hw, eave, roof, rng.uniform(0.45, 1.1), overhang=rng.uniform(0.3, 0.9),
-                    dormers=int(rng.integers(0, 2)), **look)  # fmt: skip
+            k.house(
+                a,
+                b,
+                turn,
+                hl,
+                hw,
+                eave,
+                roof,
+                rng.uniform(0.45, 1.1),
+                overhang=rng.uniform(0.3, 0.9),
+                dormers=int(rng.integers(0, 2)),
+                **look,
+            )
             if rng.random() < 0.4:  # an L
                 x, y, angle = k.at(a, b)
                 x, y = beside(x, y, angle + turn, hl - 2.6, hw)
-                house(k.parts, k.plan, rng, x, y, angle + turn + math.pi / 2, 3.6, 2.5, eave,
-                      roof if roof in ("gable", "flat") else "hip", 0.7, chimneys=0, **look)  # fmt: skip
+                house(
+                    k.parts,
+                    k.plan,
+                    rng,
+                    x,
+                    y,
+                    angle + turn + math.pi / 2,
+                    3.6,
+                    2.5,
+                    eave,
+                    roof if roof in ("gable", "flat") else "hip",
+                    0.7,
+                    chimneys=0,
+                    **look,
+                )
             k.house(p * pw + 2.6, q * pd + 3.0, 0, 1.5, 2.7, 2.5, "flat", cover="flat_roof", wall="plaster")
             k.car(p * pw + 2.6, q * pd + 8.0, math.pi / 2)
             for _ in range(4):
@@ -202,8 +225,12 @@ def _villa(k: Block) -> None:
                 if abs(x - a) > 6.6 or abs(y - b) > 6.6:
                     k.plant(plants.tree, x, y, 4, 13)
             for _ in range(6):
-                k.plant(plants.shrub, p * pw + rng.uniform(0.5, pw - 0.5), q * pd + rng.uniform(0.5, pd - 0.5),
-                        rng.uniform(0.3, 2.2))  # fmt: skip
+                k.plant(
+                    plants.shrub,
+                    p * pw + rng.uniform(0.5, pw - 0.5),
+                    q * pd + rng.uniform(0.5, pd - 0.5),
+                    rng.uniform(0.3, 2.2),
+                )
             k.line(plants.hedge, p * pw + 5, q * d, (p + 1) * pw - 0.5, q * d, rng.uniform(0.9, 1.9))
         if p:
             k.line(fence if rng.random() < 0.5 else plants.hedge, p * pw, 1, p * pw, d - 1, 1.5)
@@ -214,13 +241,36 @@ def _hall(k: Block) -> None:
     rng, w, d = k.rng, k.width, k.depth
     hw, hl = 0.27 * d, 0.46 * w
     if rng.random() < 0.5:
-        k.house(w / 2, d - hw - 1, 0, hl, hw, rng.uniform(6, 11), "flat", cover="flat_roof", wall="metal", clutter=9)
+        k.house(
+            w / 2,
+            d - hw - 1,
+            0,
+            hl,
+            hw,
+            rng.uniform(6, 11),
+            "flat",
+            cover="flat_roof",
+            wall="metal",
+            clutter=9,
+        )
     else:  # a saw-tooth roof
         eave = rng.uniform(5.5, 8)
         for n in range(4):
             half = hl / 4
-            k.house(w / 2 - hl + (2 * n + 1) * half, d - hw - 1, math.pi / 2, hw, half, eave, "shed", 0.22,
-                    cover="metal", wall="metal", overhang=0.05, chimneys=0)  # fmt: skip
+            k.house(
+                w / 2 - hl + (2 * n + 1) * half,
+                d - hw - 1,
+                math.pi / 2,
+                hw,
+                half,
+                eave,
+                "shed",
+                0.22,
+                cover="metal",
+                wall="metal",
+                overhang=0.05,
+                chimneys=0,
+            )
     k.house(0.8 * w, 0.1 * d + 4, 0, 0.15 * w, 4, rng.uniform(3.2, 9), "flat", cover="flat_roof", clutter=3)
     for row in (0.12 * d, 0.32 * d):
         for a in np.arange(2.0, 0.55 * w, 2.7):
@@ -259,179 +309,29 @@ def _field(k: Block) -> None:
     for a in np.arange(4, w - 3, 5.5):
         k.plant(plants.broadleaf, a, d - 6, rng.uniform(3.5, 5.5))
     for n in range(4):
-        k.house(5 + n * 11.0, 5.0, rng.uniform(-0.1, 0.1), 2.0, 1.6, 2.2, rng.choice(["gable", "shed", "flat"]), 0.5,
-                wall="bark", cover="slate", overhang=0.3, chimneys=0)  # fmt: skip
+        k.house(
+            5 + n * 11.0,
+            5.0,
+            rng.uniform(-0.1, 0.1),
+            2.0,
+            1.6,
+            2.2,
+            rng.choice(["gable", "shed", "flat"]),
+            0.5,
+            wall="bark",
+            cover="slate",
+            overhang=0.3,
+            chimneys=0,
+        )
         for _ in range(6):
-            k.plant(plants.shrub, 2 + n * 11.0 + rng.uniform(0, 9), rng.uniform(8, 14), rng.uniform(0.35, 1.5))
+            k.plant(
+                plants.shrub, 2 + n * 11.0 + rng.uniform(0, 9), rng.uniform(8, 14), rng.uniform(0.35, 1.5)
+            )
     for _ in range(5):
         k.plant(plants.tree, rng.uniform(2, w - 2), rng.uniform(15, d - 9), 5, 18)
 
 
 _FILL = {ROW: _row, COURT: _court, PARK: _park, VILLA: _villa, HALL: _hall, CHURCH: _church, FIELD: _field}
-
-
-def _cable(parts: Parts, a, b, sag: float, pieces: int, only: range | None = None) -> None:
-    """A conductor from a to b, hanging by `sag` metres in the middle (a parabola)."""
-    a, b = np.asarray(a), np.asarray(b)
-    share = np.linspace(0, 1, pieces + 1)
-    points = a + share[:, None] * (b - a)
-    points[:, 2] -= 4 * sag * share * (1 - share)
-    for n in only if only is not None else range(pieces):
-        parts.rod(tuple(points[n]), tuple(points[n + 1]), WIRE_RADIUS, WIRE, "cable")
-
-
-def _poles(k: Block, stations: list[tuple[float, float]], next_station: tuple[float, float], across) -> None:
-    """Wooden poles with three conductors, on to the next segment's first pole."""
-    plan, tops = k.plan, []
-    for n, (u, v) in enumerate([*stations, next_station]):
-        x, y, angle = plan.place(u, v)
-        z = plan.height(x, y)
-        if n < len(stations):
-            k.parts.rod((x, y, z), (x, y, z + 8.6), 0.13, POLE, "bark")
-        tops.append((x, y, z + 8.4, angle + across))
-    for a, b in zip(tops, tops[1:], strict=False):
-        for off in (-0.6, 0.0, 0.6):
-            p = (*beside(a[0], a[1], a[3], 0, off), a[2])
-            q = (*beside(b[0], b[1], b[3], 0, off), b[2])
-            _cable(k.parts, p, q, 0.02 * math.dist(p, q), 6)
-
-
-def _streets(k: Block) -> None:
-    """The street on the block's low-u side and the line on its low-v side."""
-    g, plan, rng, i, j = k.plan.ground, k.plan, k.rng, k.i, k.j
-    u0, u1, v0, v1 = g.u_lines[i], g.u_lines[i + 1], g.v_lines[j], g.v_lines[j + 1]
-    kind = int(g.v_kind[j])
-    quiet = {STREET: 8.0, CANAL: 15.0, BANK: 14.0}
-    begin, end = v0 + quiet[kind], v1 - quiet[int(g.v_kind[j + 1])]
-    for side in (-1, 1):
-        for v in np.arange(begin, end - 3, 6.0):
-            if rng.random() < 0.45:
-                x, y, angle = plan.place(u0 + side * 2.3, v + rng.uniform(0, 1))
-                car(k.parts, plan, rng, x, y, angle + math.pi / 2)
-    if (i + plan.first_u) % 2:
-        step = (end - begin) / 2
-        _poles(k, [(u0 + 4.9, begin + n * step) for n in range(2)] + [(u0 + 4.9, end)],
-               (u0 * 0 + u0 + 4.9, v1 + quiet[int(g.v_kind[j + 1])]), math.pi / 2)  # fmt: skip
-    else:
-        for v in np.arange(begin + 3, end, 22.0):
-            x, y, angle = plan.place(u0 - 4.4, v)
-            lamp(k.parts, plan, x, y, angle)
-        for v in np.arange(begin, end, 9.0):
-            if rng.random() < 0.55:
-                k2 = plan.place(u0 + 4.6, v)
-                plants.broadleaf(k.parts, plan, rng, k2[0], k2[1], rng.uniform(5, 9))
-    for _ in range(3):  # bins, boxes, signs
-        x, y, angle = plan.place(u0 + rng.choice([-4.6, 4.4]), rng.uniform(begin, end))
-        box(k.parts, plan, x, y, angle, 0.4, 0.35, rng.uniform(0.8, 1.4), "steel")
-    if kind == STREET:
-        _street_v(k, u0, u1, v0)
-    elif kind == CANAL:
-        _canal(k, u0, u1, v0)
-    else:
-        _bank(k, u0, u1, v0)
-    if int(g.v_kind[j + 1]) == BANK:
-        _high_line(k)
-
-
-def _street_v(k: Block, u0, u1, v0) -> None:
-    plan, rng = k.plan, k.rng
-    for side in (-1, 1):
-        for u in np.arange(u0 + 8, u1 - 9, 6.0):
-            if rng.random() < 0.4:
-                x, y, angle = plan.place(u + rng.uniform(0, 1), v0 + side * 2.3)
-                car(k.parts, plan, rng, x, y, angle)
-    step = (u1 - u0 - 14) / 2
-    _poles(k, [(u0 + 7 + n * step, v0 - 4.9) for n in range(3)], (u1 + 7, v0 - 4.9), 0.0)
-
-
-def _canal(k: Block, u0, u1, v0) -> None:
-    """Quays with trees, lamps and cars, barges, and the bridge of the street."""
-    plan, rng, g = k.plan, k.rng, k.plan.ground
-    for side in (-1, 1):
-        for u in np.arange(u0 + 9, u1 - 9, 8.0):
-            x, y, angle = plan.place(u, v0 + side * 7.4)
-            if rng.random() < 0.5:
-                plants.broadleaf(k.parts, plan, rng, x, y, rng.uniform(6, 10))
-            elif rng.random() < 0.4:
-                lamp(k.parts, plan, x, y, angle - side * math.pi / 2, 6.0)
-        for u in np.arange(u0 + 9, u1 - 9, 6.0):
-            if rng.random() < 0.4:
-                x, y, angle = plan.place(u, v0 + side * 9.3)
-                car(k.parts, plan, rng, x, y, angle)
-    level = g.v_level[k.j]
-    if rng.random() < 0.7:
-        x, y, angle = plan.place(u0 + rng.uniform(18, 38), v0 + rng.choice([-4.4, 4.4]))
-        k.parts.prism(x, y, angle, rng.uniform(5, 9), 1.6, level - 0.3, level + 0.9, 1, "metal", "metal")
-        k.parts.prism(x, y, angle, 3.2, 1.2, level, level + 2.0, 1, "bark", "paint")
-    if g.bridged[k.i, k.j]:
-        x, y, angle = plan.place(u0, v0)
-        ends = [plan.place(u0, v0 + s * (WATER_HALF + 1.2))[:2] for s in (-1, 1)]
-        top = sum(plan.height(*p) for p in ends) / 2
-        half = WATER_HALF + 0.35
-        k.parts.prism(x, y, angle + math.pi / 2, half, 5.0, top - 0.7, top, BRIDGE, "asphalt", "concrete")
-        for side in (-1, 1):
-            at = beside(x, y, angle + math.pi / 2, 0, side * 4.85)
-            k.parts.prism(*at, angle + math.pi / 2, half, 0.15, top, top + 1.0, BRIDGE, "stone", "stone")
-
-
-def _bank(k: Block, u0, u1, v0) -> None:
-    """The railway on its bank: bridge over the street, masts and contact wire."""
-    plan, rng = k.plan, k.rng
-    x, y, angle = plan.place(u0, v0)
-    sides = [plan.place(u0 + s * (BANK_GAP + 0.6), v0)[:2] for s in (-1, 1)]
-    crest = [plan.height(*p) for p in sides]
-    top, slope = sum(crest) / 2, BANK_HEIGHT / (BANK_FOOT - BANK_CREST)
-    k.parts.prism(x, y, angle, BANK_GAP + 0.45, BANK_CREST, top - 0.9, top, BRIDGE, "gravel", "concrete")
-    for s, z in zip((-1, 1), crest, strict=True):  # abutments stand before the cut bank
-        at = beside(x, y, angle, s * (BANK_GAP + 0.2), 0)
-        cuts = [(0.0, q * slope, 1.0, z + slope * BANK_CREST) for q in (-1, 1)]
-        k.parts.prism(*at, angle, 0.25, BANK_FOOT, z - BANK_HEIGHT - 1, z + 0.02, BRIDGE, "concrete", "concrete",
-                      cuts=cuts)  # fmt: skip
-    stations = [(u0 + 9.0, v0), ((u0 + u1) / 2, v0), (u1 - 9.0, v0), (u1 + 9.0, v0)]
-    tops = []
-    for n, (u, v) in enumerate(stations):
-        px, py, turn = plan.place(u, v)
-        z = plan.height(px, py)
-        mast = beside(px, py, turn, 0, 3.0)
-        if n < 3:
-            k.parts.rod((*mast, z), (*mast, z + 7.2), 0.13, POLE, "steel")
-            k.parts.rod((*mast, z + 6.6), (px, py, z + 6.8), 0.07, POLE, "steel")
-        tops.append((px, py, z))
-    for a, b in zip(tops, tops[1:], strict=False):
-        for up, sag in ((5.4, 0.05), (6.8, 0.5)):
-            _cable(k.parts, (a[0], a[1], a[2] + up), (b[0], b[1], b[2] + up), sag, 4)
-    for s in (-1, 1):
-        for u in np.arange(u0 + 9, u1 - 9, 5.0):
-            if rng.random() < 0.5:
-                px, py, _ = plan.place(u, v0 + s * rng.uniform(5, 11))
-                plants.shrub(k.parts, plan, rng, px, py, rng.uniform(0.4, 2.4))
-
-
-def _high_line(k: Block) -> None:
-    """High-voltage line below the railway: a tower in every other block, this block's part of the spans."""
-    plan, g = k.plan, k.plan.ground
-    v = g.v_lines[k.j + 1] - HIGH_LINE_AT
-
-    def tower(i):
-        i = min(max(i, 0), g.u_lines.size - 2)
-        x, y, angle = plan.place(g.u_lines[i] + PITCH_U / 2, v)
-        return x, y, plan.height(x, y), angle
-
-    def spans(i, only):
-        a, b = tower(i), tower(i + 2)
-        for up, half in HIGH_ARMS:
-            for off in (-half, half) if up > HIGH_ARMS[0][0] else (-half, -0.5 * half, 0.5 * half, half):
-                p = (*beside(a[0], a[1], a[3], 0, off), a[2] + up - 0.6)
-                q = (*beside(b[0], b[1], b[3], 0, off), b[2] + up - 0.6)
-                _cable(k.parts, p, q, 2.2, 12, only)
-
-    if (k.i + plan.first_u) % 2 == 0:
-        x, y, z, angle = tower(k.i)
-        pylon(k.parts, x, y, z, angle, HIGH_ARMS, 23.0)
-        spans(k.i, range(0, 3))
-        spans(k.i - 2, range(9, 12))
-    else:
-        spans(k.i - 1, range(3, 9))
 
 
 class Blocks:
@@ -451,7 +351,7 @@ class Blocks:
             k = Block(self.plan, i, j)
             if k.width > 20 and k.depth > 20:
                 _FILL[int(self.plan.ground.block[i, j])](k)
-            _streets(k)
+            fill_streets(k)
             made = k.parts.arrays(i * 65536 + j)
             self._made[i, j] = made
             while len(self._made) > self.keep:

@@ -26,9 +26,25 @@ def _footing(plan: Plan, x, y, angle, half_l, half_w) -> tuple[float, float]:
 
 
 def house(
-    parts: Parts, plan: Plan, rng: np.random.Generator, x, y, angle, half_l, half_w, eave, roof, pitch=0.8,
-    *, wall="plaster", cover="tile", overhang=0.4, dormers=0, chimneys=1, clutter=0,
-) -> float:  # fmt: skip
+    parts: Parts,
+    plan: Plan,
+    rng: np.random.Generator,
+    x,
+    y,
+    angle,
+    half_l,
+    half_w,
+    eave,
+    roof,
+    pitch=0.8,
+    *,
+    wall="plaster",
+    cover="tile",
+    overhang=0.4,
+    dormers=0,
+    chimneys=1,
+    clutter=0,
+) -> float:
     """One building; returns its highest z.
 
     Parameters
@@ -84,9 +100,18 @@ def house(
     parts.prism(x, y, angle, half_l, half_w, z0, top, BUILDING, cover, wall, cuts=cuts)
     under = ze - overhang * pitch - 0.18
     parts.prism(
-        x, y, angle, half_l + gable_out, half_w + overhang, under, top, BUILDING, cover, wall,
+        x,
+        y,
+        angle,
+        half_l + gable_out,
+        half_w + overhang,
+        under,
+        top,
+        BUILDING,
+        cover,
+        wall,
         cuts=cuts,
-    )  # fmt: skip
+    )
     for n in range(dormers if not hip and roof != "shed" else 0):
         a = half_l * ((n + 0.5) / dormers * 1.7 - 0.85) + rng.uniform(-0.3, 0.3)
         for side in (-1, 1):
@@ -108,9 +133,21 @@ def church(parts: Parts, plan: Plan, rng: np.random.Generator, x, y, angle) -> N
     house(parts, plan, rng, *at, angle, 3.5, 3.5, 8, "pyramid", 1.0, wall="stone", cover="slate", chimneys=0)
     at = beside(x, y, angle, -14.5, 0)
     house(
-        parts, plan, rng, *at, angle, 3, 3, rng.uniform(19, 24), "pyramid", rng.uniform(2.2, 3.4),
-        wall="stone", cover="slate", chimneys=0, overhang=0.2,
-    )  # fmt: skip
+        parts,
+        plan,
+        rng,
+        *at,
+        angle,
+        3,
+        3,
+        rng.uniform(19, 24),
+        "pyramid",
+        rng.uniform(2.2, 3.4),
+        wall="stone",
+        cover="slate",
+        chimneys=0,
+        overhang=0.2,
+    )
     for side in (-1, 1):
         at = beside(x, y, angle, 1.0, side * 7.0)
         house(parts, plan, rng, *at, angle, 9, 1.6, 5, "flat", wall="stone", cover="slate")

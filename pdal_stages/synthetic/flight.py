@@ -9,7 +9,7 @@ import numpy as np
 
 SPEED = 60.0  # metres a second
 TURN = 240.0  # seconds from the end of a strip to the start of the next
-GPS_START = 270_000_000.0  # adjusted standard GPS time: July 2020
+GPS_START = 270_000_000.0  # adjusted standard GPS time: April 2020
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,15 @@ class Flight:
             for first in range(0, self.lines, step)
         ]
 
-    def fire(self, chunk: Chunk, every: int = 1):
+    def inside(self, hit: np.ndarray, margin: float = 0.0) -> np.ndarray:
+        """Which places lie in the square, or within `margin` metres of it."""
+        return ((hit > -margin) & (hit < self.size + margin)).all(axis=1)
+
+    def fire(self, chunk: Chunk, every: int = 1, *, aimed: bool = False):
         """The pulses of a chunk whose beams pass near the square.
+
+        With `every`, only a scattered sample: one pulse in so many. With `aimed`, only the number of
+        pulses whose beam would meet level ground inside the square.
 
         Returns
         -------
@@ -83,6 +90,8 @@ class Flight:
             GPS time in seconds; scan angle in degrees, positive to the right of the flight.
         edge : (n,) bool
             Last pulse of its scan line.
+        right : (n,) bool
+            The mirror moved to the right.
         """
         line = np.repeat(np.arange(chunk.first, chunk.last), self.per_line)
         step = np.tile(np.arange(self.per_line), chunk.last - chunk.first)
@@ -93,7 +102,9 @@ class Flight:
             keep = mixed % np.uint64(every) == 0
             line, step = line[keep], step[keep]
         ids = (chunk.strip * self.lines + line) * self.per_line + step
+        right = line % 2 == 0  # the mirror swings to the right and back
         angle = -self.half_angle + (step + 0.5) * (2 * self.half_angle / self.per_line)
+        angle = np.where(right, angle, -angle)
         when = line * self.line_time + step * (self.line_time / self.per_line)
         # The aircraft rolls, pitches and drifts a little.
         phase = 1.7 * chunk.strip
@@ -115,10 +126,16 @@ class Flight:
         origin[:, 2] = self.elevation + self.altitude
         direction = np.column_stack([d_along * c - d_left * s, d_along * s + d_left * c, d_up])
         hit = origin[:, :2] + (self.altitude / -d_up)[:, None] * direction[:, :2]
-        margin = 25.0
-        near = ((hit > -margin) & (hit < self.size + margin)).all(axis=1)
+        if aimed:
+            return int(self.inside(hit).sum())
+        near = self.inside(hit, 25.0)
         time = GPS_START + chunk.strip * self.strip_time + when
         return (
-            origin[near], np.ascontiguousarray(direction[near]), ids[near].astype(np.uint64), time[near],
-            np.degrees(angle[near]), step[near] == self.per_line - 1,
-        )  # fmt: skip
+            origin[near],
+            np.ascontiguousarray(direction[near]),
+            ids[near].astype(np.uint64),
+            time[near],
+            np.degrees(angle[near]),
+            step[near] == self.per_line - 1,
+            right[near],
+        )

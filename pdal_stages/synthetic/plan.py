@@ -73,7 +73,7 @@ def to_xy(u, v, frame):
 @njit(nogil=True, cache=True)
 def find_line(value, lines, pitch):
     """Index i with lines[i] <= value < lines[i + 1], kept inside the table."""
-    i = int(math.floor((value - lines[0]) / pitch))
+    i = math.floor((value - lines[0]) / pitch)
     i = min(max(i, 0), lines.size - 2)
     while i > 0 and value < lines[i]:
         i -= 1
@@ -221,12 +221,19 @@ class Plan:
         turn = math.radians(rng.uniform(5.0, 13.0)) * (1 if seed % 2 else -1)
         frame = np.array(
             [
-                size / 2, size / 2, math.cos(turn), math.sin(turn),
-                rng.uniform(4, 6), 2 * math.pi / rng.uniform(320, 420), rng.uniform(0, 2 * math.pi),
-                rng.uniform(3, 5), 2 * math.pi / rng.uniform(300, 400), rng.uniform(0, 2 * math.pi),
+                size / 2,
+                size / 2,
+                math.cos(turn),
+                math.sin(turn),
+                rng.uniform(4, 6),
+                2 * math.pi / rng.uniform(320, 420),
+                rng.uniform(0, 2 * math.pi),
+                rng.uniform(3, 5),
+                2 * math.pi / rng.uniform(300, 400),
+                rng.uniform(0, 2 * math.pi),
                 elevation,
             ]
-        )  # fmt: skip
+        )
         # The bend must not move the middle of a small town away from its canal.
         frame[6] = 0.0 if rng.random() < 0.5 else math.pi
         frame[9] = 0.0 if rng.random() < 0.5 else math.pi
@@ -247,10 +254,18 @@ class Plan:
         phase = int(rng.integers(KINDS))
         block = (index_u[:, None] + 3 * index_v[None, :] + phase) % KINDS
         self.ground = Ground(
-            frame, np.array(waves), u_lines, v_lines, v_kind, np.zeros(nv),
-            np.zeros((nu, nv), dtype=np.uint8), block.astype(np.int64), np.zeros((nu, nv)),
-            np.zeros((nu, nv, 4)), np.uint64(seed * 7919 + 17),
-        )  # fmt: skip
+            frame,
+            np.array(waves),
+            u_lines,
+            v_lines,
+            v_kind,
+            np.zeros(nv),
+            np.zeros((nu, nv), dtype=np.uint8),
+            block.astype(np.int64),
+            np.zeros((nu, nv)),
+            np.zeros((nu, nv, 4)),
+            np.uint64(seed * 7919 + 17),
+        )
         g = self.ground
         hills = np.random.default_rng([seed, 0x7033])
         wide = (index_u[:, None] % 4 == 3) & (index_v[None, :] % 4 == 0)
@@ -259,7 +274,9 @@ class Plan:
         bridges[(index_u % 3 == 0), :] = True
         g.bridged[bridges & (v_kind == CANAL)[None, :]] = 1
         g.bridged[:, v_kind == BANK] = 1
-        for j in np.flatnonzero(v_kind == CANAL):  # the level of the land along it, middle part first
+        for j in np.flatnonzero(
+            v_kind == CANAL
+        ).tolist():  # the level of the land along it, middle part first
             along = np.linspace(-min(size, 600.0) / 2, min(size, 600.0) / 2, 41)
             xy = np.array([to_xy(a, v_lines[j], frame) for a in along])
             g.v_level[j] = np.percentile(self._bare(xy[:, 0], xy[:, 1]), 30) - 2.0
@@ -302,9 +319,7 @@ class Plan:
     def blocks_in(self, x0: float, y0: float, x1: float, y1: float, margin: float) -> list[tuple[int, int]]:
         """Indices (i, j) of the blocks that may touch a rectangle of local metres."""
         g = self.ground
-        corners = [
-            to_uv(x, y, g.frame) for x in np.linspace(x0, x1, 5) for y in np.linspace(y0, y1, 5)
-        ]
+        corners = [to_uv(x, y, g.frame) for x in np.linspace(x0, x1, 5) for y in np.linspace(y0, y1, 5)]
         u, v = np.array(corners).T
         i0 = find_line(u.min() - margin, g.u_lines, PITCH_U)
         i1 = find_line(u.max() + margin, g.u_lines, PITCH_U)

@@ -30,9 +30,16 @@ def broadleaf(parts: Parts, plan: Plan, rng: np.random.Generator, x, y, height, 
         r, rz = radius * rng.uniform(0.42, 0.62), half * rng.uniform(0.4, 0.6)
         up = z + bole + rz + (height - bole - 2 * rz) * rng.uniform(0.15, 0.85)
         parts.ellipsoid(
-            x + out * math.cos(a), y + out * math.sin(a), up, r, r * rng.uniform(0.8, 1.2), rz,
-            VEGETATION, "leaf", k,
-        )  # fmt: skip
+            x + out * math.cos(a),
+            y + out * math.sin(a),
+            up,
+            r,
+            r * rng.uniform(0.8, 1.2),
+            rz,
+            VEGETATION,
+            "leaf",
+            k,
+        )
 
 
 def conifer(parts: Parts, plan: Plan, rng: np.random.Generator, x, y, height) -> None:
@@ -40,8 +47,16 @@ def conifer(parts: Parts, plan: Plan, rng: np.random.Generator, x, y, height) ->
     z = plan.height(x, y)
     radius = height * rng.uniform(0.14, 0.22)
     _trunk(parts, x, y, z, z + 0.5 * height, 0.06 + 0.01 * height)
-    parts.cone(x, y, z + height * rng.uniform(0.04, 0.14), z + height, radius, VEGETATION, "needle",
-               rng.uniform(0.6, 1.0))  # fmt: skip
+    parts.cone(
+        x,
+        y,
+        z + height * rng.uniform(0.04, 0.14),
+        z + height,
+        radius,
+        VEGETATION,
+        "needle",
+        rng.uniform(0.6, 1.0),
+    )
 
 
 def column(parts: Parts, plan: Plan, rng: np.random.Generator, x, y, height) -> None:
@@ -61,8 +76,17 @@ def shrub(parts: Parts, plan: Plan, rng: np.random.Generator, x, y, height) -> N
     """A bush that touches the ground."""
     z = plan.height(x, y)
     r = height * rng.uniform(0.45, 0.85)
-    parts.ellipsoid(x, y, z + 0.4 * height, r, r * rng.uniform(0.8, 1.25), 0.6 * height, VEGETATION, "leaf",
-                    rng.uniform(1.2, 2.2))  # fmt: skip
+    parts.ellipsoid(
+        x,
+        y,
+        z + 0.4 * height,
+        r,
+        r * rng.uniform(0.8, 1.25),
+        0.6 * height,
+        VEGETATION,
+        "leaf",
+        rng.uniform(1.2, 2.2),
+    )
 
 
 def tree(parts: Parts, plan: Plan, rng: np.random.Generator, x, y, low=6.0, high=16.0) -> None:

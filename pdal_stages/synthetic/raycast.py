@@ -144,7 +144,7 @@ def _depth(p, label, near, far, ox, oy, oz, dx, dy, dz, key):
 
 @njit(nogil=True, cache=True)
 def _first_thing(scene, ox, oy, oz, dx, dy, dz, limit, key):
-    """Nearest thing met before range `limit`: its range, index (-1: none), cosine of incidence, upward part."""
+    """Nearest thing met before range `limit`: range, index (-1: none), cosine of incidence, upward part."""
     best, index, cosine, up = limit, -1, 1.0, 1.0
     x0, y0, nx, ny = scene.grid[0], scene.grid[1], int(scene.grid[2]), int(scene.grid[3])
     t = (scene.grid[4] - oz) / dz
@@ -152,7 +152,7 @@ def _first_thing(scene, ox, oy, oz, dx, dy, dz, limit, key):
         return best, index, cosine, up
     t = max(t, 0.0)
     x, y = (ox + t * dx - x0) / CELL, (oy + t * dy - y0) / CELL
-    i, j = int(math.floor(x)), int(math.floor(y))
+    i, j = math.floor(x), math.floor(y)
     step_i, step_j = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
     every_i = CELL / abs(dx) if abs(dx) > 1e-12 else 1e30
     every_j = CELL / abs(dy) if abs(dy) > 1e-12 else 1e30
@@ -255,7 +255,7 @@ def cast(origin, direction, pulse_id, scene, g, reflectance, setting, seed, xyz,
                         continue
                 elif surface == _QUAY:
                     code, mat = 1, _STONE
-                elif surface == _CROP or surface == _LAWN:
+                elif surface in (_CROP, _LAWN):
                     x, y = px + t * dx, py + t * dy
                     wild = value_noise(x / 6.0 + 50.0, y / 6.0, g.key) - (0.40 if surface == _CROP else 0.62)
                     tall = min(0.55, 2.2 * wild) * unit(mix(key)) if wild > 0.0 else 0.0

@@ -77,18 +77,30 @@ class Parts:
         c, s = math.cos(angle), math.sin(angle)
         first = len(self._planes)
         local = [
-            (1.0, 0.0, 0.0, half_l), (-1.0, 0.0, 0.0, half_l), (0.0, 1.0, 0.0, half_w),
-            (0.0, -1.0, 0.0, half_w), (0.0, 0.0, 1.0, z1), (0.0, 0.0, -1.0, -z0), *cuts,
-        ]  # fmt: skip
+            (1.0, 0.0, 0.0, half_l),
+            (-1.0, 0.0, 0.0, half_l),
+            (0.0, 1.0, 0.0, half_w),
+            (0.0, -1.0, 0.0, half_w),
+            (0.0, 0.0, 1.0, z1),
+            (0.0, 0.0, -1.0, -z0),
+            *cuts,
+        ]
         for na, nb, nz, offset in local:
             size = math.sqrt(na * na + nb * nb + nz * nz)
             nx, ny, nz = (na * c - nb * s) / size, (na * s + nb * c) / size, nz / size
             self._planes.append((nx, ny, nz, offset / size + nx * x + ny * y))
         ex, ey = abs(c) * half_l + abs(s) * half_w, abs(s) * half_l + abs(c) * half_w
         self._add(
-            (x - ex, y - ey, z0, x + ex, y + ey, z1), (), extinction, CONVEX, code, top, side,
-            first, len(local),
-        )  # fmt: skip
+            (x - ex, y - ey, z0, x + ex, y + ey, z1),
+            (),
+            extinction,
+            CONVEX,
+            code,
+            top,
+            side,
+            first,
+            len(local),
+        )
 
     def ellipsoid(self, x, y, z, rx, ry, rz, code, material, extinction) -> None:
         """An upright ellipsoid."""
@@ -126,10 +138,10 @@ def _fill(box, x0, y0, nx, ny, cell):
             member = np.empty(counts[nx * ny], dtype=np.int64)
             at = counts[:-1].copy()
         for n in range(box.shape[0]):
-            i0 = max(int(math.floor((box[n, 0] - x0) / cell)), 0)
-            i1 = min(int(math.floor((box[n, 3] - x0) / cell)), nx - 1)
-            j0 = max(int(math.floor((box[n, 1] - y0) / cell)), 0)
-            j1 = min(int(math.floor((box[n, 4] - y0) / cell)), ny - 1)
+            i0 = max(math.floor((box[n, 0] - x0) / cell), 0)
+            i1 = min(math.floor((box[n, 3] - x0) / cell), nx - 1)
+            j0 = max(math.floor((box[n, 1] - y0) / cell), 0)
+            j1 = min(math.floor((box[n, 4] - y0) / cell), ny - 1)
             for i in range(i0, i1 + 1):
                 for j in range(j0, j1 + 1):
                     c = i * ny + j
@@ -159,10 +171,18 @@ def build_scene(pieces: list[tuple[np.ndarray, np.ndarray]], x0, y0, x1, y1) -> 
     nx, ny = max(1, math.ceil((x1 - x0) / CELL)), max(1, math.ceil((y1 - y0) / CELL))
     box = np.ascontiguousarray(things["box"])
     shape = np.column_stack([things["p"], things["extinction"]])
-    label = np.column_stack([things[name] for name in ("first", "count", "kind", "code", "top", "side", "id")])
+    label = np.column_stack(
+        [things[name] for name in ("first", "count", "kind", "code", "top", "side", "id")]
+    )
     start, member, top = _fill(box, x0, y0, nx, ny, CELL)
     highest = float(box[:, 5].max()) if len(box) else -1e30
     return Scene(
-        box, np.ascontiguousarray(shape), np.ascontiguousarray(label.astype(np.int64)), planes,
-        start, member, top, np.array([x0, y0, nx, ny, highest]),
-    )  # fmt: skip
+        box,
+        np.ascontiguousarray(shape),
+        np.ascontiguousarray(label.astype(np.int64)),
+        planes,
+        start,
+        member,
+        top,
+        np.array([x0, y0, nx, ny, highest]),
+    )

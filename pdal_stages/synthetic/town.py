@@ -12,7 +12,7 @@ from ..errors import OptionError
 from ..parallel import map_blocks, resolve_threads
 from ..progress import Progress
 from .blocks import Blocks
-from .flight import Flight
+from .flight import Chunk, Flight
 from .materials import REFLECTANCE
 from .plan import Plan
 from .raycast import MAX_RETURNS, cast
@@ -46,7 +46,9 @@ class TownOptions:
                 fine = False
             if not fine:
                 raise OptionError(
-                    f"'{name}' must be a number from {low:g} to {high:g}{unit}", where="synthetic", found=value
+                    f"'{name}' must be a number from {low:g} to {high:g}{unit}",
+                    where="synthetic",
+                    found=value,
                 )
 
         need("size", 20, 20_000, " metres")
@@ -56,8 +58,14 @@ class TownOptions:
         need("overlap", 0, 0.8, " (a share of the swath)")
         need("noise", 0, 0.5, " metres")
         need("outliers", 0, 0.05, " (a share of the pulses)")
-        if isinstance(self.seed, bool) or not isinstance(self.seed, (int, np.integer)) or not 0 <= self.seed < 2**31:
-            raise OptionError("'seed' must be a whole number from 0 to 2147483647", where="synthetic", found=self.seed)
+        if (
+            isinstance(self.seed, bool)
+            or not isinstance(self.seed, (int, np.integer))
+            or not 0 <= self.seed < 2**31
+        ):
+            raise OptionError(
+                "'seed' must be a whole number from 0 to 2147483647", where="synthetic", found=self.seed
+            )
         try:
             origin = tuple(float(c) for c in self.origin)
         except (TypeError, ValueError):
@@ -65,7 +73,9 @@ class TownOptions:
         if len(origin) != 3 or not all(math.isfinite(c) for c in origin):
             raise OptionError("'origin' must be three numbers: x, y, z", where="synthetic", found=self.origin)
         if not isinstance(self.srs, str):
-            raise OptionError("'srs' must be text such as EPSG:25832, or 'none'", where="synthetic", found=self.srs)
+            raise OptionError(
+                "'srs' must be text such as EPSG:25832, or 'none'", where="synthetic", found=self.srs
+            )
 
 
 @dataclass
@@ -87,6 +97,9 @@ class Town:
     scan_angle : (n,) float32
         Degrees, positive to the right of the flight.
     edge_of_flight_line : (n,) bool
+        Last pulse of its scan line.
+    scan_direction : (n,) uint8
+        1 where the mirror moved to the right.
     height_above_ground : (n,) float32
         True height above the bare ground (water: above its surface).
     material : (n,) uint8
@@ -103,6 +116,7 @@ class Town:
     point_source_id: np.ndarray
     scan_angle: np.ndarray
     edge_of_flight_line: np.ndarray
+    scan_direction: np.ndarray
     height_above_ground: np.ndarray
     material: np.ndarray
     options: TownOptions = field(default_factory=TownOptions)
@@ -153,54 +167,80 @@ class _Survey:
         return Flight(o.size, 0.0, o.altitude, o.scan_angle, o.overlap, self._heading, spacing)
 
     def _spacing(self) -> float:
-        """Pulse spacing that gives the wanted density of returns, from a sample of pulses."""
+        """Pulse spacing that gives the wanted density of returns, from a scattered sample of pulses."""
         o = self.options
         spacing = 1.0 / math.sqrt(o.density)
         for _ in range(2):
             flight = self._flight(spacing)
-            # Whole scan lines of every strip, spread evenly: about 25,000 pulses.
-            seen = max(1, min(flight.per_line, int(2.2 * flight.reach / spacing)))
-            lines = max(1, min(flight.lines, 25_000 // (seen * flight.strips)))
-            at = np.unique(np.linspace(0.5, flight.lines - 0.5, lines).astype(int))
-            count = sum(
-                len(self.cast_lines(flight, strip, int(n), int(n) + 1)["height"])
-                for strip in range(flight.strips)
-                for n in at
-            )
-            got = count * flight.lines / at.size / o.size**2
-            spacing *= math.sqrt(max(got, 1e-6) / o.density)
+            step = max(1, math.ceil(60.0 / spacing))
+            parts = [
+                Chunk(s, n, min(n + step, flight.lines))
+                for s in range(flight.strips)
+                for n in range(0, flight.lines, step)
+            ]
+            if len(parts) > 60:  # a large town: some of its parts
+                picked = np.random.default_rng([int(o.seed), 0x5A3]).choice(len(parts), 60, replace=False)
+                parts = [parts[n] for n in sorted(picked)]
+            sent = step * len(parts) * min(flight.per_line, 2 * flight.reach / spacing)
+            every = max(1, int(sent / 60_000))
+            returns = pulses = 0
+            for part in parts:
+                got = self.cast_lines(flight, part, every)
+                returns += len(got["height"])
+                pulses += got["aimed"]
+            # Pulses aimed into the square go with the square of the spacing: count them on a coarse flight.
+            coarse = self._flight(max(spacing, o.size / 400.0))
+            aimed = sum(coarse.fire(Chunk(s, 0, coarse.lines), aimed=True) for s in range(coarse.strips))
+            aimed *= (coarse.spacing / spacing) ** 2
+            density = returns / max(pulses, 1) * aimed / o.size**2
+            spacing *= math.sqrt(max(density, 1e-6) / o.density)
         return spacing
 
-    def cast_lines(self, flight: Flight, strip: int, first: int, last: int) -> dict[str, np.ndarray]:
+    def cast_lines(self, flight: Flight, chunk: Chunk, every: int = 1) -> dict:
         """Returns of some scan lines of a strip, local metres."""
-        from .flight import Chunk
-
         o = self.options
-        origin, direction, ids, time, angle, edge = flight.fire(Chunk(strip, first, last))
+        origin, direction, ids, time, angle, edge, right = flight.fire(chunk, every)
         n = len(origin)
         xyz = np.empty((n * MAX_RETURNS, 3))
         byte = np.empty((n * MAX_RETURNS, 6), dtype=np.uint8)
         height, pulse = np.empty(n * MAX_RETURNS), np.empty(n * MAX_RETURNS, dtype=np.int64)
-        count = 0
+        count = aimed = 0
         if n:
             hit = origin[:, :2] + (flight.altitude / -direction[:, 2])[:, None] * direction[:, :2]
+            aimed = int(flight.inside(hit).sum())
             x0, y0 = hit.min(axis=0) - REACH
             x1, y1 = hit.max(axis=0) + REACH
             pieces = [self.blocks.get(i, j) for i, j in self.plan.blocks_in(x0, y0, x1, y1, 30.0)]
             scene = build_scene(pieces, x0, y0, x1, y1)
             setting = np.array([0.35e-3, o.noise, o.outliers, o.size, o.altitude, 0.015, 0.0, 0.0])
             count, _ = cast(
-                origin, direction, ids, scene, self.plan.ground, REFLECTANCE, setting, int(o.seed),
-                xyz, byte, height, pulse,
-            )  # fmt: skip
+                origin,
+                direction,
+                ids,
+                scene,
+                self.plan.ground,
+                REFLECTANCE,
+                setting,
+                int(o.seed),
+                xyz,
+                byte,
+                height,
+                pulse,
+            )
         pulse = pulse[:count]
         return {
-            "xyz": xyz[:count], "byte": byte[:count], "height": height[:count], "time": time[pulse],
-            "angle": angle[pulse], "edge": edge[pulse],
-        }  # fmt: skip
+            "xyz": xyz[:count],
+            "byte": byte[:count],
+            "height": height[:count],
+            "time": time[pulse],
+            "angle": angle[pulse],
+            "edge": edge[pulse],
+            "right": right[pulse],
+            "aimed": aimed,
+        }
 
-    def town(self, strip: int, first: int, last: int) -> Town:
-        got = self.cast_lines(self.flight, strip, first, last)
+    def town(self, chunk: Chunk) -> Town:
+        got = self.cast_lines(self.flight, chunk)
         byte = got["byte"]
         # Millimetres, as whole numbers, so that the file's coordinates are exactly these.
         mm = np.round(got["xyz"] * 1000.0) + np.round(np.array(self.options.origin) * 1000.0)
@@ -211,9 +251,10 @@ class _Survey:
             return_number=byte[:, 1].copy(),
             number_of_returns=byte[:, 2].copy(),
             gps_time=got["time"],
-            point_source_id=np.full(len(byte), strip + 1, dtype=np.uint16),
+            point_source_id=np.full(len(byte), chunk.strip + 1, dtype=np.uint16),
             scan_angle=got["angle"].astype(np.float32),
             edge_of_flight_line=got["edge"],
+            scan_direction=got["right"].astype(np.uint8),
             height_above_ground=got["height"].astype(np.float32),
             material=byte[:, 3].copy(),
             options=self.options,
@@ -226,8 +267,11 @@ def _options(options: TownOptions | None, changes: dict) -> TownOptions:
         if name not in known:
             from ..errors import suggest
 
-            raise OptionError(f"unknown option '{name}'", where="synthetic", cure=suggest(name, known)
-                              + f"The options are {', '.join(sorted(known))}")  # fmt: skip
+            raise OptionError(
+                f"unknown option '{name}'",
+                where="synthetic",
+                cure=suggest(name, known) + f"The options are {', '.join(sorted(known))}",
+            )
     return replace(options, **changes) if options is not None else TownOptions(**changes)
 
 
@@ -244,22 +288,27 @@ def town_chunks(
     chunks = survey.flight.chunks(PULSES_PER_CHUNK)
     total = int(chosen.density * chosen.size**2)
     with Progress(total, "synthetic", enabled=None if progress else False) as line:
-        for piece in map_blocks(lambda c: survey.town(c.strip, c.first, c.last), chunks, threads):
+        for piece in map_blocks(survey.town, chunks, threads):
             line.update(len(piece))
             if len(piece):
                 yield piece
 
 
 def make_town(
-    size: float = 200.0, density: float = 7.0, seed: int = 1, *, threads: int | None = None, progress: bool = True,
+    size: float = 200.0,
+    density: float = 7.0,
+    seed: int = 1,
+    *,
+    threads: int | None = None,
+    progress: bool = True,
     **changes,
-) -> Town:  # fmt: skip
+) -> Town:
     """A generated town under a simulated flight, with true classes and heights.
 
     Streets with kerbs and cars, houses of many roof shapes, closed blocks with courtyards, a church, halls,
-    parks with a pond, a canal with quays and bridges, a railway bank, a hill, trees that let the beam through,
-    hedges, poles, pylons and wires. Pulses are cast as five sub-beams each through that geometry, so shadows,
-    facades, roof edges with two returns and ground below trees come out as they do in a scan.
+    parks with a pond, a canal with quays and bridges, a railway bank, a hill, trees that let the beam
+    through, hedges, poles, pylons and wires. Pulses are cast as five sub-beams each through that geometry, so
+    shadows, facades, roof edges with two returns and ground below trees come out as they do in a scan.
 
     Parameters
     ----------
@@ -294,5 +343,9 @@ def make_town(
     chosen = _options(None, {"size": size, "density": density, "seed": seed, **changes})
     pieces = list(town_chunks(chosen, threads=threads, progress=progress))
     if not pieces:
-        raise OptionError("no pulse hit this town", where="synthetic", cure="Give a larger 'size' or 'density'")
-    return Town(**{name: np.concatenate([getattr(p, name) for p in pieces]) for name in _COLUMNS}, options=chosen)
+        raise OptionError(
+            "no pulse hit this town", where="synthetic", cure="Give a larger 'size' or 'density'"
+        )
+    return Town(
+        **{name: np.concatenate([getattr(p, name) for p in pieces]) for name in _COLUMNS}, options=chosen
+    )
