@@ -1,0 +1,91 @@
+"""``filters.hag_minima``: height above a coarse terrain of cell minima [W18 section 3.2]."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..asprs import NOISE
+from ..errors import OptionError
+from ..terrain import MinimaTerrain
+from .base import Stage
+from .options import Option
+from .points import Points
+
+
+class HagMinima(Stage):
+    type = "filters.hag_minima"
+    summary = "Height above a coarse terrain: the minima of a grid, interpolated"
+    source = "[W18] section 3.2"
+    where_help = "Points outside neither form the terrain nor receive a height."
+    options = (
+        Option(
+            "cell",
+            "number",
+            20.0,
+            "Side of the coarse cells whose lowest points form the terrain; larger than the largest building's half width",
+            minimum=0,
+            exclusive=True,
+            maximum=10_000,
+            unit="m",
+        ),
+        Option(
+            "resolution",
+            "number",
+            0.5,
+            "Side of the fine cells on which the terrain is evaluated",
+            minimum=0,
+            exclusive=True,
+            maximum=10_000,
+            unit="m",
+        ),
+        Option(
+            "ignore_classes",
+            "list",
+            NOISE,
+            "Class codes that do not form the terrain (they still receive heights), e.g. noise below ground",
+        ),
+    )
+    example = {"type": "filters.hag_minima", "cell": 20, "resolution": 0.5}
+
+    @classmethod
+    def check(cls, options: dict[str, Any]) -> None:
+        if options["resolution"] > options["cell"]:
+            raise OptionError(
+                "option 'resolution' must not be larger than 'cell'",
+                found=f"resolution {options['resolution']:g}, cell {options['cell']:g}",
+                cure="Swap them, or lower 'resolution'",
+            )
+        for code in options["ignore_classes"]:
+            if str(code).strip() not in map(str, range(256)):
+                raise OptionError("option 'ignore_classes' must list class codes of 0 to 255", found=repr(code))
+
+    @classmethod
+    def creates(cls, options: dict[str, Any]) -> dict[str, str]:
+        return {"HeightAboveGround": "double"}
+
+    @classmethod
+    def halo(cls, options: dict[str, Any]) -> float:
+        # The bilinear patch reaches one and a half cells, whole cells are needed, and an
+        # empty cell is filled from the nearest ones with points.
+        return 4.0 * options["cell"]
+
+    @classmethod
+    def run(cls, points: Points, options: dict[str, Any]) -> dict[str, NDArray]:
+        if points.count == 0:
+            return {"HeightAboveGround": np.empty(0)}
+        x, y, z = points.xyz.T
+        forms = np.ones(points.count, bool) if points.mask is None else points.mask.copy()
+        if "Classification" in points.arrays and options["ignore_classes"]:
+            codes = np.array([int(c) for c in options["ignore_classes"]], np.uint8)
+            noise = np.isin(points.class_codes, codes)
+            points.report["ignored"] = int(np.count_nonzero(noise & forms))
+            forms &= ~noise
+        terrain = MinimaTerrain.fit(x, y, z, cell=options["cell"], resolution=options["resolution"], mask=forms)
+        wanted = slice(None) if points.mask is None else points.mask
+        height = np.array(points.arrays["HeightAboveGround"], np.float64)
+        height[wanted] = (z[wanted] - terrain.at(x[wanted], y[wanted])) / points.units.vertical
+        points.report.update(terrain.report)
+        return {"HeightAboveGround": height}

@@ -1,0 +1,124 @@
+"""``filters.modelclassifier``: apply a model file, write ASPRS classes [B16, W18]."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..classifier import Model, load_model
+from ..progress import Progress
+from .base import Stage
+from .options import Option
+from .points import Points
+
+
+class ModelClassifier(Stage):
+    type = "filters.modelclassifier"
+    summary = "Apply a model file: compute what the model needs block by block, and write classes"
+    source = "[B16] section 3.4, [W18] section 3.3"
+    where_help = "Points outside keep their class but still serve as neighbors."
+    options = (
+        Option("model", "filename", None, "The model file to apply", required=True),
+        Option(
+            "probabilities", "boolean", False, "Also write the probability of each class, as Probability_<code>"
+        ),
+        Option("margin", "boolean", False, "Also write Margin, the winning probability minus the second"),
+        Option(
+            "reject_below",
+            "number",
+            None,
+            "Points less reliable than this are not given the winning class, and are counted",
+            minimum=0,
+            maximum=1,
+        ),
+        Option(
+            "rejected_code",
+            "integer",
+            None,
+            "Class code of rejected points; default: they keep the class they had",
+            minimum=0,
+            maximum=255,
+        ),
+        Option("memory", "integer", 512, "Memory for blocks of points, over the cloud itself", minimum=16, unit="MB"),
+    )
+    example = {"type": "filters.modelclassifier", "model": "town.model"}
+
+    @classmethod
+    def check(cls, options: dict[str, Any]) -> None:
+        cls.model(options)
+
+    @classmethod
+    def model(cls, options: dict[str, Any]) -> Model:
+        """The loaded model; read once per process as long as the file stays the same."""
+        path = Path(options["model"])
+        try:
+            stat = path.stat()
+            stamp = (stat.st_mtime_ns, stat.st_size)
+        except OSError:
+            return load_model(path)  # says what is wrong
+        return _load(str(path), stamp)
+
+    @classmethod
+    def reads(cls, options: dict[str, Any]) -> list[str]:
+        return list(cls.model(options).required_dimensions)
+
+    @classmethod
+    def creates(cls, options: dict[str, Any]) -> dict[str, str]:
+        out = {"Classification": "uint8_t", "Reliability": "float"}
+        if options["margin"]:
+            out["Margin"] = "float"
+        if options["probabilities"]:
+            out.update({f"Probability_{code}": "float" for code, _ in cls.model(options).classes})
+        return out
+
+    @classmethod
+    def halo(cls, options: dict[str, Any]) -> float:
+        return cls.model(options).halo
+
+    @classmethod
+    def largest_class(cls, options: dict[str, Any]) -> int:
+        return max([code for code, _ in cls.model(options).classes] + [options["rejected_code"] or 0])
+
+    @classmethod
+    def run(cls, points: Points, options: dict[str, Any]) -> dict[str, NDArray]:
+        creates = cls.creates(options)
+        if points.count == 0:
+            return {}
+        model = cls.model(options)
+        chosen = points.count if points.mask is None else int(np.count_nonzero(points.mask))
+        with Progress(chosen, cls.type) as progress:
+            found = model.predict(
+                points.xyz,
+                {name: points.dimension(name) for name in model.required_dimensions},
+                points.mask,
+                current=points.class_codes,
+                threads=options["threads"],
+                memory_mb=options["memory"],
+                probabilities=options["probabilities"],
+                margin=options["margin"],
+                reject_below=options["reject_below"],
+                rejected_code=options["rejected_code"],
+                progress=progress,
+            )
+        values: dict[str, NDArray] = {"Classification": found.classification, "Reliability": found.reliability}
+        if found.margin is not None:
+            values["Margin"] = found.margin
+        if found.probabilities is not None:
+            for column, (code, _) in enumerate(model.classes):
+                values[f"Probability_{code}"] = found.probabilities[:, column]
+        if points.mask is not None:  # what was there before stays outside `where`
+            for name in creates:
+                if name != "Classification":
+                    values[name] = np.where(points.mask, values[name], points.arrays[name])
+        values["Classification"] = points.with_codes(values["Classification"])
+        points.report.update(found.report)
+        return values
+
+
+@lru_cache(maxsize=4)
+def _load(path: str, stamp: tuple[int, int]) -> Model:
+    return load_model(path)

@@ -1,0 +1,174 @@
+"""``filters.multiscalefeatures``: features of many neighborhoods as dimensions [B16, W18, H17]."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DimensionError, OptionError, StageError
+from ..features import FeatureEngine, FeaturePlan, ShapeBins
+from ..progress import Progress
+from .base import Stage, plan_error
+from .options import Option
+from .points import Points
+
+#: Bytes a LAS extra-dimension name may have.
+_NAME_BYTES = 32
+#: A variable-length record holds 65,535 bytes; an extra dimension's description takes 192.
+_MOST_EXTRA = 65_535 // 192
+
+
+class MultiscaleFeatures(Stage):
+    type = "filters.multiscalefeatures"
+    summary = "Covariance, geometric and shape-distribution features of many neighborhoods"
+    source = "[B16] sections 3.1-3.2, [W18] section 3.2, [H17] equations 1-3"
+    where_help = "Features are computed for the points inside; all points are neighbors."
+    options = (
+        Option(
+            "neighborhoods",
+            "list",
+            ("c1", "c2", "c3", "c5", "kopt"),
+            "Neighborhoods: tokens (c2 cylinder, s1 sphere, k50 nearest, kopt, ropt, copt) or a preset "
+            "(blomley2016, weinmann2018, he2017)",
+        ),
+        Option(
+            "feature_set",
+            "list",
+            ("covariance", "geometric"),
+            "Groups (covariance, geometric, shapes, all) or single features (Linearity, A3, ...)",
+        ),
+        Option("seed", "integer", 0, "Seed of the random pulls of shape distributions", minimum=0, maximum=2**31 - 1),
+        Option(
+            "bins",
+            "filename",
+            None,
+            "JSON file of shape-histogram thresholds and the curvature threshold: read where it exists, "
+            "otherwise fitted to these points and written, so that other tiles see the same ones",
+        ),
+        Option("memory", "integer", 512, "Memory for blocks of points, over the cloud itself", minimum=16, unit="MB"),
+    )
+    example = {
+        "type": "filters.multiscalefeatures",
+        "neighborhoods": "c1,c2,c3,c5,kopt",
+        "feature_set": "covariance,geometric",
+    }
+
+    @classmethod
+    def plan(cls, options: dict[str, Any]) -> FeaturePlan:
+        """The parsed neighborhoods and features, point dimensions of presets left out."""
+        plan = FeaturePlan.parse(options["neighborhoods"], feature_set=options["feature_set"])
+        return plan
+
+    @classmethod
+    def check(cls, options: dict[str, Any]) -> None:
+        try:
+            names = cls._columns(cls.plan(options))
+        except StageError as error:
+            raise plan_error("neighborhoods" if "neighborhood" in error.what else "feature_set", error) from None
+        for name in names:
+            if len(name.encode()) > _NAME_BYTES:
+                raise OptionError(
+                    f"the dimension name '{name}' is longer than the {_NAME_BYTES} bytes LAS allows",
+                    cure="Use shorter neighborhood tokens",
+                )
+
+    @staticmethod
+    def _columns(plan: FeaturePlan) -> list[str]:
+        """Features to write: the point's own dimensions are there already."""
+        return [name for name in plan.names if name not in plan.dimensions]
+
+    @classmethod
+    def extra_dimensions(cls, options: dict[str, Any]) -> int:
+        """How many extra dimensions a LAS writer would have to hold."""
+        return len(cls._columns(cls.plan(options)))
+
+    @classmethod
+    def creates(cls, options: dict[str, Any]) -> dict[str, str]:
+        return {name: "float" for name in cls._columns(cls.plan(options))}
+
+    @classmethod
+    def halo(cls, options: dict[str, Any]) -> float:
+        return cls.plan(options).halo
+
+    @classmethod
+    def run(cls, points: Points, options: dict[str, Any]) -> dict[str, NDArray]:
+        plan = cls.plan(options)
+        names = cls._columns(plan)
+        if points.count == 0:
+            return {name: np.empty(0, np.float32) for name in names}
+        bins, threshold = _read_bins(options["bins"])
+        engine = FeatureEngine(
+            points.xyz, plan, bins=bins, copt_threshold=threshold, seed=options["seed"], threads=options["threads"]
+        )
+        queries = None if points.mask is None else np.flatnonzero(points.mask)
+        own = {name: points.dimension(name) for name in plan.dimensions}
+        if queries is not None:
+            own = {name: values[queries] for name, values in own.items()}
+        columns = [plan.names.index(name) for name in names]
+        out = {name: np.array(points.arrays[name], np.float32) for name in names}
+        total = points.count if queries is None else len(queries)
+        with Progress(total, cls.type) as progress:
+            for rows, values in engine.blocks(
+                queries,
+                dimensions=own,
+                threads=options["threads"],
+                memory_mb=options["memory"],
+                progress=progress,
+            ):
+                at = rows if queries is None else queries[rows]
+                for name, column in zip(names, columns, strict=True):
+                    out[name][at] = values[:, column]
+        if options["bins"] and not Path(options["bins"]).exists():
+            _write_bins(options["bins"], engine)
+        points.report.update({"neighborhoods": len(plan.neighborhoods), "features": len(names), **engine.report})
+        return out
+
+
+def too_many_for_las(count: int) -> DimensionError:
+    """The error for more extra dimensions than one LAS record can describe."""
+    return DimensionError(
+        "LAS cannot hold so many extra dimensions: one record describes "
+        f"{_MOST_EXTRA} of them",
+        found=f"{count} features",
+        cure="Take fewer neighborhoods or features, write to a format without the limit (writers.text, "
+        "writers.tiledb), or use writers.classifiermodel and filters.modelclassifier, which need no dimensions",
+    )
+
+
+def fits_las(count: int) -> bool:
+    """Whether a LAS file can describe so many extra dimensions."""
+    return count <= _MOST_EXTRA
+
+
+def _read_bins(path: str | None) -> tuple[ShapeBins | None, float | None]:
+    if path is None or not Path(path).exists():
+        return None, None
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        threshold = content.get("copt_threshold")
+        bins = content.get("bins")
+        return (
+            ShapeBins.from_dict(bins) if bins is not None else None,
+            None if threshold is None else float(threshold),
+        )
+    except (OSError, ValueError, AttributeError, TypeError, KeyError) as error:
+        raise OptionError(
+            f"option 'bins': '{path}' is not a file of thresholds written by this stage",
+            found=str(error),
+            cure="Delete it to have it written anew, or name another file",
+        ) from None
+
+
+def _write_bins(path: str, engine: FeatureEngine) -> None:
+    from ..files import write_whole
+
+    content = {
+        "format": "pdal_stages thresholds 1",
+        "bins": engine.bins.to_dict() if engine.bins is not None else None,
+        "copt_threshold": engine.copt_threshold,
+    }
+    write_whole(path, json.dumps(content, indent=1).encode())

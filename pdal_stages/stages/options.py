@@ -1,0 +1,217 @@
+"""Typed stage options: one declaration gives JSON Schema, help, the docs table and the errors."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ..errors import OptionError, suggest
+
+_JSON_TYPES = {
+    "number": "number",
+    "integer": "integer",
+    "string": "string",
+    "boolean": "boolean",
+    "filename": "string",
+    "expression": "string",
+    "list": "array",
+    "mapping": "object",
+}
+_READABLE = {
+    "number": "a number",
+    "integer": "a whole number",
+    "string": "text",
+    "boolean": "true or false",
+    "filename": "a file name",
+    "expression": "a condition such as \"Classification == 2\"",
+    "list": "a list, or text separated by commas",
+    "mapping": "a mapping such as {\"2\": \"Ground\"}",
+}
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option of a stage.
+
+    Attributes
+    ----------
+    name, help : str
+        As the user types it, and one sentence that ends without a full stop.
+    kind : str
+        ``number``, ``integer``, ``string``, ``boolean``, ``filename``, ``expression``,
+        ``list`` (a JSON list or comma-separated text) or ``mapping`` (a JSON object).
+    default : object
+        The value where the option is absent; None means "decided by the stage".
+    minimum, maximum : float, optional
+        Bounds of a number; `exclusive` leaves the lower one out.
+    choices : tuple, optional
+        The values allowed.
+    unit : str
+        Shown beside the default.
+    """
+
+    name: str
+    kind: str
+    default: Any
+    help: str
+    minimum: float | None = None
+    maximum: float | None = None
+    exclusive: bool = False
+    choices: tuple = ()
+    unit: str = ""
+    required: bool = False
+
+    def schema(self) -> dict:
+        """The option's JSON Schema."""
+        out: dict[str, Any] = {"description": self.help, "type": _JSON_TYPES[self.kind]}
+        if self.kind == "list":
+            out["type"] = ["array", "string"]
+        if self.kind in ("number", "integer", "boolean", "mapping"):
+            out["type"] = [out["type"], "string"]  # PDAL takes numbers as text too
+        if self.minimum is not None:
+            out["exclusiveMinimum" if self.exclusive else "minimum"] = self.minimum
+        if self.maximum is not None:
+            out["maximum"] = self.maximum
+        if self.choices:
+            out["enum"] = list(self.choices)
+        if self.default is not None:
+            out["default"] = self.default
+        return out
+
+    def parse(self, value: Any) -> Any:
+        """The value as the stage wants it, from JSON or from command-line text.
+
+        Raises
+        ------
+        OptionError
+            If it is of the wrong type, out of range or not among the choices.
+        """
+        parsed = getattr(self, f"_parse_{self.kind}", self._parse_string)(value)
+        if self.kind in ("number", "integer"):
+            self._check_range(parsed)
+        if self.choices and parsed not in self.choices:
+            raise OptionError(
+                f"option '{self.name}' must be one of {', '.join(map(repr, self.choices))}",
+                found=repr(value),
+                cure=suggest(str(value), map(str, self.choices)) or None,
+            )
+        return parsed
+
+    def _wrong(self, value: Any) -> OptionError:
+        return OptionError(f"option '{self.name}' must be {_READABLE[self.kind]}", found=json.dumps(value, default=str))
+
+    def _parse_number(self, value: Any) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float | str):
+            raise self._wrong(value)
+        try:
+            number = float(value)
+        except (ValueError, OverflowError):
+            raise self._wrong(value) from None
+        if not math.isfinite(number):
+            raise self._wrong(value)
+        return number
+
+    def _parse_integer(self, value: Any) -> int:
+        number = self._parse_number(value)
+        if number != int(number):
+            raise self._wrong(value)
+        return int(number)
+
+    def _parse_boolean(self, value: Any) -> bool:
+        if isinstance(value, bool):
+            return value
+        if isinstance(value, str) and value.strip().lower() in ("true", "false"):
+            return value.strip().lower() == "true"
+        raise self._wrong(value)
+
+    def _parse_string(self, value: Any) -> str:
+        if not isinstance(value, str):
+            raise self._wrong(value)
+        if self.kind in ("filename", "expression") and not value.strip():
+            raise OptionError(f"option '{self.name}' is empty", cure=f"Give {_READABLE[self.kind]}, or leave it out")
+        return value
+
+    def _parse_list(self, value: Any) -> list:
+        if isinstance(value, str):
+            value = _split(value)
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            value = [value]
+        if not isinstance(value, list | tuple) or not all(
+            isinstance(v, str | int | float) and not isinstance(v, bool) for v in value
+        ):
+            raise self._wrong(value)
+        if not value and self.default:
+            raise OptionError(
+                f"option '{self.name}' is an empty list",
+                cure="Name at least one, or leave the option out for the default "
+                f"({', '.join(map(str, self.default))})",
+            )
+        return list(value)
+
+    def _parse_mapping(self, value: Any) -> dict:
+        if isinstance(value, str):
+            try:
+                value = json.loads(value)
+            except ValueError:
+                raise self._wrong(value) from None
+        if not isinstance(value, dict):
+            raise self._wrong(value)
+        return value
+
+    def _check_range(self, value: float) -> None:
+        low, high = self.minimum, self.maximum
+        if (low is not None and (value < low or (self.exclusive and value == low))) or (
+            high is not None and value > high
+        ):
+            bounds = []
+            if low is not None:
+                bounds.append(f"more than {low:g}" if self.exclusive else f"at least {low:g}")
+            if high is not None:
+                bounds.append(f"at most {high:g}")
+            unit = f" {self.unit}" if self.unit else ""
+            raise OptionError(f"option '{self.name}' must be {' and '.join(bounds)}{unit}", found=f"{value:g}")
+
+
+def _split(text: str) -> list[str]:
+    """Split at commas outside parentheses: ``c1,kopt(10,50)`` is two tokens."""
+    parts, depth, current = [], 0, ""
+    for character in text:
+        depth += (character == "(") - (character == ")")
+        if character == "," and depth <= 0:
+            parts.append(current)
+            current = ""
+        else:
+            current += character
+    parts.append(current)
+    return [p.strip() for p in parts if p.strip()]
+
+
+def parse_options(declared: Iterable[Option], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Every declared option with its value, given or default.
+
+    Raises
+    ------
+    OptionError
+        For an unknown option (with the nearest known one), a missing required one, or a
+        value that does not fit.
+    """
+    known = {option.name: option for option in declared}
+    for name in given:
+        if name not in known:
+            raise OptionError(
+                f"there is no option '{name}'",
+                found=json.dumps(given[name], default=str)[:80],
+                cure=f"{suggest(name, known)}Options: {', '.join(sorted(known))}",
+            )
+    values: dict[str, Any] = {}
+    for name, option in known.items():
+        if name in given:
+            values[name] = option.parse(given[name])
+        elif option.required:
+            raise OptionError(f"option '{name}' is required", cure=f"It is {_READABLE[option.kind]}: {option.help}")
+        else:
+            values[name] = list(option.default) if isinstance(option.default, tuple) else option.default
+    return values

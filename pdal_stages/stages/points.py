@@ -1,0 +1,166 @@
+"""The points a stage works on: PDAL's arrays, in metres, with class codes freed of flag bits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..asprs import LEGACY_LIMIT
+from ..errors import DimensionError, StageError
+from ..expression import Expression
+from ..units import Units, units_of_wkt
+
+#: Which stage makes a dimension that a user may lack.
+MAKERS = {
+    "HeightAboveGround": 'Add {"type": "filters.hag_minima"} (or filters.hag_delaunay, filters.hag_nn) before this stage',
+    "Reference": 'Keep the labels before classifying: {"type": "filters.ferry", "dimensions": "Classification=>Reference"}',
+    "Intensity": "The reader does not give it; leave it out of the model's dimensions",
+    "ReturnNumber": "The reader does not give it; leave it out of the model's dimensions",
+    "NumberOfReturns": "The reader does not give it; leave it out of the model's dimensions",
+}
+#: Dimensions that are lengths upward, so they follow the vertical unit.
+VERTICAL_LENGTHS = ("HeightAboveGround", "Z")
+
+
+class Points:
+    """One view of points, as a stage sees it.
+
+    Parameters
+    ----------
+    arrays : mapping of str to ndarray
+        PDAL's dimensions, one value per point.
+    wkt : str
+        The spatial reference, empty where there is none.
+    options : mapping
+        Parsed options of the stage (`where` and the units are read).
+    legacy_flags : bool
+        True where the three flag bits of LAS 1.0-1.3 sit inside `Classification`.
+    """
+
+    def __init__(
+        self,
+        arrays: Mapping[str, NDArray],
+        *,
+        wkt: str = "",
+        options: Mapping[str, Any] | None = None,
+        legacy_flags: bool = False,
+    ) -> None:
+        options = options or {}
+        self.arrays = arrays
+        self.wkt = wkt
+        self.legacy_flags = legacy_flags
+        self.count = len(arrays["X"]) if "X" in arrays else 0
+        self.report: dict[str, Any] = {"points": self.count}
+        self._units = (options.get("horizontal_unit") or "", options.get("vertical_unit") or "")
+        where = options.get("where")
+        self.mask: NDArray[np.bool_] | None = None
+        if where:
+            self.mask = Expression(where).evaluate(arrays)
+            self.report["where"] = int(np.count_nonzero(self.mask))
+
+    @cached_property
+    def units(self) -> Units:
+        """Metres per unit; refuses degrees. An assumption is put in the report."""
+        units = units_of_wkt(self.wkt, horizontal=self._units[0], vertical=self._units[1])
+        if units.assumed and self.count:
+            self.report["note"] = "the points have no spatial reference: metres were assumed"
+            x, y = self.arrays["X"], self.arrays["Y"]
+            if np.abs(x).max() <= 180.0 and np.abs(y).max() <= 90.0 and max(np.ptp(x), np.ptp(y)) < 0.2:
+                self.report["warning"] = (
+                    "coordinates look like degrees; if they are, reproject with filters.reprojection first"
+                )
+        return units
+
+    @cached_property
+    def xyz(self) -> NDArray[np.float64]:
+        """Coordinates in metres, shape (n, 3).
+
+        Raises
+        ------
+        StageError
+            If any is NaN or infinite, with the count.
+        """
+        out = np.empty((self.count, 3))
+        for column, (name, unit) in enumerate(
+            (("X", self.units.horizontal), ("Y", self.units.horizontal), ("Z", self.units.vertical))
+        ):
+            np.multiply(self.arrays[name], unit, out=out[:, column])
+        bad = int(np.count_nonzero(~np.isfinite(out).all(axis=1)))
+        if bad:
+            raise StageError(
+                "coordinates are not finite (NaN or infinite)",
+                found=f"{bad:,} of {self.count:,} points",
+                cure='Drop them before this stage: {"type": "filters.expression", "expression": "X < 1e9 && Y < 1e9 '
+                '&& Z < 1e9"} (filters.range with "limits": "Z[-1000:10000]" in PDAL 2.2)',
+            )
+        return out
+
+    def dimension(self, name: str, *, metres: bool = True) -> NDArray:
+        """A dimension's values; lengths upward are converted to metres.
+
+        Raises
+        ------
+        DimensionError
+            If the points do not have it, naming the stage that makes it.
+        """
+        if name not in self.arrays:
+            raise DimensionError(
+                f"the dimension '{name}' is missing",
+                found=", ".join(self.arrays),
+                cure=MAKERS.get(name, "Add the stage that makes it before this one"),
+            )
+        values = self.arrays[name]
+        if name == "Classification":
+            return self.class_codes
+        if metres and name in VERTICAL_LENGTHS and self.units.vertical != 1.0:
+            return values * self.units.vertical
+        return values
+
+    @cached_property
+    def class_codes(self) -> NDArray[np.uint8]:
+        """`Classification` without the flag bits LAS 1.0-1.3 keeps in the same byte."""
+        if "Classification" not in self.arrays:
+            raise DimensionError("the dimension 'Classification' is missing", found=", ".join(self.arrays))
+        return self.codes_of("Classification")
+
+    def codes_of(self, name: str) -> NDArray[np.uint8]:
+        """A dimension that holds class codes, checked and freed of flag bits.
+
+        A copy made by ``filters.ferry`` carries the flag bits along, so they are taken off it too.
+        """
+        if name not in self.arrays:
+            raise DimensionError(
+                f"the dimension '{name}' is missing", found=", ".join(self.arrays), cure=MAKERS.get(name)
+            )
+        values = np.asarray(self.arrays[name])
+        if values.dtype.kind == "f":
+            whole = np.isfinite(values) & (values == np.floor(values)) & (values >= 0) & (values <= 255)
+            if not whole.all():
+                raise DimensionError(
+                    f"'{name}' must hold class codes (whole numbers of 0 to 255)",
+                    found=str(values[~whole][0]),
+                )
+        elif values.size and (int(values.min()) < 0 or int(values.max()) > 255):
+            raise DimensionError(
+                f"'{name}' must hold class codes (whole numbers of 0 to 255)",
+                found=f"{values.min()} to {values.max()}",
+            )
+        codes = values.astype(np.uint8)
+        return codes & LEGACY_LIMIT if self.legacy_flags else codes
+
+    def with_codes(self, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """New class codes for `Classification`, with the flag bits of each point kept."""
+        if not self.legacy_flags:
+            return codes
+        if codes.size and codes.max() > LEGACY_LIMIT:
+            raise StageError(
+                f"class codes above {LEGACY_LIMIT} do not fit these points, read from LAS 1.0-1.3",
+                found=int(codes.max()),
+                cure="Convert the input to LAS 1.4 first (minor_version 4, dataformat_id 6)",
+            )
+        flags = np.asarray(self.arrays["Classification"], np.uint8) & ~np.uint8(LEGACY_LIMIT)
+        return codes | flags

@@ -1,0 +1,61 @@
+"""Every stage by its type name: the modules of this package are the register."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from functools import cache
+
+from ..errors import PipelineError, suggest
+from .base import Stage
+
+_SUPPORT = {"base", "options", "points", "registry"}
+
+
+@cache
+def stages() -> dict[str, type[Stage]]:
+    """All stages, by type name, in alphabetical order."""
+    package = __name__.rpartition(".")[0]
+    path = importlib.import_module(package).__path__
+    found: dict[str, type[Stage]] = {}
+    for info in pkgutil.iter_modules(path):
+        if info.name in _SUPPORT:
+            continue
+        module = importlib.import_module(f"{package}.{info.name}")
+        for value in vars(module).values():
+            if isinstance(value, type) and issubclass(value, Stage) and value.__module__ == module.__name__:
+                found[value.type] = value
+    return dict(sorted(found.items()))
+
+
+def get(type_name: str) -> type[Stage]:
+    """The stage of a type name; an error names the nearest one."""
+    try:
+        return stages()[type_name]
+    except KeyError:
+        raise PipelineError(
+            f"there is no stage '{type_name}' in pdal_stages",
+            cure=f"{suggest(type_name, stages())}Stages: {', '.join(stages())}",
+        ) from None
+
+
+def pipeline_schema() -> dict:
+    """JSON Schema of a pipeline: our stages exactly, PDAL's by their type alone."""
+    ours = [stage.schema() for stage in stages().values()]
+    theirs = {
+        "type": "object",
+        "properties": {"type": {"type": "string", "not": {"enum": list(stages())}}},
+    }
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "PDAL pipeline with pdal_stages",
+        "type": "object",
+        "required": ["pipeline"],
+        "properties": {
+            "pipeline": {
+                "type": "array",
+                "minItems": 1,
+                "items": {"anyOf": [{"type": "string"}, theirs, *ours]},
+            }
+        },
+    }
