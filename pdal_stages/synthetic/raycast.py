@@ -285,7 +285,7 @@ def cast(origin, direction, pulse_id, scene, g, reflectance, setting, seed, xyz,
         m = 0
         while m < met or (low >= 0.0 and low < 0.7 and m == met and met > 0):
             if m == met:  # a path by way of a second mirror: below the ground
-                t = ranges[met - 1] + 1.5 + 8.0 * unit(mix(key ^ np.uint64(2)))
+                t = max(ranges[met - 1], guess) + 1.5 + 8.0 * unit(mix(key ^ np.uint64(2)))
                 code, mat, power, m = 7, _AIR, 0.04, met + 1
             else:
                 last = m
