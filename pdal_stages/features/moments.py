@@ -133,12 +133,12 @@ def finish(moments, count, volume, few, copies):
     moments : (12, m) float64 array
         Moments about the queries.
     count : int
-        How many of the m columns are in use.
+        How many of the m columns are in use, at most BATCH.
     volume : float
         Area of the cylinder's base or volume of the sphere: what Density divides by.
     few : (1,) int64 array
         Raised by the number of queries whose neighborhood has fewer than three points.
-    copies : (m,) int64 array
+    copies : (count,) int64 array
         How many queries each column stands for.
 
     Returns

@@ -8,7 +8,8 @@ import numpy as np
 
 from .candidates import FAR, LANES, count_candidates, fill_strip, gather, half_widths
 from .jit import njit
-from .moments import BATCH, MOMENTS, WIDTH, add_shared, cylinder_sums, finish, sphere_sums
+from .moments import BATCH, MOMENTS, SX, SY, SZ, WIDTH, N, add_shared, cylinder_sums, finish, sphere_sums
+from .shapes import shape_counts, shape_values
 
 #: Columns of cells whose queries share one table of where points begin.
 STRIP = 256
@@ -47,8 +48,11 @@ def count_block(cell_ix, cell_start, row_iy, row_start, iy, ix, width):
 
 
 @njit
-def radius_block(grid, cell, qx, qy, qz, copies, radii, widths, reaches, wanted, columns, few, room, out):
-    """Fill the covariance and geometric features of cylinders and spheres for a block of queries.
+def radius_block(
+    grid, cell, qx, qy, qz, copies, radii, widths, reaches, wanted, columns,
+    shaped, shape_columns, thresholds, seeds, work, few, room, out,
+):  # fmt: skip
+    """Fill the features of cylinders and spheres for a block of queries.
 
     Parameters
     ----------
@@ -68,6 +72,16 @@ def radius_block(grid, cell, qx, qy, qz, copies, radii, widths, reaches, wanted,
         Number of the cylinder and of the sphere of each radius in `columns`, or -1.
     columns : (k, 12) int64 array
         Column of each neighborhood's features in `out`, or -1.
+    shaped : (k,) bool array
+        Whether shape distributions are wanted of a neighborhood.
+    shape_columns : (k, 50) int64 array
+        Their columns in `out`, or -1.
+    thresholds : (k, 5, 9) float32 array
+        Of the shape metrics' bins, comparable (``ShapeBins.comparable``).
+    seeds : (k, m) uint64 array
+        ``shapes.point_seeds`` of the queries, used where `shaped`.
+    work : shapes.Work
+        Scratch of this thread.
     few : (k,) int64 array
         Raised by the number of neighborhoods with fewer than three points.
     room : int
@@ -81,6 +95,8 @@ def radius_block(grid, cell, qx, qy, qz, copies, radii, widths, reaches, wanted,
     px, py, pz = np.empty(size), np.empty(size), np.empty(size)
     moments = np.empty((len(columns), MOMENTS, WIDTH))
     inner = np.empty((MOMENTS, 1))
+    record = np.empty((size if shaped.any() else 1, 4), np.float32)
+    counts = np.empty(50, np.float32)
     line, left, right = 0, 1, 0  # row of the strip, columns of the queries it serves (none yet)
     for start in range(0, len(qx), BATCH):
         stop = min(start + BATCH, len(qx))
@@ -92,8 +108,8 @@ def radius_block(grid, cell, qx, qy, qz, copies, radii, widths, reaches, wanted,
                 b += 1
             if iy != line or ix < left or ix > right:
                 line, left, right = iy, ix, _last_column(qx, qy, a, cell, iy, ix + STRIP - 1)
-                columns_ = right - left + 1 + 2 * reach
-                fill_strip(cell_ix, cell_start, row_iy, row_start, iy, left - reach, reach, columns_, strip)
+                span = right - left + 1 + 2 * reach
+                fill_strip(cell_ix, cell_start, row_iy, row_start, iy, left - reach, reach, span, strip)
             for k in range(len(radii)):
                 own = reaches[k]
                 shared, end = gather(x, y, z, strip, reach, widths[k], own, ix - left + reach, px, py, pz)
@@ -106,6 +122,21 @@ def radius_block(grid, cell, qx, qy, qz, copies, radii, widths, reaches, wanted,
                     sx, sy, sz = px[:end], py[:end], pz[:end]
                     for j in range(a, b):
                         sphere_sums(sx, sy, sz, qx[j], qy[j], qz[j], r2, moments[s], j - start)
+                for kind in range(2):
+                    number = wanted[k, kind]
+                    if number < 0 or not shaped[number]:
+                        continue
+                    for j in range(a, b):
+                        n = members(px[:end], py[:end], pz[:end], qx[j], qy[j], qz[j], r2, float(kind), record)
+                        if n == 0:  # a query that is not a point of the cloud
+                            counts[:] = 0.0
+                        else:
+                            gx, gy, gz = centroid(moments[number], j - start)
+                            shape_counts(record, n, gx, gy, gz, seeds[number, j], thresholds[number], work, counts)
+                        for f in range(50):
+                            column = shape_columns[number, f]
+                            if column >= 0:
+                                out[j, column] = counts[f]
             a = b
         for k in range(len(radii)):
             r = radii[k]
@@ -152,3 +183,57 @@ def cylinders(px, py, pz, shared, end, qx, qy, qz, a, b, r2, centre, inner, out,
         cylinder_sums(rx, ry, rz, qx[j], qy[j], qz[j], r2, out, j - start)
         if shared:
             add_shared(inner, cx - qx[j], cy - qy[j], cz - qz[j], out, j - start)
+
+
+@njit
+def members(px, py, pz, qx, qy, qz, r2, spherical, record):
+    """List the members of one neighborhood in canonical order, as float32 offsets from the query.
+
+    `spherical` is 1 for a sphere and 0 for a cylinder. Returns how many there are; `record` needs one
+    row more than there are candidates.
+    """
+    n = 0
+    for i in range(len(px)):
+        dx, dy, dz = px[i] - qx, py[i] - qy, pz[i] - qz
+        record[n, 0], record[n, 1], record[n, 2], record[n, 3] = dx, dy, dz, 0.0
+        n += 1 if dx * dx + dy * dy + spherical * (dz * dz) <= r2 else 0
+    return n
+
+
+@njit(forceinline=True)
+def centroid(moments, j):
+    """Centroid of one neighborhood relative to its query, from its moments."""
+    n = moments[N, j]
+    return np.float32(moments[SX, j] / n), np.float32(moments[SY, j] / n), np.float32(moments[SZ, j] / n)
+
+
+@njit
+def radius_values(grid, cell, qx, qy, qz, radius, spherical, seeds, work, room, out):
+    """The shape metrics of every pull for a few queries: what bins are fitted to.
+
+    Parameters are those of :func:`radius_block` for one neighborhood; `out` is (m, 5, 255) float32, in the
+    comparable form of ``shapes.shape_values``. Neighborhoods that are empty give NaN.
+    """
+    x, y, z, cell_ix, cell_start, row_iy, row_start = grid
+    width = half_widths(radius, cell)
+    reach = (width.shape[1] - 1) // 2
+    strip = np.empty((2 * reach + 1, 2 * reach + 2), np.int64)
+    size = room + 4 * LANES
+    px, py, pz = np.empty(size), np.empty(size), np.empty(size)
+    record = np.empty((size, 4), np.float32)
+    sums = np.empty((MOMENTS, 1))
+    r2 = radius * radius
+    for j in range(len(qx)):
+        ix, iy = int(math.floor(qx[j] / cell)), int(math.floor(qy[j] / cell))
+        fill_strip(cell_ix, cell_start, row_iy, row_start, iy, ix - reach, reach, 2 * reach + 1, strip)
+        _, end = gather(x, y, z, strip, reach, width, reach, reach, px, py, pz)
+        n = members(px[:end], py[:end], pz[:end], qx[j], qy[j], qz[j], r2, spherical, record)
+        if n == 0:
+            out[j] = np.nan
+            continue
+        if spherical > 0.0:
+            sphere_sums(px[:end], py[:end], pz[:end], qx[j], qy[j], qz[j], r2, sums, 0)
+        else:
+            cylinder_sums(px[:end], py[:end], pz[:end], qx[j], qy[j], qz[j], r2, sums, 0)
+        gx, gy, gz = centroid(sums, 0)
+        shape_values(record, n, gx, gy, gz, seeds[j], work, out[j])

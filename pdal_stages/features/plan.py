@@ -1,0 +1,197 @@
+"""What to compute: neighborhoods, features and the points' own dimensions, and the columns they become."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+from ..errors import OptionError
+from ..neighborhoods import Neighborhood, parse_neighborhoods, preset_dimensions
+from .names import ALL_FEATURES, GROUPS, WITH_DIMENSIONS, parse_feature_set
+
+#: Halo of neighborhoods whose size is a number of points, metres: see :attr:`FeaturePlan.halo`.
+POINTS_HALO = 15.0
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The features wanted of one neighborhood.
+
+    Attributes
+    ----------
+    neighborhood : Neighborhood
+    at : dict of str to int
+        Feature (without suffix) -> column in the matrix.
+    """
+
+    neighborhood: Neighborhood
+    at: dict[str, int] = field(hash=False)
+
+    @property
+    def shapes(self) -> bool:
+        """Whether any shape distribution is wanted."""
+        return any(name in self.at for name in GROUPS["shapes"])
+
+
+@dataclass(frozen=True)
+class FeaturePlan:
+    """An ordered set of features; make it with :meth:`parse`.
+
+    Attributes
+    ----------
+    neighborhoods : tuple of Neighborhood
+    features : tuple of str
+        The words of the feature set: groups, features, or features of one neighborhood.
+    dimensions : tuple of str
+        The points' own dimensions used as features, after all others.
+    """
+
+    neighborhoods: tuple[Neighborhood, ...]
+    features: tuple[str, ...] = ("all",)
+    dimensions: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        self.layout  # noqa: B018  a plan with unusable words is refused when it is made
+
+    @classmethod
+    def parse(
+        cls,
+        neighborhoods: str | Neighborhood | Iterable[str | Neighborhood],
+        feature_set: str | Iterable[str] = "all",
+        dimensions: str | Iterable[str] = (),
+    ) -> FeaturePlan:
+        """A plan from words.
+
+        Parameters
+        ----------
+        neighborhoods : str or iterable of str
+            Presets and tokens, e.g. ``"weinmann2018"`` or ``"c1, s2, kopt"``.
+        feature_set : str or iterable of str
+            Groups (``all``, ``covariance``, ``geometric``, ``shapes``, ``A3``, ``D1`` .. ``D4``), features
+            (``Linearity``) or features of one neighborhood (``Linearity_c1``). Only what is named is computed.
+        dimensions : str or iterable of str
+            Dimensions of the points to use as features besides those that a preset brings. A preset brings
+            its own (``HeightAboveGround``, ``Z``) with the groups ``all`` and ``geometric``.
+
+        Raises
+        ------
+        OptionError
+            For unknown words, and for features that no chosen neighborhood has.
+        """
+        words = parse_feature_set(feature_set)
+        if not isinstance(neighborhoods, str | Neighborhood):
+            neighborhoods = list(neighborhoods) if isinstance(neighborhoods, Iterable) else neighborhoods
+        parsed = tuple(parse_neighborhoods(neighborhoods))
+        given = dimensions.split(",") if isinstance(dimensions, str) else list(dimensions)
+        own = preset_dimensions(neighborhoods) if any(word in WITH_DIMENSIONS for word in words) else ()
+        names = dict.fromkeys([*own, *(name.strip() for name in given if name.strip())])
+        return cls(parsed, words, tuple(names))
+
+    @cached_property
+    def layout(self) -> tuple[Columns, ...]:
+        """The columns of each neighborhood, in the order of the neighborhoods."""
+        everywhere: set[str] = set()
+        single: dict[str, bool] = {}
+        for word in self.features:
+            if word in GROUPS or word in ALL_FEATURES:
+                everywhere.update(GROUPS.get(word, (word,)))
+            else:
+                single[word] = False
+        result, column = [], 0
+        for one in self.neighborhoods:
+            at = {}
+            for feature in ALL_FEATURES:
+                if feature == "Radius" and not one.adaptive:
+                    continue
+                name = f"{feature}_{one.suffix}"
+                if name in single:
+                    single[name] = True
+                elif feature not in everywhere:
+                    continue
+                at[feature] = column
+                column += 1
+            result.append(Columns(one, at))
+        lost = [name for name, used in single.items() if not used]
+        if lost:
+            raise OptionError(
+                f"the feature '{lost[0]}' belongs to none of the neighborhoods",
+                found=", ".join(n.token for n in self.neighborhoods),
+            )
+        if not column:
+            raise OptionError(
+                f"none of the neighborhoods has the feature '{', '.join(self.features)}'",
+                found=", ".join(n.token for n in self.neighborhoods),
+                cure="Radius exists for kopt, ropt and copt only" if "Radius" in self.features else None,
+            )
+        clash = {f"{f}_{c.neighborhood.suffix}" for c in result for f in c.at} & set(self.dimensions)
+        if clash:
+            raise OptionError(f"the dimension '{min(clash)}' is also a computed feature")
+        return tuple(result)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of all columns: ``Linearity_c1``, ..., then the dimensions."""
+        return (
+            *(f"{feature}_{columns.neighborhood.suffix}" for columns in self.layout for feature in columns.at),
+            *self.dimensions,
+        )
+
+    @property
+    def shapes(self) -> bool:
+        """Whether shape distributions are computed (so thresholds must be fitted)."""
+        return any(columns.shapes for columns in self.layout)
+
+    @cached_property
+    def cell(self) -> float:
+        """Edge of the grid's cells in metres, a power of two that follows from the largest radius alone.
+
+        1 m for radii from 0.75 to 20 m, finer below, coarser above.
+        """
+        radii = [n.parameters[0] for n in self.neighborhoods if n.kind in ("cylinder", "sphere")]
+        largest = max(radii, default=1.0)
+        if largest > 20.0:
+            return 2.0 ** math.ceil(math.log2(largest / 20.0))
+        if largest < 0.75:
+            return 2.0 ** max(math.floor(math.log2(largest / 0.75)), -8)
+        return 1.0
+
+    @cached_property
+    def halo(self) -> float:
+        """Metres of surroundings a tile needs for the same result as the whole cloud.
+
+        The largest reach and one cell. ``k50`` and ``kopt`` reach as far as their points lie, which no number
+        bounds; for them at least 15 m are asked for, enough for 100 neighbors down to 0.15 points a square
+        metre. How many queries had to look farther is counted in ``FeatureEngine.report["beyond_halo"]``.
+        """
+        reach = max((n.reach for n in self.neighborhoods if n.reach is not None), default=0.0)
+        if self.unbounded:
+            reach = max(reach, POINTS_HALO)
+        return reach + self.cell
+
+    @property
+    def unbounded(self) -> bool:
+        """Whether a neighborhood's size is a number of points, so that no halo is sure to suffice."""
+        return any(n.reach is None for n in self.neighborhoods)
+
+    def to_dict(self) -> dict[str, Any]:
+        """A JSON-able description; :meth:`from_dict` reads it."""
+        return {
+            "neighborhoods": [n.token for n in self.neighborhoods],
+            "features": list(self.features),
+            "dimensions": list(self.dimensions),
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> FeaturePlan:
+        """The plan that :meth:`to_dict` described; OptionError where it is not such a description."""
+        try:
+            tokens, words, dimensions = data["neighborhoods"], data["features"], data["dimensions"]
+        except (KeyError, TypeError):
+            raise OptionError("a feature plan needs 'neighborhoods', 'features' and 'dimensions'") from None
+        for value in (tokens, words, dimensions):
+            if not isinstance(value, list | tuple) or not all(isinstance(item, str) for item in value):
+                raise OptionError("a feature plan holds lists of text", found=repr(value)[:80])
+        return cls(tuple(parse_neighborhoods(tokens)), parse_feature_set(words), tuple(dict.fromkeys(dimensions)))
