@@ -1,0 +1,160 @@
+"""Thresholds of the shape distributions' bins, fitted so that sample neighborhoods fill them evenly [B16 3.2.2]."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from ..errors import OptionError
+
+#: The metrics, in the order of the rows of all threshold arrays.
+METRICS = ("A3", "D1", "D2", "D3", "D4")
+
+#: Inner thresholds of ten bins.
+INNER = 9
+
+_CURE = "Fit the thresholds again, or take them from the model file as it was written"
+
+
+class ShapeBins:
+    """Bins of A3 (radians) and D1, D2, D3, D4 (metres) for each neighborhood.
+
+    Bin i holds the values with ``threshold[i - 1] < value <= threshold[i]``; the first and the last bin are open.
+
+    Parameters
+    ----------
+    thresholds : mapping of str to (5, 9) array
+        Neighborhood token -> ascending inner thresholds of A3, D1, D2, D3, D4, in radians and metres.
+
+    Raises
+    ------
+    OptionError
+        Where thresholds are not 5 x 9 finite, ascending numbers, angles outside 0..pi or lengths below 0.
+    """
+
+    def __init__(self, thresholds: Mapping[str, Any]) -> None:
+        self._thresholds = {str(token): _checked(str(token), rows) for token, rows in thresholds.items()}
+
+    @classmethod
+    def fit(cls, values: Mapping[str, np.ndarray]) -> ShapeBins:
+        """Thresholds at the 10 %, 20 %, ... 90 % quantiles of sample values.
+
+        A threshold is one of the values, so values that often repeat (areas of 0 on a line) make equal thresholds
+        and empty bins, and nothing else does.
+
+        Parameters
+        ----------
+        values : mapping of str to (m, 5, 255) float array
+            Neighborhood token -> values of the pulls of m sample neighborhoods, in the comparable form of
+            :func:`shapes.shape_values`. NaN (neighborhoods without points) is left out; where nothing is
+            left, the thresholds are 0.
+        """
+        result = {}
+        for token, sample in values.items():
+            rows = np.zeros((len(METRICS), INNER))
+            for m in range(len(METRICS)):
+                column = np.asarray(sample)[:, m, :].ravel()
+                column = np.sort(column[np.isfinite(column)]).astype(np.float64)
+                if len(column):
+                    at = np.ceil(len(column) * np.arange(1, INNER + 1) / (INNER + 1)).astype(int) - 1
+                    rows[m] = column[at]
+            result[token] = _to_units(rows)
+        return cls(result)
+
+    @property
+    def tokens(self) -> tuple[str, ...]:
+        """The neighborhoods there are thresholds for."""
+        return tuple(self._thresholds)
+
+    def thresholds(self, token: str) -> np.ndarray:
+        """Thresholds of one neighborhood: (5, 9) float64, in radians and metres."""
+        try:
+            return self._thresholds[token].copy()
+        except KeyError:
+            raise OptionError(
+                f"there are no shape thresholds for the neighborhood '{token}'",
+                found=", ".join(self._thresholds) or "none at all",
+                cure="Fit them for the same neighborhoods that are computed",
+            ) from None
+
+    def comparable(self, tokens: Iterable[str]) -> np.ndarray:
+        """Thresholds as the kernels compare them: (neighborhoods, 5, 9) float32."""
+        rows = [_to_comparable(self.thresholds(token)) for token in tokens]
+        return np.array(rows, np.float32).reshape(-1, len(METRICS), INNER)
+
+    def to_dict(self) -> dict[str, Any]:
+        """``{"c1": {"A3": [9 numbers], "D1": ...}, ...}``, JSON-able and exact."""
+        return {
+            token: {name: [float(v) for v in row] for name, row in zip(METRICS, rows, strict=True)}
+            for token, rows in self._thresholds.items()
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> ShapeBins:
+        """The bins that :meth:`to_dict` described.
+
+        Raises
+        ------
+        OptionError
+            Where it is not such a description.
+        """
+        if not isinstance(data, Mapping):
+            raise OptionError("shape thresholds must be an object", found=type(data).__name__, cure=_CURE)
+        result = {}
+        for token, rows in data.items():
+            if not isinstance(rows, Mapping) or set(rows) != set(METRICS):
+                raise OptionError(
+                    f"the shape thresholds of '{token}' must name {', '.join(METRICS)}",
+                    found=", ".join(map(str, rows)) if isinstance(rows, Mapping) else type(rows).__name__,
+                    cure=_CURE,
+                )
+            result[token] = [rows[name] for name in METRICS]
+        return cls(result)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, ShapeBins):
+            return NotImplemented
+        return self.to_dict() == other.to_dict()
+
+    __hash__ = None  # type: ignore[assignment]  # equal by value, and not meant for a key
+
+    def __repr__(self) -> str:
+        return f"ShapeBins({', '.join(self._thresholds)})"
+
+
+def _checked(token: str, rows: Any) -> np.ndarray:
+    try:
+        array = np.array(rows, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.zeros(0)
+    if array.shape != (len(METRICS), INNER):
+        raise OptionError(
+            f"the shape thresholds of '{token}' must be {INNER} numbers for each of {', '.join(METRICS)}", cure=_CURE
+        )
+    for name, row in zip(METRICS, array, strict=True):
+        top = math.pi if name == "A3" else math.inf
+        if not (np.isfinite(row).all() and (np.diff(row) >= 0).all() and row[0] >= 0 and row[-1] <= top):
+            raise OptionError(
+                f"the {name} thresholds of '{token}' must be finite, ascending, and "
+                + ("from 0 to pi" if name == "A3" else "not below 0"),
+                found=", ".join(f"{v:g}" for v in row),
+                cure=_CURE,
+            )
+    return array
+
+
+def _to_units(rows: np.ndarray) -> np.ndarray:
+    """Comparable values (see ``shapes``) as radians and metres."""
+    a3, d1, d2, d3, d4 = rows
+    cosine = -np.sign(a3) * np.sqrt(np.abs(a3))
+    return np.array([np.arccos(np.clip(cosine, -1, 1)), np.sqrt(d1), np.sqrt(d2), (d3 / 4) ** 0.25, np.cbrt(d4 / 6)])
+
+
+def _to_comparable(rows: np.ndarray) -> np.ndarray:
+    """Radians and metres as the kernels compare them."""
+    a3, d1, d2, d3, d4 = rows
+    cosine = np.cos(a3)
+    return np.array([-cosine * np.abs(cosine), d1**2, d2**2, 4 * d3**4, 6 * d4**3])

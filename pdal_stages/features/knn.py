@@ -1,0 +1,435 @@
+"""The k nearest neighbors, exact and in one well-defined order, for groups of nearby queries.
+
+The neighbors of a query are the first `need` points of the cloud in the order of (squared distance, x, y, z),
+where the squared distance is computed from float64 differences x_j - x_q. A query that is a point of the
+cloud is its own first neighbor. So the answer is a function of the cloud as a set: neither the order of the
+points, nor the tile, nor the grouping changes it. Points with equal coordinates are interchangeable.
+
+A block of queries is halved along its longest side until at most ``GROUP`` lie together. For a
+group, all candidates within a reach (guessed from the group before) are gathered once; for each query
+squared distances and their bins are computed with vector instructions, and a counting sort by bins (in the plane
+the squared distance is uniformly distributed, so bins fill evenly) followed by an insertion sort gives
+the order. A query with too few candidates inside the reach is repeated with a reach that
+certainly suffices.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from .jit import njit
+from .kdtree import STACK, bounding_box, farthest2, gather, halve
+
+#: Queries that share one set of candidates.
+GROUP = 8
+
+#: Bins of squared distance; the first half of them lies within the reach.
+BINS = 256
+HALF = BINS // 2
+
+#: First guess of the reach, metres; each group starts from what the one before needed.
+FIRST_REACH = 1.0
+
+#: The next group's first reach, in squared distance, as a multiple of what this one needed.
+SPARE = 1.2
+
+#: A group that would collect more candidates than CROWD * need + ROOM is split or its reach shrunk.
+CROWD = 4
+ROOM = 256
+
+#: Squared metres too small to divide by.
+TINY = 1e-200
+
+#: Factor that outweighs the rounding of a product or quotient.
+MORE = 1.0 + 1e-12
+
+#: From this many points in one bin a heapsort takes the place of the insertion sort.
+HEAP = 48
+
+
+@njit
+def make_groups(qx, qy, qz):
+    """Order of a block's queries and where its groups of at most GROUP nearby queries start.
+
+    Queries that coincide form one group however many they are.
+
+    Returns
+    -------
+    order : ndarray of uint32, shape (m,)
+    starts : ndarray of int64, shape (groups + 1,)
+    """
+    m = len(qx)
+    order = np.arange(m).astype(np.uint32)
+    keys = np.empty(m)
+    starts = np.empty(m + 1, np.int64)
+    count = 0
+    stack = np.empty((STACK, 2), np.int64)
+    stack[0, 0], stack[0, 1] = 0, m
+    top = 1 if m > 0 else 0
+    while top > 0:
+        top -= 1
+        lo, hi = stack[top, 0], stack[top, 1]
+        box = bounding_box(qx, qy, qz, order, lo, hi)
+        one = box[0] == box[3] and box[1] == box[4] and box[2] == box[5]
+        if hi - lo <= GROUP or one:
+            starts[count] = lo
+            count += 1
+            continue
+        mid = halve(qx, qy, qz, order, keys, lo, hi, box)
+        stack[top, 0], stack[top, 1] = mid, hi
+        top += 1
+        stack[top, 0], stack[top, 1] = lo, mid
+        top += 1
+    starts[count] = m
+    return order, starts[: count + 1]
+
+
+@njit(forceinline=True)
+def _before(d, a, e, b, cx, cy, cz):
+    """Whether candidate a at squared distance d comes before candidate b at e."""
+    if d != e:
+        return d < e
+    if cx[a] != cx[b]:
+        return cx[a] < cx[b]
+    if cy[a] != cy[b]:
+        return cy[a] < cy[b]
+    return cz[a] < cz[b]
+
+
+@njit
+def _insertion_sort(d, pos, lo, hi, cx, cy, cz):
+    for i in range(lo + 1, hi):
+        key, item = d[i], pos[i]
+        j = i
+        while j > lo and d[j - 1] >= key:
+            if d[j - 1] == key and not _before(key, item, key, pos[j - 1], cx, cy, cz):
+                break
+            d[j] = d[j - 1]
+            pos[j] = pos[j - 1]
+            j -= 1
+        d[j] = key
+        pos[j] = item
+
+
+@njit
+def _heap_sort(d, pos, lo, hi, cx, cy, cz):
+    n = hi - lo
+    start, end = n // 2, n
+    while end > 1:
+        if start > 0:
+            start -= 1
+        else:
+            end -= 1
+            d[lo + end], d[lo] = d[lo], d[lo + end]
+            pos[lo + end], pos[lo] = pos[lo], pos[lo + end]
+        root = start
+        while 2 * root + 1 < end:
+            child = 2 * root + 1
+            a = lo + child
+            if child + 1 < end and _before(d[a], pos[a], d[a + 1], pos[a + 1], cx, cy, cz):
+                child += 1
+                a += 1
+            r = lo + root
+            if not _before(d[r], pos[r], d[a], pos[a], cx, cy, cz):
+                break
+            d[a], d[r] = d[r], d[a]
+            pos[a], pos[r] = pos[r], pos[a]
+            root = child
+
+
+@njit
+def _distances(qx, qy, qz, cx, cy, cz, count, scale, d2, bins):
+    for i in range(count):
+        dx, dy, dz = cx[i] - qx, cy[i] - qy, cz[i] - qz
+        d = dx * dx + dy * dy + dz * dz
+        d2[i] = d
+        b = d * scale
+        b = b if b < BINS - 1 else BINS - 1.0
+        bins[i] = np.uint32(np.int32(b))
+
+
+@njit
+def _bin_distances(d2, count, scale, bins):
+    for i in range(count):
+        b = d2[i] * scale
+        b = b if b < BINS - 1 else BINS - 1.0
+        bins[i] = np.uint32(np.int32(b))
+
+
+@njit
+def nearest_sorted(qx, qy, qz, need, reach2, final, work, cx, cy, cz, count):
+    """Sort the `need` nearest of `count` candidates of one query to the front of `work`'s d and pos.
+
+    Parameters
+    ----------
+    need : int
+        At most as many as the cloud has points.
+    reach2 : float
+        All points of the cloud within this squared distance are among the candidates.
+    final : bool
+        Whether candidates beyond `reach2` do not matter, so that fewer than `need` is an answer.
+
+    Returns
+    -------
+    found : int
+        How many neighbors are in front; -1 where the reach does not suffice.
+    bound : float
+        Where it does not: a squared reach that does, or at least a larger one.
+    """
+    d2, bins, d, pos, hist = work.d2, work.bins, work.d, work.pos, work.hist
+    # A tiny bit more than HALF bins, so that rounding puts no candidate beyond the reach below HALF.
+    scale = HALF * MORE / reach2 if reach2 > TINY else HALF / TINY
+    _distances(qx, qy, qz, cx, cy, cz, count, scale, d2, bins)
+    last = _count_bins(bins, count, need, hist)
+    if not final:
+        if last >= HALF:
+            return -1, 4.0 * reach2 if last >= BINS - 1 else (last + 1) * MORE / scale
+        while hist[last] > HEAP and last < HALF // 8 and scale < 1.0 / TINY:
+            # Most bins are wasted on candidates that are too far: look closer.
+            scale = scale * HALF / (last + 1) / MORE
+            _bin_distances(d2, count, scale, bins)
+            last = _count_bins(bins, count, need, hist)
+    start = 0
+    crowded = False
+    for b in range(BINS):
+        size = hist[b]
+        crowded = crowded or (size > HEAP and b <= last)
+        hist[b] = start
+        start += size
+    for i in range(count):
+        b = bins[i]
+        p = hist[b]
+        hist[b] = p + 1
+        d[p] = d2[i]
+        pos[p] = i
+    # hist[b] is now where bin b ends; only bins up to `last` matter.
+    end = hist[last] if last < BINS else count
+    if crowded:
+        begin = 0
+        for b in range(min(last + 1, BINS)):
+            if hist[b] - begin > HEAP:
+                _heap_sort(d, pos, begin, hist[b], cx, cy, cz)
+            else:
+                _insertion_sort(d, pos, begin, hist[b], cx, cy, cz)
+            begin = hist[b]
+    else:
+        _insertion_sort(d, pos, 0, end, cx, cy, cz)
+    found = min(need, count)
+    if final:
+        while found > 0 and d[found - 1] > reach2:
+            found -= 1
+    return found, reach2
+
+
+@njit(forceinline=True)
+def _count_bins(bins, count, need, hist):
+    """Fill the histogram; the bin in which the `need`-th candidate lies, BINS where there are fewer."""
+    hist[:] = 0
+    for i in range(count):
+        hist[bins[i]] += 1
+    total = 0
+    for b in range(BINS):
+        total += hist[b]
+        if total >= need:
+            return b
+    return BINS
+
+
+class Scratch(NamedTuple):
+    """Room for the candidates of one group and for sorting them."""
+
+    cx: np.ndarray
+    cy: np.ndarray
+    cz: np.ndarray
+    ci: np.ndarray
+    d2: np.ndarray
+    bins: np.ndarray
+    d: np.ndarray
+    pos: np.ndarray
+    hist: np.ndarray
+    stack: np.ndarray
+
+
+class Rows(NamedTuple):
+    """The sorted neighbors of the queries of one group, one row a query."""
+
+    found: np.ndarray  # (GROUP,) int64: how many
+    d2: np.ndarray  # (GROUP, need) float64: squared distances
+    index: np.ndarray  # (GROUP, need) uint32: positions in the cloud
+
+
+class Search(NamedTuple):
+    """A search over a block of queries on its way; `state` holds its place and its current reach."""
+
+    qx: np.ndarray
+    qy: np.ndarray
+    qz: np.ndarray
+    order: np.ndarray
+    starts: np.ndarray
+    state: np.ndarray  # float64: group, first query of it still to do, squared reach
+
+
+@njit
+def make_scratch(room):
+    f, u = np.float64, np.uint32
+    return Scratch(
+        np.empty(room, f),
+        np.empty(room, f),
+        np.empty(room, f),
+        np.empty(room, u),
+        np.empty(room, f),
+        np.empty(room, u),
+        np.empty(room, f),
+        np.empty(room, u),
+        np.empty(BINS, np.int64),
+        np.empty((STACK, 4), np.int64),
+    )
+
+
+@njit
+def make_rows(need):
+    return Rows(np.zeros(GROUP, np.int64), np.empty((GROUP, need)), np.empty((GROUP, need), np.uint32))
+
+
+@njit
+def start_search(qx, qy, qz):
+    """A search over the queries; go on with :func:`next_rows`."""
+    order, starts = make_groups(qx, qy, qz)
+    return Search(qx, qy, qz, order, starts, np.array([0.0, 0.0, FIRST_REACH * FIRST_REACH]))
+
+
+@njit
+def next_rows(tree, search, need, cap2, scratch, rows):
+    """Find the neighbors of the next few queries.
+
+    Parameters
+    ----------
+    need : int
+        How many neighbors, the query's own point included; fewer where the cloud has fewer.
+    cap2 : float
+        Neighbors lie within this squared distance; infinity for no bound.
+
+    Returns
+    -------
+    lo, hi : int
+        The queries are search.order[lo:hi]; lo = -1 when there are none left.
+    count : int
+        Rows filled: hi - lo, or 1 where all the queries coincide.
+    scratch : Scratch
+        To be passed next time (it grows where it must).
+    """
+    group = int(search.state[0])
+    if group >= len(search.starts) - 1:
+        return -1, -1, 0, scratch
+    first, end = search.starts[group], search.starts[group + 1]
+    lo, hi = max(first, int(search.state[1])), end
+    if lo > first:
+        hi = lo + 1
+    reach2 = search.state[2]
+    done, reach2, scratch = _search_group(tree, search, lo, hi, need, cap2, reach2, scratch, rows)
+    if done == 0:  # too crowded or too far apart to go together
+        hi = lo + 1
+        done, reach2, scratch = _search_group(tree, search, lo, hi, need, cap2, reach2, scratch, rows)
+    search.state[1] = hi
+    if hi >= end:
+        search.state[0] = group + 1
+    search.state[2] = reach2
+    return lo, hi, done, scratch
+
+
+@njit
+def _search_group(tree, search, lo, hi, need, cap2, reach2, scratch, rows):
+    """Rows filled (0: the group must be split), the reach to start the next group with, the scratch."""
+    need = min(need, len(tree.perm))
+    order = search.order
+    box = bounding_box(search.qx, search.qy, search.qz, order, lo, hi)
+    one = box[0] == box[3] and box[1] == box[4] and box[2] == box[5]
+    count = 1 if one else hi - lo
+    most2 = min(farthest2(tree, box) * MORE, cap2)
+    limit = min(len(scratch.d), CROWD * need + ROOM)
+    low, high, flips, pending = 0.0, np.inf, 0, count
+    rows.found[:count] = -1
+    kth2 = 0.0
+    while pending > 0:
+        reach2 = min(reach2, most2)
+        final = reach2 >= most2
+        c = gather(tree, box, reach2, need, limit, scratch.stack, scratch.cx, scratch.cy, scratch.cz, scratch.ci)
+        if c < 0:
+            if count > 1:
+                return 0, reach2 if pending < count else 0.25 * reach2, scratch
+            flips += 1 if low > 0.0 else 0
+            if flips > 6 or reach2 < TINY:  # many at the same distance: they must all be looked at
+                limit *= 4
+                high = np.inf
+                if limit > len(scratch.d):
+                    scratch = make_scratch(limit)
+            else:
+                high = reach2
+                reach2 = math.sqrt(low * high) if low > 0.0 else 0.25 * reach2
+            continue
+        if c < need and not final:
+            flips += 1 if high < np.inf else 0
+            low = reach2
+            reach2 = math.sqrt(low * high) if high < np.inf else 4.0 * max(reach2, TINY)
+            continue
+        more2 = 0.0
+        for r in range(count):
+            if rows.found[r] >= 0:
+                continue
+            q = order[lo + r]
+            found, bound = nearest_sorted(
+                search.qx[q], search.qy[q], search.qz[q], need, reach2, final, scratch,
+                scratch.cx, scratch.cy, scratch.cz, c,
+            )  # fmt: skip
+            if found < 0:
+                more2 = max(more2, bound)
+                continue
+            rows.found[r] = found
+            pending -= 1
+            for i in range(found):
+                rows.d2[r, i] = scratch.d[i]
+                rows.index[r, i] = scratch.ci[scratch.pos[i]]
+            if found > 0:
+                kth2 = max(kth2, scratch.d[found - 1])
+        if pending > 0:
+            low, high = reach2, np.inf
+            reach2 = more2
+    return count, max(SPARE * kth2, TINY), scratch
+
+
+@njit
+def nearest_block(tree, qx, qy, qz, need, cap2, index, d2, found):
+    """The neighbors of a block of queries, sorted by (squared distance, x, y, z).
+
+    Parameters
+    ----------
+    tree : KdTree
+    qx, qy, qz : ndarray of float64, shape (m,)
+    need : int
+        Neighbors wanted, the query's own point included.
+    cap2 : float
+        Neighbors lie within this squared distance; infinity for no bound.
+    index : ndarray of uint32, shape (m, need)
+        Out: positions in the cloud.
+    d2 : ndarray of float64, shape (m, need)
+        Out: squared distances.
+    found : ndarray of int64, shape (m,)
+        Out: how many there are; what lies behind them is not written.
+    """
+    search = start_search(qx, qy, qz)
+    scratch = make_scratch(CROWD * need + ROOM)
+    rows = make_rows(need)
+    while True:
+        lo, hi, count, scratch = next_rows(tree, search, need, cap2, scratch, rows)
+        if lo < 0:
+            return
+        for j in range(lo, hi):
+            q = search.order[j]
+            r = min(j - lo, count - 1)
+            found[q] = rows.found[r]
+            for i in range(rows.found[r]):
+                index[q, i] = rows.index[r, i]
+                d2[q, i] = rows.d2[r, i]

@@ -1,0 +1,286 @@
+"""Shape distributions A3, D1, D2, D3, D4 of a neighborhood by random pulls [B16 3.2.2; Osada et al. 2002].
+
+A pull draws four different members a, b, c, d. All five metrics are taken from it:
+
+==== =================================================== ===================
+A3   angle at a between b and c                          radians
+D1   distance of a from the centroid                     metres
+D2   distance of a and b                                 metres
+D3   square root of the area of the triangle a b c       metres
+D4   cube root of the volume of the tetrahedron a b c d  metres
+==== =================================================== ===================
+
+Each metric's distribution is what separate pulls would give; only the metrics of one neighborhood share
+their chance, for a third of the memory traffic. Where members run out (n < 4) the first drawn ones take the empty
+places: c, d = a, b for two members, d = a for three, so areas or volumes are 0, as they are.
+The angle is 0 where b or c coincides with a.
+
+**No order matters.** Pull i of a neighborhood draws from a counter-based hash of (seed, the query's float64
+coordinates, the neighborhood's token, i) and members come in a canonical order, so counts have the same bits for any
+order of points, tile or number of threads.
+
+**No root is taken.** Metrics are compared with their thresholds as squares (D1, D2), as 16 area^2
+(D3: 4 t^4), as 6 volume (D4: 6 t^3) and as the negative signed square of the cosine (A3), all of which ascend with
+the metric.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from .jit import njit
+
+#: Random pulls per neighborhood [B16].
+PULLS = 255
+
+#: Arrays are padded to whole vectors.
+ROOM = 256
+
+METRICS = ("A3", "D1", "D2", "D3", "D4")
+BINS = 10
+
+#: Product of two squared lengths (m^4) below which an angle is not defined, and 0.
+NO_ANGLE = 1e-30
+
+
+class Work(NamedTuple):
+    """Scratch of one thread."""
+
+    draws: np.ndarray  # (4 * ROOM,) uint32: members drawn, all a, then all b, ...
+    points: np.ndarray  # (16 * ROOM,) float32: their records
+    values: np.ndarray  # (5 * ROOM,) float32: the metrics, comparable
+
+
+class Shapes(NamedTuple):
+    """What a kernel needs to count shapes."""
+
+    on: bool
+    thresholds: np.ndarray  # (5, 9) float32, comparable
+    counts: np.ndarray  # (m, 50) float32
+    work: Work
+
+
+def make_work() -> Work:
+    """Scratch for one thread."""
+    return Work(np.zeros(4 * ROOM, np.uint32), np.zeros(16 * ROOM, np.float32), np.zeros(5 * ROOM, np.float32))
+
+
+def no_shapes() -> Shapes:
+    """What to hand to a kernel that is to count no shapes."""
+    return Shapes(False, np.zeros((5, 9), np.float32), np.zeros((1, 50), np.float32), make_work())
+
+
+@njit(forceinline=True)
+def _mix64(h):
+    """Finaliser of splitmix64."""
+    h ^= h >> np.uint64(30)
+    h *= np.uint64(0xBF58476D1CE4E5B9)
+    h ^= h >> np.uint64(27)
+    h *= np.uint64(0x94D049BB133111EB)
+    return h ^ (h >> np.uint64(31))
+
+
+@njit
+def _point_seeds(x, y, z, start, out):
+    for i in range(len(out)):
+        h = _mix64(start + x[i])
+        h = _mix64(h + np.uint64(0x9E3779B97F4A7C15) + y[i])
+        out[i] = _mix64(h + np.uint64(0x9E3779B97F4A7C15) + z[i])
+
+
+def point_seeds(x: np.ndarray, y: np.ndarray, z: np.ndarray, seed: int, token: str) -> np.ndarray:
+    """Where the random numbers of each query start.
+
+    Parameters
+    ----------
+    x, y, z : ndarray of float64, shape (m,)
+        The queries' coordinates as they are in the cloud; every bit counts, except that -0.0 is 0.0.
+    seed : int
+    token : str
+        The neighborhood's token, so that neighborhoods draw independently.
+
+    Returns
+    -------
+    ndarray of uint64, shape (m,)
+    """
+    import hashlib
+
+    start = np.uint64(int.from_bytes(hashlib.sha256(f"{int(seed)}:{token}".encode()).digest()[:8], "little"))
+    bits = [(np.ascontiguousarray(v, dtype=np.float64) + 0.0).view(np.uint64) for v in (x, y, z)]
+    out = np.empty(len(bits[0]), np.uint64)
+    _point_seeds(*bits, start, out)
+    return out
+
+
+@njit(forceinline=True)
+def _mix32(h):
+    """Bijective 32-bit hash of low bias (Wellons 2018: "lowbias32")."""
+    h = np.uint32(h ^ np.uint32(h >> np.uint32(16)))
+    h = np.uint32(h * np.uint32(0x7FEB352D))
+    h = np.uint32(h ^ np.uint32(h >> np.uint32(15)))
+    h = np.uint32(h * np.uint32(0x846CA68B))
+    return np.uint32(h ^ np.uint32(h >> np.uint32(16)))
+
+
+@njit(forceinline=True)
+def _below(h, n):
+    """A number in 0 .. n - 1 from 32 random bits (multiply-high)."""
+    return np.uint32((np.uint64(h) * np.uint64(n)) >> np.uint64(32))
+
+
+@njit
+def draw(seed, n, draws):
+    """Draw four members of n for every pull, different ones while there are enough."""
+    low, high = np.uint32(seed & np.uint64(0xFFFFFFFF)), np.uint32(seed >> np.uint64(32))
+    if n < 4:
+        _draw_few(low, high, n, draws)
+        return
+    n0, n1, n2, n3 = np.uint32(n), np.uint32(n - 1), np.uint32(n - 2), np.uint32(n - 3)
+    for i in range(ROOM):
+        u = _mix32(np.uint32(low + np.uint32(np.uint32(i) * np.uint32(0x9E3779B9))))
+        v = _mix32(np.uint32(u + high))
+        w = _mix32(np.uint32(u ^ np.uint32(v + np.uint32(0x85EBCA6B))))
+        t = _mix32(np.uint32(v ^ np.uint32(u + np.uint32(0xC2B2AE35))))
+        a, b, c, d = _below(u, n0), _below(v, n1), _below(w, n2), _below(t, n3)
+        # Each later draw skips the members already taken, in ascending order.
+        b = np.uint32(b + (np.uint32(1) if b >= a else np.uint32(0)))
+        s0, s1 = (a, b) if a < b else (b, a)
+        c = np.uint32(c + (np.uint32(1) if c >= s0 else np.uint32(0)))
+        c = np.uint32(c + (np.uint32(1) if c >= s1 else np.uint32(0)))
+        t0 = s0 if s0 < c else c
+        m = s0 if s0 > c else c
+        t1 = s1 if s1 < m else m
+        t2 = s1 if s1 > m else m
+        d = np.uint32(d + (np.uint32(1) if d >= t0 else np.uint32(0)))
+        d = np.uint32(d + (np.uint32(1) if d >= t1 else np.uint32(0)))
+        d = np.uint32(d + (np.uint32(1) if d >= t2 else np.uint32(0)))
+        draws[i] = a
+        draws[ROOM + i] = b
+        draws[2 * ROOM + i] = c
+        draws[3 * ROOM + i] = d
+
+
+@njit
+def _draw_few(low, high, n, draws):
+    for i in range(ROOM):
+        u = _mix32(np.uint32(low + np.uint32(np.uint32(i) * np.uint32(0x9E3779B9))))
+        v = _mix32(np.uint32(u + high))
+        a = _below(u, n)
+        b = c = d = a
+        if n >= 2:
+            b = np.uint32((a + np.uint32(1) + _below(v, n - 1)) % np.uint32(n))
+            c, d = a, b
+        if n == 3:
+            c, d = np.uint32(np.uint32(3) - a - b), a
+        draws[i] = a
+        draws[ROOM + i] = b
+        draws[2 * ROOM + i] = c
+        draws[3 * ROOM + i] = d
+
+
+@njit
+def fetch(record, draws, points):
+    """Copy the drawn members' records one after another (16 bytes at once: nothing but loads and stores)."""
+    for i in range(4 * ROOM):
+        p = draws[i]
+        x, y, z, w = record[p, 0], record[p, 1], record[p, 2], record[p, 3]
+        points[4 * i] = x
+        points[4 * i + 1] = y
+        points[4 * i + 2] = z
+        points[4 * i + 3] = w
+
+
+@njit
+def measure(points, gx, gy, gz, values):
+    """The five metrics of every pull, comparable; gx, gy, gz is the centroid."""
+    for i in range(ROOM):
+        a, b, c, d = 4 * i, 4 * (ROOM + i), 4 * (2 * ROOM + i), 4 * (3 * ROOM + i)
+        ax, ay, az = points[a], points[a + 1], points[a + 2]
+        bx, by, bz = points[b] - ax, points[b + 1] - ay, points[b + 2] - az
+        cx, cy, cz = points[c] - ax, points[c + 1] - ay, points[c + 2] - az
+        dx, dy, dz = points[d] - ax, points[d + 1] - ay, points[d + 2] - az
+        ex, ey, ez = ax - gx, ay - gy, az - gz
+        bb = bx * bx + by * by + bz * bz
+        cc = cx * cx + cy * cy + cz * cz
+        bc = bx * cx + by * cy + bz * cz
+        nx, ny, nz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
+        both = bb * cc
+        some = both > np.float32(NO_ANGLE)
+        cosine = -bc * abs(bc) / (both if some else np.float32(1.0))
+        values[i] = cosine if some else np.float32(-1.0)
+        values[ROOM + i] = ex * ex + ey * ey + ez * ez
+        values[2 * ROOM + i] = bb
+        values[3 * ROOM + i] = nx * nx + ny * ny + nz * nz
+        values[4 * ROOM + i] = abs(nx * dx + ny * dy + nz * dz)
+    for m in range(5):  # the last place pads to whole vectors: above no threshold
+        for i in range(PULLS, ROOM):
+            values[m * ROOM + i] = -np.inf
+
+
+@njit
+def count_above(values, t, above):
+    """How many of the PULLS values lie above each of nine thresholds (no scatter: compare and add)."""
+    t0, t1, t2, t3, t4, t5, t6, t7, t8 = t[0], t[1], t[2], t[3], t[4], t[5], t[6], t[7], t[8]
+    c0 = c1 = c2 = c3 = c4 = c5 = c6 = c7 = c8 = np.uint32(0)
+    one, zero = np.uint32(1), np.uint32(0)
+    for i in range(ROOM):
+        v = values[i]
+        c0 = np.uint32(c0 + (one if v > t0 else zero))
+        c1 = np.uint32(c1 + (one if v > t1 else zero))
+        c2 = np.uint32(c2 + (one if v > t2 else zero))
+        c3 = np.uint32(c3 + (one if v > t3 else zero))
+        c4 = np.uint32(c4 + (one if v > t4 else zero))
+        c5 = np.uint32(c5 + (one if v > t5 else zero))
+        c6 = np.uint32(c6 + (one if v > t6 else zero))
+        c7 = np.uint32(c7 + (one if v > t7 else zero))
+        c8 = np.uint32(c8 + (one if v > t8 else zero))
+    above[0], above[1], above[2], above[3], above[4] = c0, c1, c2, c3, c4
+    above[5], above[6], above[7], above[8] = c5, c6, c7, c8
+
+
+@njit
+def shape_counts(record, n, gx, gy, gz, seed, thresholds, work, out):
+    """The 50 shape features of one neighborhood: counts / 255 in ten bins of A3, D1, D2, D3, D4.
+
+    Bin i holds the pulls with threshold[i - 1] < value <= threshold[i].
+
+    Parameters
+    ----------
+    record : ndarray of float32, shape (at least n, 4)
+        Offsets x, y, z of the members from the query, in canonical order; the fourth column is not used.
+    n : int
+        Members, at least 1.
+    gx, gy, gz : float32
+        Offset of their centroid.
+    seed : uint64
+        See :func:`point_seeds`.
+    thresholds : ndarray of float32, shape (5, 9)
+        See :meth:`bins.ShapeBins.comparable`.
+    work : Work
+    out : ndarray of float32, shape (50,)
+    """
+    draw(seed, n, work.draws)
+    fetch(record, work.draws, work.points)
+    measure(work.points, gx, gy, gz, work.values)
+    above = work.draws  # no longer needed
+    for m in range(5):
+        count_above(work.values[m * ROOM : (m + 1) * ROOM], thresholds[m], above)
+        before = np.uint32(PULLS)
+        for b in range(9):
+            out[10 * m + b] = np.float32(before - above[b]) / np.float32(PULLS)
+            before = above[b]
+        out[10 * m + 9] = np.float32(before) / np.float32(PULLS)
+
+
+@njit
+def shape_values(record, n, gx, gy, gz, seed, work, out):
+    """The metrics of the pulls that :func:`shape_counts` would count, comparable, into out (5, 255)."""
+    draw(seed, n, work.draws)
+    fetch(record, work.draws, work.points)
+    measure(work.points, gx, gy, gz, work.values)
+    for m in range(5):
+        for i in range(PULLS):
+            out[m, i] = work.values[m * ROOM + i]
