@@ -1,0 +1,10 @@
+"""Multi-scale features of point clouds: plan what to compute, compute it block by block.
+
+Importing this package is light; numba and the kernels are loaded when an engine is made.
+"""
+
+from .bins import ShapeBins
+from .engine import FeatureEngine, FeatureTable, compute_features, warmup
+from .plan import FeaturePlan
+
+__all__ = ["FeatureEngine", "FeaturePlan", "FeatureTable", "ShapeBins", "compute_features", "warmup"]

@@ -216,3 +216,44 @@ def _merge_sort(x, y, z, order):
         rows, spare = spare, rows
         width *= 2
     x[:], y[:], z[:], order[:] = x[rows], y[rows], z[rows], order[rows]
+
+
+@njit
+def cut_blocks(cell_start, cost, most_cost, most_rows):
+    """Cut sorted queries into blocks, inside cells where one cell is too much for a block.
+
+    Parameters
+    ----------
+    cell_start : (m + 1,) int64 array
+        First query of each cell.
+    cost : (m,) float64 array
+        Cost of one query in each cell.
+    most_cost, most_rows : float, int
+        Bounds of a block; a block has at least one query.
+
+    Returns
+    -------
+    (b + 1,) int64 array
+        First query of each block, and the number of queries.
+    """
+    starts = [np.int64(0)]
+    spent, rows = 0.0, 0
+    for cell in range(len(cell_start) - 1):
+        first, last = cell_start[cell], cell_start[cell + 1]
+        while first < last:
+            room = most_rows - rows
+            if cost[cell] > 0.0:
+                room = min(room, int((most_cost - spent) / cost[cell]))
+            if room <= 0:
+                if rows > 0:
+                    starts.append(first)
+                    spent, rows = 0.0, 0
+                    continue
+                room = 1
+            take = min(room, last - first)
+            first += take
+            rows += take
+            spent += take * cost[cell]
+    if len(cell_start) > 1:
+        starts.append(cell_start[-1])
+    return np.array(starts)

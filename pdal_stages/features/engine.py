@@ -1,0 +1,544 @@
+"""Features of a cloud, block by block: one index, any queries, bounded memory, every core busy."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import DimensionError, OptionError, StageError
+from ..parallel import map_blocks, resolve_threads
+from ..progress import Progress
+from .plan import FeaturePlan
+
+if TYPE_CHECKING:
+    from .adaptive import AdaptiveNeighborhoods
+    from .bins import ShapeBins
+    from .fixed import FixedRadius
+    from .index import Grid
+
+#: Sample neighborhoods that the shape thresholds are fitted to [B16 3.2.2].
+SAMPLES = 500
+
+#: Estimated nanoseconds a block may take on one core: Ctrl-C waits for the blocks in work.
+BLOCK_NS = 2.5e8
+
+#: Rows of a block, whatever the memory allows; bytes of a row besides its features.
+MOST_ROWS = 65_536
+ROW_BYTES = 1_000
+
+#: What makes a dimension that is asked for and missing.
+MAKERS = {"HeightAboveGround": "Put filters.hag_minima before this stage; in Python, hag_minima(x, y, z) makes it"}
+
+
+class FeatureEngine:
+    """Computes the features of a plan for queries against one cloud.
+
+    Parameters
+    ----------
+    xyz : (n, 3) array
+        The cloud, float64, in metres.
+    plan : FeaturePlan
+    bins : ShapeBins, optional
+        Thresholds of the shape distributions; fitted to this cloud where absent and needed.
+    copt_threshold : float, optional
+        Curvature that parts scattered from regular points (copt); fitted where absent and needed.
+    seed : int
+        Of the random pulls of the shape distributions.
+    threads : int, optional
+        ``None`` or 0: every core this process may use.
+
+    Attributes
+    ----------
+    bins, copt_threshold
+        As given or fitted.
+    report : dict
+        Counts so far: ``points`` of the cloud, ``queries`` computed, ``fewer_than_three`` (by neighborhood,
+        queries whose neighborhood had fewer than three points, so that eigen-features are 0), ``beyond_halo``
+        (by neighborhood, queries whose k nearest reach farther than ``plan.halo``: in a tile with that
+        halo they may differ from the whole cloud).
+
+    Raises
+    ------
+    StageError
+        For coordinates that are not a finite (n, 3) array of numbers.
+
+    Notes
+    -----
+    A result is the same to the last bit for any order of the points, any queries asked beside it, any number of
+    threads, any block size, and in a tile whose surroundings are covered by ``plan.halo`` metres.
+
+    Memory over the cloud's own: 28 bytes a point for the index (64 while it is being sorted), about 10 more with
+    neighborhoods of k points, and the block budget of :meth:`blocks`.
+    """
+
+    def __init__(
+        self,
+        xyz: npt.ArrayLike,
+        plan: FeaturePlan,
+        *,
+        bins: ShapeBins | None = None,
+        copt_threshold: float | None = None,
+        seed: int = 0,
+        threads: int | None = None,
+    ) -> None:
+        from .index import build_grid, check_xyz  # numba is loaded here, not when the package is
+
+        if not isinstance(plan, FeaturePlan):
+            raise OptionError("'plan' must be a FeaturePlan", found=type(plan).__name__, cure="Use FeaturePlan.parse")
+        if isinstance(seed, bool) or int(seed) != seed or not 0 <= seed < 2**63:
+            raise OptionError("'seed' must be a whole number of 0 or more", found=seed)
+        resolve_threads(threads)
+        self.plan, self.seed, self.threads = plan, int(seed), threads
+        self.bins, self.copt_threshold = bins, copt_threshold
+        self._cloud = check_xyz(xyz)
+        _compile_once("index")
+        self._grid: Grid = build_grid(self._cloud, plan.cell)
+        self._lock = threading.Lock()
+        self._parts: tuple[FixedRadius, AdaptiveNeighborhoods | None] | None = None
+        self.report: dict[str, Any] = {"points": len(self._grid), "queries": 0, "fewer_than_three": {}}
+        if plan.unbounded:
+            self.report["beyond_halo"] = {}
+
+    def __len__(self) -> int:
+        return len(self._grid)
+
+    # ---- fitting -------------------------------------------------------------------------------------------
+
+    def fit(self) -> FeatureEngine:
+        """Fit what the plan needs and was not given: shape thresholds and the threshold of copt.
+
+        Samples are the 500 points with the smallest hash of (seed, coordinates), so they do not depend on the
+        order of the points. Called by :meth:`blocks` when needed; a second call does nothing.
+
+        Raises
+        ------
+        StageError
+            Where the cloud is empty, so that there is nothing to fit to.
+        """
+        fixed, adaptive = self._prepared()
+        needs_copt = self.copt_threshold is None and adaptive is not None and adaptive.needs_copt
+        needs_bins = self.bins is None and self.plan.shapes
+        if not (needs_copt or needs_bins):
+            return self
+        if not len(self):
+            raise StageError("the cloud has no points to fit shape thresholds or copt to")
+        with self._lock:
+            if needs_copt and self.copt_threshold is None:
+                assert adaptive is not None
+                self.copt_threshold = adaptive.fit_copt(self.threads)
+            if needs_bins and self.bins is None:
+                self.bins = self._fit_bins(fixed, adaptive)
+        return self
+
+    def _fit_bins(self, fixed: FixedRadius, adaptive: AdaptiveNeighborhoods | None) -> ShapeBins:
+        from .bins import ShapeBins
+        from .shapes import point_seeds
+
+        grid = self._grid
+        hashes = point_seeds(grid.x, grid.y, grid.z, self.seed, "samples")
+        _, first = np.unique(hashes, return_index=True)  # copies of a point count once
+        sample = np.sort(first[:SAMPLES])
+        points = (grid.x[sample], grid.y[sample], grid.z[sample])
+        tokens = [c.neighborhood.token for c in self.plan.layout if c.shapes]
+
+        def values(token: str) -> np.ndarray:
+            if token in fixed.tokens:
+                return fixed.shape_values(token, points, self.seed)
+            assert adaptive is not None
+            return adaptive.shape_values(token, points, self.seed, self.copt_threshold)
+
+        return ShapeBins.fit(dict(zip(tokens, map_blocks(values, tokens, self.threads), strict=True)))
+
+    def _prepared(self) -> tuple[FixedRadius, AdaptiveNeighborhoods | None]:
+        with self._lock:
+            if self._parts is None:
+                from .fixed import FixedRadius
+
+                adaptive = None
+                if any(c.at and c.neighborhood.kind not in ("cylinder", "sphere") for c in self.plan.layout):
+                    from .adaptive import AdaptiveNeighborhoods
+
+                    _compile_once("adaptive")
+                    adaptive = AdaptiveNeighborhoods(self._grid, self.plan, self.threads)
+                self._parts = FixedRadius(self._grid, self.plan), adaptive
+            return self._parts
+
+    # ---- computing -----------------------------------------------------------------------------------------
+
+    def blocks(
+        self,
+        queries: npt.ArrayLike | None = None,
+        *,
+        dimensions: Mapping[str, npt.ArrayLike] | None = None,
+        threads: int | None = None,
+        memory_mb: float = 512,
+        progress: Progress | bool | None = None,
+        apply: Callable[[np.ndarray, np.ndarray], Any] | None = None,
+    ) -> Iterator[tuple[np.ndarray, Any]]:
+        """Compute features block by block.
+
+        Parameters
+        ----------
+        queries : array, optional
+            ``None``: every point of the cloud; an array of indices into the cloud; or (m, 3) coordinates.
+        dimensions : mapping of str to (m,) array
+            One value per query for each of ``plan.dimensions``. X, Y and Z need not be given.
+        threads : int, optional
+            The engine's where not given.
+        memory_mb : float
+            Memory that blocks may take in all, over the cloud and its index.
+        progress : Progress or bool, optional
+            A progress to update, or ``True`` for one of its own.
+        apply : callable, optional
+            ``apply(values, rows)`` is called in the worker's thread, and its result is yielded in place of the
+            values: how a classifier predicts on every core without ever holding the whole matrix.
+
+        Yields
+        ------
+        rows : (b,) int64 array
+            Where the queries are points of the cloud (``None`` or indices): their indices in the cloud.
+            Where they are coordinates: their row numbers. Every query comes once, in the order of the grid.
+        values : (b, len(plan.names)) float32 array, C-contiguous
+            Or what `apply` made of it.
+
+        Raises
+        ------
+        DimensionError
+            Where a dimension of the plan is not given, or has not one value per query.
+        """
+        run = _Run(self, queries, dimensions, self.threads if threads is None else threads, memory_mb)
+
+        def compute(block: tuple[int, int]):
+            positions, values, tally = run.compute(*block)
+            rows = positions if run.indices is None else run.indices[positions]
+            return rows, values if apply is None else apply(values, rows), len(rows), tally
+
+        yield from run.iterate(compute, progress)
+
+    def table(
+        self,
+        queries: npt.ArrayLike | None = None,
+        *,
+        dimensions: Mapping[str, npt.ArrayLike] | None = None,
+        threads: int | None = None,
+        memory_mb: float = 512,
+        progress: Progress | bool | None = None,
+    ) -> FeatureTable:
+        """The features of all queries as one table, row i for query i; parameters as for :meth:`blocks`."""
+        run = _Run(self, queries, dimensions, self.threads if threads is None else threads, memory_mb)
+        values = np.empty((len(run.grid), len(self.plan.names)), np.float32)
+
+        def compute(block: tuple[int, int]):
+            positions, part, tally = run.compute(*block)
+            values[positions] = part  # blocks are disjoint
+            return positions, None, len(positions), tally
+
+        for _ in run.iterate(compute, progress):
+            pass
+        return FeatureTable(values, self.plan.names, self.bins, self.copt_threshold, self.report)
+
+
+@dataclass
+class FeatureTable:
+    """Features of queries.
+
+    Attributes
+    ----------
+    values : (m, F) float32 array
+    names : tuple of str
+        Of the columns.
+    bins, copt_threshold
+        As given or fitted; hand them to another call to get comparable features.
+    report : dict
+        See :class:`FeatureEngine`.
+    """
+
+    values: np.ndarray
+    names: tuple[str, ...]
+    bins: ShapeBins | None = None
+    copt_threshold: float | None = None
+    report: dict[str, Any] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """The column of that name, a view."""
+        if name not in self.names:
+            from ..errors import suggest
+
+            raise KeyError(f"no feature '{name}' in this table. {suggest(name, self.names)}".strip())
+        return self.values[:, self.names.index(name)]
+
+
+def compute_features(
+    xyz: npt.ArrayLike,
+    queries: npt.ArrayLike | None = None,
+    neighborhoods="weinmann2018",
+    feature_set="all",
+    *,
+    dimensions: Mapping[str, npt.ArrayLike] | None = None,
+    bins: ShapeBins | None = None,
+    copt_threshold: float | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    memory_mb: float = 512,
+    progress: Progress | bool | None = None,
+) -> FeatureTable:
+    """Multi-scale features of a point cloud.
+
+    Parameters
+    ----------
+    xyz : (n, 3) array
+        The cloud, float64, in metres.
+    queries : array, optional
+        Whose features: ``None`` for every point, an array of indices into the cloud, or (m, 3) coordinates.
+    neighborhoods : str or list of str
+        Presets and tokens, e.g. ``"weinmann2018"`` or ``"c1, s2, kopt"``.
+    feature_set : str or list of str
+        Groups (``all``, ``covariance``, ``geometric``, ``shapes``, ``A3``, ``D1`` .. ``D4``) or single features.
+    dimensions : mapping of str to (m,) array
+        The queries' own dimensions that the plan uses as features (HeightAboveGround for weinmann2018).
+    bins, copt_threshold, seed, threads
+        See :class:`FeatureEngine`.
+    memory_mb : float
+        Memory that blocks may take, over the cloud, its index and the table.
+    progress : Progress or bool, optional
+
+    Returns
+    -------
+    FeatureTable
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> xyz = np.random.default_rng(0).uniform(0, 20, (1000, 3)) * [1, 1, 0]  # a flat field
+    >>> table = compute_features(xyz, neighborhoods="c2,s3", feature_set="covariance")
+    >>> float(table["SurfaceVariation_s3"].max())
+    0.0
+    """
+    names = tuple(dimensions) if dimensions else ()
+    plan = FeaturePlan.parse(neighborhoods, feature_set, names)
+    engine = FeatureEngine(xyz, plan, bins=bins, copt_threshold=copt_threshold, seed=seed, threads=threads)
+    return engine.table(queries, dimensions=dimensions, memory_mb=memory_mb, progress=progress)
+
+
+class _Run:
+    """One pass over queries: sorted like the cloud, cut into blocks."""
+
+    def __init__(self, engine: FeatureEngine, queries, dimensions, threads, memory_mb) -> None:
+        self.engine = engine
+        self.indices, coordinates = _queries(queries, engine._cloud)
+        count = len(engine) if coordinates is None else len(coordinates)
+        self.dimensions = _dimensions(engine.plan, dimensions, count)
+        if coordinates is None:
+            self.grid = engine._grid
+        else:
+            from .index import build_grid
+
+            self.grid = build_grid(coordinates, engine.plan.cell)
+        if not isinstance(memory_mb, int | float) or not memory_mb >= 16:
+            raise OptionError("'memory_mb' must be a number of 16 or more", found=memory_mb)
+        self.threads = resolve_threads(threads)
+        self.starts = np.zeros(1, np.int64)
+        if not count:
+            return
+        if not len(engine):
+            raise StageError("the cloud has no points", found=f"{count} queries")
+        engine.fit()
+        self.fixed, self.adaptive = engine._prepared()
+        _compile_once("shapes" if self.fixed.shaped.any() else "moments") if len(self.fixed) else None
+        self.candidates = self.fixed.candidates(self.grid.rows_of_cells(), self.grid.cell_ix)
+        self._cut(float(memory_mb) * 2**20)
+
+    def _cut(self, budget: float) -> None:
+        """Cut the queries into blocks of bounded rows and time; use fewer threads where scratch is large."""
+        from .index import cut_blocks
+
+        cost = self.fixed.cost(self.candidates) if len(self.fixed) else np.zeros(len(self.candidates))
+        scratch = float(self.fixed.scratch_bytes(int(self.candidates.max())))
+        if self.adaptive is not None:
+            cost = cost + self.adaptive.query_ns
+            scratch += self.adaptive.scratch_bytes
+        self.threads = int(max(1, min(self.threads, 0.5 * budget // scratch)))
+        # Two results per thread may wait (map_blocks) and one is being made; copies of points double a block.
+        row = 8 * len(self.engine.plan.names) + ROW_BYTES
+        rows = (budget - self.threads * scratch) / ((2 * self.threads + 1) * row)
+        total = float(cost @ np.diff(self.grid.cell_start))
+        most = min(BLOCK_NS, max(total / (4 * self.threads), 5e6))
+        self.starts = cut_blocks(self.grid.cell_start, cost, most, int(min(max(rows, 64), MOST_ROWS)))
+
+    def compute(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """Positions (in the user's order) and values of the sorted queries first..last, and what to report."""
+        engine, grid = self.engine, self.grid
+        qx, qy, qz = grid.x[first:last], grid.y[first:last], grid.z[first:last]
+        new = np.empty(last - first, np.bool_)
+        new[:1] = True
+        new[1:] = (qx[1:] != qx[:-1]) | (qy[1:] != qy[:-1]) | (qz[1:] != qz[:-1])
+        at = np.flatnonzero(new)
+        copies = np.diff(at, append=last - first)
+        if len(at) < last - first:
+            qx, qy, qz = qx[at], qy[at], qz[at]
+        width = len(engine.plan.names)
+        values = np.empty((len(at), width), np.float32)
+        tally = {}
+        if len(self.fixed):
+            a = np.searchsorted(grid.cell_start, first, "right") - 1
+            b = np.searchsorted(grid.cell_start, last, "left")
+            few = np.zeros(len(self.fixed), np.int64)
+            self.fixed.fill(
+                qx, qy, qz, copies, engine.bins, engine.seed, int(self.candidates[a:b].max()), few, values
+            )
+            tally["fewer_than_three"] = dict(zip(self.fixed.tokens, few.tolist(), strict=True))
+        if self.adaptive is not None:
+            few = np.zeros(len(self.adaptive.tokens), np.int64)
+            far = np.zeros(len(self.adaptive.tokens), np.int64)
+            self.adaptive.fill(
+                qx, qy, qz, copies, engine.bins, engine.seed, engine.copt_threshold, few, far, values
+            )
+            tally.setdefault("fewer_than_three", {}).update(zip(self.adaptive.tokens, few.tolist(), strict=True))
+            if engine.plan.unbounded:
+                tally["beyond_halo"] = {t: n for t, n in zip(self.adaptive.tokens, far.tolist(), strict=True) if n}
+        if len(at) < last - first:
+            values = np.repeat(values, copies, axis=0)
+        positions = grid.order[first:last].astype(np.int64)
+        for column, name in enumerate(engine.plan.dimensions, width - len(engine.plan.dimensions)):
+            given = self.dimensions.get(name)
+            if given is None:
+                values[:, column] = {"X": grid.x, "Y": grid.y, "Z": grid.z}[name][first:last]
+            else:
+                values[:, column] = given[positions]
+        return positions, values, tally
+
+    def iterate(self, compute, progress) -> Iterator[tuple[np.ndarray, Any]]:
+        blocks = list(zip(self.starts[:-1].tolist(), self.starts[1:].tolist(), strict=True))
+        own = Progress(len(self.grid), "features") if progress is True else None
+        bar = own if own is not None else progress or None
+        report = self.engine.report
+        try:
+            for rows, result, count, tally in map_blocks(compute, blocks, self.threads):
+                with self.engine._lock:
+                    report["queries"] += count
+                    for key, counts in tally.items():
+                        for token, n in counts.items():
+                            report[key][token] = report[key].get(token, 0) + n
+                if bar is not None:
+                    bar.update(count)
+                yield rows, result
+        finally:
+            if own is not None:
+                own.close()
+
+
+def _queries(queries, cloud: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Indices into the cloud (where the queries are such) and coordinates (None: those of the cloud)."""
+    if queries is None:
+        return None, None
+    array = np.asarray(queries)
+    if array.ndim == 2:
+        from .index import check_xyz
+
+        return None, check_xyz(array, "queries")
+    if array.ndim != 1 or array.dtype.kind not in "iu":
+        if array.size == 0 and array.ndim == 1:
+            array = array.astype(np.int64)
+        else:
+            cure = "Use np.flatnonzero(mask)" if array.dtype.kind == "b" else None
+            raise OptionError(
+                "'queries' must be indices of points or (m, 3) coordinates",
+                found=f"dtype {array.dtype}, shape {array.shape}",
+                cure=cure,
+            )
+    array = array.astype(np.int64, copy=False)
+    outside = np.count_nonzero((array < 0) | (array >= len(cloud)))
+    if outside:
+        raise OptionError(f"'queries' has indices outside the cloud of {len(cloud)} points", found=outside)
+    return array, cloud[array]
+
+
+def _dimensions(plan: FeaturePlan, given: Mapping[str, npt.ArrayLike] | None, count: int) -> dict[str, np.ndarray]:
+    given = given or {}
+    found = {}
+    for name in plan.dimensions:
+        if name not in given:
+            if name in ("X", "Y", "Z"):
+                continue
+            there = ", ".join(map(str, given)) or "none"
+            raise DimensionError(
+                f"the dimension '{name}' is needed as a feature but missing",
+                found=there,
+                cure=MAKERS.get(name, f"Give dimensions={{'{name}': values}}, or leave it out of the plan"),
+            )
+        values = np.asarray(given[name])
+        if values.shape != (count,) or values.dtype.kind not in "fiub":
+            raise DimensionError(
+                f"the dimension '{name}' must have one number per query",
+                found=f"shape {values.shape}, dtype {values.dtype}, for {count} queries",
+            )
+        found[name] = values
+    return found
+
+
+# ---- compilation -------------------------------------------------------------------------------------------
+
+_compiled: set[str] = set()
+_compile_lock = threading.Lock()
+
+
+def _compile_once(what: str) -> None:
+    """Load or compile a set of kernels on next to no data, saying so on stderr where it takes long."""
+    with _compile_lock:
+        if what in _compiled:
+            return
+        from .jit import CompilationNote
+
+        with CompilationNote():
+            _COMPILERS[what]()
+        _compiled.add(what)
+
+
+def _compile_index() -> None:
+    from .index import build_grid
+
+    build_grid(np.zeros((2, 3)), 1.0)
+
+
+def _compile_fixed() -> None:
+    from .bins import ShapeBins
+    from .fixed import FixedRadius
+    from .index import build_grid, cut_blocks
+
+    grid = build_grid(np.zeros((1, 3)), 1.0)
+    none = np.zeros(0)
+    fixed = FixedRadius(grid, FeaturePlan.parse("c1,s1", "Density"))
+    cut_blocks(grid.cell_start, fixed.cost(fixed.candidates(grid.rows_of_cells(), grid.cell_ix)), 1.0, 1)
+    out = np.zeros((0, 2), np.float32)
+    fixed.fill(none, none, none, np.zeros(0, np.int64), ShapeBins({}), 0, 1, np.zeros(2, np.int64), out)
+
+
+def _compile_adaptive() -> None:
+    from .adaptive import AdaptiveNeighborhoods
+    from .index import build_grid
+
+    plan = FeaturePlan.parse("kopt", "Density")
+    AdaptiveNeighborhoods(build_grid(np.zeros((2, 3)), 1.0), plan, 1)
+
+
+_COMPILERS = {
+    "index": _compile_index,
+    "moments": _compile_fixed,
+    "shapes": _compile_fixed,
+    "adaptive": _compile_adaptive,
+}
+
+
+def warmup() -> None:
+    """Compile every kernel and fill the cache, e.g. at installation; seconds where it is filled already."""
+    xyz = np.random.default_rng(0).uniform(0.0, 3.0, (60, 3))
+    compute_features(xyz, neighborhoods="c1,s1,k5,kopt(2,5),ropt,copt", threads=1)
+    compute_features(xyz, np.zeros((1, 3)), neighborhoods="c1", feature_set="covariance", threads=1)
