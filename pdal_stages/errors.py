@@ -34,10 +34,7 @@ class StageError(Exception):
         text = f"{self.where}: {self.what}" if self.where else self.what
         if self.found is not None:
             text += f" (found {self.found})"
-        text = text.rstrip(".") + "."
-        if self.cure:
-            text += f" {self.cure.rstrip('.')}."
-        return text
+        return _sentence(text) + (f" {_sentence(self.cure)}" if self.cure else "")
 
     def at(self, where: str) -> StageError:
         """The same error, with the place named unless it already names one."""
@@ -47,6 +44,11 @@ class StageError(Exception):
 
     def __reduce__(self):  # keeps the keyword arguments across process borders (Dask)
         return (_rebuild, (type(self), self.what, self.where, self.found, self.cure))
+
+
+def _sentence(text: str) -> str:
+    text = text.strip()
+    return text if text.endswith((".", "?", "!")) else f"{text}."
 
 
 def _rebuild(kind, what, where, found, cure):

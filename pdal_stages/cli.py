@@ -1,0 +1,277 @@
+"""The command ``pdal-stages``: thin, with PDAL's own flag habits."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from . import __version__
+from .errors import StageError
+from .overrides import parse_overrides
+
+_OVERRIDES = (
+    "Options of stages are set as in PDAL: --stage.TAG.option=VALUE for stages with a tag, "
+    "--filters.name.option=VALUE for all stages of a type."
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit code (0 fine, 1 an error, 2 wrong usage, 130 interrupted)."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in arguments or os.environ.get("PDAL_STAGES_DEBUG", "") not in ("", "0")
+    arguments = [a for a in arguments if a != "--debug"]
+    try:
+        overrides, rest = parse_overrides(arguments)
+        options = _parser().parse_args(rest)
+        if overrides and not getattr(options, "takes_overrides", False):
+            raise StageError(f"'{options.command}' takes no stage options", found=overrides[0].flag)
+        options.overrides = overrides
+        return int(options.run(options) or 0)
+    except StageError as error:
+        if debug:
+            raise
+        print(f"pdal-stages: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("pdal-stages: interrupted; nothing half-written was left", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # e.g. into head
+        sys.stderr.close()
+        return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="pdal-stages",
+        description="PDAL pipelines with stages that classify airborne laser scans.",
+        epilog=_OVERRIDES + " --debug shows tracebacks.",
+    )
+    parser.add_argument("--version", action="version", version=f"pdal-stages {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def add(name: str, run: Callable, help: str, overrides: bool = False) -> argparse.ArgumentParser:
+        command = commands.add_parser(name, help=help, description=help + ".", epilog=_OVERRIDES if overrides else None)
+        command.set_defaults(run=run, takes_overrides=overrides)
+        return command
+
+    command = add("pipeline", _pipeline, "Run a pipeline that may hold stages of ours", overrides=True)
+    _pipeline_input(command)
+    command.add_argument("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
+    command.add_argument("--validate", action="store_true", help="Check the pipeline without reading points, then stop")
+    command.add_argument("--progress", action=argparse.BooleanOptionalAction, default=None, help="Show progress")
+    command.add_argument("--nostream", action="store_true", help="Accepted for PDAL's sake: our stages never stream")
+    command.add_argument("-v", "--verbose", action="count", default=0, help="Print PDAL's log")
+
+    command = add("expand", _expand, "Print the plain PDAL JSON, which stock 'pdal pipeline' runs", overrides=True)
+    _pipeline_input(command)
+    command.add_argument("-o", "--output", metavar="FILE", help="Write it to a file instead")
+
+    command = add("validate", _validate, "Check a pipeline without reading points", overrides=True)
+    _pipeline_input(command)
+
+    command = add("drivers", _drivers, "List stages: ours, then PDAL's")
+    command.add_argument("--ours", action="store_true", help="Only ours")
+    command.add_argument("--showjson", action="store_true", help="As JSON, like pdal --drivers --showjson")
+
+    command = add("options", _options, "List the options of a stage")
+    command.add_argument("stage", help="e.g. filters.hag_minima; PDAL's stages are handed to pdal --options")
+    command.add_argument("--showjson", action="store_true", help="As JSON Schema")
+
+    command = add("classify", _classify, "Classify a cloud with a model file", overrides=True)
+    command.add_argument("input", help="A file PDAL can read")
+    command.add_argument("output", help="A file PDAL can write; other dimensions and the header are kept")
+    command.add_argument("--model", required=True, help="The model file")
+    command.add_argument("--where", help="Only classify points for which this holds; the others serve as neighbors")
+    command.add_argument("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
+
+    command = add("train", _train, "Train a model on labelled clouds", overrides=True)
+    command.add_argument("inputs", nargs="+", help="Labelled files PDAL can read")
+    command.add_argument("--model", required=True, help="The model file to write")
+    command.add_argument("--classes", help="Codes (2,5,6) or a JSON mapping of labels to classes")
+    command.add_argument("--neighborhoods", help="Preset or tokens; default weinmann2018")
+    command.add_argument("--count", type=int, help="Samples of each class")
+
+    command = add("accuracy", _accuracy, "Compare two class dimensions, or two files", overrides=True)
+    command.add_argument("input", help="The classified file")
+    command.add_argument("--reference", metavar="FILE", help="The same points with true classes; same order")
+    command.add_argument("--dimension", default="Classification", help="Classes to judge")
+    command.add_argument("--reference-dimension", help="Dimension with the true classes")
+    command.add_argument("--json", help="Write figures to this file")
+    command.add_argument("--html", help="Write a report to this file")
+
+    command = add("model", _model, "Print what a model file is")
+    command.add_argument("file")
+    command.add_argument("--showjson", action="store_true", help="Everything, as JSON")
+
+    command = add("demo", _demo, "Generate a town, train on one half, classify the other")
+    command.add_argument("folder", nargs="?", default="pdal-stages-demo", help="Where results go")
+    command.add_argument("--size", type=float, default=200.0, help="Side of the town in metres")
+    command.add_argument("--density", type=float, default=7.0, help="Points per square metre")
+    command.add_argument("--seed", type=int, default=1)
+
+    add("warmup", _warmup, "Compile the kernels for this machine once, so that later runs start at once")
+    return parser
+
+
+def _pipeline_input(command: argparse.ArgumentParser) -> None:
+    command.add_argument("file", nargs="?", help="Pipeline JSON file")
+    command.add_argument("-i", "--input", dest="file_option", metavar="FILE", help="The same, as PDAL's --input")
+    command.add_argument("-s", "--stdin", action="store_true", help="Read the pipeline from standard input")
+
+
+def _source(options: argparse.Namespace) -> str | Path:
+    if options.stdin:
+        return sys.stdin.read() or " "
+    name = options.file or options.file_option
+    if not name:
+        raise StageError("no pipeline file was given", cure=f"Usage: pdal-stages {options.command} job.json")
+    return Path(name)
+
+
+def _build(options: argparse.Namespace):
+    from .pipeline import Pipeline
+
+    source = _source(options)
+    if isinstance(source, str):
+        from .pipelinefile import parse_pipeline
+
+        source = parse_pipeline(source).stages
+    return Pipeline(source, options.overrides)
+
+
+def _pipeline(options: argparse.Namespace) -> None:
+    if options.progress is not None:
+        os.environ["PDAL_STAGES_PROGRESS"] = "1" if options.progress else "0"
+    pipeline = _build(options)
+    if options.validate:
+        pipeline.validate()
+        print(json.dumps({"valid": True, "error_detail": "", "streamable": False}, indent=2))
+        return
+    pipeline.execute(arrays=False)
+    _after(pipeline, options.metadata)
+    if options.verbose and pipeline.log:
+        print(pipeline.log, file=sys.stderr)
+
+
+def _after(pipeline, metadata: str | None) -> None:
+    from .files import write_whole
+
+    for place, reports in pipeline.reports:
+        for report in reports:
+            for key in ("warning", "note"):
+                if report.get(key):
+                    print(f"pdal-stages: {place}: {report[key]}", file=sys.stderr)
+    if metadata:
+        write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
+
+
+def _expand(options: argparse.Namespace) -> None:
+    from .files import write_whole
+
+    text = _build(options).json + "\n"
+    if options.output:
+        write_whole(options.output, text.encode())
+    else:
+        sys.stdout.write(text)
+
+
+def _validate(options: argparse.Namespace) -> None:
+    _build(options).validate()
+    print(json.dumps({"valid": True, "error_detail": "", "streamable": False}, indent=2))
+
+
+def _drivers(options: argparse.Namespace) -> None:
+    from . import describe
+
+    print(describe.drivers(ours_only=options.ours, as_json=options.showjson), end="")
+
+
+def _options(options: argparse.Namespace) -> None:
+    from . import describe
+
+    print(describe.stage_options(options.stage, as_json=options.showjson), end="")
+
+
+def _classify(options: argparse.Namespace) -> None:
+    from .jobs import classify_pipeline
+    from .pipeline import Pipeline
+
+    stages = classify_pipeline(options.input, options.output, options.model, where=options.where)
+    pipeline = Pipeline(stages, options.overrides)
+    count = pipeline.execute(arrays=False)
+    _after(pipeline, options.metadata)
+    report = pipeline.reports[-1][1][-1]
+    print(f"{count:,} points written to {options.output}")
+    print(_class_counts(report))
+
+
+def _class_counts(report: dict) -> str:
+    from .asprs import class_name
+
+    lines = [f"  {int(code):3d} {class_name(int(code)):28s} {n:>12,}" for code, n in report.get("classes", {}).items()]
+    if report.get("rejected"):
+        lines.append(f"  rejected: {report['rejected']:,}")
+    return "\n".join(lines)
+
+
+def _train(options: argparse.Namespace) -> None:
+    from .classifier import load_model
+    from .jobs import train_pipeline
+    from .pipeline import Pipeline
+
+    extra = {k: v for k in ("classes", "neighborhoods", "count") if (v := getattr(options, k)) is not None}
+    # Overrides for the model writer reach the job before it decides whether heights are needed.
+    for override in options.overrides:
+        if not override.by_tag and override.selector == "writers.classifiermodel":
+            extra[override.option] = override.value
+    pipeline = Pipeline(train_pipeline(options.inputs, options.model, **extra), options.overrides)
+    pipeline.execute(arrays=False)
+    _after(pipeline, None)
+    print(load_model(options.model))
+
+
+def _accuracy(options: argparse.Namespace) -> None:
+    from .jobs import accuracy_pipeline, attach_reference
+    from .pipeline import Pipeline
+
+    reference_dimension = options.reference_dimension or ("Classification" if options.reference else "Reference")
+    outputs = {k: v for k in ("json", "html") if (v := getattr(options, k))}
+    if options.reference:
+        attach_reference(
+            options.input, options.reference, options.dimension, reference_dimension, options.overrides, **outputs
+        )
+        return
+    stages = accuracy_pipeline(options.input, options.dimension, reference_dimension, **outputs)
+    pipeline = Pipeline(stages, options.overrides)
+    pipeline.execute(arrays=False)
+    _after(pipeline, None)
+
+
+def _model(options: argparse.Namespace) -> None:
+    from .classifier import load_model
+
+    model = load_model(options.file)
+    if options.showjson:
+        print(json.dumps(model.describe(), indent=2, default=str))
+    else:
+        print(model)
+
+
+def _demo(options: argparse.Namespace) -> None:
+    from .demo import run_demo
+
+    run_demo(options.folder, size=options.size, density=options.density, seed=options.seed)
+
+
+def _warmup(options: argparse.Namespace) -> None:
+    from .features import warmup
+
+    warmup()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,217 @@
+"""Reading pipeline JSON as PDAL does, with errors that name the line."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from .errors import PipelineError
+
+_LARGEST = 64 * 2**20
+_DEEPEST = 200
+
+
+@dataclass
+class PipelineSource:
+    """A parsed pipeline: its stages, and the line each begins on.
+
+    Attributes
+    ----------
+    stages : list
+        Objects or file names, as written.
+    lines : list of int
+        One per stage; 0 where it did not come from text.
+    name : str
+        The file, for messages; empty for text.
+    """
+
+    stages: list[Any]
+    lines: list[int]
+    name: str = ""
+
+    def where(self, index: int) -> str:
+        """``job.json, line 12`` or ``stage 3``."""
+        if self.lines[index]:
+            return f"{self.name or 'pipeline'}, line {self.lines[index]}"
+        return f"stage {index + 1}"
+
+
+def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
+    """A pipeline from a file name, JSON text, or Python lists and dicts.
+
+    Raises
+    ------
+    PipelineError
+        If the file cannot be read, is not JSON, or is no pipeline.
+    """
+    if isinstance(source, Path) or (isinstance(source, str) and not _looks_like_json(source)):
+        path = Path(source)
+        try:
+            if path.stat().st_size > _LARGEST:
+                raise PipelineError("the pipeline file is too large to be one", where=str(path), found="over 64 MB")
+            text = path.read_bytes().decode("utf-8-sig")
+        except OSError as error:
+            raise PipelineError(
+                "the pipeline file cannot be read", where=str(path), found=error.strerror or str(error)
+            ) from None
+        except UnicodeDecodeError as error:
+            raise PipelineError(
+                "the pipeline file is not UTF-8 text", where=str(path), found=f"byte {error.start}", cure="Save it as UTF-8"
+            ) from None
+        return parse_pipeline(text, str(path))
+    if isinstance(source, str):
+        return parse_pipeline(source)
+    stages = source.get("pipeline") if isinstance(source, dict) else source
+    if not isinstance(stages, list):
+        raise PipelineError("a pipeline is a list of stages, or an object with a list named 'pipeline'")
+    _check(stages, [0] * len(stages), "")
+    return PipelineSource(list(stages), [0] * len(stages))
+
+
+def parse_pipeline(text: str, name: str = "") -> PipelineSource:
+    """Parse pipeline JSON text; comments are allowed, as PDAL allows them."""
+    clean = _without_comments(text.removeprefix("\ufeff"))
+    if not clean.strip():
+        raise PipelineError("the pipeline is empty", where=name or None)
+    _check_depth(clean, name)
+    try:
+        # parse_constant: NaN and Infinity are no JSON, and PDAL refuses them too.
+        value = json.loads(clean, parse_constant=_no_constant)
+    except json.JSONDecodeError as error:
+        raise PipelineError(
+            f"the pipeline is not valid JSON: {error.msg}",
+            where=f"{name or 'pipeline'}, line {error.lineno}, column {error.colno}",
+            found=_excerpt(clean, error.pos),
+            cure=_cure(clean, error),
+        ) from None
+    except (ValueError, RecursionError) as error:
+        raise PipelineError("the pipeline is not valid JSON", where=name or None, found=str(error)[:200]) from None
+    if isinstance(value, dict):
+        if not isinstance(value.get("pipeline"), list):
+            raise PipelineError(
+                "the pipeline has no list named 'pipeline'",
+                where=name or None,
+                found=f"an object with {', '.join(map(repr, value)) or 'nothing in it'}"[:200],
+                cure='Write {"pipeline": [...]}, or the list alone',
+            )
+        stages = value["pipeline"]
+    elif isinstance(value, list):
+        stages = value
+    else:
+        raise PipelineError("the pipeline must be a list or an object", where=name or None, found=type(value).__name__)
+    lines = _lines(clean, len(stages), isinstance(value, dict))
+    _check(stages, lines, name)
+    return PipelineSource(stages, lines, name)
+
+
+def _check(stages: list, lines: list[int], name: str) -> None:
+    if not stages:
+        raise PipelineError("the pipeline has no stages", where=name or None)
+    for index, stage in enumerate(stages):
+        if not isinstance(stage, str | dict):
+            raise PipelineError(
+                "a stage is an object, or a file name",
+                where=PipelineSource(stages, lines, name).where(index),
+                found=json.dumps(stage, default=str)[:80],
+            )
+        if isinstance(stage, dict) and not isinstance(stage.get("type", ""), str):
+            raise PipelineError(
+                "a stage's 'type' is text",
+                where=PipelineSource(stages, lines, name).where(index),
+                found=json.dumps(stage["type"], default=str)[:80],
+            )
+
+
+def _looks_like_json(text: str) -> bool:
+    start = text.lstrip("\ufeff \t\r\n")[:2]
+    return start[:1] in ("[", "{") or start in ("//", "/*")
+
+
+_STRING_OR_COMMENT = re.compile(r'"(?:[^"\\\n]|\\.)*"|//[^\n]*|/\*.*?\*/', re.DOTALL)
+
+
+def _without_comments(text: str) -> str:
+    """Comments as spaces, so that places stay."""
+
+    def blank(match: re.Match) -> str:
+        word = match.group()
+        return word if word.startswith('"') else re.sub(r"[^\n]", " ", word)
+
+    return _STRING_OR_COMMENT.sub(blank, text)
+
+
+def _check_depth(text: str, name: str) -> None:
+    depth = 0
+    for match in re.finditer(r'"(?:[^"\\\n]|\\.)*"|[\[{]|[\]}]', text):
+        mark = match.group()
+        if mark in "[{":
+            depth += 1
+            if depth > _DEEPEST:
+                raise PipelineError(
+                    f"the pipeline is nested more than {_DEEPEST} levels deep",
+                    where=f"{name or 'pipeline'}, line {text.count(chr(10), 0, match.start()) + 1}",
+                )
+        elif mark in "]}":
+            depth -= 1
+
+
+def _no_constant(word: str):
+    raise ValueError(f"{word} is not a JSON number")
+
+
+def _excerpt(text: str, position: int) -> str:
+    return repr(text[max(0, position - 20) : position + 20].strip())
+
+
+def _cure(text: str, error: json.JSONDecodeError) -> str | None:
+    before = text[: error.pos].rstrip()
+    after = text[error.pos :].lstrip()[:1]
+    if before.endswith(",") and after in ("]", "}") or after == "," and before.endswith(","):
+        return "Remove the comma before the closing bracket"
+    if after in ("]", "}") and "Illegal trailing comma" in error.msg:
+        return "Remove the comma before the closing bracket"
+    if after == "'" or error.msg.startswith("Expecting property name") and after == "'":
+        return 'JSON wants double quotes: "text"'
+    if error.msg == "Extra data":
+        return "A pipeline is one list or object; remove what follows it"
+    return None
+
+
+_SPACE = re.compile(r"[\s]*")
+
+
+def _lines(text: str, count: int, is_object: bool) -> list[int]:
+    """The line each stage begins on: walk the list item by item."""
+    decoder = json.JSONDecoder(parse_constant=_no_constant)
+
+    def skip(at: int) -> int:
+        match = _SPACE.match(text, at)
+        return match.end() if match else at
+
+    at = skip(0)
+    begin = at
+    if is_object:
+        at = skip(at + 1)
+        begin = -1
+        while text[at] != "}":
+            key, at = decoder.raw_decode(text, at)
+            at = skip(skip(at) + 1)
+            if key == "pipeline":  # of equal keys the last counts, as in json.loads
+                begin = at
+            _, at = decoder.raw_decode(text, at)
+            at = skip(at)
+            if text[at] == ",":
+                at = skip(at + 1)
+    lines = []
+    at = skip(begin + 1)
+    line, counted = 1, 0
+    while len(lines) < count:
+        line += text.count("\n", counted, at)
+        counted = at
+        lines.append(line)
+        _, at = decoder.raw_decode(text, at)
+        at = skip(skip(at) + 1)
+    return lines
