@@ -1,0 +1,8 @@
+"""Classifiers: training on labelled clouds, the model file, classifying clouds. NumPy in and out; no PDAL."""
+
+from .forest import Forest
+from .model import Model, Prediction, load_model
+from .options import TrainingOptions
+from .training import TrainingCloud, train
+
+__all__ = ["Forest", "Model", "Prediction", "TrainingCloud", "TrainingOptions", "load_model", "train"]

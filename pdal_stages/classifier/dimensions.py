@@ -10,6 +10,8 @@ import numpy.typing as npt
 
 from ..errors import DimensionError
 
+#: What every point has: the feature engine takes these from the coordinates.
+COORDINATES = ("X", "Y", "Z")
 #: Derived here: ReturnNumber / NumberOfReturns, 1 for a last or only return.
 RETURN_RATIO = "ReturnRatio"
 
@@ -28,7 +30,9 @@ def required(names: Iterable[str]) -> tuple[str, ...]:
     """Dimensions the cloud must have for these dimension features."""
     out: dict[str, None] = {}
     for name in names:
-        out.update(dict.fromkeys(("ReturnNumber", "NumberOfReturns") if name == RETURN_RATIO else (name,)))
+        if name not in COORDINATES:
+            both = ("ReturnNumber", "NumberOfReturns")
+            out.update(dict.fromkeys(both if name == RETURN_RATIO else (name,)))
     return tuple(out)
 
 
@@ -93,6 +97,8 @@ def gather(
     notes: dict[str, int] = {}
     out = {}
     for name in names:
+        if name in COORDINATES:
+            continue
         if name != RETURN_RATIO:
             out[name] = picked[name]
             continue

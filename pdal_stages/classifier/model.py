@@ -231,6 +231,7 @@ class Model:
             return codes[best], win, win - second, p if probabilities else None
 
         rejected = 0
+        counted: dict[str, Any] = {}
         if count:
             engine = FeatureEngine(
                 xyz,
@@ -263,6 +264,9 @@ class Model:
                 else:
                     code = np.where(low, np.uint8(UNCLASSIFIED), code)
                 classification[at] = code
+            for key in ("fewer_than_three", "beyond_halo"):
+                if any(engine.report.get(key, {}).values()):
+                    counted[key] = {token: m for token, m in engine.report[key].items() if m}
         given, number = np.unique(classification[chosen], return_counts=True)
         report = {
             "points": n,
@@ -270,7 +274,8 @@ class Model:
             "rejected": rejected,
             "outside_where": n - count,
             "classes": {str(int(code)): int(m) for code, m in zip(given, number, strict=True)},
-            **notes,
+            **{name: m for name, m in notes.items() if m},
+            **counted,
         }
         return Prediction(classification, reliability, margins, shares, count, rejected, report)
 

@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-import re
 from typing import TYPE_CHECKING, Any
 
 from ..errors import ModelError, OptionError
+from ..features.names import GROUPS
 
 if TYPE_CHECKING:
     from .model import Model
 
-_GEOMETRY = {"Density", "Verticality", "HeightRange", "HeightStd", "Radius"}
-_SHAPE = re.compile(r"(A3|D1|D2|D3|D4)_\d+")
 GROUPINGS = ("column", "feature", "group", "neighborhood", "dimension")
 
 
-def split_name(name: str, suffixes: dict[str, str], dimensions: tuple[str, ...]) -> tuple[str, str, str]:
-    """(feature, group, neighborhood token) of one column, e.g. ``D1_3_c2`` -> (``D1``, ``shape``, ``c2``)."""
-    if name in dimensions:
-        return name, "dimension", "(dimension)"
-    # The longest suffix that fits: c2_5 before 5.
-    for suffix in sorted(suffixes, key=len, reverse=True):
-        if name.endswith("_" + suffix):
-            feature = name[: -len(suffix) - 1]
-            shape = _SHAPE.fullmatch(feature)
-            if shape:
-                return shape[1], "shape", suffixes[suffix]
-            return feature, "geometry" if feature in _GEOMETRY else "covariance", suffixes[suffix]
-    return name, "covariance", "(other)"
+def columns(model: Model) -> list[tuple[str, str, str]]:
+    """(feature, group, neighborhood token) of every column; a histogram's bins are one feature."""
+    group_of = {name: group for group in ("covariance", "geometric", "shapes") for name in GROUPS[group]}
+    out = []
+    for part in model.plan.layout:
+        for name in part.at:
+            group = group_of[name]
+            out.append((name.split("_")[0] if group == "shapes" else name, group, part.neighborhood.token))
+    return out + [(name, "dimension", "(dimension)") for name in model.plan.dimensions]
 
 
 def importances(model: Model, by: str = "feature") -> dict[str, float]:
@@ -39,16 +33,14 @@ def importances(model: Model, by: str = "feature") -> dict[str, float]:
     values = model.info.get("importances")
     if values is None:
         raise ModelError("the model file holds no importances")
-    suffixes = {one.suffix: one.token for one in model.plan.neighborhoods}
     total: dict[str, float] = {}
-    for name, value in zip(model.plan.names, values, strict=True):
-        feature, group, token = split_name(name, suffixes, tuple(model.plan.dimensions))
+    for name, (feature, group, token), value in zip(model.plan.names, columns(model), values, strict=True):
         key = {
             "column": name,
             "feature": feature,
             "group": group,
             "neighborhood": token,
-            "dimension": name if group == "dimension" else "(geometric features)",
+            "dimension": name if group == "dimension" else "(computed features)",
         }[by]
         total[key] = total.get(key, 0.0) + value
     return dict(sorted(total.items(), key=lambda item: -item[1]))

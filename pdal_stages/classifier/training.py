@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 import time
@@ -14,7 +15,7 @@ import numpy.typing as npt
 
 from .. import __version__
 from ..errors import DimensionError, OptionError
-from ..features import FeatureEngine, FeaturePlan
+from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..parallel import map_blocks
 from ..progress import Progress
 from . import crossval
@@ -82,7 +83,7 @@ def train(
                 gather((name,), cloud.dimensions, len(cloud.xyz), where=cloud.name)
     classes, samples = _sample(clouds, options)
     _must_fit(plan, len(samples))
-    values, engine_state = _features(clouds, samples, plan, options, progress)
+    values, fitted = _features(clouds, samples, plan, options, progress)
     timed = {"features": time.perf_counter() - started}
     low, high = _percentiles(values, plan, options, samples)
     xy = np.empty((len(samples), 2))
@@ -113,7 +114,7 @@ def train(
             "max_features": options.max_features,
             "min_samples_leaf": chosen["min_samples_leaf"],
             "max_depth": chosen["max_depth"],
-            **engine_state.notes,
+            **fitted.notes,
         },
         "percentiles": {"low": low, "high": high, "limited": options.scale},
         "accuracy": {"out_of_bag": bag, "cross_validation": validation},
@@ -124,8 +125,8 @@ def train(
         plan,
         forest,
         list(zip(classes.codes, classes.names, strict=True)),
-        engine_state.bins,
-        engine_state.copt_threshold,
+        fitted.bins,
+        fitted.copt_threshold,
         options.seed,
         info,
         timed,
@@ -200,10 +201,52 @@ def _must_fit(plan: FeaturePlan, n: int) -> None:
 
 
 @dataclass
-class _EngineState:
-    bins: Any = None
+class _Fitted:
+    """What the feature engine fitted, and what it counted."""
+
+    bins: ShapeBins | None = None
     copt_threshold: float | None = None
     notes: dict[str, Any] = field(default_factory=dict)
+
+
+def _engine(
+    cloud: TrainingCloud, plan: FeaturePlan, options: TrainingOptions, fitted: _Fitted
+) -> FeatureEngine:
+    return FeatureEngine(
+        np.asarray(cloud.xyz, dtype=np.float64),
+        plan,
+        bins=fitted.bins,
+        copt_threshold=fitted.copt_threshold,
+        seed=options.seed,
+        threads=options.threads,
+    )
+
+
+def _fit(clouds: Sequence[TrainingCloud], share, plan: FeaturePlan, options: TrainingOptions) -> _Fitted:
+    """Histogram and curvature thresholds: the mean of each cloud's own, weighted by its samples."""
+    fitted = _Fitted()
+    engines = [_engine(c, plan, options, fitted).fit() for c, n in zip(clouds, share, strict=True) if n]
+    weight = [n / sum(share) for n in share if n]
+
+    def mean(values) -> float:  # exactly rounded, so the order of the clouds does not matter
+        return math.fsum(w * v for w, v in zip(weight, values, strict=True)) if len(weight) > 1 else values[0]
+
+    if engines[0].copt_threshold is not None:
+        fitted.copt_threshold = mean([e.copt_threshold for e in engines])
+    if engines[0].bins is not None:
+        each = [e.bins.to_dict() for e in engines if e.bins is not None]
+        fitted.bins = ShapeBins.from_dict(
+            {
+                token: {
+                    metric: [
+                        mean(values) for values in zip(*(one[token][metric] for one in each), strict=True)
+                    ]
+                    for metric in rows
+                }
+                for token, rows in each[0].items()
+            }
+        )
+    return fitted
 
 
 def _features(
@@ -212,33 +255,22 @@ def _features(
     plan: FeaturePlan,
     options: TrainingOptions,
     progress: bool,
-) -> tuple[npt.NDArray[np.float32], _EngineState]:
+) -> tuple[npt.NDArray[np.float32], _Fitted]:
     """The (samples, features) float32 matrix, filled cloud by cloud."""
     values = np.empty((len(samples), len(plan.names)), np.float32)
-    state = _EngineState()
-    # Histogram thresholds and the curvature threshold are fitted once, on the cloud that gives most samples.
-    share = np.bincount(samples.cloud, minlength=len(clouds))
+    share = np.bincount(samples.cloud, minlength=len(clouds)).tolist()
+    fitted = _fit(clouds, share, plan, options)
     with Progress(len(samples), "features of the samples", enabled=None if progress else False) as bar:
-        for number in np.argsort(-share, kind="stable"):
+        for number, cloud in enumerate(clouds):
             at = np.flatnonzero(samples.cloud == number)
             if not len(at):
                 continue
-            cloud = clouds[number]
             at = at[np.argsort(samples.row[at], kind="stable")]
             rows = samples.row[at]
-            engine = FeatureEngine(
-                np.asarray(cloud.xyz, dtype=np.float64),
-                plan,
-                bins=state.bins,
-                copt_threshold=state.copt_threshold,
-                seed=options.seed,
-                threads=options.threads,
-            )
-            engine.fit()
-            state.bins, state.copt_threshold = engine.bins, engine.copt_threshold
+            engine = _engine(cloud, plan, options, fitted)
             fed, notes = gather(plan.dimensions, cloud.dimensions, len(cloud.xyz), rows, cloud.name)
             for name, n in notes.items():
-                state.notes[name] = state.notes.get(name, 0) + n
+                fitted.notes[name] = fitted.notes.get(name, 0) + n
             for part, block in engine.blocks(
                 queries=rows,
                 dimensions=fed,
@@ -246,12 +278,11 @@ def _features(
                 memory_mb=options.memory_mb,
                 progress=bar,
             ):
-                # `part` are rows of the cloud, in the order of the queries.
-                values[at[np.searchsorted(rows, part)]] = block
+                values[at[np.searchsorted(rows, part)]] = block  # `part` are rows of the cloud
     if not np.isfinite(values).all():
         column = int(np.argmin(np.isfinite(values).all(axis=0)))
         raise DimensionError(f"the feature {plan.names[column]} is not finite for some samples")
-    return values, state
+    return values, fitted
 
 
 def _percentiles(
@@ -263,14 +294,14 @@ def _percentiles(
     change under scaling, so only the cut is done, on the training values: no threshold can then lie beyond
     the percentiles, and a value beyond goes the way its limit would. Inference needs neither.
     """
-    geometric = len(plan.names) - len(plan.dimensions)
+    computed = len(plan.names) - len(plan.dimensions)
     low = [0.0] * len(plan.names)
     high = [1.0] * len(plan.names)
     columns = range(len(plan.names))
 
     def one(j: int) -> None:
         column = values[:, j]
-        if j >= geometric:  # dimensions keep their own scale
+        if j >= computed:  # dimensions keep their own scale
             low[j], high[j] = float(column.min()), float(column.max())
             return
         first, last = np.percentile(column, [1.0, 99.0]).astype(np.float32)
