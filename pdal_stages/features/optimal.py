@@ -266,7 +266,7 @@ def kopt_block(tree, qx, qy, qz, k_min, k_max, cap2, table, radius, seeds, shape
     ----------
     tree : KdTree
     qx, qy, qz : ndarray of float64, shape (m,)
-        Queries: points of the cloud.
+        Queries, usually points of the cloud.
     k_min, k_max : int
         Neighbors besides the point itself.
     cap2 : float
@@ -275,14 +275,20 @@ def kopt_block(tree, qx, qy, qz, k_min, k_max, cap2, table, radius, seeds, shape
     table : ndarray of float64, shape (12, m)
         Out: moments about the query, in the rows of ``moments``.
     radius : ndarray of float64, shape (m,)
-        Out: distance to the farthest member.
+        Out: distance to the farthest member, metres.
     seeds : ndarray of uint64, shape (m,)
         See :func:`shapes.point_seeds`; not used without shapes.
     shapes : Shapes
         What counts to make, or :func:`shapes.no_shapes`.
     """
+    kopt_into(tree, qx, qy, qz, np.arange(len(qx)), k_min, k_max, cap2, table, radius, seeds, shapes)
+
+
+@njit
+def kopt_into(tree, qx, qy, qz, target, k_min, k_max, cap2, table, radius, seeds, shapes):
+    """:func:`kopt_block` for the queries `target` (ndarray of int64) only; the others are left alone."""
     need = k_max + 1
-    search = start_search(qx, qy, qz)
+    search = start_search(qx[target], qy[target], qz[target])
     scratch = make_scratch(CROWD * need + ROOM)
     rows = make_rows(need)
     members = make_members(need)
@@ -292,13 +298,10 @@ def kopt_block(tree, qx, qy, qz, k_min, k_max, cap2, table, radius, seeds, shape
         if lo < 0:
             return
         for row in range(count):
-            q = search.order[lo + row]
+            q = target[search.order[lo + row]]
             found = rows.found[row]
             if found == 0:  # a query that is no point of the cloud, farther than the bound from all
-                table[:, q] = 0.0
-                radius[q] = 0.0
-                if shapes.on:
-                    shapes.counts[q, :] = 0.0
+                write_nothing(table, radius, shapes, q)
                 continue
             take_members(tree, rows.index[row], found, qx[q], qy[q], qz[q], members)
             running_sums(members.x, members.y, members.z, found, s)
@@ -308,7 +311,16 @@ def kopt_block(tree, qx, qy, qz, k_min, k_max, cap2, table, radius, seeds, shape
             if shapes.on:
                 write_shapes(members, best + 1, s, best, seeds[q], shapes, q)
         for j in range(lo + count, hi):  # queries that coincide with the first
-            copy_column(table, radius, shapes, search.order[lo], search.order[j])
+            copy_column(table, radius, shapes, target[search.order[lo]], target[search.order[j]])
+
+
+@njit
+def write_nothing(table, radius, shapes, column):
+    """The result of a neighborhood without points."""
+    table[:, column] = 0.0
+    radius[column] = 0.0
+    if shapes.on:
+        shapes.counts[column, :] = 0.0
 
 
 @njit

@@ -19,7 +19,7 @@ The angle is 0 where b or c coincides with a.
 coordinates, the neighborhood's token, i) and members come in a canonical order, so counts have the same bits for any
 order of points, tile or number of threads.
 
-**No root is taken.** Metrics are compared with their thresholds as squares (D1, D2), as 16 area^2
+**No root is taken.** Metrics are compared with their thresholds as squares (D1, D2), as 4 area^2
 (D3: 4 t^4), as 6 volume (D4: 6 t^3) and as the negative signed square of the cosine (A3), all of which ascend with
 the metric.
 """
