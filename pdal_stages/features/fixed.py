@@ -94,7 +94,7 @@ class FixedRadius:
         seeds = np.zeros((len(self.specs), len(qx) if self.shaped.any() else 1), np.uint64)
         for number, spec in enumerate(self.specs):
             if spec.shaped:
-                thresholds[number] = bins.comparable(spec.token)
+                thresholds[number] = bins.comparable([spec.token])[0]
                 seeds[number] = point_seeds(qx, qy, qz, seed, spec.token)
         radius_block(
             self.grid.tables(), self.grid.cell, qx, qy, qz, copies, self.radii, self.widths, self.reaches,
