@@ -41,7 +41,7 @@ class Frame:
         y0, y1 = float(np.min(y, where=good, initial=np.inf)), float(np.max(y, where=good, initial=-np.inf))
         wide, tall = max(x1 - x0, 1e-3), max(y1 - y0, 1e-3)
         pixel = max(wide / width, tall / (2.5 * width))
-        return Frame(x0, y0, pixel, max(1, math.ceil(wide / pixel)), max(1, math.ceil(tall / pixel)))
+        return Frame(x0, y0, pixel, max(2, math.ceil(wide / pixel)), max(2, math.ceil(tall / pixel)))
 
 
 @njit(nogil=True, cache=True)
@@ -117,14 +117,13 @@ def surface(x: np.ndarray, y: np.ndarray, z: np.ndarray, frame: Frame, gap: floa
             where="picture",
             found=f"{len(x)} points",
         )
-    # Spacing inside the cloud: pixels near some point, per pixel that has one.
-    coarse = max(1, round(math.sqrt(seen.size / max(1, seen.sum()))))
-    near = ndimage.binary_dilation(seen, iterations=coarse) if coarse < 200 else np.ones_like(seen)
-    spacing = max(1.0, math.sqrt(near.sum() / seen.sum()))
-    reach = 1.6 * spacing if gap is None else gap
-    if reach >= 1.0 and not seen.all():
+    spacing = 1.0
+    if not seen.all():
         away, at = ndimage.distance_transform_edt(~seen, return_indices=True)
-        fill = ~seen & (away <= reach)
+        # Spacing inside the cloud: pixels near some point, per pixel that has one.
+        share = math.sqrt(seen.size / seen.sum())
+        spacing = max(1.0, math.sqrt((away <= share).sum() / seen.sum()))
+        fill = ~seen & (away <= (1.6 * spacing if gap is None else gap))
         which[fill] = which[at[0][fill], at[1][fill]]
         top[fill] = top[at[0][fill], at[1][fill]]
     top[which < 0] = np.nan
@@ -141,7 +140,10 @@ def shading(s: Surface, strength: float = 1.0) -> np.ndarray:
     level = np.nanmedian(s.z)
     z = np.where(known, s.z, level)
 
+    widest = 0.05 * max(s.z.shape)  # a wider blur than that costs time and shows nothing
+
     def blur(size):
+        size = min(size, widest)
         weight = ndimage.gaussian_filter(known.astype(float), size)
         return ndimage.gaussian_filter(np.where(known, z - level, 0.0), size) / np.maximum(weight, 1e-6)
 

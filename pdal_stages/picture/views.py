@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
+from scipy import ndimage
 
 from ..asprs import class_color, class_name
 from ..errors import StageError
@@ -186,7 +187,8 @@ def _verdict(s: Surface, x, y, z, predicted, truth, ignore) -> np.ndarray:
         j = np.minimum(((y[good] - f.y0) / f.pixel).astype(np.int64), f.height - 1)
         mask = np.zeros((f.height, f.width), dtype=bool)
         mask[f.height - 1 - j, i] = True
-        shown[mask] = WRONG
+        grow = min(int(0.4 * s.spacing), 5)  # about as large as a point's share of the surface
+        shown[ndimage.binary_dilation(mask, iterations=grow) if grow else mask] = WRONG
     return shown
 
 
