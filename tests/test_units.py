@@ -1,0 +1,58 @@
+"""Length units in well-known text."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pdal_stages.errors import OptionError, StageError
+from pdal_stages.units import parse_wkt, units_of_wkt
+
+GEOGCS = 'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.25]],UNIT["degree",0.0174532925199433]]'
+METRES = f'PROJCS["UTM 32N",{GEOGCS},PROJECTION["Transverse_Mercator"],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
+FEET = METRES.replace('UNIT["metre",1', 'UNIT["US survey foot",0.304800609601219')
+VERTICAL = 'VERT_CS["NAVD88",VERT_DATUM["x",2005],UNIT["{}",{}]]'
+WKT2 = (
+    'PROJCRS["x",BASEGEOGCRS["WGS 84",DATUM["d",ELLIPSOID["e",6378137,298.2,LENGTHUNIT["metre",1]]]],'
+    'CONVERSION["c",METHOD["m"]],CS[Cartesian,2],AXIS["e",east,LENGTHUNIT["foot",0.3048]],'
+    'AXIS["n",north,LENGTHUNIT["foot",0.3048]]]'
+)
+
+
+def test_metres_and_feet():
+    assert units_of_wkt(METRES).metric
+    feet = units_of_wkt(FEET)
+    assert feet.horizontal == pytest.approx(1200 / 3937)
+    assert feet.vertical == feet.horizontal  # no vertical part: as x and y
+
+
+def test_compound_systems_have_two_units():
+    mixed = units_of_wkt(f'COMPD_CS["both",{METRES},{VERTICAL.format("foot", 0.3048)}]')
+    assert (mixed.horizontal, mixed.vertical) == (1.0, 0.3048)
+
+
+def test_wkt2_units_may_sit_on_axes():
+    assert units_of_wkt(WKT2).horizontal == 0.3048
+
+
+def test_no_reference_means_metres_and_says_so():
+    assert units_of_wkt("").assumed
+    assert not units_of_wkt(METRES).assumed
+
+
+def test_options_overrule():
+    units = units_of_wkt(METRES, vertical="ft")
+    assert (units.horizontal, units.vertical) == (1.0, 0.3048)
+    with pytest.raises(OptionError, match="Did you mean 'metre'"):
+        units_of_wkt("", horizontal="mtre")
+
+
+def test_degrees_are_refused_with_the_cure():
+    with pytest.raises(StageError, match=r"filters\.reprojection"):
+        units_of_wkt(GEOGCS)
+
+
+@given(st.text(max_size=60))
+def test_any_text_is_survived(text):
+    parse_wkt(text)
