@@ -125,16 +125,16 @@ def add_shared(inner, dx, dy, dz, out, j):
 
 
 @njit
-def finish(moments, count, volume, few, copies):
+def finish(moments, start, count, volumes, few, copies):
     """The twelve covariance and geometric features of `count` neighborhoods, from their moments.
 
     Parameters
     ----------
     moments : (12, m) float64 array
         Moments about the queries.
-    count : int
-        How many of the m columns are in use, at most BATCH.
-    volume : float
+    start, count : int
+        Which columns of it: at most BATCH of them.
+    volumes : (count,) float64 array
         Area of the cylinder's base or volume of the sphere: what Density divides by.
     few : (1,) int64 array
         Raised by the number of queries whose neighborhood has fewer than three points.
@@ -155,16 +155,16 @@ def finish(moments, count, volume, few, copies):
     """
     # Made here and of a constant shape: rows known not to overlap let the loop be vectorised.
     out = np.empty((MOMENTS, WIDTH))
-    scale = 1.0 / volume
     for j in range(count):
-        n = moments[N, j]
+        i = start + j
+        n = moments[N, i]
         inverse = 1.0 / (n if n > 0.0 else 1.0)
-        mx, my, mz = moments[SX, j] * inverse, moments[SY, j] * inverse, moments[SZ, j] * inverse
-        ax, ay, az = moments[SXX, j] * inverse, moments[SYY, j] * inverse, moments[SZZ, j] * inverse
+        mx, my, mz = moments[SX, i] * inverse, moments[SY, i] * inverse, moments[SZ, i] * inverse
+        ax, ay, az = moments[SXX, i] * inverse, moments[SYY, i] * inverse, moments[SZZ, i] * inverse
         xx, yy, zz = ax - mx * mx, ay - my * my, az - mz * mz
-        xy = moments[SXY, j] * inverse - mx * my
-        xz = moments[SXZ, j] * inverse - mx * mz
-        yz = moments[SYZ, j] * inverse - my * mz
+        xy = moments[SXY, i] * inverse - mx * my
+        xz = moments[SXZ, i] * inverse - mx * mz
+        yz = moments[SYZ, i] * inverse - my * mz
         apart = xx + yy + zz > COINCIDENT * (ax + ay + az)
         l1, l2, l3, nz = eigen3(xx, xy, xz, yy, yz, zz)
         real = (n >= 3.0) & apart
@@ -177,11 +177,11 @@ def finish(moments, count, volume, few, copies):
         out[5, j] = f[5]
         out[6, j] = f[6]
         out[7, j] = f[7]
-        out[8, j] = n * scale
+        out[8, j] = n / volumes[j]
         out[9, j] = 1.0 - nz if real else 0.0
-        out[10, j] = moments[HIGH, j] - moments[LOW, j] if n > 0.0 else 0.0
+        out[10, j] = moments[HIGH, i] - moments[LOW, i] if n > 0.0 else 0.0
         out[11, j] = math.sqrt(max(zz, 0.0)) if apart else 0.0
     for j in range(count):
-        if moments[N, j] < 3.0:
+        if moments[N, start + j] < 3.0:
             few[0] += copies[j]
     return out

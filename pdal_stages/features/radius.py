@@ -95,6 +95,7 @@ def radius_block(
     px, py, pz = np.empty(size), np.empty(size), np.empty(size)
     moments = np.empty((len(columns), MOMENTS, WIDTH))
     inner = np.empty((MOMENTS, 1))
+    volumes = np.empty(BATCH)
     record = np.empty((size if shaped.any() else 1, 4), np.float32)
     counts = np.empty(50, np.float32)
     line, left, right = 0, 1, 0  # row of the strip, columns of the queries it serves (none yet)
@@ -143,9 +144,9 @@ def radius_block(
             for kind in range(2):
                 number = wanted[k, kind]
                 if number >= 0:
-                    volume = math.pi * r * r if kind == 0 else 4.0 / 3.0 * math.pi * r * r * r
+                    volumes[:] = math.pi * r * r if kind == 0 else 4.0 / 3.0 * math.pi * r * r * r
                     tally = few[number : number + 1]
-                    values = finish(moments[number], stop - start, volume, tally, copies[start:stop])
+                    values = finish(moments[number], 0, stop - start, volumes, tally, copies[start:stop])
                     for f in range(MOMENTS):
                         column = columns[number, f]
                         if column >= 0:
