@@ -26,7 +26,7 @@ from .eigen import eigenentropy, eigenvalues3, log_fast
 from .jit import FAST, njit
 from .knn import CROWD, ROOM, make_rows, make_scratch, next_rows, start_search
 from .moments import COINCIDENT, HIGH, LOW, SX, SXX, SXY, SXZ, SY, SYY, SYZ, SZ, SZZ, N
-from .shapes import shape_counts
+from .shapes import COUNTS, VALUES, shape_counts, shape_values
 
 #: Estimated entropies are off by less than half of this.
 MARGIN = 2e-6
@@ -245,19 +245,20 @@ def write_moments(s, j, members, count, table, column):
 
 @njit
 def write_shapes(members, count, s, j, seed, shapes, column):
-    """The 50 shape counts of the first `count` members."""
+    """The shapes of the first `count` members."""
     record = members.record
     for i in range(count):
         record[i, 0], record[i, 1], record[i, 2], record[i, 3] = members.x[i], members.y[i], members.z[i], 0.0
     w = 1.0 / s.n[j]
-    shape_counts(
-        record, count, np.float32(s.x[j] * w), np.float32(s.y[j] * w), np.float32(s.z[j] * w), seed,
-        shapes.thresholds, shapes.work, shapes.counts[column],
-    )  # fmt: skip
+    gx, gy, gz = np.float32(s.x[j] * w), np.float32(s.y[j] * w), np.float32(s.z[j] * w)
+    if shapes.mode == COUNTS:
+        shape_counts(record, count, gx, gy, gz, seed, shapes.thresholds, shapes.work, shapes.counts[column])
+    else:
+        shape_values(record, count, gx, gy, gz, seed, shapes.work, shapes.values[column])
 
 
 @njit
-def kopt_block(tree, qx, qy, qz, k_min, k_max, cap2, table, radius, seeds, shapes):
+def kopt_block(tree, qx, qy, qz, k_min, k_max, cap2, table, radius, reach, seeds, shapes):
     """Moments, radius and shapes of the best k in k_min..k_max for a block of queries.
 
     With k_min = k_max the neighborhood is the k nearest.
@@ -276,16 +277,18 @@ def kopt_block(tree, qx, qy, qz, k_min, k_max, cap2, table, radius, seeds, shape
         Out: moments about the query, in the rows of ``moments``.
     radius : ndarray of float64, shape (m,)
         Out: distance to the farthest member, metres.
+    reach : ndarray of float64, shape (m,)
+        Out: distance to the k_max-th neighbor, on which the result depends; infinity where there are fewer.
     seeds : ndarray of uint64, shape (m,)
         See :func:`shapes.point_seeds`; not used without shapes.
     shapes : Shapes
-        What counts to make, or :func:`shapes.no_shapes`.
+        What to make of shapes.
     """
-    kopt_into(tree, qx, qy, qz, np.arange(len(qx)), k_min, k_max, cap2, table, radius, seeds, shapes)
+    kopt_into(tree, qx, qy, qz, np.arange(len(qx)), k_min, k_max, cap2, table, radius, reach, seeds, shapes)
 
 
 @njit
-def kopt_into(tree, qx, qy, qz, target, k_min, k_max, cap2, table, radius, seeds, shapes):
+def kopt_into(tree, qx, qy, qz, target, k_min, k_max, cap2, table, radius, reach, seeds, shapes):
     """:func:`kopt_block` for the queries `target` (ndarray of int64) only; the others are left alone."""
     need = k_max + 1
     search = start_search(qx[target], qy[target], qz[target])
@@ -300,6 +303,7 @@ def kopt_into(tree, qx, qy, qz, target, k_min, k_max, cap2, table, radius, seeds
         for row in range(count):
             q = target[search.order[lo + row]]
             found = rows.found[row]
+            reach[q] = math.sqrt(rows.d2[row, found - 1]) if found == need else math.inf
             if found == 0:  # a query that is no point of the cloud, farther than the bound from all
                 write_nothing(table, radius, shapes, q)
                 continue
@@ -308,10 +312,12 @@ def kopt_into(tree, qx, qy, qz, target, k_min, k_max, cap2, table, radius, seeds
             best = lowest_entropy(s, min(k_min, found - 1), found)
             write_moments(s, best, members, best + 1, table, q)
             radius[q] = math.sqrt(rows.d2[row, best])
-            if shapes.on:
+            if shapes.mode:
                 write_shapes(members, best + 1, s, best, seeds[q], shapes, q)
         for j in range(lo + count, hi):  # queries that coincide with the first
-            copy_column(table, radius, shapes, target[search.order[lo]], target[search.order[j]])
+            q = target[search.order[j]]
+            copy_column(table, radius, shapes, target[search.order[lo]], q)
+            reach[q] = reach[target[search.order[lo]]]
 
 
 @njit
@@ -319,8 +325,10 @@ def write_nothing(table, radius, shapes, column):
     """The result of a neighborhood without points."""
     table[:, column] = 0.0
     radius[column] = 0.0
-    if shapes.on:
+    if shapes.mode == COUNTS:
         shapes.counts[column, :] = 0.0
+    elif shapes.mode == VALUES:
+        shapes.values[column, :, :] = np.nan
 
 
 @njit
@@ -329,6 +337,7 @@ def copy_column(table, radius, shapes, source, target):
     for i in range(table.shape[0]):
         table[i, target] = table[i, source]
     radius[target] = radius[source]
-    if shapes.on:
-        for i in range(shapes.counts.shape[1]):
-            shapes.counts[target, i] = shapes.counts[source, i]
+    if shapes.mode == COUNTS:
+        shapes.counts[target] = shapes.counts[source]
+    elif shapes.mode == VALUES:
+        shapes.values[target] = shapes.values[source]

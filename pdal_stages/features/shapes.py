@@ -26,7 +26,6 @@ the metric.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -54,23 +53,49 @@ class Work(NamedTuple):
     values: np.ndarray  # (5 * ROOM,) float32: the metrics, comparable
 
 
-class Shapes(NamedTuple):
-    """What a kernel needs to count shapes."""
+#: What a kernel is to do about shapes.
+NOTHING, COUNTS, VALUES = 0, 1, 2
 
-    on: bool
-    thresholds: np.ndarray  # (5, 9) float32, comparable
-    counts: np.ndarray  # (m, 50) float32
+
+class Shapes(NamedTuple):
+    """What a kernel is to make of shapes, and where it writes it."""
+
+    mode: int  # NOTHING, COUNTS or VALUES
+    thresholds: np.ndarray  # (5, 9) float32, comparable: for COUNTS
+    counts: np.ndarray  # (m, 50) float32: out, for COUNTS
+    values: np.ndarray  # (m, 5, 255) float32: out, for VALUES
     work: Work
 
 
 def make_work() -> Work:
     """Scratch for one thread."""
-    return Work(np.zeros(4 * ROOM, np.uint32), np.zeros(16 * ROOM, np.float32), np.zeros(5 * ROOM, np.float32))
+    u, f = np.uint32, np.float32
+    return Work(np.zeros(4 * ROOM, u), np.zeros(16 * ROOM, f), np.zeros(5 * ROOM, f))
 
 
 def no_shapes() -> Shapes:
-    """What to hand to a kernel that is to count no shapes."""
-    return Shapes(False, np.zeros((5, 9), np.float32), np.zeros((1, 50), np.float32), make_work())
+    """Shapes of which nothing is made."""
+    return _shapes(NOTHING, np.zeros((5, 9)), 0, 0)
+
+
+def count_shapes(thresholds: np.ndarray, m: int) -> Shapes:
+    """Shapes counted in the bins of (5, 9) comparable thresholds, for m queries."""
+    return _shapes(COUNTS, thresholds, m, 0)
+
+
+def list_shapes(m: int) -> Shapes:
+    """Shapes whose values are kept, for m queries."""
+    return _shapes(VALUES, np.zeros((5, 9)), 0, m)
+
+
+def _shapes(mode: int, thresholds: np.ndarray, counts: int, values: int) -> Shapes:
+    return Shapes(
+        mode,
+        np.ascontiguousarray(thresholds, np.float32),
+        np.empty((counts, 5 * BINS), np.float32),
+        np.empty((values, 5, PULLS), np.float32),
+        make_work(),
+    )
 
 
 @njit(forceinline=True)
