@@ -55,6 +55,14 @@ def grid(*parts: str, least: int = 300) -> str:
     return f'<div class="grid" style="--least:{int(least)}px">{"".join(parts)}</div>'
 
 
+def strip(*parts: str, label: str) -> str:
+    """Wide markup, below each other, that scrolls sideways together where the window is narrow."""
+    return (
+        f'<div class="scroll strip" tabindex="0" role="region" aria-label="{escape(label)}">'
+        f"<div>{''.join(parts)}</div></div>"
+    )
+
+
 def tiles(figures: Iterable[tuple[str, str, str, str]]) -> str:
     """Headline figures: (label, value, unit, remark)."""
     out = []
@@ -105,22 +113,29 @@ def heat_cell(value: float, right: bool, text: str, below: str = "") -> str:
 
 
 def table(
-    header: Sequence[str] | str, rows: Iterable[str], caption: str = "", remark: str = "", wide: bool = False
+    header: Sequence[str] | str,
+    rows: Iterable[str],
+    caption: str = "",
+    remark: str = "",
+    wide: bool = False,
+    foot: str = "",
 ) -> str:
     """A table of markup rows (cells joined); `header` is column titles, or header rows as markup.
 
-    The first title is set to the left. The table scrolls sideways where the window is narrow.
+    The first title is set to the left; `foot` is a last row that sums up. The table scrolls sideways
+    where the window is narrow.
     """
     if not isinstance(header, str):
         header = "<tr>" + "".join(head(t, kind="" if i else "text") for i, t in enumerate(header)) + "</tr>"
     titled = f"<b>{escape(caption)}</b>" + (f"<br>{escape(remark)}" if remark else "")
     top = f"<caption>{titled}</caption>" if caption else ""
+    last = f"<tfoot><tr>{foot}</tr></tfoot>" if foot else ""
     body = "".join(f"<tr>{row}</tr>" for row in rows)
     kind = ' class="wide"' if wide else ""
     label = f' role="region" aria-label="{escape(caption)}"' if caption else ""
     return (
         f'<div class="scroll" tabindex="0"{label}><table{kind}>{top}<thead>{header}</thead>'
-        f"<tbody>{body}</tbody></table></div>"
+        f"<tbody>{body}</tbody>{last}</table></div>"
     )
 
 

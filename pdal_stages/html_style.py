@@ -68,7 +68,13 @@ thead th{vertical-align:bottom;color:rgb(var(--muted));font-size:13px;border-bot
 th.text,td.text{text-align:left}
 td.break{white-space:normal;overflow-wrap:anywhere;min-width:12ch}
 tbody th{font-weight:500}
-td.heat{border:1px solid rgb(var(--panel));min-width:58px;line-height:1.25}
+th.heat{white-space:normal;min-width:62px;max-width:100px;font-size:12.5px;line-height:1.3}
+th.heat,td.heat{padding:5px 7px}
+tfoot>tr>*{font-weight:600;border-top:1px solid rgb(var(--muted))}
+section>.scroll+.scroll{margin-top:28px}
+.strip>div{min-width:860px}
+.strip figure+figure{margin-top:16px}
+td.heat{border:1px solid rgb(var(--panel));line-height:1.25}
 td.heat small{display:block;font-size:11.5px}
 td.right{background:rgb(var(--right)/calc(var(--v)*@heat@))}
 td.wrong{background:rgb(var(--wrong)/calc(var(--v)*@heat@))}
@@ -111,7 +117,7 @@ footer{border-top:1px solid rgb(var(--rule));padding-top:12px}
  .tiles>div{padding:10px 12px}.tiles dd{font-size:23px}}
 @media print{:root{color-scheme:light;@light@--page:255 255 255}
  *{print-color-adjust:exact;-webkit-print-color-adjust:exact}
- body{font-size:10.5pt}main{max-width:none;padding:0}.scroll{overflow:visible}
+ body{font-size:10.5pt}main{max-width:none;padding:0}.scroll{overflow:visible}.strip>div{min-width:0}
  section{margin-bottom:20px}figure,table,.tiles,.bars{break-inside:avoid}h2,h3{break-after:avoid}
  .grid{--least:200px}@page{margin:15mm}}
 """

@@ -1,0 +1,452 @@
+"""The HTML report: self-contained, well formed, readable, bounded, and telling the truth."""
+
+from __future__ import annotations
+
+import base64
+import re
+import struct
+import zlib
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from pdal_stages import html
+from pdal_stages.accuracy import Accuracy
+from pdal_stages.accuracy_text import percent
+from pdal_stages.errors import StageError
+from pdal_stages.html_style import HEAT, PALETTE
+from pdal_stages.indexed_png import indexed_png
+from pdal_stages.report import _nice, accuracy_page, write_accuracy_report
+from pdal_stages.report_maps import _scene, _section_line
+
+VOID = {"meta", "img", "br"}
+
+
+class Page(HTMLParser):
+    """Parses strictly: every tag is closed in order; keeps tags, attributes and text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict]] = []
+        self.words: list[str] = []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+        self.text = re.sub(r"\s+", " ", " ".join(self.words))
+
+    def handle_starttag(self, tag, attrs):
+        assert len(dict(attrs)) == len(attrs), f"an attribute of <{tag}> stands twice"
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        assert "svg" in self.open
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        assert self.open and self.open[-1] == tag, f"</{tag}> closes <{self.open[-1:]}>"
+        self.open.pop()
+
+    def handle_data(self, data):
+        if not self.open or self.open[-1] != "style":
+            self.words.append(data)
+
+    def all(self, tag):
+        return [attrs for name, attrs in self.tags if name == tag]
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A house, a tree and ground in national-grid coordinates, with mistakes along the house's edge."""
+    rng = np.random.default_rng(5)
+    xy = rng.random((20_000, 2)) * (60, 40)
+    house = (np.abs(xy - (20, 20)) < 8).all(axis=1)
+    tree = np.hypot(*(xy - (45, 25)).T) < 5
+    z = np.where(house, 8.0, np.where(tree, rng.uniform(2, 9, len(xy)), 0.0)) + rng.normal(0, 0.03, len(xy))
+    reference = np.where(house, 6, np.where(tree, 5, 2))
+    reference[:50] = 1
+    predicted = reference.copy()
+    edge = house & (np.abs(xy[:, 1] - 12) < 1)
+    predicted[edge] = 5
+    predicted[60:90] = 1
+    reliability = np.where(predicted == reference, 0.95, 0.55)
+    xyz = np.column_stack([np.add(xy, (770_600, 6_277_500)), z + 50])
+    return xyz, reference, predicted, reliability
+
+
+@pytest.fixture(scope="module")
+def accuracy(scene):
+    _, reference, predicted, reliability = scene
+    return Accuracy.from_labels(
+        reference, predicted, ignore=[1], reliability=reliability, margin=2 * reliability - 1
+    )
+
+
+@pytest.fixture(scope="module")
+def full(scene, accuracy):
+    xyz, reference, predicted, _ = scene
+    return accuracy_page(
+        accuracy,
+        xyz=xyz,
+        reference=reference,
+        predicted=predicted,
+        title="Town <test> & more",
+        subtitle='A "quoted" line',
+        importances={"Planarity_c2": 0.6, "<b>bold</b>": 0.4},
+        settings={"model": {"trees": 100, "spheres": [1, 2]}, "seed": None, "note": "</td>"},
+        date="2024-05-06",
+    )
+
+
+# ---- the page --------------------------------------------------------------------------------------------
+
+
+def test_well_formed_and_self_contained(full):
+    page = Page(full)
+    assert not {"script", "link", "iframe", "object", "base"} & {tag for tag, _ in page.tags}
+    for _, attrs in page.tags:
+        for name in ("src", "href", "data", "srcset", "xlink:href"):
+            assert attrs.get(name, "data:").startswith("data:")
+        assert not any(name.startswith("on") for name in attrs)
+    assert "url(" not in full
+    assert "@import" not in full
+    assert "http" not in full
+    assert full.startswith("<!DOCTYPE html>")
+
+
+def test_nothing_given_becomes_markup(full):
+    page = Page(full)
+    for words in ("Town <test> & more", 'A "quoted" line', "<b>bold</b>", "</td>"):
+        assert words in page.text
+    assert "<test>" not in full
+    assert page.text.count("model.trees") == 1
+    assert "1, 2" in page.text
+
+
+def test_accessible(full):
+    page = Page(full)
+    assert page.all("html")[0]["lang"] == "en"
+    images = page.all("img")
+    assert len(images) == 5  # three maps, two sections
+    assert all(len(i["alt"]) > 20 and int(i["width"]) > 0 for i in images)
+    charts = [s for s in page.all("svg") if s.get("role") == "img"]
+    assert len(charts) == 2
+    assert all("%" in s["aria-label"] for s in charts)
+    assert all(h.get("scope") in ("row", "col", "colgroup") for h in page.all("th"))
+    assert len(page.all("caption")) == len(page.all("table"))
+    assert next(t for t, _ in page.tags if t in ("h1", "h2")) == "h1"
+
+
+def test_every_figure_is_there(full, accuracy):
+    text = Page(full).text
+    for value in (
+        accuracy.overall_accuracy,
+        accuracy.kappa,
+        accuracy.mean_class_recall,
+        accuracy.mean_class_precision,
+        accuracy.mean_f1,
+        accuracy.mean_iou,
+    ):
+        assert percent(value, 1) in text
+    for f in accuracy.per_class:
+        assert f"{f.support:,}" in text
+        for value in (f.recall, f.precision, f.f1, f.iou):
+            assert percent(value, 1) in text
+    for count in accuracy.matrix.ravel():
+        assert f"{count:,}" in text
+    for shares in (accuracy.by_reference, accuracy.by_prediction):
+        for share in shares.ravel():
+            assert f"{100 * share:.1f} %" in text
+    assert "Building taken for High vegetation" in text
+    assert f"{accuracy.left_out_points} points (1 Unclassified: 50)" in text
+    assert "30 points were given a class that is not compared (1 Unclassified)" in text
+    assert "2024-05-06" in text
+    assert "nan" not in text.lower().replace("national", "")
+
+
+def test_same_input_same_page(full, scene, accuracy):
+    xyz, reference, predicted, _ = scene
+    again = accuracy_page(
+        accuracy,
+        xyz=xyz,
+        reference=reference,
+        predicted=predicted,
+        title="Town <test> & more",
+        subtitle='A "quoted" line',
+        importances={"<b>bold</b>": 0.4, "Planarity_c2": 0.6},
+        settings={"model": {"trees": 100, "spheres": [1, 2]}, "seed": None, "note": "</td>"},
+        date="2024-05-06",
+    )
+    assert again == full
+
+
+@pytest.mark.parametrize(
+    "a",
+    [
+        Accuracy.from_labels([6, 6], [6, 6]),  # one class, all right
+        Accuracy.from_labels([2], [6]),  # nothing right
+        Accuracy.from_labels([2, 6], [2, 2], classes=[2, 6, 17], reliability=[1, 0], margin=[1, 0]),
+        Accuracy.from_labels(np.arange(40), np.arange(40)[::-1], names={3: "<i>"}),
+        Accuracy.from_labels([3, 4, 6], [4, 3, 6], merge={5: [3, 4]}),
+    ],
+)
+def test_odd_accuracies_make_a_page(a):
+    page = Page(accuracy_page(a))
+    assert percent(a.overall_accuracy, 1) in page.text
+    assert "nan" not in page.text.lower()
+
+
+def test_date_can_be_reproducible(monkeypatch, accuracy):
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
+    assert "1970-01-02" in accuracy_page(accuracy)
+
+
+# ---- colours ---------------------------------------------------------------------------------------------
+
+
+def luminance(color):
+    c = np.asarray(color) / 255
+    return float(np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4) @ (0.2126, 0.7152, 0.0722))
+
+
+def contrast(a, b):
+    a, b = sorted((luminance(a), luminance(b)))
+    return (b + 0.05) / (a + 0.05)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_text_has_contrast(scheme):
+    p = {name: np.array(c, float) for name, c in PALETTE[scheme].items()}
+    for text in ("ink", "muted"):
+        for ground in ("page", "panel"):
+            assert contrast(p[text], p[ground]) >= 4.5
+    for heat in ("right", "wrong"):
+        cell = HEAT * p[heat] + (1 - HEAT) * p["page"]
+        assert contrast(p["ink"], cell) >= 4.5
+        assert contrast(p[heat], p["page"]) >= 3  # graphics
+
+
+# ---- maps ------------------------------------------------------------------------------------------------
+
+
+def decode(png):
+    """A palette PNG without filters, as RGB (an independent reading of the format)."""
+    assert png[:8] == b"\x89PNG\r\n\x1a\n"
+    at, parts = 8, {}
+    while at < len(png):
+        n, kind = struct.unpack(">I4s", png[at : at + 8])
+        body = png[at + 8 : at + 8 + n]
+        assert struct.unpack(">I", png[at + 8 + n : at + 12 + n])[0] == zlib.crc32(kind + body)
+        parts[kind], at = body, at + 12 + n
+    width, height, depth, color = struct.unpack(">IIBB", parts[b"IHDR"][:10])
+    assert (depth, color) == (8, 3)
+    rows = np.frombuffer(zlib.decompress(parts[b"IDAT"]), np.uint8).reshape(height, width + 1)
+    assert not rows[:, 0].any()
+    return np.frombuffer(parts[b"PLTE"], np.uint8).reshape(-1, 3)[rows[:, 1:]]
+
+
+def test_palette_png_is_exact_for_few_colours():
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (200, 3), dtype=np.uint8)[rng.integers(0, 200, (31, 17))]
+    np.testing.assert_array_equal(decode(indexed_png(image)), image)
+
+
+def test_palette_png_is_close_for_many_colours():
+    image = np.random.default_rng(0).integers(0, 256, (300, 200, 3), dtype=np.uint8)
+    assert np.abs(decode(indexed_png(image)).astype(int) - image).max() <= 32
+    ramp = np.zeros((256, 256, 3), np.uint8)
+    ramp[..., 0] = np.arange(256)
+    ramp[..., 1] = np.arange(256)[:, None] // 64
+    assert np.abs(decode(indexed_png(ramp)).astype(int) - ramp).max() <= 4
+
+
+def test_palette_png_refuses_other_arrays():
+    for image in (np.zeros((2, 2)), np.zeros((2, 2, 3)), np.zeros((0, 2, 3), np.uint8)):
+        with pytest.raises(StageError, match="height x width x 3"):
+            indexed_png(image)
+
+
+def embedded(text):
+    found = re.findall(r'src="data:image/png;base64,([^"]+)"', text)
+    return [decode(base64.b64decode(data, validate=True)) for data in found]
+
+
+def test_error_map_shows_the_errors(full):
+    reference, prediction, errors = embedded(full)[:3]
+    assert reference.shape == prediction.shape == errors.shape
+    red = (errors[..., 0] > 2 * errors[..., 1].astype(int) + 20) & (errors[..., 0] > 100)
+    rows, columns = np.nonzero(red)
+    scale = errors.shape[1] / 60
+    # The wrong strip lies at x 12..28, y 11..13; 30 rejected points lie anywhere.
+    inside = (columns / scale > 11.5) & (columns / scale < 28.5)
+    inside &= (40 - rows / scale > 10.5) & (40 - rows / scale < 13.5)
+    assert inside.mean() > 0.7
+    differs = (reference != prediction).any(axis=2)
+    assert red[differs].mean() > 0.5
+
+
+def test_section_lies_where_the_errors_are(scene, accuracy):
+    xyz, reference, predicted, _ = scene
+    line, depth, chosen = _section_line(_scene(accuracy, xyz, reference, predicted), None)
+    (x0, y0), (x1, y1) = np.subtract(line, (770_600, 6_277_500))
+    assert chosen
+    assert abs(y0 - 12.5) < 1.5
+    assert y0 == y1
+    assert x0 < 14
+    assert x1 > 26
+    assert depth == pytest.approx(8 * np.sqrt(60 * 40 / 20_000), rel=0.01)
+
+
+def test_maps_follow_the_merge():
+    xyz = np.random.default_rng(0).random((500, 3)) * (10, 10, 2)
+    reference = np.repeat([3, 4, 6, 2, 2], 100)
+    predicted = np.where(reference == 3, 4, reference)
+    a = Accuracy.from_labels(reference, predicted, merge={5: [3, 4]})
+    text = Page(accuracy_page(a, xyz=xyz, reference=reference, predicted=predicted)).tags
+    alts = [attrs["alt"] for tag, attrs in text if tag == "img"]
+    assert any("0 of 500 compared points are wrong" in alt for alt in alts)
+    assert any("Classes 3, 4, 5 40.0 %" in alt for alt in alts)
+
+
+def test_the_page_stays_small_with_many_points(accuracy):
+    rng = np.random.default_rng(1)
+    n = 400_000
+    xyz = rng.random((n, 3)) * (500, 500, 20)
+    reference, predicted = rng.choice([2, 5, 6], (2, n))
+    text = accuracy_page(accuracy, xyz=xyz, reference=reference, predicted=predicted)
+    assert len(text) < 6_000_000  # noise, the worst case for compression
+    assert "of the" in Page(text).text
+    assert "The maps show 400,000 of the 19,950 compared points" in Page(text).text
+
+
+@pytest.mark.parametrize(
+    ("xyz", "maps"),
+    [
+        ([[1.0, 2.0, 3.0]], 0),
+        ([[1.0, 2.0, 3.0]] * 5, 0),
+        ([[0.0, 0.0, 0.0], [10.0, 0.0, 1.0], [20.0, 0.0, 2.0]], 0),  # in a line
+        ([[0.0, 0.0, 0.0], [5.0, 10.0, 1.0]], 3),
+        ([[0.0, 0.0, 0.0], [0.001, 0.0, 500.0], [0.0, 0.001, 900.0]], 3),  # a spike
+        ([[0.0, 0.0, 0.0], [300.0, 0.0, 0.0], [0.0, 10.0, 0.0]], 3),  # a strip
+        ([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [0.0, 300.0, 0.0]], 3),
+    ],
+)
+def test_degenerate_clouds(xyz, maps):
+    reference = np.full(len(xyz), 2)
+    predicted = reference.copy()
+    predicted[-1] = 6
+    a = Accuracy.from_labels(reference, predicted)
+    page = Page(accuracy_page(a, xyz=xyz, reference=reference, predicted=predicted))
+    assert len([i for i in page.all("img") if i["alt"].startswith("Map")]) == maps
+    assert ("No map: " in page.text) == (maps == 0)
+
+
+def test_stray_heights_do_not_flatten_the_section(scene, accuracy):
+    xyz, reference, predicted, _ = scene
+    strayed = xyz.copy()
+    wrong = np.flatnonzero((reference == 6) & (predicted == 5))
+    strayed[wrong[0], 2] += 5000
+    text = accuracy_page(accuracy, xyz=strayed, reference=reference, predicted=predicted)
+    assert "1 points far above or below the others are not drawn" in Page(text).text
+    assert embedded(text)[3].shape[0] < 800
+
+
+def test_a_section_of_ones_own(scene, accuracy):
+    xyz, reference, predicted, _ = scene
+    given = ((770_610.0, 6_277_520.0), (770_650.0, 6_277_525.0))
+    text = accuracy_page(accuracy, xyz=xyz, reference=reference, predicted=predicted, section=given)
+    assert "from 770610, 6277520 to 770650, 6277525" in Page(text).text
+    assert "errors are densest" not in text
+    for bad, message in (
+        (((0.0, 0.0), (1.0, 1.0)), "holds no points"),
+        (((770_610.0, 6_277_520.0),) * 2, "two different ends"),
+    ):
+        with pytest.raises(StageError, match=message):
+            accuracy_page(accuracy, xyz=xyz, reference=reference, predicted=predicted, section=bad)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"xyz": np.zeros((2, 3))}, "no reference and no predicted"),
+        ({"xyz": np.zeros((2, 2)), "reference": [2, 2], "predicted": [2, 2]}, "n x 3"),
+        ({"xyz": np.zeros((0, 3)), "reference": [], "predicted": []}, "nothing to draw"),
+        ({"xyz": np.zeros((2, 3)), "reference": [2], "predicted": [2]}, "another length"),
+        ({"xyz": [[0, 0, np.nan], [1, 1, 1]], "reference": [2, 2], "predicted": [2, 2]}, "1 of 2 points"),
+    ],
+)
+def test_misuse_is_told(accuracy, arguments, message):
+    with pytest.raises(StageError, match=message):
+        accuracy_page(accuracy, **arguments)
+
+
+# ---- writing ---------------------------------------------------------------------------------------------
+
+
+def test_written_whole(tmp_path, accuracy):
+    path = write_accuracy_report(tmp_path / "report.html", accuracy, title="Über alles")
+    assert "Über alles" in path.read_text(encoding="utf-8")
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_or_not_at_all(tmp_path, accuracy):
+    path = tmp_path / "report.html"
+    path.write_text("before")
+    with pytest.raises(StageError):
+        write_accuracy_report(path, accuracy, xyz=np.zeros((1, 2)), reference=[2], predicted=[2])
+    assert path.read_text() == "before"
+    with pytest.raises(StageError, match=r"cannot write the report .*No such file.*folder that exists"):
+        write_accuracy_report(tmp_path / "nowhere" / "report.html", accuracy)
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    with pytest.raises(StageError, match="cannot write the report"):
+        html.write_whole(folder, "text")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["folder", "report.html"]
+
+
+# ---- pieces ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("most", [0.0, 0.0001, 0.004, 0.05, 0.31, 0.5, 1.0])
+def test_axis_holds_its_values(most):
+    top, ticks = _nice(most)
+    assert top >= most
+    assert 2 <= len(ticks) <= 6
+    assert ticks[-1][0] == pytest.approx(top)
+
+
+def test_pieces_escape_what_they_are_given():
+    nasty = "<x>\"'&"
+    text = html.page(
+        nasty,
+        html.section(nasty, html.paragraph(nasty), note=nasty),
+        html.tiles([(nasty, nasty, nasty, nasty)]),
+        html.legend([((1, 2, 3), nasty)]),
+        html.table(
+            [nasty], [html.head(nasty, "row") + html.cell(nasty)], nasty, nasty, foot=html.cell(nasty)
+        ),
+        html.settings({nasty: {nasty: [nasty]}}),
+        html.bars({nasty: 0.5}),
+        html.figure(html.image(b"", nasty), nasty, nasty),
+        html.strip("", label=nasty),
+        html.details(nasty, ""),
+        html.chart(
+            alt=nasty,
+            x_label=nasty,
+            y_label=nasty,
+            x_ticks=[(0, nasty)],
+            y_ticks=[(0, nasty)],
+            bars=[(0, 1, 1, "bad", nasty)],
+            dots=[(0, 0, nasty)],
+            values=[(0, 0, nasty)],
+            lines=[([(0, 0), (1, 1)], "line")],
+        ),
+        subtitle=nasty,
+        footer=nasty,
+    )
+    page = Page(text)
+    assert "x" not in {tag for tag, _ in page.tags}
+    assert page.text.count(nasty) >= 20
