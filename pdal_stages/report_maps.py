@@ -17,7 +17,7 @@ from .errors import StageError
 from .indexed_png import indexed_png
 from .labels import as_codes, same_length
 
-#: Most pixels across a map and in all of it, fewest across, and pixels across a section.
+#: Most pixels across a map and in all of it, fewest along its longer side, and pixels across a section.
 MAP_WIDTH, MAP_PIXELS, MAP_LEAST = 820, 800_000, 240
 SECTION_WIDTH = 1400
 #: Length and depth of a section in typical distances of neighboring points.
@@ -153,7 +153,8 @@ def _width(xyz: npt.NDArray[np.float64]) -> int:
     wide, tall = np.ptp(xyz[:, :2], axis=0)
     fine = 3 * wide / math.sqrt(wide * tall / len(xyz))
     most = math.sqrt(MAP_PIXELS * wide / tall)
-    width = max(16, min(max(fine, MAP_LEAST), MAP_WIDTH, most))
+    least = MAP_LEAST * min(1.0, wide / tall)
+    width = max(16, min(max(fine, least), MAP_WIDTH, most))
     # A picture is made narrower where it would be more than 2.5 times as tall: undo that.
     return math.ceil(max(width, width * tall / wide / 2.5))
 
