@@ -17,7 +17,7 @@ def classify_pipeline(source: str, target: str, model: str, *, where: str | None
     from .classifier import load_model
 
     loaded = load_model(model)
-    stages: list[dict[str, Any]] = [{"filename": source, "tag": "input"}]
+    stages: list[dict[str, Any]] = [_reader(source, "input")]
     if "HeightAboveGround" in loaded.required_dimensions:
         stages.append({"type": "filters.hag_minima"})
     classifier: dict[str, Any] = {"type": "filters.modelclassifier", "model": model}
@@ -34,7 +34,7 @@ def train_pipeline(sources: Iterable[str], model: str, **options: Any) -> list[d
 
     writer = {"type": ClassifierModel.type, "filename": model, **options}
     parsed = ClassifierModel.parse({k: v for k, v in writer.items() if k != "type"})
-    stages: list[dict[str, Any]] = [{"filename": str(name), "tag": f"input{i}"} for i, name in enumerate(sources, 1)]
+    stages: list[dict[str, Any]] = [_reader(name, f"input{i}") for i, name in enumerate(sources, 1)]
     if "HeightAboveGround" in ClassifierModel.reads(parsed):
         stages.append({"type": "filters.hag_minima"})
     stages.append(writer)
@@ -44,7 +44,7 @@ def train_pipeline(sources: Iterable[str], model: str, **options: Any) -> list[d
 def accuracy_pipeline(source: str, dimension: str, reference: str, **outputs: str) -> list[dict[str, Any]]:
     """Read, compare two dimensions."""
     return [
-        {"filename": source, "tag": "input"},
+        _reader(source, "input"),
         {"type": "filters.accuracy", "dimension": dimension, "reference": reference, **outputs},
     ]
 
@@ -71,7 +71,7 @@ def attach_reference(
 
     both = []
     for name in (source, reference):
-        pipeline = Pipeline([{"filename": name, "tag": "input"}])
+        pipeline = Pipeline([_reader(name, "input")])
         pipeline.execute()
         both.append(np.concatenate(pipeline.arrays) if pipeline.arrays else np.empty(0))
     mine, true = both
@@ -98,6 +98,14 @@ def attach_reference(
     arrays = {name: np.ascontiguousarray(mine[name]) for name in mine.dtype.names}
     arrays["Classification"], arrays["Reference"] = mine[dimension], true[reference_dimension]
     AccuracyStage.run(Points(arrays, options={**options, "horizontal_unit": "m"}), options)
+
+
+def _reader(source: str, tag: str) -> dict[str, Any]:
+    """A reader; of LAS 1.0-1.3 it takes the extra dimensions too, which PDAL leaves out unless told."""
+    stage: dict[str, Any] = {"filename": str(source), "tag": tag}
+    if Path(source).suffix.lower() in (".las", ".laz") and not str(source).lower().endswith(".copc.laz"):
+        stage.update({"type": "readers.las", "use_eb_vlr": True})
+    return stage
 
 
 def _writer(target: str) -> dict[str, Any]:

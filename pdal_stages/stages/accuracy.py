@@ -26,7 +26,7 @@ class AccuracyStage(Stage):
         Option("dimension", "string", "Classification", "The classes to judge"),
         Option("reference", "string", "Reference", "The true classes, e.g. kept with filters.ferry"),
         Option("classes", "list", (), "Reference codes to compare; default: every one found"),
-        Option("ignore", "list", (0, 1), "Reference codes left out (and counted)"),
+        Option("ignore", "list", (0, 1), "Reference codes left out (and counted)", may_be_empty=True),
         Option("merge", "mapping", None, 'Classes taken as one on both sides: {"5": [3, 4]}'),
         Option("json", "filename", None, "Write the figures to this JSON file"),
         Option("html", "filename", None, "Write a report with maps to this HTML file"),

@@ -38,6 +38,7 @@ class ClassifierModel(Stage):
             "list",
             ("HeightAboveGround",),
             "Dimensions of the points used as features too (Intensity, ReturnNumber, NumberOfReturns, ReturnRatio)",
+            may_be_empty=True,
         ),
         Option(
             "classes",

@@ -46,6 +46,7 @@ class HagMinima(Stage):
             "list",
             NOISE,
             "Class codes that do not form the terrain (they still receive heights), e.g. noise below ground",
+            may_be_empty=True,
         ),
     )
     example = {"type": "filters.hag_minima", "cell": 20, "resolution": 0.5}

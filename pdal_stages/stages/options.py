@@ -51,6 +51,8 @@ class Option:
         The values allowed.
     unit : str
         Shown beside the default.
+    may_be_empty : bool
+        Whether an empty list means "none".
     """
 
     name: str
@@ -63,6 +65,7 @@ class Option:
     choices: tuple = ()
     unit: str = ""
     required: bool = False
+    may_be_empty: bool = False
 
     def schema(self) -> dict:
         """The option's JSON Schema."""
@@ -143,7 +146,7 @@ class Option:
             isinstance(v, str | int | float) and not isinstance(v, bool) for v in value
         ):
             raise self._wrong(value)
-        if not value and self.default:
+        if not value and self.default and not self.may_be_empty:
             raise OptionError(
                 f"option '{self.name}' is an empty list",
                 cure="Name at least one, or leave the option out for the default "

@@ -156,11 +156,14 @@ class Points:
         """New class codes for `Classification`, with the flag bits of each point kept."""
         if not self.legacy_flags:
             return codes
+        flags = np.asarray(self.arrays["Classification"], np.uint8) & ~np.uint8(LEGACY_LIMIT)
+        if not flags.any():
+            return codes
         if codes.size and codes.max() > LEGACY_LIMIT:
             raise StageError(
-                f"class codes above {LEGACY_LIMIT} do not fit these points, read from LAS 1.0-1.3",
-                found=int(codes.max()),
+                f"class codes above {LEGACY_LIMIT} do not fit these points: read from LAS 1.0-1.3, some carry "
+                "synthetic, key-point or withheld flags in the same byte",
+                found=f"code {int(codes.max())}, {np.count_nonzero(flags):,} flagged points",
                 cure="Convert the input to LAS 1.4 first (minor_version 4, dataformat_id 6)",
             )
-        flags = np.asarray(self.arrays["Classification"], np.uint8) & ~np.uint8(LEGACY_LIMIT)
         return codes | flags

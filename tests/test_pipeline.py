@@ -1,0 +1,457 @@
+"""Pipelines through PDAL itself: three doors, chaining, and the traps of filters.python."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+
+import laspy
+import numpy as np
+import pytest
+
+import pdal_stages as ps
+from pdal_stages.errors import DimensionError, OptionError, PipelineError
+from pdal_stages.terrain import hag_minima
+
+pytestmark = pytest.mark.pdal
+
+UTM = (
+    'PROJCS["WGS 84 / UTM zone 32N",GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],'
+    'PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433]],PROJECTION["Transverse_Mercator"],'
+    'PARAMETER["latitude_of_origin",0],PARAMETER["central_meridian",9],PARAMETER["scale_factor",0.9996],'
+    'PARAMETER["false_easting",500000],PARAMETER["false_northing",0],UNIT["metre",1]]'
+)
+
+
+def scene(n=3000, seed=0, size=59.9):
+    """Ground with boxes on it: X, Y, Z, Classification and some LAS dimensions."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0, size, (2, n)).round(2)
+    block = ((x // 10 + y // 10) % 3 == 0) & (x % 10 > 3) & (y % 10 > 3)
+    z = (0.02 * x + np.where(block, 6.0, rng.normal(0, 0.03, n))).round(2)
+    return {
+        "X": x + 500_000,
+        "Y": y + 5_400_000,
+        "Z": z + 100,
+        "Classification": np.where(block, 6, 2).astype(np.uint8),
+        "Intensity": rng.integers(0, 65535, n).astype(np.uint16),
+        "GpsTime": rng.uniform(0, 1e6, n),
+        "Red": rng.integers(0, 65535, n).astype(np.uint16),
+        "UserData": rng.integers(0, 255, n).astype(np.uint8),
+        "PointSourceId": rng.integers(0, 99, n).astype(np.uint16),
+    }
+
+
+@pytest.fixture()
+def cloud(tmp_path, write_las):
+    return write_las(tmp_path / "in.laz", scene(), point_format=3)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory, write_las):
+    """A small model of ground and building, trained through PDAL."""
+    folder = tmp_path_factory.mktemp("model")
+    source = write_las(folder / "train.las", scene(seed=9), point_format=3)
+    path = folder / "small.model"
+    ps.run_pipeline(
+        [
+            str(source),
+            {"type": "filters.hag_minima"},
+            {
+                "type": "writers.classifiermodel",
+                "filename": str(path),
+                "neighborhoods": "c1,s2",
+                "feature_set": "covariance,geometric",
+                "count": 300,
+                "trees": 10,
+            },
+        ]
+    )
+    return path
+
+
+def read(path):
+    return laspy.read(path)
+
+
+# ---- the three doors -------------------------------------------------------------------------------------
+
+
+def expected_heights(path):
+    las = read(path)
+    return hag_minima(np.asarray(las.x), np.asarray(las.y), np.asarray(las.z))
+
+
+def test_door_1_pipeline_json(cloud, tmp_path):
+    job = tmp_path / "job.json"
+    out = tmp_path / "out.las"
+    job.write_text(
+        json.dumps([str(cloud), {"type": "filters.hag_minima", "tag": "h"}, {"type": "writers.las", "filename": str(out), "extra_dims": "all", "forward": "all"}])
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", "pdal_stages.cli", "pipeline", str(job), "--metadata", str(tmp_path / "m.json")],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert np.allclose(read(out)["HeightAboveGround"], expected_heights(cloud))
+    metadata = json.loads((tmp_path / "m.json").read_text())["metadata"]
+    assert metadata["filters.hag_minima"]["cells"] == 9
+    assert metadata["readers.las"]["count"] == 3000
+
+
+def test_door_1_expanded_runs_in_stock_pdal(cloud, tmp_path, pdal_program):
+    out = tmp_path / "out.las"
+    pipeline = ps.Pipeline([str(cloud), {"type": "filters.hag_minima"}, {"type": "writers.las", "filename": str(out), "extra_dims": "all"}])
+    (tmp_path / "plain.json").write_text(pipeline.json)
+    assert "pdal_stages.runtime" in pipeline.json
+    done = subprocess.run([pdal_program, "pipeline", str(tmp_path / "plain.json")], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert np.allclose(read(out)["HeightAboveGround"], expected_heights(cloud))
+
+
+def test_door_2_python_objects(cloud, pdal_module, model):
+    pipeline = (
+        pdal_module.Reader.las(str(cloud))
+        | ps.Filter.hag_minima(cell=20, tag="h")
+        | ps.Filter.modelclassifier(model=str(model), margin=True)
+    )
+    assert pipeline.execute() == 3000
+    array = pipeline.arrays[0]
+    assert np.allclose(array["HeightAboveGround"], expected_heights(cloud))
+    right = np.mean(array["Classification"] == scene()["Classification"])
+    assert right > 0.95
+    assert array["Margin"].max() <= 1.0
+    with pytest.raises(OptionError, match="Did you mean 'cell'"):
+        ps.Filter.hag_minima(cel=20)
+
+
+def test_door_3_filters_python_by_hand(cloud, pdal_module):
+    source = "from pdal_stages.runtime import run_stage\ndef f(ins, outs):\n    return run_stage(globals(), ins, outs)\n"
+    stages = [
+        str(cloud),
+        {
+            "type": "filters.python",
+            "module": "by_hand",
+            "function": "f",
+            "source": source,
+            "pdalargs": {"stage": "filters.hag_minima", "options": {"cell": 10}},
+            "add_dimension": "HeightAboveGround=double",
+        },
+    ]
+    pipeline = pdal_module.Pipeline(json.dumps(stages))
+    assert pipeline.execute() == 3000
+    assert pipeline.arrays[0]["HeightAboveGround"].max() > 5
+
+
+# ---- what must survive -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("point_format,suffix", [(0, ".las"), (1, ".laz"), (3, ".las"), (6, ".laz"), (7, ".las")])
+def test_everything_else_comes_out_unchanged(tmp_path, write_las, model, point_format, suffix):
+    arrays = scene()
+    if point_format in (0, 1, 6):
+        arrays.pop("Red")
+    if point_format == 0:
+        arrays.pop("GpsTime")
+    arrays["Mine"] = np.arange(3000, dtype=np.int32)
+    source = write_las(tmp_path / f"in{suffix}", arrays, point_format=point_format, wkt=UTM if point_format >= 6 else None)
+    out = tmp_path / f"out{suffix}"
+    ps.run_pipeline(
+        [
+            {"type": "readers.las", "filename": str(source), "use_eb_vlr": True},
+            {"type": "filters.hag_minima"},
+            {"type": "filters.modelclassifier", "model": str(model)},
+            {"type": "writers.las", "filename": str(out), "forward": "all", "extra_dims": "all"},
+        ]
+    )
+    before, after = read(source), read(out)
+    assert after.header.version == before.header.version
+    assert after.header.point_format.id == before.header.point_format.id
+    assert np.array_equal(after.header.scales, before.header.scales)
+    assert np.array_equal(after.header.offsets, before.header.offsets)
+    for name in before.point_format.dimension_names:
+        if name != "classification":
+            assert np.array_equal(np.asarray(after[name]), np.asarray(before[name])), name
+    if point_format >= 6:
+        assert "UTM zone 32N" in str(after.header.vlrs.get("WktCoordinateSystemVlr")[0].string)
+    assert set(np.unique(after.classification)) <= {2, 6}
+    assert np.mean(after.classification == before.classification) > 0.95
+    assert {"HeightAboveGround", "Reliability"} <= set(after.point_format.dimension_names)
+
+
+def test_legacy_flag_bits_stay(tmp_path, write_las, model):
+    arrays = scene()
+    rng = np.random.default_rng(5)
+    for name in ("Synthetic", "KeyPoint", "Withheld"):
+        arrays[name] = rng.integers(0, 2, 3000).astype(np.uint8)
+    source = write_las(tmp_path / "in.las", arrays, point_format=3)
+    out = tmp_path / "out.las"
+    pipeline = ps.run_pipeline(
+        [
+            str(source),
+            {"type": "filters.ferry", "dimensions": "Classification=>Reference"},
+            {"type": "filters.hag_minima"},
+            {"type": "filters.modelclassifier", "model": str(model)},
+            {"type": "filters.accuracy", "print": False},
+            {"type": "writers.las", "filename": str(out), "forward": "all"},
+        ]
+    )
+    before, after = read(source), read(out)
+    for name in ("synthetic", "key_point", "withheld"):
+        assert np.array_equal(np.asarray(after[name]), np.asarray(before[name])), name
+    assert set(np.unique(after.classification)) <= {2, 6}
+    assert pipeline.metadata["metadata"]["filters.accuracy"]["overall_accuracy"] > 0.95
+
+
+# ---- class codes that do not fit -------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def wide_model(tmp_path_factory, write_las):
+    folder = tmp_path_factory.mktemp("wide")
+    source = write_las(folder / "train.las", scene(seed=3), point_format=3)
+    path = folder / "wide.model"
+    ps.run_pipeline(
+        [
+            str(source),
+            {"type": "writers.classifiermodel", "filename": str(path), "neighborhoods": "c1", "dimensions": [], "feature_set": "geometric", "classes": {"2": 2, "6": "64 Shed"}, "count": 100, "trees": 5},
+        ]
+    )
+    return path
+
+
+def test_codes_above_31_need_las_14(cloud, tmp_path, wide_model):
+    out = tmp_path / "out.las"
+    stages = [str(cloud), {"type": "filters.modelclassifier", "model": str(wide_model)}]
+    with pytest.raises(OptionError, match=r"above 31.*\"minor_version\": 4.*\"dataformat_id\": 6"):
+        ps.Pipeline([*stages, {"type": "writers.las", "filename": str(out), "forward": "all"}])
+    ps.run_pipeline([*stages, {"type": "writers.las", "filename": str(out), "minor_version": 4, "dataformat_id": 7}])
+    assert set(np.unique(read(out).classification)) == {2, 64}
+
+
+def test_codes_above_31_in_laz_14(cloud, tmp_path, wide_model):
+    from pdal_stages import pdal_env
+
+    out = tmp_path / "out.laz"
+    stages = [
+        str(cloud),
+        {"type": "filters.modelclassifier", "model": str(wide_model)},
+        {"type": "writers.las", "filename": str(out), "minor_version": 4, "dataformat_id": 6},
+    ]
+    if pdal_env.writes_extended_classes_to_laz():
+        ps.run_pipeline(stages)
+        assert set(np.unique(read(out).classification)) == {2, 64}
+    else:
+        with pytest.raises(OptionError, match="LAZ 1.4"):
+            ps.Pipeline(stages)
+
+
+# ---- views, merging, empty views -------------------------------------------------------------------------
+
+
+def test_points_of_two_readers_see_each_other(tmp_path, write_las):
+    arrays = scene()
+    west = arrays["X"] < 500_030
+    files = [
+        write_las(tmp_path / f"{i}.las", {k: v[m] for k, v in arrays.items()}, point_format=3)
+        for i, m in enumerate((west, ~west))
+    ]
+    both = ps.Pipeline([*map(str, files), {"type": "filters.hag_minima"}])
+    assert [s["type"] for s in both.lowered.stages[2:]] == ["filters.merge", "filters.python"]
+    assert both.execute() == 3000
+    order = np.concatenate([np.flatnonzero(west), np.flatnonzero(~west)])
+    whole = hag_minima(arrays["X"], arrays["Y"], arrays["Z"])[order]
+    assert np.allclose(both.arrays[0]["HeightAboveGround"], whole, atol=1e-6)
+
+
+def test_merging_keeps_inputs_and_tags(tmp_path, write_las):
+    files = [write_las(tmp_path / f"{i}.las", scene(seed=i), point_format=3) for i in range(2)]
+    stages = [
+        {"type": "readers.las", "filename": str(files[0]), "tag": "a"},
+        {"type": "readers.las", "filename": str(files[1]), "tag": "b"},
+        {"type": "filters.hag_minima", "inputs": ["a", "b"], "tag": "h"},
+        {"type": "filters.range", "limits": "HeightAboveGround[3:]", "inputs": "h"},
+    ]
+    pipeline = ps.Pipeline(stages)
+    assert 0 < pipeline.execute() < 6000
+    one = ps.Pipeline([stages[0], {"type": "filters.hag_minima", "inputs": ["a"]}])
+    assert "filters.merge" not in [s["type"] for s in one.lowered.stages]
+
+
+def test_split_views_stay_apart(cloud, tmp_path):
+    pipeline = ps.run_pipeline(
+        [
+            str(cloud),
+            {"type": "filters.splitter", "length": 30, "origin_x": 500000, "origin_y": 5400000},
+            {"type": "filters.hag_minima"},
+            {"type": "writers.las", "filename": str(tmp_path / "tile_#.las")},
+        ]
+    )
+    assert len(list(tmp_path.glob("tile_*.las"))) == 4
+    assert len(pipeline.reports[0][1]) == 4
+    assert not list(tmp_path.glob(".*partial*"))
+
+
+def test_an_empty_view_is_no_error(cloud, tmp_path, model):
+    pipeline = ps.run_pipeline(
+        [
+            str(cloud),
+            {"type": "filters.range", "limits": "Z[9000:]"},
+            {"type": "filters.hag_minima"},
+            {"type": "filters.multiscalefeatures", "neighborhoods": "c1"},
+            {"type": "filters.modelclassifier", "model": str(model)},
+            {"type": "writers.las", "filename": str(tmp_path / "none.las")},
+        ]
+    )
+    assert sum(len(a) for a in pipeline.arrays) == 0
+
+
+def test_where_leaves_the_others_alone(cloud, model):
+    stages = [str(cloud), {"type": "filters.hag_minima"}]
+    everything = ps.run_pipeline([*stages, {"type": "filters.modelclassifier", "model": str(model)}]).arrays[0]
+    part = ps.run_pipeline(
+        [
+            *stages,
+            {"type": "filters.assign", "assignment": "Classification[:]=9"},
+            {"type": "filters.modelclassifier", "model": str(model), "where": "X < 500030 && Z > 0"},
+        ]
+    ).arrays[0]
+    inside = part["X"] < 500_030
+    assert np.array_equal(part["Classification"][inside], everything["Classification"][inside])
+    assert (part["Classification"][~inside] == 9).all()
+    assert np.array_equal(part["Reliability"][inside], everything["Reliability"][inside])
+
+
+def test_rejection_is_counted(cloud, model):
+    pipeline = ps.run_pipeline(
+        [
+            str(cloud),
+            {"type": "filters.hag_minima"},
+            {"type": "filters.modelclassifier", "model": str(model), "reject_below": 0.99, "rejected_code": 1, "probabilities": True},
+        ]
+    )
+    array = pipeline.arrays[0]
+    low = array["Reliability"] < 0.99
+    assert (array["Classification"][low] == 1).all()
+    assert pipeline.metadata["metadata"]["filters.modelclassifier"]["rejected"] == np.count_nonzero(low) > 0
+    assert np.allclose(array["Probability_2"] + array["Probability_6"], 1, atol=1e-5)
+
+
+# ---- units -----------------------------------------------------------------------------------------------
+
+
+def test_feet_are_converted(tmp_path, write_las):
+    foot = 0.3048
+    metres = scene()
+    feet = {**metres, **{n: metres[n] / foot for n in "XYZ"}}
+    wkt = UTM.replace('UNIT["metre",1]', 'UNIT["foot",0.3048]')
+    a = write_las(tmp_path / "m.las", metres, point_format=7, wkt=UTM, scale=1e-4)
+    b = write_las(tmp_path / "f.las", feet, point_format=7, wkt=wkt, scale=1e-4)
+    stages = [{"type": "filters.hag_minima"}, {"type": "filters.multiscalefeatures", "neighborhoods": "c2,s2", "feature_set": "Density,HeightRange"}]
+    in_metres = ps.run_pipeline([str(a), *stages]).arrays[0]
+    in_feet = ps.run_pipeline([str(b), *stages]).arrays[0]
+    near = np.abs(in_feet["HeightAboveGround"] * foot - in_metres["HeightAboveGround"]) < 0.01
+    assert near.mean() > 0.99  # points on cell edges may fall on the other side
+    assert np.mean(np.isclose(in_feet["Density_c2"], in_metres["Density_c2"], rtol=1e-3)) > 0.97
+
+
+@pytest.mark.data
+def test_the_real_tile_in_feet(data_dir):
+    pipeline = ps.run_pipeline([str(data_dir / "units" / "autzen_feet.las"), {"type": "filters.hag_minima"}])
+    array = pipeline.arrays[0]
+    foot = 0.3048
+    expected = hag_minima(array["X"] * foot, array["Y"] * foot, array["Z"] * foot) / foot
+    assert np.allclose(array["HeightAboveGround"], expected, atol=1e-9)
+    ground = array["HeightAboveGround"][array["Classification"] == 2]
+    assert np.abs(np.median(ground)) < 3.0  # feet
+
+
+def test_degrees_are_refused(tmp_path, write_las):
+    wkt = UTM[UTM.index("GEOGCS") : UTM.index(",PROJECTION")]
+    arrays = {**scene(50), "X": np.linspace(9, 9.001, 50), "Y": np.linspace(48, 48.001, 50)}
+    source = write_las(tmp_path / "deg.las", arrays, point_format=7, wkt=wkt, scale=1e-7)
+    with pytest.raises(ps.StageError, match=r"degrees.*filters\.reprojection"):
+        ps.run_pipeline([str(source), {"type": "filters.hag_minima"}])
+
+
+# ---- errors ----------------------------------------------------------------------------------------------
+
+
+def test_a_missing_dimension_names_the_stage_that_makes_it(cloud, tmp_path, model):
+    out = tmp_path / "out.laz"
+    out.write_bytes(b"older result")
+    with pytest.raises(DimensionError, match=r"filters\.modelclassifier \(tag 'c'\).*HeightAboveGround.*filters\.hag_minima"):
+        ps.run_pipeline([str(cloud), {"type": "filters.modelclassifier", "model": str(model), "tag": "c"}, str(out)])
+    assert out.read_bytes() == b"older result"
+    assert not list(tmp_path.glob(".*partial*"))
+
+
+def test_stdout_is_given_back_when_a_stage_raises(cloud, model, pdal_module):
+    before = sys.stdout
+    with pytest.raises(ps.StageError):
+        ps.run_pipeline([str(cloud), {"type": "filters.modelclassifier", "model": str(model)}])
+    assert sys.stdout is before
+    pipeline = pdal_module.Reader.las(str(cloud)) | ps.Filter.modelclassifier(model=str(model))
+    with pytest.raises(RuntimeError, match="HeightAboveGround"):
+        pipeline.execute()
+    assert sys.stdout is before
+
+
+def test_python_exits_cleanly_after_a_stage_error(cloud, model):
+    script = (
+        "import pdal_stages as ps\n"
+        f"try: ps.run_pipeline([{str(cloud)!r}, {{'type': 'filters.modelclassifier', 'model': {str(model)!r}}}])\n"
+        "except ps.StageError as error: print('refused:', error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("refused:")
+
+
+def test_pdal_errors_come_through(tmp_path, cloud):
+    with pytest.raises(PipelineError, match="nowhere"):
+        ps.run_pipeline([str(tmp_path / "nowhere.laz"), {"type": "filters.hag_minima"}])
+    with pytest.raises(PipelineError, match=r"filters\.nosuch"):
+        ps.run_pipeline([str(cloud), {"type": "filters.nosuch"}])
+
+
+def test_validate_reads_no_points(tmp_path, cloud):
+    good = ps.Pipeline([str(cloud), {"type": "filters.hag_minima"}, str(tmp_path / "o.laz")])
+    good.validate()
+    assert not (tmp_path / "o.laz").exists()
+    with pytest.raises(PipelineError, match="nonsense"):
+        ps.Pipeline([{"type": "readers.las", "filename": str(cloud), "nonsense": 1}, {"type": "filters.hag_minima"}]).validate()
+
+
+def test_too_many_features_for_one_las_record(cloud, tmp_path):
+    writer = {"type": "writers.las", "filename": str(tmp_path / "o.las"), "minor_version": 4, "extra_dims": "all"}
+    with pytest.raises(DimensionError, match="extra dimensions"):
+        ps.Pipeline([str(cloud), {"type": "filters.multiscalefeatures", "neighborhoods": "blomley2016,s1,s2", "feature_set": "all"}, writer])
+
+
+# ---- threads ---------------------------------------------------------------------------------------------
+
+
+def test_pipelines_run_in_threads(cloud):
+    results: dict[int, np.ndarray] = {}
+
+    def work(number):
+        pipeline = ps.run_pipeline([str(cloud), {"type": "filters.hag_minima"}, {"type": "filters.multiscalefeatures", "neighborhoods": "c1,s2"}])
+        results[number] = pipeline.arrays[0]["Linearity_s2"]
+
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(4)]
+    for t in threads:
+        t.start()
+    for t in threads:
+        t.join()
+    assert len(results) == 4
+    assert all(np.array_equal(results[0], r) for r in results.values())
+
+
+def test_labels_are_unique(cloud):
+    stages = [str(cloud), {"type": "filters.hag_minima"}, {"type": "filters.hag_minima", "cell": 10}]
+    labels = [o.label for _ in range(3) for o in ps.Pipeline(stages).lowered.ours]
+    assert len(set(labels)) == 6
