@@ -97,7 +97,10 @@ def merging(mapping: Mapping[Any, Any] | None) -> tuple[npt.NDArray[np.int64], d
         # An ASPRS target keeps its own points (3, 4 -> 5); a user's own code is a new class.
         members = sorted(sources_of | ({target} if target in NAMES and to[target] == target else set()))
         if len(members) > 1:
-            called[target] = "Classes " + ", ".join(map(str, members))
+            words = {class_name(code).split()[-1] for code in members}
+            # Low, medium and high vegetation are vegetation; others have no word in common.
+            common = len(words) == 1 and all(code in NAMES for code in members)
+            called[target] = words.pop().capitalize() if common else f"Classes {', '.join(map(str, members))}"
     return to, called
 
 

@@ -161,9 +161,8 @@ def _headline(a: Accuracy) -> str:
             "they count as errors."
         )
     if a.merged:
-        notes.append(
-            "Taken as one class: " + ", ".join(f"{c} as {t}" for c, t in sorted(a.merged.items())) + "."
-        )
+        pairs = ", ".join(f"{c} as {t}" for c, t in sorted(a.merged.items()))
+        notes.append(f"Classes merged before comparing: {pairs}.")
     return html.section(
         "Summary",
         html.tiles(figures),
@@ -177,24 +176,24 @@ def _label(a: Accuracy, code: int) -> str:
 
 
 def _classes(a: Accuracy) -> str:
-    header = ["Class", "Reference points", "Predicted points", "Recall %", "Precision %", "F1 %", "IoU %"]
+    header = ["Class", "Recall %", "Precision %", "F1 %", "IoU %", "Reference points", "Predicted points"]
     rows = []
     for f in a.per_class:
         rows.append(
             html.head(_label(a, f.code), "row", "text", html.swatch(class_color(f.code)))
+            + "".join(html.bar_cell(v, percent(v, 1)) for v in (f.recall, f.precision, f.f1, f.iou))
             + html.cell(f"{f.support:,}")
             + html.cell(f"{f.predicted:,}")
-            + "".join(html.bar_cell(v, percent(v, 1)) for v in (f.recall, f.precision, f.f1, f.iou))
         )
     absent = [f for f in a.per_class if not f.support]
     mean = (
         html.head("Mean" + (" of the classes present" if absent else ""), "row", "text")
-        + html.cell("")
-        + html.cell("")
         + "".join(
             html.bar_cell(v, percent(v, 1))
             for v in (a.mean_class_recall, a.mean_class_precision, a.mean_f1, a.mean_iou)
         )
+        + html.cell(f"{a.points:,} in all")
+        + html.cell("")
     )
     return html.section(
         "Classes",

@@ -283,7 +283,8 @@ def test_one_class_only():
 def test_merged_classes_get_a_name_that_says_so():
     a = Accuracy.from_labels([3, 4, 5, 6], [4, 5, 3, 6], merge={3: 5, 4: 5})
     assert a.overall_accuracy == 1
-    assert a.name(5) == "Classes 3, 4, 5"
+    assert a.name(5) == "Vegetation"
+    assert a.merge({2: [6]}).name(2) == "Classes 2, 6"
     assert a.name(6) == "Building"
     assert a.to_dict()["merged"] == {"3": 5, "4": 5}
     assert "Merged                3 as 5, 4 as 5" in a.table()

@@ -308,7 +308,7 @@ def test_maps_follow_the_merge():
     text = Page(accuracy_page(a, xyz=xyz, reference=reference, predicted=predicted)).tags
     alts = [attrs["alt"] for tag, attrs in text if tag == "img"]
     assert any("0 of 500 compared points are wrong" in alt for alt in alts)
-    assert any("Classes 3, 4, 5 40.0 %" in alt for alt in alts)
+    assert any("Vegetation 40.0 %" in alt for alt in alts)
 
 
 def test_the_page_stays_small_with_many_points(accuracy):
