@@ -48,7 +48,7 @@ def assert_whole_pulses(town: Town) -> None:
     assert np.array_equal(town.return_number, position + 1)
     assert np.array_equal(town.number_of_returns, np.repeat(counts, counts))
     assert counts.max() <= 5
-    for name in ("point_source_id", "scan_angle", "edge_of_flight_line", "scan_direction"):
+    for name in ("point_source_id", "scan_angle", "edge_of_flight_line"):
         column = getattr(town, name)
         assert np.array_equal(column, np.repeat(column[starts], counts)), name
     later = np.flatnonzero(town.return_number > 1)
@@ -112,7 +112,6 @@ def test_extent_and_columns(town):
     assert np.abs(town.scan_angle).max() <= o.scan_angle
     assert set(np.unique(town.point_source_id)) == {1, 2}
     assert (np.diff(town.gps_time) >= 0).all()
-    assert set(np.unique(town.scan_direction)) == {0, 1}
     assert 0 < town.edge_of_flight_line.mean() < 0.02
     assert np.abs(town.scan_angle[town.edge_of_flight_line]).min() > 0.98 * o.scan_angle
 
@@ -355,7 +354,7 @@ def test_file_reads_back(tmp_path, minor, fmt):
     assert np.array_equal(np.round(las.xyz, 3), t.xyz)
     for name in ("classification", "intensity", "return_number", "number_of_returns", "point_source_id"):
         assert np.array_equal(np.asarray(las[name]), getattr(t, name)), name
-    assert np.array_equal(np.asarray(las["scan_direction_flag"]), t.scan_direction)
+    assert not np.asarray(las["scan_direction_flag"]).any()
     assert np.array_equal(las["TrueHeight"], t.height_above_ground)
     assert counts == {
         int(c): int(n) for c, n in zip(*np.unique(t.classification, return_counts=True), strict=True)

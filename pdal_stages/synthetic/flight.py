@@ -90,8 +90,6 @@ class Flight:
             GPS time in seconds; scan angle in degrees, positive to the right of the flight.
         edge : (n,) bool
             Last pulse of its scan line.
-        right : (n,) bool
-            The mirror moved to the right.
         """
         line = np.repeat(np.arange(chunk.first, chunk.last), self.per_line)
         step = np.tile(np.arange(self.per_line), chunk.last - chunk.first)
@@ -102,9 +100,8 @@ class Flight:
             keep = mixed % np.uint64(every) == 0
             line, step = line[keep], step[keep]
         ids = (chunk.strip * self.lines + line) * self.per_line + step
-        right = line % 2 == 0  # the mirror swings to the right and back
-        angle = -self.half_angle + (step + 0.5) * (2 * self.half_angle / self.per_line)
-        angle = np.where(right, angle, -angle)
+        # A turning polygon: every line runs from right to left.
+        angle = self.half_angle - (step + 0.5) * (2 * self.half_angle / self.per_line)
         when = line * self.line_time + step * (self.line_time / self.per_line)
         # The aircraft rolls, pitches and drifts a little.
         phase = 1.7 * chunk.strip
@@ -137,5 +134,4 @@ class Flight:
             time[near],
             np.degrees(angle[near]),
             step[near] == self.per_line - 1,
-            right[near],
         )

@@ -70,7 +70,7 @@ def _record(header: Any, town: Town, dataformat_id: int, true_height: bool) -> A
     record["number_of_returns"] = town.number_of_returns
     record["point_source_id"] = town.point_source_id
     record["edge_of_flight_line"] = town.edge_of_flight_line.astype(np.uint8)
-    record["scan_direction_flag"] = town.scan_direction
+    record["scan_direction_flag"] = np.zeros(len(town), dtype=np.uint8)  # right to left
     if dataformat_id >= 6:
         record["scan_angle"] = np.round(town.scan_angle / 0.006).astype(np.int16)
     else:

@@ -20,7 +20,7 @@ def broadleaf(parts: Parts, plan: Plan, rng: np.random.Generator, x, y, height, 
     z = plan.height(x, y)
     radius = height * rng.uniform(0.28, 0.4)
     bole = height * rng.uniform(0.18, 0.3)
-    k = rng.uniform(0.35, 0.6) if extinction is None else extinction
+    k = rng.uniform(0.5, 0.9) if extinction is None else extinction
     _trunk(parts, x, y, z, z + 0.6 * height, 0.08 + 0.012 * height)
     middle, half = 0.5 * (bole + height), 0.5 * (height - bole)
     parts.ellipsoid(x, y, z + middle, 0.7 * radius, 0.7 * radius, half, VEGETATION, "leaf", k)
@@ -69,7 +69,7 @@ def column(parts: Parts, plan: Plan, rng: np.random.Generator, x, y, height) -> 
 
 def sparse(parts: Parts, plan: Plan, rng: np.random.Generator, x, y, height) -> None:
     """A birch or a tree in poor leaf: most of the beam passes."""
-    broadleaf(parts, plan, rng, x, y, height, extinction=rng.uniform(0.1, 0.2))
+    broadleaf(parts, plan, rng, x, y, height, extinction=rng.uniform(0.15, 0.3))
 
 
 def shrub(parts: Parts, plan: Plan, rng: np.random.Generator, x, y, height) -> None:

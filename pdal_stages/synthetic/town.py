@@ -97,9 +97,7 @@ class Town:
     scan_angle : (n,) float32
         Degrees, positive to the right of the flight.
     edge_of_flight_line : (n,) bool
-        Last pulse of its scan line.
-    scan_direction : (n,) uint8
-        1 where the mirror moved to the right.
+        Last pulse of its scan line (lines run from right to left).
     height_above_ground : (n,) float32
         True height above the bare ground (water: above its surface).
     material : (n,) uint8
@@ -116,7 +114,6 @@ class Town:
     point_source_id: np.ndarray
     scan_angle: np.ndarray
     edge_of_flight_line: np.ndarray
-    scan_direction: np.ndarray
     height_above_ground: np.ndarray
     material: np.ndarray
     options: TownOptions = field(default_factory=TownOptions)
@@ -199,7 +196,7 @@ class _Survey:
     def cast_lines(self, flight: Flight, chunk: Chunk, every: int = 1) -> dict:
         """Returns of some scan lines of a strip, local metres."""
         o = self.options
-        origin, direction, ids, time, angle, edge, right = flight.fire(chunk, every)
+        origin, direction, ids, time, angle, edge = flight.fire(chunk, every)
         n = len(origin)
         xyz = np.empty((n * MAX_RETURNS, 3))
         byte = np.empty((n * MAX_RETURNS, 6), dtype=np.uint8)
@@ -235,7 +232,6 @@ class _Survey:
             "time": time[pulse],
             "angle": angle[pulse],
             "edge": edge[pulse],
-            "right": right[pulse],
             "aimed": aimed,
         }
 
@@ -254,7 +250,6 @@ class _Survey:
             point_source_id=np.full(len(byte), chunk.strip + 1, dtype=np.uint16),
             scan_angle=got["angle"].astype(np.float32),
             edge_of_flight_line=got["edge"],
-            scan_direction=got["right"].astype(np.uint8),
             height_above_ground=got["height"].astype(np.float32),
             material=byte[:, 3].copy(),
             options=self.options,
