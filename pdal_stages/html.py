@@ -9,13 +9,9 @@ from __future__ import annotations
 
 import base64
 import html
-import os
-import uuid
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-from .errors import StageError
 from .html_style import style_sheet
 
 
@@ -50,9 +46,9 @@ def paragraph(text: str, kind: str = "") -> str:
     return f'<p class="{kind}">{escape(text)}</p>' if kind else f"<p>{escape(text)}</p>"
 
 
-def grid(*parts: str, least: int = 300) -> str:
-    """Markup side by side, in columns of at least `least` pixels."""
-    return f'<div class="grid" style="--least:{int(least)}px">{"".join(parts)}</div>'
+def grid(*parts: str, least: int = 300, kind: str = "") -> str:
+    """Markup side by side, in columns of at least `least` pixels; `kind` "row" stays a row in print."""
+    return f'<div class="{f"grid {kind}".strip()}" style="--least:{int(least)}px">{"".join(parts)}</div>'
 
 
 def strip(*parts: str, label: str) -> str:
@@ -269,31 +265,3 @@ def chart(
 def details(summary: str, content: str) -> str:
     """Markup that is folded away under a summary."""
     return f"<details><summary>{escape(summary)}</summary>{content}</details>"
-
-
-# ---- writing ---------------------------------------------------------------------------------------------
-
-
-def write_whole(path: str | os.PathLike[str], text: str) -> Path:
-    """Write a text file whole or not at all: beside, then renamed.
-
-    Raises
-    ------
-    StageError
-        Where the folder is missing or cannot be written; an existing file is then as it was.
-    """
-    target = Path(path)
-    temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex}.tmp")
-    try:
-        with open(temporary, "x", encoding="utf-8", newline="\n") as out:
-            out.write(text)
-        os.replace(temporary, target)
-    except OSError as error:
-        raise StageError(
-            f"cannot write the report '{target}'",
-            found=error.strerror or str(error),
-            cure="Name a file in a folder that exists and can be written",
-        ) from error
-    finally:
-        temporary.unlink(missing_ok=True)
-    return target

@@ -50,9 +50,9 @@ p{margin:0 0 12px;max-width:78ch}
 .note{margin-bottom:12px}
 .lead{font-size:17px}
 ul.plain{list-style:none;margin:0;padding:0}
-.tiles{display:grid;grid-template-columns:repeat(auto-fit,minmax(150px,1fr));gap:1px;margin:0 0 16px;
- background:rgb(var(--rule));border:1px solid rgb(var(--rule))}
-.tiles>div{background:rgb(var(--panel));padding:12px 16px;display:flex;flex-direction:column}
+.tiles{display:grid;grid-template-columns:repeat(auto-fit,minmax(150px,1fr));gap:1px;margin:1px 1px 17px}
+.tiles>div{box-shadow:0 0 0 1px rgb(var(--rule));
+ background:rgb(var(--panel));padding:12px 16px;display:flex;flex-direction:column}
 .tiles dt{order:2;color:rgb(var(--muted));font-size:13.5px}
 .tiles dd{margin:0;font-size:27px;line-height:1.2;font-weight:600;font-variant-numeric:tabular-nums}
 .tiles dd small{font-size:15px;font-weight:400;color:rgb(var(--muted))}
@@ -118,8 +118,10 @@ footer{border-top:1px solid rgb(var(--rule));padding-top:12px}
 @media print{:root{color-scheme:light;@light@--page:255 255 255}
  *{print-color-adjust:exact;-webkit-print-color-adjust:exact}
  body{font-size:10.5pt}main{max-width:none;padding:0}.scroll{overflow:visible}.strip>div{min-width:0}
- section{margin-bottom:20px}figure,table,.tiles,.bars{break-inside:avoid}h2,h3{break-after:avoid}
- .grid{--least:200px}@page{margin:15mm}}
+ section{margin-bottom:20px}figure,table,.tiles,.bars{break-inside:avoid}h2,h2+.note,h3{break-after:avoid}
+ .grid.row{grid-template-columns:repeat(auto-fit,minmax(0,1fr));grid-auto-flow:column}
+ .tiles{grid-template-columns:repeat(6,1fr)}.tiles>div{padding:8px 10px}.tiles dd{font-size:19px}
+ @page{margin:15mm}}
 """
 
 

@@ -15,6 +15,7 @@ from . import html
 from .accuracy import Accuracy
 from .accuracy_text import percent
 from .asprs import class_color
+from .files import write_whole
 from .grading import Grading
 
 #: Errors listed by name.
@@ -87,7 +88,8 @@ def write_accuracy_report(
         section=section,
         date=date,
     )
-    return html.write_whole(path, text)
+    write_whole(path, text.encode())
+    return Path(path)
 
 
 def accuracy_page(
@@ -285,7 +287,7 @@ def _confidence(a: Accuracy) -> str:
         return ""
     return html.section(
         "Confidence",
-        html.grid(*(f"<div>{figure}</div>" for figure in figures), least=340),
+        html.grid(*(f"<div>{figure}</div>" for figure in figures), least=340, kind="row"),
         note="How far the classifier's own figures tell where it is wrong.",
     )
 

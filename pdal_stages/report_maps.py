@@ -142,7 +142,11 @@ def _maps(a: Accuracy, s: Scene, unit: str, line: Line | None) -> str:
     )
     if line is not None:
         note += " The line marks the vertical section below."
-    parts = [html.legend(keys), html.legend(verdict), html.grid(*figures, least=_least(wide / tall))]
+    parts = [
+        html.legend(keys),
+        html.legend(verdict),
+        html.grid(*figures, least=_least(wide / tall), kind="row" if wide < 1.7 * tall else ""),
+    ]
     if n != a.points:
         parts.append(html.paragraph(f"The maps show {n:,} of the {a.points:,} compared points.", "note"))
     return html.section("Maps", *parts, note=note)
