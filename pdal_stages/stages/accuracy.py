@@ -17,6 +17,10 @@ from .options import Option
 from .points import Points
 
 
+#: Options that the report lists.
+_SHOWN = ("dimension", "reference", "classes", "ignore", "merge", "where")
+
+
 class AccuracyStage(Stage):
     type = "filters.accuracy"
     summary = "Compare a class dimension with a reference dimension; report as table, JSON and HTML"
@@ -26,7 +30,13 @@ class AccuracyStage(Stage):
         Option("dimension", "string", "Classification", "The classes to judge"),
         Option("reference", "string", "Reference", "The true classes, e.g. kept with filters.ferry"),
         Option("classes", "list", (), "Reference codes to compare; default: every one found"),
-        Option("ignore", "list", (0, 1), "Reference codes left out (and counted)", may_be_empty=True),
+        Option(
+            "ignore",
+            "list",
+            (0, 1),
+            "Reference codes left out (and counted); where 'classes' is given, only those left out by it",
+            may_be_empty=True,
+        ),
         Option("merge", "mapping", None, 'Classes taken as one on both sides: {"5": [3, 4]}'),
         Option("json", "filename", None, "Write the figures to this JSON file"),
         Option("html", "filename", None, "Write a report with maps to this HTML file"),
@@ -61,6 +71,8 @@ class AccuracyStage(Stage):
             raise StageError(
                 "there are no points to compare", cure="Check the reader's file and the filters before this stage"
             )
+        classes = [_number(c) for c in options["classes"]]
+        ignore = [] if classes else [_number(c) for c in options["ignore"]]
         inside = slice(None) if points.mask is None else points.mask
         reference = points.codes_of(options["reference"])[inside]
         predicted = points.codes_of(options["dimension"])[inside]
@@ -72,8 +84,8 @@ class AccuracyStage(Stage):
         accuracy = Accuracy.from_labels(
             reference,
             predicted,
-            classes=[_number(c) for c in options["classes"]] or None,
-            ignore=[_number(c) for c in options["ignore"]],
+            classes=classes or None,
+            ignore=ignore,
             merge=options["merge"],
             reliability=graded.get("reliability"),
             margin=graded.get("margin"),
@@ -103,7 +115,7 @@ def _report(points, inside, reference, predicted, accuracy: Accuracy, options: d
     from ..report import write_accuracy_report
 
     importances = None
-    settings: dict[str, Any] = {k: v for k, v in options.items() if k in ("dimension", "reference", "classes", "ignore")}
+    settings: dict[str, Any] = {k: v for k, v in options.items() if k in _SHOWN}
     if options["model"]:
         from ..classifier import load_model
 

@@ -1,0 +1,132 @@
+"""Every file in pipelines/, run through PDAL on the generated town."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+
+from pdal_stages.overrides import parse_overrides
+from pdal_stages.pipeline import Pipeline
+from pdal_stages.synthetic import TownOptions, write_town
+
+pytestmark = pytest.mark.pdal
+FOLDER = Path(__file__).resolve().parent.parent / "pipelines"
+FILES = sorted(FOLDER.glob("*.json"))
+#: Smaller than the files say, so that the tests stay quick; the stages are the same.
+QUICK = ["--stage.model.neighborhoods=c2,s2", "--stage.model.count=300", "--stage.model.trees=10"]
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory):
+    path = tmp_path_factory.mktemp("town") / "town.laz"
+    write_town(TownOptions(size=60, density=5, seed=3), path)
+    return path
+
+
+def run(name, *words):
+    overrides, rest = parse_overrides(words)
+    assert not rest
+    pipeline = Pipeline(FOLDER / f"{name}.json", overrides)
+    pipeline.execute()
+    return pipeline
+
+
+@pytest.fixture(scope="module")
+def models(town, tmp_path_factory):
+    """The models that other pipelines apply, trained by the training pipelines."""
+    folder = tmp_path_factory.mktemp("models")
+    for name, file in (("train", "classes"), ("train-binary", "buildings"), ("train-on-smrf-ground", "smrf")):
+        run(name, f"--stage.input.filename={town}", f"--stage.model.filename={folder / file}.model", *QUICK)
+    return folder
+
+
+def test_none_is_forgotten():
+    tested = {
+        "normalise", "features", "features-for-viewers", "train", "train-binary", "classify", "classify-with-rejection",
+        "evaluate", "train-on-smrf-ground", "classify-on-smrf-ground", "tiles-to-tiles",
+    }  # fmt: skip
+    assert {f.stem for f in FILES} == tested
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
+def test_names_say_what_they_are(path):
+    stages = json.loads(path.read_text())
+    assert isinstance(stages, list)
+    assert all("tag" in s for s in stages)
+
+
+def test_normalise(town, tmp_path):
+    out = tmp_path / "o.laz"
+    run("normalise", f"--stage.input.filename={town}", f"--stage.output.filename={out}")
+    las = laspy.read(out)
+    ground = np.asarray(las["HeightAboveGround"])[np.asarray(las.classification) == 2]
+    assert np.median(np.abs(ground)) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "dimension"), [("features", "Linearity_kopt"), ("features-for-viewers", "Verticality_s2")]
+)
+def test_features(town, tmp_path, name, dimension):
+    out = tmp_path / "o.laz"
+    run(name, f"--stage.input.filename={town}", f"--stage.output.filename={out}")
+    values = np.asarray(laspy.read(out)[dimension])
+    assert np.isfinite(values).all()
+    assert 0 <= values.min() < values.max() <= 1
+
+
+def test_training_gives_models(models):
+    from pdal_stages.classifier import load_model
+
+    assert {2, 5, 6} <= {code for code, _ in load_model(models / "classes.model").classes}
+    assert [code for code, _ in load_model(models / "buildings.model").classes] == [1, 6]
+
+
+@pytest.mark.parametrize("name", ["classify", "classify-with-rejection", "classify-on-smrf-ground"])
+def test_classify(town, models, tmp_path, name):
+    out = tmp_path / "o.laz"
+    model = models / ("smrf.model" if "smrf" in name else "classes.model")
+    run(name, f"--stage.input.filename={town}", f"--stage.classifier.model={model}", f"--stage.output.filename={out}")
+    before, after = laspy.read(town), laspy.read(out)
+    sure = np.isin(before.classification, [2, 5, 6]) & (np.asarray(after["Reliability"]) > 0.5)
+    assert np.mean(np.asarray(after.classification)[sure] == np.asarray(before.classification)[sure]) > 0.85
+    if name == "classify-with-rejection":
+        low = np.asarray(after["Reliability"]) < 0.5
+        assert (np.asarray(after.classification)[low] == 1).all()
+        assert {"Margin", "Probability_2"} <= set(after.point_format.dimension_names)
+
+
+def test_evaluate(town, models, tmp_path):
+    pipeline = run(
+        "evaluate",
+        f"--stage.input.filename={town}",
+        f"--stage.classifier.model={models / 'classes.model'}",
+        f"--stage.output.filename={tmp_path / 'o.laz'}",
+        f"--stage.accuracy.json={tmp_path / 'a.json'}",
+        f"--stage.accuracy.html={tmp_path / 'a.html'}",
+    )
+    figures = json.loads((tmp_path / "a.json").read_text())
+    shown = pipeline.metadata["metadata"]["filters.accuracy"]["overall_accuracy"]
+    assert 0.8 < shown <= 1
+    assert str(round(shown, 6))[:6] in json.dumps(figures)
+    assert "<html" in (tmp_path / "a.html").read_text()
+
+
+def test_tiles_to_tiles(town, models, tmp_path):
+    for half, limits in (("west", "X[:500030]"), ("east", "X(500030:]")):
+        Pipeline(
+            [str(town), {"type": "filters.range", "limits": limits}, {"type": "writers.las", "filename": str(tmp_path / f"{half}.laz")}]
+        ).execute()
+    run(
+        "tiles-to-tiles",
+        f"--stage.input.filename={tmp_path}/*.laz",
+        f"--stage.classifier.model={models / 'classes.model'}",
+        f"--stage.output.filename={tmp_path}/classified_#.laz",
+        "--stage.tiles.length=40",
+    )
+    parts = [laspy.read(p) for p in sorted(tmp_path.glob("classified_*.laz"))]
+    assert len(parts) >= 4
+    assert sum(len(p) for p in parts) == len(laspy.read(town))
