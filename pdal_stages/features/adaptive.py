@@ -14,7 +14,7 @@ from ..parallel import map_blocks
 from .bins import ShapeBins
 from .index import Grid
 from .jit import CompilationNote, njit
-from .kdtree import build_tree
+from .kdtree import KdTree, build_tree
 from .moments import BATCH, MOMENTS, finish
 from .names import MOMENT_FEATURES, SHAPE_FEATURES
 from .optimal import kopt_block
@@ -69,12 +69,14 @@ class AdaptiveNeighborhoods:
 
     def __init__(self, grid: Grid, plan: FeaturePlan, threads: int | None = None) -> None:
         self.grid, self.halo = grid, plan.halo
-        self.specs = [_spec(c) for c in plan.layout if c.at and c.neighborhood.kind not in ("cylinder", "sphere")]
+        fixed = ("cylinder", "sphere")
+        self.specs = [_spec(c) for c in plan.layout if c.at and c.neighborhood.kind not in fixed]
         self.tokens = [spec.token for spec in self.specs]
         self.needs_copt = any(spec.kind == "copt" for spec in self.specs)
         self.query_ns = sum(NS_QUERY[s.kind] * _load(s) + NS_SHAPES * s.shaped for s in self.specs)
-        self.scratch_bytes = 2_000_000 + int(500 * max((s.parameters[-1] for s in self.specs if s.parameters), default=0))
-        self._tree = None
+        largest = max((s.parameters[-1] for s in self.specs if s.parameters), default=0.0)
+        self.scratch_bytes = 2_000_000 + int(500 * largest)
+        self._tree: KdTree | None = None
         if len(grid):
             with CompilationNote():
                 self._tree = build_tree(grid.x, grid.y, grid.z, lambda f, b: list(map_blocks(f, b, threads)))
@@ -100,7 +102,8 @@ class AdaptiveNeighborhoods:
 
         def compute(start: int) -> None:
             part = slice(start, start + CHUNK)
-            curvature_block(self._tree, grid.x[part], grid.y[part], grid.z[part], no_shapes(), curvatures[part])
+            x, y, z = grid.x[part], grid.y[part], grid.z[part]
+            curvature_block(self._tree, x, y, z, no_shapes(), curvatures[part])
 
         for _ in map_blocks(compute, range(0, len(grid), CHUNK), threads):
             pass

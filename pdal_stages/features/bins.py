@@ -1,4 +1,4 @@
-"""Thresholds of the shape distributions' bins, fitted so that sample neighborhoods fill them evenly [B16 3.2.2]."""
+"""Thresholds of the shape distributions' bins, which sample neighborhoods fill evenly [B16 3.2.2]."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ _CURE = "Fit the thresholds again, or take them from the model file as it was wr
 class ShapeBins:
     """Bins of A3 (radians) and D1, D2, D3, D4 (metres) for each neighborhood.
 
-    Bin i holds the values with ``threshold[i - 1] < value <= threshold[i]``; the first and the last bin are open.
+    Bin i holds the values with ``threshold[i - 1] < value <= threshold[i]``; the first and the last bin are
+    open.
 
     Parameters
     ----------
@@ -42,8 +43,8 @@ class ShapeBins:
     def fit(cls, values: Mapping[str, np.ndarray]) -> ShapeBins:
         """Thresholds at the 10 %, 20 %, ... 90 % quantiles of sample values.
 
-        A threshold is one of the values, so values that often repeat (areas of 0 on a line) make equal thresholds
-        and empty bins, and nothing else does.
+        A threshold is one of the values, so values that often repeat (areas of 0 on a line) make equal
+        thresholds and empty bins, and nothing else does.
 
         Parameters
         ----------
@@ -55,6 +56,7 @@ class ShapeBins:
         result = {}
         for token, sample in values.items():
             rows = np.zeros((len(METRICS), INNER))
+            rows[0] = -1.0  # an angle of 0
             for m in range(len(METRICS)):
                 column = np.asarray(sample)[:, m, :].ravel()
                 column = np.sort(column[np.isfinite(column)]).astype(np.float64)
@@ -132,7 +134,8 @@ def _checked(token: str, rows: Any) -> np.ndarray:
         array = np.zeros(0)
     if array.shape != (len(METRICS), INNER):
         raise OptionError(
-            f"the shape thresholds of '{token}' must be {INNER} numbers for each of {', '.join(METRICS)}", cure=_CURE
+            f"the shape thresholds of '{token}' must be {INNER} numbers for each of {', '.join(METRICS)}",
+            cure=_CURE,
         )
     for name, row in zip(METRICS, array, strict=True):
         top = math.pi if name == "A3" else math.inf
@@ -150,7 +153,9 @@ def _to_units(rows: np.ndarray) -> np.ndarray:
     """Comparable values (see ``shapes``) as radians and metres."""
     a3, d1, d2, d3, d4 = rows
     cosine = -np.sign(a3) * np.sqrt(np.abs(a3))
-    return np.array([np.arccos(np.clip(cosine, -1, 1)), np.sqrt(d1), np.sqrt(d2), (d3 / 4) ** 0.25, np.cbrt(d4 / 6)])
+    return np.array(
+        [np.arccos(np.clip(cosine, -1, 1)), np.sqrt(d1), np.sqrt(d2), (d3 / 4) ** 0.25, np.cbrt(d4 / 6)]
+    )
 
 
 def _to_comparable(rows: np.ndarray) -> np.ndarray:

@@ -2,11 +2,11 @@
 
 A grid suits an airborne cloud, but not a facade (thousands of points over one cell), a mobile scan, a stray
 point at 1e9 m or ten million copies of one point. This tree does: every node halves its points along
-the longest side of their bounding box, so it has the same depth everywhere. Only a permutation (4 bytes a point)
-and the boxes of the nodes are stored (about 6 bytes a point).
+the longest side of their bounding box, so it has the same depth everywhere. Only a permutation (4 bytes a
+point) and the boxes of the nodes are stored (about 6 bytes a point).
 
-Searches are made for *groups* of nearby queries: one traversal gathers every point within reach of the group's
-bounding box into a flat scratch, which all queries of the group then scan with vector instructions.
+Searches are made for *groups* of nearby queries: one traversal gathers every point within reach of the
+group's bounding box into a flat scratch, which all queries of the group then scan with vector instructions.
 
 Which points are gathered never depends on rounding: a box is skipped only if the distance computed to it is
 larger than the reach, and computed distances are monotone in the coordinates.

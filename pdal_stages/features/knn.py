@@ -7,10 +7,9 @@ points, nor the tile, nor the grouping changes it. Points with equal coordinates
 
 A block of queries is halved along its longest side until at most ``GROUP`` lie together. For a
 group, all candidates within a reach (guessed from the group before) are gathered once; for each query
-squared distances and their bins are computed with vector instructions, and a counting sort by bins (in the plane
-the squared distance is uniformly distributed, so bins fill evenly) followed by an insertion sort gives
-the order. A query with too few candidates inside the reach is repeated with a reach that
-certainly suffices.
+squared distances and their bins are computed with vector instructions, and a counting sort by bins (in the
+plane the squared distance is uniformly distributed, so bins fill evenly) followed by an insertion sort gives
+the order. A query with too few candidates inside the reach is repeated with a reach that certainly suffices.
 """
 
 from __future__ import annotations
@@ -258,7 +257,7 @@ class Rows(NamedTuple):
 
     found: np.ndarray  # (GROUP,) int64: how many
     d2: np.ndarray  # (GROUP, need) float64: squared distances
-    index: np.ndarray  # (GROUP, need) uint32: positions in the cloud
+    at: np.ndarray  # (GROUP, need) uint32: positions in the cloud
 
 
 class Search(NamedTuple):
@@ -356,7 +355,8 @@ def _search_group(tree, search, lo, hi, need, cap2, reach2, scratch, rows):
     while pending > 0:
         reach2 = min(reach2, most2)
         final = reach2 >= most2
-        c = gather(tree, box, reach2, need, limit, scratch.stack, scratch.cx, scratch.cy, scratch.cz, scratch.ci)
+        cx, cy, cz = scratch.cx, scratch.cy, scratch.cz
+        c = gather(tree, box, reach2, need, limit, scratch.stack, cx, cy, cz, scratch.ci)
         if c < 0:
             if count > 1:
                 return 0, reach2 if pending < count else 0.25 * reach2, scratch
@@ -391,7 +391,7 @@ def _search_group(tree, search, lo, hi, need, cap2, reach2, scratch, rows):
             pending -= 1
             for i in range(found):
                 rows.d2[r, i] = scratch.d[i]
-                rows.index[r, i] = scratch.ci[scratch.pos[i]]
+                rows.at[r, i] = scratch.ci[scratch.pos[i]]
             if found > 0:
                 kth2 = max(kth2, scratch.d[found - 1])
         if pending > 0:
@@ -431,5 +431,5 @@ def nearest_block(tree, qx, qy, qz, need, cap2, index, d2, found):
             r = min(j - lo, count - 1)
             found[q] = rows.found[r]
             for i in range(rows.found[r]):
-                index[q, i] = rows.index[r, i]
+                index[q, i] = rows.at[r, i]
                 d2[q, i] = rows.d2[r, i]

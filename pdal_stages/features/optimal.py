@@ -5,13 +5,13 @@ Weinmann et al. 2015, whose structure tensor sums from 0 to k. Members are added
 and the moments kept after each, so all k of a range cost one pass.
 
 Which candidate wins is decided in two steps. A vectorised closed form estimates all entropies to 1e-7; those
-within ``MARGIN`` of the lowest are computed again by the exact method of the features. Entropies that then lie
-within ``TIE`` of each other count as equal, and the smallest neighborhood wins: in a perfect plane or line
-rounding noise would decide otherwise.
+within ``MARGIN`` of the lowest are computed again by the exact method of the features. Entropies that then
+lie within ``TIE`` of each other count as equal, and the smallest neighborhood wins: in a perfect plane or
+line rounding noise would decide otherwise.
 
-A candidate needs ``LEAST`` members that do not all coincide. Where no candidate qualifies (a lone point, copies of
-one point, a cloud of two points), the largest neighborhood is taken; its eigen-features then say "no structure".
-A cloud with fewer points than k_min + 1 gives the neighborhood of all its points.
+A candidate needs ``LEAST`` members that do not all coincide. Where no candidate qualifies (a lone point,
+copies of one point, a cloud of two points), the largest neighborhood is taken; its eigen-features then say
+"no structure". A cloud with fewer points than k_min + 1 gives the neighborhood of all its points.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Sums(NamedTuple):
 
 
 class Members(NamedTuple):
-    """The members of the largest neighborhood of one query, nearest first: offsets from the query, and heights."""
+    """Members of the largest neighborhood of a query, nearest first: offsets from the query, and heights."""
 
     x: np.ndarray
     y: np.ndarray
@@ -78,7 +78,11 @@ def make_sums(count):
 @njit
 def make_members(room):
     return Members(
-        np.empty(room), np.empty(room), np.empty(room), np.empty(room, np.int64), np.empty((room, 4), np.float32)
+        np.empty(room),
+        np.empty(room),
+        np.empty(room),
+        np.empty(room, np.int64),
+        np.empty((room, 4), np.float32),
     )
 
 
@@ -88,8 +92,8 @@ def estimate_entropy(xx, xy, xz, yy, yz, zz, noise):
 
     ``NEVER`` where the trace is not above `noise`.
 
-    With unit trace, the eigenvalues are 1/3 + 2 p cos(phi + 2 pi i / 3), cos(3 phi) = r. For r >= 0 the squared
-    sine of phi is (1 - r) times a smooth function of r, here a polynomial of degree 8 (fitted at
+    With unit trace, the eigenvalues are 1/3 + 2 p cos(phi + 2 pi i / 3), cos(3 phi) = r. For r >= 0 the
+    squared sine of phi is (1 - r) times a smooth function of r, here a polynomial of degree 8 (fitted at
     Chebyshev nodes, error 7e-10); r < 0 is its mirror image.
     """
     trace = xx + yy + zz
@@ -307,7 +311,7 @@ def kopt_into(tree, qx, qy, qz, target, k_min, k_max, cap2, table, radius, reach
             if found == 0:  # a query that is no point of the cloud, farther than the bound from all
                 write_nothing(table, radius, shapes, q)
                 continue
-            take_members(tree, rows.index[row], found, qx[q], qy[q], qz[q], members)
+            take_members(tree, rows.at[row], found, qx[q], qy[q], qz[q], members)
             running_sums(members.x, members.y, members.z, found, s)
             best = lowest_entropy(s, min(k_min, found - 1), found)
             write_moments(s, best, members, best + 1, table, q)

@@ -1,12 +1,12 @@
 """``ropt`` and ``copt``: radii chosen point by point [H17].
 
-``ropt`` takes the radius with the lowest eigenentropy. ``copt`` first looks at the curvature (surface variation)
-of the sphere of 1 m round the point: where it is at least c_t the point is *scattered* and takes the best k of
-10..50 within 3 m, otherwise it is *regular* and takes the best radius of 0.5..2 m. The threshold c_t follows from
-the curvatures of the whole cloud.
+``ropt`` takes the radius with the lowest eigenentropy. ``copt`` first looks at the curvature (surface
+variation) of the sphere of 1 m round the point: where it is at least c_t the point is *scattered* and takes
+the best k of 10..50 within 3 m, otherwise it is *regular* and takes the best radius of 0.5..2 m. The
+threshold c_t follows from the curvatures of the whole cloud.
 
-A radius is a candidate where it holds at least ``optimal.LEAST`` points that do not all coincide; where no radius
-does, the largest is taken. Radii that hold the same points are equal, and the smallest wins.
+A radius is a candidate where it holds at least ``optimal.LEAST`` points that do not all coincide; where no
+radius does, the largest is taken. Radii that hold the same points are equal, and the smallest wins.
 
 The tree must be built over a cloud in canonical order (``index.Grid``): sums run over the members in the
 order of their shell, then of the cloud.
@@ -66,9 +66,9 @@ def radii_of(first: float, last: float, step: float) -> np.ndarray:
 def curvature_threshold(curvatures: np.ndarray) -> float:
     """The curvature from which on a point is scattered [H17 eq. 1-3].
 
-    Two means, started at the smallest and the largest value, give the centres cur1 and cur2 of two groups of n1
-    and n2 = n - n1 values; c_t = cur1 + (cur2 - cur1) n2 / n. Where all values are equal that is the value, and
-    all points are scattered, which needs no radius to hold enough points.
+    Two means, started at the smallest and the largest value, give the centres cur1 and cur2 of two groups of
+    n1 and n2 = n - n1 values; c_t = cur1 + (cur2 - cur1) n2 / n. Where all values are equal that is the
+    value, and all points are scattered, which needs no radius to hold enough points.
 
     Parameters
     ----------

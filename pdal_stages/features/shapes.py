@@ -11,17 +11,16 @@ D4   cube root of the volume of the tetrahedron a b c d  metres
 ==== =================================================== ===================
 
 Each metric's distribution is what separate pulls would give; only the metrics of one neighborhood share
-their chance, for a third of the memory traffic. Where members run out (n < 4) the first drawn ones take the empty
-places: c, d = a, b for two members, d = a for three, so areas or volumes are 0, as they are.
-The angle is 0 where b or c coincides with a.
+their chance, for a third of the memory traffic. Where members run out (n < 4) the first drawn ones take the
+empty places: c, d = a, b for two members, d = a for three, so areas or volumes are 0, as they are. The angle
+is 0 where b or c coincides with a.
 
 **No order matters.** Pull i of a neighborhood draws from a counter-based hash of (seed, the query's float64
-coordinates, the neighborhood's token, i) and members come in a canonical order, so counts have the same bits for any
-order of points, tile or number of threads.
+coordinates, the neighborhood's token, i) and members come in a canonical order, so counts have the same bits
+for any order of points, tile or number of threads.
 
-**No root is taken.** Metrics are compared with their thresholds as squares (D1, D2), as 4 area^2
-(D3: 4 t^4), as 6 volume (D4: 6 t^3) and as the negative signed square of the cosine (A3), all of which ascend with
-the metric.
+**No root is taken.** Metrics are compared with their thresholds as squares (D1, D2), as 4 area^2 (D3: 4 t^4),
+as 6 volume (D4: 6 t^3) and as the negative signed square of the cosine (A3); all ascend with the metric.
 """
 
 from __future__ import annotations

@@ -1,0 +1,460 @@
+"""k nearest, kopt, ropt and copt against the oracle: members exactly, choices up to real ties."""
+
+import math
+
+import numpy as np
+import oracle
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdal_stages.features import compute_features
+from pdal_stages.features.engine import FeatureEngine
+from pdal_stages.features.index import build_grid
+from pdal_stages.features.kdtree import build_tree
+from pdal_stages.features.knn import nearest_block
+from pdal_stages.features.optimal import kopt_block
+from pdal_stages.features.plan import FeaturePlan
+from pdal_stages.features.ropt import curvature_block, curvature_threshold, radii_of, ropt_block
+from pdal_stages.features.shapes import no_shapes
+
+TWELVE = [*oracle.COVARIANCE, *oracle.GEOMETRIC]
+NO_SEEDS = np.zeros(0, np.uint64)
+
+
+def scattered(n, seed, size=(12.0, 12.0, 3.0), origin=(0.0, 0.0, 0.0)):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(0, 1, (n, 3)) * size + origin
+
+
+def town(n=3000, seed=3, origin=(0.0, 0.0, 0.0)):
+    """Ground, a roof, a wall and a tree, in millimetres."""
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform(0, 1, (n, 3)) * (20, 20, 0.05)
+    roof = (abs(xyz[:, 0] - 5) < 3) & (abs(xyz[:, 1] - 6) < 4)
+    xyz[roof, 2] += 7 - 0.6 * abs(xyz[roof, 0] - 5)
+    wall = (abs(xyz[:, 0] - 12) < 0.6) & (xyz[:, 1] < 12)
+    xyz[wall, 0], xyz[wall, 2] = 12.0, rng.uniform(0, 9, wall.sum())
+    tree = np.hypot(xyz[:, 0] - 16, xyz[:, 1] - 15) < 3
+    xyz[tree, 2] = rng.uniform(2, 9, tree.sum())
+    return np.round(xyz, 3) + origin
+
+
+def cospherical(n=400):
+    """A point, and many at exactly the same squared distance from it (permutations and signs of 3, 4, 12)."""
+    rng = np.random.default_rng(0)
+    base = np.array([rng.permutation([3.0, 4.0, 12.0]) for _ in range(n)]) * rng.choice([-1.0, 1.0], (n, 3))
+    return np.vstack([[0.0, 0.0, 0.0], base])
+
+
+LATTICE = np.array([(x, y, z) for x in range(9) for y in range(9) for z in range(4)], float)
+CLOUDS = {
+    "scattered": scattered(1500, 1),
+    "town": town(),
+    "utm": town(1500, 4, (500_000.0, 6_000_000.0, 120.0)),
+    "negative": -town(1200, 5),
+    "lattice": LATTICE,
+    "plane": np.c_[LATTICE[:, :2], np.zeros(len(LATTICE))] * 0.5,
+    "line": np.outer(np.arange(300), [0.1, 0.2, 0.05]),
+    "one column": np.c_[np.full((800, 2), 3.25), np.random.default_rng(2).uniform(0, 30, 800)],
+    "copies": np.vstack([np.tile([5.0, 5.0, 1.0], (700, 1)), scattered(300, 6)]),
+    "all copies": np.tile([1.0, 2.0, 3.0], (500, 1)),
+    "stray": np.vstack([scattered(500, 7), [1e9, 0.0, 0.0], [-1e9, 1e9, 0.0]]),
+    "two clusters": np.vstack([scattered(300, 8, (1e-3, 1e-3, 1e-3)), scattered(90, 9) + 1e4]),
+    "cospherical": cospherical(),
+    "one": np.array([[1.0, 2.0, 3.0]]),
+    "two": np.array([[1.0, 2.0, 3.0], [1.5, 2.0, 3.0]]),
+    "five": scattered(5, 10),
+    "thirty": scattered(30, 11),
+}
+
+
+def tree_of(xyz):
+    """The tree over the sorted cloud, as the engine builds it."""
+    grid = build_grid(np.ascontiguousarray(xyz), 1.0)
+    return build_tree(grid.x, grid.y, grid.z)
+
+
+def some(xyz, most=60):
+    return xyz[np.unique(np.linspace(0, len(xyz) - 1, most).astype(int))]
+
+
+def columns(points):
+    return tuple(np.ascontiguousarray(points[:, i]) for i in range(3))
+
+
+def check_nearest(xyz, queries, need, cap=math.inf):
+    tree = tree_of(xyz)
+    m = len(queries)
+    index, d2, found = np.zeros((m, need), np.uint32), np.zeros((m, need)), np.zeros(m, np.int64)
+    nearest_block(tree, *columns(queries), need, cap * cap, index, d2, found)
+    for i, q in enumerate(queries):
+        points, _ = oracle.by_distance(xyz, q)
+        expected = oracle.squared_distance(points, q)
+        n = min(need, int(np.count_nonzero(expected <= cap * cap)))
+        assert found[i] == n
+        at = index[i, :n]
+        got = np.c_[tree.x[at], tree.y[at], tree.z[at]]
+        assert np.array_equal(got, points[:n]), f"query {i}"
+        assert np.array_equal(d2[i, :n], expected[:n])
+        assert len(np.unique(at)) == n  # no point twice
+
+
+# ---- the tree ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cloud", CLOUDS)
+def test_tree_boxes_hold_their_points(cloud):
+    tree = tree_of(CLOUDS[cloud])
+    assert np.array_equal(np.sort(tree.perm), np.arange(len(tree.x)))
+
+    def visit(node, lo, hi, depth):
+        points = np.c_[tree.x, tree.y, tree.z][tree.perm[lo:hi]]
+        assert np.array_equal(tree.boxes[node], np.r_[points.min(axis=0), points.max(axis=0)])
+        if depth:
+            mid = (lo + hi) // 2
+            visit(2 * node + 1, lo, mid, depth - 1)
+            visit(2 * node + 2, mid, hi, depth - 1)
+
+    visit(0, 0, len(tree.x), tree.depth)
+
+
+def test_a_tree_built_in_pieces_is_the_same():
+    xyz = scattered(120_000, 12, (300, 300, 10))
+    one = build_tree(*columns(xyz))
+    pieces = build_tree(*columns(xyz), lambda function, blocks: [function(block) for block in blocks])
+    assert np.array_equal(one.perm, pieces.perm) and np.array_equal(one.boxes, pieces.boxes)
+
+
+def test_no_tree_over_nothing():
+    with pytest.raises(ValueError, match="not 0"):
+        build_tree(*np.zeros((3, 0)))
+
+
+# ---- the nearest -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("need", [1, 2, 17, 101])
+@pytest.mark.parametrize("cloud", CLOUDS)
+def test_nearest_are_those_of_brute_force(cloud, need):
+    check_nearest(CLOUDS[cloud], some(CLOUDS[cloud]), need)
+
+
+@pytest.mark.parametrize("cloud", ["town", "copies", "lattice", "stray", "one"])
+def test_nearest_within_a_cap(cloud):
+    check_nearest(CLOUDS[cloud], some(CLOUDS[cloud], 30), 51, cap=2.0)
+
+
+def test_queries_that_are_no_points_of_the_cloud():
+    rng = np.random.default_rng(3)
+    queries = np.vstack([rng.uniform(-5, 25, (40, 3)), [[1e6, 1e6, 1e6]], [[5.0, 5.0, 1.0]] * 9])
+    check_nearest(CLOUDS["town"], queries, 33)
+    check_nearest(CLOUDS["town"], queries, 33, cap=1.0)
+
+
+def test_queries_far_apart_share_no_group():
+    xyz = np.vstack([scattered(400, 20) + offset for offset in ([0, 0, 0], [5e5, 0, 0], [0, 3e6, 50])])
+    check_nearest(xyz, xyz[::97], 40)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.tuples(*[st.integers(-3, 3)] * 3), min_size=1, max_size=60),
+    st.integers(1, 20),
+    st.sampled_from([1.0, 0.1, 1e5]),
+)
+def test_nearest_with_many_ties(points, need, scale):
+    xyz = np.array(points, float) * scale
+    check_nearest(xyz, xyz[:10], need)
+
+
+@pytest.mark.timeout(120)
+def test_half_a_million_copies_are_not_quadratic():
+    xyz = np.vstack([np.tile([100.0, 200.0, 5.0], (500_000, 1)), scattered(2000, 13)])
+    values = compute_features(xyz, neighborhoods="kopt", feature_set="Density,Radius,Eigenentropy").values
+    assert np.isfinite(values).all()
+    assert (values[:500_000] == values[0]).all()
+
+
+@pytest.mark.timeout(120)
+def test_a_dense_facade_and_a_dense_ball_are_not_quadratic():
+    rng = np.random.default_rng(14)
+    facade = np.c_[np.full(60_000, 3.0), rng.uniform(0, 0.5, 60_000), rng.uniform(0, 30, 60_000)]
+    ball = rng.normal(50, 1e-4, (60_000, 3))
+    xyz = np.vstack([facade, ball])
+    tree = tree_of(xyz)
+    m, need = len(xyz), 21
+    index, d2, found = np.zeros((m, need), np.uint32), np.zeros((m, need)), np.zeros(m, np.int64)
+    nearest_block(tree, *columns(xyz), need, math.inf, index, d2, found)
+    for i in range(0, m, 7001):
+        _, distance = oracle.by_distance(xyz, xyz[i])
+        assert np.sqrt(d2[i]) == pytest.approx(distance[:need], rel=1e-12)
+
+
+# ---- kopt and k --------------------------------------------------------------------------------------------
+
+
+def run_kopt(xyz, queries, k_min, k_max, cap=math.inf):
+    m = len(queries)
+    table, radius, reach = np.zeros((12, m)), np.zeros(m), np.zeros(m)
+    none = no_shapes()
+    kopt_block(tree_of(xyz), *columns(queries), k_min, k_max, cap * cap, table, radius, reach, NO_SEEDS, none)
+    return table, radius, reach
+
+
+@pytest.mark.parametrize("cloud", CLOUDS)
+def test_kopt_is_the_oracle_s(cloud):
+    xyz = CLOUDS[cloud]
+    queries = some(xyz, 50)
+    table, radius, _ = run_kopt(xyz, queries, 10, 100)
+    for i, q in enumerate(queries):
+        members, r, entropies = oracle.kopt(xyz, q)
+        n = int(table[0, i])
+        least = min(11, len(xyz))
+        got = entropies[n - least]
+        if math.isinf(got):  # no candidate at all: the largest is taken
+            assert n == len(members)
+        # The same, unless the two differ by rounding only.
+        assert n == len(members) or abs(got - entropies[len(members) - least]) < 2e-9, f"query {i}"
+        if n == len(members):
+            assert radius[i] == r
+
+
+@pytest.mark.parametrize(
+    ("k_min", "k_max", "cap"), [(2, 2, math.inf), (2, 30, math.inf), (10, 50, 1.0), (50, 50, 9.0)]
+)
+def test_other_ranges_and_a_cap(k_min, k_max, cap):
+    xyz = CLOUDS["town"]
+    queries = some(xyz, 50)
+    table, radius, _ = run_kopt(xyz, queries, k_min, k_max, cap)
+    for i, q in enumerate(queries):
+        members, r, _ = oracle.kopt(xyz, q, k_min, k_max, cap)
+        assert (table[0, i], radius[i]) == (len(members), r)
+
+
+def test_features_of_kopt_and_k():
+    for xyz in (CLOUDS["town"], CLOUDS["utm"]):
+        at = np.arange(0, len(xyz), 40)
+        got = compute_features(xyz, at, "kopt,k50", ["covariance", "geometric", "Radius"])
+        for i, q in enumerate(xyz[at]):
+            for token, (members, r) in (
+                ("kopt", oracle.kopt(xyz, q)[:2]),
+                ("k50", oracle.nearest(xyz, q, 50)),
+            ):
+                expected = oracle.features(members, oracle.ball_volume(r))
+                for name in TWELVE:
+                    if name == "Verticality" and oracle.normal_gap(members) < 1e-7:
+                        continue
+                    value = float(got[f"{name}_{token}"][i])
+                    assert value == pytest.approx(expected[name], rel=1e-5, abs=1e-7), (token, name, i)
+            assert got["Radius_kopt"][i] == np.float32(oracle.kopt(xyz, q)[1])
+
+
+@pytest.mark.parametrize("cloud", CLOUDS)
+def test_no_nan_anywhere(cloud):
+    xyz = CLOUDS[cloud]
+    table = compute_features(xyz, neighborhoods="k5,kopt,ropt,copt", feature_set="all")
+    assert np.isfinite(table.values).all()
+    assert (table["Density_kopt"] > 0).all()
+
+
+def test_copies_have_a_finite_density_and_no_structure():
+    table = compute_features(CLOUDS["all copies"], neighborhoods="kopt", feature_set="all")
+    assert table["SurfaceVariation_kopt"][0] == np.float32(1 / 3)
+    assert table["Linearity_kopt"][0] == 0
+    assert table["Density_kopt"][0] == pytest.approx(101 / oracle.ball_volume(0.001))
+
+
+# ---- ropt --------------------------------------------------------------------------------------------------
+
+
+def oracle_ropt(xyz, q, radii):
+    entropies = [oracle.entropy(oracle.sphere(xyz, q, r)) for r in radii]
+    return radii[oracle._first_lowest(entropies)], entropies
+
+
+@pytest.mark.parametrize("cloud", CLOUDS)
+def test_ropt_is_the_oracle_s(cloud):
+    xyz = CLOUDS[cloud]
+    queries = some(xyz, 40)
+    m = len(queries)
+    for radii in (radii_of(0.25, 2.0, 0.05), radii_of(1.5, 1.5, 1.0)):
+        table, radius = np.zeros((12, m)), np.zeros(m)
+        ropt_block(tree_of(xyz), *columns(queries), radii, table, radius, NO_SEEDS, no_shapes())
+        for i, q in enumerate(queries):
+            r, entropies = oracle_ropt(xyz, q, radii)
+            assert table[0, i] == len(oracle.sphere(xyz, q, radius[i]))
+            mine = entropies[list(radii).index(radius[i])]
+            assert radius[i] == r or abs(mine - min(entropies)) < 2e-9, f"query {i}"
+
+
+def test_members_at_exactly_a_radius_are_inside():
+    xyz = np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0], [0, 0, 0.3], [0, 0, -0.3]])
+    table, radius = np.zeros((12, 1)), np.zeros(1)
+    radii = radii_of(0.25, 2.0, 0.05)
+    ropt_block(tree_of(xyz), *columns(xyz[:1]), radii, table, radius, NO_SEEDS, no_shapes())
+    assert (radius[0], table[0, 0]) == (0.3, 5)
+
+
+def test_radii():
+    assert radii_of(0.25, 2.0, 0.05).shape == (36,) and radii_of(0.25, 2.0, 0.05)[-1] == 2.0
+    assert radii_of(0.5, 2.0, 0.05).shape == (31,)
+    assert radii_of(1.0, 1.0, 0.5).tolist() == [1.0]
+
+
+def test_features_of_ropt():
+    xyz = CLOUDS["town"]
+    at = np.arange(0, len(xyz), 60)
+    got = compute_features(xyz, at, "ropt(0.4,2,0.1)", ["covariance", "geometric", "Radius"])
+    for i, q in enumerate(xyz[at]):
+        r = oracle_ropt(xyz, q, radii_of(0.4, 2, 0.1))[0]
+        expected = oracle.of_sphere(xyz, q, r)
+        assert got.values[i, -1] == np.float32(r)
+        for name in TWELVE:
+            if name == "Verticality" and oracle.normal_gap(oracle.sphere(xyz, q, r)) < 1e-7:
+                continue
+            column = got.names.index(f"{name}_ropt0_4_2_0_1")
+            assert got.values[i, column] == pytest.approx(expected[name], rel=1e-5, abs=3e-5), (name, i)
+
+
+# ---- copt --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cloud", CLOUDS)
+def test_curvature(cloud):
+    xyz = CLOUDS[cloud]
+    queries = some(xyz, 40)
+    got = np.zeros(len(queries))
+    curvature_block(tree_of(xyz), *columns(queries), no_shapes(), got)
+    assert got == pytest.approx([oracle.curvature(xyz, q) for q in queries], rel=1e-9, abs=1e-12)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.floats(0, 1 / 3), min_size=1, max_size=200))
+def test_a_curvature_threshold_lies_among_the_values(values):
+    got = curvature_threshold(np.array(values))
+    assert min(values) - 1e-15 <= got <= max(values) + 1e-15
+    assert curvature_threshold(np.array(values[::-1])) == got
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_curvature_threshold_is_the_oracle_s(seed):
+    rng = np.random.default_rng(seed)
+    values = rng.beta(0.5, 4, rng.integers(2, 500)) / 3
+    assert curvature_threshold(values) == pytest.approx(oracle.copt_threshold(values), rel=1e-9)
+
+
+def test_curvature_threshold_of_two_clear_groups():
+    values = np.r_[np.full(30, 0.01), np.full(10, 0.25)]
+    assert curvature_threshold(values) == pytest.approx(0.01 + 0.24 * 10 / 40)
+    assert curvature_threshold(np.full(5, 0.125)) == 0.125
+    for bad in ([], [0.1, np.nan], [np.inf]):
+        with pytest.raises(ValueError):
+            curvature_threshold(np.array(bad))
+
+
+def test_copt_is_the_oracle_s():
+    xyz = CLOUDS["town"]
+    engine = FeatureEngine(xyz, FeaturePlan.parse("copt", ["Density", "Radius", "Eigenentropy"])).fit()
+    curvatures = np.array([oracle.curvature(xyz, q) for q in xyz])
+    threshold = engine.copt_threshold
+    assert threshold == pytest.approx(oracle.copt_threshold(curvatures), rel=1e-9)
+    at = np.arange(0, len(xyz), 40)
+    got = engine.table(at)
+    kinds = set()
+    for i, q in zip(range(len(at)), xyz[at], strict=True):
+        if curvatures[at[i]] >= threshold:
+            members, r, _ = oracle.kopt(xyz, q, 10, 50, cap=3.0)
+        else:
+            r = oracle_ropt(xyz, q, radii_of(0.5, 2.0, 0.05))[0]
+            members = oracle.sphere(xyz, q, r)
+        kinds.add(curvatures[at[i]] >= threshold)
+        assert got["Radius_copt"][i] == np.float32(r)
+        assert got["Density_copt"][i] == pytest.approx(len(members) / oracle.ball_volume(r), rel=1e-6)
+    assert kinds == {True, False}
+
+
+# ---- the same for any order, block, thread and tile --------------------------------------------------------
+
+ADAPTIVE = "k7,kopt(10,60),ropt,copt"
+
+
+@pytest.fixture(scope="module")
+def reference():
+    xyz = CLOUDS["utm"]
+    engine = FeatureEngine(xyz, FeaturePlan.parse(ADAPTIVE), seed=4)
+    return xyz, engine.fit(), engine.table()
+
+
+def again(xyz, engine, **options):
+    return FeatureEngine(
+        xyz, engine.plan, bins=engine.bins, copt_threshold=engine.copt_threshold, seed=engine.seed, **options
+    )
+
+
+def test_any_order_gives_the_same_bits_fits_included(reference):
+    xyz, engine, table = reference
+    order = np.random.default_rng(0).permutation(len(xyz))
+    other = FeatureEngine(xyz[order], engine.plan, seed=4).fit()
+    assert other.bins == engine.bins and other.copt_threshold == engine.copt_threshold
+    assert np.array_equal(other.table().values, table.values[order])
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_any_threads_queries_and_blocks_give_the_same_bits(reference, threads):
+    xyz, engine, table = reference
+    some_ = np.random.default_rng(1).permutation(len(xyz))[: 40 * threads]
+    assert np.array_equal(again(xyz, engine, threads=threads).table(some_).values, table.values[some_])
+    assert np.array_equal(again(xyz, engine, threads=threads).table(memory_mb=16).values, table.values)
+
+
+def test_a_tile_gives_the_same_bits(reference):
+    xyz, engine, table = reference
+    x = xyz[:, 0] - xyz[:, 0].min()
+    inside = np.flatnonzero(x < 6)
+    tile = np.flatnonzero(x < 15)
+    part = again(xyz[tile], engine)
+    got = part.table(np.searchsorted(tile, inside))
+    assert part.report["beyond_halo"] == {}
+    assert np.array_equal(got.values, table.values[inside])
+
+
+def test_what_reaches_beyond_the_halo_is_counted():
+    xyz = np.vstack([scattered(300, 15), [[500.0, 0.0, 0.0]] * 3])
+    report = compute_features(xyz, neighborhoods="k10,kopt", feature_set="Density").report
+    assert report["beyond_halo"] == {"k10": 3, "kopt": 3}
+
+
+def test_a_different_seed_changes_shapes_only(reference):
+    xyz, engine, table = reference
+    other = FeatureEngine(
+        xyz, engine.plan, bins=engine.bins, copt_threshold=engine.copt_threshold, seed=5
+    ).table(np.arange(20))
+    shape = np.array([name[:2] in oracle.METRICS for name in table.names])
+    assert np.array_equal(other.values[:, ~shape], table.values[:20, ~shape])
+    assert not np.array_equal(other.values[:, shape], table.values[:20, shape])
+
+
+# ---- real clouds -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("file", ["delft/train", "montpellier/train", "oakland/train", "isprs_filter"])
+def test_real_clouds(data_dir, file):
+    import laspy
+
+    found = data_dir / file if (data_dir / file).is_dir() else (data_dir / file).parent
+    path = min(p for p in sorted(found.rglob("*.la[sz]")) if file.split("/")[-1] in str(p))
+    with laspy.open(path) as reader:
+        cloud = reader.read()
+    xyz = np.c_[cloud.x, cloud.y, cloud.z]
+    xyz = xyz[np.lexsort((xyz[:, 0], np.floor(xyz[:, 1] / 20)))][:40_000]
+    queries = some(xyz, 40)
+    check_nearest(xyz, queries, 101)
+    table, radius, _ = run_kopt(xyz, queries, 10, 100)
+    for i, q in enumerate(queries):
+        points, distance = oracle.by_distance(xyz, q)
+        members, _, entropies = oracle.kopt(points[:101], q)
+        n = int(table[0, i])
+        assert n == len(members) or abs(entropies[n - 11] - entropies[len(members) - 11]) < 2e-9
+        assert radius[i] == distance[n - 1]
