@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy import ndimage
 
 from ..errors import StageError
+from ..features.jit import njit
 
 BACKGROUND = (246, 246, 243)
 #: More pixels than this are refused: a picture, not a map sheet.
@@ -44,7 +44,7 @@ class Frame:
         return Frame(x0, y0, pixel, max(2, math.ceil(wide / pixel)), max(2, math.ceil(tall / pixel)))
 
 
-@njit(nogil=True, cache=True)
+@njit
 def _highest(x, y, z, x0, y0, pixel, width, height, top, which, base):
     for n in range(x.size):
         if not (math.isfinite(x[n]) and math.isfinite(y[n]) and math.isfinite(z[n])):

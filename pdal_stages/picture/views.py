@@ -7,11 +7,11 @@ import os
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from scipy import ndimage
 
 from ..asprs import class_color, class_name
 from ..errors import StageError
+from ..features.jit import njit
 from .png import write_png
 from .raster import BACKGROUND, Frame, Surface, paint, shading, surface
 from .text import LARGE, draw_text, fit_text, text_size
@@ -192,7 +192,7 @@ def _verdict(s: Surface, x, y, z, predicted, truth, ignore) -> np.ndarray:
     return shown
 
 
-@njit(nogil=True, cache=True)
+@njit
 def _dots(out, left, row, color, radius):
     height, width = out.shape[:2]
     for n in range(left.size):

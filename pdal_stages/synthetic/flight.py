@@ -46,7 +46,8 @@ class Flight:
         self.spacing = spacing
         swath = 2.0 * altitude * math.tan(self.half_angle)
         c, s = abs(math.cos(heading)), abs(math.sin(heading))
-        self.reach = 0.5 * size * (c + s) + 4.0  # half extent of the square along and across the flight
+        # Half extent of the square along and across the flight, and what pitch and roll may take away.
+        self.reach = 0.5 * size * (c + s) + 4.0 + 0.01 * altitude
         apart = swath * (1.0 - overlap)
         # At least two strips, so that every town is seen from two sides.
         self.strips = max(2, math.ceil((2 * self.reach - swath * overlap) / apart))
@@ -71,6 +72,17 @@ class Flight:
             for first in range(0, self.lines, step)
         ]
 
+    def _steps(self, strip: int) -> tuple[int, int]:
+        """The part of every scan line that can reach the square: first step, and the one after the last."""
+        side = (-1.0 if strip % 2 else 1.0) * self.across[strip]  # metres the square lies to the right
+        margin = self.reach + 30.0
+        left = math.atan((side - margin) / self.altitude) - 0.01  # 0.008 is the most the aircraft rolls
+        right = math.atan((side + margin) / self.altitude) + 0.01
+        each = 2 * self.half_angle / self.per_line
+        low = math.floor((self.half_angle - right) / each)
+        high = math.ceil((self.half_angle - left) / each)
+        return min(max(low, 0), self.per_line), min(max(high, 0), self.per_line)
+
     def inside(self, hit: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """Which places lie in the square, or within `margin` metres of it."""
         return ((hit > -margin) & (hit < self.size + margin)).all(axis=1)
@@ -91,8 +103,9 @@ class Flight:
         edge : (n,) bool
             Last pulse of its scan line.
         """
-        line = np.repeat(np.arange(chunk.first, chunk.last), self.per_line)
-        step = np.tile(np.arange(self.per_line), chunk.last - chunk.first)
+        low, high = self._steps(chunk.strip)
+        line = np.repeat(np.arange(chunk.first, chunk.last), high - low)
+        step = np.tile(np.arange(low, high), chunk.last - chunk.first)
         if every > 1:
             ids = (chunk.strip * self.lines + line) * self.per_line + step
             # A scattered sample: whole numbers times an odd constant, upper bits.

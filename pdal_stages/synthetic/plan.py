@@ -11,8 +11,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from ..features.jit import njit
 from .random import value_noise
 
 PITCH_U, PITCH_V = 58.0, 68.0
@@ -49,7 +49,7 @@ class Ground(NamedTuple):
     key: np.uint64
 
 
-@njit(nogil=True, cache=True)
+@njit
 def to_uv(x, y, frame):
     """Local metres to town coordinates."""
     dx, dy = x - frame[0], y - frame[1]
@@ -60,7 +60,7 @@ def to_uv(x, y, frame):
     return u, v
 
 
-@njit(nogil=True, cache=True)
+@njit
 def to_xy(u, v, frame):
     """Town coordinates to local metres (the bend is gentle: a fixed point in a few steps)."""
     u0, v0 = u, v
@@ -70,7 +70,7 @@ def to_xy(u, v, frame):
     return frame[0] + frame[2] * u0 - frame[3] * v0, frame[1] + frame[3] * u0 + frame[2] * v0
 
 
-@njit(nogil=True, cache=True)
+@njit
 def find_line(value, lines, pitch):
     """Index i with lines[i] <= value < lines[i + 1], kept inside the table."""
     i = math.floor((value - lines[0]) / pitch)
@@ -82,13 +82,13 @@ def find_line(value, lines, pitch):
     return i
 
 
-@njit(nogil=True, cache=True)
+@njit
 def _ramp(value, low, high):
     t = min(max((value - low) / (high - low), 0.0), 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
-@njit(nogil=True, cache=True)
+@njit
 def relief(x, y, u, v, i, j, g):
     """The land before anybody built on it: waves of several lengths and hills."""
     z = g.frame[10]
@@ -105,7 +105,7 @@ def relief(x, y, u, v, i, j, g):
     return z
 
 
-@njit(nogil=True, cache=True)
+@njit
 def ground(x, y, g):
     """Height of the bare ground (water: its surface) and the surface there.
 
@@ -194,7 +194,7 @@ def ground(x, y, g):
     return z, LAWN
 
 
-@njit(nogil=True, cache=True)
+@njit
 def ground_many(x, y, g):
     """Ground heights at many places: (n,) float64."""
     z = np.empty(x.size)
@@ -252,7 +252,12 @@ class Plan:
         v_lines = PITCH_V * index_v + 26.0 + jitter.uniform(-2, 2, nv)
         v_kind = np.array([STREET, BANK, STREET, CANAL], dtype=np.int64)[index_v % 4]
         phase = int(rng.integers(KINDS))
+        # Near the middle every kind in turn, so that small towns have all; farther out mostly by chance.
         block = (index_u[:, None] + 3 * index_v[None, :] + phase) % KINDS
+        chance = np.random.default_rng([seed, 0x7036])
+        other = chance.choice(KINDS, (nu, nv), p=[0.22, 0.16, 0.14, 0.22, 0.11, 0.03, 0.12])
+        far = (np.abs(index_u + 0.5)[:, None] > 3) | (np.abs(index_v + 0.5)[None, :] > 3)
+        block = np.where(far & (chance.random((nu, nv)) < 0.8), other, block)
         self.ground = Ground(
             frame,
             np.array(waves),

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from ..features.jit import njit
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _M1 = np.uint64(0xBF58476D1CE4E5B9)
@@ -14,7 +15,7 @@ _S30, _S27, _S31, _S11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(
 _TO_UNIT = 1.0 / 9007199254740992.0  # 2 ** -53
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(inline="always")
 def mix(value):
     """One splitmix64 step (Steele, Lea, Flood 2014): uint64 in, well-mixed uint64 out."""
     value = value + _GOLDEN
@@ -23,13 +24,13 @@ def mix(value):
     return value ^ (value >> _S31)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(inline="always")
 def unit(key):
     """A float in [0, 1) from a mixed key."""
     return float(key >> _S11) * _TO_UNIT
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(inline="always")
 def gauss(key):
     """A standard normal number from a mixed key (Box-Muller)."""
     a = 1.0 - unit(key)
@@ -37,7 +38,7 @@ def gauss(key):
     return math.sqrt(-2.0 * math.log(a)) * math.cos(2.0 * math.pi * b)
 
 
-@njit(nogil=True, cache=True)
+@njit
 def lattice(i, j, k, key):
     """A float in [0, 1) for a whole-numbered place in space."""
     h = mix(key ^ np.uint64(np.int64(i)))
@@ -45,7 +46,7 @@ def lattice(i, j, k, key):
     return unit(mix(h ^ np.uint64(np.int64(k))))
 
 
-@njit(nogil=True, cache=True)
+@njit
 def value_noise(x, y, key):
     """Smooth noise in [0, 1] over the plane, one value per unit square corner."""
     i, j = math.floor(x), math.floor(y)

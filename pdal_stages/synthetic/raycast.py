@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from ..features.jit import njit
 from . import plan as _plan
 from .materials import CODE
 from .plan import ground
@@ -27,7 +27,7 @@ _SURFACE = np.array(
 )
 
 
-@njit(nogil=True, cache=True)
+@njit
 def _ground_range(ox, oy, oz, dx, dy, dz, guess, g):
     """Range to the ground along a steep downward ray: fixed point, else march and halve."""
     t = guess
@@ -54,7 +54,7 @@ def _ground_range(ox, oy, oz, dx, dy, dz, guess, g):
     return high, surface
 
 
-@njit(nogil=True, cache=True)
+@njit
 def _interval(p, label, planes, ox, oy, oz, dx, dy, dz):
     """Ranges at which a ray enters and leaves a thing (enter > leave: missed), and the entry's normal."""
     near, far = -1e30, 1e30
@@ -119,7 +119,7 @@ def _interval(p, label, planes, ox, oy, oz, dx, dy, dz):
     return t - 0.5 * p[6], t + 0.5 * p[6], nx, ny, nz
 
 
-@njit(nogil=True, cache=True)
+@njit
 def _depth(p, label, near, far, ox, oy, oz, dx, dy, dz, key):
     """Range at which a beam is caught inside a porous thing, or -1: free paths among clumps."""
     key = mix(key ^ np.uint64(label[6]))
@@ -142,7 +142,7 @@ def _depth(p, label, near, far, ox, oy, oz, dx, dy, dz, key):
     return -1.0
 
 
-@njit(nogil=True, cache=True)
+@njit
 def _first_thing(scene, ox, oy, oz, dx, dy, dz, limit, key):
     """Nearest thing met before range `limit`: range, index (-1: none), cosine of incidence, upward part."""
     best, index, cosine, up = limit, -1, 1.0, 1.0
@@ -185,7 +185,7 @@ def _first_thing(scene, ox, oy, oz, dx, dy, dz, limit, key):
     return best, index, cosine, up
 
 
-@njit(nogil=True, cache=True)
+@njit
 def cast(origin, direction, pulse_id, scene, g, reflectance, setting, seed, xyz, byte, height, pulse):
     """Returns of a block of pulses.
 

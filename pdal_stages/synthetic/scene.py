@@ -10,8 +10,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from ..features.jit import njit
 from .materials import CODE
 
 CONVEX, ELLIPSOID, CONE, ROD = range(4)
@@ -127,7 +127,7 @@ class Parts:
         return things, np.array(self._planes, dtype=np.float64).reshape(-1, 4)
 
 
-@njit(nogil=True, cache=True)
+@njit
 def _fill(box, x0, y0, nx, ny, cell):
     counts = np.zeros(nx * ny + 1, dtype=np.int64)
     top = np.full(nx * ny, -1e30)

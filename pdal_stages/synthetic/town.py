@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 
 from ..errors import OptionError
+from ..features.jit import CompilationNote
 from ..parallel import map_blocks, resolve_threads
 from ..progress import Progress
 from .blocks import Blocks
@@ -157,6 +158,8 @@ class _Survey:
         heading = math.radians(np.random.default_rng([int(options.seed), 0xF117]).uniform(70, 110))
         self._heading = heading
         self.flight = self._flight(1.0 / math.sqrt(options.density))
+        with CompilationNote():  # one scan line, so that the note is about compiling alone
+            self.cast_lines(self.flight, Chunk(0, self.flight.lines // 2, self.flight.lines // 2 + 1))
         self.flight = self._flight(self._spacing())
 
     def _flight(self, spacing: float) -> Flight:
