@@ -63,12 +63,18 @@ def _mean(results: dict, method: str) -> str:
     if not rows:
         return "none"
     means = [np.mean([r[key] for r in rows]) for key in ("mean_absolute", "p95_absolute")]
-    return f"{means[0]:.2f} / {means[1]:.2f}" + (f" ({len(rows)} of {len(results)})" if len(rows) < len(results) else "")
+    return f"{means[0]:.2f} / {means[1]:.2f}" + (
+        f" ({len(rows)} of {len(results)})" if len(rows) < len(results) else ""
+    )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default=os.environ.get("PDAL_STAGES_DATA"), help="folder with isprs_filter/")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--data", default=os.environ.get("PDAL_STAGES_DATA"), help="folder with isprs_filter/"
+    )
     parser.add_argument("--json", help="write the figures here")
     options = parser.parse_args()
     if not options.data:
@@ -76,7 +82,9 @@ def main() -> None:
     results = {}
     for path in sorted(Path(options.data, "isprs_filter").glob("*.laz")):
         results[path.stem] = measure(path)
-    print(f"PDAL {'.'.join(map(str, pdal_env.version()))}, {platform.machine()}; metres, |height| of true ground points\n")
+    print(
+        f"PDAL {'.'.join(map(str, pdal_env.version()))}, {platform.machine()}; metres, |height| of true ground points\n"
+    )
     print("| sample |" + "".join(f" {m}: mean / 95 % |" for m in METHODS))
     print("|---|" + "---:|" * len(METHODS))
     for name, row in results.items():

@@ -30,7 +30,7 @@ _WHERE = {
     "write_accuracy_report": "report",
 }
 
-__all__ = [*_WHERE, "__version__"]  # noqa: PLE0604
+__all__ = [*_WHERE, "__version__"]
 
 if TYPE_CHECKING:
     from .accuracy import Accuracy

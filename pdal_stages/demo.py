@@ -12,7 +12,13 @@ from .errors import StageError
 from .files import write_whole
 
 #: Classes of the town that the demo tells apart; small ones are left to the reader.
-CLASSES = {"2": "Ground", "3": "Low vegetation", "5": "High vegetation", "6": "Building", "14": "Wire - conductor (phase)"}
+CLASSES = {
+    "2": "Ground",
+    "3": "Low vegetation",
+    "5": "High vegetation",
+    "6": "Building",
+    "14": "Wire - conductor (phase)",
+}
 
 
 def run_demo(folder: str | Path, *, size: float = 200.0, density: float = 7.0, seed: int = 1) -> dict:
@@ -29,9 +35,15 @@ def run_demo(folder: str | Path, *, size: float = 200.0, density: float = 7.0, s
         raise StageError("the demo's folder cannot be made", found=str(folder))
     settings = {"version": __version__, "size": size, "density": density, "seed": seed}
     stamp = folder / "demo.json"
-    outputs = [folder / n for n in ("classified.laz", "classified.png", "accuracy.html", "accuracy.json", "table.txt")]
+    outputs = [
+        folder / n
+        for n in ("classified.laz", "classified.png", "accuracy.html", "accuracy.json", "table.txt")
+    ]
     if _same(stamp, settings) and all(path.is_file() for path in outputs):
-        print(f"{folder} holds the results of this very demo; delete the folder to run it again.", file=sys.stderr)
+        print(
+            f"{folder} holds the results of this very demo; delete the folder to run it again.",
+            file=sys.stderr,
+        )
     else:
         stamp.unlink(missing_ok=True)
         _work(folder, size, density, seed)

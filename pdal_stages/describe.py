@@ -23,9 +23,7 @@ def drivers(*, ours_only: bool = False, as_json: bool = False) -> str:
     width = max(len(name) for name, _ in ours) + 2
     lines = ["=" * 80, "pdal_stages", "=" * 80]
     lines += [
-        textwrap.fill(
-            f"{name:{width}}{text}", 80, subsequent_indent=" " * width, break_long_words=False
-        )
+        textwrap.fill(f"{name:{width}}{text}", 80, subsequent_indent=" " * width, break_long_words=False)
         for name, text in ours
     ]
     text = "\n".join(lines) + "\n"
@@ -62,7 +60,9 @@ def stage_options(type_name: str, *, as_json: bool = False) -> str:
         if option.required:
             head += "  (required)"
         elif option.default not in (None, "", ()):
-            shown = ",".join(map(str, option.default)) if isinstance(option.default, tuple) else option.default
+            shown = (
+                ",".join(map(str, option.default)) if isinstance(option.default, tuple) else option.default
+            )
             head += f" [{str(shown).lower() if isinstance(shown, bool) else shown}{' ' + option.unit if option.unit else ''}]"
         lines += [head, textwrap.fill(help_text, 80, initial_indent=" " * 6, subsequent_indent=" " * 6), ""]
     return "\n".join(lines)

@@ -21,7 +21,14 @@ _TOKEN = re.compile(
     r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
     r"|(?P<mark>&&|\|\||==|!=|<=|>=|[-+*/()<>!]))"
 )
-_LEVELS: tuple[tuple[str, ...], ...] = (("||",), ("&&",), ("==", "!="), ("<", "<=", ">", ">="), ("+", "-"), ("*", "/"))
+_LEVELS: tuple[tuple[str, ...], ...] = (
+    ("||",),
+    ("&&",),
+    ("==", "!="),
+    ("<", "<=", ">", ">="),
+    ("+", "-"),
+    ("*", "/"),
+)
 _OPERATIONS = {
     "||": np.logical_or,
     "&&": np.logical_and,
@@ -110,7 +117,7 @@ class Expression:
         return OptionError(
             f"the 'where' expression cannot be read: {what}, at character {place + 1}",
             found=repr(self.text),
-            cure="Example: \"Classification == 2 && Z > 3\"",
+            cure='Example: "Classification == 2 && Z > 3"',
         )
 
     def _peek(self) -> str:

@@ -22,7 +22,9 @@ def check_writable(path: str | os.PathLike, what: str = "output") -> None:
     """Refuse an output path whose folder is missing or read-only, before any work is done."""
     folder = Path(path).absolute().parent
     if not folder.is_dir():
-        raise StageError(f"the folder of the {what} file does not exist", found=str(folder), cure="Create it first")
+        raise StageError(
+            f"the folder of the {what} file does not exist", found=str(folder), cure="Create it first"
+        )
     if Path(path).is_dir():
         raise StageError(f"the {what} file names a folder", found=str(path), cure="Give a file name")
     if not os.access(folder, os.W_OK):
@@ -47,7 +49,9 @@ def write_whole(path: str | os.PathLike, content: bytes) -> None:
         os.replace(name, path)
     except OSError as error:
         Path(name).unlink(missing_ok=True)
-        raise StageError("the file could not be written", found=f"{path}: {error.strerror or error}") from error
+        raise StageError(
+            "the file could not be written", found=f"{path}: {error.strerror or error}"
+        ) from error
     except BaseException:
         Path(name).unlink(missing_ok=True)
         raise

@@ -12,7 +12,9 @@ from .errors import DimensionError, StageError
 from .overrides import Override
 
 
-def classify_pipeline(source: str, target: str, model: str, *, where: str | None = None) -> list[dict[str, Any]]:
+def classify_pipeline(
+    source: str, target: str, model: str, *, where: str | None = None
+) -> list[dict[str, Any]]:
     """Read, give heights if the model wants them, classify, write with everything else kept."""
     from .classifier import load_model
 
@@ -69,7 +71,7 @@ def attach_reference(
     from .stages.accuracy import AccuracyStage
     from .stages.points import Points
 
-    both = []
+    both: list[Any] = []
     for name in (source, reference):
         pipeline = Pipeline([_reader(name, "input")])
         pipeline.execute()

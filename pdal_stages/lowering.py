@@ -247,7 +247,9 @@ def _writes_las(stage: dict[str, Any]) -> bool:
     return type_name in _LAS_WRITERS or (not type_name and suffix in (".las", ".laz"))
 
 
-def _check_codes(ours: LoweredStage, largest: int, writer: dict[str, Any], before: list[dict[str, Any]]) -> None:
+def _check_codes(
+    ours: LoweredStage, largest: int, writer: dict[str, Any], before: list[dict[str, Any]]
+) -> None:
     from . import pdal_env
 
     if writer.get("type") == "writers.copc":

@@ -45,7 +45,9 @@ def bindings():
         ) from error
     except (OSError, subprocess.SubprocessError) as error:  # it asks the program `pdal` for its drivers
         raise DependencyError(
-            "python-pdal could not start the program 'pdal'", found=str(error), cure="Put pdal on PATH. " + INSTALL
+            "python-pdal could not start the program 'pdal'",
+            found=str(error),
+            cure="Put pdal on PATH. " + INSTALL,
         ) from error
     return pdal
 
@@ -71,7 +73,9 @@ def ask_program(*arguments: str) -> str:
     """What `pdal` prints for some arguments."""
     done = subprocess.run([program(), *arguments], capture_output=True, text=True, check=False, timeout=120)
     if done.returncode:
-        raise PipelineError(f"pdal {' '.join(arguments)} failed", found=(done.stderr or done.stdout).strip()[-500:])
+        raise PipelineError(
+            f"pdal {' '.join(arguments)} failed", found=(done.stderr or done.stdout).strip()[-500:]
+        )
     return done.stdout
 
 
@@ -106,7 +110,9 @@ def execute(stages: list[dict[str, Any]], *, arrays: bool = True) -> Execution:
 def translate(message: str) -> PipelineError | DependencyError:
     """PDAL's error text as an error of ours, with a cure where the cause is known."""
     text = message.strip()
-    if re.search(r"(create|load|find).*filters\.python", text) or "filters.python" in text and "driver" in text.lower():
+    if re.search(r"(create|load|find).*filters\.python", text) or (
+        "filters.python" in text and "driver" in text.lower()
+    ):
         return DependencyError("PDAL has no filters.python", found=text, cure=_DRIVER_CURE)
     if "ModuleNotFoundError" in text and "pdal_stages" in text:
         return DependencyError(

@@ -120,7 +120,9 @@ def _partial_outputs(stages: list[dict[str, Any]]) -> tuple[list[dict[str, Any]]
             final = Path(stage["filename"])
             check_writable(final)
             if final.absolute() in finals:
-                raise PipelineError("two writers write the same file", found=str(final), cure="Give each its own name")
+                raise PipelineError(
+                    "two writers write the same file", found=str(final), cure="Give each its own name"
+                )
             finals.add(final.absolute())
             partial = partial_name(final)
             stage = {**stage, "filename": str(partial)}
@@ -134,7 +136,9 @@ def _expanded(partial: Path) -> list[Path]:
     if "#" not in partial.name:
         return [partial] if partial.exists() else []
     pattern = glob.escape(str(partial)).replace("#", "*")
-    return [Path(p) for p in sorted(glob.glob(pattern, include_hidden=True) if _HIDDEN else glob.glob(pattern))]
+    return [
+        Path(p) for p in sorted(glob.glob(pattern, include_hidden=True) if _HIDDEN else glob.glob(pattern))
+    ]
 
 
 _HIDDEN = "include_hidden" in (glob.glob.__kwdefaults__ or {})
@@ -178,7 +182,9 @@ def _validate_with_pdal(stages: list[dict[str, Any]]) -> None:
         raise pdal_env.translate(str(verdict.get("error_detail") or "the pipeline is not valid"))
 
 
-def _named_metadata(metadata: dict[str, Any], reports: list[tuple[str, list[dict[str, Any]]]]) -> dict[str, Any]:
+def _named_metadata(
+    metadata: dict[str, Any], reports: list[tuple[str, list[dict[str, Any]]]]
+) -> dict[str, Any]:
     """PDAL's metadata, with our stages under their own names instead of filters.python."""
     inner = metadata.get("metadata")
     if not isinstance(inner, dict):

@@ -51,7 +51,9 @@ def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
         path = Path(source)
         try:
             if path.stat().st_size > _LARGEST:
-                raise PipelineError("the pipeline file is too large to be one", where=str(path), found="over 64 MB")
+                raise PipelineError(
+                    "the pipeline file is too large to be one", where=str(path), found="over 64 MB"
+                )
             text = path.read_bytes().decode("utf-8-sig")
         except OSError as error:
             raise PipelineError(
@@ -59,7 +61,10 @@ def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
             ) from None
         except UnicodeDecodeError as error:
             raise PipelineError(
-                "the pipeline file is not UTF-8 text", where=str(path), found=f"byte {error.start}", cure="Save it as UTF-8"
+                "the pipeline file is not UTF-8 text",
+                where=str(path),
+                found=f"byte {error.start}",
+                cure="Save it as UTF-8",
             ) from None
         return parse_pipeline(text, str(path))
     if isinstance(source, str):
@@ -88,7 +93,9 @@ def parse_pipeline(text: str, name: str = "") -> PipelineSource:
             cure=_cure(clean, error),
         ) from None
     except (ValueError, RecursionError) as error:
-        raise PipelineError("the pipeline is not valid JSON", where=name or None, found=str(error)[:200]) from None
+        raise PipelineError(
+            "the pipeline is not valid JSON", where=name or None, found=str(error)[:200]
+        ) from None
     if isinstance(value, dict):
         if not isinstance(value.get("pipeline"), list):
             raise PipelineError(
@@ -101,7 +108,9 @@ def parse_pipeline(text: str, name: str = "") -> PipelineSource:
     elif isinstance(value, list):
         stages = value
     else:
-        raise PipelineError("the pipeline must be a list or an object", where=name or None, found=type(value).__name__)
+        raise PipelineError(
+            "the pipeline must be a list or an object", where=name or None, found=type(value).__name__
+        )
     lines = _lines(clean, len(stages), isinstance(value, dict))
     _check(stages, lines, name)
     return PipelineSource(stages, lines, name)
@@ -169,11 +178,11 @@ def _excerpt(text: str, position: int) -> str:
 def _cure(text: str, error: json.JSONDecodeError) -> str | None:
     before = text[: error.pos].rstrip()
     after = text[error.pos :].lstrip()[:1]
-    if before.endswith(",") and after in ("]", "}") or after == "," and before.endswith(","):
+    if (before.endswith(",") and after in ("]", "}")) or (after == "," and before.endswith(",")):
         return "Remove the comma before the closing bracket"
     if after in ("]", "}") and "Illegal trailing comma" in error.msg:
         return "Remove the comma before the closing bracket"
-    if after == "'" or error.msg.startswith("Expecting property name") and after == "'":
+    if after == "'" or (error.msg.startswith("Expecting property name") and after == "'"):
         return 'JSON wants double quotes: "text"'
     if error.msg == "Extra data":
         return "A pipeline is one list or object; remove what follows it"
@@ -205,7 +214,7 @@ def _lines(text: str, count: int, is_object: bool) -> list[int]:
             at = skip(at)
             if text[at] == ",":
                 at = skip(at + 1)
-    lines = []
+    lines: list[int] = []
     at = skip(begin + 1)
     line, counted = 1, 0
     while len(lines) < count:

@@ -44,7 +44,7 @@ class Progress:
             self.enabled = False
         self.count = 0
         self.started = time.monotonic()
-        self._terminal = bool(self.enabled and self.stream.isatty())
+        self._terminal = bool(self.enabled and self.stream is not None and self.stream.isatty())
         self._every = 0.2 if self._terminal else log_every
         self._next = self.started + delay
         self._shown = False
@@ -70,6 +70,8 @@ class Progress:
             text += f", {seconds:.1f} s"
         elif self.total and rate > 0:
             text += f", {max(self.total - self.count, 0) / rate:.0f} s left"
+        if self.stream is None:
+            return
         try:
             self.stream.write(f"\r{text}\x1b[K" if self._terminal else f"{text}\n")
             self.stream.flush()
@@ -81,7 +83,7 @@ class Progress:
         """Draw the last state, if anything was drawn at all."""
         if self._shown and self.enabled:
             self._draw(time.monotonic(), end=True)
-            if self._terminal:
+            if self._terminal and self.stream is not None:
                 self.stream.write("\n")
         self.enabled = False
 

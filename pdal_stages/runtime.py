@@ -96,11 +96,15 @@ def _as_stage_error(error: BaseException, where: str) -> StageError:
         return error.at(where)
     if isinstance(error, MemoryError):
         return StageError(
-            "memory ran out", where=where, cure="Lower 'memory', work in tiles (--tile), or take fewer features"
+            "memory ran out",
+            where=where,
+            cure="Lower 'memory', work in tiles (--tile), or take fewer features",
         )
     if isinstance(error, KeyboardInterrupt):
         return StageError("interrupted", where=where)
-    failure = StageError(f"{type(error).__name__}: {error}", where=where, cure="Run with --debug and report it")
+    failure = StageError(
+        f"{type(error).__name__}: {error}", where=where, cure="Run with --debug and report it"
+    )
     failure.__traceback__ = error.__traceback__
     return failure
 

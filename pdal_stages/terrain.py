@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from .errors import OptionError, StageError
 
@@ -132,6 +131,8 @@ class MinimaTerrain:
         values = self._minima[place].copy()
         empty = np.flatnonzero(self._keys[place] != keys)
         if empty.size:
+            from scipy.spatial import cKDTree  # most clouds have no gaps: not loaded at start
+
             filled_at = np.column_stack(_unkey(self._keys)).astype(np.float64)
             wanted_at = np.column_stack(_unkey(keys[empty])).astype(np.float64)
             nearest = cKDTree(filled_at).query(wanted_at, k=1)[0]
@@ -190,7 +191,9 @@ def hag_minima(
     """
     x, y, z = (np.asarray(a, np.float64) for a in (x, y, z))
     if not (x.shape == y.shape == z.shape and x.ndim == 1):
-        raise StageError("x, y and z must be one-dimensional and of one length", found=(x.shape, y.shape, z.shape))
+        raise StageError(
+            "x, y and z must be one-dimensional and of one length", found=(x.shape, y.shape, z.shape)
+        )
     if x.size == 0:
         _check_sizes(cell, resolution)
         return np.empty(0)

@@ -49,7 +49,13 @@ def run(capsys, *words):
 def test_pipeline_with_overrides(job, tmp_path, capsys):
     out = tmp_path / "other.las"
     code, _, err = run(
-        capsys, "pipeline", job, "--stage.height.cell=10", f"--writers.las.filename={out}", "--metadata", tmp_path / "m.json"
+        capsys,
+        "pipeline",
+        job,
+        "--stage.height.cell=10",
+        f"--writers.las.filename={out}",
+        "--metadata",
+        tmp_path / "m.json",
     )
     assert code == 0, err
     assert len(laspy.read(out)) == 800
@@ -139,7 +145,16 @@ def test_schemas_are_schemas_and_accept_the_examples():
 def test_train_model_classify_accuracy(cloud, tmp_path, capsys):
     model, out = tmp_path / "m.model", tmp_path / "out.laz"
     code, printed, err = run(
-        capsys, "train", cloud, "--model", model, "--neighborhoods", "c1,s2", "--count", 100, "--writers.classifiermodel.trees=5"
+        capsys,
+        "train",
+        cloud,
+        "--model",
+        model,
+        "--neighborhoods",
+        "c1,s2",
+        "--count",
+        100,
+        "--writers.classifiermodel.trees=5",
     )
     assert code == 0, err
     assert "Ground" in printed and "Building" in printed
@@ -148,7 +163,17 @@ def test_train_model_classify_accuracy(cloud, tmp_path, capsys):
     code, printed, err = run(capsys, "classify", cloud, out, "--model", model)
     assert code == 0, err
     assert "800 points written" in printed
-    code, _, err = run(capsys, "accuracy", out, "--reference", cloud, "--json", tmp_path / "a.json", "--html", tmp_path / "a.html")
+    code, _, err = run(
+        capsys,
+        "accuracy",
+        out,
+        "--reference",
+        cloud,
+        "--json",
+        tmp_path / "a.json",
+        "--html",
+        tmp_path / "a.html",
+    )
     assert code == 0, err
     assert (tmp_path / "a.html").stat().st_size > 10_000
 
@@ -182,6 +207,9 @@ def test_debug_shows_the_traceback(job, tmp_path):
 
 
 def test_importing_the_package_is_light():
-    code = "import sys, pdal_stages; heavy = {'numba', 'sklearn', 'pdal', 'scipy', 'torch'} & set(sys.modules); sys.exit(f'{heavy}' if heavy else 0)"
+    code = (
+        "import sys, pdal_stages; heavy = {'numba', 'sklearn', 'pdal', 'scipy', 'torch'} & set(sys.modules); "
+        "sys.exit(f'{heavy}' if heavy else 0)"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

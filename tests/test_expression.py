@@ -77,7 +77,9 @@ _conditions = st.recursive(
 @given(_conditions)
 def test_agrees_with_pdal(pdal_module, condition):
     rng = np.random.default_rng(7)
-    points = np.zeros(200, [("X", "f8"), ("Y", "f8"), ("Z", "f8"), ("Classification", "u1"), ("GpsTime", "f8")])
+    points = np.zeros(
+        200, [("X", "f8"), ("Y", "f8"), ("Z", "f8"), ("Classification", "u1"), ("GpsTime", "f8")]
+    )
     for name in "XYZ":
         points[name] = rng.integers(0, 6, 200)
     points["Classification"] = rng.integers(0, 6, 200)

@@ -88,10 +88,24 @@ def test_door_1_pipeline_json(cloud, tmp_path):
     job = tmp_path / "job.json"
     out = tmp_path / "out.las"
     job.write_text(
-        json.dumps([str(cloud), {"type": "filters.hag_minima", "tag": "h"}, {"type": "writers.las", "filename": str(out), "extra_dims": "all", "forward": "all"}])
+        json.dumps(
+            [
+                str(cloud),
+                {"type": "filters.hag_minima", "tag": "h"},
+                {"type": "writers.las", "filename": str(out), "extra_dims": "all", "forward": "all"},
+            ]
+        )
     )
     done = subprocess.run(
-        [sys.executable, "-m", "pdal_stages.cli", "pipeline", str(job), "--metadata", str(tmp_path / "m.json")],
+        [
+            sys.executable,
+            "-m",
+            "pdal_stages.cli",
+            "pipeline",
+            str(job),
+            "--metadata",
+            str(tmp_path / "m.json"),
+        ],
         capture_output=True,
         text=True,
     )
@@ -104,10 +118,18 @@ def test_door_1_pipeline_json(cloud, tmp_path):
 
 def test_door_1_expanded_runs_in_stock_pdal(cloud, tmp_path, pdal_program):
     out = tmp_path / "out.las"
-    pipeline = ps.Pipeline([str(cloud), {"type": "filters.hag_minima"}, {"type": "writers.las", "filename": str(out), "extra_dims": "all"}])
+    pipeline = ps.Pipeline(
+        [
+            str(cloud),
+            {"type": "filters.hag_minima"},
+            {"type": "writers.las", "filename": str(out), "extra_dims": "all"},
+        ]
+    )
     (tmp_path / "plain.json").write_text(pipeline.json)
     assert "pdal_stages.runtime" in pipeline.json
-    done = subprocess.run([pdal_program, "pipeline", str(tmp_path / "plain.json")], capture_output=True, text=True)
+    done = subprocess.run(
+        [pdal_program, "pipeline", str(tmp_path / "plain.json")], capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     assert np.allclose(read(out)["HeightAboveGround"], expected_heights(cloud))
 
@@ -149,7 +171,9 @@ def test_door_3_filters_python_by_hand(cloud, pdal_module):
 # ---- what must survive -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("point_format,suffix", [(0, ".las"), (1, ".laz"), (3, ".las"), (6, ".laz"), (7, ".las")])
+@pytest.mark.parametrize(
+    "point_format,suffix", [(0, ".las"), (1, ".laz"), (3, ".las"), (6, ".laz"), (7, ".las")]
+)
 def test_everything_else_comes_out_unchanged(tmp_path, write_las, model, point_format, suffix):
     arrays = scene()
     if point_format in (0, 1, 6):
@@ -157,7 +181,9 @@ def test_everything_else_comes_out_unchanged(tmp_path, write_las, model, point_f
     if point_format == 0:
         arrays.pop("GpsTime")
     arrays["Mine"] = np.arange(3000, dtype=np.int32)
-    source = write_las(tmp_path / f"in{suffix}", arrays, point_format=point_format, wkt=UTM if point_format >= 6 else None)
+    source = write_las(
+        tmp_path / f"in{suffix}", arrays, point_format=point_format, wkt=UTM if point_format >= 6 else None
+    )
     out = tmp_path / f"out{suffix}"
     ps.run_pipeline(
         [
@@ -217,7 +243,16 @@ def wide_model(tmp_path_factory, write_las):
     ps.run_pipeline(
         [
             str(source),
-            {"type": "writers.classifiermodel", "filename": str(path), "neighborhoods": "c1", "dimensions": [], "feature_set": "geometric", "classes": {"2": 2, "6": "64 Shed"}, "count": 100, "trees": 5},
+            {
+                "type": "writers.classifiermodel",
+                "filename": str(path),
+                "neighborhoods": "c1",
+                "dimensions": [],
+                "feature_set": "geometric",
+                "classes": {"2": 2, "6": "64 Shed"},
+                "count": 100,
+                "trees": 5,
+            },
         ]
     )
     return path
@@ -228,7 +263,9 @@ def test_codes_above_31_need_las_14(cloud, tmp_path, wide_model):
     stages = [str(cloud), {"type": "filters.modelclassifier", "model": str(wide_model)}]
     with pytest.raises(OptionError, match=r"above 31.*\"minor_version\": 4.*\"dataformat_id\": 6"):
         ps.Pipeline([*stages, {"type": "writers.las", "filename": str(out), "forward": "all"}])
-    ps.run_pipeline([*stages, {"type": "writers.las", "filename": str(out), "minor_version": 4, "dataformat_id": 7}])
+    ps.run_pipeline(
+        [*stages, {"type": "writers.las", "filename": str(out), "minor_version": 4, "dataformat_id": 7}]
+    )
     assert set(np.unique(read(out).classification)) == {2, 64}
 
 
@@ -245,7 +282,7 @@ def test_codes_above_31_in_laz_14(cloud, tmp_path, wide_model):
         ps.run_pipeline(stages)
         assert set(np.unique(read(out).classification)) == {2, 64}
     else:
-        with pytest.raises(OptionError, match="LAZ 1.4"):
+        with pytest.raises(OptionError, match=r"LAZ 1\.4"):
             ps.Pipeline(stages)
 
 
@@ -311,7 +348,9 @@ def test_an_empty_view_is_no_error(cloud, tmp_path, model):
 
 def test_where_leaves_the_others_alone(cloud, model):
     stages = [str(cloud), {"type": "filters.hag_minima"}]
-    everything = ps.run_pipeline([*stages, {"type": "filters.modelclassifier", "model": str(model)}]).arrays[0]
+    everything = ps.run_pipeline([*stages, {"type": "filters.modelclassifier", "model": str(model)}]).arrays[
+        0
+    ]
     part = ps.run_pipeline(
         [
             *stages,
@@ -330,7 +369,13 @@ def test_rejection_is_counted(cloud, model):
         [
             str(cloud),
             {"type": "filters.hag_minima"},
-            {"type": "filters.modelclassifier", "model": str(model), "reject_below": 0.99, "rejected_code": 1, "probabilities": True},
+            {
+                "type": "filters.modelclassifier",
+                "model": str(model),
+                "reject_below": 0.99,
+                "rejected_code": 1,
+                "probabilities": True,
+            },
         ]
     )
     array = pipeline.arrays[0]
@@ -350,7 +395,14 @@ def test_feet_are_converted(tmp_path, write_las):
     wkt = UTM.replace('UNIT["metre",1]', 'UNIT["foot",0.3048]')
     a = write_las(tmp_path / "m.las", metres, point_format=7, wkt=UTM, scale=1e-4)
     b = write_las(tmp_path / "f.las", feet, point_format=7, wkt=wkt, scale=1e-4)
-    stages = [{"type": "filters.hag_minima"}, {"type": "filters.multiscalefeatures", "neighborhoods": "c2,s2", "feature_set": "Density,HeightRange"}]
+    stages = [
+        {"type": "filters.hag_minima"},
+        {
+            "type": "filters.multiscalefeatures",
+            "neighborhoods": "c2,s2",
+            "feature_set": "Density,HeightRange",
+        },
+    ]
     in_metres = ps.run_pipeline([str(a), *stages]).arrays[0]
     in_feet = ps.run_pipeline([str(b), *stages]).arrays[0]
     near = np.abs(in_feet["HeightAboveGround"] * foot - in_metres["HeightAboveGround"]) < 0.01
@@ -383,8 +435,12 @@ def test_degrees_are_refused(tmp_path, write_las):
 def test_a_missing_dimension_names_the_stage_that_makes_it(cloud, tmp_path, model):
     out = tmp_path / "out.laz"
     out.write_bytes(b"older result")
-    with pytest.raises(DimensionError, match=r"filters\.modelclassifier \(tag 'c'\).*HeightAboveGround.*filters\.hag_minima"):
-        ps.run_pipeline([str(cloud), {"type": "filters.modelclassifier", "model": str(model), "tag": "c"}, str(out)])
+    with pytest.raises(
+        DimensionError, match=r"filters\.modelclassifier \(tag 'c'\).*HeightAboveGround.*filters\.hag_minima"
+    ):
+        ps.run_pipeline(
+            [str(cloud), {"type": "filters.modelclassifier", "model": str(model), "tag": "c"}, str(out)]
+        )
     assert out.read_bytes() == b"older result"
     assert not list(tmp_path.glob(".*partial*"))
 
@@ -423,13 +479,30 @@ def test_validate_reads_no_points(tmp_path, cloud):
     good.validate()
     assert not (tmp_path / "o.laz").exists()
     with pytest.raises(PipelineError, match="nonsense"):
-        ps.Pipeline([{"type": "readers.las", "filename": str(cloud), "nonsense": 1}, {"type": "filters.hag_minima"}]).validate()
+        ps.Pipeline(
+            [{"type": "readers.las", "filename": str(cloud), "nonsense": 1}, {"type": "filters.hag_minima"}]
+        ).validate()
 
 
 def test_too_many_features_for_one_las_record(cloud, tmp_path):
-    writer = {"type": "writers.las", "filename": str(tmp_path / "o.las"), "minor_version": 4, "extra_dims": "all"}
+    writer = {
+        "type": "writers.las",
+        "filename": str(tmp_path / "o.las"),
+        "minor_version": 4,
+        "extra_dims": "all",
+    }
     with pytest.raises(DimensionError, match="extra dimensions"):
-        ps.Pipeline([str(cloud), {"type": "filters.multiscalefeatures", "neighborhoods": "blomley2016,s1,s2", "feature_set": "all"}, writer])
+        ps.Pipeline(
+            [
+                str(cloud),
+                {
+                    "type": "filters.multiscalefeatures",
+                    "neighborhoods": "blomley2016,s1,s2",
+                    "feature_set": "all",
+                },
+                writer,
+            ]
+        )
 
 
 # ---- threads ---------------------------------------------------------------------------------------------
@@ -439,7 +512,13 @@ def test_pipelines_run_in_threads(cloud):
     results: dict[int, np.ndarray] = {}
 
     def work(number):
-        pipeline = ps.run_pipeline([str(cloud), {"type": "filters.hag_minima"}, {"type": "filters.multiscalefeatures", "neighborhoods": "c1,s2"}])
+        pipeline = ps.run_pipeline(
+            [
+                str(cloud),
+                {"type": "filters.hag_minima"},
+                {"type": "filters.multiscalefeatures", "neighborhoods": "c1,s2"},
+            ]
+        )
         results[number] = pipeline.arrays[0]["Linearity_s2"]
 
     threads = [threading.Thread(target=work, args=(i,)) for i in range(4)]

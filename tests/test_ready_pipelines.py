@@ -89,7 +89,12 @@ def test_training_gives_models(models):
 def test_classify(town, models, tmp_path, name):
     out = tmp_path / "o.laz"
     model = models / ("smrf.model" if "smrf" in name else "classes.model")
-    run(name, f"--stage.input.filename={town}", f"--stage.classifier.model={model}", f"--stage.output.filename={out}")
+    run(
+        name,
+        f"--stage.input.filename={town}",
+        f"--stage.classifier.model={model}",
+        f"--stage.output.filename={out}",
+    )
     before, after = laspy.read(town), laspy.read(out)
     sure = np.isin(before.classification, [2, 5, 6]) & (np.asarray(after["Reliability"]) > 0.5)
     assert np.mean(np.asarray(after.classification)[sure] == np.asarray(before.classification)[sure]) > 0.85
@@ -118,7 +123,11 @@ def test_evaluate(town, models, tmp_path):
 def test_tiles_to_tiles(town, models, tmp_path):
     for half, limits in (("west", "X[:500030]"), ("east", "X(500030:]")):
         Pipeline(
-            [str(town), {"type": "filters.range", "limits": limits}, {"type": "writers.las", "filename": str(tmp_path / f"{half}.laz")}]
+            [
+                str(town),
+                {"type": "filters.range", "limits": limits},
+                {"type": "writers.las", "filename": str(tmp_path / f"{half}.laz")},
+            ]
         ).execute()
     run(
         "tiles-to-tiles",

@@ -9,8 +9,12 @@ from hypothesis import strategies as st
 from pdal_stages.errors import OptionError, StageError
 from pdal_stages.units import parse_wkt, units_of_wkt
 
-GEOGCS = 'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.25]],UNIT["degree",0.0174532925199433]]'
-METRES = f'PROJCS["UTM 32N",{GEOGCS},PROJECTION["Transverse_Mercator"],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
+GEOGCS = (
+    'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.25]],UNIT["degree",0.0174532925199433]]'
+)
+METRES = (
+    f'PROJCS["UTM 32N",{GEOGCS},PROJECTION["Transverse_Mercator"],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
+)
 FEET = METRES.replace('UNIT["metre",1', 'UNIT["US survey foot",0.304800609601219')
 VERTICAL = 'VERT_CS["NAVD88",VERT_DATUM["x",2005],UNIT["{}",{}]]'
 WKT2 = (

@@ -16,7 +16,6 @@ from .base import Stage
 from .options import Option
 from .points import Points
 
-
 #: Options that the report lists.
 _SHOWN = ("dimension", "reference", "classes", "ignore", "merge", "where")
 
@@ -44,7 +43,12 @@ class AccuracyStage(Stage):
         Option("model", "filename", None, "Model file whose importances the report shows"),
         Option("print", "boolean", True, "Print the table on standard error"),
     )
-    example = {"type": "filters.accuracy", "reference": "Reference", "json": "accuracy.json", "html": "accuracy.html"}
+    example = {
+        "type": "filters.accuracy",
+        "reference": "Reference",
+        "json": "accuracy.json",
+        "html": "accuracy.html",
+    }
 
     @classmethod
     def check(cls, options: dict[str, Any]) -> None:
@@ -69,7 +73,8 @@ class AccuracyStage(Stage):
     def run(cls, points: Points, options: dict[str, Any]) -> dict[str, NDArray]:
         if points.count == 0:
             raise StageError(
-                "there are no points to compare", cure="Check the reader's file and the filters before this stage"
+                "there are no points to compare",
+                cure="Check the reader's file and the filters before this stage",
             )
         classes = [_number(c) for c in options["classes"]]
         ignore = [] if classes else [_number(c) for c in options["ignore"]]

@@ -14,7 +14,12 @@ from .points import Points
 
 #: Options every stage of ours has.
 COMMON = (
-    Option("where", "expression", None, "Points the stage acts on; the others stay as they are but serve as neighbors"),
+    Option(
+        "where",
+        "expression",
+        None,
+        "Points the stage acts on; the others stay as they are but serve as neighbors",
+    ),
     Option("threads", "integer", 0, "Threads to use; 0 is every core on offer", minimum=0, maximum=1024),
     Option(
         "horizontal_unit",
@@ -22,7 +27,12 @@ COMMON = (
         "",
         "Unit of x and y (metre, foot, us-ft), where the spatial reference is missing or wrong",
     ),
-    Option("vertical_unit", "string", "", "Unit of z, where the spatial reference does not say; otherwise as x and y"),
+    Option(
+        "vertical_unit",
+        "string",
+        "",
+        "Unit of z, where the spatial reference does not say; otherwise as x and y",
+    ),
 )
 
 
@@ -67,7 +77,7 @@ class Stage(ABC):
         return values
 
     @classmethod
-    def check(cls, options: dict[str, Any]) -> None:  # noqa: B027
+    def check(cls, options: dict[str, Any]) -> None:
         """Refuse options that contradict each other; read the files they name."""
 
     @classmethod

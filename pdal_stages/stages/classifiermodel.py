@@ -32,7 +32,9 @@ class ClassifierModel(Stage):
             ("weinmann2018",),
             "Neighborhoods: tokens (c2, s1, k50, kopt, ropt, copt) or a preset (blomley2016, weinmann2018, he2017)",
         ),
-        Option("feature_set", "list", ("all",), "Groups (covariance, geometric, shapes, all) or single features"),
+        Option(
+            "feature_set", "list", ("all",), "Groups (covariance, geometric, shapes, all) or single features"
+        ),
         Option(
             "dimensions",
             "list",
@@ -56,8 +58,17 @@ class ClassifierModel(Stage):
         ),
         Option("target", "integer", None, "Class to find with the binary strategy", minimum=0, maximum=255),
         Option("background", "integer", 1, "Code of all other classes with it", minimum=0, maximum=255),
-        Option("count", "integer", 10_000, "Samples of each class; smaller classes are duplicated", minimum=1),
-        Option("seed", "integer", 0, "Seed of sampling, trees and shape distributions", minimum=0, maximum=2**31 - 1),
+        Option(
+            "count", "integer", 10_000, "Samples of each class; smaller classes are duplicated", minimum=1
+        ),
+        Option(
+            "seed",
+            "integer",
+            0,
+            "Seed of sampling, trees and shape distributions",
+            minimum=0,
+            maximum=2**31 - 1,
+        ),
         Option("trees", "list", (100,), "Number of trees; several values are searched by cross-validation"),
         Option("max_depth", "list", (0,), "Depth of trees, 0 for no limit; several values are searched"),
         Option("min_samples_leaf", "list", (5,), "Samples a leaf must have; several values are searched"),
@@ -72,7 +83,9 @@ class ClassifierModel(Stage):
         ),
         Option("folds", "integer", 0, "Folds of cross-validation over spatial blocks; 0 for none", minimum=0),
         Option("block_size", "number", 25.0, "Side of those blocks", minimum=0, exclusive=True, unit="m"),
-        Option("memory", "integer", 512, "Memory for blocks of points, over the samples", minimum=16, unit="MB"),
+        Option(
+            "memory", "integer", 512, "Memory for blocks of points, over the samples", minimum=16, unit="MB"
+        ),
     )
     example = {
         "type": "writers.classifiermodel",
@@ -86,7 +99,9 @@ class ClassifierModel(Stage):
         # A list of codes is as good as a mapping.
         classes = given.get("classes")
         if isinstance(classes, list | str) and not str(classes).lstrip().startswith("{"):
-            codes = classes if isinstance(classes, list) else [c.strip() for c in classes.split(",") if c.strip()]
+            codes = (
+                classes if isinstance(classes, list) else [c.strip() for c in classes.split(",") if c.strip()]
+            )
             given = {**given, "classes": {str(c): _code(c) for c in codes}}
         return super().parse(given, where)
 
@@ -105,7 +120,9 @@ class ClassifierModel(Stage):
         from ..features import FeaturePlan
 
         training = cls.training_options(options)
-        FeaturePlan.parse(training.neighborhoods, feature_set=training.feature_set, dimensions=training.dimensions)
+        FeaturePlan.parse(
+            training.neighborhoods, feature_set=training.feature_set, dimensions=training.dimensions
+        )
         if training.classes is not None:
             ClassMap.parse(training.classes)
         check_writable(options["filename"], "model")
@@ -130,7 +147,8 @@ class ClassifierModel(Stage):
     def run(cls, points: Points, options: dict[str, Any]) -> dict[str, NDArray]:
         if points.count == 0:
             raise StageError(
-                "there are no points to train on", cure="Check the reader's file and the filters before this stage"
+                "there are no points to train on",
+                cure="Check the reader's file and the filters before this stage",
             )
         needed = cls.reads(options)[1:]
         cloud = TrainingCloud(

@@ -61,7 +61,9 @@ class HagMinima(Stage):
             )
         for code in options["ignore_classes"]:
             if str(code).strip() not in map(str, range(256)):
-                raise OptionError("option 'ignore_classes' must list class codes of 0 to 255", found=repr(code))
+                raise OptionError(
+                    "option 'ignore_classes' must list class codes of 0 to 255", found=repr(code)
+                )
 
     @classmethod
     def creates(cls, options: dict[str, Any]) -> dict[str, str]:
@@ -84,7 +86,9 @@ class HagMinima(Stage):
             noise = np.isin(points.class_codes, codes)
             points.report["ignored"] = int(np.count_nonzero(noise & forms))
             forms &= ~noise
-        terrain = MinimaTerrain.fit(x, y, z, cell=options["cell"], resolution=options["resolution"], mask=forms)
+        terrain = MinimaTerrain.fit(
+            x, y, z, cell=options["cell"], resolution=options["resolution"], mask=forms
+        )
         wanted = slice(None) if points.mask is None else points.mask
         height = np.array(points.arrays["HeightAboveGround"], np.float64)
         height[wanted] = (z[wanted] - terrain.at(x[wanted], y[wanted])) / points.units.vertical

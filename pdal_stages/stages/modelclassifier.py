@@ -24,7 +24,10 @@ class ModelClassifier(Stage):
     options = (
         Option("model", "filename", None, "The model file to apply", required=True),
         Option(
-            "probabilities", "boolean", False, "Also write the probability of each class, as Probability_<code>"
+            "probabilities",
+            "boolean",
+            False,
+            "Also write the probability of each class, as Probability_<code>",
         ),
         Option("margin", "boolean", False, "Also write Margin, the winning probability minus the second"),
         Option(
@@ -43,7 +46,14 @@ class ModelClassifier(Stage):
             minimum=0,
             maximum=255,
         ),
-        Option("memory", "integer", 512, "Memory for blocks of points, over the cloud itself", minimum=16, unit="MB"),
+        Option(
+            "memory",
+            "integer",
+            512,
+            "Memory for blocks of points, over the cloud itself",
+            minimum=16,
+            unit="MB",
+        ),
     )
     example = {"type": "filters.modelclassifier", "model": "town.model"}
 
@@ -104,7 +114,10 @@ class ModelClassifier(Stage):
                 rejected_code=options["rejected_code"],
                 progress=progress,
             )
-        values: dict[str, NDArray] = {"Classification": found.classification, "Reliability": found.reliability}
+        values: dict[str, NDArray] = {
+            "Classification": found.classification,
+            "Reliability": found.reliability,
+        }
         if found.margin is not None:
             values["Margin"] = found.margin
         if found.probabilities is not None:

@@ -41,7 +41,14 @@ class MultiscaleFeatures(Stage):
             ("covariance", "geometric"),
             "Groups (covariance, geometric, shapes, all) or single features (Linearity, A3, ...)",
         ),
-        Option("seed", "integer", 0, "Seed of the random pulls of shape distributions", minimum=0, maximum=2**31 - 1),
+        Option(
+            "seed",
+            "integer",
+            0,
+            "Seed of the random pulls of shape distributions",
+            minimum=0,
+            maximum=2**31 - 1,
+        ),
         Option(
             "bins",
             "filename",
@@ -49,7 +56,14 @@ class MultiscaleFeatures(Stage):
             "JSON file of shape-histogram thresholds and the curvature threshold: read where it exists, "
             "otherwise fitted to these points and written, so that other tiles see the same ones",
         ),
-        Option("memory", "integer", 512, "Memory for blocks of points, over the cloud itself", minimum=16, unit="MB"),
+        Option(
+            "memory",
+            "integer",
+            512,
+            "Memory for blocks of points, over the cloud itself",
+            minimum=16,
+            unit="MB",
+        ),
     )
     example = {
         "type": "filters.multiscalefeatures",
@@ -68,7 +82,9 @@ class MultiscaleFeatures(Stage):
         try:
             names = cls._columns(cls.plan(options))
         except StageError as error:
-            raise plan_error("neighborhoods" if "neighborhood" in error.what else "feature_set", error) from None
+            raise plan_error(
+                "neighborhoods" if "neighborhood" in error.what else "feature_set", error
+            ) from None
         for name in names:
             if len(name.encode()) > _NAME_BYTES:
                 raise OptionError(
@@ -88,7 +104,7 @@ class MultiscaleFeatures(Stage):
 
     @classmethod
     def creates(cls, options: dict[str, Any]) -> dict[str, str]:
-        return {name: "float" for name in cls._columns(cls.plan(options))}
+        return dict.fromkeys(cls._columns(cls.plan(options)), "float")
 
     @classmethod
     def halo(cls, options: dict[str, Any]) -> float:
@@ -102,7 +118,12 @@ class MultiscaleFeatures(Stage):
             return {name: np.empty(0, np.float32) for name in names}
         bins, threshold = _read_bins(options["bins"])
         engine = FeatureEngine(
-            points.xyz, plan, bins=bins, copt_threshold=threshold, seed=options["seed"], threads=options["threads"]
+            points.xyz,
+            plan,
+            bins=bins,
+            copt_threshold=threshold,
+            seed=options["seed"],
+            threads=options["threads"],
         )
         queries = None if points.mask is None else np.flatnonzero(points.mask)
         own = {name: points.dimension(name) for name in plan.dimensions}
@@ -124,15 +145,16 @@ class MultiscaleFeatures(Stage):
                     out[name][at] = values[:, column]
         if options["bins"] and not Path(options["bins"]).exists():
             _write_bins(options["bins"], engine)
-        points.report.update({"neighborhoods": len(plan.neighborhoods), "features": len(names), **engine.report})
+        points.report.update(
+            {"neighborhoods": len(plan.neighborhoods), "features": len(names), **engine.report}
+        )
         return out
 
 
 def too_many_for_las(count: int) -> DimensionError:
     """The error for more extra dimensions than one LAS record can describe."""
     return DimensionError(
-        "LAS cannot hold so many extra dimensions: one record describes "
-        f"{_MOST_EXTRA} of them",
+        f"LAS cannot hold so many extra dimensions: one record describes {_MOST_EXTRA} of them",
         found=f"{count} features",
         cure="Take fewer neighborhoods or features, write to a format without the limit (writers.text, "
         "writers.tiledb), or use writers.classifiermodel and filters.modelclassifier, which need no dimensions",

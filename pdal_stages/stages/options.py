@@ -26,9 +26,9 @@ _READABLE = {
     "string": "text",
     "boolean": "true or false",
     "filename": "a file name",
-    "expression": "a condition such as \"Classification == 2\"",
+    "expression": 'a condition such as "Classification == 2"',
     "list": "a list, or text separated by commas",
-    "mapping": "a mapping such as {\"2\": \"Ground\"}",
+    "mapping": 'a mapping such as {"2": "Ground"}',
 }
 
 
@@ -93,7 +93,7 @@ class Option:
             If it is of the wrong type, out of range or not among the choices.
         """
         parsed = getattr(self, f"_parse_{self.kind}", self._parse_string)(value)
-        if self.kind in ("number", "integer"):
+        if isinstance(parsed, int | float) and self.kind in ("number", "integer"):
             self._check_range(parsed)
         if self.choices and parsed not in self.choices:
             raise OptionError(
@@ -104,7 +104,9 @@ class Option:
         return parsed
 
     def _wrong(self, value: Any) -> OptionError:
-        return OptionError(f"option '{self.name}' must be {_READABLE[self.kind]}", found=json.dumps(value, default=str))
+        return OptionError(
+            f"option '{self.name}' must be {_READABLE[self.kind]}", found=json.dumps(value, default=str)
+        )
 
     def _parse_number(self, value: Any) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float | str):
@@ -134,7 +136,9 @@ class Option:
         if not isinstance(value, str):
             raise self._wrong(value)
         if self.kind in ("filename", "expression") and not value.strip():
-            raise OptionError(f"option '{self.name}' is empty", cure=f"Give {_READABLE[self.kind]}, or leave it out")
+            raise OptionError(
+                f"option '{self.name}' is empty", cure=f"Give {_READABLE[self.kind]}, or leave it out"
+            )
         return value
 
     def _parse_list(self, value: Any) -> list:
@@ -175,7 +179,9 @@ class Option:
             if high is not None:
                 bounds.append(f"at most {high:g}")
             unit = f" {self.unit}" if self.unit else ""
-            raise OptionError(f"option '{self.name}' must be {' and '.join(bounds)}{unit}", found=f"{value:g}")
+            raise OptionError(
+                f"option '{self.name}' must be {' and '.join(bounds)}{unit}", found=f"{value:g}"
+            )
 
 
 def _split(text: str) -> list[str]:
@@ -214,7 +220,9 @@ def parse_options(declared: Iterable[Option], given: Mapping[str, Any]) -> dict[
         if name in given:
             values[name] = option.parse(given[name])
         elif option.required:
-            raise OptionError(f"option '{name}' is required", cure=f"It is {_READABLE[option.kind]}: {option.help}")
+            raise OptionError(
+                f"option '{name}' is required", cure=f"It is {_READABLE[option.kind]}: {option.help}"
+            )
         else:
             values[name] = list(option.default) if isinstance(option.default, tuple) else option.default
     return values

@@ -150,7 +150,7 @@ class Points:
                 found=f"{values.min()} to {values.max()}",
             )
         codes = values.astype(np.uint8)
-        return codes & LEGACY_LIMIT if self.legacy_flags else codes
+        return codes & np.uint8(LEGACY_LIMIT) if self.legacy_flags else codes
 
     def with_codes(self, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """New class codes for `Classification`, with the flag bits of each point kept."""
