@@ -1,0 +1,180 @@
+"""Outputs: read the points of a file or tile again, put the results in, run the tail, rename."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import pdal_env
+from ..errors import StageError
+from . import marks
+from .cloudindex import open_las, read_block
+from .extract import Piece
+
+_PDAL_TYPES = {
+    "f8": "double",
+    "f4": "float",
+    "u1": "uint8_t",
+    "u2": "uint16_t",
+    "u4": "uint32_t",
+    "u8": "uint64_t",
+    "i1": "int8_t",
+    "i2": "int16_t",
+    "i4": "int32_t",
+    "i8": "int64_t",
+}
+
+
+def write_tile(task: dict[str, Any], results: Any, pieces: list[Piece], folder: str) -> dict[str, Any]:
+    """Write one tile's own points from the pieces already cut."""
+    readers, columns = [], []
+    for number, (piece, source) in enumerate(zip(pieces, _sources_of(task, pieces), strict=True)):
+        own = np.flatnonzero(piece.margin < 0)
+        if not own.size:
+            continue
+        rows = np.searchsorted(own, results.rows[number])
+        path = Path(piece.path)
+        core = str(path.with_name(path.name.replace("piece", "core")))
+        readers.append({**source["reader"], "type": "readers.las", "filename": core})
+        columns.append((len(own), rows, {n: c[number] for n, c in results.values.items()}))
+    if not readers:
+        return {"outputs": []}
+    return _write(readers, columns, task["tail"], task["outputs"])
+
+
+def _sources_of(task: dict[str, Any], pieces: list[Piece]) -> list[dict[str, Any]]:
+    """The source of each piece, by the number in the piece's name."""
+    return [task["sources"][int(Path(p.path).stem.removeprefix("piece"))] for p in pieces]
+
+
+def write_file(task: dict[str, Any]) -> dict[str, Any]:
+    """Put one input file's results together and write its output.
+
+    Parameters
+    ----------
+    task : dict
+        ``source`` (path, reader, key), ``count``, ``results`` (files of tiles), ``tail``, ``outputs``.
+    """
+    source, count = task["source"], task["count"]
+    kept = np.zeros(count, bool)
+    seen = 0
+    columns: dict[str, list[tuple[NDArray, NDArray]]] = {}
+    for name in task["results"]:
+        with np.load(name, allow_pickle=False) as tile:
+            prefix = f"{source['key']}/"
+            if f"{prefix}index" not in tile:
+                continue
+            index = tile[f"{prefix}index"]
+            seen += int(tile[f"{prefix}core"])
+            if index.size and (index[-1] >= count or kept[index].any()):
+                raise StageError("internal: two tiles hold the same point", where=source["path"], found=name)
+            kept[index] = True
+            for key in tile.files:
+                if key.startswith(f"{prefix}dim/"):
+                    columns.setdefault(key.removeprefix(f"{prefix}dim/"), []).append((index, tile[key]))
+    if seen != count:
+        raise StageError(
+            "the tiles do not hold all points of the file: it changed while it was worked on",
+            where=source["path"],
+            found=f"{seen:,} of {count:,} points",
+            cure="Start the run again with --resume",
+        )
+    values: dict[str, Any] = {}
+    for name, parts in columns.items():
+        if sum(len(i) for i, _ in parts) == count:
+            full = np.empty(count, parts[0][1].dtype)
+            for index, part in parts:
+                full[index] = part
+            values[name] = (None, full)
+        else:
+            values[name] = (np.concatenate([i for i, _ in parts]), np.concatenate([v for _, v in parts]))
+        parts.clear()
+    reader = {**source["reader"], "type": "readers.las", "filename": source["path"]}
+    return _run([reader], [(kept, values)], task["tail"], task["outputs"])
+
+
+def _write(readers, columns, tail, outputs) -> dict[str, Any]:
+    made = []
+    for count, rows, values in columns:
+        kept = np.zeros(count, bool)
+        kept[rows] = True
+        every = len(rows) == count
+        made.append((kept, {n: (None if every else rows, v) for n, v in values.items()}))
+    return _run(readers, made, tail, outputs)
+
+
+def _run(readers, injected, tail, outputs: list[str]) -> dict[str, Any]:
+    """Run readers, results and tail; files appear under their names when all are whole."""
+    token = uuid.uuid4().hex
+    stages: list[dict[str, Any]] = []
+    inputs = []
+    for number, (reader, (kept, values)) in enumerate(zip(readers, injected, strict=True)):
+        adds = {n: _PDAL_TYPES[v.dtype.str[1:]] for n, (_, v) in values.items()}
+        stage = marks.inject_stage(token, number, values, kept, adds)
+        stages += [{**reader, "tag": f"in{number}"}, {**stage, "inputs": [f"in{number}"], "tag": f"put{number}"}]
+        inputs.append(f"put{number}")
+    stages.append({"type": "filters.merge", "inputs": inputs, "tag": "merged"})
+    partials: list[tuple[Path, Path]] = []
+    waiting = list(outputs)
+    for stage in tail:
+        stage = {k: v for k, v in stage.items() if k != "inputs"}
+        if stage["type"].startswith("writers."):
+            final = Path(waiting.pop(0))
+            partial = final.with_name(f".{final.stem}.partial-{uuid.uuid4().hex[:12]}{final.suffix}")
+            partials.append((partial, final))
+            stage["filename"] = str(partial)
+        stages.append(stage)
+    try:
+        run = pdal_env.execute(stages, arrays=False)
+        for partial, final in partials:
+            check_whole(partial, final, run.count)
+        for partial, final in partials:
+            os.replace(partial, final)
+    except OSError as error:
+        raise StageError("the output could not be written", found=error.strerror or str(error)) from error
+    finally:
+        marks.forget(token)
+        for partial, _ in partials:
+            partial.unlink(missing_ok=True)
+    return {"outputs": [[str(final), *_stamp(final)] for _, final in partials], "written": run.count}
+
+
+def _stamp(path: Path) -> list[int]:
+    stat = path.stat()
+    return [stat.st_size, stat.st_mtime_ns]
+
+
+def check_whole(partial: Path, final: Path, count: int) -> None:
+    """Refuse a file that is not whole: a writer may not notice that the disk is full.
+
+    Raises
+    ------
+    StageError
+        Naming the output.
+    """
+    if not partial.exists():
+        raise StageError("the writer wrote no file", found=str(final))
+    with open(partial, "rb+") as file:
+        os.fsync(file.fileno())  # some file systems report a full disk only here
+    if final.suffix.lower() not in (".las", ".laz"):
+        return
+    full = "The disk may be full"
+    try:
+        with open_las(str(partial)) as reader:
+            header = reader.header
+            found = int(header.point_count)
+            if found == count and count:
+                read_block(reader, str(partial), count - 1, 1)
+                if final.suffix.lower() == ".las":
+                    needed = header.offset_to_point_data + count * header.point_format.size
+                    if partial.stat().st_size < needed:
+                        raise StageError("cut short")
+    except StageError:
+        raise StageError("the output is not whole", found=str(final), cure=full) from None
+    if found != count:
+        raise StageError("the output is not whole", found=f"{found:,} of {count:,} points in {final}", cure=full)

@@ -1,0 +1,171 @@
+"""Cut points out of LAS and LAZ files, byte for byte, with the file's own header."""
+
+from __future__ import annotations
+
+import os
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import StageError
+from .cloudindex import BLOCK, open_las, read_block, runs
+from .grid import Box, Grid
+
+_COMPRESSOR = b"laszip encoded"
+
+
+@dataclass
+class Piece:
+    """Points of one file, in that file's order, as an uncompressed LAS file.
+
+    Attributes
+    ----------
+    path : str
+        The LAS file.
+    index : (n,) int64
+        Number of each point in the input file.
+    margin : (n,) float64
+        How far it lies outside the tile, in the unit of the coordinates; -1 inside.
+    """
+
+    path: str
+    index: NDArray[np.int64]
+    margin: NDArray[np.float64]
+
+
+def plain_header(path: str) -> tuple[bytearray, bytes]:
+    """Header and records of a file as an uncompressed one has them, and its extended records.
+
+    Counts are left as they are; :func:`finish` sets them.
+    """
+    with open(path, "rb") as file:
+        head = bytearray(file.read(375))
+        size, start, count = struct.unpack_from("<HII", head, 94)
+        head = head[:size]
+        file.seek(size)
+        body = file.read(start - size)
+        tail = b""
+        if head[25] >= 4:
+            first, number = struct.unpack_from("<QI", head, 235)
+            if number:
+                file.seek(first)
+                tail = file.read()
+    at, kept, dropped = 0, [], 0
+    for _ in range(count):
+        (length,) = struct.unpack_from("<H", body, at + 20)
+        record = body[at : at + 54 + length]
+        at += len(record)
+        if record[2:18].split(b"\0")[0] == _COMPRESSOR:
+            dropped += 1
+        else:
+            kept.append(record)
+    records = b"".join(kept)
+    gap = body[at:]  # a signature or padding before the points
+    head[104] &= 0x3F
+    struct.pack_into("<II", head, 96, size + len(records) + len(gap), count - dropped)
+    return head + records + gap, tail
+
+
+def finish(file: Any, head: bytearray, tail: bytes, count: int) -> None:
+    """Write extended records after `count` points, and the header with the right counts."""
+    version = head[25]
+    (width,) = struct.unpack_from("<H", head, 105)
+    (start,) = struct.unpack_from("<I", head, 96)
+    if version >= 4:
+        struct.pack_into("<I", head, 107, count if head[104] < 6 and count < 2**32 else 0)
+        struct.pack_into("<Q", head, 247, count)
+        if tail:
+            struct.pack_into("<Q", head, 235, start + count * width)
+    else:
+        struct.pack_into("<I", head, 107, count)
+    file.write(tail)
+    file.seek(0)
+    file.write(head)
+
+
+def cut(
+    path: str,
+    boxes: list[Box],
+    count: int,
+    grid: Grid,
+    tile: tuple[int, int],
+    margin: float,
+    target: str,
+    core_target: str | None = None,
+) -> Piece | None:
+    """Cut a tile and its surroundings out of a file.
+
+    Parameters
+    ----------
+    path : str
+        A LAS or LAZ file.
+    boxes, count
+        Its index, see :func:`pdal_stages.tiling.cloudindex.index_las`.
+    grid, tile
+        Which tile.
+    margin : float
+        Surroundings, in the unit of the coordinates.
+    target : str
+        The LAS file to write.
+    core_target : str, optional
+        A second file, for the tile's own points alone.
+
+    Returns
+    -------
+    Piece or None
+        None where the file has no point there.
+    """
+    box = grid.box(tile, margin)
+    blocks = runs(boxes, box)
+    if not blocks:
+        return None
+    index: list[NDArray[np.int64]] = []
+    margins: list[NDArray[np.float64]] = []
+    cores = 0
+    head, tail = plain_header(path)
+    try:
+        with open_las(path) as reader, open(target, "wb") as out, open(core_target or os.devnull, "wb") as core_out:
+            out.write(head)
+            core_out.write(head)
+            for first, last in blocks:
+                for block in range(first, last):
+                    start = block * BLOCK
+                    points = read_block(reader, path, start, min(BLOCK, count - start))
+                    x, y = np.asarray(points.x), np.asarray(points.y)
+                    rows = np.flatnonzero((x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3]))
+                    if not rows.size:
+                        continue
+                    away = outside(x[rows], y[rows], grid, tile)
+                    raw = points.array[rows]
+                    if raw.dtype.itemsize != struct.unpack_from("<H", head, 105)[0]:
+                        raise StageError("the points have another length than the header says", where=path)
+                    out.write(raw.tobytes())
+                    if core_target:
+                        mine = away < 0
+                        core_out.write(raw[mine].tobytes())
+                        cores += int(np.count_nonzero(mine))
+                    index.append(rows + start)
+                    margins.append(away)
+            found = sum(len(i) for i in index)
+            finish(out, bytearray(head), tail, found)
+            if core_target:
+                finish(core_out, bytearray(head), tail, cores)
+    except OSError as error:
+        raise StageError("a tile could not be cut out", where=path, found=error.strerror or str(error)) from error
+    if not index:
+        os.unlink(target)
+        if core_target:
+            os.unlink(core_target)
+        return None
+    return Piece(target, np.concatenate(index), np.concatenate(margins))
+
+
+def outside(x: NDArray, y: NDArray, grid: Grid, tile: tuple[int, int]) -> NDArray[np.float64]:
+    """Distance of points from a tile along the farther axis; -1 for its own points."""
+    x0, y0, x1, y1 = grid.box(tile)
+    away = np.maximum(np.maximum(x0 - x, x - x1), np.maximum(y0 - y, y - y1))
+    mine = (grid.index(x) == tile[0]) & (grid.index(y) == tile[1])
+    return np.where(mine, -1.0, np.maximum(away, 0.0))

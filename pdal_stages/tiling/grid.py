@@ -1,0 +1,79 @@
+"""The grid of tiles: anchored at zero, half-open, the same for every run."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import OptionError
+
+Box = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Square tiles of one size; tile (i, j) holds ``i*size <= x < (i+1)*size``, likewise y.
+
+    Attributes
+    ----------
+    size : float
+        Side of a tile, in the unit of the coordinates.
+    """
+
+    size: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.size) and self.size > 0):
+            raise OptionError("the size of tiles must be a positive length", found=self.size)
+
+    def index(self, coordinate: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Column or row of every coordinate.
+
+        The edges decide, not the quotient: a point on an edge belongs to the tile it begins,
+        whatever the division rounds to, so each point has exactly one tile.
+        """
+        where = np.floor(coordinate / self.size)
+        where -= coordinate < where * self.size
+        where += coordinate >= (where + 1.0) * self.size
+        return where.astype(np.int64)
+
+    def box(self, tile: tuple[int, int], margin: float = 0.0) -> Box:
+        """(min x, min y, max x, max y) of a tile, grown by a margin."""
+        i, j = tile
+        return (
+            i * self.size - margin,
+            j * self.size - margin,
+            (i + 1) * self.size + margin,
+            (j + 1) * self.size + margin,
+        )
+
+    def name(self, tile: tuple[int, int]) -> str:
+        """South-west corner, e.g. ``500000_5400500``."""
+        return "_".join(f"{n * self.size:.10g}" for n in tile)
+
+    def covering(self, box: Box) -> list[tuple[int, int]]:
+        """Every tile that a box touches, row by row."""
+        x0, y0, x1, y1 = (int(self.index(np.array([v]))[0]) for v in box)
+        return [(i, j) for j in range(y0, y1 + 1) for i in range(x0, x1 + 1)]
+
+
+def touch(a: Box, b: Box) -> bool:
+    """Whether two boxes share a point, edges included."""
+    return a[0] <= b[2] and b[0] <= a[2] and a[1] <= b[3] and b[1] <= a[3]
+
+
+def inside(a: Box, b: Box) -> bool:
+    """Whether box a lies in box b."""
+    return a[0] >= b[0] and a[1] >= b[1] and a[2] <= b[2] and a[3] <= b[3]
+
+
+def union(boxes: list[Box]) -> Box:
+    """The box around boxes."""
+    if not boxes:
+        return (math.inf, math.inf, -math.inf, -math.inf)
+    low = np.array(boxes)[:, :2].min(axis=0)
+    high = np.array(boxes)[:, 2:].max(axis=0)
+    return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))

@@ -1,0 +1,176 @@
+"""The inputs of a tiled run: files behind a pipeline's readers, and where they lie."""
+
+from __future__ import annotations
+
+import glob
+import hashlib
+import json
+import os
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..errors import PipelineError, StageError
+from .grid import Box
+from .tindex import locations
+
+#: Readers of files whose points can be fetched by number.
+_LAS = ("readers.las", "readers.copc")
+
+
+@dataclass(frozen=True)
+class Source:
+    """One input.
+
+    Attributes
+    ----------
+    path : str
+        Absolute path, or an address.
+    reader : dict
+        The reader stage that reads it.
+    kind : str
+        ``las`` (LAS, LAZ, COPC) or ``ept``.
+    """
+
+    path: str
+    reader: dict[str, Any]
+    kind: str
+
+    @property
+    def key(self) -> str:
+        """A short name, the same in every run."""
+        return hashlib.sha1(self.path.encode()).hexdigest()[:12]
+
+    @property
+    def stem(self) -> str:
+        """The name outputs are called after."""
+        name = Path(self.path).name
+        for suffix in (".copc.laz", ".laz", ".las"):
+            if name.lower().endswith(suffix):
+                return name[: -len(suffix)]
+        return Path(name).stem
+
+    def stamp(self) -> list[int]:
+        """Size and time of change, which tell whether an input is still the same."""
+        if "://" in self.path:
+            return [0, 0]
+        try:
+            stat = os.stat(self.path)
+        except OSError:
+            return [-1, -1]
+        return [stat.st_size, stat.st_mtime_ns]
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"path": self.path, "reader": self.reader, "kind": self.kind}
+
+
+def find_sources(readers: list[dict[str, Any]]) -> list[Source]:
+    """The inputs behind readers: names, patterns, EPT addresses, tile indexes.
+
+    Raises
+    ------
+    PipelineError
+        Where nothing is found, or a reader cannot be cut into tiles.
+    """
+    found: dict[str, Source] = {}
+    for reader in readers:
+        name = str(reader.get("filename", ""))
+        kind = reader["type"]
+        if kind == "readers.tindex":
+            options = {k: v for k, v in reader.items() if k in ("override_srs", "default_srs")}
+            paths = locations(name, str(reader.get("tindex_name", "location")))
+            reader = {"type": "readers.las", **options}
+        elif kind == "readers.ept":
+            path = name.removeprefix("ept://")
+            path = path if path.endswith("ept.json") else path.rstrip("/") + "/ept.json"
+            path = path if "://" in path else str(Path(path).absolute())
+            found.setdefault(path, Source(path, _bare(reader), "ept"))
+            continue
+        elif kind in _LAS:
+            patterned = any(c in name for c in "*?[") and not os.path.exists(name)
+            paths = sorted(glob.glob(name, recursive=True)) if patterned else [name]
+            if not paths:
+                raise PipelineError("no file fits the reader's pattern", where=kind, found=name)
+        else:
+            raise PipelineError(
+                f"{kind} cannot read a part of a file, so it cannot be cut into tiles",
+                found=name,
+                cure="Convert the input first: pdal translate INPUT input.laz",
+            )
+        for path in paths:
+            full = str(Path(path).absolute())
+            found.setdefault(full, Source(full, {**_bare(reader), "type": "readers.las"}, "las"))
+    return list(found.values())
+
+
+def _bare(reader: dict[str, Any]) -> dict[str, Any]:
+    return {k: v for k, v in reader.items() if k not in ("filename", "tag", "inputs")}
+
+
+@dataclass(frozen=True)
+class Header:
+    """What an input says of itself.
+
+    Attributes
+    ----------
+    count : int
+        Points.
+    box : Box
+        Bounding box.
+    """
+
+    count: int
+    box: Box
+
+
+def read_header(source: Source) -> Header:
+    """Number of points and bounding box, from the first bytes.
+
+    Raises
+    ------
+    StageError
+        If the input cannot be read.
+    """
+    return _ept_header(source) if source.kind == "ept" else las_header(source.path)
+
+
+def las_header(path: str) -> Header:
+    """Number of points and bounding box in the header of a LAS or LAZ file."""
+    try:
+        with open(path, "rb") as file:
+            head = file.read(375)
+    except OSError as error:
+        raise StageError("the input cannot be read", where=path, found=error.strerror or str(error)) from None
+    if len(head) < 227 or head[:4] != b"LASF":
+        raise StageError("the input is not a LAS or LAZ file", where=path, found=f"{head[:4]!r} as first bytes")
+    (count,) = struct.unpack_from("<I", head, 107)
+    if head[25] >= 4 and len(head) >= 255:
+        (count,) = struct.unpack_from("<Q", head, 247)
+    x1, x0, y1, y0 = struct.unpack_from("<4d", head, 179)
+    if count and not (x0 <= x1 and y0 <= y1):
+        raise StageError("the header has no bounding box", where=path, found=f"x {x0} to {x1}, y {y0} to {y1}")
+    return Header(int(count), (x0, y0, x1, y1))
+
+
+def read_ept(path: str) -> dict[str, Any]:
+    """The description of an EPT source."""
+    try:
+        if "://" in path:
+            import urllib.request
+
+            with urllib.request.urlopen(path, timeout=60) as answer:
+                text = answer.read()
+        else:
+            text = Path(path).read_bytes()
+        found = json.loads(text)
+        found["points"], found["boundsConforming"], found["schema"]  # noqa: B018
+        return found
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise StageError("the EPT source cannot be read", where=path, found=str(error)) from None
+
+
+def _ept_header(source: Source) -> Header:
+    described = read_ept(source.path)
+    x0, y0, _, x1, y1, _ = (float(v) for v in described["boundsConforming"])
+    return Header(int(described["points"]), (x0, y0, x1, y1))

@@ -1,0 +1,84 @@
+"""File names in a tile index, as ``pdal tindex create`` writes it: Shapefile, GeoPackage, SQLite or GeoJSON."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import struct
+from pathlib import Path
+
+from ..errors import StageError
+
+
+def locations(path: str, column: str = "location") -> list[str]:
+    """The files a tile index names; relative names count from the index's folder, then from here.
+
+    Raises
+    ------
+    StageError
+        If it cannot be read, or has no such column.
+    """
+    file = Path(path)
+    try:
+        suffix = file.suffix.lower()
+        if suffix == ".shp":
+            names = _dbf(file.with_suffix(".dbf").read_bytes(), column)
+        elif suffix in (".gpkg", ".sqlite", ".db"):
+            names = _sqlite(file, column)
+        elif suffix in (".geojson", ".json"):
+            features = json.loads(file.read_text(encoding="utf-8"))["features"]
+            names = [str(feature["properties"][column]) for feature in features]
+        else:
+            raise StageError(
+                "a tile index of this kind is not read",
+                where=path,
+                found=suffix or "no suffix",
+                cure="Write it as .gpkg, .sqlite, .shp or .geojson",
+            )
+    except (OSError, ValueError, KeyError, TypeError, struct.error, sqlite3.Error) as error:
+        raise StageError(
+            "the tile index cannot be read",
+            where=path,
+            found=f"{type(error).__name__}: {error}",
+            cure=f"It needs a column '{column}' with file names (option tindex_name)",
+        ) from None
+    if not names:
+        raise StageError("the tile index names no file", where=path)
+    return [_resolve(name, file.absolute().parent) for name in dict.fromkeys(names)]
+
+
+def _resolve(name: str, folder: Path) -> str:
+    beside = folder / name
+    return str(beside if beside.exists() else Path(name).absolute())
+
+
+def _sqlite(file: Path, column: str) -> list[str]:
+    file.stat()  # sqlite3 would make a missing file
+    with sqlite3.connect(f"file:{file.absolute().as_posix()}?mode=ro", uri=True) as base:
+        for (table,) in base.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall():
+            quoted = table.replace('"', '""')
+            columns = [row[1] for row in base.execute(f'PRAGMA table_info("{quoted}")')]
+            if column in columns:
+                return [str(row[0]) for row in base.execute(f'SELECT "{column}" FROM "{quoted}"')]
+    raise KeyError(column)
+
+
+def _dbf(data: bytes, column: str) -> list[str]:
+    """Values of one text column of a dBASE table."""
+    rows, start, width = struct.unpack_from("<IHH", data, 4)
+    at, offset = 32, 1
+    while data[at] != 0x0D:
+        name = data[at : at + 11].split(b"\0")[0].decode("latin-1")
+        length = data[at + 16]
+        if name == column[:10]:
+            break
+        offset += length
+        at += 32
+    else:
+        raise KeyError(column)
+    out = []
+    for row in range(rows):
+        record = data[start + row * width : start + (row + 1) * width]
+        if record[:1] != b"*":
+            out.append(record[offset : offset + length].decode("utf-8", "replace").strip())
+    return out
