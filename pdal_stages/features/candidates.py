@@ -13,14 +13,15 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
+from .index import SPARE
 from .jit import njit
 
 #: Coordinates of padding points: the square is still finite, and larger than any squared radius.
 FAR = 1e150
-LANES = 8
+LANES = SPARE
 
-#: With fewer rows of cells than this between centre and rim, sharing the inner cells costs more than it saves.
-INNER_FROM = 3
+#: With no more rows of cells than this between centre and rim, sharing the inner cells costs more than it saves.
+INNER_FROM = 2
 
 
 @intrinsic
@@ -61,13 +62,13 @@ def half_widths(radius, cell):
     """
     r2 = radius * radius
     reach = int(np.ceil(radius / cell)) + 1
-    while reach > 0 and ((reach - 1) * cell) ** 2 > r2:
+    while reach > 0 and ((reach - 1) * cell) ** 2 >= r2:
         reach -= 1
     widths = np.empty((2, 2 * reach + 1), np.int64)
     for row in range(-reach, reach + 1):
         near, far = max(abs(row) - 1, 0), abs(row) + 1
         outer = reach
-        while outer > 0 and (near**2 + (outer - 1) ** 2) * cell**2 > r2:
+        while outer > 0 and (near**2 + (outer - 1) ** 2) * cell**2 >= r2:
             outer -= 1
         inner = -1
         if reach > INNER_FROM:
@@ -140,14 +141,10 @@ def _copy8(typingctx, target, i, source, j):
 def _copy(x, y, z, first, last, px, py, pz, at):
     """Append the points first..last; what a whole vector copies too much is overwritten by the next."""
     n = last - first
-    if first + n + LANES <= len(x):
-        for i in range(0, n, LANES):
-            _copy8(px, at + i, x, first + i)
-            _copy8(py, at + i, y, first + i)
-            _copy8(pz, at + i, z, first + i)
-    else:
-        for i in range(n):
-            px[at + i], py[at + i], pz[at + i] = x[first + i], y[first + i], z[first + i]
+    for i in range(0, n, LANES):
+        _copy8(px, at + i, x, first + i)
+        _copy8(py, at + i, y, first + i)
+        _copy8(pz, at + i, z, first + i)
     return at + n
 
 
@@ -175,8 +172,8 @@ def gather(x, y, z, strip, reach, width, own, column, px, py, pz):
 
     Parameters
     ----------
-    x, y, z : (n,) float64 arrays
-        The sorted cloud.
+    x, y, z : (n + SPARE,) float64 arrays
+        The sorted cloud and a vector to spare.
     strip, reach : array, int
         :func:`fill_strip`'s table and the reach it was made for.
     width, own : (2, 2 own + 1) int64 array, int

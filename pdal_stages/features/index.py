@@ -19,6 +19,9 @@ from .jit import njit
 #: Coordinates beyond this many metres are no point cloud (and would overflow cell numbers).
 LIMIT = 1e12
 
+#: Values behind the last coordinate that kernels may read.
+SPARE = 8
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -30,8 +33,10 @@ class Grid:
         Edge of a cell in metres, a power of two (so that cell corners are exact).
     order : (n,) int32 or int64 array
         ``order[i]`` is the index, in the cloud as it was given, of the i-th sorted point.
+    xyz : (3, n + SPARE) float64 array
+        The sorted coordinates; kernels that copy whole vectors may read (and ignore) what lies behind the last.
     x, y, z : (n,) float64 arrays
-        The sorted coordinates.
+        Views of them.
     cell_ix, cell_start : (m,) and (m + 1,) int64 arrays
         Column number of each occupied cell and its first point; cells ascend by row, then column.
     row_iy, row_start : (r,) and (r + 1,) int64 arrays
@@ -40,26 +45,40 @@ class Grid:
 
     cell: float
     order: np.ndarray
-    x: np.ndarray
-    y: np.ndarray
-    z: np.ndarray
+    xyz: np.ndarray
     cell_ix: np.ndarray
     cell_start: np.ndarray
     row_iy: np.ndarray
     row_start: np.ndarray
 
     def __len__(self) -> int:
-        return len(self.x)
+        return len(self.order)
+
+    @property
+    def x(self) -> np.ndarray:
+        """Sorted x, metres."""
+        return self.xyz[0, : len(self)]
+
+    @property
+    def y(self) -> np.ndarray:
+        """Sorted y, metres."""
+        return self.xyz[1, : len(self)]
+
+    @property
+    def z(self) -> np.ndarray:
+        """Sorted z, metres."""
+        return self.xyz[2, : len(self)]
 
     @property
     def nbytes(self) -> int:
         """Memory held, in bytes."""
-        arrays = (self.order, self.x, self.y, self.z, self.cell_ix, self.cell_start, self.row_iy, self.row_start)
+        arrays = (self.order, self.xyz, self.cell_ix, self.cell_start, self.row_iy, self.row_start)
         return sum(array.nbytes for array in arrays)
 
     def tables(self) -> tuple[np.ndarray, ...]:
-        """The arrays kernels take: x, y, z, cell_ix, cell_start, row_iy, row_start."""
-        return self.x, self.y, self.z, self.cell_ix, self.cell_start, self.row_iy, self.row_start
+        """The arrays kernels take: x, y, z (with spare values behind), cell_ix, cell_start, row_iy, row_start."""
+        x, y, z = self.xyz
+        return x, y, z, self.cell_ix, self.cell_start, self.row_iy, self.row_start
 
     def rows_of_cells(self) -> np.ndarray:
         """Row number of every occupied cell, (m,) int64."""
@@ -134,16 +153,18 @@ def build_grid(xyz: np.ndarray, cell: float) -> Grid:
         iy, ix = ranks[0][iy], ranks[1][ix]
     else:
         iy, ix = iy + y0, ix + x0
-    x, y, z = (np.take(xyz[:, k], order) for k in range(3))
+    spare = np.zeros((3, n + SPARE))
+    for k in range(3):
+        np.take(xyz[:, k], order, out=spare[k, :n], mode="clip")  # "raise" would make a copy
+    spare += 0.0  # -0.0 becomes 0.0: equal coordinates are equal bits
+    x, y, z = spare[:, :n]
     cell_start = np.concatenate((starts, [n])).astype(np.int64)
     sort_cells(x, y, z, order, cell_start)
     rows = np.flatnonzero(np.concatenate(([True], iy[1:] != iy[:-1]))) if n else np.zeros(0, np.int64)
     return Grid(
         cell=float(cell),
         order=order,
-        x=x,
-        y=y,
-        z=z,
+        xyz=spare,
         cell_ix=ix,
         cell_start=cell_start,
         row_iy=iy[rows],

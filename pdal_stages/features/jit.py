@@ -110,7 +110,7 @@ def _stamp(dispatcher, function: Callable) -> None:
 class CompilationNote:
     """Say on stderr, once, that kernels are being compiled, if it takes longer than `delay` seconds."""
 
-    def __init__(self, delay: float = 2.0) -> None:
+    def __init__(self, delay: float = 3.0) -> None:
         self._timer = threading.Timer(delay, self._say)
         self._timer.daemon = True
 

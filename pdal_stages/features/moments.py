@@ -58,7 +58,7 @@ def _mul(typingctx, a, b):
     return types.float64(types.float64, types.float64), codegen
 
 
-@njit
+@njit(forceinline=True)
 def cylinder_sums(px, py, pz, qx, qy, qz, r2, out, j):
     """Moments about (qx, qy, qz) of the candidates within sqrt(r2) of it in x and y, into ``out[:, j]``."""
     n = sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
@@ -82,7 +82,7 @@ def cylinder_sums(px, py, pz, qx, qy, qz, r2, out, j):
     out[LOW, j], out[HIGH, j] = from_order_bits(low), from_order_bits(high)
 
 
-@njit
+@njit(forceinline=True)
 def sphere_sums(px, py, pz, qx, qy, qz, r2, out, j):
     """Moments about (qx, qy, qz) of the candidates within sqrt(r2) of it, into ``out[:, j]``."""
     n = sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
@@ -106,7 +106,7 @@ def sphere_sums(px, py, pz, qx, qy, qz, r2, out, j):
     out[LOW, j], out[HIGH, j] = from_order_bits(low), from_order_bits(high)
 
 
-@njit
+@njit(forceinline=True)
 def add_shared(inner, dx, dy, dz, out, j):
     """Add the moments ``inner[:, 0]``, taken about a point at (dx, dy, dz) from the query, to ``out[:, j]``."""
     n, sx, sy, sz = inner[N, 0], inner[SX, 0], inner[SY, 0], inner[SZ, 0]

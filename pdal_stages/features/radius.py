@@ -120,9 +120,7 @@ def radius_block(
                     centre = (ix + 0.5) * cell, (iy + 0.5) * cell
                     cylinders(px, py, pz, shared, end, qx, qy, qz, a, b, r2, centre, inner, moments[c], start)
                 if s >= 0:
-                    sx, sy, sz = px[:end], py[:end], pz[:end]
-                    for j in range(a, b):
-                        sphere_sums(sx, sy, sz, qx[j], qy[j], qz[j], r2, moments[s], j - start)
+                    spheres(px[:end], py[:end], pz[:end], qx, qy, qz, a, b, r2, moments[s], start)
                 for kind in range(2):
                     number = wanted[k, kind]
                     if number < 0 or not shaped[number]:
@@ -184,6 +182,13 @@ def cylinders(px, py, pz, shared, end, qx, qy, qz, a, b, r2, centre, inner, out,
         cylinder_sums(rx, ry, rz, qx[j], qy[j], qz[j], r2, out, j - start)
         if shared:
             add_shared(inner, cx - qx[j], cy - qy[j], cz - qz[j], out, j - start)
+
+
+@njit
+def spheres(px, py, pz, qx, qy, qz, a, b, r2, out, start):
+    """Moments of one radius' spheres for the queries a..b of one cell."""
+    for j in range(a, b):
+        sphere_sums(px, py, pz, qx[j], qy[j], qz[j], r2, out, j - start)
 
 
 @njit
