@@ -1,0 +1,17 @@
+"""alsNet [WM19]: PointNet++ for airborne scans, in circular batches. Applying it needs NumPy; training, PyTorch."""
+
+from .algorithm import AlsNet, InputPlan
+from .circles import Circles
+from .configuration import CONFIGURATIONS, Configuration, Level, parse_configuration
+from .options import NetworkOptions
+
+__all__ = [
+    "CONFIGURATIONS",
+    "AlsNet",
+    "Circles",
+    "Configuration",
+    "InputPlan",
+    "Level",
+    "NetworkOptions",
+    "parse_configuration",
+]

@@ -1,0 +1,360 @@
+"""alsNet as a classifier of a model file: made from arrays, applied to whole clouds."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from ..classifier.arrays import ArrayRule
+from ..errors import ModelError, OptionError, StageError
+from ..parallel import map_blocks, resolve_threads
+from . import circles as circles_
+from .circles import Circles
+from .configuration import Configuration, parse_configuration
+from .pyramid import Pyramid, build, scramble
+from .weights import Folded, Weights, check
+
+#: Metres that become 1 where X, Y or Z is an input.
+METRES = 10.0
+
+
+@dataclass(frozen=True)
+class InputPlan:
+    """What a network needs of the points; stands where a forest has its plan of features.
+
+    Attributes
+    ----------
+    dimensions : tuple of str
+        Inputs in order. X, Y and Z are taken from the batch's centre.
+    halo : float
+        Metres around a tile that its results depend on.
+    """
+
+    dimensions: tuple[str, ...]
+    halo: float
+    neighborhoods: tuple = ()
+    layout: tuple = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The inputs."""
+        return self.dimensions
+
+    def to_dict(self) -> dict[str, Any]:
+        """As the manifest has it."""
+        return {"neighborhoods": [], "features": [], "dimensions": list(self.dimensions)}
+
+
+@dataclass(frozen=True, eq=False)
+class CloudProbabilities:
+    """What a network says of a cloud's points.
+
+    Attributes
+    ----------
+    mean : (m, classes) float64
+        Mean probabilities over the batches a point is in.
+    variance : (m,) float64
+        Variance of a class's probability over those batches, mean over the classes; 0 in a single one.
+    report : dict
+        Counts for the metadata.
+    """
+
+    mean: npt.NDArray[np.float64]
+    variance: npt.NDArray[np.float64]
+    report: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class AlsNet:
+    """A trained network.
+
+    Parameters
+    ----------
+    weights : dict of str to float32 array
+    configuration : Configuration
+    inputs : tuple of str
+        Names of the inputs.
+    mean, scale : tuple of float
+        An input is (value - mean) / scale.
+    spacing : float
+        Of the batches' grid, metres.
+    n_classes : int
+    """
+
+    weights: Weights
+    configuration: Configuration
+    inputs: tuple[str, ...]
+    mean: tuple[float, ...]
+    scale: tuple[float, ...]
+    spacing: float
+    n_classes: int
+
+    name: ClassVar[str] = "alsnet"
+    #: A network is applied to clouds, not to rows of features.
+    whole_cloud: ClassVar[bool] = True
+    rules: ClassVar[Mapping[str, ArrayRule]] = {
+        "sa*": ArrayRule(("<f4",), 2),
+        "fp*": ArrayRule(("<f4",), 2),
+        "head_*": ArrayRule(("<f4",), 2),
+        "scores": ArrayRule(("<f4",), 2),
+    }
+
+    # ---- file ----------------------------------------------------------------------------------------------
+
+    @classmethod
+    def from_arrays(
+        cls,
+        arrays: Mapping[str, npt.NDArray[Any]],
+        parameters: Mapping[str, Any],
+        n_features: int,
+        n_classes: int,
+    ) -> AlsNet:
+        """Made from a model file's content, everything checked."""
+        wanted = {"configuration", "spacing", "inputs", "weights"}
+        if set(parameters) != wanted or not isinstance(parameters["inputs"], list):
+            raise ModelError("the network's parameters are not right", found=sorted(map(str, parameters))[:6])
+        try:
+            configuration = parse_configuration(_mapping(parameters["configuration"]))
+        except OptionError as error:
+            raise ModelError("the network's configuration is not right", found=error) from None
+        spacing = _finite(parameters["spacing"], "spacing", 1e-3, 1e6)
+        entries = [_mapping(entry) for entry in parameters["inputs"]]
+        if len(entries) != n_features or not all(isinstance(entry.get("name"), str) for entry in entries):
+            raise ModelError(
+                "the network's inputs are not the model's", found=f"{len(entries)} and {n_features}"
+            )
+        mean = tuple(_finite(entry.get("mean"), "mean", -1e12, 1e12) for entry in entries)
+        scale = tuple(_finite(entry.get("scale"), "scale", 1e-12, 1e12) for entry in entries)
+        check(arrays, configuration, n_features, n_classes)
+        return cls(
+            dict(arrays), configuration, tuple(e["name"] for e in entries), mean, scale, spacing, n_classes
+        )
+
+    def arrays(self) -> Weights:
+        """What the file stores."""
+        return dict(self.weights)
+
+    def parameters(self) -> dict[str, Any]:
+        """What the manifest says."""
+        return {
+            "configuration": self.configuration.to_dict(),
+            "spacing": self.spacing,
+            "inputs": [
+                {"name": name, "mean": mean, "scale": scale}
+                for name, mean, scale in zip(self.inputs, self.mean, self.scale, strict=True)
+            ],
+            "weights": int(sum(array.size for array in self.weights.values())),
+        }
+
+    @classmethod
+    def plan_of(cls, manifest: Mapping[str, Any]) -> InputPlan:
+        """The plan of a model file."""
+        spacing = _finite(_mapping(manifest["parameters"]).get("spacing"), "spacing", 1e-3, 1e6)
+        return InputPlan(tuple(manifest["dimensions"]), circles_.halo(spacing))
+
+    @property
+    def plan(self) -> InputPlan:
+        """What it needs of the points."""
+        return InputPlan(self.inputs, circles_.halo(self.spacing))
+
+    # ---- applying ------------------------------------------------------------------------------------------
+
+    def predict_proba(self, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """Not possible: a network looks at neighbors."""
+        raise ModelError("a network classifies clouds, not rows of features", cure="Use Model.predict")
+
+    @cached_property
+    def folded(self) -> Folded:
+        """The network, ready to apply."""
+        return Folded(self.weights, self.configuration)
+
+    def columns(
+        self, xyz: npt.NDArray[np.float64], dimensions: Mapping[str, npt.ArrayLike]
+    ) -> npt.NDArray[np.float32]:
+        """The inputs that do not depend on the batch, scaled; columns of X, Y and Z are left 0."""
+        return scaled(xyz, dimensions, self.inputs, self.mean, self.scale)
+
+    def predict_cloud(
+        self,
+        xyz: npt.NDArray[np.float64],
+        dimensions: Mapping[str, npt.ArrayLike],
+        rows: npt.NDArray[np.int64] | None = None,
+        *,
+        threads: int | None = None,
+        memory_mb: float = 512.0,
+        progress: Any = None,
+    ) -> CloudProbabilities:
+        """Mean probabilities over all batches a point is in [WM19].
+
+        Parameters
+        ----------
+        xyz : (n, 3) float64
+            Coordinates in metres.
+        dimensions : mapping
+            Name to (n,) values of the inputs that are dimensions.
+        rows : (m,) int64, ascending, optional
+            Points wanted; all by default. The others are neighbors.
+        threads, memory_mb
+            Batches are computed side by side, as many as fit into the memory, at least one.
+        progress : object, optional
+            Its ``update`` is called with the points done.
+        """
+        columns = self.columns(xyz, dimensions)
+        circles = Circles(xyz, self.configuration.points, self.spacing, columns)
+        numbers = circles.needed(rows)
+        n = len(xyz)
+        place = np.arange(n) if rows is None else np.full(n, -1, np.int64)
+        if rows is not None:
+            place[rows] = np.arange(len(rows))
+        m = n if rows is None else len(rows)
+        total = np.zeros((m, self.n_classes))
+        squares = np.zeros(m)
+        count = np.zeros(m, np.int64)
+        each = self.configuration.memory_mb(len(self.inputs))
+        side_by_side = max(1, min(resolve_threads(threads), int(memory_mb / each)))
+        apply = _Applier(self)
+
+        def one(number: int):
+            members = circles.members(number)
+            order, pyramid = make_pyramid(
+                xyz, columns, members, circles.centres[number], self.inputs, self.configuration
+            )
+            return members[order], apply(pyramid)
+
+        seen = 0
+        with single_threaded():
+            for members, p in map_blocks(one, numbers.tolist(), side_by_side, ahead=1):
+                at = place[members]
+                mine = at >= 0
+                at, p = at[mine], p[mine]
+                new = int(np.count_nonzero(count[at] == 0))
+                total[at] += p
+                squares[at] += (p * p).sum(axis=1)
+                count[at] += 1
+                seen += new
+                if progress is not None:
+                    progress.update(new)
+        if m and not count.all():
+            raise StageError("a point is in no batch; this is a bug", found=int(np.count_nonzero(count == 0)))
+        mean = total / np.maximum(count, 1)[:, None]
+        variance = squares / np.maximum(count, 1) - (mean * mean).sum(axis=1)
+        variance = np.where(count > 1, np.maximum(variance / self.n_classes, 0.0), 0.0)
+        report = {
+            "batches": len(numbers),
+            "batches_per_point": {
+                "mean": round(float(count.mean()), 2) if m else 0.0,
+                "least": int(count.min()) if m else 0,
+            },
+            "device": apply.device,
+        }
+        return CloudProbabilities(mean, variance, report)
+
+
+class _Applier:
+    """Runs a pyramid on a CUDA device where PyTorch finds one, otherwise with NumPy."""
+
+    def __init__(self, net: AlsNet) -> None:
+        self.device, self._run = "cpu", net.folded
+        if _cuda():
+            from .network import Applied
+
+            self.device, self._run = "cuda", Applied(net.weights, net.configuration, "cuda")
+
+    def __call__(self, pyramid: Pyramid) -> npt.NDArray[np.float64]:
+        return self._run(pyramid)
+
+
+def _cuda() -> bool:
+    """Whether PyTorch is installed and sees a CUDA device; PyTorch is not imported where there is no driver."""
+    if importlib.util.find_spec("torch") is None:
+        return False
+    if (
+        "torch" not in sys.modules
+        and not Path("/proc/driver/nvidia").exists()
+        and not shutil.which("nvidia-smi")
+    ):
+        return False
+    import torch
+
+    return bool(torch.cuda.is_available())
+
+
+def single_threaded():
+    """BLAS on one thread: a batch's result then does not depend on how many are computed side by side."""
+    from threadpoolctl import threadpool_limits
+
+    return threadpool_limits(1)
+
+
+def scaled(
+    xyz: npt.NDArray[np.float64],
+    dimensions: Mapping[str, npt.ArrayLike],
+    inputs: Sequence[str],
+    mean: Sequence[float],
+    scale: Sequence[float],
+) -> npt.NDArray[np.float32]:
+    """(n, inputs) float32: (value - mean) / scale of each dimension, 0 where X, Y and Z come later."""
+    out = np.zeros((len(xyz), len(inputs)), np.float32)
+    for k, name in enumerate(inputs):
+        if name not in ("X", "Y", "Z"):
+            out[:, k] = (np.asarray(dimensions[name], dtype=np.float64) - mean[k]) / scale[k]
+    return out
+
+
+def make_pyramid(
+    xyz: npt.NDArray[np.float64],
+    columns: npt.NDArray[np.float32],
+    members: npt.NDArray[np.int64],
+    centre: npt.NDArray[np.float64],
+    inputs: Sequence[str],
+    configuration: Configuration,
+    change: Any = None,
+) -> tuple[npt.NDArray[np.int64], Pyramid]:
+    """A batch's pyramid, and the order of its points among `members`.
+
+    Parameters
+    ----------
+    members : (k,) int64
+        Rows of the cloud in the canonical order.
+    centre : (2,) float64
+        Coordinates are taken from it, heights from the batch's median.
+    change : function, optional
+        Augmentation: from coordinates (k, 3) to (coordinates, rows kept).
+    """
+    z = xyz[members, 2]
+    middle = float(np.partition(z, (len(z) - 1) // 2)[(len(z) - 1) // 2])
+    local = xyz[members] - np.array([centre[0], centre[1], middle])
+    kept = None
+    if change is not None:
+        local, kept = change(local)
+    order = scramble(local)
+    local = np.ascontiguousarray(local[order])
+    if kept is not None:
+        order = kept[order]
+    values = columns[members[order]]
+    for k, name in enumerate(inputs):
+        if name in ("X", "Y", "Z"):
+            values[:, k] = local[:, "XYZ".index(name)] / METRES
+    return order, build(local, values, configuration)
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise ModelError("the network's parameters are not right", found=repr(value)[:60])
+    return value
+
+
+def _finite(value: Any, name: str, low: float, high: float) -> float:
+    good = isinstance(value, int | float) and not isinstance(value, bool)
+    if not good or not low <= value <= high:
+        raise ModelError(f"the network's '{name}' must be from {low:g} to {high:g}", found=repr(value)[:60])
+    return float(value)

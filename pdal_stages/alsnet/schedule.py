@@ -1,0 +1,127 @@
+"""Which batches are trained on, and which ground is held out. No PyTorch here."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..classifier import crossval
+from ..errors import OptionError
+from .circles import Circles
+
+#: A batch of a cloud: (cloud, circle).
+Batch = tuple[int, int]
+
+
+def spread(histogram: npt.NDArray[Any]) -> float:
+    """Standard deviation of a batch's class shares, per cent: large where one class is nearly all [WM19].
+
+    Infinite for a batch without labels.
+    """
+    total = histogram.sum()
+    return float(np.std(histogram / total) * 100.0) if total else float("inf")
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """Batches chosen for training.
+
+    Attributes
+    ----------
+    batches : list of (cloud, circle)
+    all : int
+        How many there were.
+    spread_ok : int
+        How many of them have mixed classes.
+    added : int
+        How many were taken in spite of their spread, for a class that had no other.
+    """
+
+    batches: list[Batch]
+    all: int
+    spread_ok: int
+    added: int
+
+
+def choose(
+    circles: Sequence[Circles], labels: Sequence[npt.NDArray[Any]], n_classes: int, threshold: float
+) -> Choice:
+    """Batches whose classes are mixed; see ``NetworkOptions.histogram_threshold``.
+
+    Where that leaves a class without any batch, the most mixed one that has it is taken too.
+
+    Parameters
+    ----------
+    circles : one per cloud
+    labels : one (n,) array of class positions per cloud; -1 is not looked at
+    """
+    histograms: dict[Batch, npt.NDArray[np.int64]] = {}
+    for cloud, (one, label) in enumerate(zip(circles, labels, strict=True)):
+        for number in range(len(one)):
+            mine = label[one.members(number)]
+            histograms[cloud, number] = np.bincount(mine[mine >= 0], minlength=n_classes)
+    spreads = {batch: spread(histogram) for batch, histogram in histograms.items()}
+    good = {batch for batch, value in spreads.items() if value < threshold}
+    chosen = set(good)
+    for position in range(n_classes):
+        if not any(histograms[batch][position] for batch in chosen):
+            having = [batch for batch in histograms if histograms[batch][position]]
+            if having:
+                chosen.add(min(having, key=lambda batch: (spreads[batch], batch)))
+    return Choice(sorted(chosen), len(histograms), len(good), len(chosen) - len(good))
+
+
+def hold_out(
+    clouds: Sequence[npt.NDArray[np.float64]],
+    labels: Sequence[npt.NDArray[Any]],
+    share: float,
+    block_size: float,
+) -> list[npt.NDArray[np.bool_]]:
+    """Which points lie in the blocks held out for validation, one mask per cloud."""
+    if share == 0.0:
+        return [np.zeros(len(xyz), bool) for xyz in clouds]
+    use = [np.flatnonzero(label >= 0) for label in labels]
+    xy = np.concatenate([xyz[rows, :2] for xyz, rows in zip(clouds, use, strict=True)])
+    label = np.concatenate([one[rows] for one, rows in zip(labels, use, strict=True)])
+    folds = max(2, round(1.0 / share))
+    try:
+        fold = crossval.block_folds(xy, label, np.ones(len(xy)), folds, block_size)
+    except OptionError as error:
+        raise OptionError(
+            error.what,
+            found=f"validation {share:g}, block_size {block_size:g}",
+            cure="Make block_size smaller, or set validation to 0 and choose the number of epochs yourself",
+        ) from None
+    out, start = [], 0
+    for xyz, rows in zip(clouds, use, strict=True):
+        mask = np.zeros(len(xyz), bool)
+        mask[rows] = fold[start : start + len(rows)] == 0
+        out.append(mask)
+        start += len(rows)
+    return out
+
+
+def covering(circles: Circles, wanted: npt.NDArray[np.bool_]) -> list[int]:
+    """A few circles that hold every wanted point at least once."""
+    left = wanted.copy()
+    out = []
+    if left.any():
+        for number in circles.needed(np.flatnonzero(left)).tolist():
+            members = circles.members(number)
+            if left[members].any():
+                left[members] = False
+                out.append(number)
+    return out
+
+
+def class_weights(count: npt.NDArray[Any], kind: str) -> npt.NDArray[np.float64]:
+    """Weight of each class in the loss; their mean over the points is 1."""
+    share = count / count.sum()
+    if kind == "none":
+        return np.ones(len(count))
+    weight = 1.0 / np.sqrt(share) if kind == "sqrt" else 1.0 / share
+    return weight / (weight * share).sum()

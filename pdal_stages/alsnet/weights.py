@@ -1,0 +1,132 @@
+"""A network's weights as named arrays: made, checked, and applied with NumPy alone.
+
+Applying a network needs no PyTorch; only training does. The two agree to rounding (a test compares them).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import ModelError
+from .configuration import Configuration
+from .pyramid import Pyramid
+
+Weights = dict[str, npt.NDArray[np.float32]]
+
+#: Added to the variance in batch normalisation.
+EPSILON = 1e-5
+
+
+def fresh(configuration: Configuration, inputs: int, classes: int, seed: int) -> Weights:
+    """Untrained weights: He et al. 2015 for the linear layers, identity for the normalisations."""
+    random = np.random.default_rng([seed, 0xA15])
+    out: Weights = {}
+    for name, (rows, columns) in configuration.shapes(inputs, classes).items():
+        array = np.zeros((rows, columns), np.float32)
+        width = columns - (1 if name == "scores" else 4)
+        gain = 1.0 if name == "scores" else 2.0
+        array[:, :width] = random.normal(0.0, math.sqrt(gain / width), (rows, width))
+        if name != "scores":
+            array[:, width] = 1.0  # scale
+            array[:, width + 3] = 1.0  # running variance
+        out[name] = array
+    return out
+
+
+def check(
+    weights: Mapping[str, npt.NDArray[Any]], configuration: Configuration, inputs: int, classes: int
+) -> None:
+    """Refuse arrays that are not this network's weights.
+
+    Raises
+    ------
+    ModelError
+        An array is missing, unknown, of another shape, not finite, or has a negative variance.
+    """
+    shapes = configuration.shapes(inputs, classes)
+    odd = sorted(set(weights) - set(shapes))
+    if odd:
+        raise ModelError("the network has an array its configuration does not know", found=repr(odd[0])[:60])
+    for name, shape in shapes.items():
+        if name not in weights:
+            raise ModelError("the network lacks an array", found=name)
+        array = weights[name]
+        if array.shape != shape:
+            raise ModelError(f"the network's array '{name}' must be {shape}", found=f"shape {array.shape}")
+        if array.dtype != np.float32 or not np.isfinite(array).all():
+            raise ModelError(
+                f"the network's array '{name}' must be finite float32 numbers", found=str(array.dtype)
+            )
+        if name != "scores" and array[:, -1].min() < 0.0:
+            raise ModelError(f"the network's array '{name}' has a negative variance")
+
+
+class Folded:
+    """A network for applying: batch normalisation folded into the linear layers.
+
+    Parameters
+    ----------
+    weights : mapping
+        As :func:`check` accepts them.
+    configuration : Configuration
+    """
+
+    def __init__(self, weights: Mapping[str, npt.NDArray[np.float32]], configuration: Configuration) -> None:
+        self.configuration = configuration
+        self._layers: dict[str, tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]] = {}
+        for name, array in weights.items():
+            if name == "scores":
+                self._layers[name] = (np.ascontiguousarray(array[:, :-1].T), array[:, -1].copy())
+                continue
+            scale, shift, mean, variance = array[:, -4:].astype(np.float64).T
+            factor = scale / np.sqrt(variance + EPSILON)
+            matrix = (array[:, :-4] * factor[:, None]).astype(np.float32)
+            self._layers[name] = (np.ascontiguousarray(matrix.T), (shift - mean * factor).astype(np.float32))
+
+    def _shared(self, prefix: str, values: npt.NDArray[np.float32], depth: int) -> npt.NDArray[np.float32]:
+        for step in range(1, depth + 1):
+            matrix, bias = self._layers[f"{prefix}_{step}"]
+            values = values @ matrix
+            values += bias
+            np.maximum(values, 0.0, out=values)
+        return values
+
+    def __call__(self, pyramid: Pyramid) -> npt.NDArray[np.float64]:
+        """Class probabilities of a batch's points, (n, classes) float64."""
+        levels = self.configuration.levels
+        features = [pyramid.inputs]
+        for number, (level, step) in enumerate(zip(levels, pyramid.steps, strict=True), 1):
+            m, samples = step.groups.shape
+            groups = np.concatenate([step.offsets, features[-1][step.groups]], axis=2).reshape(
+                m * samples, -1
+            )
+            described = self._shared(f"sa{number}", groups, len(level.mlp))
+            features.append(described.reshape(m, samples, -1).max(axis=1))
+        below = features[-1]
+        for number in range(len(levels), 0, -1):
+            step = pyramid.steps[number - 1]
+            carried = below[step.near[:, 0]] * step.weights[:, :1]
+            carried += below[step.near[:, 1]] * step.weights[:, 1:2]
+            carried += below[step.near[:, 2]] * step.weights[:, 2:]
+            below = self._shared(
+                f"fp{number}",
+                np.concatenate([carried, features[number - 1]], axis=1),
+                len(levels[number - 1].up),
+            )
+        below = self._shared("head", below, len(self.configuration.head))
+        matrix, bias = self._layers["scores"]
+        scores = (below @ matrix + bias).astype(np.float64)
+        scores -= scores.max(axis=1, keepdims=True)
+        np.exp(scores, out=scores)
+        scores /= scores.sum(axis=1, keepdims=True)
+        if not np.isfinite(scores).all():
+            raise ModelError(
+                "the network gave probabilities that are not numbers",
+                cure="Its weights or the points' dimensions are out of all proportion; train the model again",
+            )
+        return scores
