@@ -43,6 +43,18 @@ class AccuracyStage(Stage):
         Option("model", "filename", None, "Model file whose importances the report shows"),
         Option("print", "boolean", True, "Print the table on standard error"),
     )
+    details = """
+Prints the table of overall accuracy, kappa, mean class recall and precision, mean F1 and the figures of each class
+on standard error; `json` and `html` write them to files. Keep the labels before classifying with
+`{"type": "filters.ferry", "dimensions": "Classification=>Reference"}`. Dimensions `Reliability` and `Margin`, where
+present, add a reliability curve and the error by margin.
+"""
+    before = (
+        {"type": "filters.ferry", "dimensions": "Classification=>Reference"},
+        {"type": "filters.hag_minima"},
+        {"type": "filters.modelclassifier", "model": "town.model"},
+    )
+    after = ()
     example = {
         "type": "filters.accuracy",
         "reference": "Reference",

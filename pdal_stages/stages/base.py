@@ -48,6 +48,13 @@ class Stage(ABC):
     source: ClassVar[str] = ""
     options: ClassVar[tuple[Option, ...]] = ()
     example: ClassVar[dict[str, Any]] = {}
+    #: Stages shown round the example in the docs.
+    before: ClassVar[tuple[dict[str, Any], ...]] = ()
+    after: ClassVar[tuple[Any, ...]] = ("output.laz",)
+    #: Paragraphs of the docs page (Markdown).
+    details: ClassVar[str] = ""
+    #: Dimensions, for the docs of a stage whose example cannot be parsed without a file.
+    dimensions_help: ClassVar[str] = ""
     #: What `where` means here; None where the stage has no such option.
     where_help: ClassVar[str | None] = ""
 

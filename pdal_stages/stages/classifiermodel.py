@@ -87,6 +87,15 @@ class ClassifierModel(Stage):
             "memory", "integer", 512, "Memory for blocks of points, over the samples", minimum=16, unit="MB"
         ),
     )
+    details = """
+Samples `count` points of each class, spread over space; computes features for the samples only; fits the
+percentiles and histogram thresholds; grows a Random Forest; writes [one model file](../model-file.md). A class with
+fewer points has them several times, and the counts are in the file. Lists in `trees`, `max_depth` and
+`min_samples_leaf` are searched by cross-validation over spatial blocks, so that neighbors never stand on both
+sides. Points of several readers are merged first. `label` names the dimension that holds the classes.
+"""
+    before = ({"type": "filters.hag_minima"},)
+    after = ()
     example = {
         "type": "writers.classifiermodel",
         "filename": "town.model",

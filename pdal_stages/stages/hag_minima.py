@@ -49,6 +49,18 @@ class HagMinima(Stage):
             may_be_empty=True,
         ),
     )
+    details = """
+The terrain is the lowest point of each cell of a coarse grid, interpolated bilinearly between cell centres and
+evaluated on a fine grid; a point's height is its Z minus the value of the fine cell it falls in. Both grids are
+anchored to absolute coordinates (`floor(x / cell)`), so every tile of a survey sees the same cells. Empty coarse cells
+are filled from the nearest ones with points, by inverse distance, and counted in the metadata.
+
+The terrain is coarse on purpose: it needs no ground classification and never fails, and the classifier copes with its
+errors. Where heights themselves matter use `filters.smrf` with `filters.hag_nn` or `filters.hag_delaunay`;
+[the comparison](../benchmarks.md) says how far apart they are. Lengths are metres; `HeightAboveGround` is in
+the unit of Z.
+"""
+    after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)
     example = {"type": "filters.hag_minima", "cell": 20, "resolution": 0.5}
 
     @classmethod

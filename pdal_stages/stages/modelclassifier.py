@@ -55,6 +55,18 @@ class ModelClassifier(Stage):
             unit="MB",
         ),
     )
+    details = """
+Computes the features the model needs block by block and classifies them at once, so memory does not grow with their
+number. A model asked for a dimension that the points lack names the dimension and the stage that makes it.
+`Reliability` is the probability of the winning class. With LAS 1.0-1.3 the synthetic, key-point and withheld flags of
+each point stay. Codes above 31 need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked
+before any work is done.
+"""
+    dimensions_help = """- Reads: X, Y, Z, `Classification`, and what the model names (`pdal-stages model FILE`)
+- Writes: `Classification` (uint8_t), `Reliability` (float); on request `Margin` and `Probability_<code>` (float)
+- Halo: that of the model's neighborhoods"""
+    before = ({"type": "filters.hag_minima"},)
+    after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)
     example = {"type": "filters.modelclassifier", "model": "town.model"}
 
     @classmethod

@@ -65,6 +65,15 @@ class MultiscaleFeatures(Stage):
             unit="MB",
         ),
     )
+    details = """
+Each neighborhood is a token, which ends the dimension's name: `Linearity_c2` is the linearity in the vertical cylinder
+of radius 2 m. See [neighborhoods and features](../features.md) for all tokens, presets and definitions.
+Shape distributions (`shapes`) need histogram thresholds, which are fitted to the points unless `bins` names a file;
+name one when several files must have comparable features. Features are 32-bit floats. LAS writers need
+`"extra_dims": "all"`, and one file describes at most 341 extra dimensions: training and classification compute
+features inside and need no dimensions at all.
+"""
+    after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)
     example = {
         "type": "filters.multiscalefeatures",
         "neighborhoods": "c1,c2,c3,c5,kopt",

@@ -1,0 +1,30 @@
+"""Sphinx configuration: MyST pages, stage pages generated from the registry at each build."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import stage_pages
+
+from pdal_stages import __version__
+
+stage_pages.write()
+
+project = "pdal_stages"
+author = "the pdal_stages authors"
+copyright = "2026, the pdal_stages authors"
+release = version = __version__
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+myst_enable_extensions = ["colon_fence", "dollarmath"]
+myst_heading_anchors = 3
+exclude_patterns = ["_build"]
+html_theme = "alabaster"
+html_theme_options = {
+    "description": "PDAL stages that classify airborne laser scans",
+    "page_width": "1100px",
+    "sidebar_width": "240px",
+}
+html_static_path: list[str] = []
+autodoc_member_order = "bysource"
+suppress_warnings = ["myst.xref_missing"]

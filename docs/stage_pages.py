@@ -1,0 +1,96 @@
+"""Pages of stages, generated from the registry: the same declaration gives JSON Schema, help, errors and these.
+
+    python docs/stage_pages.py        # writes docs/stages/*.md
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from pdal_stages.stages import registry
+from pdal_stages.stages.base import Stage
+
+FOLDER = Path(__file__).resolve().parent / "stages"
+
+
+def page(stage: type[Stage]) -> str:
+    """One stage in the shape of PDAL's stage pages."""
+    options = stage.parse({k: v for k, v in stage.example.items() if k != "type"}) if _parses(stage) else None
+    lines = [f"# {stage.type}", "", f"{stage.summary}.", ""]
+    doc = (stage.details or "").strip()
+    if doc:
+        lines += [doc, ""]
+    if stage.source:
+        lines += [f"Source: {stage.source} (see [the papers](../papers.md)).", ""]
+    lines += ["## Example", "", "```json", json.dumps(["input.laz", *stage.before, stage.example, *stage.after], indent=4), "```", ""]
+    lines += ["## Dimensions", ""]
+    if options is not None:
+        reads = stage.reads(options)
+        creates = stage.creates(options)
+        lines += [
+            f"- Reads: X, Y, Z{''.join(f', {name}' for name in reads)}",
+            f"- Writes: {', '.join(f'`{name}` ({kind})' for name, kind in list(creates.items())[:8]) or 'none'}"
+            + (f" and {len(creates) - 8} more" if len(creates) > 8 else ""),
+            f"- Halo: {stage.halo(options):g} m round a tile, with the example's options",
+            "",
+        ]
+    elif stage.dimensions_help:
+        lines += [stage.dimensions_help, ""]
+    lines += ["## Options", "", "| option | default | meaning |", "|---|---|---|"]
+    lines += [_row(stage, option) for option in stage.all_options()]
+    lines += ["| `tag`, `inputs` | | As in every PDAL stage |", ""]
+    return "\n".join(lines)
+
+
+def _parses(stage: type[Stage]) -> bool:
+    try:
+        stage.parse({k: v for k, v in stage.example.items() if k != "type"})
+    except Exception:  # an example that names a file which is not here
+        return False
+    return True
+
+
+def _row(stage: type[Stage], option) -> str:
+    if option.required:
+        default = "required"
+    elif option.default in (None, "", ()):
+        default = ""
+    elif isinstance(option.default, tuple):
+        default = f"`{','.join(map(str, option.default))}`"
+    else:
+        shown = json.dumps(option.default).strip('"')
+        default = f"`{shown}`{' ' + option.unit if option.unit else ''}"
+    text = f"{stage.where_help}" if option.name == "where" and stage.where_help else f"{option.help}."
+    if option.name == "where":
+        text = f"A condition on points, as in PDAL. {text}"
+    if option.choices:
+        text += f" One of {', '.join(f'`{c}`' for c in option.choices)}."
+    bounds = []
+    if option.minimum is not None:
+        bounds.append(f"more than {option.minimum:g}" if option.exclusive else f"at least {option.minimum:g}")
+    if option.maximum is not None and option.maximum < 2**31 - 1:
+        bounds.append(f"at most {option.maximum:g}")
+    if bounds:
+        text += f" ({' and '.join(bounds)})"
+    return f"| `{option.name}` | {default} | {text.replace('|', '&#124;')} |"
+
+
+def index() -> str:
+    """The list of stages."""
+    lines = ["# Stages", "", "| stage | does |", "|---|---|"]
+    lines += [f"| [{s.type}]({s.type}.md) | {s.summary} |" for s in registry.stages().values()]
+    lines += ["", "```{toctree}", ":hidden:", "", *registry.stages(), "```", ""]
+    return "\n".join(lines)
+
+
+def write() -> None:
+    """Write all pages."""
+    FOLDER.mkdir(exist_ok=True)
+    for stage in registry.stages().values():
+        (FOLDER / f"{stage.type}.md").write_text(page(stage), encoding="utf-8")
+    (FOLDER / "index.md").write_text(index(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    write()
