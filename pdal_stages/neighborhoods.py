@@ -31,7 +31,9 @@ MAX_K = 10_000
 MIN_RADIUS, MAX_RADIUS = 0.001, 100_000.0  # metres
 
 _KNOWN = ("c2", "s1", "k50", "kopt", "ropt", "copt", *PRESETS)
-_TOKEN = re.compile(r"(?P<head>kopt|ropt|copt|c|s|k)(?P<value>\d+(?:\.\d*)?|\.\d+)?(?:\((?P<inner>[^()]*)\))?")
+_TOKEN = re.compile(
+    r"(?P<head>kopt|ropt|copt|c|s|k)(?P<value>\d+(?:\.\d*)?|\.\d+)?(?:\((?P<inner>[^()]*)\))?"
+)
 _CURE = (
     "Write c2 (vertical cylinder of 2 m radius), s1 (sphere of 1 m), k50 (50 nearest), "
     "kopt, kopt(10,100), ropt, ropt(0.25,2,0.05), copt, or a preset: " + ", ".join(PRESETS)
@@ -144,7 +146,9 @@ def _words(spec) -> list:
     try:
         items = list(spec)
     except TypeError:
-        raise OptionError("'neighborhoods' must be text or a list of text", found=repr(spec), cure=_CURE) from None
+        raise OptionError(
+            "'neighborhoods' must be text or a list of text", found=repr(spec), cure=_CURE
+        ) from None
     words: list = []
     for item in items:
         if not isinstance(item, str | Neighborhood):
@@ -197,7 +201,8 @@ def _adaptive(text: str, head: str, inner: str | None) -> Neighborhood:
             MIN_RADIUS <= values[0] <= values[1] <= MAX_RADIUS and values[2] >= MIN_RADIUS
         ):
             raise OptionError(
-                f"ropt takes metres, ropt(r_min,r_max,step), each at least {MIN_RADIUS}, r_min <= r_max", found=text
+                f"ropt takes metres, ropt(r_min,r_max,step), each at least {MIN_RADIUS}, r_min <= r_max",
+                found=text,
             )
         if (values[1] - values[0]) / values[2] > 1000:
             raise OptionError("ropt may try at most 1000 radii", found=text, cure="Make the step larger")

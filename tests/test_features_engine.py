@@ -29,7 +29,8 @@ def cloud():
     ground = np.column_stack([rng.uniform(0, 24, (1500, 2)), rng.normal(0, 0.03, 1500)])
     roof = np.column_stack([rng.uniform(6, 12, (400, 2)), rng.normal(5, 0.02, 400)])
     bush = rng.normal([17, 17, 1.5], 0.8, (300, 3))
-    xyz = np.round(np.vstack([ground, roof, bush, ground[:40]]), 3) + [500_000.0, 6_000_000.0, 30.0]
+    xyz = np.round(np.vstack([ground, roof, bush, ground[:40]]), 3)
+    xyz = xyz + np.array([500_000.0, 6_000_000.0, 30.0])
     return xyz[rng.permutation(len(xyz))]
 
 
@@ -42,7 +43,13 @@ def whole(cloud):
 def again(whole, cloud, queries=None, neighborhoods=KINDS, feature_set="all", **options):
     options = {"threads": 1, **options}
     return compute_features(
-        cloud, queries, neighborhoods, feature_set, bins=whole.bins, copt_threshold=whole.copt_threshold, **options
+        cloud,
+        queries,
+        neighborhoods,
+        feature_set,
+        bins=whole.bins,
+        copt_threshold=whole.copt_threshold,
+        **options,
     )
 
 
@@ -108,7 +115,8 @@ def test_refused_plans(spec, feature_set, message):
 
 
 @pytest.mark.parametrize(
-    "data", [{}, [], None, {"neighborhoods": "c1", "features": [], "dimensions": []}, {"neighborhoods": ["c1"]}]
+    "data",
+    [{}, [], None, {"neighborhoods": "c1", "features": [], "dimensions": []}, {"neighborhoods": ["c1"]}],
 )
 def test_refused_plan_dicts(data):
     with pytest.raises(OptionError):
@@ -152,7 +160,9 @@ def test_any_other_neighborhoods(cloud, whole, part):
         assert np.array_equal(table[name], whole[name]), name
 
 
-@pytest.mark.parametrize("feature_set", ["Planarity", "HeightRange,A3_5", "D2", "Radius", "SurfaceVariation_s4,D4_9_c1"])
+@pytest.mark.parametrize(
+    "feature_set", ["Planarity", "HeightRange,A3_5", "D2", "Radius", "SurfaceVariation_s4,D4_9_c1"]
+)
 def test_any_other_features(cloud, whole, feature_set):
     table = again(whole, cloud, None, KINDS, feature_set)
     for name in table.names:
@@ -199,7 +209,9 @@ def test_rigid_motions(data):
     shift = np.array([data.draw(st.integers(-5000, 5000)), data.draw(st.integers(-5000, 5000)), 0])
     assert np.array_equal(still, compute_features(exact + shift, None, spec, MOMENTS).values)
     turned = np.column_stack([-xyz[:, 1], xyz[:, 0], xyz[:, 2]])
-    vertical = [i for i, name in enumerate(FeaturePlan.parse(spec, MOMENTS).names) if name.startswith("Verticality")]
+    vertical = [
+        i for i, name in enumerate(FeaturePlan.parse(spec, MOMENTS).names) if name.startswith("Verticality")
+    ]
     both = [base, compute_features(turned, None, spec, MOMENTS).values]
     for values in both:
         values[:, vertical] = 0  # of a ball or a line it may jump
@@ -207,7 +219,9 @@ def test_rigid_motions(data):
 
 
 def test_many_copies_are_not_quadratic():
-    xyz = np.vstack([np.tile([[0.3, 0.4, 0.5]], (200_000, 1)), np.random.default_rng(0).uniform(0, 3, (50, 3))])
+    xyz = np.vstack(
+        [np.tile([[0.3, 0.4, 0.5]], (200_000, 1)), np.random.default_rng(0).uniform(0, 3, (50, 3))]
+    )
     table = compute_features(xyz, None, "c1,s1", MOMENTS, threads=2, memory_mb=32)
     assert (table.values[:200_000] == table.values[0]).all()
 
@@ -226,7 +240,9 @@ def test_blocks_cover_every_query_once(cloud, whole):
             assert np.array_equal(values, whole.values[rows])  # rows of the cloud
             seen.append(rows)
         seen = np.concatenate(seen)
-        assert len(seen) == count and np.array_equal(np.sort(seen), np.arange(len(cloud)) if queries is None else queries)
+        assert len(seen) == count and np.array_equal(
+            np.sort(seen), np.arange(len(cloud)) if queries is None else queries
+        )
     rows = np.concatenate([r for r, _ in engine.blocks(cloud[:50] + 0.25)])
     assert np.array_equal(np.sort(rows), np.arange(50))  # coordinates: rows of the queries
 
@@ -240,7 +256,7 @@ def test_apply_runs_in_the_workers(cloud):
         assert len(values) == len(rows)
         return values.mean(axis=1)
 
-    large = np.vstack([cloud + [30.0 * i, 0, 0] for i in range(20)])
+    large = np.vstack([cloud + np.array([30.0 * i, 0, 0]) for i in range(20)])
     engine = FeatureEngine(large, FeaturePlan.parse("c1,c3,s3", MOMENTS))
     parts = list(engine.blocks(apply=mean, threads=2, memory_mb=16))
     assert len(parts) > 1 and main not in threads
@@ -296,7 +312,9 @@ def test_dimensions(cloud):
         assert np.array_equal(values[:, 2], own[rows].astype(np.float32))
         assert np.array_equal(values[:, 1], cloud[rows, 2].astype(np.float32))
     picked = np.array([7, 3, 9])
-    for rows, values in engine.blocks(picked, dimensions={"HeightAboveGround": [70.0, 30.0, 90.0], "Z": [1, 2, 3]}):
+    for rows, values in engine.blocks(
+        picked, dimensions={"HeightAboveGround": [70.0, 30.0, 90.0], "Z": [1, 2, 3]}
+    ):
         assert np.array_equal(values[:, 2], rows * 10)  # one value per query
         assert sorted(values[:, 1]) == [1, 2, 3]  # a Z that is given is taken
     table = compute_features(cloud, neighborhoods="c1", feature_set="Density", dimensions={"Intensity": own})
@@ -374,14 +392,19 @@ def test_other_number_types(kind):
     xyz = np.random.default_rng(0).integers(0, 9, (200, 3))
     same = compute_features(xyz.astype(float), None, "c2,s2", MOMENTS).values
     assert np.array_equal(compute_features(xyz.astype(kind), None, "c2,s2", MOMENTS).values, same)
-    assert np.array_equal(compute_features(np.asfortranarray(xyz.astype(float)), None, "c2,s2", MOMENTS).values, same)
+    assert np.array_equal(
+        compute_features(np.asfortranarray(xyz.astype(float)), None, "c2,s2", MOMENTS).values, same
+    )
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 4])
 def test_few_points(count):
     xyz = np.random.default_rng(0).uniform(0, 2, (count, 3))
     if count == 0:
-        assert compute_features(xyz, None, KINDS, MOMENTS).values.shape == (0, len(FeaturePlan.parse(KINDS, MOMENTS).names))
+        assert compute_features(xyz, None, KINDS, MOMENTS).values.shape == (
+            0,
+            len(FeaturePlan.parse(KINDS, MOMENTS).names),
+        )
         return
     table = compute_features(xyz, None, KINDS)
     assert np.isfinite(table.values).all() and len(table) == count
@@ -403,7 +426,9 @@ def run_python(code, **environment):
 
 
 def test_importing_is_light():
-    out = run_python("import pdal_stages.features, sys; print('numba' in sys.modules, 'scipy' in sys.modules)")
+    out = run_python(
+        "import pdal_stages.features, sys; print('numba' in sys.modules, 'scipy' in sys.modules)"
+    )
     assert out.split() == ["False", "False"]
 
 
@@ -428,7 +453,10 @@ def test_without_a_writable_folder(tmp_path):
     for broken in (False, True):
         file.write_text(textwrap.dedent(code.format(broken=broken)))
         done = subprocess.run(
-            [sys.executable, str(file)], capture_output=True, text=True, env={**os.environ, "TMPDIR": str(tmp_path)}
+            [sys.executable, str(file)],
+            capture_output=True,
+            text=True,
+            env={**os.environ, "TMPDIR": str(tmp_path)},
         )
         assert done.returncode == 0, done.stderr
         kind, folder = done.stdout.split()

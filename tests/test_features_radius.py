@@ -36,7 +36,10 @@ def check(xyz, queries, radii=(1.0, 2.5), kinds="cs", atol=1e-9, results=None):
                     if name == "Verticality" and (len(members) < 3 or oracle.normal_gap(members) < 1e-7):
                         assert 0.0 <= got <= 1.0, where  # no normal to speak of
                         continue
-                    assert got == pytest.approx(expected[name], rel=RTOL, abs=ATOL.get(name, atol)), (name, where)
+                    assert got == pytest.approx(expected[name], rel=RTOL, abs=ATOL.get(name, atol)), (
+                        name,
+                        where,
+                    )
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +64,9 @@ def test_negative_coordinates_and_cell_borders(rng):
 
 
 def test_members_at_exactly_the_radius():
-    xyz = np.array([[0, 0, 0], [3, 4, 0], [5, 0, 0], [-5, 0, 0], [0, -5, 0], [0, 0, 5], [3, 4, 1e-7], [5.0000001, 0, 0]])
+    xyz = np.array(
+        [[0, 0, 0], [3, 4, 0], [5, 0, 0], [-5, 0, 0], [0, -5, 0], [0, 0, 5], [3, 4, 1e-7], [5.0000001, 0, 0]]
+    )
     table = compute_features(xyz, [0], "c5,s5", "Density")
     assert round(table["Density_c5"][0] * math.pi * 25) == 7
     assert round(table["Density_s5"][0] * oracle.ball_volume(5)) == 6
@@ -86,7 +91,10 @@ def test_every_cell_size(rng, radius):
         ("duplicates", lambda r: np.repeat(r.uniform(0, 5, (60, 3)), 7, axis=0)),
         ("one place", lambda r: np.tile(r.uniform(0, 5, (1, 3)), (40, 1))),
         ("two places", lambda r: np.tile(r.uniform(0, 1, (2, 3)), (20, 1))),
-        ("cube corners", lambda r: np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)),
+        (
+            "cube corners",
+            lambda r: np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)], float),
+        ),
         ("sparse", lambda r: r.uniform(0, 300, (200, 3))),
         ("dense", lambda r: r.normal(0, 0.2, (3000, 3))),
         ("stray", lambda r: np.vstack([r.uniform(0, 9, (400, 3)), [[1e9, -1e9, 1e4], [4.0, 4.0, 1e6]]])),
@@ -135,7 +143,13 @@ def test_crowded_cell(rng):
 
 @pytest.mark.data
 @pytest.mark.parametrize(
-    "file", ["montpellier/train_77050_627755.laz", "delft/train.laz", "isprs_filter/samp11.laz", "isprs_filter/samp54.laz"]
+    "file",
+    [
+        "montpellier/train_77050_627755.laz",
+        "delft/train.laz",
+        "isprs_filter/samp11.laz",
+        "isprs_filter/samp54.laz",
+    ],
 )
 def test_real_tiles(data_dir, file):
     laspy = pytest.importorskip("laspy")
@@ -162,13 +176,17 @@ def test_against_jakteristics(peers_cloud):
         "surface_variation": "SurfaceVariation",
         "verticality": "Verticality",
     }
-    theirs = jakteristics.compute_features(peers_cloud, search_radius=1.2, feature_names=[*pairs, "number_of_neighbors"])
+    theirs = jakteristics.compute_features(
+        peers_cloud, search_radius=1.2, feature_names=[*pairs, "number_of_neighbors"]
+    )
     ours = compute_features(peers_cloud, None, "s1.2", ["covariance", "geometric"])
     members = np.rint(ours["Density_s1_2"] * oracle.ball_volume(1.2))
     assert np.array_equal(members, theirs[:, -1])
     assert members.min() >= 3
     for column, name in enumerate(pairs.values()):
-        np.testing.assert_allclose(ours[f"{name}_s1_2"], theirs[:, column], rtol=1e-5, atol=1e-6, err_msg=name)
+        np.testing.assert_allclose(
+            ours[f"{name}_s1_2"], theirs[:, column], rtol=1e-5, atol=1e-6, err_msg=name
+        )
 
 
 def test_against_pgeof(peers_cloud):

@@ -75,7 +75,9 @@ def test_refuses(spec, word):
 
 
 def test_suffix_and_reach():
-    found = {n.token: (n.suffix, n.reach, n.adaptive) for n in parse_neighborhoods("c2.5,s1,k50,kopt,ropt,copt")}
+    found = {
+        n.token: (n.suffix, n.reach, n.adaptive) for n in parse_neighborhoods("c2.5,s1,k50,kopt,ropt,copt")
+    }
     assert found == {
         "c2.5": ("c2_5", 2.5, False),
         "s1": ("s1", 1.0, False),

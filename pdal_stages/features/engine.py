@@ -32,7 +32,9 @@ MOST_ROWS = 65_536
 ROW_BYTES = 1_000
 
 #: What makes a dimension that is asked for and missing.
-MAKERS = {"HeightAboveGround": "Put filters.hag_minima before this stage; in Python, hag_minima(x, y, z) makes it"}
+MAKERS = {
+    "HeightAboveGround": "Put filters.hag_minima before this stage; in Python, hag_minima(x, y, z) makes it"
+}
 
 
 class FeatureEngine:
@@ -89,7 +91,9 @@ class FeatureEngine:
         from .index import build_grid, check_xyz  # numba is loaded here, not when the package is
 
         if not isinstance(plan, FeaturePlan):
-            raise OptionError("'plan' must be a FeaturePlan", found=type(plan).__name__, cure="Use FeaturePlan.parse")
+            raise OptionError(
+                "'plan' must be a FeaturePlan", found=type(plan).__name__, cure="Use FeaturePlan.parse"
+            )
         if isinstance(seed, bool) or int(seed) != seed or not 0 <= seed < 2**63:
             raise OptionError("'seed' must be a whole number of 0 or more", found=seed)
         resolve_threads(threads)
@@ -352,7 +356,8 @@ class _Run:
             raise StageError("the cloud has no points", found=f"{count} queries")
         engine.fit()
         self.fixed, self.adaptive = engine._prepared()
-        _compile_once("shapes" if self.fixed.shaped.any() else "moments") if len(self.fixed) else None
+        if len(self.fixed):
+            _compile_once("fixed")
         self.candidates = self.fixed.candidates(self.grid.rows_of_cells(), self.grid.cell_ix)
         self._cut(float(memory_mb) * 2**20)
 
@@ -373,7 +378,7 @@ class _Run:
         most = min(BLOCK_NS, max(total / (4 * self.threads), 5e6))
         self.starts = cut_blocks(self.grid.cell_start, cost, most, int(min(max(rows, 64), MOST_ROWS)))
 
-    def compute(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    def compute(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, dict[str, dict[str, int]]]:
         """Positions (in the user's order) and values of the sorted queries first..last, and what to report."""
         engine, grid = self.engine, self.grid
         qx, qy, qz = grid.x[first:last], grid.y[first:last], grid.z[first:last]
@@ -386,7 +391,7 @@ class _Run:
             qx, qy, qz = qx[at], qy[at], qz[at]
         width = len(engine.plan.names)
         values = np.empty((len(at), width), np.float32)
-        tally = {}
+        tally: dict[str, dict[str, int]] = {}
         if len(self.fixed):
             a = np.searchsorted(grid.cell_start, first, "right") - 1
             b = np.searchsorted(grid.cell_start, last, "left")
@@ -401,9 +406,13 @@ class _Run:
             self.adaptive.fill(
                 qx, qy, qz, copies, engine.bins, engine.seed, engine.copt_threshold, few, far, values
             )
-            tally.setdefault("fewer_than_three", {}).update(zip(self.adaptive.tokens, few.tolist(), strict=True))
+            tally.setdefault("fewer_than_three", {}).update(
+                zip(self.adaptive.tokens, few.tolist(), strict=True)
+            )
             if engine.plan.unbounded:
-                tally["beyond_halo"] = {t: n for t, n in zip(self.adaptive.tokens, far.tolist(), strict=True) if n}
+                tally["beyond_halo"] = {
+                    t: n for t, n in zip(self.adaptive.tokens, far.tolist(), strict=True) if n
+                }
         if len(at) < last - first:
             values = np.repeat(values, copies, axis=0)
         positions = grid.order[first:last].astype(np.int64)
@@ -461,7 +470,9 @@ def _queries(queries, cloud: np.ndarray) -> tuple[np.ndarray | None, np.ndarray 
     return array, cloud[array]
 
 
-def _dimensions(plan: FeaturePlan, given: Mapping[str, npt.ArrayLike] | None, count: int) -> dict[str, np.ndarray]:
+def _dimensions(
+    plan: FeaturePlan, given: Mapping[str, npt.ArrayLike] | None, count: int
+) -> dict[str, np.ndarray]:
     given = given or {}
     found = {}
     for name in plan.dimensions:
@@ -531,8 +542,7 @@ def _compile_adaptive() -> None:
 
 _COMPILERS = {
     "index": _compile_index,
-    "moments": _compile_fixed,
-    "shapes": _compile_fixed,
+    "fixed": _compile_fixed,
     "adaptive": _compile_adaptive,
 }
 

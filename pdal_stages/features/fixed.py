@@ -40,7 +40,9 @@ class FixedRadius:
         self.grid = grid
         chosen = [c for c in plan.layout if c.neighborhood.kind in ("cylinder", "sphere") and c.at]
         self.specs = [
-            _Spec(c.neighborhood.token, c.neighborhood.parameters[0], c.neighborhood.kind == "sphere", c.shapes)
+            _Spec(
+                c.neighborhood.token, c.neighborhood.parameters[0], c.neighborhood.kind == "sphere", c.shapes
+            )
             for c in chosen
         ]
         self.tokens = [spec.token for spec in self.specs]
@@ -62,7 +64,9 @@ class FixedRadius:
         if not self.specs:
             return np.zeros(len(ix), np.int64)
         g = self.grid
-        return count_block(g.cell_ix, g.cell_start, g.row_iy, g.row_start, iy, ix, self._width(len(self.radii) - 1))
+        return count_block(
+            g.cell_ix, g.cell_start, g.row_iy, g.row_start, iy, ix, self._width(len(self.radii) - 1)
+        )
 
     def cost(self, candidates: np.ndarray) -> np.ndarray:
         """Estimated nanoseconds of one query in cells with so many candidates."""
@@ -70,7 +74,9 @@ class FixedRadius:
         each = NS_NEIGHBORHOOD + NS_CANDIDATE * np.multiply.outer(candidates, area)
         listed = NS_SHAPES + NS_MEMBER * np.multiply.outer(candidates, area)
         number = (self.wanted >= 0).sum(axis=1)
-        shaped = np.where(self.wanted >= 0, self.shaped[self.wanted], False).sum(axis=1) if self.specs else number
+        shaped = (
+            np.where(self.wanted >= 0, self.shaped[self.wanted], False).sum(axis=1) if self.specs else number
+        )
         return each @ number.astype(float) + listed @ shaped.astype(float)
 
     def scratch_bytes(self, room: int) -> int:
@@ -102,7 +108,9 @@ class FixedRadius:
             few, room, out,
         )  # fmt: skip
 
-    def shape_values(self, token: str, points: tuple[np.ndarray, np.ndarray, np.ndarray], seed: int) -> np.ndarray:
+    def shape_values(
+        self, token: str, points: tuple[np.ndarray, np.ndarray, np.ndarray], seed: int
+    ) -> np.ndarray:
         """Metrics of all pulls of a neighborhood for a few points, (m, 5, 255) float32, comparable."""
         spec = self.specs[self.tokens.index(token)]
         k = int(np.searchsorted(self.radii, spec.radius))

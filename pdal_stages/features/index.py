@@ -119,7 +119,9 @@ def check_xyz(xyz, what: str = "xyz") -> np.ndarray:
                 cure="Remove them first, e.g. with filters.range or filters.expression",
             )
         far = int(np.count_nonzero((np.abs(array) > LIMIT).any(axis=1)))
-        raise StageError(f"'{what}' has coordinates beyond {LIMIT:g} m", found=f"{far} of {len(array)} points")
+        raise StageError(
+            f"'{what}' has coordinates beyond {LIMIT:g} m", found=f"{far} of {len(array)} points"
+        )
     if array.dtype == np.float32 and largest > 1e5:
         raise StageError(
             f"'{what}' is float32, too coarse for coordinates of this size",

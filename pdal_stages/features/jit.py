@@ -53,13 +53,14 @@ def njit(function: Callable | None = None, **options):
 def _elsewhere(function: Callable, options: dict):
     folder = private_cache_folder()
     if folder is not None:
-        before, config.CACHE_DIR = config.CACHE_DIR, folder
+        settings: Any = config
+        before, settings.CACHE_DIR = settings.CACHE_DIR, folder
         try:
             return numba.njit(**options)(function)
         except RuntimeError:
             pass
         finally:
-            config.CACHE_DIR = before
+            settings.CACHE_DIR = before
     return numba.njit(**{**options, "cache": False})(function)
 
 
@@ -102,7 +103,7 @@ def _stamp(dispatcher, function: Callable) -> None:
         except TypeError:  # a global that cannot be hashed is no kernel
             continue
     _stamps[dispatcher] = frozenset(parts)
-    file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    file: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if hasattr(file, "_source_stamp"):
         file._source_stamp = "-".join(sorted(parts))
 

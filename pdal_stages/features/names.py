@@ -99,7 +99,9 @@ def parse_feature_set(spec: str | Iterable[str]) -> tuple[str, ...]:
             name = head + word[len(head) :].lower()
         found[name] = None
     if not found:
-        raise OptionError("'feature_set' names no feature", found=repr(spec), cure="Write all, or leave it out")
+        raise OptionError(
+            "'feature_set' names no feature", found=repr(spec), cure="Write all, or leave it out"
+        )
     return tuple(found)
 
 

@@ -135,7 +135,11 @@ class FeaturePlan:
     def names(self) -> tuple[str, ...]:
         """Names of all columns: ``Linearity_c1``, ..., then the dimensions."""
         return (
-            *(f"{feature}_{columns.neighborhood.suffix}" for columns in self.layout for feature in columns.at),
+            *(
+                f"{feature}_{columns.neighborhood.suffix}"
+                for columns in self.layout
+                for feature in columns.at
+            ),
             *self.dimensions,
         )
 
@@ -194,4 +198,6 @@ class FeaturePlan:
         for value in (tokens, words, dimensions):
             if not isinstance(value, list | tuple) or not all(isinstance(item, str) for item in value):
                 raise OptionError("a feature plan holds lists of text", found=repr(value)[:80])
-        return cls(tuple(parse_neighborhoods(tokens)), parse_feature_set(words), tuple(dict.fromkeys(dimensions)))
+        return cls(
+            tuple(parse_neighborhoods(tokens)), parse_feature_set(words), tuple(dict.fromkeys(dimensions))
+        )

@@ -103,9 +103,9 @@ def radius_block(
         stop = min(start + BATCH, len(qx))
         a = start
         while a < stop:
-            ix, iy = int(math.floor(qx[a] / cell)), int(math.floor(qy[a] / cell))
+            ix, iy = math.floor(qx[a] / cell), math.floor(qy[a] / cell)
             b = a + 1
-            while b < stop and int(math.floor(qx[b] / cell)) == ix and int(math.floor(qy[b] / cell)) == iy:
+            while b < stop and math.floor(qx[b] / cell) == ix and math.floor(qy[b] / cell) == iy:
                 b += 1
             if iy != line or ix < left or ix > right:
                 line, left, right = iy, ix, _last_column(qx, qy, a, cell, iy, ix + STRIP - 1)
@@ -126,12 +126,16 @@ def radius_block(
                     if number < 0 or not shaped[number]:
                         continue
                     for j in range(a, b):
-                        n = members(px[:end], py[:end], pz[:end], qx[j], qy[j], qz[j], r2, float(kind), record)
+                        n = members(
+                            px[:end], py[:end], pz[:end], qx[j], qy[j], qz[j], r2, float(kind), record
+                        )
                         if n == 0:  # a query that is not a point of the cloud
                             counts[:] = 0.0
                         else:
                             gx, gy, gz = centroid(moments[number], j - start)
-                            shape_counts(record, n, gx, gy, gz, seeds[number, j], thresholds[number], work, counts)
+                            shape_counts(
+                                record, n, gx, gy, gz, seeds[number, j], thresholds[number], work, counts
+                            )
                         for f in range(50):
                             column = shape_columns[number, f]
                             if column >= 0:
@@ -155,10 +159,10 @@ def radius_block(
 @njit
 def _last_column(qx, qy, a, cell, iy, limit):
     """The last column, at most `limit`, of the queries from `a` on that lie in row `iy`."""
-    last = int(math.floor(qx[a] / cell))
+    last = math.floor(qx[a] / cell)
     for j in range(a + 1, len(qx)):
-        column = int(math.floor(qx[j] / cell))
-        if column > limit or int(math.floor(qy[j] / cell)) != iy:
+        column = math.floor(qx[j] / cell)
+        if column > limit or math.floor(qy[j] / cell) != iy:
             break
         last = column
     return last
@@ -230,7 +234,7 @@ def radius_values(grid, cell, qx, qy, qz, radius, spherical, seeds, work, room, 
     sums = np.empty((MOMENTS, 1))
     r2 = radius * radius
     for j in range(len(qx)):
-        ix, iy = int(math.floor(qx[j] / cell)), int(math.floor(qy[j] / cell))
+        ix, iy = math.floor(qx[j] / cell), math.floor(qy[j] / cell)
         fill_strip(cell_ix, cell_start, row_iy, row_start, iy, ix - reach, reach, 2 * reach + 1, strip)
         _, end = gather(x, y, z, strip, reach, width, reach, reach, px, py, pz)
         n = members(px[:end], py[:end], pz[:end], qx[j], qy[j], qz[j], r2, spherical, record)
