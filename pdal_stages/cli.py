@@ -65,6 +65,9 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--progress", action=argparse.BooleanOptionalAction, default=None, help="Show progress")
     command.add_argument("--nostream", action="store_true", help="Accepted for PDAL's sake: our stages never stream")
     command.add_argument("-v", "--verbose", action="count", default=0, help="Print PDAL's log")
+    from .tiling.command import add_arguments
+
+    add_arguments(command)
 
     command = add("expand", _expand, "Print the plain PDAL JSON, which stock 'pdal pipeline' runs", overrides=True)
     _pipeline_input(command)
@@ -143,18 +146,23 @@ def _build(options: argparse.Namespace):
     return Pipeline(source, options.overrides)
 
 
-def _pipeline(options: argparse.Namespace) -> None:
+def _pipeline(options: argparse.Namespace) -> int | None:
     if options.progress is not None:
         os.environ["PDAL_STAGES_PROGRESS"] = "1" if options.progress else "0"
+    from .tiling.command import run_command, wants_tiles
+
+    if wants_tiles(options):
+        return run_command(options, _source(options))
     pipeline = _build(options)
     if options.validate:
         pipeline.validate()
         print(json.dumps({"valid": True, "error_detail": "", "streamable": False}, indent=2))
-        return
+        return None
     pipeline.execute(arrays=False)
     _after(pipeline, options.metadata)
     if options.verbose and pipeline.log:
         print(pipeline.log, file=sys.stderr)
+    return None
 
 
 def _after(pipeline, metadata: str | None) -> None:

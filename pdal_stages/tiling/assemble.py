@@ -116,7 +116,10 @@ def _run(readers, injected, tail, outputs: list[str]) -> dict[str, Any]:
     for number, (reader, (kept, values)) in enumerate(zip(readers, injected, strict=True)):
         adds = {n: _PDAL_TYPES[v.dtype.str[1:]] for n, (_, v) in values.items()}
         stage = marks.inject_stage(token, number, values, kept, adds)
-        stages += [{**reader, "tag": f"in{number}"}, {**stage, "inputs": [f"in{number}"], "tag": f"put{number}"}]
+        stages += [
+            {**reader, "tag": f"in{number}"},
+            {**stage, "inputs": [f"in{number}"], "tag": f"put{number}"},
+        ]
         inputs.append(f"put{number}")
     stages.append({"type": "filters.merge", "inputs": inputs, "tag": "merged"})
     partials: list[tuple[Path, Path]] = []
@@ -177,4 +180,6 @@ def check_whole(partial: Path, final: Path, count: int) -> None:
     except StageError:
         raise StageError("the output is not whole", found=str(final), cure=full) from None
     if found != count:
-        raise StageError("the output is not whole", found=f"{found:,} of {count:,} points in {final}", cure=full)
+        raise StageError(
+            "the output is not whole", found=f"{found:,} of {count:,} points in {final}", cure=full
+        )

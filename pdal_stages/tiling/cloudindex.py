@@ -22,7 +22,9 @@ def open_las(path: str):
     except OSError as error:
         raise StageError("the input cannot be read", where=path, found=error.strerror or str(error)) from None
     except Exception as error:  # laspy and the decompressor raise many types
-        raise StageError("the input cannot be read", where=path, found=f"{type(error).__name__}: {error}") from None
+        raise StageError(
+            "the input cannot be read", where=path, found=f"{type(error).__name__}: {error}"
+        ) from None
 
 
 def read_block(reader: Any, path: str, start: int, count: int):
@@ -37,7 +39,9 @@ def read_block(reader: Any, path: str, start: int, count: int):
             "the input is damaged", where=path, found=f"{type(error).__name__} at point {start:,}: {error}"
         ) from None
     if len(points) != count:
-        raise StageError("the input is cut short", where=path, found=f"it ends before point {start + count:,}")
+        raise StageError(
+            "the input is cut short", where=path, found=f"it ends before point {start + count:,}"
+        )
     return points
 
 
@@ -70,7 +74,9 @@ def index_las(path: str, size: float) -> dict[str, Any]:
             points = read_block(reader, path, start, min(BLOCK, total - start))
             x, y = np.asarray(points.x), np.asarray(points.y)
             boxes.append((float(x.min()), float(y.min()), float(x.max()), float(y.max())))
-            pairs, counts = np.unique(np.column_stack([grid.index(x), grid.index(y)]), axis=0, return_counts=True)
+            pairs, counts = np.unique(
+                np.column_stack([grid.index(x), grid.index(y)]), axis=0, return_counts=True
+            )
             for (i, j), number in zip(pairs.tolist(), counts.tolist(), strict=True):
                 tiles[i, j] = tiles.get((i, j), 0) + number
     return {

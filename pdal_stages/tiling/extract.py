@@ -127,7 +127,11 @@ def cut(
     cores = 0
     head, tail = plain_header(path)
     try:
-        with open_las(path) as reader, open(target, "wb") as out, open(core_target or os.devnull, "wb") as core_out:
+        with (
+            open_las(path) as reader,
+            open(target, "wb") as out,
+            open(core_target or os.devnull, "wb") as core_out,
+        ):
             out.write(head)
             core_out.write(head)
             for first, last in blocks:
@@ -154,7 +158,9 @@ def cut(
             if core_target:
                 finish(core_out, bytearray(head), tail, cores)
     except OSError as error:
-        raise StageError("a tile could not be cut out", where=path, found=error.strerror or str(error)) from error
+        raise StageError(
+            "a tile could not be cut out", where=path, found=error.strerror or str(error)
+        ) from error
     if not index:
         os.unlink(target)
         if core_target:

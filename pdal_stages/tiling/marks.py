@@ -89,7 +89,9 @@ def originals(token: str) -> list[dict[str, NDArray]]:
 # ---- the terrain's reach ---------------------------------------------------------------------------------
 
 
-def terrain_stage(token: str, number: int, options: dict[str, Any], within: float, core: list[float]) -> dict[str, Any]:
+def terrain_stage(
+    token: str, number: int, options: dict[str, Any], within: float, core: list[float]
+) -> dict[str, Any]:
     """A stage behind ``filters.hag_minima`` that finds how far its terrain reached.
 
     Parameters
@@ -103,7 +105,9 @@ def terrain_stage(token: str, number: int, options: dict[str, Any], within: floa
     core : list of float
         The tile, in the unit of the coordinates.
     """
-    return _stage("terrain", {"token": token, "number": number, "options": options, "within": within, "core": core}, {})
+    return _stage(
+        "terrain", {"token": token, "number": number, "options": options, "within": within, "core": core}, {}
+    )
 
 
 def terrain(module: dict[str, Any], ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> bool:
@@ -150,7 +154,7 @@ def terrain_reach(x, y, forms, wanted, cell: float, resolution: float, core) -> 
         np.column_stack([np.floor(x[wanted] / resolution), np.floor(y[wanted] / resolution)]), axis=0
     )
     low = np.floor((fine + 0.5) * (resolution / cell) - 0.5)
-    cells = np.unique(np.concatenate([low + [a, b] for a in (0, 1) for b in (0, 1)]), axis=0)
+    cells = np.unique(np.concatenate([low + np.array([a, b]) for a in (0, 1) for b in (0, 1)]), axis=0)
     nearest = cKDTree(filled).query(cells)[0]
     radius = np.where(nearest > 0, nearest + 1.5, 0.0) + 0.5  # whole cells around it
     centre = cells + 0.5

@@ -21,17 +21,22 @@ ROW, SOURCE, MARGIN = "PdalStagesRow", "PdalStagesSource", "PdalStagesMargin"
 
 #: PDAL's filters that look at one point at a time.
 PER_POINT = {
-    "filters." + n
-    for n in "assign colorization crop expression ferry hag_dem info merge mongo mongoexpression overlay "
-    "range projpipeline reprojection transformation".split()
+    f"filters.{name}"
+    for name in (
+        *("assign", "colorization", "crop", "expression", "ferry", "hag_dem", "info", "merge", "mongo"),
+        *("mongoexpression", "overlay", "projpipeline", "range", "reprojection", "transformation"),
+    )
 }
 #: Of them, those that move points: tiles are cut before, so they may only come after all stages of ours.
 _MOVING = {"filters.reprojection", "filters.transformation", "filters.projpipeline"}
 #: Filters whose result depends on all points at once.
 _GLOBAL = {
-    "filters." + n
-    for n in "chipper colorinterp cpd divider fps georeference gpstimeconvert groupby head hexbin icp iqr locate mad "
-    "mortonorder randomize relaxationdartthrowing returns shell sort splitter stats tail teaser".split()
+    f"filters.{name}"
+    for name in (
+        *("chipper", "colorinterp", "cpd", "divider", "fps", "georeference", "gpstimeconvert", "groupby", "head"),
+        *("hexbin", "icp", "iqr", "locate", "mad", "mortonorder", "randomize", "relaxationdartthrowing"),
+        *("returns", "shell", "sort", "splitter", "stats", "tail", "teaser"),
+    )
 }
 #: Stages of ours whose result depends on all points at once, and what to do instead.
 _OUR_GLOBAL = {
@@ -108,10 +113,14 @@ def make_plan(source: Any, overrides: Iterable[Override], options: TilingOptions
     ]
     unit = next((v["horizontal_unit"] for v in parsed if v is not None and v["horizontal_unit"]), "")
     ready = _prepare(head, kinds, parsed, reaches)
-    foreign = [s["type"] for s, k in zip(head, kinds, strict=True) if k is None and s["type"] != "filters.merge"]
+    foreign = [
+        s["type"] for s, k in zip(head, kinds, strict=True) if k is None and s["type"] != "filters.merge"
+    ]
     creates: list[str] | None = None
     if not foreign:
-        creates = sorted({n for k, v in zip(kinds, parsed, strict=True) if k is not None for n in k.creates(v)})
+        creates = sorted(
+            {n for k, v in zip(kinds, parsed, strict=True) if k is not None for n in k.creates(v)}
+        )
     notes = []
     if any(k is None and t not in PER_POINT for k, t in zip(kinds, (s["type"] for s in head), strict=True)):
         notes.append(
@@ -202,7 +211,9 @@ def _refuse_global(stage: dict[str, Any], where: str, options: TilingOptions) ->
     kind = stage["type"]
     if kind in _OUR_GLOBAL:
         raise PipelineError(
-            f"{kind} needs all points at once, so it cannot be run in tiles", where=where, cure=_OUR_GLOBAL[kind]
+            f"{kind} needs all points at once, so it cannot be run in tiles",
+            where=where,
+            cure=_OUR_GLOBAL[kind],
         )
     if kind in _GLOBAL:
         raise PipelineError(f"{kind} needs all points at once, so it cannot be run in tiles", where=where)
@@ -293,7 +304,9 @@ def outputs_for(plan: TilePlan, names: list[str]) -> list[list[Path]]:
                 f"{Path(text).stem}_#{Path(text).suffix}",
             )
         if "#" in str(Path(text).parent):
-            raise PipelineError("'#' stands in the file's name, not in its folder", where=writer["type"], found=text)
+            raise PipelineError(
+                "'#' stands in the file's name, not in its folder", where=writer["type"], found=text
+            )
         path = Path(text).absolute()
         found.append([path.with_name(path.name.replace("#", n)) for n in names])
     flat = [p for paths in found for p in paths]

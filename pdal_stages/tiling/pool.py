@@ -29,7 +29,9 @@ class Here:
 
     def __exit__(self, *exc: object) -> None: ...
 
-    def run(self, tasks: Callable[[], tuple[Any, str] | None], busy: Callable[[], bool]) -> Iterator[tuple[Any, Any]]:
+    def run(
+        self, tasks: Callable[[], tuple[Any, str] | None], busy: Callable[[], bool]
+    ) -> Iterator[tuple[Any, Any]]:
         """Yield (key, answer) for every task; see :meth:`OnDask.run`."""
         while (task := tasks()) is not None:
             key, text = task
@@ -53,12 +55,18 @@ class OnDask:
         o = self._options
         try:
             if o.scheduler:
-                self._client = self._stack.enter_context(distributed.Client(o.scheduler, timeout=30, set_as_default=False))
+                self._client = self._stack.enter_context(
+                    distributed.Client(o.scheduler, timeout=30, set_as_default=False)
+                )
                 with contextlib.suppress(TimeoutError, AttributeError):
                     self._client.wait_for_workers(1, timeout=_WAIT)
                 threads = self._client.nthreads()
                 if not threads:
-                    raise StageError("the scheduler has no workers", found=o.scheduler, cure="Start dask worker on some hosts")
+                    raise StageError(
+                        "the scheduler has no workers",
+                        found=o.scheduler,
+                        cure="Start dask worker on some hosts",
+                    )
                 self.slots = len(threads)
                 # One tile at a time in a process; what Dask calls its threads are the cores it may use.
                 self.threads = max(1, min(threads.values()))
@@ -89,7 +97,9 @@ class OnDask:
                 self.address = cluster.scheduler_address
         except OSError as error:
             self._stack.close()
-            raise StageError("the Dask scheduler cannot be reached", found=f"{o.scheduler}: {error}") from None
+            raise StageError(
+                "the Dask scheduler cannot be reached", found=f"{o.scheduler}: {error}"
+            ) from None
         except BaseException:
             self._stack.close()
             raise
@@ -99,7 +109,9 @@ class OnDask:
     def __exit__(self, *exc: object) -> None:
         self._stack.close()
 
-    def run(self, tasks: Callable[[], tuple[Any, str] | None], busy: Callable[[], bool]) -> Iterator[tuple[Any, Any]]:
+    def run(
+        self, tasks: Callable[[], tuple[Any, str] | None], busy: Callable[[], bool]
+    ) -> Iterator[tuple[Any, Any]]:
         """Yield (key, answer) for every task, as they finish.
 
         Parameters
@@ -113,7 +125,7 @@ class OnDask:
         -----
         As many tasks are out as there are workers, so that one that kills its worker takes no other along.
         """
-        finished = self._distributed.as_completed()
+        finished = self._distributed.as_completed(loop=self._client.loop)
         keys: dict[str, Any] = {}
         futures: dict[str, Any] = {}
         try:

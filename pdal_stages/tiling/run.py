@@ -201,7 +201,9 @@ class _Run:
             except StageError as error:
                 self.unreadable[source.path] = str(error)
         if not found:
-            raise StageError("none of the inputs can be read", found=next(iter(self.unreadable.values()), "no input"))
+            raise StageError(
+                "none of the inputs can be read", found=next(iter(self.unreadable.values()), "no input")
+            )
         if self.unreadable:
             self.notes.append(
                 f"{len(self.unreadable)} inputs have no readable header, so nobody knows where they lie: tiles beside "
@@ -231,7 +233,11 @@ class _Run:
             metadata = pdal_env.execute([reader], arrays=False).metadata.get("metadata", {})
         except PipelineError as error:
             self.unreadable.setdefault(first.path, str(error))
-            return 1.0 if not self.plan.unit else units_of_wkt("", horizontal=self.plan.unit, vertical="").horizontal
+            return (
+                1.0
+                if not self.plan.unit
+                else units_of_wkt("", horizontal=self.plan.unit, vertical="").horizontal
+            )
         node = metadata.get(first.reader["type"], {})
         srs = (node[0] if isinstance(node, list) else node).get("srs", {})
         wkt = str(srs.get("compoundwkt") or srs.get("wkt") or "")
@@ -276,7 +282,9 @@ class _Run:
         writers = self.plan.writers
         folder = Path(writers[0]["filename"]).absolute().parent
         if not folder.is_dir():
-            raise StageError("the folder of the output does not exist", found=str(folder), cure="Create it first")
+            raise StageError(
+                "the folder of the output does not exist", found=str(folder), cure="Create it first"
+            )
         return folder
 
     def _all_paths(self) -> list[Path]:
@@ -367,8 +375,14 @@ class _Run:
             jobs.append(job)
         for job in jobs:
             job.mark = fingerprint(
-                __version__, self.plan.head, self._files_of(self.plan.head), self.plan.creates, self.halo, self.grid.size,
-                job.tile, [[s.path, s.stamp(), s.reader] for s in job.sources],
+                __version__,
+                self.plan.head,
+                self._files_of(self.plan.head),
+                self.plan.creates,
+                self.halo,
+                self.grid.size,
+                job.tile,
+                [[s.path, s.stamp(), s.reader] for s in job.sources],
                 [self.plan.tail, self._files_of(self.plan.tail)] if self.per == "tile" else "",
             )
         return jobs
@@ -398,7 +412,11 @@ class _Run:
             if source.path in self.unreadable:
                 out.state, out.reason = "failed", "its input cannot be read"
             out.mark = fingerprint(
-                source.path, source.stamp(), source.reader, self.plan.tail, self._files_of(self.plan.tail),
+                source.path,
+                source.stamp(),
+                source.reader,
+                self.plan.tail,
+                self._files_of(self.plan.tail),
                 [job.mark for job in out.jobs],
             )
             outputs.append(out)
@@ -485,8 +503,10 @@ class _Run:
             return
         failed = [job for job in out.jobs if job.state == "failed"]
         if failed:
-            out.state, out.reason = "failed", f"tile {failed[0].name} failed" + (
-                f", and {len(failed) - 1} more of its tiles" if len(failed) > 1 else ""
+            out.state, out.reason = (
+                "failed",
+                f"tile {failed[0].name} failed"
+                + (f", and {len(failed) - 1} more of its tiles" if len(failed) > 1 else ""),
             )
         else:
             out.state = "ready"
@@ -557,7 +577,8 @@ class _Run:
         if short:
             self.notes.append(
                 f"{len(short)} tiles have points whose neighborhoods or terrain reach farther than could be read within "
-                f"{self.options.most_points:,} points; they may differ from an untiled run: " + ", ".join(short[:5])
+                f"{self.options.most_points:,} points; they may differ from an untiled run: "
+                + ", ".join(short[:5])
             )
         points = sum(job.report.get("points", 0) for job in worked)
         peaks = [item.report.get("peak_mb", 0.0) for item in [*worked, *outputs]]
@@ -627,9 +648,10 @@ def _failure(answer: Any) -> tuple[str, bool]:
     if isinstance(answer, BaseException):
         name = type(answer).__name__
         if name == "KilledWorker":
-            return "it killed its worker each time it was tried: too little memory, or a crash in a library", False
+            return (
+                "it killed its worker each time it was tried: too little memory, or a crash in a library",
+                False,
+            )
         return f"{name}: {answer}", True
     error = json.loads(answer).get("error")
     return (error["reason"], bool(error["again"])) if error else ("", False)
-
-

@@ -143,13 +143,17 @@ def las_header(path: str) -> Header:
     except OSError as error:
         raise StageError("the input cannot be read", where=path, found=error.strerror or str(error)) from None
     if len(head) < 227 or head[:4] != b"LASF":
-        raise StageError("the input is not a LAS or LAZ file", where=path, found=f"{head[:4]!r} as first bytes")
+        raise StageError(
+            "the input is not a LAS or LAZ file", where=path, found=f"{head[:4]!r} as first bytes"
+        )
     (count,) = struct.unpack_from("<I", head, 107)
     if head[25] >= 4 and len(head) >= 255:
         (count,) = struct.unpack_from("<Q", head, 247)
     x1, x0, y1, y0 = struct.unpack_from("<4d", head, 179)
     if count and not (x0 <= x1 and y0 <= y1):
-        raise StageError("the header has no bounding box", where=path, found=f"x {x0} to {x1}, y {y0} to {y1}")
+        raise StageError(
+            "the header has no bounding box", where=path, found=f"x {x0} to {x1}, y {y0} to {y1}"
+        )
     return Header(int(count), (x0, y0, x1, y1))
 
 
@@ -164,7 +168,7 @@ def read_ept(path: str) -> dict[str, Any]:
         else:
             text = Path(path).read_bytes()
         found = json.loads(text)
-        found["points"], found["boundsConforming"], found["schema"]  # noqa: B018
+        found["points"], found["boundsConforming"], found["schema"]
         return found
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StageError("the EPT source cannot be read", where=path, found=str(error)) from None

@@ -91,10 +91,14 @@ class Store:
                 msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
             except OSError:
                 file.close()
-                raise StageError("another run is working in this output folder", found=str(self.folder)) from None
+                raise StageError(
+                    "another run is working in this output folder", found=str(self.folder)
+                ) from None
         file.seek(0)
         file.truncate()
-        file.write(f"process {os.getpid()} on {socket.gethostname()} since {time.strftime('%Y-%m-%d %H:%M:%S')}\n")
+        file.write(
+            f"process {os.getpid()} on {socket.gethostname()} since {time.strftime('%Y-%m-%d %H:%M:%S')}\n"
+        )
         file.flush()
         self._lock = file
 

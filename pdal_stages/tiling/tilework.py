@@ -104,10 +104,18 @@ def _settle(task: dict[str, Any], folder: str) -> tuple[Results, list[str], list
         estimate = read * ((task["size"] * unit + 2 * need) / (task["size"] * unit + 2 * buffer)) ** 2
         if attempt == _WIDENINGS or estimate > task["most_points"]:
             if result is None:
-                raise StageError("no terrain: no point near the tile may form one", found=f"within {buffer:.0f} m")
+                raise StageError(
+                    "no terrain: no point near the tile may form one", found=f"within {buffer:.0f} m"
+                )
             break
         buffer, short = float(need) + 1e-6, False
-    report = {"points": own, "read": read, "buffer": buffer, "short": short, "widened": buffer > task["buffer"]}
+    report = {
+        "points": own,
+        "read": read,
+        "buffer": buffer,
+        "short": short,
+        "widened": buffer > task["buffer"],
+    }
     if not own:
         result = Results([np.empty(0, np.int64) for _ in pieces], {}, [0 for _ in pieces])
     report["dropped"] = own - sum(len(r) for r in result.rows)
@@ -163,7 +171,9 @@ def _head(task, grid, tile, pieces: list[Piece], sources, everything: bool) -> t
                 stage["threads"] = min(given, task["threads"]) if given else task["threads"]
             stages.append(stage)
             if stage["type"] == "filters.hag_minima" and not everything:
-                options = {k: v for k, v in stage.items() if k not in ("type", "tag", "inputs", "user_data", "log")}
+                options = {
+                    k: v for k, v in stage.items() if k not in ("type", "tag", "inputs", "user_data", "log")
+                }
                 stages.append(marks.terrain_stage(token, place, options, later[place], list(grid.box(tile))))
         pipeline = Pipeline(stages)
         try:
@@ -174,7 +184,9 @@ def _head(task, grid, tile, pieces: list[Piece], sources, everything: bool) -> t
             raise
         result = _collect(pipeline.arrays, pieces, cores, task["creates"], marks.originals(token))
         need = marks.need(token)
-        if not everything and any(_looked_far(report) for _, reports in pipeline.reports for report in reports):
+        if not everything and any(
+            _looked_far(report) for _, reports in pipeline.reports for report in reports
+        ):
             need = max(need, _far_neighbors(pipeline.arrays, head, grid.box(tile), unit, task["threads"]))
         return result, need
     finally:
@@ -228,7 +240,9 @@ def _changed(values, rows, before) -> dict[str, list[NDArray]]:
             if not len(column):
                 continue
             kept = old[number]
-            if name not in kept or not np.array_equal(kept[name][np.searchsorted(kept[ROW], rows[number])], column):
+            if name not in kept or not np.array_equal(
+                kept[name][np.searchsorted(kept[ROW], rows[number])], column
+            ):
                 out[name] = columns
                 break
     return out
@@ -248,7 +262,13 @@ def _far_neighbors(arrays, head, box, unit: float, threads: int) -> float:
         if kind is None:
             continue
         options = kind.parse({k: v for k, v in stage.items() if k not in ("type", "tag", "inputs")})
-        plan = kind.plan(options) if hasattr(kind, "plan") else kind.model(options).plan if hasattr(kind, "model") else None
+        plan = (
+            kind.plan(options)
+            if hasattr(kind, "plan")
+            else kind.model(options).plan
+            if hasattr(kind, "model")
+            else None
+        )
         for one in plan.neighborhoods if plan is not None else ():
             if one.reach is None:
                 most = max(most, int(one.parameters[-1] if one.kind == "knn" else one.parameters[1]))
@@ -282,7 +302,9 @@ def _save(path: Path, results: Results, keys: list[str], pieces: list[Piece]) ->
             os.fsync(file.fileno())
         os.replace(partial, path)
     except OSError as error:
-        raise StageError("a tile's results could not be written", found=error.strerror or str(error)) from error
+        raise StageError(
+            "a tile's results could not be written", found=error.strerror or str(error)
+        ) from error
     finally:
         partial.unlink(missing_ok=True)
 

@@ -36,7 +36,9 @@ def perform(task: str) -> str:
         except StageError as error:
             result = {"error": {"reason": str(error), "again": _again(error)}}
         except MemoryError:
-            result = {"error": {"reason": "memory ran out. Take smaller tiles or fewer workers", "again": True}}
+            result = {
+                "error": {"reason": "memory ran out. Take smaller tiles or fewer workers", "again": True}
+            }
         except Exception as error:
             last = traceback.extract_tb(error.__traceback__)[-1]
             reason = f"{type(error).__name__}: {error} ({last.name}, line {last.lineno})"

@@ -1,0 +1,165 @@
+"""The flags of ``pdal-stages pipeline --tile``, and what it prints."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from ..errors import OptionError, StageError
+from ..files import check_writable, write_whole
+from .options import PER, TilingOptions
+from .run import TiledRun, run_tiled
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """Add the flags to the parser of ``pipeline``."""
+    group = command.add_argument_group("large areas", "Run the pipeline in tiles; see docs/large-areas.md.")
+    group.add_argument("--tile", type=float, metavar="SIZE", help="Side of the tiles, in the unit of the coordinates")
+    group.add_argument(
+        "--workers", type=int, metavar="N", help="Processes; 0: this one alone, without Dask (default: half the cores)"
+    )
+    group.add_argument("--scheduler", default="", metavar="ADDRESS", help="A running Dask scheduler, tcp://HOST:8786")
+    group.add_argument(
+        "--per", choices=PER, default="auto", help="One output for each input file, or for each tile (auto: file)"
+    )
+    group.add_argument(
+        "--buffer", type=float, metavar="METRES", help="Surroundings for PDAL filters that look at neighbors"
+    )
+    group.add_argument("--resume", action="store_true", help="Keep what an earlier run into this folder finished")
+    group.add_argument("--retries", type=int, default=2, metavar="N", help="Tries again of a failed tile (2)")
+    group.add_argument("--dry-run", action="store_true", help="Show tiles and an estimate, and stop")
+    group.add_argument(
+        "--report", action="append", default=[], metavar="FILE", help="Write a report, .html or .json; may be repeated"
+    )
+
+
+def wants_tiles(options: argparse.Namespace) -> bool:
+    """Whether a run in tiles is asked for."""
+    if options.tile is not None:
+        return True
+    given = {
+        "--workers": options.workers is not None,
+        "--scheduler": bool(options.scheduler),
+        "--per": options.per != "auto",
+        "--buffer": options.buffer is not None,
+        "--resume": options.resume,
+        "--dry-run": options.dry_run,
+        "--report": bool(options.report),
+    }
+    for flag, used in given.items():
+        if used:
+            raise OptionError(f"{flag} needs --tile", cure="Give the side of the tiles, e.g. --tile 500")
+    return False
+
+
+def run_command(options: argparse.Namespace, source: str | Path) -> int:
+    """Run ``pdal-stages pipeline --tile``; the exit code, 1 where anything failed."""
+    for name in options.report:
+        if Path(name).suffix.lower() not in (".html", ".htm", ".json"):
+            raise OptionError("--report writes .html or .json", found=name)
+        check_writable(name, "report")
+    if options.metadata:
+        check_writable(options.metadata, "metadata")
+    chosen = TilingOptions(
+        tile=options.tile,
+        workers=options.workers,
+        scheduler=options.scheduler,
+        per=options.per,
+        buffer=options.buffer,
+        resume=options.resume,
+        retries=options.retries,
+    )
+    if options.validate:
+        from ..pipeline import Pipeline
+        from .plan import make_plan
+
+        make_plan(source, options.overrides, chosen)
+        Pipeline(source, options.overrides).validate()
+        print(json.dumps({"valid": True, "error_detail": "", "streamable": False}, indent=2))
+        return 0
+    with _terminated_as_interrupted():
+        run = run_tiled(
+            source, chosen, options.overrides, dry_run=options.dry_run, progress=_progress(options.progress)
+        )
+    _print_dry(run) if options.dry_run else _print(run)
+    for name in [*options.report, *([options.metadata] if options.metadata else [])]:
+        _write_report(name, run)
+    return 1 if run.failures else 0
+
+
+def _progress(asked: bool | None) -> bool | None:
+    return asked if asked is not None else os.environ.get("PDAL_STAGES_PROGRESS", "1") != "0"
+
+
+@contextmanager
+def _terminated_as_interrupted():
+    """A run stopped by a service manager or batch system cleans up like one stopped by Ctrl-C."""
+
+    def stop(number: int, frame: Any) -> None:
+        raise KeyboardInterrupt
+
+    try:
+        before = signal.signal(signal.SIGTERM, stop)
+    except ValueError:  # not in the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _print(run: TiledRun) -> None:
+    s = run.summary
+    states = s["states"]
+    line = f"{states['done']} tiles done"
+    if states["kept"]:
+        line += f", {states['kept']} kept from an earlier run"
+    if states["failed"]:
+        line += f", {states['failed']} failed"
+    print(f"{line}; {s['points']:,} points in {s['seconds']:.1f} s ({s['points_per_second']:,.0f} points/s)")
+    if s["dropped"]:
+        print(f"{s['dropped']:,} points were dropped by filters of the pipeline")
+    for note in run.notes:
+        print(f"pdal-stages: {note}", file=sys.stderr)
+    failures = run.failures
+    for what, reason in failures[:20]:
+        print(f"pdal-stages: {what}: {reason}", file=sys.stderr)
+    if len(failures) > 20:
+        print(f"pdal-stages: and {len(failures) - 20} more; see --report", file=sys.stderr)
+    if failures:
+        print("pdal-stages: run it again with --resume to try only what failed", file=sys.stderr)
+
+
+def _print_dry(run: TiledRun) -> None:
+    s = run.summary
+    print(f"{len(run.tiles)} tiles of {s['tile']:g}, read with {s['buffer_metres']:g} m of surroundings")
+    print(f"{s['inputs']} inputs, {s['points']:,} points; output per {s['per']}")
+    print(f"{s['points_of_largest_tile']:,} points in the largest tile")
+    print(f"{s['workers']} workers with {s['threads_per_worker']} threads each, about {s['points_read_by_a_tile']:,} ")
+    for job in run.tiles[:50]:
+        print(f"  {job.name:24s} {job.points:>14,} points  {len(job.sources)} inputs")
+    if len(run.tiles) > 50:
+        print(f"  and {len(run.tiles) - 50} more")
+    for note in run.notes:
+        print(f"pdal-stages: {note}", file=sys.stderr)
+    for what, reason in run.failures:
+        print(f"pdal-stages: {what}: {reason}", file=sys.stderr)
+
+
+def _write_report(name: str, run: TiledRun) -> None:
+    if Path(name).suffix.lower() == ".json":
+        try:
+            write_whole(name, (json.dumps(run.to_dict(), indent=1) + "\n").encode())
+        except StageError as error:
+            raise error.at("--report") from None
+        return
+    from .report import write_report
+
+    write_report(name, run)
