@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from ..classifier.arrays import ArrayRule
 from ..errors import ModelError, OptionError, StageError
+from ..features.index import check_xyz
 from ..parallel import map_blocks, resolve_threads
 from . import circles as circles_
 from .circles import Circles
@@ -158,7 +159,12 @@ class AlsNet:
     @classmethod
     def plan_of(cls, manifest: Mapping[str, Any]) -> InputPlan:
         """The plan of a model file."""
-        spacing = _finite(_mapping(manifest["parameters"]).get("spacing"), "spacing", 1e-3, 1e6)
+        parameters = _mapping(manifest["parameters"])
+        spacing = _finite(parameters.get("spacing"), "spacing", 1e-3, 1e6)
+        entries = parameters.get("inputs")
+        names = [_mapping(entry).get("name") for entry in entries] if isinstance(entries, list) else None
+        if names != manifest["dimensions"]:
+            raise ModelError("the network's inputs are not the model's dimensions", found=repr(names)[:80])
         return InputPlan(tuple(manifest["dimensions"]), circles_.halo(spacing))
 
     @property
@@ -208,6 +214,7 @@ class AlsNet:
         progress : object, optional
             Its ``update`` is called with the points done.
         """
+        xyz = check_xyz(xyz)
         columns = self.columns(xyz, dimensions)
         circles = Circles(xyz, self.configuration.points, self.spacing, columns)
         numbers = circles.needed(rows)
@@ -263,7 +270,8 @@ class _Applier:
     """Runs a pyramid on a CUDA device where PyTorch finds one, otherwise with NumPy."""
 
     def __init__(self, net: AlsNet) -> None:
-        self.device, self._run = "cpu", net.folded
+        self.device = "cpu"
+        self._run: Any = net.folded
         if _cuda():
             from .network import Applied
 

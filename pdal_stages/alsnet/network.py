@@ -13,8 +13,8 @@ from .configuration import Configuration
 from .pyramid import Pyramid
 from .weights import EPSILON, Weights
 
-torch = optional_import("torch", "deep", "training an alsNet")
-nn = torch.nn
+torch: Any = optional_import("torch", "deep", "training an alsNet")
+nn: Any = torch.nn
 
 #: Share of a batch's statistics in the running ones.
 MOMENTUM = 0.05

@@ -118,7 +118,9 @@ class _Session:
         self.device = _device(options.device, torch)
         self.seconds = {"batches": 0.0, "steps": 0.0, "validation": 0.0}
         source = None if options.start_from is None else _source(options, inputs)
-        self.mean, self.scale = (source.mean, source.scale) if source else _statistics(clouds, inputs)
+        statistics = (source.mean, source.scale) if source else _statistics(clouds, inputs)
+        self.mean: tuple[float, ...] = statistics[0]
+        self.scale: tuple[float, ...] = statistics[1]
         self.spacing = options.spacing or spacing_for(
             options.configuration.points, density([c.xyz for c in clouds])
         )
@@ -133,7 +135,8 @@ class _Session:
             np.where(h, -1, p).astype(np.int64) for p, h in zip(positions, held, strict=True)
         ]
         self.held_labels = [np.where(h, p, -1).astype(np.int64) for p, h in zip(positions, held, strict=True)]
-        self.count = sum(np.bincount(p[p >= 0], minlength=self.n_classes) for p in self.train_labels)
+        used = np.concatenate([p[p >= 0] for p in self.train_labels])
+        self.count = np.bincount(used, minlength=self.n_classes)
         if not self.count.all():
             k = int(np.argmin(self.count))
             raise OptionError(
@@ -348,10 +351,14 @@ class _Session:
 
     def _resume(self, path: str) -> None:
         state, arrays = checkpoint.load(path, self._identity(), self._shapes())
-        curve, best, steps = state.get("curve"), state.get("best_epoch"), state.get("steps")
-        good = isinstance(curve, list) and all(isinstance(row, dict) for row in curve)
-        good = good and isinstance(steps, int) and isinstance(best, int) and 0 <= best <= len(curve)
-        if not good:
+        curve: Any = state.get("curve")
+        best: Any = state.get("best_epoch")
+        steps: Any = state.get("steps")
+        needed = {"epoch", "loss"} | ({"mean_f1"} if self.held_batches else set())
+        good = isinstance(curve, list) and all(isinstance(row, dict) and needed <= set(row) for row in curve)
+        good = good and all(isinstance(row[key], int | float | None) for row in curve for key in needed)
+        good = good and isinstance(steps, int) and steps >= 0
+        if not (good and isinstance(best, int) and 0 <= best <= len(curve)):
             raise ModelError(
                 "the checkpoint's state is not right", where=path, cure="Delete it to begin anew"
             )

@@ -7,6 +7,11 @@ An algorithm is a class with
 - ``from_arrays(arrays, parameters, n_features, n_classes)`` : made from a file, everything checked;
 - ``arrays()`` and ``parameters()`` : what a file stores;
 - ``predict_proba(values)`` : (n, features) float32 to (n, classes) float64, thread-safe and without the GIL.
+
+One that looks at neighbors by itself (a network) says ``whole_cloud = True`` and has instead of the last
+
+- ``plan_of(manifest)`` : what it needs of the points, in place of a plan of features;
+- ``predict_cloud(xyz, dimensions, rows, threads, memory_mb, progress)`` : mean probabilities, their variance, a report.
 """
 
 from __future__ import annotations
@@ -17,7 +22,10 @@ from typing import Any
 from ..errors import ModelError
 
 #: Word in the manifest -> module and class.
-ALGORITHMS = {"random_forest": ("pdal_stages.classifier.forest", "Forest")}
+ALGORITHMS = {
+    "random_forest": ("pdal_stages.classifier.forest", "Forest"),
+    "alsnet": ("pdal_stages.alsnet.algorithm", "AlsNet"),
+}
 
 
 def algorithm(name: str) -> Any:

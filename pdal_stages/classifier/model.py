@@ -38,6 +38,8 @@ class Prediction:
         Winning minus second probability; 0 outside `where`.
     probabilities : (n, classes) float32 or None
         In the order of ``Model.classes``; 0 outside `where`.
+    variance : (n,) float32 or None
+        Variance of a class's probability over a network's batches, mean over the classes; 0 outside `where`.
     classified, rejected : int
         Points looked at, and those of them whose reliability was below `reject_below`.
     report : dict
@@ -51,6 +53,7 @@ class Prediction:
     classified: int
     rejected: int
     report: dict[str, Any]
+    variance: npt.NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +62,7 @@ class Model:
 
     Attributes
     ----------
-    plan : FeaturePlan
+    plan : FeaturePlan or InputPlan
         Features and dimensions it needs.
     algorithm : object
         The classifier itself, e.g. a :class:`Forest`.
@@ -76,7 +79,7 @@ class Model:
         What training took, by part; not stored.
     """
 
-    plan: FeaturePlan
+    plan: Any
     algorithm: Any
     classes: list[tuple[int, str]]
     bins: ShapeBins | None
@@ -177,6 +180,7 @@ class Model:
         memory_mb: float = 512.0,
         probabilities: bool = False,
         margin: bool = False,
+        variance: bool = False,
         reject_below: float | None = None,
         rejected_code: int | None = None,
         progress: Any = None,
@@ -198,8 +202,8 @@ class Model:
             the former get 0 (never classified) and the latter 1 (unclassified).
         threads, memory_mb
             Cores to use, and memory for the blocks of features under way.
-        probabilities, margin : bool
-            Whether to return them.
+        probabilities, margin, variance : bool
+            Whether to return them; the last only a network has.
         reject_below : float, optional
             Points less reliable than this are not given the winning class, and are counted.
         rejected_code : int, optional
@@ -214,17 +218,27 @@ class Model:
             raise OptionError("'rejected_code' must be a class code from 0 to 255", found=rejected_code)
         rows = _rows(where, n)
         old = None if current is None else _codes_now(current, n)
-        fed, notes = gather(self.plan.dimensions, dimensions or {}, n, rows)
+        whole = getattr(self.algorithm, "whole_cloud", False)
+        if variance and not whole:
+            raise OptionError(
+                "only a network gives a variance",
+                found=f"a model of {self.algorithm.name}",
+                cure="Use 'margin'",
+            )
+        fed, notes = gather(self.plan.dimensions, dimensions or {}, n, None if whole else rows)
         chosen = slice(None) if rows is None else rows
         classification = np.zeros(n, np.uint8) if old is None else old.copy()
         reliability = np.zeros(n, np.float32)
         margins = np.zeros(n, np.float32) if margin else None
         shares = np.zeros((n, len(self.classes)), np.float32) if probabilities else None
+        variances = np.zeros(n, np.float32) if variance else None
         count = n if rows is None else len(rows)
         codes = self.codes
 
         def classify(values, _rows):
-            p = self.algorithm.predict_proba(values)
+            return decide(self.algorithm.predict_proba(values))
+
+        def decide(p):
             best = p.argmax(axis=1)
             win = np.take_along_axis(p, best[:, None], axis=1)[:, 0]
             second = np.partition(p, -2, axis=1)[:, -2] if margin and p.shape[1] > 1 else np.zeros(len(p))
@@ -232,7 +246,16 @@ class Model:
 
         rejected = 0
         counted: dict[str, Any] = {}
-        if count:
+        blocks: Any = ()
+        if count and whole:
+            found = self.algorithm.predict_cloud(
+                xyz, fed, rows, threads=threads, memory_mb=memory_mb, progress=progress
+            )
+            blocks = [(chosen, decide(found.mean))]
+            counted.update(found.report)
+            if variances is not None:
+                variances[chosen] = found.variance
+        elif count:
             engine = FeatureEngine(
                 xyz,
                 self.plan,
@@ -249,21 +272,22 @@ class Model:
                 progress=progress,
                 apply=classify,
             )
-            for at, (code, win, lead, p) in blocks:
-                reliability[at] = win
-                if margins is not None:
-                    margins[at] = lead
-                if shares is not None:
-                    shares[at] = p
-                low = win < threshold
-                rejected += int(np.count_nonzero(low))
-                if rejected_code is not None:
-                    code = np.where(low, np.uint8(rejected_code), code)
-                elif old is not None:
-                    code = np.where(low, old[at], code)
-                else:
-                    code = np.where(low, np.uint8(UNCLASSIFIED), code)
-                classification[at] = code
+        for at, (code, win, lead, p) in blocks:
+            reliability[at] = win
+            if margins is not None:
+                margins[at] = lead
+            if shares is not None:
+                shares[at] = p
+            low = win < threshold
+            rejected += int(np.count_nonzero(low))
+            if rejected_code is not None:
+                code = np.where(low, np.uint8(rejected_code), code)
+            elif old is not None:
+                code = np.where(low, old[at], code)
+            else:
+                code = np.where(low, np.uint8(UNCLASSIFIED), code)
+            classification[at] = code
+        if count and not whole:
             for key in ("fewer_than_three", "beyond_halo"):
                 if any(engine.report.get(key, {}).values()):
                     counted[key] = {token: m for token, m in engine.report[key].items() if m}
@@ -277,7 +301,7 @@ class Model:
             **{name: m for name, m in notes.items() if m},
             **counted,
         }
-        return Prediction(classification, reliability, margins, shares, count, rejected, report)
+        return Prediction(classification, reliability, margins, shares, count, rejected, report, variances)
 
 
 def load_model(path: str | os.PathLike) -> Model:
@@ -298,7 +322,10 @@ def load_model(path: str | os.PathLike) -> Model:
 
 
 def _assemble(manifest: dict[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> Model:
-    plan = FeaturePlan.from_dict(manifest["features"])
+    kind = algorithm(manifest["algorithm"])
+    plan: Any = (
+        kind.plan_of(manifest) if hasattr(kind, "plan_of") else FeaturePlan.from_dict(manifest["features"])
+    )
     names = manifest["feature_names"]
     if list(plan.names) != names or list(plan.dimensions) != manifest["dimensions"]:
         raise ModelError(
@@ -315,7 +342,6 @@ def _assemble(manifest: dict[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) 
     codes = [code for code, _ in classes]
     if sorted(set(codes)) != codes:
         raise ModelError("the model's classes must be ascending, each once", found=codes[:10])
-    kind = algorithm(manifest["algorithm"])
     made = kind.from_arrays(arrays, manifest["parameters"], len(names), len(classes))
     bins = manifest["shape_bins"]
     return Model(

@@ -56,6 +56,11 @@ class TrainingOptions:
     gap : float or None
         Training samples nearer than this (metres, in plan) to a validation sample are left out of that fold.
         None: the largest radius of the neighborhoods.
+    algorithm : {"random_forest", "alsnet"}
+        A forest on features, or a network on the points themselves [WM19], which uses `dimensions`, `classes`,
+        `strategy`, `seed` and `threads` of these options and all of `alsnet`.
+    alsnet : mapping or NetworkOptions, optional
+        How the network is trained; see :class:`pdal_stages.alsnet.NetworkOptions`.
     threads : int or None
     memory_mb : float
         For blocks of features under way; the matrix of all samples comes on top.
@@ -79,6 +84,8 @@ class TrainingOptions:
     folds: int = 0
     block_size: float = 25.0
     gap: float | None = None
+    algorithm: str = "random_forest"
+    alsnet: Any = None
     threads: int | None = None
     memory_mb: float = 512.0
 
@@ -97,6 +104,7 @@ class TrainingOptions:
                 found=repr(self.strategy),
                 cure=f"Choose one of {', '.join(STRATEGIES)}",
             )
+        self._check_algorithm()
         if self.strategy == "binary" and self.target is None:
             raise OptionError("the binary strategy needs 'target', the code of the class to find")
         if self.strategy == "multiclass" and self.target is not None:
@@ -132,6 +140,25 @@ class TrainingOptions:
         if not isinstance(self.scale, bool):
             raise OptionError("'scale' must be true or false", found=repr(self.scale))
         resolve_threads(self.threads)
+
+    def _check_algorithm(self) -> None:
+        from .algorithms import ALGORITHMS
+
+        if self.algorithm not in ALGORITHMS:
+            raise OptionError(
+                "'algorithm' is not known",
+                found=repr(self.algorithm),
+                cure=f"Choose one of {', '.join(ALGORITHMS)}",
+            )
+        if self.alsnet and self.algorithm != "alsnet":
+            raise OptionError("'alsnet' means something only with algorithm 'alsnet'", found=self.algorithm)
+        if self.algorithm == "alsnet":
+            from ..alsnet.options import NetworkOptions
+
+            if self.alsnet is not None and not isinstance(self.alsnet, Mapping | NetworkOptions):
+                raise OptionError("'alsnet' must be a mapping of options", found=repr(self.alsnet)[:60])
+            if not isinstance(self.alsnet, NetworkOptions):
+                object.__setattr__(self, "alsnet", NetworkOptions.from_dict(self.alsnet or {}))
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> TrainingOptions:

@@ -73,6 +73,10 @@ def train(
     clouds = [clouds] if isinstance(clouds, TrainingCloud) else list(clouds)
     if not clouds:
         raise OptionError("no training cloud was given")
+    if options.algorithm == "alsnet":
+        from ..alsnet.model import train_model
+
+        return train_model(clouds, options, progress)
     started = time.perf_counter()
     plan = FeaturePlan.parse(
         options.neighborhoods, feature_set=options.feature_set, dimensions=options.dimensions
@@ -137,6 +141,18 @@ def train(
 
 
 def _sample(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> tuple[ClassMap, Samples]:
+    classes, positions = class_positions(clouds, options)
+    inputs = [
+        (np.asarray(cloud.xyz, dtype=np.float64), position)
+        for cloud, position in zip(clouds, positions, strict=True)
+    ]
+    return classes, draw_samples(inputs, len(classes.codes), options.count, options.seed)
+
+
+def class_positions(
+    clouds: Sequence[TrainingCloud], options: TrainingOptions
+) -> tuple[ClassMap, list[npt.NDArray[np.int16]]]:
+    """The classes, and for each cloud the place of each point's class in them, -1 where it is not used."""
     usable = []
     found: dict[int, int] = {}
     for cloud in clouds:
@@ -173,13 +189,13 @@ def _sample(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> tuple[
             found=f"labels {listing}",
             cure=f"Labels {', '.join(map(str, LEFT_OUT))} are left out unless 'classes' names them",
         )
-    inputs = []
-    for cloud, (labels, mask) in zip(clouds, usable, strict=True):
+    positions = []
+    for labels, mask in usable:
         position = classes.index(labels)
         if mask is not None:
             position[~mask] = -1
-        inputs.append((np.asarray(cloud.xyz, dtype=np.float64), position))
-    return classes, draw_samples(inputs, len(classes.codes), options.count, options.seed)
+        positions.append(position)
+    return classes, positions
 
 
 def _must_fit(plan: FeaturePlan, n: int) -> None:
