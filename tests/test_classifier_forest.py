@@ -209,7 +209,18 @@ def test_growing_does_not_depend_on_threads_and_out_of_bag_rows_are_out():
     weight[:50] = 3
     weight[290:] = 0
     runs = [
-        list(grow(x, y, weight, 7, TreeOptions(min_samples_leaf=2), 4, score="out of bag", threads=threads))
+        list(
+            grow(
+                x,
+                y,
+                weight,
+                7,
+                TreeOptions(min_samples_leaf=2, max_samples=0.5),
+                4,
+                score="out of bag",
+                threads=threads,
+            )
+        )
         for threads in (1, 3)
     ]
     for (tree_a, rows_a, shares_a), (tree_b, rows_b, shares_b) in zip(*runs, strict=True):

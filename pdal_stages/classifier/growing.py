@@ -26,8 +26,8 @@ class TreeOptions:
     """How each tree is grown; see ``TrainingOptions``."""
 
     max_depth: int | None = None
-    min_samples_leaf: int = 5
-    max_samples: float = 0.5
+    min_samples_leaf: int = 1
+    max_samples: float = 1.0
     max_features: str | int | float = "sqrt"
 
 

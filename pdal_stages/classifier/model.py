@@ -278,7 +278,7 @@ class Model:
                 margins[at] = lead
             if shares is not None:
                 shares[at] = p
-            low = win < threshold
+            low = reliability[at] < threshold  # as stored, so that users can find the same points
             rejected += int(np.count_nonzero(low))
             if rejected_code is not None:
                 code = np.where(low, np.uint8(rejected_code), code)
@@ -344,6 +344,7 @@ def _assemble(manifest: dict[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) 
         raise ModelError("the model's classes must be ascending, each once", found=codes[:10])
     made = kind.from_arrays(arrays, manifest["parameters"], len(names), len(classes))
     bins = manifest["shape_bins"]
+    _check_fitted(plan, bins or {}, manifest["copt_threshold"])
     return Model(
         plan,
         made,
@@ -353,6 +354,17 @@ def _assemble(manifest: dict[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) 
         manifest["feature_seed"],
         {key: value for key, value in manifest.items() if key not in _OWN},
     )
+
+
+def _check_fitted(plan: Any, bins: Mapping[str, Any], copt_threshold: float | None) -> None:
+    """What the engine would otherwise fit to the cloud at hand must come from the file."""
+    if not isinstance(plan, FeaturePlan):
+        return
+    for part in plan.layout:
+        if part.shapes and part.neighborhood.token not in bins:
+            raise ModelError("the model lacks the thresholds of shape distributions", found=part.neighborhood.token)
+        if part.neighborhood.kind == "copt" and copt_threshold is None:
+            raise ModelError("the model lacks the curvature threshold of copt")
 
 
 def _rows(where: npt.ArrayLike | None, n: int) -> npt.NDArray[np.int64] | None:
@@ -379,9 +391,9 @@ def _codes_now(current: npt.ArrayLike, n: int) -> npt.NDArray[np.uint8]:
     return array.astype(np.uint8)
 
 
-def _checked_reject(value: float | None) -> float:
+def _checked_reject(value: float | None) -> np.float32:
     if value is None:
-        return 0.0
+        return np.float32(0)
     if isinstance(value, bool) or not 0.0 <= value <= 1.0:
         raise OptionError("'reject_below' must be a probability from 0 to 1", found=value)
-    return float(value)
+    return np.float32(value)

@@ -77,8 +77,8 @@ class TrainingOptions:
     seed: int = 0
     trees: int | Sequence[int] = 100
     max_depth: int | Sequence[int | None] | None = None
-    min_samples_leaf: int | Sequence[int] = 5
-    max_samples: float = 0.5
+    min_samples_leaf: int | Sequence[int] = 1
+    max_samples: float = 1.0
     max_features: str | int | float = "sqrt"
     scale: bool = True
     folds: int = 0

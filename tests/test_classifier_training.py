@@ -1,0 +1,426 @@
+"""Training and prediction on small clouds: labels, files, blocks, threads, where, rejection, dimensions."""
+
+import json
+
+import numpy as np
+import pytest
+
+from pdal_stages.classifier import (
+    Model,
+    Prediction,
+    TrainingCloud,
+    TrainingOptions,
+    load_model,
+    train,
+)
+from pdal_stages.classifier.sampling import draw_samples
+from pdal_stages.errors import DimensionError, ModelError, OptionError, StageError
+from pdal_stages.features import FeatureEngine
+
+SMALL = {
+    "neighborhoods": "c1,s2,kopt(5,20)",
+    "feature_set": "covariance,geometric,D2",
+    "count": 150,
+    "trees": 12,
+}
+
+
+def scene(seed=0, n=6000, origin=(0.0, 0.0, 0.0)):
+    """A field (2), boxes with flat roofs (6) and round bushes (5), seen from above; dimensions of a flight."""
+    random = np.random.default_rng(seed)
+    xyz = random.random((n, 3)) * (60, 60, 0.1)
+    label = np.full(n, 2)
+    block = np.floor(xyz[:, :2] / 10).astype(int)
+    kind = random.integers(0, 3, (6, 6))[block[:, 0], block[:, 1]]
+    inside = (np.abs(xyz[:, :2] % 10 - 5) < 3).all(axis=1)
+    roof, bush = (kind == 1) & inside, (kind == 2) & inside
+    xyz[roof, 2] += 4
+    xyz[bush, 2] += random.random(bush.sum()) * 4
+    label[roof], label[bush] = 6, 5
+    dimensions = {
+        "HeightAboveGround": xyz[:, 2].copy(),
+        "Intensity": random.integers(0, 1000, n).astype(np.uint16),
+        "ReturnNumber": np.ones(n, np.uint8),
+        "NumberOfReturns": random.integers(1, 4, n).astype(np.uint8),
+    }
+    return xyz + origin, label, dimensions
+
+
+@pytest.fixture(scope="module")
+def trained() -> Model:
+    xyz, label, dimensions = scene()
+    return train(
+        [TrainingCloud(xyz, label, dimensions, "some/folder/a.laz")], TrainingOptions(**SMALL), progress=False
+    )
+
+
+@pytest.fixture(scope="module")
+def other():
+    return scene(seed=7, n=4000)
+
+
+def accuracy(prediction, label):
+    return (prediction.classification == label).mean()
+
+
+def same(a: Prediction, b: Prediction):
+    for name in ("classification", "reliability", "margin", "probabilities"):
+        one, two = getattr(a, name), getattr(b, name)
+        assert (one is None) == (two is None)
+        assert one is None or np.array_equal(one, two), name
+
+
+# ---- what comes out ------------------------------------------------------------------------------------
+
+
+def test_another_place_is_classified(trained, other):
+    xyz, label, dimensions = other
+    result = trained.predict(xyz, dimensions, margin=True, probabilities=True)
+    assert accuracy(result, label) > 0.9
+    assert result.classification.dtype == np.uint8 and set(np.unique(result.classification)) <= {2, 5, 6}
+    assert result.reliability.dtype == np.float32
+    p = np.sort(result.probabilities, axis=1)
+    assert np.allclose(p.sum(axis=1), 1, atol=1e-6)
+    assert np.array_equal(result.reliability, p[:, -1])
+    assert np.allclose(result.margin, p[:, -1] - p[:, -2], atol=1e-6)
+    assert np.array_equal(trained.codes[result.probabilities.argmax(axis=1)], result.classification)
+    assert result.classified == len(xyz) and result.rejected == 0
+    assert sum(result.report["classes"].values()) == len(xyz)
+
+
+def test_equals_sklearn_on_the_same_features(other):
+    """The same features into scikit-learn's own trees: identical labels, identical probabilities."""
+    from pdal_stages.classifier import training
+
+    xyz, label, dimensions = scene()
+    kept = []
+    original = training.Forest.from_sklearn
+    training.Forest.from_sklearn = classmethod(  # type: ignore[method-assign, assignment]
+        lambda cls, trees, n: kept.extend(trees) or original(trees, n)
+    )
+    try:
+        model = train([TrainingCloud(xyz, label, dimensions)], TrainingOptions(**SMALL), progress=False)
+    finally:
+        training.Forest.from_sklearn = original  # type: ignore[method-assign]
+    xyz, label, dimensions = other
+    engine = FeatureEngine(xyz, model.plan, bins=model.bins, copt_threshold=model.copt_threshold)
+    values = engine.table(dimensions={"HeightAboveGround": dimensions["HeightAboveGround"]}).values
+    expected = sum(tree.predict(values) for tree in kept) / len(kept)
+    result = model.predict(xyz, dimensions, probabilities=True)
+    assert np.array_equal(result.probabilities, expected.astype(np.float32))
+    assert np.array_equal(result.classification, model.codes[expected.argmax(axis=1)])
+    labels, probabilities = model.predict_features(values)
+    assert np.array_equal(labels, result.classification) and np.array_equal(probabilities, expected)
+
+
+def test_blocks_and_threads_change_nothing(trained, other):
+    xyz, _, dimensions = other
+    first = trained.predict(xyz, dimensions, threads=1, memory_mb=2000, margin=True, probabilities=True)
+    same(first, trained.predict(xyz, dimensions, threads=3, memory_mb=16, margin=True, probabilities=True))
+
+
+def test_order_of_points_changes_nothing(trained, other):
+    xyz, _, dimensions = other
+    p = np.random.default_rng(0).permutation(len(xyz))
+    first = trained.predict(xyz, dimensions)
+    second = trained.predict(xyz[p], {k: v[p] for k, v in dimensions.items()})
+    assert np.array_equal(first.classification[p], second.classification)
+    assert np.array_equal(first.reliability[p], second.reliability)
+
+
+def test_training_does_not_depend_on_order_or_threads(trained, tmp_path):
+    xyz, label, dimensions = scene()
+    p = np.random.default_rng(0).permutation(len(xyz))
+    again = train(
+        [TrainingCloud(xyz[p], label[p], {k: v[p] for k, v in dimensions.items()}, "another/folder/a.laz")],
+        TrainingOptions(**SMALL, threads=3, memory_mb=20),
+        progress=False,
+    )
+    trained.save(tmp_path / "a")
+    again.save(tmp_path / "b")
+    # The samples come in another order, so only what is learnt from them as a set is equal ...
+    assert again.bins == trained.bins and again.info["classes"] == trained.info["classes"]
+    # ... and, since samples are ordered along the curve, the whole file is.
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_file_gives_the_same_model(trained, other, tmp_path):
+    xyz, _, dimensions = other
+    trained.save(tmp_path / "m.model")
+    again = load_model(tmp_path / "m.model")
+    same(trained.predict(xyz, dimensions, margin=True), again.predict(xyz, dimensions, margin=True))
+    assert again.describe() == json.loads(json.dumps(trained.describe()))
+    assert str(again) == str(trained)
+    again.save(tmp_path / "n.model")
+    assert (tmp_path / "m.model").read_bytes() == (tmp_path / "n.model").read_bytes()
+    assert b"some/folder" not in (tmp_path / "m.model").read_bytes()
+
+
+# ---- where and rejection -------------------------------------------------------------------------------
+
+
+def test_where_keeps_the_rest_which_still_are_neighbors(trained, other):
+    xyz, label, dimensions = other
+    where = xyz[:, 0] > 30
+    current = np.where(label == 2, 17, 4)
+    whole = trained.predict(xyz, dimensions)
+    part = trained.predict(xyz, dimensions, where=where, current=current, probabilities=True)
+    assert np.array_equal(part.classification[where], whole.classification[where])
+    assert np.array_equal(part.reliability[where], whole.reliability[where])
+    assert np.array_equal(part.classification[~where], current[~where])
+    assert not part.reliability[~where].any() and not part.probabilities[~where].any()
+    assert part.classified == where.sum() and part.report["outside_where"] == (~where).sum()
+    # Without them as neighbors the result near the line is another one.
+    alone = trained.predict(xyz[where], {k: v[where] for k, v in dimensions.items()})
+    assert not np.array_equal(alone.reliability, whole.reliability[where])
+    assert not trained.predict(xyz, dimensions, where=where).classification[~where].any()
+
+
+def test_where_nothing_and_everything(trained, other):
+    xyz, _, dimensions = other
+    none = trained.predict(xyz, dimensions, where=np.zeros(len(xyz), bool))
+    assert none.classified == 0 and not none.classification.any()
+    same(trained.predict(xyz, dimensions), trained.predict(xyz, dimensions, where=np.ones(len(xyz), bool)))
+    with pytest.raises(OptionError, match="where"):
+        trained.predict(xyz, dimensions, where=np.arange(3))
+
+
+def test_reject(trained, other):
+    xyz, _, dimensions = other
+    whole = trained.predict(xyz, dimensions)
+    low = whole.reliability < np.float32(0.7)
+    assert 0 < low.sum() < len(xyz)
+    for keywords, expected in (
+        ({}, 1),
+        ({"current": np.full(len(xyz), 9)}, 9),
+        ({"current": np.full(len(xyz), 9), "rejected_code": 30}, 30),
+    ):
+        result = trained.predict(xyz, dimensions, reject_below=0.7, **keywords)
+        assert result.rejected == low.sum() == result.report["rejected"]
+        assert (result.classification[low] == expected).all()
+        assert np.array_equal(result.classification[~low], whole.classification[~low])
+        assert np.array_equal(result.reliability, whole.reliability)
+        assert result.report["classified"] == (~low).sum()
+    for bad in (-0.1, 1.1, float("nan"), True):
+        with pytest.raises(OptionError, match="reject_below"):
+            trained.predict(xyz, dimensions, reject_below=bad)
+
+
+def test_empty_cloud(trained):
+    empty = trained.predict(
+        np.zeros((0, 3)), {"HeightAboveGround": np.zeros(0)}, margin=True, probabilities=True
+    )
+    assert len(empty.classification) == 0 and empty.probabilities.shape == (0, 3)
+
+
+def test_wrong_features(trained):
+    with pytest.raises(ModelError, match="features per point"):
+        trained.predict_features(np.zeros((3, 5)))
+    values = np.zeros((2, len(trained.plan.names)), np.float32)
+    values[1, 3] = np.nan
+    with pytest.raises(ModelError, match="not a finite"):
+        trained.predict_features(values)
+
+
+# ---- dimensions ----------------------------------------------------------------------------------------
+
+
+def test_a_missing_dimension_names_itself_and_its_maker(trained, other):
+    xyz, label, _ = other
+    with pytest.raises(DimensionError, match=r"HeightAboveGround.*hag_minima"):
+        trained.predict(xyz, {})
+    with pytest.raises(DimensionError, match=r"HeightAboveGround.*hag_minima"):
+        train([TrainingCloud(xyz, label, {}, "b.laz")], TrainingOptions(**SMALL), progress=False)
+    bad = {"HeightAboveGround": np.where(np.arange(len(xyz)) < 5, np.nan, 1.0)}
+    with pytest.raises(DimensionError, match="5 points"):
+        trained.predict(xyz, bad)
+    with pytest.raises(DimensionError, match="one value per point"):
+        trained.predict(xyz, {"HeightAboveGround": np.zeros(3)})
+
+
+def test_return_ratio_and_intensity(other):
+    xyz, label, dimensions = scene()
+    options = TrainingOptions(**{**SMALL, "dimensions": "HeightAboveGround,Intensity,ReturnRatio"})
+    model = train([TrainingCloud(xyz, label, dimensions)], options, progress=False)
+    assert model.plan.names[-3:] == ("HeightAboveGround", "Intensity", "ReturnRatio")
+    assert set(model.required_dimensions) == {
+        "HeightAboveGround", "Intensity", "ReturnNumber", "NumberOfReturns",
+    }  # fmt: skip
+    xyz, label, dimensions = other
+    assert accuracy(model.predict(xyz, dimensions), label) > 0.85
+    dimensions = {**dimensions, "NumberOfReturns": dimensions["NumberOfReturns"].copy()}
+    dimensions["NumberOfReturns"][:7] = 0
+    assert model.predict(xyz, dimensions).report["points_without_return_numbers"] == 7
+    dimensions["NumberOfReturns"][:] = 0
+    with pytest.raises(DimensionError, match="0 everywhere"):
+        model.predict(xyz, dimensions)
+    del dimensions["NumberOfReturns"]
+    with pytest.raises(DimensionError, match="NumberOfReturns"):
+        model.predict(xyz, dimensions)
+
+
+# ---- training ------------------------------------------------------------------------------------------
+
+
+def test_counts_scores_and_importances(trained):
+    classes = {entry["code"]: entry for entry in trained.info["classes"]}
+    assert [entry["samples"] + entry["duplicates"] for entry in classes.values()] == [150] * 3
+    bag = trained.info["accuracy"]["out_of_bag"]
+    assert 0.85 < bag["overall_accuracy"] <= 1 and set(bag["f1"]) == {"2", "5", "6"}
+    for by in ("column", "feature", "group", "neighborhood", "dimension"):
+        assert sum(trained.importances(by).values()) == pytest.approx(1)
+    assert set(trained.importances("neighborhood")) == {"c1", "s2", "kopt(5,20)", "(dimension)"}
+    assert set(trained.importances("group")) == {"covariance", "geometric", "shapes", "dimension"}
+    with pytest.raises(OptionError, match="grouped"):
+        trained.importances("colour")
+    text = str(trained)
+    for word in ("Ground", "Building", "c1 s2 kopt(5,20)", "HeightAboveGround", "a.laz", "out of bag"):
+        assert word in text
+
+
+def test_small_classes_are_counted_several_times():
+    xyz, label, dimensions = scene()
+    label = np.where(np.cumsum(label == 5) <= 20, label, np.where(label == 5, 1, label))
+    model = train([TrainingCloud(xyz, label, dimensions)], TrainingOptions(**SMALL), progress=False)
+    entry = next(e for e in model.info["classes"] if e["code"] == 5)
+    assert entry == {
+        "code": 5, "name": "High vegetation", "labels": [5], "available": 20, "samples": 20, "duplicates": 130,
+    }  # fmt: skip
+
+
+def test_labels_left_out_still_are_neighbors_and_a_mask_limits_samples():
+    xyz, label, dimensions = scene()
+    label = np.where(xyz[:, 0] < 10, 1, label)
+    mask = xyz[:, 1] > 20
+    cloud = TrainingCloud(xyz, label, dimensions, mask=mask)
+    model = train([cloud], TrainingOptions(**SMALL), progress=False)
+    assert [code for code, _ in model.classes] == [2, 5, 6]
+    available = {e["code"]: e["available"] for e in model.info["classes"]}
+    assert available == {c: int((mask & (label == c)).sum()) for c in (2, 5, 6)}
+
+
+def test_several_clouds_are_sampled_together_but_are_not_neighbors():
+    a, b = scene(0), scene(1, origin=(1000.0, 0.0, 0.0))
+    clouds = [TrainingCloud(*a, name="a"), TrainingCloud(*b, name="b")]
+    options = TrainingOptions(**SMALL)
+    model = train(clouds, options, progress=False)
+    assert [c["name"] for c in model.info["training"]["clouds"]] == ["a", "b"]
+    swapped = train(clouds[::-1], options, progress=False)
+    assert swapped.bins == model.bins
+    assert np.array_equal(swapped.algorithm.threshold, model.algorithm.threshold)
+    # Overlapping clouds: each sees its own points only.
+    alone = train([clouds[0]], options, progress=False)
+    twice = train(
+        [clouds[0], TrainingCloud(a[0][:0], a[1][:0], {k: v[:0] for k, v in a[2].items()})], options, False
+    )
+    assert np.array_equal(alone.algorithm.threshold, twice.algorithm.threshold)
+
+
+def test_errors_say_what_was_found():
+    xyz, label, dimensions = scene(n=500)
+    cloud = TrainingCloud(xyz, label, dimensions)
+    with pytest.raises(OptionError, match=r"class 9 .* has no samples .*2: "):
+        train([cloud], TrainingOptions(**SMALL, classes=[2, 9]), progress=False)
+    with pytest.raises(OptionError, match=r"at least two classes .*1: 500"):
+        train([TrainingCloud(xyz, np.ones(500, int), dimensions)], TrainingOptions(**SMALL), progress=False)
+    with pytest.raises(OptionError, match="differ in number"):
+        train([TrainingCloud(xyz, label[:-1], dimensions)], TrainingOptions(**SMALL), progress=False)
+    with pytest.raises(OptionError, match="no training cloud"):
+        train([], TrainingOptions(**SMALL), progress=False)
+    with pytest.raises(OptionError, match="mask"):
+        train([TrainingCloud(xyz, label, dimensions, mask=label)], TrainingOptions(**SMALL), progress=False)
+    with pytest.raises(OptionError, match="do not fit in this machine's memory"):
+        many = TrainingOptions(**{**SMALL, "count": 10**8})
+        import pdal_stages.classifier.training as training
+
+        original, training.draw_samples = training.draw_samples, lambda *_: range(10**10)  # type: ignore
+        try:
+            train([cloud], many, progress=False)
+        finally:
+            training.draw_samples = original
+    assert training.draw_samples is draw_samples
+
+
+def test_binary():
+    xyz, label, dimensions = scene()
+    options = TrainingOptions(**SMALL, strategy="binary", target=6)
+    model = train([TrainingCloud(xyz, label, dimensions)], options, progress=False)
+    assert model.classes == [(1, "Background"), (6, "Building")]
+    assert model.info["classes"][0]["labels"] == [2, 5]
+    result = model.predict(xyz, dimensions)
+    assert accuracy(result, np.where(label == 6, 6, 1)) > 0.9
+    assert "binary, target 6" in str(model)
+
+
+def test_merged_and_named_classes(tmp_path):
+    xyz, label, dimensions = scene()
+    options = TrainingOptions(**SMALL, classes={"2": "Ground", "5,6": "64 Things"})
+    model = train([TrainingCloud(xyz, label, dimensions)], options, progress=False)
+    assert model.classes == [(2, "Ground"), (64, "Things")]
+    model.save(tmp_path / "m")
+    assert load_model(tmp_path / "m").classes == model.classes
+
+
+def test_grid_search_with_blocks_held_out(tmp_path):
+    xyz, label, dimensions = scene()
+    options = TrainingOptions(**{**SMALL, "trees": [3, 9]}, max_depth=[2, None], folds=3, block_size=15.0)
+    model = train([TrainingCloud(xyz, label, dimensions)], options, progress=False)
+    found = model.info["accuracy"]["cross_validation"]
+    assert found["folds"] == 3 and found["gap"] == 2.0 and len(found["tried"]) == 4
+    assert found["chosen"] in found["tried"]
+    assert model.algorithm.n_trees == found["chosen"]["trees"]
+    model.save(tmp_path / "m")
+    assert load_model(tmp_path / "m").info["accuracy"]["cross_validation"]["chosen"] == found["chosen"]
+
+
+def test_limits_to_percentiles_are_in_the_thresholds(trained):
+    """No threshold lies beyond the percentiles: a value beyond goes the way its limit would [B16 3.3]."""
+    low = np.array(trained.info["percentiles"]["low"], np.float32)
+    high = np.array(trained.info["percentiles"]["high"], np.float32)
+    forest = trained.algorithm
+    split = forest.feature >= 0
+    column, limit = forest.feature[split], forest.threshold[split]
+    assert (limit >= low[column]).all() and (limit < high[column]).all()
+    random = np.random.default_rng(0)
+    values = (low + (high - low) * (random.random((500, len(low))) * 3 - 1)).astype(np.float32)
+    cut = np.clip(values, low, high)
+    assert np.array_equal(forest.predict_proba(values), forest.predict_proba(cut))
+    for name, value in zip(trained.plan.names, low, strict=True):
+        if name.startswith("D2_"):
+            assert value == 0.0  # histogram bins that are empty somewhere start at 0
+
+
+# ---- hostile manifests ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda m: m["features"].update(neighborhoods=["c9"]),
+        lambda m: m["features"].update(neighborhoods=["__import__('os')"]),
+        lambda m: m.update(features={}),
+        lambda m: m.update(feature_names=m["feature_names"][::-1]),
+        lambda m: m.update(dimensions=[]),
+        lambda m: m["percentiles"].update(low=[0.0]),
+        lambda m: m.update(importances=[1.0]),
+        lambda m: m["classes"].reverse(),
+        lambda m: m["classes"].pop(),
+        lambda m: m.update(shape_bins={"c1": 3}),
+        lambda m: m.update(shape_bins=None),
+        lambda m: m["shape_bins"].pop("c1"),
+    ],
+)
+def test_manifests_that_do_not_fit_themselves(trained, tmp_path, edit, other):
+    import copy
+
+    from pdal_stages.classifier import modelfile
+
+    manifest = copy.deepcopy(trained.manifest())
+    edit(manifest)
+    modelfile.write(tmp_path / "m", manifest, trained.algorithm.arrays())
+    with pytest.raises(ModelError):
+        load_model(tmp_path / "m")
+
+
+def test_any_model_error_is_a_stage_error():
+    assert issubclass(ModelError, StageError)
