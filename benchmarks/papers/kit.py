@@ -1,0 +1,366 @@
+"""What the commands of this folder share: clouds, cached features, forests, results that resume."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import pdal_stages
+from pdal_stages.accuracy import Accuracy
+from pdal_stages.classifier.forest import Forest
+from pdal_stages.features import FeatureEngine, FeaturePlan, ShapeBins
+from pdal_stages.progress import Progress
+from pdal_stages.terrain import hag_minima
+
+#: Scene -> classes trained and scored; points of other classes are neighbors only.
+SCENES = {"montpellier": (2, 3, 4, 5, 6), "delft": (1, 2, 6)}
+
+
+# ---- clouds ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """A labelled cloud: (n, 3) coordinates in metres, (n,) class codes, and the points' own dimensions."""
+
+    name: str
+    xyz: np.ndarray
+    labels: np.ndarray
+    dimensions: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def only(self, mask: np.ndarray) -> Cloud:
+        """The points of a mask, as a cloud of their own."""
+        return Cloud(
+            self.name,
+            np.ascontiguousarray(self.xyz[mask]),
+            self.labels[mask],
+            {k: v[mask] for k, v in self.dimensions.items()},
+        )
+
+
+def read_cloud(paths: Iterable[Path], name: str) -> Cloud:
+    """LAS or LAZ files as one cloud."""
+    import laspy
+
+    tiles = [laspy.read(path) for path in paths]
+    if not tiles:
+        sys.exit(f"no clouds for {name}: name their folder with --data")
+    xyz = np.concatenate([np.column_stack([t.x, t.y, t.z]) for t in tiles])
+    return Cloud(name, xyz, np.concatenate([np.asarray(t.classification) for t in tiles]))
+
+
+def with_height(cloud: Cloud) -> Cloud:
+    """The cloud with HeightAboveGround [W18 3.2]."""
+    made = hag_minima(*cloud.xyz.T)
+    height = made[0] if isinstance(made, tuple) else made
+    return Cloud(cloud.name, cloud.xyz, cloud.labels, {**cloud.dimensions, "HeightAboveGround": height})
+
+
+def read_scene(data: Path, scene: str, part: str, columns: str | None = None) -> Cloud:
+    """A part (train, test) of one of the airborne scenes: a folder of LAZ, or ``.pts`` text (see pts_input)."""
+    folder = data / scene
+    text = sorted(folder.glob(f"{part}*.pts"))
+    if text:
+        from pts_input import COLUMNS, read_pts
+
+        return read_pts(text, f"{scene} {part}", columns or COLUMNS)
+    return read_cloud(sorted(folder.glob(f"{part}*.la[sz]")), f"{scene} {part}")
+
+
+# ---- the cache ---------------------------------------------------------------------------------------------
+
+
+def code_fingerprint() -> str:
+    """Changes whenever code that features depend on does."""
+    root = Path(pdal_stages.__file__).parent
+    digest = hashlib.sha256()
+    for path in sorted([*root.glob("features/*.py"), root / "neighborhoods.py", root / "terrain.py"]):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def fingerprint(*arrays: np.ndarray) -> str:
+    """Of the content of arrays."""
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(str((array.shape, array.dtype.str)).encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:24]
+
+
+class Cache:
+    """Arrays in a folder, each keyed by everything it was made from; files appear whole or not at all.
+
+    Parameters
+    ----------
+    folder : Path, optional
+        Made where absent; ``None`` keeps nothing.
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        self.folder = folder
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+
+    def array(self, key: Mapping[str, Any], make: Callable[[], np.ndarray]) -> np.ndarray:
+        """The array of a key: read where it is there (as a map of the file), else made and kept."""
+        if self.folder is None:
+            return make()
+        text = json.dumps({"code": code_fingerprint(), **key}, sort_keys=True)
+        path = self.folder / f"{key.get('what', 'array')}-{hashlib.sha256(text.encode()).hexdigest()[:24]}.npy"
+        if not path.exists():
+            value = make()
+            beside = path.with_suffix(f".{os.getpid()}.tmp")
+            with open(beside, "wb") as file:
+                np.save(file, value)
+            os.replace(beside, path)
+        return np.load(path, mmap_mode="r")
+
+
+def features(
+    cloud: Cloud,
+    plan: FeaturePlan,
+    cache: Cache,
+    *,
+    bins: ShapeBins | None = None,
+    copt_threshold: float | None = None,
+    queries: np.ndarray | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+) -> np.ndarray:
+    """Features of a cloud's points (or of those at `queries`), (m, F) float32, from the cache where it has them."""
+    rows = np.arange(len(cloud)) if queries is None else queries
+    given = {name: np.asarray(cloud.dimensions[name])[rows] for name in plan.dimensions if name not in "XYZ"}
+    key = {
+        "what": "features",
+        "plan": plan.to_dict(),
+        "cloud": fingerprint(cloud.xyz),
+        "queries": None if queries is None else fingerprint(queries),
+        "dimensions": {name: fingerprint(value) for name, value in given.items()},
+        "bins": None if bins is None else bins.to_dict(),
+        "copt": copt_threshold,
+        "seed": seed,
+    }
+
+    def make() -> np.ndarray:
+        start = time.process_time()
+        engine = FeatureEngine(
+            cloud.xyz, plan, bins=bins, copt_threshold=copt_threshold, seed=seed, threads=threads
+        )
+        label = f"features of {cloud.name}"
+        with Progress(len(rows), label) as progress:
+            table = engine.table(queries, dimensions=given or None, progress=progress)
+        note(f"{label}: {len(rows):,} x {len(plan.names)} in {time.process_time() - start:.1f} CPU s")
+        return table.values
+
+    return cache.array(key, make)
+
+
+def fitted_bins(cloud: Cloud, plan: FeaturePlan, cache: Cache, seed: int, threads: int | None) -> ShapeBins | None:
+    """Thresholds of the shape distributions, fitted to a training cloud [B16 3.2.2]."""
+    if not plan.shapes:
+        return None
+    tokens = [columns.neighborhood.token for columns in plan.layout if columns.shapes]
+    key = {"what": "bins", "cloud": fingerprint(cloud.xyz), "plan": plan.to_dict(), "seed": seed}
+
+    def make() -> np.ndarray:
+        engine = FeatureEngine(cloud.xyz, plan, seed=seed, threads=threads).fit()
+        assert engine.bins is not None
+        return np.stack([engine.bins.thresholds(token) for token in tokens])
+
+    return ShapeBins(dict(zip(tokens, np.array(cache.array(key, make)), strict=True)))
+
+
+# ---- forests -----------------------------------------------------------------------------------------------
+
+
+def draw(labels: np.ndarray, classes: Sequence[int], count: int, seed: int) -> np.ndarray:
+    """`count` random points of each class; a class that has fewer gives each of its points about equally often."""
+    random = np.random.default_rng(seed)
+    rows = []
+    for code in classes:
+        here = np.flatnonzero(labels == code)
+        if not len(here):
+            sys.exit(f"class {code} has no training points")
+        share, rest = divmod(count, len(here))
+        rows.append(np.concatenate([np.tile(here, share), random.choice(here, rest, replace=False)]))
+    return np.concatenate(rows)
+
+
+def limits(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """1st and 99th percentile of each column [B16 3.3]; trees need no scaling, but values beyond are cut off."""
+    low, high = np.percentile(values, [1, 99], axis=0).astype(np.float32)
+    return np.where(values.min(axis=0) == 0, np.float32(0), low), high
+
+
+def grow_forest(
+    values: np.ndarray,
+    labels: np.ndarray,
+    *,
+    trees: int,
+    depth: int | None,
+    seed: int,
+    threads: int | None = None,
+    leaf: int = 1,
+    bag: float | None = None,
+):
+    """A Random Forest as the papers describe it: Breiman's, sqrt(features) tried at a node."""
+    from sklearn.ensemble import RandomForestClassifier
+
+    forest = RandomForestClassifier(
+        trees, max_depth=depth, min_samples_leaf=leaf, max_samples=bag, random_state=seed, n_jobs=threads or -1
+    )
+    return forest.fit(values, labels)
+
+
+def predict(forest, values: np.ndarray, classes: Sequence[int], low=None, high=None, chunk: int = 65_536):
+    """Class codes of rows, chunk by chunk (they may lie in a file)."""
+    ours = Forest.from_sklearn([tree.tree_ for tree in forest.estimators_], values.shape[1])
+    codes = np.asarray(forest.classes_)
+    assert set(codes.tolist()) <= set(classes)
+    result = np.empty(len(values), codes.dtype)
+    for start in range(0, len(values), chunk):
+        part = np.ascontiguousarray(values[start : start + chunk], np.float32)
+        if low is not None:
+            part = np.clip(part, low, high)
+        result[start : start + chunk] = codes[ours.predict_proba(part).argmax(axis=1)]
+    return result
+
+
+def figures(result: Accuracy) -> dict[str, Any]:
+    """All measures in per cent, and the matrix they come from."""
+    names = {
+        "oa": "overall_accuracy",
+        "kappa": "kappa",
+        "mcr": "mean_class_recall",
+        "mcp": "mean_class_precision",
+        "mf1": "mean_f1",
+    }
+    return {
+        **{short: 100 * float(getattr(result, long) or 0) for short, long in names.items()},
+        "recall": {str(c.code): 100 * (c.recall or 0) for c in result.per_class},
+        "precision": {str(c.code): 100 * (c.precision or 0) for c in result.per_class},
+        "f1": {str(c.code): 100 * (c.f1 or 0) for c in result.per_class},
+        "classes": list(result.classes),
+        "matrix": np.asarray(result.matrix).tolist(),
+    }
+
+
+# ---- results that resume -----------------------------------------------------------------------------------
+
+
+class Results:
+    """Finished runs in a file of JSON lines; a run that is there is not done again.
+
+    Parameters
+    ----------
+    path : Path, optional
+        ``None`` keeps them in memory only.
+    context : mapping
+        What all runs depend on (data, code); lines of another context are ignored.
+    """
+
+    def __init__(self, path: Path | None, context: Mapping[str, Any]) -> None:
+        self.path, self.context = path, json.loads(json.dumps({"code": code_fingerprint(), **context}))
+        self.done: dict[str, dict[str, Any]] = {}
+        if path is not None and path.exists():
+            for line in path.read_text().splitlines():
+                try:
+                    entry = json.loads(line)
+                except json.JSONDecodeError:  # the last line of an interrupted run
+                    continue
+                if entry["context"] == self.context:
+                    self.done[json.dumps(entry["run"], sort_keys=True)] = entry["result"]
+
+    def get(self, run: Mapping[str, Any], make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """The result of a run, done now where it has not been."""
+        key = json.dumps(run, sort_keys=True)
+        if key not in self.done:
+            start = time.process_time(), time.perf_counter()
+            result = make()
+            seconds = {
+                "cpu": round(time.process_time() - start[0], 1),
+                "wall": round(time.perf_counter() - start[1], 1),
+            }
+            self.done[key] = json.loads(json.dumps({**result, "seconds": seconds}))
+            if self.path is not None:
+                with open(self.path, "a") as file:
+                    line = {"context": self.context, "run": dict(run), "result": self.done[key]}
+                    file.write(json.dumps(line) + "\n")
+            note(f"{key}: {brief(result)}, {seconds['cpu']} CPU s")
+        return self.done[key]
+
+    def runs(self) -> list[dict[str, Any]]:
+        """All finished runs: what was run, and its result."""
+        return [{**json.loads(key), **result} for key, result in self.done.items()]
+
+
+def brief(result: Mapping[str, Any]) -> str:
+    return "  ".join(f"{k} {v:.2f}" for k, v in result.items() if isinstance(v, float))
+
+
+def note(text: str) -> None:
+    """A line of what has been done, on stderr."""
+    print(text, file=sys.stderr, flush=True)
+
+
+# ---- command lines -----------------------------------------------------------------------------------------
+
+
+def parser(description: str | None) -> argparse.ArgumentParser:
+    """With the options all commands have."""
+    made = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    made.add_argument("--data", type=Path, default=os.environ.get("PDAL_STAGES_DATA"), help="folder of the clouds")
+    made.add_argument("--cache", type=Path, help="folder for features and finished runs: makes a run resumable")
+    made.add_argument("--seeds", type=int, default=5)
+    made.add_argument("--threads", type=int)
+    made.add_argument("--json", type=Path, help="results")
+    made.add_argument("--tables", type=Path, help="Markdown tables; printed where not given")
+    return made
+
+
+def opened(args: argparse.Namespace, name: str, context: Mapping[str, Any]) -> tuple[Cache, Results]:
+    """The cache and results of a command."""
+    cache = Cache(args.cache)
+    return cache, Results(None if args.cache is None else args.cache / f"{name}.jsonl", context)
+
+
+def finish(args: argparse.Namespace, runs: list[dict[str, Any]], text: str, **more: Any) -> None:
+    """Write results and tables where the user wants them."""
+    if args.json:
+        args.json.write_text(json.dumps({"machine": machine(), **more, "runs": runs}, indent=1) + "\n")
+    if args.tables:
+        args.tables.write_text(text)
+    else:
+        print(text)
+
+
+def machine() -> dict[str, Any]:
+    import numba
+    import sklearn
+
+    return {
+        "pdal_stages": pdal_stages.__version__,
+        "code": code_fingerprint(),
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "scikit-learn": sklearn.__version__,
+        "numba": numba.__version__,
+        "cores": len(os.sched_getaffinity(0)),
+    }

@@ -1,0 +1,72 @@
+"""Feature tables of the airborne scenes, computed once for all experiments of [B16] and [W18]."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from kit import SCENES, Cache, Cloud, features, fingerprint, fitted_bins, note, read_scene, with_height
+
+from pdal_stages.features import FeaturePlan
+
+NEIGHBORHOODS = "weinmann2018"  # [B16]'s are among them
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Train and test part: clouds, and features (n, F) of all their points."""
+
+    name: str
+    classes: tuple[int, ...]
+    plan: FeaturePlan
+    train: Cloud
+    test: Cloud
+    train_values: np.ndarray
+    test_values: np.ndarray
+
+    def columns(self, names: list[str]) -> np.ndarray:
+        """Where features stand in the tables."""
+        at = {name: number for number, name in enumerate(self.plan.names)}
+        return np.array([at[name] for name in names])
+
+
+def load(
+    data: Path,
+    name: str,
+    cache: Cache,
+    *,
+    classes: tuple[int, ...] | None = None,
+    columns: str | None = None,
+    neighborhoods: str = NEIGHBORHOODS,
+    threads: int | None = None,
+) -> Scene:
+    """Read a scene, compute its features where the cache has none.
+
+    Shape thresholds come from the training cloud and serve both parts [B16 3.2.2]. Every point of a cloud
+    is a neighbor; only points of the classes are queries.
+    """
+    parts = {part: with_height(read_scene(data, name, part, columns)) for part in ("train", "test")}
+    if classes is None:
+        classes = SCENES.get(name) or tuple(np.unique(parts["train"].labels).tolist())
+    plan = FeaturePlan.parse(neighborhoods, "all", ("HeightAboveGround", "Z"))
+    bins = fitted_bins(parts["train"], plan, cache, 0, threads)
+    clouds, tables = [], []
+    for part in parts.values():
+        queries = np.flatnonzero(np.isin(part.labels, classes))
+        note(f"{part.name}: {len(queries):,} of {len(part):,} points are of the classes {classes}")
+        tables.append(features(part, plan, cache, bins=bins, queries=queries, threads=threads))
+        clouds.append(part.only(queries))
+    return Scene(name, classes, plan, *clouds, *tables)
+
+
+def context(scene: Scene) -> dict:
+    """What all runs on a scene depend on."""
+    return {"scene": scene.name, "data": fingerprint(scene.train.xyz, scene.test.xyz), "classes": list(scene.classes)}
+
+
+def add_options(options: argparse.ArgumentParser) -> None:
+    options.add_argument("--scene", nargs="+", default=list(SCENES), help="folders of DIR, with train* and test*")
+    options.add_argument("--classes", type=int, nargs="+", help="labels to train and score; default: the scene's")
+    options.add_argument("--columns", help="of .pts text; see pts_input.py")

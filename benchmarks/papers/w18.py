@@ -1,0 +1,230 @@
+"""[W18]'s questions on real production clouds: how many samples, binary or multi-class, and which features carry it.
+
+    python benchmarks/papers/w18.py --data DIR --cache DIR
+
+All 560 features (nine neighborhoods and the height above ground). Samples, trees and limits are those of
+``writers.classifiermodel``: samples spread over space, trees with at least 5 samples a leaf grown on half the
+samples. Importances come from the training samples alone; the tenth they pick is then trained and scored by itself,
+beside a tenth drawn by chance.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import scenes
+from kit import Cache, Results, figures, finish, note, parser
+from tables import choose, spread, table, values
+
+from pdal_stages.accuracy import Accuracy
+from pdal_stages.asprs import class_name
+from pdal_stages.classifier.forest import Forest
+from pdal_stages.classifier.growing import TreeOptions, grow
+from pdal_stages.classifier.sampling import draw_samples
+from pdal_stages.features.names import GROUPS
+
+#: Scene -> classes found by themselves, against all others.
+TARGETS = {"montpellier": (6, 5), "delft": (6,)}
+
+
+def names_of(scene: scenes.Scene) -> list[str]:
+    """The features of the paper: all but the point's own Z."""
+    return [name for name in scene.plan.names if name != "Z"]
+
+
+def group(name: str) -> str:
+    """The kind of a feature."""
+    head, _, _ = name.rpartition("_")
+    for kind in ("covariance", "geometric", "A3", "D1", "D2", "D3", "D4"):
+        if any(name.startswith(word + "_") and head.startswith(word) for word in GROUPS[kind]):
+            return kind
+    return name
+
+
+def neighborhood(name: str) -> str:
+    return name if name == "HeightAboveGround" else name.rpartition("_")[2]
+
+
+class Trainer:
+    """Trains and scores on one scene; importances of finished runs serve later ones."""
+
+    def __init__(self, scene: scenes.Scene, trees: int, threads: int | None) -> None:
+        self.scene, self.trees, self.threads = scene, trees, threads
+        self.names = names_of(scene)
+
+    def run(
+        self, count: int, seed: int, target: int | None = None, chosen: list[str] | None = None
+    ) -> dict[str, Any]:
+        """Train on `count` samples per class; `target`: that class against all others; `chosen`: features."""
+        scene, names = self.scene, chosen or self.names
+        codes, train, test = self._labels(target)
+        columns = scene.columns(names)
+        position = np.searchsorted(codes, train).astype(np.int16)
+        samples = draw_samples([(scene.train.xyz, position)], len(codes), count, seed)
+        order = np.argsort(samples.row, kind="stable")  # the table is a file: read it forwards
+        x = np.ascontiguousarray(scene.train_values[samples.row[order]][:, columns])
+        label, weight = samples.label[order], samples.weight[order]
+        low, high = np.full(len(names), -np.inf, np.float32), np.full(len(names), np.inf, np.float32)
+        for k, name in enumerate(names):
+            if name != "HeightAboveGround":
+                low[k], high[k] = np.percentile(x[:, k], [1, 99])
+        np.clip(x, low, high, out=x)
+        trees, importance = [], np.zeros(len(names))
+        for tree, _, _ in grow(x, label, weight, self.trees, TreeOptions(), seed, threads=self.threads):
+            trees.append(tree.tree_)
+            importance += tree.feature_importances_ / self.trees
+        found = self._predict(trees, columns, low, high)
+        result = Accuracy.from_labels(test, np.asarray(codes)[found], classes=codes)
+        ranked = sorted(zip(importance.tolist(), names, strict=True), reverse=True)
+        return {
+            **figures(result),
+            "features": len(names),
+            "samples": len(x),
+            "importance": {name: round(value, 6) for value, name in ranked},
+        }
+
+    def _labels(self, target: int | None) -> tuple[list[int], np.ndarray, np.ndarray]:
+        train, test = self.scene.train.labels, self.scene.test.labels
+        if target is None:
+            return sorted(self.scene.classes), train, test
+        other = 0 if target != 0 else 255
+        return (
+            sorted([other, target]),
+            np.where(train == target, target, other),
+            np.where(test == target, target, other),
+        )
+
+    def _predict(self, trees: list, columns: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        forest, chunk = Forest.from_sklearn(trees, len(columns)), 65_536
+        table_ = self.scene.test_values
+        result = np.empty(len(table_), np.int64)
+        for start in range(0, len(table_), chunk):
+            part = np.clip(table_[start : start + chunk][:, columns], low, high)
+            result[start : start + chunk] = forest.predict_proba(np.ascontiguousarray(part)).argmax(axis=1)
+        return result
+
+
+def best_tenth(result: dict[str, Any]) -> list[str]:
+    ranked = list(result["importance"])
+    return sorted(ranked[: round(len(ranked) / 10)])
+
+
+# ---- tables ------------------------------------------------------------------------------------------------
+
+
+def report(runs: list[dict[str, Any]]) -> str:
+    text = []
+    for name in dict.fromkeys(run["scene"] for run in runs):
+        here = choose(runs, scene=name)
+        text.append(f"### {name}\n")
+        rows = []
+        for what in dict.fromkeys((run["kind"], run["count"]) for run in here if run["target"] is None):
+            some = choose(here, kind=what[0], count=what[1], target=None)
+            cells = [spread(values(some, key)) for key in ("oa", "kappa", "mcr", "mcp", "mf1")]
+            rows.append([what[0], f"{what[1]:,}", str(some[0]["features"]), str(len(some)), *cells])
+        head = ("Features", "Samples per class", "Number", "Seeds", "OA", "Kappa", "Mean recall", "Mean precision", "Mean F1")
+        text.append(table(head, rows))
+        codes = list(choose(here, kind="all", target=None)[0]["f1"])
+        rows = []
+        for what in dict.fromkeys((run["kind"], run["count"]) for run in here if run["target"] is None):
+            some = choose(here, kind=what[0], count=what[1], target=None)
+            rows.append([f"{what[0]}, {what[1]:,}", *(spread(values(some, "f1", code)) for code in codes)])
+        text.append("F1 by class\n\n" + table(("", *(class_name(int(code)) for code in codes)), rows))
+        text.append(_binary(here))
+        text.append(_carriers(here))
+    return "\n".join(text)
+
+
+def _binary(runs: list[dict[str, Any]]) -> str:
+    rows = []
+    for target, count in dict.fromkeys((r["target"], r["count"]) for r in runs if r["target"] is not None):
+        ours = choose(runs, target=target, count=count)
+        multi = choose(runs, target=None, kind="all", count=count)
+        for words, some in (("binary", ours), ("multi-class", multi)):
+            cells = [spread(values(some, key, str(target))) for key in ("recall", "precision", "f1")]
+            rows.append([f"{class_name(target)}, {words}", f"{count:,}", str(len(some)), *cells])
+    return table(("Target", "Samples per class", "Seeds", "Recall", "Precision", "F1"), rows) if rows else ""
+
+
+def _carriers(runs: list[dict[str, Any]]) -> str:
+    """Where the best tenth comes from, and its share of all importance."""
+    text = []
+    for label, part in (("Neighborhood", neighborhood), ("Kind", group)):
+        share: Counter[str] = Counter()
+        places: Counter[str] = Counter()
+        full = choose(runs, kind="all", target=None)
+        full = [run for run in full if run["count"] == min(r["count"] for r in full)]
+        for run in full:
+            for name, value in run["importance"].items():
+                share[part(name)] += 100 * value / len(full)
+            places.update(part(name) for name in best_tenth(dict(run)))
+        rows = [
+            [name, f"{value:.1f} %", f"{places[name] / len(full):.1f}"] for name, value in share.most_common()
+        ]
+        text.append(table((label, "Share of importance", "Features in the best tenth"), rows))
+    first = list(full[0]["importance"].items())[:15]
+    text.append(table(("Feature (seed 0)", "Importance"), [[n, f"{100 * v:.2f} %"] for n, v in first]))
+    return "\n".join(text)
+
+
+def run_scene(
+    scene: scenes.Scene, results: Results, args: Any, targets: tuple[int, ...]
+) -> list[dict[str, Any]]:
+    trainer, runs = Trainer(scene, args.trees, args.threads), []
+
+    def get(make, **run: Any) -> dict[str, Any]:
+        run = {"scene": scene.name, "trees": args.trees, **run}
+        runs.append({**run, **results.get(run, make)})
+        return runs[-1]
+
+    few, *more = args.count
+    for seed in range(args.seeds):
+        full = get(lambda s=seed: trainer.run(few, s), kind="all", count=few, target=None, seed=seed)
+        best = best_tenth(full)
+        get(
+            lambda s=seed, b=best: trainer.run(few, s, chosen=b),
+            kind="best tenth", count=few, target=None, seed=seed,
+        )  # fmt: skip
+        chance = np.random.default_rng(seed).choice(trainer.names, len(best), replace=False).tolist()
+        get(
+            lambda s=seed, c=sorted(chance): trainer.run(few, s, chosen=c),
+            kind="a tenth by chance", count=few, target=None, seed=seed,
+        )  # fmt: skip
+        for target in targets:
+            get(
+                lambda s=seed, t=target: trainer.run(few, s, target=t),
+                kind="all", count=few, target=target, seed=seed,
+            )  # fmt: skip
+    for count in more:
+        for seed in range(args.large_seeds):
+            get(lambda s=seed, n=count: trainer.run(n, s), kind="all", count=count, target=None, seed=seed)
+    return runs
+
+
+def main() -> None:
+    options = parser(__doc__)
+    scenes.add_options(options)
+    options.add_argument("--count", type=int, nargs="+", default=[10_000, 100_000])
+    options.add_argument("--large-seeds", type=int, default=1, help="for all counts but the first")
+    options.add_argument("--trees", type=int, default=100)
+    options.add_argument("--target", type=int, nargs="+", help="classes found by themselves")
+    args = options.parse_args()
+    if args.data is None:
+        options.error("name the folder of the clouds: --data DIR, or PDAL_STAGES_DATA")
+    cache, runs = Cache(args.cache), []
+    for name in args.scene:
+        classes = tuple(args.classes) if args.classes else None
+        scene = scenes.load(
+            args.data, name, cache, classes=classes, columns=args.columns, threads=args.threads
+        )
+        note(f"{name}: tables of {scene.train_values.shape} and {scene.test_values.shape}")
+        path = None if args.cache is None else args.cache / "w18.jsonl"
+        targets = tuple(args.target) if args.target else TARGETS.get(name, ())
+        runs += run_scene(scene, Results(path, scenes.context(scene)), args, targets)
+    finish(args, runs, report(runs))
+
+
+if __name__ == "__main__":
+    main()
