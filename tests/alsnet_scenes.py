@@ -1,0 +1,63 @@
+"""Small labelled scenes and untrained networks for the tests of alsNet. No PyTorch."""
+
+import numpy as np
+
+from pdal_stages.alsnet import AlsNet, Configuration, Level
+from pdal_stages.alsnet.weights import fresh
+
+TINY = Configuration(
+    "test",
+    256,
+    (Level(64, 1.5, 8, (16, 16, 32), (32, 32)), Level(16, 4.0, 8, (32, 32, 64), (32, 32))),
+    head=(32,),
+    dropout=0.0,
+)
+
+
+def scene(n=3000, side=24.0, seed=0, origin=(0.0, 0.0, 0.0)):
+    """Ground, a flat roof 4 m above it and a tree's crown: (xyz, labels, dimensions)."""
+    random = np.random.default_rng(seed)
+    xy = random.random((n, 2)) * side
+    z = random.normal(0.0, 0.02, n)
+    labels = np.full(n, 2, np.uint8)
+    roof = (xy[:, 0] % 12 < 5) & (xy[:, 1] % 12 < 5)
+    tree = (xy[:, 0] % 12 > 7) & (xy[:, 1] % 12 > 7)
+    z[roof] += 4.0
+    z[tree] += random.uniform(1.0, 6.0, np.count_nonzero(tree))
+    labels[roof], labels[tree] = 6, 5
+    xyz = np.round(np.column_stack([xy, z]), 3) + np.asarray(origin)
+    intensity = random.integers(0, 200, n).astype(np.uint16)
+    return xyz, labels, {"Intensity": intensity, "HeightAboveGround": z}
+
+
+def random_net(inputs=("Z",), classes=3, configuration=TINY, spacing=3.0, seed=0):
+    """A network whose weights are random, normalisations included."""
+    random = np.random.default_rng(seed)
+    weights = fresh(configuration, len(inputs), classes, seed)
+    for name, array in weights.items():
+        if name != "scores":
+            array[:, -4:] = random.uniform(0.5, 1.5, (len(array), 4))
+    return AlsNet(
+        weights, configuration, tuple(inputs), (0.0,) * len(inputs), (1.0,) * len(inputs), spacing, classes
+    )
+
+
+def model_of(net, codes=(2, 5, 6)):
+    """A network as a model, as training would leave it."""
+    from pdal_stages.classifier.model import Model
+
+    info = {
+        "strategy": "multiclass",
+        "target": None,
+        "background": None,
+        "classes": [
+            {"code": c, "name": str(c), "labels": [c], "available": 9, "samples": 9, "duplicates": 0}
+            for c in codes
+        ],
+        "training": {"clouds": [{"name": "a.laz", "points": 9}], "count": 9, "seed": 0, "samples": 27},
+        "percentiles": {"low": [0.0] * len(net.inputs), "high": [1.0] * len(net.inputs), "limited": False},
+        "accuracy": {"out_of_bag": None, "cross_validation": None},
+        "importances": None,
+        "created_by": {"pdal_stages": "0.1.0"},
+    }
+    return Model(net.plan, net, [(c, str(c)) for c in codes], None, None, 0, info)

@@ -1,0 +1,294 @@
+"""Sampling, balls, circular batches: held against slow, obvious references. No PyTorch."""
+
+import numpy as np
+import pytest
+from alsnet_scenes import TINY, scene
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdal_stages.alsnet import CONFIGURATIONS, Circles, parse_configuration
+from pdal_stages.alsnet.circles import REACH, density, halo, spacing_for
+from pdal_stages.alsnet.pyramid import build, scramble, stack
+from pdal_stages.alsnet.sampling import ball_query, farthest_points, three_nearest
+from pdal_stages.errors import OptionError
+
+# ---- references ------------------------------------------------------------------------------------------
+
+
+def slow_farthest(p, count, start):
+    far, out, now = np.full(len(p), np.inf), [], start
+    for _ in range(count):
+        out.append(now)
+        far = np.minimum(far, ((p - p[now]) ** 2).sum(axis=1))
+        far[out] = -1.0
+        now = int(np.argmax(far))  # of equals the first
+    return np.array(out)
+
+
+def slow_ball(p, centres, radius, samples):
+    out = []
+    for c in centres:
+        inside = np.flatnonzero(((p - p[c]) ** 2).sum(axis=1) <= radius * radius)[:samples]
+        out.append(np.concatenate([inside, np.full(samples - len(inside), inside[0])]))
+    return np.array(out)
+
+
+clouds = st.builds(
+    lambda seed, n, kind: (
+        np.random.default_rng(seed).integers(0, 4, (n, 3)).astype(float)  # ties and coinciding points
+        if kind == "lattice"
+        else np.random.default_rng(seed).normal(size=(n, 3)) * (10.0 if kind == "wide" else [50.0, 1e-3, 2.0])
+    ),
+    st.integers(0, 2**32),
+    st.integers(1, 300),
+    st.sampled_from(["lattice", "wide", "line"]),
+)
+
+# ---- farthest points, balls, nearest ------------------------------------------------------------------------
+
+
+@given(clouds, st.data())
+@settings(max_examples=60, deadline=None)
+def test_farthest_points_equal_the_reference(p, data):
+    count = data.draw(st.integers(1, len(p)))
+    start = data.draw(st.integers(0, len(p) - 1))
+    found = farthest_points(p, count, start)
+    assert np.array_equal(found, slow_farthest(p, count, start))
+    assert len(set(found.tolist())) == count
+
+
+def test_farthest_points_of_points_all_at_one_place():
+    assert sorted(farthest_points(np.ones((200, 3)), 200, 3).tolist()) == list(range(200))
+
+
+def test_farthest_points_refuse_more_than_there_are():
+    with pytest.raises(ValueError):
+        farthest_points(np.zeros((3, 3)), 4)
+
+
+@given(clouds, st.floats(0.01, 30.0), st.integers(1, 20), st.integers(0, 2**32))
+@settings(max_examples=60, deadline=None)
+def test_ball_query_equals_the_reference(p, radius, samples, seed):
+    centres = np.random.default_rng(seed).integers(0, len(p), min(len(p), 30))
+    assert np.array_equal(ball_query(p, centres, radius, samples), slow_ball(p, centres, radius, samples))
+
+
+@given(clouds, st.integers(1, 10))
+@settings(max_examples=40, deadline=None)
+def test_three_nearest_weigh_by_inverse_square(p, m):
+    coarse = p[:m]
+    index, weight = three_nearest(p, coarse)
+    d2 = ((p[:, None, :] - coarse[None, :, :]) ** 2).sum(axis=2)
+    k = min(3, len(coarse))
+    np.testing.assert_allclose(
+        np.take_along_axis(d2, index[:, :k], axis=1), np.sort(d2, axis=1)[:, :k], rtol=1e-9, atol=1e-12
+    )
+    expected = 1.0 / np.maximum(np.sort(d2, axis=1)[:, :k], 1e-10)
+    np.testing.assert_allclose(weight[:, :k], expected / expected.sum(axis=1, keepdims=True), rtol=1e-4)
+    assert not weight[:, k:].any()
+
+
+# ---- circles ------------------------------------------------------------------------------------------------
+
+
+@given(
+    st.integers(0, 2**32),
+    st.integers(1, 2500),
+    st.integers(16, 300),
+    st.sampled_from(["even", "clumps", "places"]),
+)
+@settings(max_examples=40, deadline=None)
+def test_every_point_is_in_a_batch_and_batches_are_the_nearest_points(seed, n, points, kind):
+    random = np.random.default_rng(seed)
+    xyz = random.random((n, 3)) * [60.0, 40.0, 5.0]
+    if kind == "clumps":  # density varies a thousandfold
+        xyz[: n // 2, :2] = random.normal([10.0, 10.0], 0.3, (n // 2, 2))
+    if kind == "places":
+        xyz = np.floor(xyz / 20.0) * 20.0
+    circles = Circles(xyz, points, spacing_for(points, n / 2400.0))
+    seen = np.zeros(n, int)
+    for number, (x, y) in enumerate(circles.centres):
+        members = circles.members(number)
+        assert len(members) <= circles.sizes[number]
+        seen[members] += 1
+        d2 = (xyz[:, 0] - x) ** 2 + (xyz[:, 1] - y) ** 2
+        expected = np.sort(d2[d2 <= circles.reach**2])[: circles.sizes[number]]
+        assert np.array_equal(np.sort(d2[members]), expected)
+    assert seen.min() >= 1
+    assert np.array_equal(seen, circles.coverage)
+    if kind == "even":
+        assert (circles.sizes == points).all()
+
+
+def test_points_are_in_four_batches_on_average():
+    xyz = np.random.default_rng(0).random((60_000, 3)) * [200.0, 200.0, 10.0]
+    points = 1000
+    circles = Circles(xyz, points, spacing_for(points, density([xyz])))
+    assert circles.coverage.min() >= 1
+    assert 3.7 < circles.coverage.mean() < 4.3
+    inside = ((xyz[:, :2] > 30) & (xyz[:, :2] < 170)).all(axis=1)
+    assert 3.8 < circles.coverage[inside].mean() < 4.2
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["montpellier/test_", "delft/test"])
+def test_coverage_of_real_clouds(data_dir, name):
+    laspy = pytest.importorskip("laspy")
+    folder, stem = name.split("/")
+    tiles = [laspy.read(path) for path in sorted((data_dir / folder).glob(f"{stem}*.laz"))]
+    xyz = np.concatenate([np.column_stack([t.x, t.y, t.z]) for t in tiles])
+    circles = Circles(xyz, 4096, spacing_for(4096, density([xyz])))
+    assert circles.coverage.min() >= 1
+    assert 3.5 < circles.coverage.mean() < 5.5
+
+
+@given(st.integers(0, 2**32))
+@settings(max_examples=15, deadline=None)
+def test_batches_do_not_depend_on_the_order_of_the_points(seed):
+    random = np.random.default_rng(seed)
+    xyz = np.round(random.random((1500, 3)) * 30, 1)  # many at the same place
+    inputs = random.integers(0, 3, (1500, 1))
+    shuffled = random.permutation(len(xyz))
+    one, other = Circles(xyz, 200, 5.0, inputs), Circles(xyz[shuffled], 200, 5.0, inputs[shuffled])
+    assert np.array_equal(one.centres, other.centres)
+    for number in range(len(one)):
+        a, b = one.members(number), shuffled[other.members(number)]
+        assert np.array_equal(xyz[a], xyz[b])
+        assert np.array_equal(inputs[a], inputs[b])
+
+
+def test_a_tile_with_its_halo_has_the_batches_of_the_whole():
+    xyz, _, _ = scene(20_000, 80.0)
+    dense = (xyz[:, 0] > 40) & (xyz[:, 0] < 42)
+    xyz = np.concatenate(
+        [xyz, np.repeat(xyz[dense], 9, axis=0) + np.random.default_rng(0).random((9 * dense.sum(), 3))]
+    )
+    spacing = 4.0
+    whole = Circles(xyz, 200, spacing)
+    low, high = np.array([30.0, 30.0]), np.array([45.0, 50.0])
+    own = ((xyz[:, :2] >= low) & (xyz[:, :2] < high)).all(axis=1)
+    around = ((xyz[:, :2] >= low - halo(spacing)) & (xyz[:, :2] < high + halo(spacing))).all(axis=1)
+    rows = np.flatnonzero(around)
+    tile = Circles(xyz[rows], 200, spacing)
+
+    def holding(circles, mine, back):
+        out = {}
+        for number in circles.needed(np.flatnonzero(mine)).tolist():
+            members = circles.members(number)
+            if mine[members].any():
+                out[tuple(circles.centres[number])] = back[members].tolist()
+        return out
+
+    assert holding(whole, own, np.arange(len(xyz))) == holding(tile, own[rows], rows)
+    assert len(np.unique(whole.sizes)) == 1 and len(whole) > (80 / spacing) ** 2  # some cells were quartered
+
+
+def test_needed_circles_are_all_that_hold_a_row():
+    xyz, _, _ = scene(4000, 40.0)
+    circles = Circles(xyz, 150, 3.0)
+    rows = np.flatnonzero((xyz[:, 0] < 5) & (xyz[:, 1] < 8))
+    holding = {k for k in range(len(circles)) if np.isin(circles.members(k), rows).any()}
+    assert holding <= set(circles.needed(rows).tolist())
+
+
+def test_sparse_strays_get_a_batch_of_their_own():
+    xyz = np.concatenate([scene(2000)[0], [[1e5, -3e5, 0.0], [7e5, 2e5, 9.0]]])
+    circles = Circles(xyz, 200, 3.0)
+    assert circles.coverage[-2:].tolist() == [1, 1]
+    assert circles.reach == REACH * 3.0
+
+
+def test_empty_cloud_has_no_batches():
+    assert len(Circles(np.zeros((0, 3)), 100, 2.0)) == 0
+
+
+# ---- pyramids -----------------------------------------------------------------------------------------------
+
+
+def test_pyramid_shapes_and_who_is_where():
+    xyz, _, _ = scene(256, 6.0)
+    local = xyz - xyz.mean(axis=0)
+    local = local[scramble(local)]
+    pyramid = build(local, np.zeros((256, 1), np.float32), TINY)
+    n, rows = len(local), local
+    for level, step in zip(TINY.levels, pyramid.steps, strict=True):
+        assert step.groups.shape == (level.centres, level.samples)
+        assert step.offsets.shape == (level.centres, level.samples, 3)
+        assert step.near.shape == step.weights.shape == (n, 3)
+        assert np.linalg.norm(step.offsets, axis=2).max() <= 1.0 + 1e-5
+        np.testing.assert_allclose(step.weights.sum(axis=1), 1.0, rtol=1e-5)
+        # a centre is its own nearest coarse point
+        centre = rows[step.groups[0, 0]] - step.offsets[0, 0] * level.radius
+        assert np.linalg.norm(rows - centre, axis=1).min() < 1e-5
+        own = farthest_points(
+            rows,
+            level.centres,
+            0 if step is not pyramid.steps[0] else int(np.argmin((rows[:, :2] ** 2).sum(axis=1))),
+        )
+        assert np.array_equal(step.near[own, 0], np.arange(level.centres))
+        rows, n = rows[own], level.centres
+
+
+def test_pyramid_of_fewer_points_than_centres():
+    pyramid = build(np.random.default_rng(0).random((5, 3)), np.zeros((5, 1), np.float32), TINY)
+    assert [len(step.groups) for step in pyramid.steps] == [5, 5]
+    assert len(build(np.zeros((1, 3)), np.zeros((1, 1), np.float32), TINY).steps) == 2
+
+
+def test_stacked_pyramids_do_not_mix():
+    parts = [build(scene(n, 6.0, n)[0], np.full((n, 1), n, np.float32), TINY) for n in (100, 256, 30)]
+    whole = stack(parts)
+    fine = np.repeat(np.arange(3), [100, 256, 30])
+    for k, step in enumerate(whole.steps):
+        coarse = np.repeat(np.arange(3), [len(part.steps[k].groups) for part in parts])
+        assert (fine[step.groups] == coarse[:, None]).all()
+        assert (coarse[step.near] == fine[:, None]).all()
+        fine = coarse
+
+
+def test_scramble_follows_the_coordinates():
+    xyz = np.random.default_rng(1).random((500, 3))
+    shuffled = np.random.default_rng(2).permutation(500)
+    assert np.array_equal(xyz[scramble(xyz)], xyz[shuffled][scramble(xyz[shuffled])])
+    assert abs(np.corrcoef(np.arange(500), xyz[scramble(xyz)][:, 0])[0, 1]) < 0.2
+
+
+# ---- configurations -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", sorted(CONFIGURATIONS))
+def test_configurations_survive_json(name):
+    import json
+
+    one = CONFIGURATIONS[name]
+    assert parse_configuration(json.loads(json.dumps(one.to_dict()))) == one
+    assert len(one.shapes(2, 5)) == one.layers
+    assert one.memory_mb(2, training=True) > one.memory_mb(2) > 0
+
+
+def test_published_configuration():
+    one = CONFIGURATIONS["alsnet4"]
+    assert one.points == 200_000
+    assert [(v.centres, v.radius, v.samples) for v in one.levels] == [
+        (8192, 1.0, 16), (4096, 2.0, 16), (2048, 5.0, 16), (512, 15.0, 32),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "given, text",
+    [
+        ("smal", "Did you mean 'small'"),
+        (3, "name or a mapping"),
+        ({"points": 100}, "needs 'levels'"),
+        ({"points": 100, "levels": [], "depth": 3}, "no 'depth'"),
+        ({"points": 100, "levels": []}, "1 to 8 levels"),
+        ({"points": 1e99, "levels": [TINY.to_dict()["levels"][0]]}, "'points'"),
+        ({"points": 100, "levels": [{**TINY.to_dict()["levels"][0], "radius": float("nan")}]}, "'radius'"),
+        ({"points": 100, "levels": [{**TINY.to_dict()["levels"][0], "mlp": [0]}]}, "'mlp'"),
+        ({"points": 100, "levels": [{**TINY.to_dict()["levels"][0], "samples": True}]}, "'samples'"),
+        ({"points": 100, "levels": TINY.to_dict()["levels"] * 5}, "1 to 8"),
+    ],
+)
+def test_bad_configurations(given, text):
+    with pytest.raises(OptionError, match=text):
+        parse_configuration(given)

@@ -1,0 +1,308 @@
+"""Networks in model files and on clouds: averaging, order, tiles, files that lie. No PyTorch."""
+
+import dataclasses
+import json
+import zipfile
+
+import numpy as np
+import pytest
+from alsnet_scenes import TINY, model_of, random_net, scene
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdal_stages.alsnet import AlsNet, Circles
+from pdal_stages.alsnet.algorithm import make_pyramid
+from pdal_stages.alsnet.pyramid import build, scramble
+from pdal_stages.alsnet.weights import Folded, check
+from pdal_stages.classifier import load_model, modelfile
+from pdal_stages.errors import DimensionError, ModelError, OptionError
+
+INPUTS = ("Z", "HeightAboveGround", "Intensity")
+
+
+def net_with(**changes):
+    return dataclasses.replace(random_net(INPUTS), mean=(0.0, 1.0, 90.0), scale=(1.0, 2.0, 50.0), **changes)
+
+
+# ---- the network ------------------------------------------------------------------------------------------
+
+
+def test_a_level_equals_a_computation_by_hand():
+    """One level, one layer each, one ball: every number checked with loops."""
+    from pdal_stages.alsnet import Configuration, Level
+
+    one = Configuration("one", 16, (Level(2, 5.0, 3, (4,), (3,)),), head=(2,), dropout=0.0)
+    net = random_net(("Z",), 2, one)
+    xyz = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 1.0], [0.0, 2.0, 0.5], [3.0, 3.0, 0.0]])
+    values = xyz[:, 2:].astype(np.float32)
+    pyramid = build(xyz, values, one)
+    (step,) = pyramid.steps
+
+    def layer(name, row):
+        array = net.weights[name].astype(float)
+        scale, shift, mean, variance = array[:, -4:].T
+        return np.maximum((array[:, :-4] @ row - mean) / np.sqrt(variance + 1e-5) * scale + shift, 0.0)
+
+    balls = []
+    for ball in range(2):
+        described = [
+            layer("sa1_1", np.concatenate([step.offsets[ball, k], values[step.groups[ball, k]]]))
+            for k in range(3)
+        ]
+        balls.append(np.max(described, axis=0))
+    expected = []
+    for i in range(4):
+        carried = sum(step.weights[i, k] * balls[step.near[i, k]] for k in range(3))
+        row = layer("head_1", layer("fp1_1", np.concatenate([carried, values[i]])))
+        scores = net.weights["scores"][:, :-1] @ row + net.weights["scores"][:, -1]
+        expected.append(np.exp(scores) / np.exp(scores).sum())
+    np.testing.assert_allclose(net.folded(pyramid), expected, rtol=1e-4)
+
+
+@given(st.integers(0, 2**32), st.integers(1, 300))
+@settings(max_examples=20, deadline=None)
+def test_probabilities_belong_to_points_not_to_their_order(seed, n):
+    net = random_net(("Z",))
+    random = np.random.default_rng(seed)
+    xyz = np.round(random.random((n, 3)) * [8.0, 8.0, 3.0], 1)
+    shuffled = random.permutation(n)
+
+    def probabilities(points):
+        order = scramble(points)
+        out = np.empty((len(points), 3))
+        out[order] = net.folded(build(points[order], points[order, 2:].astype(np.float32), TINY))
+        return out
+
+    whole = probabilities(xyz)
+    assert whole.shape == (n, 3)
+    np.testing.assert_allclose(whole.sum(axis=1), 1.0, rtol=1e-9)
+    other = probabilities(xyz[shuffled])
+    # points at one and the same place may swap, so rows are compared by place
+    for row in np.unique(xyz, axis=0)[:50]:
+        here, there = (xyz == row).all(axis=1), (xyz[shuffled] == row).all(axis=1)
+        assert np.array_equal(np.sort(whole[here], axis=0), np.sort(other[there], axis=0))
+
+
+# ---- clouds -----------------------------------------------------------------------------------------------
+
+
+def test_averages_equal_a_hand_computation():
+    xyz, _, dimensions = scene(1500, 20.0)
+    net = net_with()
+    found = net.predict_cloud(xyz, dimensions)
+    columns = net.columns(xyz, dimensions)
+    np.testing.assert_allclose(columns[:, 1], (dimensions["HeightAboveGround"] - 1.0) / 2.0, rtol=1e-5)
+    circles = Circles(xyz, TINY.points, net.spacing, columns)
+    each = [[] for _ in xyz]
+    for number in range(len(circles)):
+        members = circles.members(number)
+        order, pyramid = make_pyramid(xyz, columns, members, circles.centres[number], INPUTS, TINY)
+        for row, p in zip(members[order], net.folded(pyramid), strict=True):
+            each[row].append(p)
+    assert [len(part) for part in each] == circles.coverage.tolist()
+    for i, part in enumerate(each):
+        np.testing.assert_allclose(found.mean[i], np.mean(part, axis=0), rtol=1e-9)
+        np.testing.assert_allclose(found.variance[i], np.var(part, axis=0).mean(), rtol=1e-6, atol=1e-12)
+    assert found.report["batches"] == len(circles)
+    assert found.report["batches_per_point"]["least"] == circles.coverage.min()
+    assert found.variance[circles.coverage > 1].max() > 0
+
+
+def test_order_of_points_threads_and_rows_do_not_matter():
+    xyz, _, dimensions = scene(2500, 20.0)
+    model = model_of(net_with())
+    whole = model.predict(xyz, dimensions, threads=1, probabilities=True, variance=True, margin=True)
+    shuffled = np.random.default_rng(5).permutation(len(xyz))
+    other = model.predict(
+        xyz[shuffled],
+        {k: v[shuffled] for k, v in dimensions.items()},
+        threads=2,
+        probabilities=True,
+        variance=True,
+    )
+    assert np.array_equal(whole.probabilities[shuffled], other.probabilities)
+    assert np.array_equal(whole.variance[shuffled], other.variance)
+    where = xyz[:, 0] < 7
+    part = model.predict(
+        xyz, dimensions, where, current=np.full(len(xyz), 9), probabilities=True, variance=True
+    )
+    assert np.array_equal(part.probabilities[where], whole.probabilities[where])
+    assert not part.probabilities[~where].any() and not part.variance[~where].any()
+    assert (part.classification[~where] == 9).all()
+    assert part.report["batches"] < whole.report["batches"]
+    top = np.sort(whole.probabilities, axis=1)
+    np.testing.assert_allclose(whole.margin, top[:, -1] - top[:, -2], atol=1e-6)
+
+
+def test_a_tile_with_its_halo_gets_the_labels_of_the_whole():
+    xyz, _, dimensions = scene(12_000, 60.0, origin=(620000.0, 6270000.0, 100.0))
+    model = model_of(net_with())
+    whole = model.predict(xyz, dimensions, probabilities=True, variance=True)
+    assert model.halo == pytest.approx((3.0 + 0.5**0.5) * 3.0)
+    low = xyz.min(axis=0)[:2] + 20.0
+    own = ((xyz[:, :2] >= low) & (xyz[:, :2] < low + 12.0)).all(axis=1)
+    near = ((xyz[:, :2] >= low - model.halo) & (xyz[:, :2] < low + 12.0 + model.halo)).all(axis=1)
+    tile = model.predict(
+        xyz[near], {k: v[near] for k, v in dimensions.items()}, own[near], probabilities=True, variance=True
+    )
+    assert np.array_equal(tile.probabilities[own[near]], whole.probabilities[own])
+    assert np.array_equal(tile.variance[own[near]], whole.variance[own])
+
+
+def test_small_and_empty_clouds():
+    model = model_of(random_net(("Z",)))
+    assert len(model.predict(np.zeros((0, 3)), {}).classification) == 0
+    one = model.predict(np.array([[5.0, 5.0, 5.0]]), {}, variance=True)
+    assert one.classified == 1 and one.variance[0] == 0.0
+    same = model.predict(np.ones((700, 3)), {})  # more than a batch at one place
+    assert same.report["batches_per_point"]["least"] >= 1
+
+
+def test_missing_dimension_and_coordinates_that_are_none():
+    xyz, _, dimensions = scene(300, 8.0)
+    model = model_of(net_with())
+    assert model.required_dimensions == ("HeightAboveGround", "Intensity")
+    with pytest.raises(DimensionError, match=r"HeightAboveGround.*hag_minima"):
+        model.predict(xyz, {"Intensity": dimensions["Intensity"]})
+    xyz[3, 1] = np.nan
+    with pytest.raises(Exception, match="finite"):
+        model.predict(xyz, dimensions)
+
+
+def test_a_forest_has_no_variance_and_a_network_no_rows():
+    with pytest.raises(ModelError, match="clouds, not rows"):
+        model_of(net_with()).predict_features(np.zeros((2, 3)))
+
+
+def test_absurd_weights_give_an_error_not_nan():
+    net = net_with()
+    weights = {name: array * np.float32(1e30) for name, array in net.weights.items()}
+    xyz, _, dimensions = scene(300, 8.0)
+    with np.errstate(all="ignore"), pytest.raises(ModelError, match="not numbers"):
+        dataclasses.replace(net, weights=weights).predict_cloud(xyz, dimensions)
+
+
+# ---- files ------------------------------------------------------------------------------------------------
+
+
+def test_saved_and_loaded_gives_the_same_labels(tmp_path):
+    xyz, _, dimensions = scene(2000, 18.0)
+    model = model_of(net_with())
+    model.save(tmp_path / "a.model")
+    again = load_model(tmp_path / "a.model")
+    again.save(tmp_path / "b.model")
+    assert (tmp_path / "a.model").read_bytes() == (tmp_path / "b.model").read_bytes()
+    assert isinstance(again.algorithm, AlsNet) and again.halo == model.halo
+    one, other = (m.predict(xyz, dimensions, probabilities=True) for m in (model, again))
+    assert np.array_equal(one.probabilities, other.probabilities)
+    assert "alsnet" in str(again) and again.describe()["parameters"]["configuration"]["name"] == "test"
+
+
+def rewritten(path, weights=None, **parameters):
+    """A model file with some weights or parameters changed, checksums right."""
+    net = net_with()
+    model = model_of(net)
+    arrays = {**net.arrays(), **(weights or {})}
+    arrays = {name: array for name, array in arrays.items() if array is not None}
+    modelfile.write(path, {**model.manifest(), "parameters": {**net.parameters(), **parameters}}, arrays)
+    return path
+
+
+def spoiled(name, value, at=(0, 0)):
+    array = net_with().weights[name].copy()
+    array[at] = value
+    return {name: array}
+
+
+@pytest.mark.parametrize(
+    "weights, text",
+    [
+        (spoiled("sa1_1", np.nan), "finite"),
+        (spoiled("scores", np.inf), "finite"),
+        (spoiled("fp1_2", -1.0, (3, -1)), "negative variance"),
+        ({"sa2_1": None}, "lacks an array"),
+        ({"sa2_1": np.zeros((32, 9), np.float32)}, r"must be \(32, "),
+        ({"scores": np.zeros((4, 33), np.float32)}, "must be"),
+        ({"sa9_1": np.zeros((3, 3), np.float32)}, "does not know"),
+        ({"extra": np.zeros((3, 3), np.float32)}, "does not know"),
+        ({"scores": np.zeros(3, np.float32)}, "2 axes"),
+        ({"sa1_1": net_with().weights["sa1_1"].astype(np.float64)}, "<f4"),
+    ],
+)
+def test_hostile_weights_are_refused(weights, text, tmp_path):
+    with pytest.raises(ModelError, match=text):
+        load_model(rewritten(tmp_path / "bad.model", weights))
+
+
+def shallow(**changes):
+    return {**TINY.to_dict(), **changes}
+
+
+@pytest.mark.parametrize(
+    "parameters, text",
+    [
+        ({"spacing": 0}, "spacing"),
+        ({"spacing": "3"}, "spacing"),
+        ({"configuration": 7}, "parameters are not right"),
+        ({"configuration": shallow(points=10**9)}, "points"),
+        ({"configuration": shallow(levels=TINY.to_dict()["levels"][:1])}, "does not know|must be"),
+        ({"inputs": []}, "inputs"),
+        ({"inputs": [{"name": n, "mean": 0, "scale": 0} for n in INPUTS]}, "scale"),
+        ({"inputs": [{"name": n, "mean": True, "scale": 1} for n in INPUTS]}, "mean"),
+        ({"inputs": [{"name": n, "mean": 0, "scale": 1} for n in ("Z", "Z", "Intensity")]}, "inputs"),
+        ({"more": 1}, "parameters are not right"),
+    ],
+)
+def test_hostile_parameters_are_refused(parameters, text, tmp_path):
+    with pytest.raises(ModelError, match=text):
+        load_model(rewritten(tmp_path / "bad.model", **parameters))
+
+
+def test_the_file_is_data_only(tmp_path):
+    rewritten(tmp_path / "a.model")
+    with zipfile.ZipFile(tmp_path / "a.model") as archive:
+        names = archive.namelist()
+        manifest = json.loads(archive.read("manifest.json"))
+    assert manifest["algorithm"] == "alsnet"
+    assert all(name == "manifest.json" or name.endswith(".npy") for name in names)
+
+
+def test_check_accepts_what_fresh_makes():
+    net = random_net()
+    check(net.weights, TINY, 1, 3)
+    assert Folded(net.weights, TINY) is not None
+
+
+def test_where_no_torch_is_training_says_what_to_install(monkeypatch):
+    import sys
+
+    from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
+    from pdal_stages.errors import DependencyError
+
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.delitem(sys.modules, "pdal_stages.alsnet.network", raising=False)
+    xyz, labels, dimensions = scene(300, 8.0)
+    with pytest.raises(DependencyError, match=r"pip install 'pdal-stages\[deep\]'"):
+        train([TrainingCloud(xyz, labels, dimensions)], TrainingOptions(algorithm="alsnet"), progress=False)
+    model_of(net_with()).predict(xyz, dimensions)  # applying needs none
+
+
+@pytest.mark.parametrize(
+    "values, text",
+    [
+        ({"algorithm": "alsnett"}, "not known"),
+        ({"alsnet": {"epochs": 3}}, "only with algorithm"),
+        ({"algorithm": "alsnet", "alsnet": {"epoch": 3}}, "Did you mean 'epochs'"),
+        ({"algorithm": "alsnet", "alsnet": {"epochs": 0}}, "epochs"),
+        ({"algorithm": "alsnet", "alsnet": {"thin": 1.5}}, "thin"),
+        ({"algorithm": "alsnet", "alsnet": {"class_weights": "more"}}, "class_weights"),
+        ({"algorithm": "alsnet", "alsnet": {"configuration": "tinny"}}, "tiny"),
+        ({"algorithm": "alsnet", "alsnet": [1]}, "mapping"),
+        ({"algorithm": "alsnet", "alsnet": {"rotate": 1}}, "rotate"),
+    ],
+)
+def test_options_are_checked(values, text):
+    from pdal_stages.classifier import TrainingOptions
+
+    with pytest.raises(OptionError, match=text):
+        TrainingOptions.from_dict(values)
