@@ -149,7 +149,7 @@ features inside and need no dimensions at all.
                 memory_mb=options["memory"],
                 progress=progress,
             ):
-                at = rows if queries is None else queries[rows]
+                at = rows  # indices into the cloud, with queries too
                 for name, column in zip(names, columns, strict=True):
                     out[name][at] = values[:, column]
         if options["bins"] and not Path(options["bins"]).exists():

@@ -120,6 +120,10 @@ def _run(readers, injected, tail, outputs: list[str]) -> dict[str, Any]:
             {**reader, "tag": f"in{number}"},
             {**stage, "inputs": [f"in{number}"], "tag": f"put{number}"},
         ]
+        if not kept.all():
+            drop = marks.drop_stage(token, number, kept)
+            stages[-1]["tag"] = f"all{number}"
+            stages.append({**drop, "inputs": [f"all{number}"], "tag": f"put{number}"})
         inputs.append(f"put{number}")
     stages.append({"type": "filters.merge", "inputs": inputs, "tag": "merged"})
     partials: list[tuple[Path, Path]] = []

@@ -178,7 +178,7 @@ def need(token: str) -> float:
 def inject_stage(
     token: str, number: int, values: Injected, keep: NDArray[np.bool_], adds: dict[str, str]
 ) -> dict[str, Any]:
-    """A stage that gives the points of reader `number` the values of dimensions, and drops some.
+    """A stage that gives points of reader `number` the values of dimensions.
 
     Parameters
     ----------
@@ -209,8 +209,20 @@ def inject(module: dict[str, Any], ins: Mapping[str, NDArray], outs: dict[str, N
             full = np.array(ins[name])
             full[rows] = given
             outs[name] = full
-    if not every:
-        outs["Mask"] = np.ascontiguousarray(keep, np.uint8)
+    return True
+
+
+def drop_stage(token: str, number: int, keep: NDArray[np.bool_]) -> dict[str, Any]:
+    """A stage that drops points of reader `number`; PDAL wants it apart from new values."""
+    _inject_data[f"{token}_{number}_drop"] = ({}, keep)
+    return _stage("drop", {"token": token, "number": number}, {})
+
+
+def drop(module: dict[str, Any], ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> bool:
+    """Keep only some points; see :func:`drop_stage`."""
+    arguments = _arguments(module)
+    _, keep = _inject_data.pop(f"{arguments['token']}_{arguments['number']}_drop")
+    outs["Mask"] = np.ascontiguousarray(keep, bool)
     return True
 
 

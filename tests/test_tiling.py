@@ -1,0 +1,420 @@
+"""Tiled runs give what untiled runs give, to the last bit."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import laspy
+import numpy as np
+import pytest
+import tiling_clouds as clouds
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pdal_stages as ps
+from pdal_stages.errors import OptionError, PipelineError, StageError
+from pdal_stages.synthetic.srs import wkt
+from pdal_stages.tiling import TilingOptions, run_tiled
+from pdal_stages.tiling.cloudindex import index_las, runs
+from pdal_stages.tiling.extract import cut, plain_header
+from pdal_stages.tiling.grid import Grid, inside, touch
+from pdal_stages.tiling.marks import terrain_reach
+from pdal_stages.tiling.plan import make_plan
+from pdal_stages.tiling.sources import find_sources, las_header
+from pdal_stages.tiling.tindex import locations
+
+pytestmark = pytest.mark.pdal
+WKT = wkt("EPSG:25832")
+
+
+@pytest.fixture(scope="session")
+def model_file(tmp_path_factory, pdal_module):
+    return clouds.model(tmp_path_factory.mktemp("tiling") / "small.model")
+
+
+@pytest.fixture(scope="session")
+def town_file(tmp_path_factory, write_las):
+    """A town with a hole and points on edges, with an extra dimension."""
+    made, xyz, keep = clouds.town()
+    arrays = {
+        "X": xyz[keep, 0],
+        "Y": xyz[keep, 1],
+        "Z": xyz[keep, 2],
+        "Intensity": made.intensity[keep],
+        "Classification": made.classification[keep],
+        "GpsTime": made.gps_time[keep],
+        "TrueHeight": made.height_above_ground[keep],
+    }
+    path = tmp_path_factory.mktemp("tiling") / "town.laz"
+    return write_las(path, arrays, point_format=6, wkt=WKT, scale=0.001, offset=(499_000.0, 5_399_000.0, 0.0))
+
+
+@pytest.fixture(scope="session")
+def whole(tmp_path_factory, town_file, model_file):
+    """The untiled result."""
+    path = tmp_path_factory.mktemp("tiling") / "whole.laz"
+    ps.Pipeline(clouds.stages([town_file], path, model_file)).execute(arrays=False)
+    return path
+
+
+# ---- the grid --------------------------------------------------------------------------------------------
+
+
+@given(
+    st.floats(1e-3, 1e4),
+    st.lists(st.floats(-1e7, 1e7), min_size=1, max_size=20),
+    st.integers(-1000, 1000),
+)
+def test_every_point_has_one_tile(size, values, edge):
+    grid = Grid(size)
+    x = np.array([*values, edge * size])
+    at = grid.index(x)
+    for value, i in zip(x.tolist(), at.tolist(), strict=True):
+        assert i * size <= value < (i + 1) * size or math.isclose(value, i * size, rel_tol=1e-12)
+    assert at[-1] == edge  # a point on an edge belongs to the tile it begins
+
+
+def test_boxes_touch_on_their_edges():
+    grid = Grid(10)
+    assert touch(grid.box((0, 0)), grid.box((1, 1)))
+    assert not touch(grid.box((0, 0)), grid.box((2, 0)))
+    assert inside(grid.box((0, 0)), grid.box((0, 0), 1)) and not inside(grid.box((0, 0), 1), grid.box((0, 0)))
+    assert grid.covering((0, 0, 10, 5)) == [(0, 0), (1, 0)]
+    assert Grid(500).name((1000, -1)) == "500000_-500"
+
+
+# ---- reading parts of files ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize("point_format", [1, 6])
+def test_a_cut_is_the_files_own_bytes(tmp_path, random_cloud, write_las, suffix, point_format):
+    xyz = random_cloud(120_000, seed=1, extent=(100, 100, 5))
+    xyz = xyz[np.argsort(xyz[:, 0], kind="stable")]  # so that blocks are compact
+    arrays = dict(zip("XYZ", xyz.T, strict=True)) | {"Intensity": np.arange(len(xyz)) % 65536, "Extra": xyz[:, 0]}
+    path = write_las(tmp_path / f"cloud{suffix}", arrays, point_format=point_format, wkt=WKT if point_format == 6 else None)
+    index = index_las(str(path), 25.0)
+    assert index["count"] == len(xyz) and sum(n for _, _, n in index["tiles"]) == len(xyz)
+    assert len(runs(index["boxes"], (0, 0, 10, 100))) == 1
+    target = tmp_path / "piece.las"
+    piece = cut(str(path), index["boxes"], index["count"], Grid(25.0), (1, 2), 3.0, str(target), str(tmp_path / "core.las"))
+    las, all_ = laspy.read(target), laspy.read(path)
+    expected = np.flatnonzero((xyz[:, 0] >= 22) & (xyz[:, 0] <= 53) & (xyz[:, 1] >= 47) & (xyz[:, 1] <= 78))
+    assert np.array_equal(piece.index, expected)
+    assert las.points.array.tobytes() == all_.points.array[expected].tobytes()
+    core = (xyz[expected, 0] >= 25) & (xyz[expected, 0] < 50) & (xyz[expected, 1] >= 50) & (xyz[expected, 1] < 75)
+    assert np.array_equal(piece.margin < 0, core)
+    assert len(laspy.read(tmp_path / "core.las")) == np.count_nonzero(core)
+    assert [v.record_id for v in las.header.vlrs] == [v.record_id for v in all_.header.vlrs if v.record_id != 22204]
+    assert len(plain_header(str(path))[0]) == las.header.offset_to_point_data
+
+
+def test_index_refuses_what_is_cut_short(tmp_path, random_cloud, write_las):
+    xyz = random_cloud(60_000)
+    path = write_las(tmp_path / "cloud.laz", dict(zip("XYZ", xyz.T, strict=True)))
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(StageError, match=r"damaged|cut short|cannot be read"):
+        index_las(str(path), 10.0)
+    path.write_bytes(b"not a cloud")
+    with pytest.raises(StageError, match="not a LAS"):
+        las_header(str(path))
+
+
+# ---- the same as untiled ---------------------------------------------------------------------------------
+
+
+def test_one_file_comes_back_bit_for_bit(tmp_path, town_file, model_file, whole):
+    run = run_tiled(clouds.stages([town_file], tmp_path / "out.laz", model_file), 30, workers=0)
+    assert not run.failures
+    assert len(run.tiles) == 11  # the hole's tile has no points
+    x, y = (np.asarray(v) for v in (laspy.read(town_file).x, laspy.read(town_file).y))
+    assert np.count_nonzero(x == 500_040.0) > 10 and np.count_nonzero(y == 5_400_030.0) > 10
+    assert any(job.report["read"] < run.summary["points"] for job in run.tiles)  # some were really cut
+    clouds.same_points(whole, tmp_path / "out.laz")
+    counted = np.bincount(np.asarray(laspy.read(whole).classification), minlength=7)
+    assert run.summary["classes"] == {str(c): int(counted[c]) for c in np.flatnonzero(counted)}
+    assert (tmp_path / "out.laz").read_bytes() == whole.read_bytes()
+
+
+def test_two_worker_processes_give_the_same(tmp_path, town_file, model_file, whole):
+    pytest.importorskip("distributed")
+    run = run_tiled(clouds.stages([town_file], tmp_path / "out.laz", model_file), 45, workers=min(2, _cores()))
+    assert not run.failures and run.summary["workers"] * run.summary["threads_per_worker"] <= _cores()
+    clouds.same_points(whole, tmp_path / "out.laz")
+
+
+def _cores() -> int:
+    from pdal_stages.parallel import available_threads
+
+    return available_threads()
+
+
+def test_input_files_that_do_not_match_the_tiles(tmp_path, town_file, model_file):
+    """Cut by a slanted line and by strips, with other offsets, formats and extra dimensions in each."""
+    las = laspy.read(town_file)
+    x, y = np.asarray(las.x) - 500_000, np.asarray(las.y) - 5_400_000
+    part = np.where(x + 2 * y < 80, 0, np.where(np.arange(len(x)) % 2 == 0, 1, 2))
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for number in range(3):
+        piece = laspy.LasData(laspy.LasHeader(version="1.4", point_format=(6, 7, 6)[number]))
+        piece.header.vlrs = las.header.vlrs
+        piece.header.global_encoding.wkt = True
+        piece.header.offsets, piece.header.scales = np.array([number * 1000.0, 5_400_000.0, 7.0]), np.full(3, 0.001)
+        rows = np.flatnonzero(part == number)
+        record = laspy.ScaleAwarePointRecord.zeros(len(rows), header=piece.header)
+        piece.points = record
+        piece.x, piece.y, piece.z = las.xyz[rows].T
+        piece.intensity, piece.gps_time = las.intensity[rows], las.gps_time[rows]
+        piece.write(folder / f"part{number}.laz")
+    pipeline = clouds.stages([folder / "part*.laz"], tmp_path / "c_#.laz", model_file)
+    pipeline[0] = {"type": "readers.las", "filename": pipeline[0], "tag": "input"}
+    run = run_tiled(pipeline, 30, workers=0)
+    assert not run.failures
+    # Other offsets round coordinates otherwise in their last bits, so the same files are read untiled.
+    untiled = ps.Pipeline([*(str(folder / f"part{n}.laz") for n in range(3)), *pipeline[1:-1]])
+    untiled.execute()
+    arrays = np.concatenate(untiled.arrays)
+    ends = np.cumsum([0, *(np.count_nonzero(part == n) for n in range(3))])
+    names = {"classification": "Classification", "gps_time": "GpsTime", "intensity": "Intensity"}
+    for number in range(3):
+        made, given_ = laspy.read(tmp_path / f"c_part{number}.laz"), laspy.read(folder / f"part{number}.laz")
+        expected = arrays[ends[number] : ends[number + 1]]
+        assert np.array_equal(made.points.array["X"], given_.points.array["X"])
+        assert np.array_equal(made.header.offsets, given_.header.offsets)
+        assert made.header.point_format.id == given_.header.point_format.id
+        for name in ("classification", "HeightAboveGround", "Reliability", "gps_time", "intensity"):
+            assert np.array_equal(made[name], expected[names.get(name, name)]), (number, name)
+    run = run_tiled(pipeline[:-1] + [{**pipeline[-1], "filename": str(tmp_path / "t_#.laz")}], 30, workers=0, per="tile")
+    assert not run.failures
+    got = np.concatenate([_table(path) for path in sorted(tmp_path.glob("t_*.laz"))])
+    parts = np.concatenate([_table(tmp_path / f"c_part{n}.laz") for n in range(3)])
+    assert np.array_equal(np.sort(got), np.sort(parts))
+    for path in tmp_path.glob("t_*.laz"):
+        header = laspy.read(path).header
+        assert header.x_max - header.x_min < 30.0
+
+
+def _table(path):
+    las = laspy.read(path)
+    out = np.zeros(len(las), [("t", "f8"), ("x", "i8"), ("y", "i8"), ("z", "i8"), ("h", "f8"), ("c", "u1"), ("r", "f4")])
+    out["t"], out["h"], out["c"], out["r"] = las.gps_time, las.HeightAboveGround, las.classification, las.Reliability
+    for name in "xyz":
+        out[name] = np.round(np.asarray(las[name]) * 1000)
+    return out
+
+
+def test_feature_stage_and_pdal_filters(tmp_path, town_file):
+    """Filters before (dropping points, keeping labels) and after, features with where."""
+    pipeline = [
+        str(town_file),
+        {"type": "filters.ferry", "dimensions": "Classification=>Reference"},
+        {"type": "filters.range", "limits": "Intensity[10:]"},
+        {"type": "filters.multiscalefeatures", "neighborhoods": "c1,k10", "feature_set": "Linearity,Density", "where": "Z > 62"},
+        {"type": "filters.assign", "assignment": "UserData[:]=7"},
+        {"type": "writers.las", "filename": str(tmp_path / "a.las"), "forward": "all", "extra_dims": "all"},
+    ]
+    untiled = ps.Pipeline(pipeline)
+    untiled.execute(arrays=False)
+    pipeline[-1] = {**pipeline[-1], "filename": str(tmp_path / "b.las")}
+    run = run_tiled(pipeline, 30, workers=0)
+    assert not run.failures
+    assert run.summary["dropped"] == len(laspy.read(town_file)) - len(laspy.read(tmp_path / "a.las")) > 0
+    clouds.same_points(tmp_path / "a.las", tmp_path / "b.las")
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_delft_comes_back_bit_for_bit(tmp_path, data_dir, model_file):
+    las = laspy.read(data_dir / "delft" / "test.laz")
+    x, y = np.asarray(las.x), np.asarray(las.y)
+    part = las[(x < x.min() + 75) & (y < y.min() + 75)]
+    part.write(tmp_path / "delft.laz")
+    ps.Pipeline(clouds.stages([tmp_path / "delft.laz"], tmp_path / "whole.laz", model_file)).execute(arrays=False)
+    run = run_tiled(clouds.stages([tmp_path / "delft.laz"], tmp_path / "tiled.laz", model_file), 25, workers=0)
+    assert not run.failures and len(run.tiles) >= 9
+    assert (tmp_path / "whole.laz").read_bytes() == (tmp_path / "tiled.laz").read_bytes()
+
+
+# ---- reaches that no halo bounds -------------------------------------------------------------------------
+
+
+def test_sparse_points_widen_the_surroundings(tmp_path, random_cloud, write_las):
+    """k nearest neighbors and the terrain reach beyond the halo; the tile is read again, wider."""
+    xyz = random_cloud(900, seed=3, extent=(300, 300, 4))
+    xyz = xyz[(np.abs(xyz[:, 0] - 150) > 40) | (xyz[:, 1] > 200)]
+    path = write_las(tmp_path / "sparse.las", dict(zip("XYZ", xyz.T, strict=True)))
+    pipeline = [
+        str(path),
+        {"type": "filters.hag_minima", "cell": 4},
+        {"type": "filters.multiscalefeatures", "neighborhoods": "kopt", "feature_set": "Linearity,Radius"},
+        {"type": "writers.las", "filename": str(tmp_path / "a.las"), "forward": "all", "extra_dims": "all"},
+    ]
+    ps.Pipeline(pipeline).execute(arrays=False)
+    pipeline[-1] = {**pipeline[-1], "filename": str(tmp_path / "b.las")}
+    run = run_tiled(pipeline, 60, workers=0)
+    assert not run.failures and not run.notes
+    assert any(job.report["widened"] for job in run.tiles)
+    clouds.same_points(tmp_path / "a.las", tmp_path / "b.las")
+    pipeline[-1] = {**pipeline[-1], "filename": str(tmp_path / "c.las")}
+    run = run_tiled(pipeline, 60, workers=0, most_points=50)  # no room to widen: said, not hidden
+    assert any("may differ" in note for note in run.notes)
+    assert any(job.report["short"] for job in run.tiles)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10_000), st.floats(0.002, 0.1))
+def test_terrain_within_its_reach_is_the_whole_terrain(seed, density):
+    """Oracle: heights from the points within the reach equal heights from all points."""
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform(0, 100, (max(3, int(density * 10_000)), 3))
+    core = (40.0, 40.0, 60.0, 60.0)
+    wanted = (xyz[:, 0] >= 40) & (xyz[:, 0] < 60) & (xyz[:, 1] >= 40) & (xyz[:, 1] < 60)
+    if not wanted.any():
+        return
+    x, y, z = xyz.T
+    reach = terrain_reach(x, y, np.ones(len(x), bool), wanted, 8.0, 0.5, core)
+    near = (x >= 40 - reach) & (x <= 60 + reach) & (y >= 40 - reach) & (y <= 60 + reach)
+    full, part = ps.hag_minima(x, y, z, cell=8.0), ps.hag_minima(x[near], y[near], z[near], cell=8.0)
+    assert np.array_equal(full[wanted], part[wanted[near]])
+    # What a smaller cut believes to need is never less than the truth.
+    small = (x >= 38) & (x <= 62) & (y >= 38) & (y <= 62)
+    believed = terrain_reach(x[small], y[small], np.ones(small.sum(), bool), wanted[small], 8.0, 0.5, core)
+    assert believed >= reach or believed <= 2.0
+
+
+# ---- what tiles cannot do --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "stage, message",
+    [
+        ({"type": "filters.accuracy", "reference": "Reference"}, "all points at once"),
+        ({"type": "filters.sort", "dimension": "X"}, "all points at once"),
+        ({"type": "filters.outlier"}, "--buffer"),
+        ({"type": "filters.multiscalefeatures", "feature_set": "shapes"}, "fitted to the points"),
+        ({"type": "filters.multiscalefeatures", "neighborhoods": "copt"}, "fitted to the points"),
+    ],
+)
+def test_global_stages_are_refused(tmp_path, town_file, stage, message):
+    with pytest.raises((PipelineError, OptionError), match=message) as caught:
+        run_tiled([str(town_file), stage, str(tmp_path / "out.laz")], 30)
+    assert caught.value.cure or "all points" in caught.value.what
+
+
+def test_training_is_refused(tmp_path, town_file):
+    stage = {"type": "writers.classifiermodel", "filename": str(tmp_path / "x.model"), "dimensions": "Z"}
+    with pytest.raises(PipelineError, match="all points at once"):
+        run_tiled([str(town_file), stage], 30)
+
+
+def test_moving_points_before_our_stages_is_refused(tmp_path, town_file):
+    with pytest.raises(PipelineError, match="moves points"):
+        run_tiled(
+            [str(town_file), {"type": "filters.reprojection", "out_srs": "EPSG:25833"}, {"type": "filters.hag_minima"},
+             str(tmp_path / "out.laz")],
+            30,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"tile": 0}, "positive"),
+        ({"workers": -1}, "0 or more"),
+        ({"workers": 10_000}, "more workers than cores"),
+        ({"workers": 1, "scheduler": "tcp://x:1"}, "one of them"),
+        ({"per": "day"}, "one of"),
+        ({"buffer": -1.0}, "0 or more"),
+        ({"retries": -1}, "0 or more"),
+    ],
+)
+def test_options_are_checked(change, message):
+    with pytest.raises(OptionError) as caught:
+        TilingOptions(**{"tile": 10.0, **change})
+    assert message in str(caught.value)
+
+
+def test_outputs_need_names(tmp_path, town_file):
+    las = laspy.read(town_file)
+    for name in ("a", "b"):
+        las[:100].write(tmp_path / f"{name}.las")
+    with pytest.raises(PipelineError, match="one name"):
+        run_tiled([str(tmp_path / "a.las"), str(tmp_path / "b.las"), str(tmp_path / "out.las")], 30)
+    with pytest.raises(StageError, match="one of the inputs"):
+        run_tiled([str(tmp_path / "a.las"), str(tmp_path / "b.las"), str(tmp_path / "#.las")], 30)
+    (tmp_path / "deep").mkdir()
+    las[:100].write(tmp_path / "deep" / "a.las")
+    with pytest.raises(PipelineError, match="same file"):
+        run_tiled([str(tmp_path / "a.las"), str(tmp_path / "deep" / "a.las"), str(tmp_path / "o_#.las")], 30)
+    with pytest.raises(PipelineError, match="no file fits"):
+        find_sources([{"type": "readers.las", "filename": str(tmp_path / "none*.las")}])
+
+
+def test_only_seen_points_are_computed(tmp_path, town_file, model_file):
+    plan = make_plan(clouds.stages([town_file], tmp_path / "o.las", model_file), (), TilingOptions(30))
+    assert plan.head[1]["where"] == "PdalStagesMargin < 0"
+    assert [s["type"] for s in plan.tail] == ["writers.las"]
+    assert plan.halo == pytest.approx(4 * clouds.CELL + 16)
+
+
+# ---- tile indexes and EPT --------------------------------------------------------------------------------
+
+
+def test_tile_indexes_are_read(tmp_path, town_file, pdal_program, model_file, whole):
+    import subprocess
+
+    for name, driver in (("a.shp", "ESRI Shapefile"), ("b.gpkg", "GPKG"), ("c.sqlite", "SQLite"), ("d.geojson", "GeoJSON")):
+        subprocess.run(
+            [pdal_program, "tindex", "create", tmp_path / name, town_file, "-f", driver, "--fast_boundary"],
+            check=True,
+            capture_output=True,
+        )
+        assert locations(str(tmp_path / name)) == [str(town_file)]
+        with pytest.raises(StageError, match="cannot be read"):
+            locations(str(tmp_path / name), "nothing")
+    pipeline = clouds.stages([town_file], tmp_path / "out.laz", model_file)
+    pipeline[0] = {"type": "readers.tindex", "filename": str(tmp_path / "b.gpkg")}
+    assert not run_tiled(pipeline, 60, workers=0).failures
+    clouds.same_points(whole, tmp_path / "out.laz")
+
+
+def test_ept_source(tmp_path, town_file, model_file, whole):
+    """A hand-made EPT source of one node, read through PDAL by bounds."""
+    las = laspy.read(town_file)
+    root = tmp_path / "ept"
+    for name in ("ept-data", "ept-hierarchy"):
+        (root / name).mkdir(parents=True)
+    las.write(root / "ept-data" / "0-0-0-0.laz")
+    (root / "ept-hierarchy" / "0-0-0-0.json").write_text(json.dumps({"0-0-0-0": len(las)}))
+    low, high = las.xyz.min(axis=0), las.xyz.max(axis=0)
+    side = float((high - low).max())
+    axes = [
+        {"name": n, "type": "signed", "size": 4, "scale": 0.001, "offset": o}
+        for n, o in zip("XYZ", las.header.offsets.tolist(), strict=True)
+    ]
+    others = [
+        {"name": "Intensity", "type": "unsigned", "size": 2},
+        {"name": "Classification", "type": "unsigned", "size": 1},
+        {"name": "GpsTime", "type": "float", "size": 8},
+    ]
+    described = {
+        "bounds": [*low.tolist(), *(low + side).tolist()],
+        "boundsConforming": [*low.tolist(), *high.tolist()],
+        "dataType": "laszip",
+        "hierarchyType": "json",
+        "points": len(las),
+        "schema": axes + others,
+        "span": 128,
+        "srs": {"wkt": WKT},
+        "version": "1.0.0",
+    }
+    (root / "ept.json").write_text(json.dumps(described))
+    pipeline = clouds.stages([town_file], tmp_path / "e_#.laz", model_file)
+    pipeline[0] = {"type": "readers.ept", "filename": str(root / "ept.json")}
+    run = run_tiled(pipeline, 30, workers=0)
+    assert not run.failures and run.summary["per"] == "tile"
+    got = np.concatenate([_table(path) for path in sorted(tmp_path.glob("e_*.laz"))])
+    assert np.array_equal(np.sort(got), np.sort(_table(whole)))
