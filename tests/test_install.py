@@ -1,0 +1,219 @@
+"""The set-up: scripts, environment.yml, package data, and the rule on skips."""
+
+from __future__ import annotations
+
+import fnmatch
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+SHELL = ["scripts/lib.sh", "scripts/setup", "scripts/install-pdal", "scripts/demo", "scripts/test", ".ci/run"]
+
+
+def load(name):
+    spec = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def bash(text, tmp_path, **environment):
+    """Run shell lines that may use scripts/lib.sh, with the log and the state below tmp_path."""
+    lines = f"set -euo pipefail; . '{ROOT}/scripts/lib.sh'; STATE='{tmp_path}'; LOG=\"$STATE/log\"; : >\"$LOG\"\n{text}"
+    return subprocess.run(
+        ["bash", "-c", lines], capture_output=True, text=True, env={**os.environ, **environment}, timeout=60
+    )
+
+
+# ---- the scripts -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SHELL)
+def test_shell_scripts_parse_and_are_executable(name):
+    script = ROOT / name
+    subprocess.run(["bash", "-n", script], check=True)
+    assert name.endswith(".sh") or os.access(script, os.X_OK)
+
+
+def test_ci_runs_the_readme_command_strictly():
+    text = (ROOT / ".ci/run").read_text()
+    assert "PDAL_STAGES_REQUIRE=pdal" in text
+    assert re.search(r"^exec \./scripts/test$", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("output", "message"),
+    [
+        ("cp: error writing 'x': No space left on device", "the disk is full"),
+        ("E: Temporary failure resolving 'mirror.example'", "does not answer"),
+        ("SSLError(SSLCertVerificationError(1, 'certificate verify failed'))", "certificate is not trusted"),
+        ("mkdir: cannot create directory 'x': Permission denied", "no permission to write"),
+        ("E: Could not get lock /var/lib/dpkg/lock-frontend", "another package manager"),
+        ("ERROR: No matching distribution found for numba>=0.58", "no package that fits for numba>=0.58"),
+        ("THESE PACKAGES DO NOT MATCH THE HASHES", "not the file that was expected"),
+        ("fatal error: Python.h: No such file or directory", "headers are missing"),
+        ("something new", "failed; see the output above"),
+    ],
+)
+def test_failed_step_says_why(tmp_path, output, message):
+    done = bash('fail() { echo "$1"; false; echo never; }\nstep "The step" fail "$OUTPUT"', tmp_path, OUTPUT=output)
+    assert done.returncode == 1
+    assert "The step" in done.stdout and "FAILED" in done.stdout
+    assert message in done.stderr and output in done.stderr and "never" not in done.stderr
+
+
+def test_step_that_works_is_timed_and_logged(tmp_path):
+    done = bash('step "The step" echo hidden', tmp_path)
+    assert done.returncode == 0 and re.fullmatch(r"  The step +\d+ s\n", done.stdout)
+    assert "hidden" in (tmp_path / "log").read_text()
+
+
+def test_packages_without_root_prints_the_command(tmp_path):
+    stubs = "installed() { false; }; may_install() { false; }; packages Compiling g++ patchelf"
+    done = bash(stubs, tmp_path)
+    assert done.returncode == 1 and "apt-get install -y --no-install-recommends g++ patchelf" in done.stderr
+
+
+@pytest.mark.parametrize("name", ["plain", "a b", "it's", "é$HOME"])
+def test_wrapper_survives_any_path(tmp_path, name):
+    venv, program = tmp_path / name / "venv", tmp_path / name / "pdal"
+    (venv / "bin").mkdir(parents=True)
+    program.write_text('#!/bin/sh\nprintf "%s\\n" "${PATH%%:*}" "$PDAL_DRIVER_PATH" "$@"\n')
+    program.chmod(0o755)
+    made = bash('write_wrapper "$V" "$P" "$V/plugins"', tmp_path, V=str(venv), P=str(program))
+    assert made.returncode == 0, made.stderr
+    environment = {k: v for k, v in os.environ.items() if k != "PDAL_DRIVER_PATH"}
+    command = [venv / "bin/pdal", "info", "x y"]
+    said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert said == [str(venv / "bin"), str(venv / "plugins"), "info", "x y"]
+    environment["PDAL_DRIVER_PATH"] = "/elsewhere"
+    said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert said[1] == "/elsewhere"
+
+
+# ---- PDAL's check and patches ----------------------------------------------------------------------------
+
+
+@pytest.mark.pdal
+def test_check_pdal_proves_bindings_and_program(pdal_program):
+    command = [sys.executable, ROOT / "scripts/check_pdal.py", "--program", pdal_program]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert re.match(r"PDAL \d+\.\d+\.\d+, python-pdal \d", done.stdout)
+
+
+def test_check_pdal_names_what_is_missing():
+    # -S: no site-packages, hence no pdal
+    command = [sys.executable, "-I", "-S", ROOT / "scripts/check_pdal.py"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1 and "import pdal" in done.stderr
+
+
+@pytest.mark.pdal
+def test_check_pdal_refuses_another_interpreters_program(tmp_path):
+    fake = tmp_path / "pdal"
+    fake.write_text("#!/bin/sh\necho wrong interpreter >&2\nexit 1\n")
+    fake.chmod(0o755)
+    command = [sys.executable, ROOT / "scripts/check_pdal.py", "--program", fake]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1 and "wrong interpreter" in done.stderr
+
+
+def test_patch_refuses_unexpected_sources(tmp_path):
+    patch = load("patch_bindings")
+    file = tmp_path / "x.cpp"
+    file.write_text("dtype->fields; dtype->fields;\n")
+    patch.substitute(file, r"\bdtype->fields\b", "F(dtype)", 2)
+    assert file.read_text() == "F(dtype); F(dtype);\n"
+    with pytest.raises(SystemExit, match="found 0 times, not 2"):
+        patch.substitute(file, r"\bdtype->fields\b", "F(dtype)", 2)
+
+
+# ---- what is shipped and what is named -------------------------------------------------------------------
+
+
+def repository_files():
+    """Text files of the repository, without a need for git."""
+    made = {"build", "dist", "_build", "__pycache__"}
+    for folder, folders, names in os.walk(ROOT):
+        folders[:] = [f for f in folders if f == ".ci" or (f[0] != "." and f not in made and f[-9:] != ".egg-info")]
+        for name in names:
+            path = Path(folder, name)
+            if path.suffix in {".py", ".md", ".sh", ".toml", ".yml", ".yaml", ".json", ".cfg", ".txt", ""}:
+                yield path
+
+
+def test_no_registry_or_mirror_is_named():
+    host = re.compile(r"https?://[\w.-]*(pypi|pythonhosted|debian|ubuntu|anaconda|conda-forge)[\w.-]*", re.IGNORECASE)
+    found = [
+        f"{path.relative_to(ROOT)}: {match.group()}"
+        for path in repository_files()
+        if path.name != Path(__file__).name
+        for match in host.finditer(path.read_text(encoding="utf-8", errors="replace"))
+    ]
+    assert not found
+
+
+def project():
+    return pytest.importorskip("tomllib", reason="Python 3.10 has no tomllib").loads(
+        (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    )
+
+
+def test_conda_environment_has_every_dependency():
+    text = (ROOT / "environment.yml").read_text(encoding="utf-8")
+    conda = {match.lower() for match in re.findall(r"^  - ([\w-]+)", text, re.MULTILINE)}
+    wanted = {re.match(r"[\w-]+", line).group().lower() for line in project()["project"]["dependencies"]}
+    assert wanted | {"pdal", "python-pdal", "lazrs-python"} <= conda
+
+
+def test_every_data_file_is_packaged():
+    patterns = project()["tool"]["setuptools"]["package-data"]["pdal_stages"]
+    package = ROOT / "pdal_stages"
+    code = {".py", ".pyc", ".nbi", ".nbc"}
+    data = [p.relative_to(package).as_posix() for p in package.rglob("*") if p.is_file() and p.suffix not in code]
+    assert data and not [name for name in data if not any(fnmatch.fnmatch(name, p) for p in patterns)]
+    without_init = {p.parent for p in package.rglob("*.py")} - {p.parent for p in package.rglob("__init__.py")}
+    assert not without_init
+
+
+# ---- the rule on skips -----------------------------------------------------------------------------------
+
+SKIPS = """
+import pytest
+
+def test_imports():
+    pytest.importorskip("pdal_is_not_here", reason="no pdal on this machine")
+
+def test_plugin():
+    pytest.skip("filters.python is missing")
+
+def test_version():
+    pytest.skip("needs PDAL >= 99")
+
+def test_data(data_dir):
+    pass
+"""
+
+
+@pytest.mark.parametrize(
+    ("required", "failed", "skipped"), [("", 0, 4), ("pdal", 2, 2), ("data", 1, 3), ("pdal,data", 3, 1)]
+)
+def test_skips_that_must_not_happen_fail(tmp_path, required, failed, skipped):
+    shutil.copy(ROOT / "tests/conftest.py", tmp_path)
+    (tmp_path / "test_skips.py").write_text(SKIPS)
+    environment = {**os.environ, "PDAL_STAGES_REQUIRE": required, "PDAL_STAGES_DATA": str(tmp_path / "absent")}
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", os.devnull, "--rootdir", tmp_path]
+    done = subprocess.run([*command, tmp_path], env=environment, capture_output=True, text=True, timeout=120)
+    counts = dict.fromkeys(("failed", "error", "skipped"), 0)
+    for number, word in re.findall(r"(\d+) (failed|error|skipped)", done.stdout.splitlines()[-1]):
+        counts[word] = int(number)
+    assert (counts["failed"] + counts["error"], counts["skipped"]) == (failed, skipped), done.stdout
+    assert done.returncode == (1 if failed else 0)
