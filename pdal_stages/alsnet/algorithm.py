@@ -334,13 +334,14 @@ def make_pyramid(
     members : (k,) int64
         Rows of the cloud in the canonical order.
     centre : (2,) float64
-        Coordinates are taken from it, heights from the batch's median.
+        Coordinates are taken from it, heights from the batch's first percentile: near its ground, whatever few
+        strays lie below.
     change : function, optional
         Augmentation: from coordinates (k, 3) to (coordinates, rows kept).
     """
     z = xyz[members, 2]
-    middle = float(np.partition(z, (len(z) - 1) // 2)[(len(z) - 1) // 2])
-    local = xyz[members] - np.array([centre[0], centre[1], middle])
+    low = float(np.partition(z, len(z) // 100)[len(z) // 100])
+    local = xyz[members] - np.array([centre[0], centre[1], low])
     kept = None
     if change is not None:
         local, kept = change(local)

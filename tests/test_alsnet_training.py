@@ -1,0 +1,371 @@
+"""Training networks: PyTorch against NumPy, overfitting, resuming, transfer, held out ground."""
+
+import importlib.util
+import zipfile
+
+import numpy as np
+import pytest
+from alsnet_scenes import TINY, model_of, random_net, scene
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdal_stages.alsnet import Circles, NetworkOptions
+from pdal_stages.alsnet import checkpoint as checkpoints
+from pdal_stages.alsnet.augment import Augmentation
+from pdal_stages.alsnet.pyramid import build
+from pdal_stages.alsnet.schedule import choose, class_weights, covering, hold_out, spread
+from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, train
+from pdal_stages.errors import DependencyError, ModelError, OptionError
+
+needs_torch = pytest.mark.skipif(
+    importlib.util.find_spec("torch") is None,
+    reason="PyTorch is not installed (extra 'deep'): training alsNet is not tested",
+)
+
+
+def fit(clouds=None, progress=False, dimensions=("HeightAboveGround",), **network):
+    if clouds is None:
+        xyz, labels, values = scene()
+        clouds = [TrainingCloud(xyz, labels, values, name="scene")]
+    network = {"configuration": TINY, "validation": 0, "epochs": 2, "histogram_threshold": 100, **network}
+    options = TrainingOptions(algorithm="alsnet", alsnet=network, dimensions=dimensions, seed=3, threads=1)
+    return train(clouds, options, progress)
+
+
+# ---- which batches (no PyTorch) ------------------------------------------------------------------------------
+
+
+def test_spread_of_a_histogram():
+    assert spread(np.array([25, 25, 25, 25])) == 0.0
+    assert spread(np.array([100, 0, 0, 0])) == pytest.approx(np.std([100, 0, 0, 0]))
+    assert spread(np.array([0, 0])) == np.inf
+
+
+def test_batches_of_one_class_are_passed_over_unless_a_class_would_be_lost():
+    random = np.random.default_rng(0)
+    xyz = random.random((4000, 3)) * [80.0, 20.0, 1.0]
+    labels = np.where(xyz[:, 0] < 40, 0, random.integers(0, 2, 4000))  # left: one class; right: two, mixed
+    lonely = (xyz[:, 0] < 4) & (xyz[:, 1] < 4)
+    labels[lonely] = 2
+    circles = Circles(xyz, 200, 6.0)
+    choice = choose([circles], [labels], 3, 30.0)
+    shares = [np.bincount(labels[circles.members(k)], minlength=3) for _, k in choice.batches]
+    assert choice.added == 1 and choice.spread_ok == len(choice.batches) - 1 < choice.all
+    assert sum(spread(s) >= 30.0 for s in shares) == 1
+    assert sum(shares)[2] > 0
+    assert choose([circles], [labels], 3, 100.0).all == len(choose([circles], [labels], 3, 100.0).batches)
+
+
+def test_ground_held_out_is_whole_blocks_with_all_classes():
+    xyz, labels, _ = scene(4000, 60.0)
+    position = np.searchsorted([2, 5, 6], labels)
+    (mask,) = hold_out([xyz], [position], 0.2, 12.0)
+    block = np.floor(xyz[:, :2] / 12.0).astype(int) @ [1, 1000]
+    assert all(len(set(mask[block == b])) == 1 for b in np.unique(block))
+    assert 0.1 < mask.mean() < 0.3
+    assert set(position[mask]) == {0, 1, 2}
+    assert not hold_out([xyz], [position], 0.0, 12.0)[0].any()
+    with pytest.raises(OptionError, match="validation to 0"):
+        hold_out([xyz], [position], 0.2, 1000.0)
+
+
+def test_covering_batches_hold_every_wanted_point():
+    xyz, _, _ = scene()
+    circles = Circles(xyz, 256, 4.0)
+    wanted = xyz[:, 0] > 15
+    numbers = covering(circles, wanted)
+    seen = np.zeros(len(xyz), bool)
+    for number in numbers:
+        seen[circles.members(number)] = True
+    assert seen[wanted].all() and len(numbers) < len(circles)
+
+
+def test_class_weights():
+    count = np.array([100, 25, 400])
+    assert class_weights(count, "none").tolist() == [1, 1, 1]
+    root = class_weights(count, "sqrt")
+    np.testing.assert_allclose(root[1] / root[2], 4.0)
+    np.testing.assert_allclose((root * count).sum() / count.sum(), 1.0)
+    even = class_weights(count, "balanced")
+    np.testing.assert_allclose(even * count, (even * count)[0])
+
+
+@given(st.integers(0, 2**32), st.integers(1, 300), st.floats(0, 0.95), st.floats(0, 0.1))
+@settings(max_examples=40, deadline=None)
+def test_augmentation_turns_shakes_and_thins(seed, n, thin, jitter):
+    options = NetworkOptions(thin=thin, jitter=jitter, configuration=TINY)
+    xyz = np.random.default_rng(seed).normal(size=(n, 3)) * 10
+    out, kept = Augmentation(options, np.random.default_rng(seed))(xyz)
+    assert len(out) == len(kept) == len(set(kept.tolist()))
+    assert len(kept) >= max(min(n, 16), int((1 - thin) * n) - 1)
+    away = 3 * jitter * 3**0.5 + 1e-9
+    assert np.abs(np.linalg.norm(out[:, :2], axis=1) - np.linalg.norm(xyz[kept, :2], axis=1)).max() <= away
+    assert np.abs(out[:, 2] - xyz[kept, 2]).max() <= away
+
+
+# ---- PyTorch --------------------------------------------------------------------------------------------------
+
+
+@needs_torch
+def test_torch_and_numpy_agree():
+    from pdal_stages.alsnet.network import Applied, Network
+
+    net = random_net(("Z", "Intensity"), 4)
+    xyz, _, values = scene(256, 7.0)
+    inputs = np.column_stack([xyz[:, 2], values["Intensity"] / 100.0]).astype(np.float32)
+    pyramid = build(xyz, inputs, TINY)
+    np.testing.assert_allclose(Applied(net.weights, TINY)(pyramid), net.folded(pyramid), atol=2e-6)
+    again = Network(TINY, 2, 4).load(net.weights).dump()
+    assert list(again) == list(net.weights)
+    assert all(np.array_equal(again[name], net.weights[name]) for name in again)
+
+
+@needs_torch
+def test_a_tiny_network_overfits_a_tiny_scene():
+    """Without heights above ground: from the points' positions alone."""
+    xyz, labels, _ = scene(1200, 12.0)
+    model = fit(
+        [TrainingCloud(xyz, labels)],
+        dimensions=(),
+        points=600,
+        epochs=25,
+        learning_rate=0.01,
+        thin=0.0,
+        jitter=0.0,
+        shift=0.1,
+    )
+    found = model.predict(xyz, {}, variance=True)
+    assert np.mean(found.classification == labels) > 0.97
+    curve = model.info["training"]["curve"]
+    assert len(curve) == 25 and curve[-1]["loss"] < 0.3 * curve[0]["loss"]
+
+
+@needs_torch
+def test_training_twice_gives_the_same_file(tmp_path):
+    one, other = fit(), fit()
+    one.save(tmp_path / "a")
+    other.save(tmp_path / "b")
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    xyz, _, values = scene(seed=7)
+    again = load_model(tmp_path / "a")
+    assert np.array_equal(again.predict(xyz, values).classification, one.predict(xyz, values).classification)
+    assert again.info["training"]["network"]["spacing"] == one.algorithm.spacing
+
+
+@needs_torch
+def test_resumed_training_equals_one_without_a_break(tmp_path):
+    """Dropout, momenta, learning rates and the choice of the best epoch included."""
+    xyz, labels, values = scene(2500, 40.0)
+    clouds = [TrainingCloud(xyz, labels, values)]
+    network = TINY.__class__(**{**TINY.__dict__, "dropout": 0.5})
+    setting = {"configuration": network, "validation": 0.25, "block_size": 6.0, "epochs": 4}
+    whole = fit(clouds, **setting)
+    path = str(tmp_path / "run.checkpoint")
+
+    from pdal_stages.alsnet import training
+
+    class Stop(Exception):
+        pass
+
+    save = training._Session._save
+
+    def stop(self, where):
+        save(self, where)
+        if len(self.curve) == 2:
+            raise Stop
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training._Session, "_save", stop)
+        with pytest.raises(Stop):
+            fit(clouds, checkpoint=path, **setting)
+    resumed = fit(clouds, checkpoint=path, **setting)
+    assert resumed.info["training"]["curve"] == whole.info["training"]["curve"]
+    for name, array in whole.algorithm.weights.items():
+        assert np.array_equal(array, resumed.algorithm.weights[name]), name
+    held = whole.info["training"]["held_out"]
+    assert held["mean_f1"] == max(row["mean_f1"] for row in whole.info["training"]["curve"])
+    with pytest.raises(ModelError, match=r"another training.*options"):
+        fit(clouds, checkpoint=path, **{**setting, "learning_rate": 0.5})
+
+
+@needs_torch
+def test_early_stop_keeps_the_best_epoch():
+    xyz, labels, values = scene(2500, 40.0)
+    model = fit(
+        [TrainingCloud(xyz, labels, values)],
+        validation=0.25,
+        block_size=6.0,
+        epochs=30,
+        patience=1,
+        learning_rate=0.05,
+    )
+    training = model.info["training"]
+    assert training["epochs"] < 30
+    assert training["epochs"] - training["best_epoch"] == 1
+    assert training["points_held_out"] > 0
+
+
+@needs_torch
+def test_transfer_starts_from_the_other_model(tmp_path):
+    xyz, labels, values = scene()
+    first = fit(epochs=6, learning_rate=0.01)
+    first.save(tmp_path / "first.model")
+    two = np.where(labels == 5, 1, labels)  # the tree is another class now
+    model = fit(
+        [TrainingCloud(xyz, two, values)], start_from=str(tmp_path / "first.model"), epochs=1, learning_rate=1e-8,
+        patience=0,
+    )  # fmt: skip
+    fresh = fit([TrainingCloud(xyz, labels, values)], epochs=1, learning_rate=1e-8)
+    old, new = first.algorithm, model.algorithm
+    np.testing.assert_allclose(new.weights["sa1_1"][:, :4], old.weights["sa1_1"][:, :4], atol=1e-6)
+    assert not np.allclose(fresh.algorithm.weights["sa1_1"], old.weights["sa1_1"], atol=1e-3)
+    assert (new.mean, new.scale) == (old.mean, old.scale)
+    assert [code for code, _ in model.classes] == [2, 6]  # 1 is left out unless it is named
+    np.testing.assert_allclose(new.weights["scores"], old.weights["scores"][[0, 2]], atol=1e-6)
+    assert model.info["training"]["network"]["start_from"] == "first.model"
+
+
+@needs_torch
+def test_transfer_from_something_else_is_refused(tmp_path):
+    model_of(random_net(("Z", "Intensity"))).save(tmp_path / "other.model")
+    with pytest.raises(ModelError, match=r"other inputs.*Z, Intensity"):
+        fit(start_from=str(tmp_path / "other.model"))
+    with pytest.raises(ModelError, match="another network"):
+        fit(start_from=str(tmp_path / "other.model"), configuration="tiny")
+    xyz, labels, values = scene(600, 12.0)
+    forest = train(
+        [TrainingCloud(xyz, labels, values)],
+        TrainingOptions(neighborhoods="c1", count=50, trees=2),
+        progress=False,
+    )
+    forest.save(tmp_path / "forest.model")
+    with pytest.raises(ModelError, match="network only"):
+        fit(start_from=str(tmp_path / "forest.model"))
+    with pytest.raises(OptionError, match="only a network"):
+        forest.predict(xyz, values, variance=True)
+
+
+@needs_torch
+def test_cuda_where_there_is_none_is_an_error():
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("there is a CUDA device here")
+    with pytest.raises(DependencyError, match="no CUDA device"):
+        fit(device="cuda")
+
+
+@needs_torch
+def test_a_class_only_in_the_ground_held_out_is_an_error(monkeypatch):
+    from pdal_stages.alsnet import schedule
+
+    xyz, labels, values = scene()
+    monkeypatch.setattr(schedule, "hold_out", lambda clouds, positions, *_: [positions[0] == 2])
+    with pytest.raises(OptionError, match=r"class 6 .* outside the ground held out"):
+        fit([TrainingCloud(xyz, labels, values)], validation=0.5)
+
+
+@needs_torch
+def test_masked_points_are_seen_but_not_trained_on():
+    xyz, labels, values = scene()
+    mask = xyz[:, 0] < 12
+    model = fit([TrainingCloud(xyz, labels, values, mask=mask)])
+    assert sum(entry["samples"] for entry in model.info["classes"]) == np.count_nonzero(mask)
+
+
+@needs_torch
+@pytest.mark.slow
+@pytest.mark.data
+def test_variance_and_margin_mark_errors_on_real_data(data_dir):
+    """[WM19] find that errors have a large variance over the batches and a small margin."""
+    laspy = pytest.importorskip("laspy")
+    from pdal_stages.terrain import hag_minima
+
+    def read(part):
+        tiles = [laspy.read(path) for path in sorted((data_dir / "montpellier").glob(f"{part}_*.laz"))]
+        xyz = np.concatenate([np.column_stack([t.x, t.y, t.z]) for t in tiles])
+        labels = np.concatenate([np.asarray(t.classification) for t in tiles])
+        every = np.random.default_rng(0).random(len(xyz)) < 0.25  # a quarter of the density: a short test
+        height = hag_minima(*xyz.T)
+        height = height[0] if isinstance(height, tuple) else height
+        return xyz[every], labels[every], {"HeightAboveGround": height[every]}
+
+    xyz, labels, values = read("train")
+    cloud = TrainingCloud(xyz, labels, values)
+    network = {"configuration": "tiny", "epochs": 4, "learning_rate": 0.005, "histogram_threshold": 30}
+    model = fit([cloud], **network)
+    xyz, labels, values = read("test")
+    found = model.predict(xyz, values, variance=True, margin=True, threads=1)
+    known = np.isin(labels, [2, 3, 4, 5, 6])
+    wrong = (found.classification != labels)[known]
+    assert 0.02 < wrong.mean() < 0.35
+
+    def share_of_pairs(
+        score,
+    ):  # that a wrong point has a larger value than a right one (area under the ROC curve)
+        rank = np.argsort(np.argsort(score))
+        n = np.count_nonzero(wrong)
+        return (rank[wrong].sum() - n * (n - 1) / 2) / (n * np.count_nonzero(~wrong))
+
+    assert share_of_pairs(found.variance[known]) > 0.65
+    assert share_of_pairs(-found.margin[known]) > 0.7
+
+
+# ---- checkpoints that lie (no PyTorch) ----------------------------------------------------------------------
+
+
+SHAPES = {"now.sa1_1": (4, 5), "first.scores.bias": (3,)}
+IDENTITY = {"seed": 1, "options": {"points": 5}}
+
+
+@pytest.fixture
+def good(tmp_path):
+    path = tmp_path / "a.checkpoint"
+    arrays = {name: np.ones(shape, np.float32) for name, shape in SHAPES.items()}
+    checkpoints.save(path, {"identity": IDENTITY, "curve": []}, arrays)
+    return path
+
+
+def test_checkpoints_come_back(good):
+    state, arrays = checkpoints.load(good, IDENTITY, SHAPES)
+    assert state["curve"] == [] and arrays["now.sa1_1"].shape == (4, 5)
+
+
+def test_checkpoints_that_lie_are_refused(good, tmp_path):
+    with pytest.raises(ModelError, match="different seed"):
+        checkpoints.load(good, {**IDENTITY, "seed": 2}, SHAPES)
+    with pytest.raises(ModelError, match="arrays are not"):
+        checkpoints.load(good, IDENTITY, {**SHAPES, "more": (1,)})
+    with pytest.raises(ModelError, match="does not fit"):
+        checkpoints.load(good, IDENTITY, {**SHAPES, "now.sa1_1": (5, 4)})
+    with pytest.raises(ModelError, match="larger"):
+        checkpoints.load(big(tmp_path), IDENTITY, {"a": (1,)})
+    for content in (b"", b"nothing", good.read_bytes()[:-30], b"PK\x05\x06" + b"\0" * 18):
+        good.write_bytes(content)
+        with pytest.raises(ModelError):
+            checkpoints.load(good, IDENTITY, SHAPES)
+
+
+def big(tmp_path):
+    path = tmp_path / "big.checkpoint"
+    checkpoints.save(path, {"identity": IDENTITY}, {"a": np.ones(10_000, np.float32)})
+    return path
+
+
+def test_checkpoint_with_pickled_or_infinite_numbers(good, tmp_path):
+    import io
+
+    def replace(name, data):
+        out = tmp_path / "changed.checkpoint"
+        with zipfile.ZipFile(good) as old, zipfile.ZipFile(out, "w") as new:
+            for info in old.infolist():
+                new.writestr(info.filename, data if info.filename == name else old.read(info))
+        return out
+
+    buffer = io.BytesIO()
+    np.save(buffer, np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    for data in (buffer.getvalue(), checkpoints.to_bytes(np.full((4, 5), np.inf, np.float32))):
+        with pytest.raises(ModelError):
+            checkpoints.load(replace("now.sa1_1.npy", data), IDENTITY, SHAPES)
+    with pytest.raises(ModelError):
+        checkpoints.load(replace("state.json", b"[" * 100_000), IDENTITY, SHAPES)
