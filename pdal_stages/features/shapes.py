@@ -50,6 +50,7 @@ class Work(NamedTuple):
     draws: np.ndarray  # (4 * ROOM,) uint32: members drawn, all a, then all b, ...
     points: np.ndarray  # (16 * ROOM,) float32: their records
     values: np.ndarray  # (5 * ROOM,) float32: the metrics, comparable
+    above: np.ndarray  # (5, 9) float32
 
 
 #: What a kernel is to do about shapes.
@@ -69,7 +70,7 @@ class Shapes(NamedTuple):
 def make_work() -> Work:
     """Scratch for one thread."""
     u, f = np.uint32, np.float32
-    return Work(np.zeros(4 * ROOM, u), np.zeros(16 * ROOM, f), np.zeros(5 * ROOM, f))
+    return Work(np.zeros(4 * ROOM, u), np.zeros(16 * ROOM, f), np.zeros(5 * ROOM, f), np.zeros((5, 9), f))
 
 
 def no_shapes() -> Shapes:
@@ -207,7 +208,7 @@ def _draw_few(low, high, n, draws):
 
 @njit
 def fetch(record, draws, points):
-    """Copy the drawn members' records one after another (16 bytes at once: nothing but loads and stores)."""
+    """Copy the drawn members' records one after another (16 bytes at once: loads and stores, no more)."""
     for i in range(4 * ROOM):
         p = draws[i]
         x, y, z, w = record[p, 0], record[p, 1], record[p, 2], record[p, 3]
@@ -239,30 +240,40 @@ def measure(points, gx, gy, gz, values):
         values[2 * ROOM + i] = bb
         values[3 * ROOM + i] = nx * nx + ny * ny + nz * nz
         values[4 * ROOM + i] = abs(nx * dx + ny * dy + nz * dz)
-    for m in range(5):  # the last place pads to whole vectors: above no threshold
-        for i in range(PULLS, ROOM):
-            values[m * ROOM + i] = -np.inf
 
 
 @njit
+def pull(record, n, gx, gy, gz, seed, work):
+    """The metrics of all pulls, into work.values."""
+    draw(seed, n, work.draws)
+    fetch(record, work.draws, work.points)
+    measure(work.points, gx, gy, gz, work.values)
+    for m in range(5):  # the last places pad to whole vectors: above no threshold
+        for i in range(PULLS, ROOM):
+            work.values[m * ROOM + i] = -np.inf
+
+
+@njit(fastmath={"reassoc", "nsz"})  # sums of ones, exact in any order: what lets LLVM vectorise them
 def count_above(values, t, above):
-    """How many of the PULLS values lie above each of nine thresholds (no scatter: compare and add)."""
-    t0, t1, t2, t3, t4, t5, t6, t7, t8 = t[0], t[1], t[2], t[3], t[4], t[5], t[6], t[7], t[8]
-    c0 = c1 = c2 = c3 = c4 = c5 = c6 = c7 = c8 = np.uint32(0)
-    one, zero = np.uint32(1), np.uint32(0)
-    for i in range(ROOM):
-        v = values[i]
-        c0 = np.uint32(c0 + (one if v > t0 else zero))
-        c1 = np.uint32(c1 + (one if v > t1 else zero))
-        c2 = np.uint32(c2 + (one if v > t2 else zero))
-        c3 = np.uint32(c3 + (one if v > t3 else zero))
-        c4 = np.uint32(c4 + (one if v > t4 else zero))
-        c5 = np.uint32(c5 + (one if v > t5 else zero))
-        c6 = np.uint32(c6 + (one if v > t6 else zero))
-        c7 = np.uint32(c7 + (one if v > t7 else zero))
-        c8 = np.uint32(c8 + (one if v > t8 else zero))
-    above[0], above[1], above[2], above[3], above[4] = c0, c1, c2, c3, c4
-    above[5], above[6], above[7], above[8] = c5, c6, c7, c8
+    """How many of each metric's values lie above each of nine thresholds (no scatter: compare and add)."""
+    one, zero = np.float32(1.0), np.float32(0.0)
+    for m in range(5):
+        t0, t1, t2, t3, t4 = t[m, 0], t[m, 1], t[m, 2], t[m, 3], t[m, 4]
+        t5, t6, t7, t8 = t[m, 5], t[m, 6], t[m, 7], t[m, 8]
+        c0 = c1 = c2 = c3 = c4 = c5 = c6 = c7 = c8 = zero
+        for i in range(ROOM):
+            v = values[m * ROOM + i]
+            c0 += one if v > t0 else zero
+            c1 += one if v > t1 else zero
+            c2 += one if v > t2 else zero
+            c3 += one if v > t3 else zero
+            c4 += one if v > t4 else zero
+            c5 += one if v > t5 else zero
+            c6 += one if v > t6 else zero
+            c7 += one if v > t7 else zero
+            c8 += one if v > t8 else zero
+        above[m, 0], above[m, 1], above[m, 2], above[m, 3], above[m, 4] = c0, c1, c2, c3, c4
+        above[m, 5], above[m, 6], above[m, 7], above[m, 8] = c5, c6, c7, c8
 
 
 @njit
@@ -286,25 +297,21 @@ def shape_counts(record, n, gx, gy, gz, seed, thresholds, work, out):
     work : Work
     out : ndarray of float32, shape (50,)
     """
-    draw(seed, n, work.draws)
-    fetch(record, work.draws, work.points)
-    measure(work.points, gx, gy, gz, work.values)
-    above = work.draws  # no longer needed
+    pull(record, n, gx, gy, gz, seed, work)
+    above = work.above
+    count_above(work.values, thresholds, above)
     for m in range(5):
-        count_above(work.values[m * ROOM : (m + 1) * ROOM], thresholds[m], above)
-        before = np.uint32(PULLS)
+        before = np.float32(PULLS)
         for b in range(9):
-            out[10 * m + b] = np.float32(before - above[b]) / np.float32(PULLS)
-            before = above[b]
-        out[10 * m + 9] = np.float32(before) / np.float32(PULLS)
+            out[10 * m + b] = (before - above[m, b]) / np.float32(PULLS)
+            before = above[m, b]
+        out[10 * m + 9] = before / np.float32(PULLS)
 
 
 @njit
 def shape_values(record, n, gx, gy, gz, seed, work, out):
     """The metrics of the pulls that :func:`shape_counts` would count, comparable, into out (5, 255)."""
-    draw(seed, n, work.draws)
-    fetch(record, work.draws, work.points)
-    measure(work.points, gx, gy, gz, work.values)
+    pull(record, n, gx, gy, gz, seed, work)
     for m in range(5):
         for i in range(PULLS):
             out[m, i] = work.values[m * ROOM + i]
