@@ -1,6 +1,6 @@
 """Pages of stages, generated from the registry: the same declaration gives JSON Schema, help, errors and these.
 
-    python docs/stage_pages.py        # writes docs/stages/*.md
+python docs/stage_pages.py        # writes docs/stages/*.md
 """
 
 from __future__ import annotations
@@ -23,7 +23,14 @@ def page(stage: type[Stage]) -> str:
         lines += [doc, ""]
     if stage.source:
         lines += [f"Source: {stage.source} (see [the papers](../papers.md)).", ""]
-    lines += ["## Example", "", "```json", json.dumps(["input.laz", *stage.before, stage.example, *stage.after], indent=4), "```", ""]
+    lines += [
+        "## Example",
+        "",
+        "```json",
+        json.dumps(["input.laz", *stage.before, stage.example, *stage.after], indent=4),
+        "```",
+        "",
+    ]
     lines += ["## Dimensions", ""]
     if options is not None:
         reads = stage.reads(options)

@@ -1,0 +1,10 @@
+"""Heights above the coarse terrain of 20 m minima, from above."""
+
+from _common import save, town
+
+import pdal_stages as ps
+from pdal_stages.picture import top_view
+
+points = town()
+height = ps.hag_minima(points.x, points.y, points.z)
+save("1_heights", top_view(points.x, points.y, points.z, values=height, width=900))

@@ -1,0 +1,31 @@
+"""The town every gallery script uses, and where pictures go."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from pdal_stages.picture import write_png
+from pdal_stages.synthetic import Town, make_town
+
+#: Tests set a smaller town and another folder.
+SIZE = float(os.environ.get("GALLERY_SIZE", "120"))
+OUTPUT = Path(os.environ.get("GALLERY_OUTPUT", Path(__file__).parent / "pictures"))
+
+
+def town(seed: int = 1) -> Town:
+    return make_town(size=SIZE, density=7.0, seed=seed, progress=False)
+
+
+def halves(points: Town) -> tuple[np.ndarray, np.ndarray]:
+    """Masks of the western and the eastern half."""
+    west = points.x < np.median(points.x)
+    return west, ~west
+
+
+def save(name: str, rgb: np.ndarray) -> None:
+    OUTPUT.mkdir(parents=True, exist_ok=True)
+    write_png(OUTPUT / f"{name}.png", rgb)
+    print(OUTPUT / f"{name}.png")
