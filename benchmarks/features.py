@@ -38,6 +38,10 @@ from pdal_stages.parallel import resolve_threads
 
 RADII = (1.0, 2.0, 3.0, 5.0)
 TWELVE = "covariance,Density,Verticality,HeightRange,HeightStd"
+PDAL_FEATURES = (
+    "Linearity,Planarity,Scattering,Verticality,Omnivariance,Anisotropy,Eigenentropy,EigenvalueSum,"
+    "SurfaceVariation"
+)
 REAL = {
     "delft": "delft/train.laz",
     "montpellier": "montpellier/train_*.laz",
@@ -132,7 +136,9 @@ def cases(threads: int) -> dict[str, tuple[str, Callable, dict[str, Callable]]]:
     spheres = ",".join(f"s{r:g}" for r in RADII)
     cylinders = ",".join(f"c{r:g}" for r in RADII)
     near = {"pgeof": pgeof_spheres, "jakteristics": jakteristics_spheres(threads)}
-    pdal_spheres = [{"type": "filters.covariancefeatures", "radius": r, "feature_set": "all"} for r in RADII]
+    pdal_spheres = [
+        {"type": "filters.covariancefeatures", "radius": r, "feature_set": PDAL_FEATURES} for r in RADII
+    ]
     pdal_optimal = [{"type": "filters.optimalneighborhood", "min_k": 10, "max_k": 100}]
     return {
         "moments": (
@@ -219,10 +225,12 @@ def measure(xyz: np.ndarray, only: Iterable[str], repeats: int, threads: int, pe
                 if peer == "PDAL" and turn:  # a minute a run: once
                     continue
                 try:
-                    entry["peers"].setdefault(peer, []).append(timed(function, xyz))
+                    times = timed(function, xyz)
                 except (ImportError, RuntimeError) as error:
                     print(f"{peer} left out: {error}", file=sys.stderr)
                     del alive[peer]
+                else:
+                    entry["peers"].setdefault(peer, []).append(times)
         results.append(entry)
         print(
             f"  {name}: {', '.join(f'{cpu:.2f}' for cpu, _ in entry['ours'])} CPU s",
@@ -265,44 +273,50 @@ def table(cloud: str, xyz: np.ndarray, results: list[dict], threads: int) -> str
 
 
 def scaling(density: float, threads: int) -> list[dict]:
-    """Time and memory of growing towns of constant density, each in a process of its own."""
+    """Time and memory for a growing cloud of constant density, each size in a process of its own.
+
+    The cloud is a generated town of 250,000 points, laid side by side 1 to 64 times.
+    """
     results = []
-    for millions in (0.25, 0.5, 1, 2, 4, 8, 16):
-        code = (
-            "import resource, sys, time; sys.path.insert(0, sys.argv[1]); import features as f\n"
-            "n, density, threads = int(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])\n"
-            "xyz = f.town(n, density)\n"
-            "f.ours('c1,c2,c3,c5,s1,s2,s3,s5', f.TWELVE, threads)(xyz[:2000])\n"
-            "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
-            "cpu, wall = f.timed(f.ours('c1,c2,c3,c5,s1,s2,s3,s5', f.TWELVE, threads), xyz)\n"
-            "after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
-            "print(len(xyz), cpu, wall, xyz.nbytes / 2**20, before / 1024, after / 1024)\n"
-        )
-        here = str(Path(__file__).resolve().parent)
-        done = subprocess.run(
-            [sys.executable, "-c", code, here, str(int(millions * 1e6)), str(density), str(threads)],
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        n, cpu, wall, cloud, before, after = map(float, done.stdout.split())
-        results.append(
-            {
-                "points": int(n),
-                "cpu": cpu,
-                "wall": wall,
-                "cloud_mb": cloud,
-                "peak_before_mb": before,
-                "peak_mb": after,
-            }
-        )
-        print(f"  {int(n):,}: {cpu:.2f} CPU s", file=sys.stderr, flush=True)
+    code = (
+        "import resource, sys; sys.path.insert(0, sys.argv[1]); import features as f, numpy as np\n"
+        "one, times, threads = np.load(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])\n"
+        "side = np.ceil(np.ptp(one, axis=0).max())\n"
+        "xyz = np.empty((len(one) * times, 3))\n"
+        "for i in range(times):\n"
+        "    xyz[i * len(one) : (i + 1) * len(one)] = one + [i % 8 * side, i // 8 * side, 0]\n"
+        "job = f.ours('c1,c2,c3,c5,s1,s2,s3,s5', f.TWELVE, threads)\n"
+        "job(xyz[:2000])\n"
+        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "cpu, wall = f.timed(job, xyz)\n"
+        "after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "print(len(xyz), cpu, wall, xyz.nbytes / 2**20, before / 1024, after / 1024)\n"
+    )
+    here = str(Path(__file__).resolve().parent)
+    with tempfile.TemporaryDirectory() as folder:
+        file = f"{folder}/town.npy"
+        np.save(file, town(250_000, density))
+        for times in (1, 2, 4, 8, 16, 32, 64):
+            command = [sys.executable, "-c", code, here, file, str(times), str(threads)]
+            done = subprocess.run(command, capture_output=True, text=True, check=True)
+            n, cpu, wall, cloud, before, after = map(float, done.stdout.split())
+            results.append(
+                {
+                    "points": int(n),
+                    "cpu": cpu,
+                    "wall": wall,
+                    "cloud_mb": cloud,
+                    "before_mb": before,
+                    "peak_mb": after,
+                }
+            )
+            print(f"  {int(n):,}: {cpu:.2f} CPU s", file=sys.stderr, flush=True)
     return results
 
 
 def scaling_table(results: list[dict]) -> str:
     lines = [
-        "12 features of c1 c2 c3 c5 s1 s2 s3 s5, generated towns of constant density",
+        "12 features of c1 c2 c3 c5 s1 s2 s3 s5, a generated town of 250,000 points laid side by side 1 to 64 times",
         "",
         "| points | CPU s | microseconds a point | cloud, MiB | peak of the process over what it was, MiB |",
         "|---:|---:|---:|---:|---:|",
@@ -310,7 +324,7 @@ def scaling_table(results: list[dict]) -> str:
     for r in results:
         lines.append(
             f"| {r['points']:,} | {r['cpu']:.2f} | {r['cpu'] / r['points'] * 1e6:.2f} | {r['cloud_mb']:.0f} "
-            f"| {r['peak_mb'] - r['peak_before_mb']:.0f} |"
+            f"| {r['peak_mb'] - r['before_mb']:.0f} |"
         )
     return "\n".join(lines) + "\n"
 
@@ -357,35 +371,39 @@ def versions() -> dict[str, str]:
     return found
 
 
-def plot(clouds: dict[str, list[dict]], path: Path) -> None:
-    """Median CPU seconds of every case, a bar each, logarithmic."""
+def plot(clouds: dict[str, tuple[int, list[dict]]], path: Path) -> None:
+    """Median CPU microseconds a point of every case, a bar each."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     colours = {"pdal_stages": "#1b6ca8", "pgeof": "#b0b7bf", "jakteristics": "#8d97a1", "PDAL": "#6b7682"}
-    entries = [(cloud, entry) for cloud, results in clouds.items() for entry in results]
-    figure, axis = plt.subplots(figsize=(8, 0.9 + 0.75 * len(entries)), constrained_layout=True)
+    entries = [
+        (cloud, n, entry) for cloud, (n, results) in clouds.items() for entry in results if entry["peers"]
+    ]
+    if not entries:
+        return
+    bars = sum(1 + len(entry["peers"]) for _, _, entry in entries)
+    figure, axis = plt.subplots(figsize=(8, 0.8 + 0.24 * bars + 0.2 * len(entries)), constrained_layout=True)
     place, ticks, labels = 0.0, [], []
-    for cloud, entry in entries:
+    for cloud, n, entry in entries:
         rows = {"pdal_stages": entry["ours"], **entry["peers"]}
         start = place
         for who, times in rows.items():
-            seconds = float(np.median([cpu for cpu, _ in times]))
-            axis.barh(place, seconds, 0.85, color=colours[who])
-            axis.text(seconds * 1.03, place, f"{who} {seconds:.1f}", va="center", fontsize=8)
+            each = float(np.median([cpu for cpu, _ in times])) / n * 1e6
+            axis.barh(place, each, 0.85, color=colours[who])
+            axis.text(each, place, f" {who} {each:.1f}", va="center", fontsize=8)
             place += 1
         ticks.append((start + place - 1) / 2)
-        labels.append(f"{entry['case']}\n{cloud}")
+        labels.append(f"{entry['case']}, {cloud}")
         place += 0.8
     axis.set_yticks(ticks, labels, fontsize=8)
     axis.invert_yaxis()
-    axis.set_xscale("log")
-    axis.set_xlim(right=axis.get_xlim()[1] * 2.5)
-    axis.set_xlabel("CPU seconds, all threads (logarithmic)")
+    axis.margins(x=0.18)
+    axis.set_xlabel("CPU microseconds a point (all threads together)", fontsize=8)
     axis.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=130)
 
 
 def main() -> None:
@@ -416,15 +434,16 @@ def main() -> None:
         text = profile(load(options.cloud[0], options.points, options.density))
         data["profile"] = text
     else:
-        clouds = {}
+        clouds, shown = {}, {}
         for name in options.cloud:
             xyz = load(name, options.points, options.density)
             label = Path(name).stem
             clouds[label] = measure(xyz, options.only, options.repeats, threads, not options.no_peers)
+            shown[label] = len(xyz), clouds[label]
             text += table(label, xyz, clouds[label], threads) + "\n"
         data["clouds"] = clouds
         if options.write:
-            plot(clouds, options.write.with_suffix(".png"))
+            plot(shown, options.write.with_suffix(".png"))
     text += "\n" + ", ".join(f"{name} {number}" for name, number in data["versions"].items()) + "\n"
     print(text)
     if options.json:

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 #: Sample neighborhoods that the shape thresholds are fitted to [B16 3.2.2].
 SAMPLES = 500
 
+#: Points hashed at a time when samples are drawn.
+SAMPLE_CHUNK = 1_000_000
+
 #: Estimated nanoseconds a block may take on one core: Ctrl-C waits for the blocks in work.
 BLOCK_NS = 2.5e8
 
@@ -141,12 +144,9 @@ class FeatureEngine:
 
     def _fit_bins(self, fixed: FixedRadius, adaptive: AdaptiveNeighborhoods | None) -> ShapeBins:
         from .bins import ShapeBins
-        from .shapes import point_seeds
 
         grid = self._grid
-        hashes = point_seeds(grid.x, grid.y, grid.z, self.seed, "samples")
-        _, first = np.unique(hashes, return_index=True)  # copies of a point count once
-        sample = np.sort(first[:SAMPLES])
+        sample = self._sample()
         points = (grid.x[sample], grid.y[sample], grid.z[sample])
         tokens = [c.neighborhood.token for c in self.plan.layout if c.shapes]
 
@@ -157,6 +157,21 @@ class FeatureEngine:
             return adaptive.shape_values(token, points, self.seed, self.copt_threshold)
 
         return ShapeBins.fit(dict(zip(tokens, map_blocks(values, tokens, self.threads), strict=True)))
+
+    def _sample(self) -> np.ndarray:
+        """Sorted positions of the SAMPLES points with the smallest hash; copies of a point count once."""
+        from .shapes import point_seeds
+
+        grid = self._grid
+        hashes, at = np.zeros(0, np.uint64), np.zeros(0, np.int64)
+        for start in range(0, len(grid), SAMPLE_CHUNK):
+            part = slice(start, start + SAMPLE_CHUNK)
+            more = point_seeds(grid.x[part], grid.y[part], grid.z[part], self.seed, "samples")
+            hashes = np.concatenate((hashes, more))
+            at = np.concatenate((at, np.arange(start, start + len(more))))
+            hashes, first = np.unique(hashes, return_index=True)
+            hashes, at = hashes[:SAMPLES], at[first[:SAMPLES]]
+        return np.sort(at)
 
     def _prepared(self) -> tuple[FixedRadius, AdaptiveNeighborhoods | None]:
         with self._lock:
