@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
+import signal
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -24,24 +27,60 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments or os.environ.get("PDAL_STAGES_DEBUG", "") not in ("", "0")
     arguments = [a for a in arguments if a != "--debug"]
+    _print_anything()
     try:
         overrides, rest = parse_overrides(arguments)
         options = _parser().parse_args(rest)
         if overrides and not getattr(options, "takes_overrides", False):
             raise StageError(f"'{options.command}' takes no stage options", found=overrides[0].flag)
         options.overrides = overrides
-        return int(options.run(options) or 0)
-    except StageError as error:
-        if debug:
-            raise
-        print(f"pdal-stages: {error}", file=sys.stderr)
-        return 1
+        options.is_program = argv is None
+        code = int(options.run(options) or 0)
+        sys.stdout.flush()  # a full disk or a closed pipe shows here, not at exit
+        return code
+    except BrokenPipeError:  # e.g. into head
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return 0
     except KeyboardInterrupt:
         print("pdal-stages: interrupted; nothing half-written was left", file=sys.stderr)
         return 130
-    except BrokenPipeError:  # e.g. into head
-        sys.stderr.close()
-        return 0
+    except Exception as error:
+        if debug:
+            raise
+        print(f"pdal-stages: {error if isinstance(error, StageError) else _unforeseen(error)}", file=sys.stderr)
+        return 1
+
+
+def _print_anything() -> None:
+    """A locale that lacks a character shows its code, rather than ending the run."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(AttributeError, ValueError):  # a notebook's stream cannot
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _unforeseen(error: Exception) -> StageError:
+    """What nobody thought of, as a message of one paragraph."""
+    if isinstance(error, MemoryError):
+        return StageError("memory ran out", cure="Work in tiles (--tile), or lower 'memory'")
+    if isinstance(error, OSError):
+        name = f"{error.filename}: " if error.filename is not None else ""
+        return StageError("the system refused", found=f"{name}{error.strerror or error}")
+    if isinstance(error, ImportError):
+        return StageError(
+            "a Python package cannot be imported",
+            found=f"{sys.executable}: {str(error).strip().splitlines()[0] if str(error).strip() else error!r}",
+            cure="Install pdal-stages with its packages into one environment, e.g. with conda; packages built for "
+            "another NumPy or Python must be installed again",
+        )
+    return StageError(
+        f"internal error: {type(error).__name__}: {error}", cure="Run with --debug and report what it prints"
+    )
+
+
+def _end_at_once(options: argparse.Namespace) -> None:
+    """Ctrl-C ends the program although PDAL works: Python hears nothing meanwhile. Files are removed all the same."""
+    if options.is_program and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -128,7 +167,10 @@ def _pipeline_input(command: argparse.ArgumentParser) -> None:
 
 def _source(options: argparse.Namespace) -> str | Path:
     if options.stdin:
-        return sys.stdin.read() or " "
+        from .pipelinefile import decode
+
+        raw = getattr(sys.stdin, "buffer", None)
+        return (decode(raw.read(), "standard input") if raw is not None else sys.stdin.read()) or " "
     name = options.file or options.file_option
     if not name:
         raise StageError("no pipeline file was given", cure=f"Usage: pdal-stages {options.command} job.json")
@@ -142,7 +184,7 @@ def _build(options: argparse.Namespace):
     if isinstance(source, str):
         from .pipelinefile import parse_pipeline
 
-        source = parse_pipeline(source).stages
+        source = parse_pipeline(source, "standard input")
     return Pipeline(source, options.overrides)
 
 
@@ -158,11 +200,21 @@ def _pipeline(options: argparse.Namespace) -> int | None:
         pipeline.validate()
         print(json.dumps({"valid": True, "error_detail": "", "streamable": False}, indent=2))
         return None
+    _check_metadata(options)
+    _end_at_once(options)
     pipeline.execute(arrays=False)
     _after(pipeline, options.metadata)
     if options.verbose and pipeline.log:
         print(pipeline.log, file=sys.stderr)
     return None
+
+
+def _check_metadata(options: argparse.Namespace) -> None:
+    """Before the work, not after it."""
+    from .files import check_writable
+
+    if options.metadata:
+        check_writable(options.metadata, "metadata")
 
 
 def _after(pipeline, metadata: str | None) -> None:
@@ -208,8 +260,10 @@ def _classify(options: argparse.Namespace) -> None:
     from .jobs import classify_pipeline
     from .pipeline import Pipeline
 
+    _check_metadata(options)
     stages = classify_pipeline(options.input, options.output, options.model, where=options.where)
     pipeline = Pipeline(stages, options.overrides)
+    _end_at_once(options)
     count = pipeline.execute(arrays=False)
     _after(pipeline, options.metadata)
     report = pipeline.reports[-1][1][-1]
@@ -237,6 +291,7 @@ def _train(options: argparse.Namespace) -> None:
         if not override.by_tag and override.selector == "writers.classifiermodel":
             extra[override.option] = override.value
     pipeline = Pipeline(train_pipeline(options.inputs, options.model, **extra), options.overrides)
+    _end_at_once(options)
     pipeline.execute(arrays=False)
     _after(pipeline, None)
     print(load_model(options.model))

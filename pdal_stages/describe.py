@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import textwrap
 
@@ -66,3 +67,11 @@ def stage_options(type_name: str, *, as_json: bool = False) -> str:
             head += f" [{str(shown).lower() if isinstance(shown, bool) else shown}{' ' + option.unit if option.unit else ''}]"
         lines += [head, textwrap.fill(help_text, 80, initial_indent=" " * 6, subsequent_indent=" " * 6), ""]
     return "\n".join(lines)
+
+
+def nearest_stage(type_name: str) -> str:
+    """``Did you mean ...?`` among PDAL's stages and ours, and where they are listed."""
+    known = list(registry.stages())
+    with contextlib.suppress(DependencyError, PipelineError, ValueError, OSError):
+        known += [entry["name"] for entry in json.loads(pdal_env.ask_program("--drivers", "--showjson"))]
+    return f"{suggest(type_name, known)}List the stages there are with: pdal-stages drivers"

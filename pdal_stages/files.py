@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 import tempfile
 from pathlib import Path
 
@@ -15,12 +16,76 @@ def partial_name(path: str | os.PathLike) -> Path:
     Writers choose their format by the suffix, so it stays.
     """
     path = Path(path)
-    return path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
+    tail = f".partial-{os.getpid()}{path.suffix}"
+    stem = path.stem
+    while len(f".{stem}{tail}".encode(errors="surrogateescape")) > _LONGEST_NAME and "#" not in stem[-1:]:
+        stem = stem[:-1]
+    return path.with_name(f".{stem}{tail}")
+
+
+#: Bytes a file's name may have, on every usual file system.
+_LONGEST_NAME = 255
+
+
+def check_complete(path: str | os.PathLike, name: str | os.PathLike) -> None:
+    """Refuse a file that a writer could not finish: PDAL's do not notice that a disk is full.
+
+    Parameters
+    ----------
+    path : path
+        The file as it was written.
+    name : path
+        The name it is to get, for the message.
+
+    Raises
+    ------
+    StageError
+        If a LAS or LAZ file is shorter than its header says, or no space is left beside the file.
+    """
+    path = Path(path)
+    try:
+        size = path.stat().st_size
+        short = _las_is_short(path, size) if path.suffix.lower() in (".las", ".laz") else None
+        full = not short and hasattr(os, "statvfs") and os.statvfs(path).f_bavail == 0 and short is None
+    except OSError as error:
+        raise StageError("the output file cannot be read back", found=f"{name}: {error}") from error
+    if short or full:
+        raise StageError(
+            "the output file could not be written completely",
+            found=f"{name}: {size:,} bytes were written",
+            cure="Make room on the disk (or raise the limit on file sizes)",
+        )
+
+
+def _las_is_short(path: Path, size: int) -> bool | None:
+    """Whether a LAS or LAZ file ends before its points do; None where it is no LAS file."""
+    with open(path, "rb") as file:
+        head = file.read(375)
+        if len(head) < 227 or head[:4] != b"LASF":
+            return True if size < 227 else None
+        minor, (offset,) = head[25], struct.unpack_from("<I", head, 96)
+        kind, length = head[104], struct.unpack_from("<H", head, 105)[0]
+        count = struct.unpack_from("<I", head, 107)[0]
+        if minor >= 4 and len(head) >= 255:
+            count = struct.unpack_from("<Q", head, 247)[0]
+        if not kind & 0x80:  # points of a fixed length
+            return offset + count * length > size
+        file.seek(offset)
+        place = file.read(8)
+        if len(place) < 8:
+            return True
+        table = struct.unpack("<q", place)[0]  # of LAZ chunks, written last
+        if table == -1:  # a stream that could not be rewound has it at its end
+            file.seek(size - 8)
+            table = struct.unpack("<q", file.read(8))[0]
+        return not offset + 8 <= table <= size - 8
 
 
 def check_writable(path: str | os.PathLike, what: str = "output") -> None:
     """Refuse an output path whose folder is missing or read-only, before any work is done."""
     folder = Path(path).absolute().parent
+    if len(Path(path).name.encode(errors="surrogateescape")) > _LONGEST_NAME:
+        raise StageError(f"the name of the {what} file is longer than {_LONGEST_NAME} bytes", found=str(path))
     if not folder.is_dir():
         raise StageError(
             f"the folder of the {what} file does not exist", found=str(folder), cure="Create it first"

@@ -287,9 +287,15 @@ def _las_version(writer: dict[str, Any], before: list[dict[str, Any]]) -> tuple[
             minor = headers[0][0]
         if len({h[1] for h in headers}) == 1:
             format_id = headers[0][1]
-    minor = int(writer.get("minor_version", minor))
-    format_id = int(writer.get("dataformat_id", format_id))
-    return minor, format_id
+    return _whole(writer.get("minor_version"), minor), _whole(writer.get("dataformat_id"), format_id)
+
+
+def _whole(value: Any, otherwise: int) -> int:
+    """An option of PDAL's as a whole number; what is none is left for PDAL to refuse."""
+    try:
+        return otherwise if value is None else int(value)
+    except (TypeError, ValueError, OverflowError):
+        return otherwise
 
 
 def _las_header(stage: dict[str, Any]) -> tuple[int, int] | None:
@@ -297,10 +303,13 @@ def _las_header(stage: dict[str, Any]) -> tuple[int, int] | None:
     type_name = stage.get("type", "")
     if type_name not in ("", "readers.las", "readers.copc"):
         return None
+    path = Path(str(stage.get("filename", "")))
     try:
-        with open(str(stage.get("filename", "")), "rb") as file:
+        if not path.is_file():  # a pipe or device must not be read here
+            return None
+        with open(path, "rb") as file:
             head = file.read(105)
-    except OSError:
+    except (OSError, ValueError):
         return None
     if len(head) < 105 or head[:4] != b"LASF":
         return None

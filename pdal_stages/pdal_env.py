@@ -96,6 +96,12 @@ def execute(stages: list[dict[str, Any]], *, arrays: bool = True) -> Execution:
         count = pipeline.execute()
     except RuntimeError as error:
         raise translate(str(error)) from None
+    except MemoryError:
+        raise PipelineError(
+            "memory ran out", cure="Work in tiles (--tile), or read less, e.g. with filters.crop"
+        ) from None
+    except TypeError as error:  # json.dumps: a pipeline of Python objects that are not JSON
+        raise PipelineError("the pipeline holds what JSON cannot say", found=str(error)) from None
     finally:
         # A stage that raises leaves sys.stdout pointing into PDAL's log.
         sys.stdout = stdout

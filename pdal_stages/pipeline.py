@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import glob
 import json
 import os
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from . import pdal_env, runtime
 from .errors import PipelineError, StageError
-from .files import check_writable, partial_name
+from .files import check_complete, check_writable, partial_name
+from .leftovers import removed_if_killed
 from .lowering import Lowered, lower
 from .overrides import Override, apply_overrides
 from .pipelinefile import PipelineSource, read_pipeline
@@ -22,8 +25,8 @@ class Pipeline:
 
     Parameters
     ----------
-    source : str, Path, list or dict
-        A file name, JSON text, or the stages themselves.
+    source : str, Path, list, dict or PipelineSource
+        A file name, JSON text, the stages themselves, or what :func:`parse_pipeline` made of text.
     overrides : iterable of Override, optional
         Options set from outside (see :mod:`pdal_stages.overrides`).
 
@@ -40,8 +43,10 @@ class Pipeline:
     1065
     """
 
-    def __init__(self, source: str | Path | list | dict, overrides: Iterable[Override] = ()) -> None:
-        read = read_pipeline(source)
+    def __init__(
+        self, source: str | Path | list | dict | PipelineSource, overrides: Iterable[Override] = ()
+    ) -> None:
+        read = source if isinstance(source, PipelineSource) else read_pipeline(source)
         self.source = PipelineSource(apply_overrides(read.stages, overrides), read.lines, read.name)
         self.lowered: Lowered = lower(self.source)
         self.metadata: dict[str, Any] = {}
@@ -59,7 +64,10 @@ class Pipeline:
         for stage in self.lowered.stages:
             if _is_writer(stage, self.lowered.stages):
                 check_writable(stage["filename"])
-        _validate_with_pdal(self.lowered.stages)
+        try:
+            _validate_with_pdal(self.lowered.stages)
+        except StageError as error:
+            raise self._located(error) from None
 
     def execute(self, *, arrays: bool = True) -> int:
         """Run the pipeline in this process; the number of points that came out.
@@ -78,7 +86,8 @@ class Pipeline:
         failure: StageError | None = None
         try:
             try:
-                result = pdal_env.execute(stages, arrays=arrays)
+                with removed_if_killed([*map(_pattern, (p for p, _ in renames)), *self._models()]):
+                    result = pdal_env.execute(stages, arrays=arrays)
             finally:
                 self.reports = []
                 for ours in self.lowered.ours:
@@ -87,12 +96,34 @@ class Pipeline:
                     self.reports.append((ours.place, reports))
             _rename(renames)
         except StageError as error:
-            raise failure or error from None
+            raise failure or self._located(error) from None
         finally:
             _discard(renames)
         self.metadata = _named_metadata(result.metadata, self.reports)
         self.arrays, self.log = result.arrays, result.log
         return result.count
+
+    def _models(self) -> list[str]:
+        """Where models are being written: what to remove if the process is killed meanwhile."""
+        names = (Path(o.options["filename"]) for o in self.lowered.ours if "filename" in o.options)
+        return [glob.escape(str(n.with_name(f".{n.name}.{os.getpid()}"))) + ".*" for n in names]
+
+    def _located(self, error: StageError) -> StageError:
+        """PDAL's words, with the line of the stage that they name and the nearest stage there is."""
+        if not isinstance(error, PipelineError) or error.where is not None:
+            return error
+        named = _STAGE_TYPE.search(str(error.found or ""))
+        if named is None:
+            return error
+        given = [s.get("type") if isinstance(s, dict) else None for s in self.source.stages]
+        if given.count(named.group()) == 1:
+            error.where = self.source.where(given.index(named.group()))
+        if error.cure is None and "Couldn't create" in str(error.found):
+            from . import describe
+
+            error.found = str(error.found).splitlines()[0]
+            error.cure = describe.nearest_stage(named.group())
+        return error
 
 
 def run_pipeline(source: str | Path | list | dict, overrides: Iterable[Override] = ()) -> Pipeline:
@@ -100,6 +131,9 @@ def run_pipeline(source: str | Path | list | dict, overrides: Iterable[Override]
     pipeline = Pipeline(source, overrides)
     pipeline.execute()
     return pipeline
+
+
+_STAGE_TYPE = re.compile(r"\b(?:readers|filters|writers)\.\w+")
 
 
 def _is_writer(stage: dict[str, Any], stages: list[dict[str, Any]]) -> bool:
@@ -131,35 +165,44 @@ def _partial_outputs(stages: list[dict[str, Any]]) -> tuple[list[dict[str, Any]]
     return out, renames
 
 
+def _pattern(partial: Path) -> str:
+    """What :func:`glob.glob` finds a writer's files by; one name with '#' stands for several."""
+    return glob.escape(str(partial)).replace("#", "*")
+
+
 def _expanded(partial: Path) -> list[Path]:
-    """Files a writer made; one name with '#' stands for several."""
+    """Files a writer made."""
     if "#" not in partial.name:
         return [partial] if partial.exists() else []
-    pattern = glob.escape(str(partial)).replace("#", "*")
-    return [
-        Path(p) for p in sorted(glob.glob(pattern, include_hidden=True) if _HIDDEN else glob.glob(pattern))
-    ]
-
-
-_HIDDEN = "include_hidden" in (glob.glob.__kwdefaults__ or {})
+    return [Path(name) for name in sorted(glob.glob(_pattern(partial)))]
 
 
 def _rename(renames: list[tuple[Path, Path]]) -> None:
+    """Give every file its final name, after all of them were found complete."""
+    moves: list[tuple[Path, Path]] = []
     for partial, final in renames:
         for path in _expanded(partial):
+            target = final
             if "#" in partial.name:
                 before, _, after = partial.name.partition("#")
                 number = path.name[len(before) : len(path.name) - len(after)]
                 target = final.with_name(final.name.replace("#", number, 1))
-            else:
-                target = final
+            check_complete(path, target)
+            moves.append((path, target))
+    for path, target in moves:
+        try:
             os.replace(path, target)
+        except OSError as error:
+            raise StageError(
+                "the output file could not be given its name", found=f"{target}: {error.strerror or error}"
+            ) from error
 
 
 def _discard(renames: list[tuple[Path, Path]]) -> None:
     for partial, _ in renames:
         for path in _expanded(partial):
-            path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
 
 
 def _validate_with_pdal(stages: list[dict[str, Any]]) -> None:

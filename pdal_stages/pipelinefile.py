@@ -50,23 +50,21 @@ def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
     if isinstance(source, Path) or (isinstance(source, str) and not _looks_like_json(source)):
         path = Path(source)
         try:
-            if path.stat().st_size > _LARGEST:
+            with open(path, "rb") as file:
+                data = file.read(_LARGEST + 1)
+            if len(data) > _LARGEST:
                 raise PipelineError(
                     "the pipeline file is too large to be one", where=str(path), found="over 64 MB"
                 )
-            text = path.read_bytes().decode("utf-8-sig")
+        except ValueError as error:  # a NUL, or half a surrogate pair
+            raise PipelineError(
+                "this cannot be the name of a pipeline file", found=f"{str(source)[:80]!r}: {error}"
+            ) from None
         except OSError as error:
             raise PipelineError(
-                "the pipeline file cannot be read", where=str(path), found=error.strerror or str(error)
+                "the pipeline file cannot be read", where=str(path)[:200], found=error.strerror or str(error)
             ) from None
-        except UnicodeDecodeError as error:
-            raise PipelineError(
-                "the pipeline file is not UTF-8 text",
-                where=str(path),
-                found=f"byte {error.start}",
-                cure="Save it as UTF-8",
-            ) from None
-        return parse_pipeline(text, str(path))
+        return parse_pipeline(decode(data, str(path)), str(path))
     if isinstance(source, str):
         return parse_pipeline(source)
     stages = source.get("pipeline") if isinstance(source, dict) else source
@@ -76,9 +74,23 @@ def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
     return PipelineSource(list(stages), [0] * len(stages))
 
 
+def decode(data: bytes, name: str) -> str:
+    """The text of a pipeline file, which is UTF-8, with or without a byte order mark."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        wide = data[:2] in (b"\xff\xfe", b"\xfe\xff")
+        raise PipelineError(
+            "the pipeline file is not UTF-8 text",
+            where=name,
+            found="UTF-16" if wide else f"byte {error.start} is 0x{data[error.start]:02x}",
+            cure="Save it as UTF-8",
+        ) from None
+
+
 def parse_pipeline(text: str, name: str = "") -> PipelineSource:
     """Parse pipeline JSON text; comments are allowed, as PDAL allows them."""
-    clean = _without_comments(text.removeprefix("\ufeff"))
+    clean = _without_comments(text.removeprefix("\ufeff"), name)
     if not clean.strip():
         raise PipelineError("the pipeline is empty", where=name or None)
     _check_depth(clean, name)
@@ -126,12 +138,53 @@ def _check(stages: list, lines: list[int], name: str) -> None:
                 where=PipelineSource(stages, lines, name).where(index),
                 found=json.dumps(stage, default=str)[:80],
             )
-        if isinstance(stage, dict) and not isinstance(stage.get("type", ""), str):
+        where = PipelineSource(stages, lines, name).where(index)
+        _check_texts(stage, where)
+        if not isinstance(stage, dict):
+            continue
+        for key, kinds, what in _SHAPES:
+            value = stage.get(key, "")
+            if not isinstance(value, kinds) or (
+                isinstance(value, list) and not all(isinstance(v, str) for v in value)
+            ):
+                raise PipelineError(
+                    f"a stage's '{key}' is {what}",
+                    where=where,
+                    found=json.dumps(value, default=str)[:80],
+                )
+
+
+#: What PDAL wants of the options that wire stages together.
+_SHAPES: tuple[tuple[str, tuple[type, ...], str], ...] = (
+    ("type", (str,), "text"),
+    ("tag", (str,), "text"),
+    ("inputs", (str, list), "a tag, or a list of tags"),
+)
+
+
+def _check_texts(value: Any, where: str, depth: int = 0) -> None:
+    """PDAL takes UTF-8 without NUL; JSON can write half a surrogate pair, and file names may be other bytes."""
+    if depth > _DEEPEST:
+        raise PipelineError(f"the pipeline is nested more than {_DEEPEST} levels deep", where=where)
+    if isinstance(value, str):
+        try:
+            good = "\0" not in value and bool(value.encode() or True)
+        except UnicodeEncodeError:
+            good = False
+        if not good:
             raise PipelineError(
-                "a stage's 'type' is text",
-                where=PipelineSource(stages, lines, name).where(index),
-                found=json.dumps(stage["type"], default=str)[:80],
+                "a text is not valid UTF-8, or holds a NUL character",
+                where=where,
+                found=ascii(value[:80]),
+                cure="If it is a file's name, rename the file",
             )
+    elif isinstance(value, dict):
+        for key, inner in value.items():
+            _check_texts(key, where, depth + 1)
+            _check_texts(inner, where, depth + 1)
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            _check_texts(inner, where, depth + 1)
 
 
 def _looks_like_json(text: str) -> bool:
@@ -139,22 +192,42 @@ def _looks_like_json(text: str) -> bool:
     return start[:1] in ("[", "{") or start in ("//", "/*")
 
 
-_STRING_OR_COMMENT = re.compile(r'"(?:[^"\\\n]|\\.)*"|//[^\n]*|/\*.*?\*/', re.DOTALL)
+# The closing quote is optional, so that a match never fails: searching stays linear whatever the text.
+_STRING = r'"[^"\\\n]*(?:\\.[^"\\\n]*)*"?'
+_STRING_OR_COMMENT = re.compile(rf"{_STRING}|//|/\*")
+_STRING_OR_BRACKET = re.compile(rf"{_STRING}|[\[{{]|[\]}}]")
 
 
-def _without_comments(text: str) -> str:
+def _without_comments(text: str, name: str = "") -> str:
     """Comments as spaces, so that places stay."""
-
-    def blank(match: re.Match) -> str:
-        word = match.group()
-        return word if word.startswith('"') else re.sub(r"[^\n]", " ", word)
-
-    return _STRING_OR_COMMENT.sub(blank, text)
+    if "/" not in text:
+        return text
+    parts, at = [], 0
+    while (match := _STRING_OR_COMMENT.search(text, at)) is not None:
+        start, end = match.span()
+        if match.group() == "//":
+            end = text.find("\n", start)
+            end = len(text) if end < 0 else end
+        elif match.group() == "/*":
+            end = text.find("*/", start + 2) + 2
+            if end < 2:
+                raise PipelineError(
+                    "a comment that begins with /* does not end",
+                    where=f"{name or 'pipeline'}, line {text.count(chr(10), 0, start) + 1}",
+                    cure="Close it with */",
+                )
+        else:
+            parts.append(text[at:end])
+            at = end
+            continue
+        parts += [text[at:start], re.sub(r"[^\n]", " ", text[start:end])]
+        at = end
+    return "".join([*parts, text[at:]])
 
 
 def _check_depth(text: str, name: str) -> None:
     depth = 0
-    for match in re.finditer(r'"(?:[^"\\\n]|\\.)*"|[\[{]|[\]}]', text):
+    for match in _STRING_OR_BRACKET.finditer(text):
         mark = match.group()
         if mark in "[{":
             depth += 1
