@@ -8,7 +8,7 @@ from pdal_stages.picture import top_view
 
 points = town(seed=2)
 west, east = halves(points)
-height = np.where(west, 0.0, 0.0)
+height = np.zeros(len(points.x))
 for half in (west, east):
     height[half] = ps.hag_minima(*points.xyz[half].T)
 options = ps.TrainingOptions(
