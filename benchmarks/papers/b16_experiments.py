@@ -31,6 +31,7 @@ NEIGHBORHOODS = {
 }
 SETS = ("measures", "distributions", "both")
 COUNT, TREES = 1000, 100
+EXPERIMENT = 1  # raised when runs mean something else than before, so that none is resumed
 
 
 def names_of(tokens: tuple[str, ...], feature_set: str) -> list[str]:
@@ -58,7 +59,12 @@ def experiment(
     own = [k for k, name in enumerate(names) if name == "Z"]
     low[own], high[own] = -np.inf, np.inf  # no neighborhood's feature
     forest = grow_forest(
-        np.clip(chosen, low, high), scene.train.labels[rows], trees=TREES, depth=None, seed=seed, threads=threads
+        np.clip(chosen, low, high),
+        scene.train.labels[rows],
+        trees=TREES,
+        depth=None,
+        seed=seed,
+        threads=threads,
     )
     found = predict(forest, _Columns(scene.test_values, columns), scene.classes, low, high)
     result = Accuracy.from_labels(scene.test.labels, found, classes=scene.classes)
@@ -124,7 +130,8 @@ def _findings(runs: list[dict[str, Any]]) -> str:
         return f"{np.mean(pairs):+.2f} ({won} of {len(pairs)})" if pairs else "–"
 
     rows = [
-        [f"both sets beat measures, {hood}", better((hood, "both"), (hood, "measures"))] for hood in NEIGHBORHOODS
+        [f"both sets beat measures, {hood}", better((hood, "both"), (hood, "measures"))]
+        for hood in NEIGHBORHOODS
     ]
     rows += [
         [f"both sets beat distributions, {hood}", better((hood, "both"), (hood, "distributions"))]
@@ -132,7 +139,10 @@ def _findings(runs: list[dict[str, Any]]) -> str:
     ]
     singles = ("c1", "c2", "c3", "c5")
     rows += [
-        [f"all cylinders beat {one}, {feature_set}", better(("all cylinders", feature_set), (one, feature_set))]
+        [
+            f"all cylinders beat {one}, {feature_set}",
+            better(("all cylinders", feature_set), (one, feature_set)),
+        ]
         for feature_set in SETS
         for one in singles
     ]
@@ -145,9 +155,7 @@ def _findings(runs: list[dict[str, Any]]) -> str:
     return "The paper's findings, tested\n\n" + table(head, rows)
 
 
-def run_scene(
-    scene: scenes.Scene, results: Results, seeds: int, threads: int | None
-) -> list[dict[str, Any]]:
+def run_scene(scene: scenes.Scene, results: Results, seeds: int, threads: int | None) -> list[dict[str, Any]]:
     runs = []
     for seed in range(seeds):
         for feature_set in SETS:
@@ -174,7 +182,12 @@ def main() -> None:
         )
         note(f"{name}: tables of {scene.train_values.shape} and {scene.test_values.shape}")
         path = None if args.cache is None else args.cache / "b16.jsonl"
-        runs += run_scene(scene, Results(path, scenes.context(scene)), args.seeds, args.threads)
+        runs += run_scene(
+            scene,
+            Results(path, {**scenes.context(scene), "experiment": EXPERIMENT}),
+            args.seeds,
+            args.threads,
+        )
     finish(args, runs, report(runs))
 
 

@@ -121,7 +121,9 @@ class Cache:
         if self.folder is None:
             return make()
         text = json.dumps({"code": code_fingerprint(), **key}, sort_keys=True)
-        path = self.folder / f"{key.get('what', 'array')}-{hashlib.sha256(text.encode()).hexdigest()[:24]}.npy"
+        path = (
+            self.folder / f"{key.get('what', 'array')}-{hashlib.sha256(text.encode()).hexdigest()[:24]}.npy"
+        )
         if not path.exists():
             value = make()
             beside = path.with_suffix(f".{os.getpid()}.tmp")
@@ -170,7 +172,9 @@ def features(
     return cache.array(key, make)
 
 
-def fitted_bins(cloud: Cloud, plan: FeaturePlan, cache: Cache, seed: int, threads: int | None) -> ShapeBins | None:
+def fitted_bins(
+    cloud: Cloud, plan: FeaturePlan, cache: Cache, seed: int, threads: int | None
+) -> ShapeBins | None:
     """Thresholds of the shape distributions, fitted to a training cloud [B16 3.2.2]."""
     if not plan.shapes:
         return None
@@ -222,7 +226,12 @@ def grow_forest(
     from sklearn.ensemble import RandomForestClassifier
 
     forest = RandomForestClassifier(
-        trees, max_depth=depth, min_samples_leaf=leaf, max_samples=bag, random_state=seed, n_jobs=threads or -1
+        trees,
+        max_depth=depth,
+        min_samples_leaf=leaf,
+        max_samples=bag,
+        random_state=seed,
+        n_jobs=threads or -1,
     )
     return forest.fit(values, labels)
 
@@ -326,8 +335,12 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    made.add_argument("--data", type=Path, default=os.environ.get("PDAL_STAGES_DATA"), help="folder of the clouds")
-    made.add_argument("--cache", type=Path, help="folder for features and finished runs: makes a run resumable")
+    made.add_argument(
+        "--data", type=Path, default=os.environ.get("PDAL_STAGES_DATA"), help="folder of the clouds"
+    )
+    made.add_argument(
+        "--cache", type=Path, help="folder for features and finished runs: makes a run resumable"
+    )
     made.add_argument("--seeds", type=int, default=5)
     made.add_argument("--threads", type=int)
     made.add_argument("--json", type=Path, help="results")

@@ -63,10 +63,18 @@ def load(
 
 def context(scene: Scene) -> dict:
     """What all runs on a scene depend on."""
-    return {"scene": scene.name, "data": fingerprint(scene.train.xyz, scene.test.xyz), "classes": list(scene.classes)}
+    return {
+        "scene": scene.name,
+        "data": fingerprint(scene.train.xyz, scene.test.xyz),
+        "classes": list(scene.classes),
+    }
 
 
 def add_options(options: argparse.ArgumentParser) -> None:
-    options.add_argument("--scene", nargs="+", default=list(SCENES), help="folders of DIR, with train* and test*")
-    options.add_argument("--classes", type=int, nargs="+", help="labels to train and score; default: the scene's")
+    options.add_argument(
+        "--scene", nargs="+", default=list(SCENES), help="folders of DIR, with train* and test*"
+    )
+    options.add_argument(
+        "--classes", type=int, nargs="+", help="labels to train and score; default: the scene's"
+    )
     options.add_argument("--columns", help="of .pts text; see pts_input.py")

@@ -25,6 +25,7 @@ from pdal_stages.classifier.growing import TreeOptions, grow
 from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.features.names import GROUPS
 
+EXPERIMENT = 1  # raised when runs mean something else than before, so that none is resumed
 #: Scene -> classes found by themselves, against all others.
 TARGETS = {"montpellier": (6, 5), "delft": (6,)}
 
@@ -124,7 +125,8 @@ def report(runs: list[dict[str, Any]]) -> str:
             some = choose(here, kind=what[0], count=what[1], target=None)
             cells = [spread(values(some, key)) for key in ("oa", "kappa", "mcr", "mcp", "mf1")]
             rows.append([what[0], f"{what[1]:,}", str(some[0]["features"]), str(len(some)), *cells])
-        head = ("Features", "Samples per class", "Number", "Seeds", "OA", "Kappa", "Mean recall", "Mean precision", "Mean F1")
+        scores = ("OA", "Kappa", "Mean recall", "Mean precision", "Mean F1")
+        head = ("Features", "Samples per class", "Number", "Seeds", *scores)
         text.append(table(head, rows))
         codes = list(choose(here, kind="all", target=None)[0]["f1"])
         rows = []
@@ -187,9 +189,9 @@ def run_scene(
             lambda s=seed, b=best: trainer.run(few, s, chosen=b),
             kind="best tenth", count=few, target=None, seed=seed,
         )  # fmt: skip
-        chance = np.random.default_rng(seed).choice(trainer.names, len(best), replace=False).tolist()
+        chance = sorted(np.random.default_rng(seed).choice(trainer.names, len(best), replace=False).tolist())
         get(
-            lambda s=seed, c=sorted(chance): trainer.run(few, s, chosen=c),
+            lambda s=seed, c=chance: trainer.run(few, s, chosen=c),
             kind="a tenth by chance", count=few, target=None, seed=seed,
         )  # fmt: skip
         for target in targets:
@@ -222,7 +224,9 @@ def main() -> None:
         note(f"{name}: tables of {scene.train_values.shape} and {scene.test_values.shape}")
         path = None if args.cache is None else args.cache / "w18.jsonl"
         targets = tuple(args.target) if args.target else TARGETS.get(name, ())
-        runs += run_scene(scene, Results(path, scenes.context(scene)), args, targets)
+        runs += run_scene(
+            scene, Results(path, {**scenes.context(scene), "experiment": EXPERIMENT}), args, targets
+        )
     finish(args, runs, report(runs))
 
 

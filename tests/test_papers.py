@@ -1,0 +1,284 @@
+"""benchmarks/papers: the tables, the cache, ``.pts`` input through PDAL, tiny experiments on the generated town."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+FOLDER = Path(__file__).resolve().parent.parent / "benchmarks" / "papers"
+if str(FOLDER) not in sys.path:
+    sys.path.insert(0, str(FOLDER))
+
+import b16_experiments  # noqa: E402
+import h17_oakland  # noqa: E402
+import kit  # noqa: E402
+import pts_input  # noqa: E402
+import scenes  # noqa: E402
+import tables  # noqa: E402
+import w18  # noqa: E402
+
+from pdal_stages.errors import StageError  # noqa: E402
+from pdal_stages.features import FeaturePlan, compute_features  # noqa: E402
+
+#: The town's ASPRS codes -> labels of the Vaihingen files that they stand in for.
+LABELS = {2: 2, 3: 1, 5: 8, 6: 5}
+
+
+@pytest.fixture(scope="module")
+def town():
+    from pdal_stages.synthetic import make_town
+
+    made = make_town(size=60, density=4, seed=3)
+    labels = np.full(len(made), 7)
+    for code, label in LABELS.items():
+        labels[made.classification == code] = label
+    dimensions = {
+        "Intensity": made.intensity.astype(float),
+        "ReturnNumber": made.return_number.astype(float),
+        "NumberOfReturns": made.number_of_returns.astype(float),
+    }
+    return kit.Cloud("town", made.xyz, labels, dimensions)
+
+
+@pytest.fixture(scope="module")
+def folder(town, tmp_path_factory):
+    """A scene of two ``.pts`` files, west and east."""
+    root = tmp_path_factory.mktemp("papers")
+    (root / "town").mkdir()
+    west = town.xyz[:, 0] < np.median(town.xyz[:, 0])
+    pts_input.write_pts(root / "town" / "train.pts", town.only(west))
+    pts_input.write_pts(root / "town" / "test.pts", town.only(~west))
+    return root
+
+
+# ---- tables ----------------------------------------------------------------------------------------------
+
+
+def test_table_is_markdown():
+    text = tables.table(("What", "OA"), [("ours", "96.1")])
+    assert text == "| What | OA |\n| --- | ---: |\n| ours | 96.1 |\n"
+    with pytest.raises(ValueError, match="1 cells under 2 heads"):
+        tables.table(("What", "OA"), [("ours",)])
+
+
+def test_spread_is_the_sample_deviation():
+    assert tables.spread([1.0, 3.0]) == "2.00 ± 1.41"
+    assert tables.spread([1.0]) == "1.00"
+    assert tables.spread([]) == "–"
+
+
+def test_choose_takes_absent_options_as_none():
+    runs = [{"a": 1, "b": 2}, {"a": 1}]
+    assert tables.choose(runs, a=1, b=None) == [{"a": 1}]
+
+
+# ---- cache and results -----------------------------------------------------------------------------------
+
+
+def test_cache_makes_once_and_again_for_other_keys(tmp_path):
+    made = []
+
+    def make():
+        made.append(1)
+        return np.arange(3.0)
+
+    cache = kit.Cache(tmp_path)
+    for key in ({"what": "x", "a": 1}, {"what": "x", "a": 1}, {"what": "x", "a": 2}):
+        assert cache.array(key, make).tolist() == [0, 1, 2]
+    assert len(made) == 2
+    assert not list(tmp_path.glob("*.tmp"))
+
+
+def test_cached_features_are_those_computed_and_depend_on_the_cloud(town, tmp_path):
+    cache, plan = kit.Cache(tmp_path), FeaturePlan.parse("c2", "covariance")
+    first = kit.features(town, plan, cache)
+    expected = compute_features(town.xyz, neighborhoods="c2", feature_set="covariance").values
+    np.testing.assert_array_equal(first, expected)
+    moved = kit.Cloud("town", town.xyz * [1, 1, 2], town.labels)
+    assert not np.array_equal(kit.features(moved, plan, cache), expected)
+    assert len(list(tmp_path.glob("*.npy"))) == 2
+
+
+def test_results_resume_and_forget_other_contexts(tmp_path):
+    path, done = tmp_path / "r.jsonl", []
+
+    def make():
+        done.append(1)
+        return {"oa": 50.0}
+
+    kit.Results(path, {"data": "a"}).get({"seed": 1}, make)
+    with open(path, "a") as file:
+        file.write('{"context": {"da')  # an interrupted line
+    again = kit.Results(path, {"data": "a"})
+    assert again.get({"seed": 1}, make)["oa"] == 50.0
+    assert len(done) == 1
+    kit.Results(path, {"data": "b"}).get({"seed": 1}, make)
+    assert len(done) == 2
+
+
+def test_draw_balances_and_repeats_small_classes():
+    labels = np.array([1] * 100 + [2] * 3)
+    rows = kit.draw(labels, (1, 2), 10, 0)
+    assert np.bincount(labels[rows]).tolist() == [0, 10, 10]
+    assert len(set(rows[:10])) == 10
+    assert np.bincount(rows[10:])[100:].max() == 4
+
+
+# ---- .pts ------------------------------------------------------------------------------------------------
+
+
+def test_pts_round_trip(folder, town):
+    back = pts_input.read_pts(sorted((folder / "town").glob("*.pts")), "town")
+    assert len(back) == len(town)
+    assert sorted(back.labels) == sorted(town.labels)
+    assert set(back.dimensions) == {"Intensity", "ReturnNumber", "NumberOfReturns"}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1 2 3 4\n", "has 4 columns, not 7"),
+        ("1 2 3 4 x 6 7\n", "no table|not a table"),
+        ("1 2 3 4 5 6 0.5\n", "whole"),
+    ],
+)
+def test_pts_that_is_none(tmp_path, text, message):
+    path = tmp_path / "bad.pts"
+    path.write_text(text)
+    with pytest.raises(StageError, match=message):
+        pts_input.read_pts([path], "bad")
+
+
+@pytest.mark.pdal
+def test_pts_through_pdal(folder, tmp_path, monkeypatch):
+    """The commands of docs/papers.md for clouds that cannot be had, on a stand-in with the same format."""
+    from pdal_stages.overrides import parse_overrides
+    from pdal_stages.pipeline import Pipeline
+
+    monkeypatch.chdir(tmp_path)
+
+    def run(name, *words):
+        overrides, rest = parse_overrides(words)
+        assert not rest
+        Pipeline(FOLDER / f"{name}.json", overrides).execute()
+
+    quick = ["--stage.model.neighborhoods=c2,s2", "--stage.model.count=200", "--stage.model.trees=10"]
+    # A class that is not there is an error, so the stand-in names those it has.
+    classes = json.loads((FOLDER / "vaihingen-train.json").read_text())[-1]["classes"]
+    there = {str(label): classes[str(label)] for label in (1, 2, 5, 7, 8)}
+    run(
+        "vaihingen-train",
+        f"--stage.input.filename={folder / 'town' / 'train.pts'}",
+        f"--stage.model.classes={json.dumps(there)}",
+        *quick,
+    )
+    run("vaihingen-evaluate", f"--stage.input.filename={folder / 'town' / 'test.pts'}")
+    report = json.loads((tmp_path / "vaihingen-accuracy.json").read_text())
+    assert {one["code"] for one in report["classes"]} == {3, 4, 5, 6, 11}
+    test = pts_input.read_pts([folder / "town" / "test.pts"], "test")
+    matrix = np.array(report["confusion"]["counts"])
+    assert matrix.sum() == len(test)
+    assert np.trace(matrix) / matrix.sum() > 0.7
+
+
+# ---- experiments -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scene(folder, tmp_path_factory):
+    cache = kit.Cache(tmp_path_factory.mktemp("cache"))
+    return scenes.load(folder, "town", cache, classes=(1, 2, 5, 8), neighborhoods="c1,c2,c3,c5,kopt")
+
+
+def test_b16_names():
+    count = {
+        (hood, one): len(b16_experiments.names_of(tokens, one))
+        for hood, tokens in b16_experiments.NEIGHBORHOODS.items()
+        for one in b16_experiments.SETS
+    }
+    assert count["c1", "measures"] == 13  # 12 and Z
+    assert count["c1", "distributions"] == 50
+    assert count["kopt", "both"] == 64
+    assert count["all", "both"] == 312  # 311 and Z
+
+
+def test_b16_experiment(scene, monkeypatch):
+    monkeypatch.setattr(b16_experiments, "COUNT", 100)
+    monkeypatch.setattr(b16_experiments, "TREES", 10)
+    results = kit.Results(None, {})
+    runs = []
+    for feature_set in b16_experiments.SETS:
+        run = {"scene": "town", "neighborhood": "c3", "set": feature_set, "seed": 0}
+        made = results.get(run, lambda f=feature_set: b16_experiments.experiment(scene, "c3", f, 0, 1))
+        runs.append({**run, **made})
+    assert runs[0]["oa"] > 60
+    assert runs[1]["oa"] > 40  # distributions alone
+    assert runs[2]["oa"] > 60
+    assert np.array(runs[0]["matrix"]).sum() == len(scene.test)
+    text = b16_experiments.report(runs)
+    assert f"{runs[0]['kappa']:.2f}" in text
+    assert "both sets beat measures, c3" in text
+
+
+def test_w18_run(scene):
+    trainer = w18.Trainer(scene, trees=10, threads=1)
+    full = trainer.run(100, 0)
+    best = w18.best_tenth(full)
+    assert len(best) == round(full["features"] / 10)
+    assert sum(full["importance"].values()) == pytest.approx(1, abs=1e-3)
+    runs = [
+        {"scene": "town", "kind": "all", "count": 100, "target": None, "seed": 0, **full},
+        {
+            "scene": "town", "kind": "best tenth", "count": 100, "target": None, "seed": 0,
+            **trainer.run(100, 0, chosen=best),
+        },
+        {"scene": "town", "kind": "all", "count": 100, "target": 5, "seed": 0, **trainer.run(100, 0, target=5)},
+    ]  # fmt: skip
+    assert runs[2]["classes"] == [0, 5]
+    assert runs[1]["oa"] > 60
+    text = w18.report(runs)
+    assert "best tenth" in text
+    assert "HeightAboveGround" in text
+
+
+def test_w18_groups():
+    assert w18.group("D1_0_c2") == "D1"
+    assert w18.group("Linearity_kopt") == "covariance"
+    assert w18.group("HeightStd_s5") == "geometric"
+    assert w18.group("HeightAboveGround") == w18.neighborhood("HeightAboveGround") == "HeightAboveGround"
+    assert w18.neighborhood("D1_0_c2") == "c2"
+
+
+def test_h17_thresholds_are_a_choice_between_two_tables(town):
+    """What the command takes together from two tables is what the engine computes at that threshold."""
+    cloud = kit.with_height(kit.Cloud("town", town.xyz, town.labels))
+    part = h17_oakland.compute([cloud], kit.Cache(None), 1)
+    words = (*h17_oakland.SIX, "Radius")
+    direct = compute_features(town.xyz, neighborhoods="copt", feature_set=words, copt_threshold=0.05)
+    np.testing.assert_array_equal(part.adaptive(0.05), np.column_stack([direct[f"{w}_copt"] for w in words]))
+    assert 0.05 < (part.curvature >= 0.05).mean() < 0.95
+    shares = h17_oakland.shares(part, 0.0)
+    assert all(one["points"] == one["scattered"] for one in shares.values())
+
+
+def test_h17_score_and_report(town, monkeypatch):
+    monkeypatch.setattr(h17_oakland, "COUNT", 50)
+    monkeypatch.setattr(h17_oakland, "TREES", 5)
+    monkeypatch.setattr(h17_oakland, "CURVE", (0.03,))
+    codes = np.array(list(h17_oakland.CLASSES))
+    labels = codes[np.searchsorted([1, 2, 5, 7, 8], town.labels) % 5]
+    cloud = kit.with_height(kit.Cloud("town", town.xyz, labels))
+    part = h17_oakland.compute([cloud], kit.Cache(None), 1)
+    runs = []
+    for name in h17_oakland.TOKENS:
+        for height in h17_oakland.HEIGHTS:
+            run = {"name": name, "seed": 0, "depth": None, "height": height, "threshold": 0.03}
+            runs.append({**run, **h17_oakland.score(part, part, threads=1, **run)})
+    assert np.sum(runs[0]["clouds"], axis=0).tolist() == runs[0]["matrix"]
+    shares = {at: h17_oakland.shares(part, 0.03) for at in ("train", "0.03")}
+    text = h17_oakland.report(runs, {"train": 0.03, "test": 0.03, "shares": shares})
+    assert f"{runs[0]['mcp']:.2f}" in text
