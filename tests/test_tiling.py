@@ -187,7 +187,7 @@ def test_input_files_that_do_not_match_the_tiles(tmp_path, town_file, model_file
         assert made.header.point_format.id == given_.header.point_format.id
         for name in ("classification", "HeightAboveGround", "Reliability", "gps_time", "intensity"):
             assert np.array_equal(made[name], expected[names.get(name, name)]), (number, name)
-    run = run_tiled(pipeline[:-1] + [{**pipeline[-1], "filename": str(tmp_path / "t_#.laz")}], 30, workers=0, per="tile")
+    run = run_tiled([*pipeline[:-1], {**pipeline[-1], "filename": str(tmp_path / "t_#.laz")}], 30, workers=0, per="tile")
     assert not run.failures
     got = np.concatenate([_table(path) for path in sorted(tmp_path.glob("t_*.laz"))])
     parts = np.concatenate([_table(tmp_path / f"c_part{n}.laz") for n in range(3)])
@@ -212,7 +212,12 @@ def test_feature_stage_and_pdal_filters(tmp_path, town_file):
         str(town_file),
         {"type": "filters.ferry", "dimensions": "Classification=>Reference"},
         {"type": "filters.range", "limits": "Intensity[10:]"},
-        {"type": "filters.multiscalefeatures", "neighborhoods": "c1,k10", "feature_set": "Linearity,Density", "where": "Z > 62"},
+        {
+            "type": "filters.multiscalefeatures",
+            "neighborhoods": "c1,k10",
+            "feature_set": "Linearity,Density",
+            "where": "Z > 62",
+        },
         {"type": "filters.assign", "assignment": "UserData[:]=7"},
         {"type": "writers.las", "filename": str(tmp_path / "a.las"), "forward": "all", "extra_dims": "all"},
     ]

@@ -90,7 +90,7 @@ def runs(boxes: list[Box], box: Box) -> list[tuple[int, int]]:
     """Blocks (first, one after the last) that may hold points of a box."""
     out: list[tuple[int, int]] = []
     for number, one in enumerate(boxes):
-        if touch(tuple(one), box):
+        if touch(one, box):
             if out and out[-1][1] == number:
                 out[-1] = (out[-1][0], number + 1)
             else:

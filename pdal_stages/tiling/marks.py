@@ -201,7 +201,6 @@ def inject(module: dict[str, Any], ins: Mapping[str, NDArray], outs: dict[str, N
     count = len(ins["X"])
     if count != len(keep):
         raise RuntimeError(f"the reader gave {count} points of {len(keep)}")
-    every = bool(keep.all())
     for name, (rows, given) in values.items():
         if rows is None:
             outs[name] = np.ascontiguousarray(given, ins[name].dtype)

@@ -49,6 +49,7 @@ class TilingOptions:
     most_points: int = 20_000_000
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "tile", float(self.tile))  # 20 and 20.0 are one run
         if not (math.isfinite(self.tile) and self.tile > 0):
             raise OptionError("--tile must be a positive length", found=self.tile)
         if self.workers is not None and self.workers < 0:

@@ -118,9 +118,8 @@ def make_plan(source: Any, overrides: Iterable[Override], options: TilingOptions
     ]
     creates: list[str] | None = None
     if not foreign:
-        creates = sorted(
-            {n for k, v in zip(kinds, parsed, strict=True) if k is not None for n in k.creates(v)}
-        )
+        made = ((k, v) for k, v in zip(kinds, parsed, strict=True) if k is not None and v is not None)
+        creates = sorted({name for kind, values in made for name in kind.creates(values)})
     notes = []
     if any(k is None and t not in PER_POINT for k, t in zip(kinds, (s["type"] for s in head), strict=True)):
         notes.append(
@@ -155,7 +154,9 @@ def _driver(name: str, kind: str) -> str:
     )
 
 
-def _sections(stages, where):
+def _sections(
+    stages: list[dict[str, Any]], where: list[str]
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]], list[dict[str, Any]]]:
     kinds = [str(s["type"]).partition(".")[0] for s in stages]
     order = {"readers": 0, "filters": 1, "writers": 2}
     ranks = [

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from ..errors import StageError, optional_import
+from .interrupts import gentle
 from .options import TilingOptions
 from .work import perform
 
@@ -33,9 +34,12 @@ class Here:
         self, tasks: Callable[[], tuple[Any, str] | None], busy: Callable[[], bool]
     ) -> Iterator[tuple[Any, Any]]:
         """Yield (key, answer) for every task; see :meth:`OnDask.run`."""
-        while (task := tasks()) is not None:
-            key, text = task
-            yield key, perform(text)
+        with gentle() as interrupts:
+            while (task := tasks()) is not None:
+                key, text = task
+                answer = perform(text)
+                interrupts.check()
+                yield key, answer
 
 
 class OnDask:
@@ -56,7 +60,7 @@ class OnDask:
         try:
             if o.scheduler:
                 self._client = self._stack.enter_context(
-                    distributed.Client(o.scheduler, timeout=30, set_as_default=False)
+                    distributed.Client(o.scheduler, timeout=10, set_as_default=False)
                 )
                 with contextlib.suppress(TimeoutError, AttributeError):
                     self._client.wait_for_workers(1, timeout=_WAIT)

@@ -315,7 +315,7 @@ class _Run:
         return self._result(jobs, outputs, pool)
 
     def _index_all(self, store: Store, pool: Here | OnDask) -> None:
-        waiting = deque()
+        waiting: deque[tuple[Source, str]] = deque()
         for source in self.sources:
             if source.kind != "las" or source.path not in self.headers:
                 continue
@@ -581,7 +581,8 @@ class _Run:
                 + ", ".join(short[:5])
             )
         points = sum(job.report.get("points", 0) for job in worked)
-        peaks = [item.report.get("peak_mb", 0.0) for item in [*worked, *outputs]]
+        reports = [job.report for job in worked] + [out.report for out in outputs]
+        peaks = [report.get("peak_mb", 0.0) for report in reports]
         summary = {
             "tile": self.grid.size,
             "buffer_metres": self.halo,
@@ -605,7 +606,7 @@ class _Run:
     def _dry(self) -> TiledRun:
         """Tiles and points as the headers tell."""
         self._all_paths()
-        jobs = {}
+        jobs: dict[tuple[int, int], Job] = {}
         for source in self.sources:
             header = self.headers.get(source.path)
             if header is None or not header.count:

@@ -90,6 +90,7 @@ def _settle(task: dict[str, Any], folder: str) -> tuple[Results, list[str], list
     grid, tile, unit = Grid(task["size"]), tuple(task["tile"]), task["unit"]
     buffer = task["buffer"]
     short = False
+    result: Results | None = None
     for attempt in range(_WIDENINGS + 1):
         keys, pieces, sources = _cut_all(task, grid, tile, buffer / unit, folder)
         read = sum(len(p.index) for p in pieces)
@@ -109,14 +110,14 @@ def _settle(task: dict[str, Any], folder: str) -> tuple[Results, list[str], list
                 )
             break
         buffer, short = float(need) + 1e-6, False
-    report = {
+    report: dict[str, Any] = {
         "points": own,
         "read": read,
         "buffer": buffer,
         "short": short,
         "widened": buffer > task["buffer"],
     }
-    if not own:
+    if not own or result is None:
         result = Results([np.empty(0, np.int64) for _ in pieces], {}, [0 for _ in pieces])
     report["dropped"] = own - sum(len(r) for r in result.rows)
     return result, keys, pieces, report
@@ -297,7 +298,7 @@ def _save(path: Path, results: Results, keys: list[str], pieces: list[Piece]) ->
     partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.npz")
     try:
         with open(partial, "wb") as file:
-            np.savez(file, **content)
+            np.savez(file, **content)  # type: ignore[arg-type]
             file.flush()
             os.fsync(file.fileno())
         os.replace(partial, path)

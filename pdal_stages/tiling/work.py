@@ -34,6 +34,8 @@ def perform(task: str) -> str:
         try:
             result = _kinds()[given["kind"]](given)
         except StageError as error:
+            if error.what == "interrupted":  # what a stage makes of Ctrl-C within PDAL
+                raise KeyboardInterrupt from None
             result = {"error": {"reason": str(error), "again": _again(error)}}
         except MemoryError:
             result = {

@@ -1,0 +1,313 @@
+"""What a tiled run does when workers, disks, inputs and people fail it."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+import tiling_clouds as clouds
+
+from pdal_stages.errors import OptionError, StageError
+from pdal_stages.parallel import available_threads
+from pdal_stages.tiling import run_tiled
+from pdal_stages.tiling.assemble import check_whole
+from pdal_stages.tiling.store import Store
+
+pytestmark = pytest.mark.pdal
+WORKERS = min(2, available_threads())
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, write_las):
+    """Two neighboring files of 40 m by 40 m."""
+    rng = np.random.default_rng(4)
+    folder = tmp_path_factory.mktemp("faults")
+    for name, x0 in (("east", 40.0), ("west", 0.0)):
+        xyz = np.round(rng.uniform(0, 1, (6_000, 3)) * (39.99, 40, 5) + (x0, 0, 0), 3)
+        write_las(folder / f"{name}.laz", dict(zip("XYZ", xyz.T, strict=True)), point_format=6)
+    return folder
+
+
+def python_filter(body: str) -> dict:
+    """A filter that runs some lines on each tile: the user's own, so it can do anything."""
+    lines = "".join(f"    {line}\n" for line in body.splitlines())
+    source = f"import os, signal, time\ndef f(ins, outs):\n{lines}    return True\n"
+    return {"type": "filters.python", "module": "own", "function": "f", "source": source}
+
+
+def pipeline(folder: Path, output: Path, *own: dict) -> list:
+    return [
+        {"type": "readers.las", "filename": str(folder / "*.laz")},
+        {"type": "filters.hag_minima", "cell": 2},
+        *own,
+        {"type": "writers.las", "filename": str(output), "forward": "all", "extra_dims": "all"},
+    ]
+
+
+def command(job: Path, stages: list, *flags: str, tile: int = 20, **popen) -> subprocess.Popen:
+    job.write_text(json.dumps(stages))
+    words = [sys.executable, "-m", "pdal_stages.cli", "pipeline", str(job), "--tile", str(tile), "--buffer", "0", *flags]
+    return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **popen)
+
+
+@pytest.fixture(scope="module")
+def expected(folder, tmp_path_factory):
+    """What an undisturbed run writes."""
+    out = tmp_path_factory.mktemp("expected")
+    assert not run_tiled(pipeline(folder, out / "o_#.laz"), 20, workers=0).failures
+    return {name: (out / f"o_{name}.laz").read_bytes() for name in ("east", "west")}
+
+
+def check_same(folder: Path, expected: dict[str, bytes]) -> None:
+    for name, content in expected.items():
+        assert (folder / f"o_{name}.laz").read_bytes() == content
+    assert not clouds.hidden(folder)
+
+
+# ---- workers ---------------------------------------------------------------------------------------------
+
+
+def test_killed_workers(tmp_path, folder):
+    """One tile kills its worker once and is done again; one always does, is given up and listed."""
+    pytest.importorskip("distributed")
+    flag = tmp_path / "killed"
+    kill = f"""first = ins['X'].max() < 20 and not os.path.exists({str(flag)!r})
+if first:
+    open({str(flag)!r}, 'w').close()
+if first or (ins['X'].max() > 75 and ins['Y'].max() < 35):
+    os.kill(os.getpid(), signal.SIGKILL)"""
+    run = command(
+        tmp_path / "job.json",
+        pipeline(folder, tmp_path / "o_#.laz", python_filter(kill)),
+        *("--workers", str(WORKERS), "--retries", "1", "--per", "tile", "--report", str(tmp_path / "r.json")),
+        tile=10,
+    )
+    _, err = run.communicate(timeout=300)
+    assert run.returncode == 1
+    assert "tile 70_0: it killed its worker" in err and "--resume" in err
+    report = json.loads((tmp_path / "r.json").read_text())
+    failed = {tile["name"] for tile in report["tiles"] if tile["state"] == "failed"}
+    assert "70_0" in failed and "0_0" not in failed and flag.exists()
+    assert len(list(tmp_path.glob("o_*.laz"))) == 32 - len(failed) and not clouds.hidden(tmp_path)
+
+
+def test_failing_tiles_are_tried_again_a_bounded_number_of_times(tmp_path, folder):
+    count = tmp_path / "count"
+    body = "if ins['X'].min() < 1 and ins['Y'].min() < 1:\n"
+    body += f"    open({str(count)!r}, 'a').write('x')\n    raise ValueError('odd')"
+    run = run_tiled(pipeline(folder, tmp_path / "o_#.laz", python_filter(body)), 20, workers=0, retries=3, buffer=0.0)
+    assert len(count.read_text()) == 4
+    assert [what for what, _ in run.failures] == ["tile 0_0", str(tmp_path / "o_west.laz")]
+    assert "odd" in run.failures[0][1] and "tile 0_0 failed" in run.failures[1][1]
+    assert (tmp_path / "o_east.laz").exists() and not (tmp_path / "o_west.laz").exists()
+    assert not clouds.hidden(tmp_path)
+
+
+def test_a_failure_of_every_tile_stops_the_run(tmp_path, folder):
+    with pytest.raises(StageError, match="all failed for one reason"):
+        fails = python_filter("raise ValueError('no')")
+        run_tiled(pipeline(folder, tmp_path / "o_#.laz", fails), 10, workers=0, retries=0, buffer=0.0)
+
+
+# ---- disks -----------------------------------------------------------------------------------------------
+
+
+def test_full_disk_leaves_nothing_half_written(tmp_path, folder, expected):
+    """A limit on the size of files stands for a full disk: writes fail in the middle."""
+
+    def limit():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))
+
+    stages = pipeline(folder, tmp_path / "o_#.laz")
+    run = command(tmp_path / "job.json", stages, "--workers", "0", "--retries", "0", preexec_fn=limit)
+    _, err = run.communicate(timeout=300)
+    assert run.returncode == 1, err
+    assert not list(tmp_path.glob("o_*")) and not clouds.hidden(tmp_path)
+    run = command(tmp_path / "job.json", stages, "--workers", "0", "--resume")
+    assert run.wait(300) == 0
+    check_same(tmp_path, expected)
+
+
+def test_full_file_system(tmp_path, folder, expected):
+    small = tmp_path / "small"
+    small.mkdir()
+    made = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(small)], capture_output=True, check=False)
+    if made.returncode:
+        pytest.skip("mounting a small file system needs root")
+    try:
+        run = run_tiled(pipeline(folder, small / "o_#.laz"), 20, workers=0, retries=1)
+        assert run.failures and all(reason for _, reason in run.failures)
+        whole = [n for n in expected if (small / f"o_{n}.laz").exists()]
+        assert len(whole) < 2 and not clouds.hidden(small)
+        for name in whole:
+            assert (small / f"o_{name}.laz").read_bytes() == expected[name]
+        subprocess.run(["mount", "-o", "remount,size=40m", str(small)], check=True)
+        assert not run_tiled(pipeline(folder, small / "o_#.laz"), 20, workers=0, resume=True).failures
+        check_same(small, expected)
+    finally:
+        subprocess.run(["umount", str(small)], check=True)
+
+
+def test_outputs_are_checked_before_they_get_their_name(tmp_path, folder):
+    source = folder / "east.laz"
+    whole = tmp_path / "whole.las"
+    laspy.read(source).write(whole)
+    count = len(laspy.read(whole))
+    check_whole(whole, whole, count)
+    with pytest.raises(StageError, match="not whole"):
+        check_whole(whole, whole, count + 1)
+    for path in (whole, tmp_path / "whole.laz"):
+        laspy.read(source).write(path)
+        content = path.read_bytes()
+        path.write_bytes(content[: len(content) - 2_000])
+        with pytest.raises(StageError, match="not whole"):
+            check_whole(path, path, count)
+
+
+# ---- inputs ----------------------------------------------------------------------------------------------
+
+
+def test_unreadable_input(tmp_path, folder, expected):
+    """Its neighbors' seam tiles fail, all others are done; once repaired, --resume runs only what is missing."""
+    inputs = tmp_path / "in"
+    inputs.mkdir()
+    for name in ("east", "west"):
+        (inputs / f"{name}.laz").write_bytes((folder / f"{name}.laz").read_bytes())
+    good = (inputs / "east.laz").read_bytes()
+    (inputs / "east.laz").write_bytes(good[: len(good) // 2])
+    stages = pipeline(inputs, tmp_path / "o_#.laz")
+    run = run_tiled(stages, 20, workers=0, retries=1)
+    assert any("east.laz" in what and "damaged" in why for what, why in run.failures)
+    # West of x = 20 no tile sees the broken file; beside it, neighbors would be missing.
+    states = {job.name: job.state for job in run.tiles}
+    assert states["0_0"] == states["0_20"] == "done" and states["20_0"] == "failed"
+    assert not list(tmp_path.glob("o_*")) and not clouds.hidden(tmp_path)
+    (inputs / "east.laz").write_bytes(good)
+    run = run_tiled(stages, 20, workers=0, resume=True)
+    assert not run.failures and run.summary["states"] == {"done": 6, "kept": 2, "failed": 0}
+    check_same(tmp_path, expected)
+    (inputs / "east.laz").write_bytes(b"gone")
+    run = run_tiled(stages, 20, workers=0)
+    assert any("not a LAS" in why for _, why in run.failures) and run.notes
+    (inputs / "west.laz").write_bytes(b"gone")
+    with pytest.raises(StageError, match="none of the inputs"):
+        run_tiled(stages, 20, workers=0)
+
+
+def test_resume_does_only_what_changed(tmp_path, folder, expected):
+    stages = pipeline(folder, tmp_path / "o_#.laz")
+    run_tiled(stages, 20, workers=0)
+    again = run_tiled(stages, 20, workers=0, resume=True)
+    assert again.summary["states"] == {"done": 0, "kept": 8, "failed": 0}
+    assert {o.state for o in again.outputs} == {"kept"}
+    (tmp_path / "o_west.laz").unlink()
+    again = run_tiled(stages, 20, workers=0, resume=True)
+    assert {o.source.stem: o.state for o in again.outputs} == {"west": "done", "east": "kept"}
+    check_same(tmp_path, expected)
+    stages[1]["cell"] = 3  # another pipeline: nothing of the old one counts
+    again = run_tiled(stages, 20, workers=0, resume=True)
+    assert again.summary["states"]["done"] == 8
+    assert (tmp_path / "o_west.laz").read_bytes() != expected["west"]
+
+
+# ---- people ----------------------------------------------------------------------------------------------
+
+
+def stop_in_the_middle(tmp_path: Path, stages: list, workers: int, number: int, *flags: str) -> str:
+    """Start a run, send a signal when some tiles are done; what it wrote on standard error."""
+    flags = ("--workers", str(workers), *flags)
+    done = tmp_path / ".pdal-stages" / "tiles"
+    before = len(list(done.glob("*.json")))
+    run = command(tmp_path / "job.json", stages, *flags, start_new_session=True)
+    until = time.monotonic() + 200
+    while len(list(done.glob("*.json"))) < before + 2:
+        assert run.poll() is None and time.monotonic() < until, run.communicate()
+        time.sleep(0.02)
+    os.killpg(run.pid, number) if number == signal.SIGINT else run.send_signal(number)  # as a terminal does
+    _, err = run.communicate(timeout=60)
+    assert run.returncode == (-9 if number == signal.SIGKILL else 130), err
+    assert not list(tmp_path.glob("o_*"))
+    if number != signal.SIGKILL:
+        assert "interrupted" in err and not clouds.hidden(tmp_path)
+        assert not _alive(run.pid)
+    return err
+
+
+def test_ctrl_c_stops_the_workers_too(tmp_path, folder, expected):
+    pytest.importorskip("distributed")
+    stages = pipeline(folder, tmp_path / "o_#.laz", python_filter("time.sleep(0.5)"))
+    stop_in_the_middle(tmp_path, stages, WORKERS, signal.SIGINT)
+    run = run_tiled(stages, 20, workers=0, resume=True, buffer=0.0)
+    assert not run.failures and run.summary["states"]["kept"] >= 2
+    check_same(tmp_path, expected)
+
+
+def test_killed_then_terminated_then_finished(tmp_path, folder, expected):
+    stages = pipeline(folder, tmp_path / "o_#.laz", python_filter("time.sleep(0.5)"))
+    stop_in_the_middle(tmp_path, stages, 0, signal.SIGKILL)
+    stop_in_the_middle(tmp_path, stages, 0, signal.SIGTERM, "--resume")
+    run = run_tiled(stages, 20, workers=0, resume=True, buffer=0.0)
+    assert not run.failures and run.summary["states"]["kept"] >= 4
+    check_same(tmp_path, expected)
+
+
+def _alive(group: int) -> bool:
+    """Whether any process of a group still lives, after a moment's grace."""
+    for _ in range(50):
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return False
+        time.sleep(0.1)
+    return True
+
+
+def test_two_runs_into_one_folder(tmp_path, folder):
+    stages = pipeline(folder, tmp_path / "o_#.laz")
+    with Store(tmp_path):
+        with pytest.raises(StageError, match="another run") as caught:
+            run_tiled(stages, 20, workers=0)
+        assert str(os.getpid()) in str(caught.value)
+    assert not run_tiled(stages, 20, workers=0).failures
+
+
+def test_the_command_says_what_is_missing(tmp_path, folder):
+    run = command(tmp_path / "job.json", pipeline(folder, tmp_path / "none" / "o_#.laz"))
+    _, err = run.communicate(timeout=100)
+    assert run.returncode == 1 and "folder" in err
+    from pdal_stages.cli import main
+
+    assert main(["pipeline", str(tmp_path / "job.json"), "--resume"]) == 1
+    with pytest.raises(OptionError, match="needs --tile"):
+        main(["--debug", "pipeline", str(tmp_path / "job.json"), "--dry-run"])
+
+
+def test_an_unreachable_scheduler(tmp_path, folder):
+    pytest.importorskip("distributed")
+    import socket
+
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with pytest.raises(StageError, match="cannot be reached"):
+        run_tiled(pipeline(folder, tmp_path / "o_#.laz"), 20, scheduler=f"tcp://127.0.0.1:{port}")
+
+
+def test_a_scheduler_that_runs_already(tmp_path, folder, expected):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=WORKERS, threads_per_worker=1, dashboard_address=None) as cluster:
+        run = run_tiled(pipeline(folder, tmp_path / "o_#.laz"), 20, scheduler=cluster.scheduler_address)
+    assert not run.failures and run.summary["workers"] == WORKERS
+    check_same(tmp_path, expected)
+
+
