@@ -37,6 +37,7 @@ def random_net(inputs=("Z",), classes=3, configuration=TINY, spacing=3.0, seed=0
     for name, array in weights.items():
         if name != "scores":
             array[:, -4:] = random.uniform(0.5, 1.5, (len(array), 4))
+    weights["scores"] *= np.float32(0.1)  # so that probabilities are neither 0 nor 1
     return AlsNet(
         weights, configuration, tuple(inputs), (0.0,) * len(inputs), (1.0,) * len(inputs), spacing, classes
     )

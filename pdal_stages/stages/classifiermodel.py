@@ -21,11 +21,24 @@ _OWN = {"filename", "label", "where", "threads", "memory", "horizontal_unit", "v
 class ClassifierModel(Stage):
     type = "writers.classifiermodel"
     summary = "Train a classifier on the labelled points that reach it, and write one model file"
-    source = "[B16] sections 3.3-4.2, [W18] section 4.3"
+    source = "[B16] sections 3.3-4.2, [W18] section 4.3, [WM19] for alsnet"
     where_help = "Samples are drawn from the points inside; all points are neighbors."
     options = (
         Option("filename", "filename", None, "The model file to write", required=True),
         Option("label", "string", "Classification", "Dimension that holds the labels"),
+        Option(
+            "algorithm",
+            "string",
+            "random_forest",
+            "A forest on computed features, or a network on the points themselves (needs PyTorch)",
+            choices=("random_forest", "alsnet"),
+        ),
+        Option(
+            "alsnet",
+            "mapping",
+            None,
+            'Options of the network: {"configuration": "small", "epochs": 60, ...}; see the page on alsNet',
+        ),
         Option(
             "neighborhoods",
             "list",
@@ -92,7 +105,9 @@ Samples `count` points of each class, spread over space; computes features for t
 percentiles and histogram thresholds; grows a Random Forest; writes [one model file](../model-file.md). A class with
 fewer points has them several times, and the counts are in the file. Lists in `trees`, `max_depth` and
 `min_samples_leaf` are searched by cross-validation over spatial blocks, so that neighbors never stand on both
-sides. Points of several readers are merged first. `label` names the dimension that holds the classes.
+sides. With `"algorithm": "alsnet"` a network is trained instead, from `dimensions`, `classes`,
+`strategy`, `seed` and the options in `alsnet` ([alsNet](../alsnet.md)). Points of several readers are
+merged first. `label` names the dimension that holds the classes.
 """
     before = ({"type": "filters.hag_minima"},)
     after = ()
@@ -129,9 +144,14 @@ sides. Points of several readers are merged first. `label` names the dimension t
         from ..features import FeaturePlan
 
         training = cls.training_options(options)
-        FeaturePlan.parse(
-            training.neighborhoods, feature_set=training.feature_set, dimensions=training.dimensions
-        )
+        if training.algorithm == "alsnet":
+            cls._plan_dimensions(options)
+            if training.alsnet.checkpoint:
+                check_writable(training.alsnet.checkpoint, "checkpoint")
+        else:
+            FeaturePlan.parse(
+                training.neighborhoods, feature_set=training.feature_set, dimensions=training.dimensions
+            )
         if training.classes is not None:
             ClassMap.parse(training.classes)
         check_writable(options["filename"], "model")
@@ -147,6 +167,10 @@ sides. Points of several readers are merged first. `label` names the dimension t
         from ..features import FeaturePlan
 
         training = cls.training_options(options)
+        if training.algorithm == "alsnet":
+            from ..alsnet.model import input_names
+
+            return input_names(training.alsnet.coordinates, training.dimensions)
         plan = FeaturePlan.parse(
             training.neighborhoods, feature_set=training.feature_set, dimensions=training.dimensions
         )
@@ -170,6 +194,8 @@ sides. Points of several readers are merged first. `label` names the dimension t
         model = train([cloud], cls.training_options(options))
         model.save(options["filename"])
         points.report.update({"model": options["filename"], **_brief(model.info), "seconds": model.seconds})
+        if options["algorithm"] == "alsnet":  # with the curve
+            points.report["training"] = _plain(model.info["training"])
         return {}
 
 

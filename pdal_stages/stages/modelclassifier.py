@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..classifier import Model, load_model
+from ..errors import OptionError
 from ..progress import Progress
 from .base import Stage
 from .options import Option
@@ -19,7 +20,7 @@ from .points import Points
 class ModelClassifier(Stage):
     type = "filters.modelclassifier"
     summary = "Apply a model file: compute what the model needs block by block, and write classes"
-    source = "[B16] section 3.4, [W18] section 3.3"
+    source = "[B16] section 3.4, [W18] section 3.3, [WM19] for networks"
     where_help = "Points outside keep their class but still serve as neighbors."
     options = (
         Option("model", "filename", None, "The model file to apply", required=True),
@@ -30,6 +31,12 @@ class ModelClassifier(Stage):
             "Also write the probability of each class, as Probability_<code>",
         ),
         Option("margin", "boolean", False, "Also write Margin, the winning probability minus the second"),
+        Option(
+            "variance",
+            "boolean",
+            False,
+            "Also write Variance, that of the probabilities over a network's batches (alsnet only)",
+        ),
         Option(
             "reject_below",
             "number",
@@ -63,7 +70,7 @@ each point stay. Codes above 31 need LAS 1.4 (`"minor_version": 4, "dataformat_i
 before any work is done.
 """
     dimensions_help = """- Reads: X, Y, Z, `Classification`, and what the model names (`pdal-stages model FILE`)
-- Writes: `Classification` (uint8_t), `Reliability` (float); on request `Margin` and `Probability_<code>` (float)
+- Writes: `Classification` (uint8_t), `Reliability` (float); on request `Margin`, `Variance` and `Probability_<code>` (float)
 - Halo: that of the model's neighborhoods"""
     before = ({"type": "filters.hag_minima"},)
     after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)
@@ -71,7 +78,13 @@ before any work is done.
 
     @classmethod
     def check(cls, options: dict[str, Any]) -> None:
-        cls.model(options)
+        model = cls.model(options)
+        if options["variance"] and not getattr(model.algorithm, "whole_cloud", False):
+            raise OptionError(
+                "option 'variance' is for networks; this model is another",
+                found=model.algorithm.name,
+                cure="Use 'margin'",
+            )
 
     @classmethod
     def model(cls, options: dict[str, Any]) -> Model:
@@ -93,6 +106,8 @@ before any work is done.
         out = {"Classification": "uint8_t", "Reliability": "float"}
         if options["margin"]:
             out["Margin"] = "float"
+        if options["variance"]:
+            out["Variance"] = "float"
         if options["probabilities"]:
             out.update({f"Probability_{code}": "float" for code, _ in cls.model(options).classes})
         return out
@@ -122,6 +137,7 @@ before any work is done.
                 memory_mb=options["memory"],
                 probabilities=options["probabilities"],
                 margin=options["margin"],
+                variance=options["variance"],
                 reject_below=options["reject_below"],
                 rejected_code=options["rejected_code"],
                 progress=progress,
@@ -132,6 +148,8 @@ before any work is done.
         }
         if found.margin is not None:
             values["Margin"] = found.margin
+        if found.variance is not None:
+            values["Variance"] = found.variance
         if found.probabilities is not None:
             for column, (code, _) in enumerate(model.classes):
                 values[f"Probability_{code}"] = found.probabilities[:, column]

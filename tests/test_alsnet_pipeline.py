@@ -1,0 +1,144 @@
+"""Networks through PDAL: trained by one word, applied by the same stage, in tiles as in one piece."""
+
+import dataclasses
+import importlib.util
+import json
+
+import numpy as np
+import pytest
+from alsnet_scenes import TINY, model_of, random_net, scene
+
+import pdal_stages as ps
+from pdal_stages.classifier import load_model
+from pdal_stages.errors import OptionError
+from pdal_stages.stages import registry
+
+WRITER = "writers.classifiermodel"
+
+
+@pytest.fixture
+def cloud(tmp_path, write_las):
+    xyz, labels, dimensions = scene(6000, 48.0, origin=(500_000.0, 5_400_000.0, 100.0))
+    arrays = {
+        **dict(zip("XYZ", xyz.T, strict=True)),
+        "Classification": labels,
+        "Intensity": dimensions["Intensity"],
+    }
+    return write_las(tmp_path / "in.las", arrays, point_format=6), xyz, dimensions
+
+
+@pytest.fixture
+def model(tmp_path):
+    path = tmp_path / "net.model"
+    net = dataclasses.replace(random_net(("Z", "Intensity"), seed=4), mean=(0.2, 100.0), scale=(0.3, 60.0))
+    model_of(net).save(path)
+    return path
+
+
+@pytest.mark.pdal
+def test_modelclassifier_applies_a_network(cloud, model, tmp_path, pdal_module):
+    laspy = pytest.importorskip("laspy")
+    path = cloud[0]
+    out = tmp_path / "out.las"
+    ps.run_pipeline(
+        [
+            str(path),
+            {"type": "filters.modelclassifier", "model": str(model), "margin": True, "variance": True},
+            {
+                "type": "writers.las",
+                "filename": str(out),
+                "forward": "all",
+                "extra_dims": "all",
+                "minor_version": 4,
+            },
+        ]
+    )
+    las = laspy.read(out)
+    read = np.column_stack([las.x, las.y, las.z])
+    found = load_model(model).predict(
+        read, {"Intensity": np.asarray(las.intensity)}, variance=True, margin=True
+    )
+    assert np.array_equal(np.asarray(las.classification), found.classification)
+    assert np.array_equal(np.asarray(las["Variance"]), found.variance)
+    assert np.array_equal(np.asarray(las["Margin"]), found.margin)
+    assert len(np.unique(found.classification)) > 1
+
+
+@pytest.mark.pdal
+def test_tiles_give_the_labels_of_the_whole(cloud, model, tmp_path, pdal_module):
+    laspy = pytest.importorskip("laspy")
+    from pdal_stages.tiling import run_tiled
+
+    path = cloud[0]
+
+    def stages(out):
+        return [
+            str(path),
+            {"type": "filters.modelclassifier", "model": str(model), "variance": True},
+            {
+                "type": "writers.las",
+                "filename": str(out),
+                "forward": "all",
+                "extra_dims": "all",
+                "minor_version": 4,
+            },
+        ]
+
+    ps.run_pipeline(stages(tmp_path / "whole.las"))
+    run = run_tiled(stages(tmp_path / "tiled.las"), 20, workers=0)
+    assert not run.failures and len(run.tiles) == 9
+    whole, tiled = laspy.read(tmp_path / "whole.las"), laspy.read(tmp_path / "tiled.las")
+
+    def rows(las):
+        columns = [
+            las.X,
+            las.Y,
+            las.Z,
+            las.intensity,
+            las.classification,
+            las["Reliability"],
+            las["Variance"],
+        ]
+        table = np.column_stack([np.asarray(c, np.float64) for c in columns])
+        return table[np.lexsort(table.T[::-1])]
+
+    assert np.array_equal(rows(whole), rows(tiled))
+
+
+@pytest.mark.pdal
+@pytest.mark.skipif(
+    importlib.util.find_spec("torch") is None,
+    reason="PyTorch is not installed (extra 'deep'): training is not tested",
+)
+def test_one_word_trains_a_network(cloud, tmp_path, pdal_module):
+    path = cloud[0]
+    network = {
+        "configuration": TINY.to_dict(),
+        "epochs": 2,
+        "validation": 0,
+        "checkpoint": str(tmp_path / "run.ckpt"),
+    }
+    result = ps.run_pipeline(
+        [
+            str(path),
+            {"type": "filters.hag_minima"},
+            {"type": WRITER, "filename": str(tmp_path / "a.model"), "algorithm": "alsnet", "alsnet": network},
+        ]
+    )
+    made = load_model(tmp_path / "a.model")
+    assert made.algorithm.name == "alsnet" and made.required_dimensions == ("HeightAboveGround",)
+    assert len(made.info["training"]["curve"]) == 2
+    assert "curve" in json.dumps(result.metadata, default=str)
+
+
+def test_stage_options(model, tmp_path):
+    classifier, writer = registry.get("filters.modelclassifier"), registry.get(WRITER)
+    options = classifier.parse({"model": str(model), "variance": True})
+    assert classifier.creates(options)["Variance"] == "float"
+    assert classifier.halo(options) == load_model(model).halo
+    given = {"filename": str(tmp_path / "m"), "algorithm": "alsnet", "alsnet": {"coordinates": "XYZ"}}
+    assert writer.reads(writer.parse(given)) == ["Classification", "HeightAboveGround"]
+    with pytest.raises(OptionError, match="epochs"):
+        writer.parse({**given, "alsnet": {"epochs": -1}})
+    with pytest.raises(OptionError, match="algorithm"):
+        writer.parse({**given, "algorithm": "resnet"})
