@@ -107,6 +107,8 @@ may_install() {
   [ -t 0 ] && [ -t 1 ] && sudo -p 'sudo password for %u, to install Debian packages: ' true
 }
 
+LATER="libgfortran5" # not in a minimal Debian, and not needed by the packages above
+
 # packages WHY NAME...: install those of the Debian packages that are missing
 packages() {
   local why=$1 name missing=()
@@ -114,7 +116,11 @@ packages() {
   for name; do installed "$name" || missing+=("$name"); done
   [ ${#missing[@]} = 0 ] && return 0
   if ! may_install; then
-    die "$why needs Debian packages that only root can install. Run this as root, once:" \
+    # What later steps will ask for as well, so that root is needed once
+    for name in python3 python3-venv python3-dev g++ patchelf $LATER; do
+      installed "$name" || [[ " ${missing[*]} " == *" $name "* ]] || missing+=("$name")
+    done
+    die "$why needs Debian packages that only root can install. Run this as root, once, then this script again:" \
       "apt-get update && apt-get install -y --no-install-recommends ${missing[*]}"
   fi
   refresh_apt

@@ -78,7 +78,8 @@ def test_step_that_works_is_timed_and_logged(tmp_path):
 def test_packages_without_root_prints_the_command(tmp_path):
     stubs = "installed() { false; }; may_install() { false; }; packages Compiling g++ patchelf"
     done = bash(stubs, tmp_path)
-    assert done.returncode == 1 and "apt-get install -y --no-install-recommends g++ patchelf" in done.stderr
+    assert done.returncode == 1 and "apt-get install -y --no-install-recommends g++ patchelf " in done.stderr
+    assert done.stderr.count("patchelf") == 1 and "python3-dev" in done.stderr
 
 
 @pytest.mark.parametrize("name", ["plain", "a b", "it's", "é$HOME"])
