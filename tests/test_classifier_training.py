@@ -99,7 +99,9 @@ def test_equals_sklearn_on_the_same_features(other):
         lambda cls, trees, n: kept.extend(trees) or original(trees, n)
     )
     try:
-        model = train([TrainingCloud(xyz, label, dimensions)], TrainingOptions(**SMALL), progress=False)
+        model = train(
+            [TrainingCloud(xyz, label, dimensions)], TrainingOptions(**SMALL, prior_weight=0), progress=False
+        )
     finally:
         training.Forest.from_sklearn = original  # type: ignore[method-assign]
     xyz, label, dimensions = other
@@ -352,6 +354,25 @@ def test_binary():
     assert "binary, target 6" in str(model)
 
 
+def test_prior_weight(other):
+    """Probabilities times (frequency in the clouds / in the samples) ** weight; the frequent gain, the rare lose."""
+    xyz, label, dimensions = scene()
+    clouds = [TrainingCloud(xyz, label, dimensions)]
+    models = {w: train(clouds, TrainingOptions(**SMALL, prior_weight=w), progress=False) for w in (0, 0.3, 1)}
+    xyz, label, dimensions = other
+    results = {w: m.predict(xyz, dimensions, probabilities=True) for w, m in models.items()}
+    frequency = np.array([e["available"] for e in models[1].info["classes"]]) / 150
+    for w in (0.3, 1):
+        expected = results[0].probabilities * frequency**w
+        expected /= expected.sum(axis=1, keepdims=True)
+        assert np.allclose(results[w].probabilities, expected, atol=1e-6)
+        ground = [(results[k].classification == 2).sum() for k in (0, w)]
+        assert ground[1] > ground[0]
+    assert models[0].info["priors"] is None
+    with pytest.raises(OptionError, match="prior_weight"):
+        TrainingOptions(prior_weight=1.5)
+
+
 def test_merged_and_named_classes(tmp_path):
     xyz, label, dimensions = scene()
     options = TrainingOptions(**SMALL, classes={"2": "Ground", "5,6": "64 Things"})
@@ -403,6 +424,7 @@ def test_limits_to_percentiles_are_in_the_thresholds(trained):
         lambda m: m.update(dimensions=[]),
         lambda m: m["percentiles"].update(low=[0.0]),
         lambda m: m.update(importances=[1.0]),
+        lambda m: m["priors"].update(factors=[1.0]),
         lambda m: m["classes"].reverse(),
         lambda m: m["classes"].pop(),
         lambda m: m.update(shape_bins={"c1": 3}),

@@ -96,6 +96,20 @@ class Model:
         return np.array([code for code, _ in self.classes], np.uint8)
 
     @property
+    def factors(self) -> npt.NDArray[np.float64] | None:
+        """What each class's probability is multiplied by for being frequent (``prior_weight``), or None."""
+        priors = self.info.get("priors")
+        return None if priors is None else np.array(priors["factors"])
+
+    def _weigh(self, p: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        factors = self.factors
+        if factors is None:
+            return p
+        p = p * factors
+        p /= p.sum(axis=1, keepdims=True)
+        return p
+
+    @property
     def required_dimensions(self) -> tuple[str, ...]:
         """Dimensions a cloud must have beside its coordinates."""
         return required(self.plan.dimensions)
@@ -166,7 +180,7 @@ class Model:
             raise ModelError(
                 "a feature is not a finite number", cure="Compute features with this package's own stage"
             )
-        probabilities = self.algorithm.predict_proba(array)
+        probabilities = self._weigh(self.algorithm.predict_proba(array))
         return self.codes[probabilities.argmax(axis=1)], probabilities
 
     def predict(
@@ -236,7 +250,7 @@ class Model:
         codes = self.codes
 
         def classify(values, _rows):
-            return decide(self.algorithm.predict_proba(values))
+            return decide(self._weigh(self.algorithm.predict_proba(values)))
 
         def decide(p):
             best = p.argmax(axis=1)
@@ -332,6 +346,9 @@ def _assemble(manifest: dict[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) 
             "the model's feature names are not those its neighborhoods give in this release",
             found=f"{len(names)} and {len(plan.names)} features",
         )
+    priors = manifest.get("priors")
+    if priors is not None and len(priors["factors"]) != len(manifest["classes"]):
+        raise ModelError("the manifest's priors must have one factor per class", found=len(priors["factors"]))
     for key in ("percentiles/low", "percentiles/high", "importances"):
         group: Any = manifest
         for part in key.split("/"):
@@ -362,7 +379,9 @@ def _check_fitted(plan: Any, bins: Mapping[str, Any], copt_threshold: float | No
         return
     for part in plan.layout:
         if part.shapes and part.neighborhood.token not in bins:
-            raise ModelError("the model lacks the thresholds of shape distributions", found=part.neighborhood.token)
+            raise ModelError(
+                "the model lacks the thresholds of shape distributions", found=part.neighborhood.token
+            )
         if part.neighborhood.kind == "copt" and copt_threshold is None:
             raise ModelError("the model lacks the curvature threshold of copt")
 

@@ -44,8 +44,12 @@ class TrainingOptions:
         `max_depth` None or 0: unlimited.
     max_samples : float
         Size of each tree's bootstrap sample, as a share of all samples.
-    max_features : "sqrt", "log2", int or float
-        Features tried at a split; a float is a share of them.
+    max_features : "auto", "sqrt", "log2", int or float
+        Features tried at a split; a float is a share of them. Auto: a tenth, but at least the square root.
+    prior_weight : float
+        0: classes are taken as equally frequent, as they are sampled; rare ones are then called too often.
+        1: as frequent as in the training clouds; rare ones are then hardly called at all. Between: each class's
+        probability is multiplied by its frequency to this power.
     scale : bool
         Limit features to the 1st and 99th percentile of the samples, from 0 where the smallest value is 0
         [B16 3.3].
@@ -79,7 +83,8 @@ class TrainingOptions:
     max_depth: int | Sequence[int | None] | None = None
     min_samples_leaf: int | Sequence[int] = 1
     max_samples: float = 1.0
-    max_features: str | int | float = "sqrt"
+    max_features: str | int | float = "auto"
+    prior_weight: float = 0.1
     scale: bool = True
     folds: int = 0
     block_size: float = 25.0
@@ -115,18 +120,21 @@ class TrainingOptions:
         _number("max_samples", self.max_samples, 0.0, 1.0)
         _number("block_size", self.block_size, 0.0, 1e6)
         _number("memory_mb", self.memory_mb, 0.0, 1e9)
+        if self.prior_weight != 0:
+            _number("prior_weight", self.prior_weight, 0.0, 1.0)
         if self.gap is not None and self.gap != 0:
             _number("gap", self.gap, 0.0, 1e6)
         m = self.max_features
         if isinstance(m, str):
-            good = m in ("sqrt", "log2")
+            good = m in ("auto", "sqrt", "log2")
         elif isinstance(m, float | np.floating):
             good = 0.0 < m <= 1.0
         else:
             good = isinstance(m, int | np.integer) and not isinstance(m, bool) and m >= 1
         if not good:
             raise OptionError(
-                "'max_features' must be sqrt, log2, a number of features, or a share up to 1.0", found=repr(m)
+                "'max_features' must be auto, sqrt, log2, a number of features, or a share up to 1.0",
+                found=repr(m),
             )
         names = self.dimensions
         names = (

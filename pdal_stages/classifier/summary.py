@@ -72,6 +72,8 @@ def text(model: Model) -> str:
         f"halo           {model.plan.halo:g} m",
     ]
     training = info.get("training", {})
+    if info.get("priors"):
+        lines.append(f"prior weight   {info['priors']['weight']:g}")
     if info.get("strategy") == "binary":
         lines.append(
             f"strategy       binary, target {info.get('target')}, background {info.get('background')}"

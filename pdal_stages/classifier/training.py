@@ -120,6 +120,7 @@ def train(
             "max_depth": chosen["max_depth"],
             **fitted.notes,
         },
+        "priors": _priors(samples, len(classes.codes), float(options.prior_weight)),
         "percentiles": {"low": low, "high": high, "limited": options.scale},
         "accuracy": {"out_of_bag": bag, "cross_validation": validation},
         "importances": importance,
@@ -196,6 +197,15 @@ def class_positions(
             position[~mask] = -1
         positions.append(position)
     return classes, positions
+
+
+def _priors(samples: Samples, n_classes: int, weight: float) -> dict[str, Any] | None:
+    """Factors of the classes' probabilities: frequency in the clouds over frequency in the samples, tempered."""
+    if weight == 0:
+        return None
+    drawn = np.bincount(samples.label, samples.weight, n_classes)
+    factors = (np.array(samples.available) / drawn) ** weight
+    return {"weight": weight, "factors": (factors / factors.max()).tolist()}
 
 
 def _must_fit(plan: FeaturePlan, n: int) -> None:
