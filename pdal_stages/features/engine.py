@@ -77,7 +77,7 @@ class FeatureEngine:
     A result is the same to the last bit for any order of the points, any queries asked beside it, any number of
     threads, any block size, and in a tile whose surroundings are covered by ``plan.halo`` metres.
 
-    Memory over the cloud's own: 28 bytes a point for the index (64 while it is being sorted), about 10 more with
+    Memory over the cloud's own: 28 bytes a point for the index (about 52 while it is being sorted), about 10 more with
     neighborhoods of k points, and the block budget of :meth:`blocks`.
     """
 
@@ -182,7 +182,6 @@ class FeatureEngine:
                 if any(c.at and c.neighborhood.kind not in ("cylinder", "sphere") for c in self.plan.layout):
                     from .adaptive import AdaptiveNeighborhoods
 
-                    _compile_once("adaptive")
                     adaptive = AdaptiveNeighborhoods(self._grid, self.plan, self.threads)
                 self._parts = FixedRadius(self._grid, self.plan), adaptive
             return self._parts
@@ -547,18 +546,9 @@ def _compile_fixed() -> None:
     fixed.fill(none, none, none, np.zeros(0, np.int64), ShapeBins({}), 0, 1, np.zeros(2, np.int64), out)
 
 
-def _compile_adaptive() -> None:
-    from .adaptive import AdaptiveNeighborhoods
-    from .index import build_grid
-
-    plan = FeaturePlan.parse("kopt", "Density")
-    AdaptiveNeighborhoods(build_grid(np.zeros((2, 3)), 1.0), plan, 1)
-
-
 _COMPILERS = {
     "index": _compile_index,
     "fixed": _compile_fixed,
-    "adaptive": _compile_adaptive,
 }
 
 

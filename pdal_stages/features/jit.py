@@ -30,6 +30,7 @@ from typing import Any
 
 import numba
 from numba.core import config
+from numba.core.compiler_lock import global_compiler_lock
 
 #: Flags that allow sums to be reordered and contracted, but keep NaN and infinity meaningful.
 FAST = frozenset({"reassoc", "contract", "nsz", "arcp"})
@@ -109,25 +110,52 @@ def _stamp(dispatcher, function: Callable) -> None:
 
 
 class CompilationNote:
-    """Say on stderr, once, that kernels are being compiled, if it takes longer than `delay` seconds."""
+    """Say on stderr, once in a process, that kernels are being compiled, where that takes long.
+
+    After `delay` seconds the note is written if numba is compiling at that moment, else it is looked again
+    every second: work that merely takes long is no reason to claim compilation.
+    """
+
+    _said = False
 
     def __init__(self, delay: float = 3.0) -> None:
-        self._timer = threading.Timer(delay, self._say)
-        self._timer.daemon = True
+        self._delay = delay
+        self._end = threading.Event()
 
-    @staticmethod
-    def _say() -> None:
+    def _watch(self) -> None:
+        wait = self._delay
+        while not self._end.wait(wait):
+            wait = 1.0
+            if _is_compiling():
+                self._say()
+                return
+
+    @classmethod
+    def _say(cls) -> None:
         stream = sys.__stderr__
-        if stream is not None:
-            try:
-                stream.write("pdal_stages: compiling for this processor, once (about a minute)...\n")
-                stream.flush()
-            except (OSError, ValueError):
-                pass
+        if stream is None or cls._said:
+            return
+        cls._said = True
+        try:
+            stream.write("pdal_stages: compiling for this processor, once (about a minute)...\n")
+            stream.flush()
+        except (OSError, ValueError):  # a closed stderr must not stop the work
+            pass
 
     def __enter__(self) -> CompilationNote:
-        self._timer.start()
+        threading.Thread(target=self._watch, daemon=True).start()
         return self
 
     def __exit__(self, *exc) -> None:
-        self._timer.cancel()
+        self._end.set()
+
+
+def _is_compiling() -> bool:
+    """Whether another thread holds numba's compiler lock."""
+    lock = getattr(global_compiler_lock, "_lock", None)
+    if lock is None:
+        return True
+    if lock.acquire(blocking=False):
+        lock.release()
+        return False
+    return True
