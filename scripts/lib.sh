@@ -107,6 +107,7 @@ may_install() {
   [ -t 0 ] && [ -t 1 ] && sudo -p 'sudo password for %u, to install Debian packages: ' true
 }
 
+BUNDLE=/etc/ssl/certs/ca-certificates.crt
 LATER="libgfortran5" # not in a minimal Debian, and not needed by the packages above
 
 # packages WHY NAME...: install those of the Debian packages that are missing
@@ -124,8 +125,14 @@ packages() {
       "apt-get update && apt-get install -y --no-install-recommends ${missing[*]}"
   fi
   refresh_apt
+  installed ca-certificates || cp "$BUNDLE" "$STATE/trusted.crt" 2>/dev/null || true
   step "apt: ${missing[*]:0:4}$([ ${#missing[@]} -le 4 ] || echo " and $((${#missing[@]} - 4)) more")" \
     apt_root apt-get -q -o DPkg::Lock::Timeout=300 -o Acquire::Retries=3 install -y --no-install-recommends "${missing[@]}"
+  # A list of certificates put there by hand, as containers behind a proxy have it, was just replaced by Debian's:
+  # let pip go on with the one it had
+  if [ -e "$STATE/trusted.crt" ] && ! cmp -s "$BUNDLE" "$STATE/trusted.crt" && [ "${PIP_CERT:-$BUNDLE}" = "$BUNDLE" ]; then
+    export PIP_CERT=$STATE/trusted.crt
+  fi
 }
 
 # refresh_apt: once per run. A third party's broken source must not stop us: whether the packages are found decides.
