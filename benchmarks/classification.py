@@ -2,12 +2,13 @@
 
     python benchmarks/classification.py --data DIR                    # both scenes, defaults
     python benchmarks/classification.py --data DIR --count 1000 10000 100000 --json out.json
-    python benchmarks/classification.py --data DIR --scene montpellier --target 6     # Building against the rest
-    python benchmarks/classification.py --data DIR --tune             # defaults, from the training parts alone
+    python benchmarks/classification.py --data DIR --scene montpellier --target 6    # Building, the rest
+    python benchmarks/classification.py --data DIR --tune             # defaults, from the training parts
 
-DIR (or the environment variable PDAL_STAGES_DATA) holds montpellier/train_*.laz, test_*.laz and delft/train.laz, test.laz.
-Scores are over the test points of the classes trained; all others (0, 1 in Montpellier; 9, 26 in Delft) are neither
-trained nor scored, but serve as neighbors. Times are wall seconds, with CPU seconds beside them.
+DIR (or the environment variable PDAL_STAGES_DATA) holds montpellier/train_*.laz, montpellier/test_*.laz,
+delft/train.laz and delft/test.laz. Scores are over the test points of the classes trained; all others
+(0 and 1 in Montpellier, 9 and 26 in Delft) are neither trained nor scored, but are neighbors.
+Times are wall seconds, with CPU seconds beside them.
 """
 
 from __future__ import annotations
@@ -120,6 +121,7 @@ def score(data: Path, scene: str, options: TrainingOptions, progress: bool) -> d
         "count": options.count,
         "features": len(model.plan.names),
         "dimensions": list(options.dimensions),
+        "prior_weight": options.prior_weight,
         "strategy": options.strategy,
         "target": options.target,
         **figures(result),
@@ -181,7 +183,7 @@ def warm(options: TrainingOptions) -> None:
 def tune(
     data: Path, scene: str, options: TrainingOptions, folds: int, block: float, quick: int
 ) -> list[dict]:
-    """Leaf size, bootstrap size, number of trees, samples and limits, judged on blocks held out of the training part.
+    """How trees are grown and classes weighed, judged on blocks held out of the training part.
 
     Unlike the scores kept in a model file these count points as they lie (not classes alike), as the test does.
     """
@@ -190,47 +192,36 @@ def tune(
     plan = FeaturePlan.parse(
         options.neighborhoods, feature_set=options.feature_set, dimensions=options.dimensions
     )
-    codes = SCENES[scene]
+    codes = np.array(SCENES[scene])
     position = np.full(len(xyz), -1, np.int16)
     for k, code in enumerate(codes):
         position[labels == code] = k
     use = np.flatnonzero(position >= 0)
-    fold = np.full(len(xyz), -1)
-    fold[use] = block_folds(xyz[use, :2], position[use], np.ones(len(use)), folds, block)
+    fold = block_folds(xyz[use, :2], position[use], np.ones(len(use)), folds, block)
     print(f"{scene}: features of {len(use):,} points", flush=True)
     engine = FeatureEngine(xyz, plan, seed=options.seed, threads=options.threads)
-    engine.fit()
     values = np.empty((len(xyz), len(plan.names)), np.float32)
     fed = {name: np.asarray(dimensions[name])[use] for name in plan.dimensions}
-    for rows, block_values in engine.blocks(queries=use, dimensions=fed, threads=options.threads):
-        values[rows] = block_values
-    base = {
-        "count": options.count,
-        "trees": 100,
-        "leaf": 5,
-        "bag": 0.5,
-        "features": "sqrt",
-        "limit": True,
-        "depth": None,
-    }
+    for rows, part in engine.blocks(queries=use, dimensions=fed, threads=options.threads):
+        values[rows] = part
+    base = {"count": options.count, "trees": 50, "leaf": 1, "bag": 1.0, "tried": "auto", "limit": True}
     trials = [dict(base)]
     for key, choices in {
-        "leaf": (1, 2, 10, 20),
-        "bag": (0.2, 1.0),
-        "features": ("log2", 0.1),
-        "depth": (15, 25),
+        "tried": ("sqrt", 0.2),
+        "bag": (0.5,),
+        "leaf": (3, 5),
         "limit": (False,),
-        "count": (1000, 3000, 30_000),
+        "trees": (25, 100),
+        "count": (1000, 30_000),
     }.items():
         trials += [{**base, key: choice} for choice in choices]
-    random = np.random.default_rng(0)
     out = []
     for trial in trials[: quick or None]:
-        sums: dict[int, np.ndarray] = {}
-        cpu = walk = 0.0
-        nodes = judged = 0
+        sums = dict.fromkeys((0.0, 0.05, 0.1, 0.2, 0.3), 0)
+        cpu = 0.0
+        nodes = 0
         for number in range(folds):
-            train_mask, held = split(xyz[use, :2], fold[use], number, 5.0)
+            train_mask, held = split(xyz[use, :2], fold, number, 5.0)
             masked = np.full(len(xyz), -1, np.int16)
             masked[use[train_mask]] = position[use[train_mask]]
             samples = draw_samples([(xyz, masked)], len(codes), trial["count"], options.seed)
@@ -239,43 +230,43 @@ def tune(
                 for j in range(x.shape[1] - len(plan.dimensions)):
                     np.clip(x[:, j], *np.percentile(x[:, j], [1, 99]).astype(np.float32), out=x[:, j])
             start = time.process_time()
-            tree_options = TreeOptions(trial["depth"], trial["leaf"], trial["bag"], trial["features"])
-            trees = [
-                tree.tree_
-                for tree, _, _ in grow(
-                    x, samples.label, samples.weight, trial["trees"], tree_options, options.seed
-                )
-            ]
+            setting = TreeOptions(None, trial["leaf"], trial["bag"], trial["tried"])
+            grown = grow(x, samples.label, samples.weight, trial["trees"], setting, options.seed)
+            forest = Forest.from_sklearn([tree.tree_ for tree, _, _ in grown], x.shape[1])
             cpu += time.process_time() - start
-            rows = use[random.permutation(held)[:40_000]]
-            for size in (25, 50, 100):
-                forest = Forest.from_sklearn(trees[:size], x.shape[1])
-                start = time.process_time()
-                best = np.array(codes)[forest.predict_proba(values[rows]).argmax(axis=1)]
-                if size == trial["trees"]:
-                    walk += time.process_time() - start
-                    nodes += len(forest.feature)
-                    judged += len(rows)
+            nodes += len(forest.feature)
+            rows = use[np.random.default_rng(0).permutation(held)[:30_000]]
+            shares = forest.predict_proba(values[rows])
+            drawn = np.bincount(samples.label, samples.weight)
+            for weight in sums:
+                best = (shares * (np.array(samples.available) / drawn) ** weight).argmax(axis=1)
                 matrix = np.zeros((len(codes), len(codes)), np.int64)
-                np.add.at(matrix, (position[rows], np.searchsorted(codes, best)), 1)
-                sums[size] = sums.get(size, 0) + matrix
-        row = {
-            **trial,
-            "scene": scene,
-            "grow_cpu": round(cpu, 1),
-            "walk_rate": round(judged / walk),
-            "nodes": nodes // folds,
-        }
-        for size, matrix in sums.items():
-            accuracy = Accuracy.from_confusion(matrix, codes)
-            row[f"oa_{size}"] = round(100 * accuracy.overall_accuracy, 2)
-            row[f"f1_{size}"] = round(100 * accuracy.mean_f1, 2)
+                np.add.at(matrix, (position[rows], best), 1)
+                sums[weight] = sums[weight] + matrix
+        row = {"scene": scene, **trial, "grow_cpu": round(cpu / folds, 1), "nodes": nodes // folds}
+        print(json.dumps(row))
+        for weight, matrix in sums.items():
+            result = Accuracy.from_confusion(matrix, codes)
+            row[f"prior_{weight:g}"] = figures(result)
+            merged = result.merge(MERGED[scene]).overall_accuracy if MERGED[scene] else None
+            print(
+                f"  prior_weight {weight:<5g} OA {100 * result.overall_accuracy:.2f}  "
+                f"F1 {100 * result.mean_f1:.2f}" + (f"  merged OA {100 * merged:.2f}" if merged else ""),
+                flush=True,
+            )
         out.append(row)
-        print(json.dumps(row), flush=True)
     return out
 
 
 # ---- command -----------------------------------------------------------------------------------------------
+
+
+def number(text: str) -> str | int | float:
+    """``sqrt``, ``56`` or ``0.1`` as what it means."""
+    try:
+        return float(text) if "." in text else int(text)
+    except ValueError:
+        return text
 
 
 def main() -> None:
@@ -290,6 +281,8 @@ def main() -> None:
     parser.add_argument("--dimensions", default="HeightAboveGround", help="comma-separated")
     parser.add_argument("--trees", type=int, default=TrainingOptions.trees)
     parser.add_argument("--leaf", type=int, default=TrainingOptions.min_samples_leaf)
+    parser.add_argument("--prior-weight", type=float, default=TrainingOptions.prior_weight)
+    parser.add_argument("--max-features", type=number, default=TrainingOptions.max_features)
     parser.add_argument("--target", type=int, help="binary: this class against the rest")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int)
@@ -315,6 +308,8 @@ def main() -> None:
                 count=count,
                 trees=args.trees,
                 min_samples_leaf=args.leaf,
+                prior_weight=args.prior_weight,
+                max_features=args.max_features,
                 seed=args.seed,
                 threads=args.threads,
             )

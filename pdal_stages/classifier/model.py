@@ -56,7 +56,7 @@ class Prediction:
     variance: npt.NDArray[np.float32] | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Model:
     """A trained classifier. Make one with :func:`train` or :func:`load_model`.
 
@@ -133,6 +133,9 @@ class Model:
     def describe(self) -> dict[str, Any]:
         """Everything about the model as plain data; ``str(model)`` is the same as text."""
         return summary.describe(self)
+
+    def __repr__(self) -> str:
+        return f"<Model {self.algorithm.name} of classes {[code for code, _ in self.classes]}>"
 
     def __str__(self) -> str:
         return summary.text(self)
