@@ -55,7 +55,7 @@ def _print_anything() -> None:
     """A locale that lacks a character shows its code, rather than ending the run."""
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(AttributeError, ValueError):  # a notebook's stream cannot
-            stream.reconfigure(errors="backslashreplace")
+            stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
 
 
 def _unforeseen(error: Exception) -> StageError:
@@ -179,13 +179,11 @@ def _source(options: argparse.Namespace) -> str | Path:
 
 def _build(options: argparse.Namespace):
     from .pipeline import Pipeline
+    from .pipelinefile import parse_pipeline
 
     source = _source(options)
-    if isinstance(source, str):
-        from .pipelinefile import parse_pipeline
-
-        source = parse_pipeline(source, "standard input")
-    return Pipeline(source, options.overrides)
+    read = parse_pipeline(source, "standard input") if isinstance(source, str) else source
+    return Pipeline(read, options.overrides)
 
 
 def _pipeline(options: argparse.Namespace) -> int | None:

@@ -23,7 +23,9 @@ class _Family:
             raise AttributeError(name)
         kind = registry.get(f"{self._family}.{name}")
 
-        def make(filename: str | None = None, *, merge: bool = True, **options: Any):
+        def make(filename: str | None = None, *, merge: Any = True, **options: Any):
+            if not isinstance(merge, bool):  # filters.accuracy has an option of this name
+                options["merge"], merge = merge, True
             if filename is not None:
                 options["filename"] = filename
             pdal = pdal_env.bindings()

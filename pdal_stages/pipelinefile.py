@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -139,7 +140,7 @@ def _check(stages: list, lines: list[int], name: str) -> None:
                 found=json.dumps(stage, default=str)[:80],
             )
         where = PipelineSource(stages, lines, name).where(index)
-        _check_texts(stage, where)
+        _check_values(stage, where)
         if not isinstance(stage, dict):
             continue
         for key, kinds, what in _SHAPES:
@@ -162,8 +163,12 @@ _SHAPES: tuple[tuple[str, tuple[type, ...], str], ...] = (
 )
 
 
-def _check_texts(value: Any, where: str, depth: int = 0) -> None:
-    """PDAL takes UTF-8 without NUL; JSON can write half a surrogate pair, and file names may be other bytes."""
+def _check_values(value: Any, where: str, depth: int = 0) -> None:
+    """Refuse what PDAL cannot be given.
+
+    It takes UTF-8 without NUL, but JSON can write half a surrogate pair, and file names may be other bytes; and it
+    takes numbers that a double holds.
+    """
     if depth > _DEEPEST:
         raise PipelineError(f"the pipeline is nested more than {_DEEPEST} levels deep", where=where)
     if isinstance(value, str):
@@ -178,13 +183,15 @@ def _check_texts(value: Any, where: str, depth: int = 0) -> None:
                 found=ascii(value[:80]),
                 cure="If it is a file's name, rename the file",
             )
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise PipelineError("a number is not finite, or too large for a double", where=where, found=value)
     elif isinstance(value, dict):
         for key, inner in value.items():
-            _check_texts(key, where, depth + 1)
-            _check_texts(inner, where, depth + 1)
+            _check_values(key, where, depth + 1)
+            _check_values(inner, where, depth + 1)
     elif isinstance(value, list | tuple):
         for inner in value:
-            _check_texts(inner, where, depth + 1)
+            _check_values(inner, where, depth + 1)
 
 
 def _looks_like_json(text: str) -> bool:

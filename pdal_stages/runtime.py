@@ -30,6 +30,7 @@ _lock = threading.Lock()
 _reports: dict[str, list[dict[str, Any]]] = {}
 _failures: dict[str, StageError] = {}
 _stdout: dict[str, Any] = {}
+_kept: list[Any] = []
 
 
 def place(type_name: str, tag: str | None) -> str:
@@ -60,6 +61,9 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
             original = _stdout.pop(label, None)
         if original is not None:  # PDAL restores it only where nothing is raised
             sys.stdout = original
+            # PDAL remembers the object without holding it, until a run succeeds: it must not be freed.
+            if not any(kept is original for kept in _kept):
+                _kept.append(original)
         # A class of our own, raised afresh: some exception types crash python-pdal at exit.
         raise failure from None
     with _lock:

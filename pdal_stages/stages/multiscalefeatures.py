@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import DimensionError, OptionError, StageError
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
+from ..neighborhoods import parse_neighborhoods
 from ..progress import Progress
 from .base import Stage, plan_error
 from .options import Option
@@ -89,11 +90,13 @@ features inside and need no dimensions at all.
     @classmethod
     def check(cls, options: dict[str, Any]) -> None:
         try:
+            parse_neighborhoods(options["neighborhoods"])
+        except StageError as error:
+            raise plan_error("neighborhoods", error) from None
+        try:
             names = cls._columns(cls.plan(options))
         except StageError as error:
-            raise plan_error(
-                "neighborhoods" if "neighborhood" in error.what else "feature_set", error
-            ) from None
+            raise plan_error("feature_set", error) from None
         for name in names:
             if len(name.encode()) > _NAME_BYTES:
                 raise OptionError(

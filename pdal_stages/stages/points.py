@@ -61,6 +61,8 @@ class Points:
         if where:
             self.mask = Expression(where).evaluate(arrays)
             self.report["where"] = int(np.count_nonzero(self.mask))
+            if self.count and not self.report["where"]:
+                self.report["warning"] = f"'where' holds for none of the {self.count:,} points: {where}"
 
     @cached_property
     def units(self) -> Units:
