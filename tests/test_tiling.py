@@ -423,3 +423,48 @@ def test_ept_source(tmp_path, town_file, model_file, whole):
     assert not run.failures and run.summary["per"] == "tile"
     got = np.concatenate([_table(path) for path in sorted(tmp_path.glob("e_*.laz"))])
     assert np.array_equal(np.sort(got), np.sort(_table(whole)))
+
+
+# ---- telling ---------------------------------------------------------------------------------------------
+
+
+def test_reports(tmp_path, town_file, model_file):
+    """Both reports tell the same, the page is well-formed, and its map has a square for every tile."""
+    import xml.dom.minidom as dom
+
+    from pdal_stages.cli import main
+
+    job = tmp_path / "job.json"
+    broken = tmp_path / "broken_town.laz"
+    broken.write_bytes(b"LASF")
+    stages = clouds.stages([town_file, broken], tmp_path / "c_#.laz", model_file)
+    job.write_text(json.dumps(stages))
+    names = ["--report", str(tmp_path / "r.json"), "--report", str(tmp_path / "r.html")]
+    words = ["pipeline", str(job), "--tile", "45", "--workers", "0"]
+    assert main([*words, *names, "--dry-run"]) == 1  # an input cannot be read
+    assert not list(tmp_path.glob("c_*"))
+    dry = json.loads((tmp_path / "r.json").read_text())
+    assert abs(sum(tile["points"] for tile in dry["tiles"]) - dry["points"]) <= len(dry["tiles"])  # rounding
+    assert main([*words, *names]) == 1
+    told = json.loads((tmp_path / "r.json").read_text())
+    assert told["states"]["failed"] == 0 and told["failures"][0]["what"] == str(broken)
+    assert sum(told["classes"].values()) == told["points"] == len(laspy.read(tmp_path / "c_town.laz"))
+    assert sum(tile["points"] for tile in told["tiles"]) == told["points"]
+    text = (tmp_path / "r.html").read_text()
+    assert "broken_town.laz" in text and "Ground" in text and f"{told['points']:,}" in text
+    start, end = text.index("<svg"), text.index("</svg>") + 6
+    drawn = dom.parseString(text[start:end])
+    assert len(drawn.getElementsByTagName("rect")) == len(told["tiles"])
+    assert "<script" not in text and "http" not in text.split("</style>")[1]
+
+
+def test_a_failed_tile_is_crossed_out():
+    from pdal_stages.tiling.report import page
+    from pdal_stages.tiling.run import Job, TiledRun
+
+    jobs = [Job((0, 0), "0_0", 5, [], state="done", report={"points": 5, "read": 9, "buffer": 1.0, "seconds": 2.0})]
+    jobs.append(Job((1, 0), "10_0", 5, [], state="failed", reason="<odd> & broken"))
+    summary = {"tile": 10.0, "points": 5, "states": {"done": 1, "kept": 0, "failed": 1}, "classes": {}}
+    text = page(TiledRun(jobs, [], {}, [], summary))
+    assert text.count("<rect") == 2 and text.count('d="M1.2') == 1
+    assert "&lt;odd&gt; &amp; broken" in text and "<odd>" not in text

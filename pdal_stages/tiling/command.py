@@ -139,10 +139,12 @@ def _print(run: TiledRun) -> None:
 
 def _print_dry(run: TiledRun) -> None:
     s = run.summary
-    print(f"{len(run.tiles)} tiles of {s['tile']:g}, read with {s['buffer_metres']:g} m of surroundings")
-    print(f"{s['inputs']} inputs, {s['points']:,} points; output per {s['per']}")
-    print(f"{s['points_of_largest_tile']:,} points in the largest tile")
-    print(f"{s['workers']} workers with {s['threads_per_worker']} threads each, about {s['points_read_by_a_tile']:,} ")
+    print(f"{len(run.tiles)} tiles of {s['tile']:g}, each read with {s['buffer_metres']:g} m of surroundings")
+    print(f"{s['inputs']} inputs, {s['points']:,} points; one output for each {s['per']}")
+    print(f"about {s['points_read_by_a_tile']:,} points read for a tile, {s['points_of_largest_tile']:,} its own at most")
+    memory, rate = s["memory_mb_of_a_worker"], s["assumed_points_per_core_second"]
+    print(f"up to {memory:,.0f} MB for each of {s['workers']} workers with {s['threads_per_worker']} threads")
+    print(f"roughly {s['core_hours']:.2f} core hours at {rate:,} points/s and core; the model decides")
     for job in run.tiles[:50]:
         print(f"  {job.name:24s} {job.points:>14,} points  {len(job.sources)} inputs")
     if len(run.tiles) > 50:

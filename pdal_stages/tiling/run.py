@@ -24,6 +24,11 @@ from .pool import Here, OnDask, open_pool
 from .sources import Header, Source, find_sources, read_header
 from .store import Store, fingerprint
 
+#: Memory of a worker: programs and model, a tile's point, a file's point, and the `memory` option of our stages.
+_BASE_MB, _TILE_BYTES, _FILE_BYTES, _BLOCKS_MB = 350, 350, 250, 512
+#: Points a core does in a second, for the estimate of a dry run; the figure of the default features.
+_RATE = 5_000
+
 #: A run stops when so many tiles failed and none succeeded.
 _HOPELESS = 10
 
@@ -113,7 +118,7 @@ class TiledRun:
             "notes": self.notes,
             "failures": [{"what": what, "reason": reason} for what, reason in self.failures],
             "tiles": [
-                {"name": j.name, "tile": list(j.tile), "state": j.state, "tries": j.tries}
+                {"name": j.name, "tile": list(j.tile), "state": j.state, "tries": j.tries, "points": j.points}
                 | {k: v for k, v in j.report.items() if k not in ("fingerprint",)}
                 | ({"reason": j.reason} if j.reason else {})
                 for j in self.tiles
@@ -121,7 +126,7 @@ class TiledRun:
             "outputs": [
                 {"input": o.source.path, "output": [str(p) for p in o.paths], "state": o.state}
                 | ({"reason": o.reason} if o.reason else {})
-                | {k: o.report[k] for k in ("written", "seconds", "peak_mb") if k in o.report}
+                | {k: o.report[k] for k in ("written", "seconds", "cpu_seconds", "peak_mb") if k in o.report}
                 for o in self.outputs
             ],
         }
@@ -597,6 +602,7 @@ class _Run:
             "dropped": sum(job.report.get("dropped", 0) for job in worked),
             "seconds": seconds,
             "points_per_second": points / seconds if seconds else 0.0,
+            "cpu_seconds": sum(report.get("cpu_seconds", 0.0) for report in reports),
             "peak_mb_of_a_worker": max(peaks, default=0.0),
             "states": {s: sum(j.state == s for j in jobs) for s in ("done", "kept", "failed")},
             "classes": dict(sorted(classes.items(), key=lambda kv: int(kv[0]))),
@@ -627,6 +633,7 @@ class _Run:
         area = sum((h.box[2] - h.box[0]) * (h.box[3] - h.box[1]) for h in self.headers.values() if h.count)
         density = count / area if area else 0.0
         side = self.grid.size + 2 * self.halo / self.unit
+        read = min(count, round(density * side * side))
         summary = {
             "tile": self.grid.size,
             "buffer_metres": self.halo,
@@ -638,10 +645,26 @@ class _Run:
             "bounds": list(self.bounds),
             "points": count,
             "points_of_largest_tile": max((j.points for j in listed), default=0),
-            "points_read_by_a_tile": round(density * side * side),
+            "points_read_by_a_tile": read,
+            "memory_mb_of_a_worker": estimate_memory(read, count if self.per == "file" else 0, len(self.headers)),
+            "assumed_points_per_core_second": _RATE,
+            "core_hours": count / _RATE / 3600,
             "states": {"waiting": len(listed)},
         }
         return TiledRun(listed, [], self.unreadable, self.notes, summary)
+
+
+def estimate_memory(read: int, count: int, files: int) -> float:
+    """Megabytes a worker holds at most: see docs/large-areas.md.
+
+    Parameters
+    ----------
+    read : int
+        Points of a tile with its surroundings.
+    count, files : int
+        Points of all inputs and their number, where each becomes one output; else 0.
+    """
+    return _BASE_MB + max(read * _TILE_BYTES + _BLOCKS_MB * 2**20, count / max(files, 1) * _FILE_BYTES) / 2**20
 
 
 def _failure(answer: Any) -> tuple[str, bool]:

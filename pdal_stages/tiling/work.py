@@ -30,7 +30,7 @@ def perform(task: str) -> str:
     """
     given = json.loads(task)
     with _one:
-        started = time.perf_counter()
+        started, cpu = time.perf_counter(), time.process_time()
         try:
             result = _kinds()[given["kind"]](given)
         except StageError as error:
@@ -46,6 +46,7 @@ def perform(task: str) -> str:
             reason = f"{type(error).__name__}: {error} ({last.name}, line {last.lineno})"
             result = {"error": {"reason": reason, "again": True}}
         result["seconds"] = time.perf_counter() - started
+        result["cpu_seconds"] = time.process_time() - cpu
         result["peak_mb"] = _peak()
         return json.dumps(result)
 
