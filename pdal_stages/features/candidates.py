@@ -54,6 +54,9 @@ def from_order_bits(typingctx, value):
 def half_widths(radius, cell):
     """Cells a neighborhood of `radius` can touch, and cells it surely covers, row by row.
 
+    A cell is half open, so one whose nearest border is `radius` away holds no member: its points are farther, be
+    it by less than rounding shows.
+
     Returns
     -------
     (2, 2 R + 1) int64 array
