@@ -26,7 +26,12 @@ from pdal_stages.pipeline import Pipeline
 
 PIPELINES = Path(__file__).resolve().parent.parent / "pipelines"
 CLOUDS = {
-    "montpellier": {"train": "train_*.laz", "test": "test_*.laz", "classes": "2,3,4,5,6", "merge": {"5": [3, 4]}},
+    "montpellier": {
+        "train": "train_*.laz",
+        "test": "test_*.laz",
+        "classes": "2,3,4,5,6",
+        "merge": {"5": [3, 4]},
+    },
     "delft": {"train": "train.laz", "test": "test.laz", "classes": "1,2,6", "merge": None},
 }
 #: Existing library at radii 1, 2, 3, 5 m, same height, 100 trees, 10,000 samples per class.
@@ -104,7 +109,9 @@ def unchanged(source: Path, target: Path) -> int:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--data", default=os.environ.get("PDAL_STAGES_DATA"))
     parser.add_argument("--work", default="real-clouds", help="folder for models, clouds and reports")
     parser.add_argument("--only", choices=list(CLOUDS))
@@ -123,7 +130,11 @@ def main() -> None:
         print(
             f"{name}: OA {100 * r['overall_accuracy']:.1f} (peer {oa}), kappa {100 * r['kappa']:.1f} (peer {kappa}), "
             f"mean F1 {100 * r['mean_f1']:.1f} (peer {f1})"
-            + (f", 3-4-5 merged OA {100 * r['merged_overall_accuracy']:.1f} (peer {joined})" if joined else "")
+            + (
+                f", 3-4-5 merged OA {100 * r['merged_overall_accuracy']:.1f} (peer {joined})"
+                if joined
+                else ""
+            )
             + f"; {r['points']:,} points unchanged but for the class; train {r['train_seconds']:.0f} s, "
             f"classify and evaluate {r['evaluate_seconds']:.0f} s",
             flush=True,

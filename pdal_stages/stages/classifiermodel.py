@@ -18,6 +18,11 @@ from .points import Points
 _OWN = {"filename", "label", "where", "threads", "memory", "horizontal_unit", "vertical_unit"}
 
 
+def _default(name: str) -> Any:
+    """The trainer's own default."""
+    return TrainingOptions.__dataclass_fields__[name].default
+
+
 class ClassifierModel(Stage):
     type = "writers.classifiermodel"
     summary = "Train a classifier on the labelled points that reach it, and write one model file"
@@ -72,7 +77,11 @@ class ClassifierModel(Stage):
         Option("target", "integer", None, "Class to find with the binary strategy", minimum=0, maximum=255),
         Option("background", "integer", 1, "Code of all other classes with it", minimum=0, maximum=255),
         Option(
-            "count", "integer", 10_000, "Samples of each class; smaller classes are duplicated", minimum=1
+            "count",
+            "integer",
+            _default("count"),
+            "Samples of each class; smaller classes are duplicated",
+            minimum=1,
         ),
         Option(
             "seed",
@@ -82,16 +91,40 @@ class ClassifierModel(Stage):
             minimum=0,
             maximum=2**31 - 1,
         ),
-        Option("trees", "list", (100,), "Number of trees; several values are searched by cross-validation"),
+        Option(
+            "trees",
+            "list",
+            (_default("trees"),),
+            "Number of trees; several values are searched by cross-validation",
+        ),
         Option("max_depth", "list", (0,), "Depth of trees, 0 for no limit; several values are searched"),
-        Option("min_samples_leaf", "list", (5,), "Samples a leaf must have; several values are searched"),
+        Option(
+            "min_samples_leaf",
+            "list",
+            (_default("min_samples_leaf"),),
+            "Samples a leaf must have; several values are searched",
+        ),
         Option(
             "max_samples",
             "number",
-            0.5,
-            "Share of the samples each tree sees",
+            _default("max_samples"),
+            "Share of the samples each tree draws",
             minimum=0,
             exclusive=True,
+            maximum=1,
+        ),
+        Option(
+            "max_features",
+            "string",
+            _default("max_features"),
+            "Features tried at a split: auto (a tenth, at least the square root), sqrt, log2, a number or a share",
+        ),
+        Option(
+            "prior_weight",
+            "number",
+            _default("prior_weight"),
+            "0: all classes count as equally frequent, as they are sampled; 1: as frequent as in the training points",
+            minimum=0,
             maximum=1,
         ),
         Option("folds", "integer", 0, "Folds of cross-validation over spatial blocks; 0 for none", minimum=0),
@@ -127,6 +160,9 @@ merged first. `label` names the dimension that holds the classes.
                 classes if isinstance(classes, list) else [c.strip() for c in classes.split(",") if c.strip()]
             )
             given = {**given, "classes": {str(c): _code(c) for c in codes}}
+        share = given.get("max_features")
+        if isinstance(share, int | float) and not isinstance(share, bool):
+            given = {**given, "max_features": str(share)}
         return super().parse(given, where)
 
     @classmethod
@@ -136,6 +172,7 @@ merged first. `label` names the dimension that holds the classes.
         for name in ("trees", "max_depth", "min_samples_leaf"):
             numbers = [int(v) if str(v).strip().lstrip("-").isdigit() else v for v in values[name]]
             values[name] = numbers[0] if len(numbers) == 1 else numbers
+        values["max_features"] = _number(values["max_features"])
         return TrainingOptions(**values, threads=options["threads"], memory_mb=options["memory"])
 
     @classmethod
@@ -204,6 +241,16 @@ def _code(label: Any) -> Any:
         return int(label)
     except (TypeError, ValueError):
         return label
+
+
+def _number(text: str) -> Any:
+    """``0.1`` as a share, ``24`` as a number of features, words as they are."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
 
 
 def _brief(info: dict[str, Any]) -> dict[str, Any]:
