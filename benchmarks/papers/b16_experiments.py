@@ -180,7 +180,9 @@ def main() -> None:
         scene = scenes.load(
             args.data, name, cache, classes=classes, columns=args.columns, threads=args.threads
         )
-        note(f"{name}: tables of {scene.train_values.shape} and {scene.test_values.shape}")
+        if args.chequerboard:
+            scene = scenes.chequerboard(scene)
+        note(f"{scene.name}: tables of {scene.train_values.shape} and {scene.test_values.shape}")
         path = None if args.cache is None else args.cache / "b16.jsonl"
         runs += run_scene(
             scene,

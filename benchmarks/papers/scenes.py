@@ -61,6 +61,19 @@ def load(
     return Scene(name, classes, plan, *clouds, *tables)
 
 
+def chequerboard(scene: Scene, size: float = 25.0) -> Scene:
+    """The training part alone, cut into fields: white ones train, black ones are scored.
+
+    Training and scored points then come from the same buildings and trees, as they do where a survey is classified
+    from samples all over it; the scene's own test part is another place.
+    """
+    fields = np.floor(scene.train.xyz[:, :2] / size).astype(np.int64).sum(axis=1)
+    white = fields % 2 == 0
+    values = [np.ascontiguousarray(scene.train_values[mask]) for mask in (white, ~white)]
+    clouds = [scene.train.only(mask) for mask in (white, ~white)]
+    return Scene(f"{scene.name}, chequerboard", scene.classes, scene.plan, *clouds, *values)
+
+
 def context(scene: Scene) -> dict:
     """What all runs on a scene depend on."""
     return {
@@ -76,5 +89,10 @@ def add_options(options: argparse.ArgumentParser) -> None:
     )
     options.add_argument(
         "--classes", type=int, nargs="+", help="labels to train and score; default: the scene's"
+    )
+    options.add_argument(
+        "--chequerboard",
+        action="store_true",
+        help="score every other 25 m field of the training part, not the test part",
     )
     options.add_argument("--columns", help="of .pts text; see pts_input.py")

@@ -221,9 +221,11 @@ def main() -> None:
         scene = scenes.load(
             args.data, name, cache, classes=classes, columns=args.columns, threads=args.threads
         )
-        note(f"{name}: tables of {scene.train_values.shape} and {scene.test_values.shape}")
+        if args.chequerboard:
+            scene = scenes.chequerboard(scene)
+        note(f"{scene.name}: tables of {scene.train_values.shape} and {scene.test_values.shape}")
         path = None if args.cache is None else args.cache / "w18.jsonl"
-        targets = tuple(args.target) if args.target else TARGETS.get(name, ())
+        targets = tuple(args.target) if args.target else TARGETS.get(name.partition(",")[0], ())
         runs += run_scene(
             scene, Results(path, {**scenes.context(scene), "experiment": EXPERIMENT}), args, targets
         )
