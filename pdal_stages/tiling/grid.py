@@ -8,7 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import OptionError
+from ..errors import OptionError, StageError
+
+#: Most tiles of a run.
+_MOST = 10_000_000
 
 Box = tuple[float, float, float, float]
 
@@ -55,8 +58,20 @@ class Grid:
         return "_".join(f"{n * self.size:.10g}" for n in tile)
 
     def covering(self, box: Box) -> list[tuple[int, int]]:
-        """Every tile that a box touches, row by row."""
+        """Every tile that a box touches, row by row.
+
+        Raises
+        ------
+        StageError
+            For more than ten million.
+        """
         x0, y0, x1, y1 = (int(self.index(np.array([v]))[0]) for v in box)
+        if (x1 - x0 + 1) * (y1 - y0 + 1) > _MOST:
+            raise StageError(
+                f"more than {_MOST:,} tiles",
+                found=f"bounds {box}, tiles of {self.size:g}",
+                cure="Take larger tiles, or repair the bounding box in the header",
+            )
         return [(i, j) for j in range(y0, y1 + 1) for i in range(x0, x1 + 1)]
 
 

@@ -11,13 +11,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from .. import __version__, pdal_env
 from ..errors import OptionError, PipelineError, StageError
 from ..overrides import Override
 from ..progress import Progress
 from ..stages import registry
 from ..units import units_of_wkt
-from .grid import Box, Grid, touch, union
+from .grid import Box, Grid, union
 from .options import TilingOptions
 from .plan import TilePlan, check_not_inputs, make_plan, outputs_for
 from .pool import Here, OnDask, open_pool
@@ -190,11 +192,10 @@ class _Run:
         self.headers = self._headers()
         self.per = self._per()
         self.unit = self._unit()
-        self.bounds: Box = union([h.box for h in self.headers.values() if h.count])
         self.extra = float(options.buffer or 0.0)
-        # At least a little, so that a point on the far edge never stands alone.
         self.halo = plan.halo
         self.index: dict[str, dict[str, Any]] = {}
+        self._place_sources()
 
     # ---- before any work ----------------------------------------------------------------------------
 
@@ -254,15 +255,22 @@ class _Run:
                 raise
             return 1.0
 
-    def _near(self, box: Box, margin: float) -> list[Source]:
-        grown = (box[0] - margin, box[1] - margin, box[2] + margin, box[3] + margin)
-        return [s for s in self.sources if s.path in self.headers and touch(self._box(s), grown)]
+    def _place_sources(self) -> None:
+        """Where readable headers or indexes say that inputs lie; thousands of them are compared at once."""
+        self._placed = [s for s in self.sources if s.path in self.headers and self.headers[s.path].count]
+        boxes = []
+        for source in self._placed:
+            index = self.index.get(source.path)
+            known = union([(b[0], b[1], b[2], b[3]) for b in index["boxes"]]) if index else None
+            boxes.append(known or self.headers[source.path].box)
+        self._boxes = np.array(boxes, np.float64).reshape(-1, 4)
+        self.bounds = union(boxes)
 
-    def _box(self, source: Source) -> Box:
-        index = self.index.get(source.path)
-        if index and index.get("boxes"):
-            return union([tuple(b) for b in index["boxes"]])
-        return self.headers[source.path].box
+    def _near(self, box: Box, margin: float) -> list[Source]:
+        b = self._boxes
+        hits = (b[:, 0] <= box[2] + margin) & (b[:, 2] >= box[0] - margin)
+        hits &= (b[:, 1] <= box[3] + margin) & (b[:, 3] >= box[1] - margin)
+        return [self._placed[n] for n in np.flatnonzero(hits)]
 
     # ---- the run ------------------------------------------------------------------------------------
 
@@ -354,8 +362,7 @@ class _Run:
                 self.index[source.path] = found
                 store.keep_index(mark, found)
                 progress.update(found["count"])
-        boxes = [self._box(s) for s in self.sources if s.path in self.headers and self.headers[s.path].count]
-        self.bounds = union(boxes)
+        self._place_sources()
 
     def _jobs(self) -> list[Job]:
         """Tiles with points of their own, row by row."""
@@ -464,7 +471,8 @@ class _Run:
                 by_job.setdefault(job.tile, []).append(out)
         for out in outputs:
             self._ready(out, waiting)
-        done = good
+        done, tried = good, 0
+        reasons: set[str] = set()
 
         def tasks():
             if not waiting:
@@ -493,11 +501,11 @@ class _Run:
                             store.wrote(item.name, item.mark, item.report)
                     for out in by_job.get(item.tile, ()):
                         self._ready(out, waiting)
-                    failed = [job for job in jobs if job.state == "failed" and job.tries]
-                    if not good and len(failed) >= _HOPELESS and len({job.reason for job in failed}) == 1:
+                    reasons |= {reason} if reason else set()
+                    tried += 1
+                    if not good and tried >= _HOPELESS and len(reasons) == 1:
                         raise StageError(
-                            f"the first {len(failed)} tiles all failed for one reason, so the run was stopped",
-                            found=reason,
+                            f"the first {tried} tiles all failed for one reason, so the run was stopped", found=reason
                         )
                 elif not reason:
                     store.wrote(item.source.key, item.mark, item.report)
@@ -537,7 +545,7 @@ class _Run:
             "unit": self.unit,
             "buffer": self.halo,
             "bounds": list(self.bounds),
-            "sources": [self._described(s, item) for s in far if s.path not in self.unreadable],
+            "sources": [self._described(s) for s in far if s.path not in self.unreadable],
             "head": self.plan.head,
             "extra": self.extra,
             "creates": self.plan.creates,
@@ -552,8 +560,10 @@ class _Run:
             task.update({"tail": self.plan.tail, "outputs": self.tile_paths[item.tile]})
         return task
 
-    def _described(self, source: Source, job: Job) -> dict[str, Any]:
-        return {**source.to_dict(), "key": source.key, "index": self.index.get(source.path)}
+    def _described(self, source: Source) -> dict[str, Any]:
+        index = self.index.get(source.path)
+        short = {"count": index["count"], "boxes": index["boxes"]} if index else None
+        return {**source.to_dict(), "key": source.key, "index": short}
 
     def _clean(self, store: Store, jobs: list[Job], outputs: list[Output]) -> None:
         """Results whose outputs are all written are not needed any more."""

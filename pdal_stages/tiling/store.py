@@ -42,7 +42,7 @@ class Store:
         self.folder = outputs / FOLDER
         self.tiles = self.folder / "tiles"
         self.scratch = self.folder / "scratch"
-        self.files = self.folder / "files.json"
+        self.files = self.folder / "files.jsonl"
         self.indexes = self.folder / "index"
         self._lock: Any = None
         self._written: dict[str, Any] = {}
@@ -136,9 +136,12 @@ class Store:
     # ---- outputs -------------------------------------------------------------------------------------
 
     def _load(self) -> dict[str, Any]:
-        with contextlib.suppress(OSError, ValueError):
-            return json.loads(self.files.read_text())
-        return {}
+        found: dict[str, Any] = {}
+        with contextlib.suppress(OSError):
+            for line in self.files.read_text().splitlines():
+                with contextlib.suppress(ValueError):  # the last line of a run that was killed
+                    found.update(json.loads(line))
+        return found
 
     def written(self, name: str, mark: str) -> dict[str, Any] | None:
         """The report of outputs that exist unchanged and were made of the same things; otherwise None."""
@@ -157,7 +160,8 @@ class Store:
     def wrote(self, name: str, mark: str, report: dict[str, Any]) -> None:
         """Remember outputs."""
         self._written[name] = {**report, "fingerprint": mark}
-        write_whole(self.files, json.dumps(self._written).encode())
+        with open(self.files, "a", encoding="utf-8") as file:
+            file.write("\n" + json.dumps({name: self._written[name]}))
 
     # ---- indexes -------------------------------------------------------------------------------------
 
