@@ -145,6 +145,24 @@ def test_two_worker_processes_give_the_same(tmp_path, town_file, model_file, who
     clouds.same_points(whole, tmp_path / "out.laz")
 
 
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+def test_large_files_are_written_in_parts(tmp_path, town_file, model_file, whole, suffix, monkeypatch):
+    from pdal_stages.tiling import assemble
+
+    monkeypatch.setattr(assemble, "MOST_AT_ONCE", 11_000)
+    out = tmp_path / f"out.{suffix}"
+    assert not run_tiled(clouds.stages([town_file], out, model_file), 60, workers=0).failures
+    clouds.same_points(whole, out)
+    one, two = laspy.read(whole).header, laspy.read(out).header
+    for name in ("mins", "maxs", "number_of_points_by_return", "generating_software", "point_count"):
+        assert np.all(getattr(one, name) == getattr(two, name)), name
+    # Automatic offsets differ from part to part: such a file is written at once.
+    stages = clouds.stages([town_file], tmp_path / "auto.las", model_file, offset_x="auto", forward="vlr")
+    assert not run_tiled(stages, 60, workers=0).failures
+    assert len(laspy.read(tmp_path / "auto.las")) == len(laspy.read(whole))
+    assert not clouds.hidden(tmp_path)
+
+
 def _cores() -> int:
     from pdal_stages.parallel import available_threads
 

@@ -16,6 +16,8 @@ from . import marks
 from .cloudindex import open_las, read_block
 from .extract import Piece
 
+#: A larger file is written in parts of so many points.
+MOST_AT_ONCE = 4_000_000
 _PDAL_TYPES = {
     "f8": "double",
     "f4": "float",
@@ -60,23 +62,50 @@ def write_file(task: dict[str, Any]) -> dict[str, Any]:
     task : dict
         ``source`` (path, reader, key), ``count``, ``results`` (files of tiles), ``tail``, ``outputs``.
     """
+    count = task["count"]
+    if count > MOST_AT_ONCE and all(_las(s) for s in task["tail"] if s["type"].startswith("writers.")):
+        from .inparts import write_in_parts
+
+        written = write_in_parts(task, MOST_AT_ONCE)
+        if written is not None:
+            return written
+    kept, values = gather(task, 0, count)
+    reader = {**task["source"]["reader"], "type": "readers.las", "filename": task["source"]["path"]}
+    return run_tail([reader], [(kept, values)], task["tail"], task["outputs"])
+
+
+def _las(writer: dict[str, Any]) -> bool:
+    return writer["type"] == "writers.las" and Path(writer["filename"]).suffix.lower() in (".las", ".laz")
+
+
+def gather(task: dict[str, Any], start: int, end: int) -> tuple[NDArray[np.bool_], dict[str, Any]]:
+    """Results of points `start` to `end` of a file: which of them came out, and their new values.
+
+    Raises
+    ------
+    StageError
+        If the tiles do not hold each of the file's points once.
+    """
     source, count = task["source"], task["count"]
-    kept = np.zeros(count, bool)
+    prefix = f"{source['key']}/"
+    kept = np.zeros(end - start, bool)
     seen = 0
     columns: dict[str, list[tuple[NDArray, NDArray]]] = {}
     for name in task["results"]:
         with np.load(name, allow_pickle=False) as tile:
-            prefix = f"{source['key']}/"
             if f"{prefix}index" not in tile:
                 continue
-            index = tile[f"{prefix}index"]
+            index = tile[f"{prefix}index"]  # ascending
             seen += int(tile[f"{prefix}core"])
-            if index.size and (index[-1] >= count or kept[index].any()):
+            first, last = np.searchsorted(index, (start, end))
+            mine = index[first:last] - start
+            if (index.size and index[-1] >= count) or kept[mine].any():
                 raise StageError("internal: two tiles hold the same point", where=source["path"], found=name)
-            kept[index] = True
+            kept[mine] = True
             for key in tile.files:
                 if key.startswith(f"{prefix}dim/"):
-                    columns.setdefault(key.removeprefix(f"{prefix}dim/"), []).append((index, tile[key]))
+                    part = tile[key][first:last].copy() if last - first < index.size else tile[key]
+                    columns.setdefault(key.removeprefix(f"{prefix}dim/"), []).append((mine, part))
     if seen != count:
         raise StageError(
             "the tiles do not hold all points of the file: it changed while it was worked on",
@@ -86,16 +115,15 @@ def write_file(task: dict[str, Any]) -> dict[str, Any]:
         )
     values: dict[str, Any] = {}
     for name, parts in columns.items():
-        if sum(len(i) for i, _ in parts) == count:
-            full = np.empty(count, parts[0][1].dtype)
+        if sum(len(i) for i, _ in parts) == end - start:
+            full = np.empty(end - start, parts[0][1].dtype)
             for index, part in parts:
                 full[index] = part
             values[name] = (None, full)
         else:
             values[name] = (np.concatenate([i for i, _ in parts]), np.concatenate([v for _, v in parts]))
         parts.clear()
-    reader = {**source["reader"], "type": "readers.las", "filename": source["path"]}
-    return _run([reader], [(kept, values)], task["tail"], task["outputs"])
+    return kept, values
 
 
 def _write(readers, columns, tail, outputs) -> dict[str, Any]:
@@ -105,10 +133,10 @@ def _write(readers, columns, tail, outputs) -> dict[str, Any]:
         kept[rows] = True
         every = len(rows) == count
         made.append((kept, {n: (None if every else rows, v) for n, v in values.items()}))
-    return _run(readers, made, tail, outputs)
+    return run_tail(readers, made, tail, outputs)
 
 
-def _run(readers, injected, tail, outputs: list[str]) -> dict[str, Any]:
+def run_tail(readers, injected, tail, outputs: list[str]) -> dict[str, Any]:
     """Run readers, results and tail; files appear under their names when all are whole."""
     token = uuid.uuid4().hex
     stages: list[dict[str, Any]] = []
@@ -148,10 +176,10 @@ def _run(readers, injected, tail, outputs: list[str]) -> dict[str, Any]:
         marks.forget(token)
         for partial, _ in partials:
             partial.unlink(missing_ok=True)
-    return {"outputs": [[str(final), *_stamp(final)] for _, final in partials], "written": run.count}
+    return {"outputs": [[str(final), *stamp(final)] for _, final in partials], "written": run.count}
 
 
-def _stamp(path: Path) -> list[int]:
+def stamp(path: Path) -> list[int]:
     stat = path.stat()
     return [stat.st_size, stat.st_mtime_ns]
 

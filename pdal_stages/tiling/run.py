@@ -531,6 +531,7 @@ class _Run:
                 "kind": "file",
                 "source": {**item.source.to_dict(), "key": item.source.key},
                 "count": self.index[item.source.path]["count"],
+                "scratch": str(store.scratch),
                 "results": [str(store.result(job.name)) for job in item.jobs],
                 "tail": self.plan.tail,
                 "outputs": [str(p) for p in item.paths],

@@ -1,0 +1,122 @@
+"""A large file's output, written part by part, so that memory does not grow with the file."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from pathlib import Path
+from typing import Any
+
+from ..errors import StageError
+from .assemble import check_whole, gather, run_tail, stamp
+from .cloudindex import BLOCK, open_las, read_block
+from .extract import finish, plain_header
+from .tilework import scratch
+
+
+def write_in_parts(task: dict[str, Any], most: int) -> dict[str, Any] | None:
+    """Write the outputs of a file, `most` points at a time.
+
+    Each part goes through the pipeline's own tail and writer into an uncompressed file; their points are then
+    joined under the first part's header.
+
+    Returns
+    -------
+    dict or None
+        None where the writer gives parts different headers (such as automatic offsets), so that
+        they cannot be joined.
+    """
+    source, count = task["source"], task["count"]
+    writers = [s for s in task["tail"] if s["type"].startswith("writers.")]
+    finals = [Path(p) for p in task["outputs"]]
+    partials = [p.with_name(f".{p.stem}.partial-{uuid.uuid4().hex[:12]}{p.suffix}") for p in finals]
+    joined = [_Joined(p) for p in partials]
+    try:
+        with scratch(task["scratch"]) as folder:
+            for start in range(0, count, most):
+                end = min(count, start + most)
+                piece = os.path.join(folder, "part.las")
+                _copy(source["path"], start, end, piece)
+                outputs = [os.path.join(folder, f"out{n}.las") for n in range(len(writers))]
+                reader = {**source["reader"], "type": "readers.las", "filename": piece}
+                run_tail([reader], [gather(task, start, end)], _uncompressed(task["tail"]), outputs)
+                if not all(j.add(output) for j, output in zip(joined, outputs, strict=True)):
+                    return None
+        for one in joined:
+            one.close()
+        for one, partial, final in zip(joined, partials, finals, strict=True):
+            check_whole(partial, final, one.count)
+        for partial, final in zip(partials, finals, strict=True):
+            os.replace(partial, final)
+    except OSError as error:
+        raise StageError("the output could not be written", found=error.strerror or str(error)) from error
+    finally:
+        for one, partial in zip(joined, partials, strict=True):
+            one.abandon()
+            partial.unlink(missing_ok=True)
+    return {"outputs": [[str(p), *stamp(p)] for p in finals], "written": joined[0].count if joined else 0}
+
+
+def _uncompressed(tail: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [{k: v for k, v in s.items() if k != "compression"} if s["type"] == "writers.las" else s for s in tail]
+
+
+def _copy(path: str, start: int, end: int, target: str) -> None:
+    """Points `start` to `end` as an uncompressed file with the file's own header."""
+    head, tail = plain_header(path)
+    with open_las(path) as reader, open(target, "wb") as out:
+        out.write(head)
+        for first in range(start, end, BLOCK):
+            out.write(read_block(reader, path, first, min(BLOCK, end - first)).array.tobytes())
+        finish(out, head, tail, end - start)
+
+
+class _Joined:
+    """A LAS or LAZ file made of others with one header."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.count = path, 0
+        self._writer: Any = None
+        self._head: Any = None
+
+    def add(self, part: str) -> bool:
+        """Append the points of a file; False where its header differs."""
+        import laspy
+
+        with open_las(part) as reader:
+            header = reader.header
+            head = (
+                *header.scales.tolist(),
+                *header.offsets.tolist(),
+                header.point_format,
+                str(header.version),
+                [(v.user_id, v.record_id, v.record_data_bytes()) for v in header.vlrs],
+            )
+            if self._writer is None:
+                self._head = head
+                self._writer = laspy.open(
+                    self.path, mode="w", header=header, do_compress=self.path.suffix.lower() == ".laz"
+                )
+            elif head != self._head:
+                return False
+            total = int(header.point_count)
+            for first in range(0, total, BLOCK):
+                self._writer.write_points(read_block(reader, part, first, min(BLOCK, total - first)))
+            self.count += total
+        os.unlink(part)
+        return True
+
+    def close(self) -> None:
+        """Finish the file."""
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+    def abandon(self) -> None:
+        """Close the file whatever state it is in."""
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            try:
+                writer.close()
+            except Exception:  # it is deleted anyway
+                return
