@@ -138,7 +138,7 @@ packages() {
 # refresh_apt: once per run. A third party's broken source must not stop us: whether the packages are found decides.
 refresh_apt() {
   [ -z "${APT_FRESH:-}" ] || return 0
-  APT_FRESH=1
+  export APT_FRESH=1
   step "apt: refresh the package lists" tolerate apt_root apt-get -q -o Acquire::Retries=3 update
 }
 
