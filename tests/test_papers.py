@@ -282,3 +282,22 @@ def test_h17_score_and_report(town, monkeypatch):
     shares = {at: h17_oakland.shares(part, 0.03) for at in ("train", "0.03")}
     text = h17_oakland.report(runs, {"train": 0.03, "test": 0.03, "shares": shares})
     assert f"{runs[0]['mcp']:.2f}" in text
+
+
+def test_b16_command_on_pts_resumes(folder, tmp_path, monkeypatch, capsys):
+    """The command for clouds that cannot be had, on the stand-in; a second run does nothing again."""
+    monkeypatch.setattr(b16_experiments, "COUNT", 50)
+    monkeypatch.setattr(b16_experiments, "TREES", 3)
+    monkeypatch.setattr(scenes, "NEIGHBORHOODS", "c1,c2,c3,c5,kopt")
+    words = ["--data", str(folder), "--scene", "town", "--cache", str(tmp_path / "cache"), "--seeds", "1"]
+    words += ["--threads", "1", "--json", str(tmp_path / "r.json"), "--tables", str(tmp_path / "t.md")]
+    monkeypatch.setattr(sys, "argv", ["b16_experiments.py", *words])
+    b16_experiments.main()
+    first = json.loads((tmp_path / "r.json").read_text())
+    assert len(first["runs"]) == 21
+    assert first["machine"]["pdal_stages"]
+    assert "Kappa" in (tmp_path / "t.md").read_text()
+    capsys.readouterr()
+    b16_experiments.main()
+    assert json.loads((tmp_path / "r.json").read_text()) == first
+    assert '"neighborhood"' not in capsys.readouterr().err  # nothing was run

@@ -39,7 +39,7 @@ def load(
     *,
     classes: tuple[int, ...] | None = None,
     columns: str | None = None,
-    neighborhoods: str = NEIGHBORHOODS,
+    neighborhoods: str | None = None,
     threads: int | None = None,
 ) -> Scene:
     """Read a scene, compute its features where the cache has none.
@@ -50,7 +50,7 @@ def load(
     parts = {part: with_height(read_scene(data, name, part, columns)) for part in ("train", "test")}
     if classes is None:
         classes = SCENES.get(name) or tuple(np.unique(parts["train"].labels).tolist())
-    plan = FeaturePlan.parse(neighborhoods, "all", ("HeightAboveGround", "Z"))
+    plan = FeaturePlan.parse(neighborhoods or NEIGHBORHOODS, "all", ("HeightAboveGround", "Z"))
     bins = fitted_bins(parts["train"], plan, cache, 0, threads)
     clouds, tables = [], []
     for part in parts.values():
