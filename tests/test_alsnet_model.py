@@ -238,6 +238,11 @@ def shallow(**changes):
     return {**TINY.to_dict(), **changes}
 
 
+def greedy():
+    level = {**TINY.to_dict()["levels"][0], "centres": 10**6, "samples": 1024}
+    return shallow(points=10**6, levels=[level, TINY.to_dict()["levels"][1]])
+
+
 @pytest.mark.parametrize(
     "parameters, text",
     [
@@ -246,6 +251,7 @@ def shallow(**changes):
         ({"configuration": 7}, "parameters are not right"),
         ({"configuration": shallow(points=10**9)}, "points"),
         ({"configuration": shallow(levels=TINY.to_dict()["levels"][:1])}, "does not know|must be"),
+        ({"configuration": greedy()}, "too much memory"),
         ({"inputs": []}, "inputs"),
         ({"inputs": [{"name": n, "mean": 0, "scale": 0} for n in INPUTS]}, "scale"),
         ({"inputs": [{"name": n, "mean": True, "scale": 1} for n in INPUTS]}, "mean"),

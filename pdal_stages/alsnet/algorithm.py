@@ -24,6 +24,8 @@ from .configuration import Configuration, parse_configuration
 from .pyramid import Pyramid, build, scramble
 from .weights import Folded, Weights, check
 
+#: A network whose batch would need more megabytes is not loaded; the published ones need a few thousand.
+MOST_MB = 32_768
 #: Metres that become 1 where X, Y or Z is an input.
 METRES = 10.0
 
@@ -135,6 +137,9 @@ class AlsNet:
             )
         mean = tuple(_finite(entry.get("mean"), "mean", -1e12, 1e12) for entry in entries)
         scale = tuple(_finite(entry.get("scale"), "scale", 1e-12, 1e12) for entry in entries)
+        needed = configuration.memory_mb(n_features)
+        if needed > MOST_MB:
+            raise ModelError("a batch of the network would need too much memory", found=f"{needed:,.0f} MB")
         check(arrays, configuration, n_features, n_classes)
         return cls(
             dict(arrays), configuration, tuple(e["name"] for e in entries), mean, scale, spacing, n_classes

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -106,16 +107,24 @@ def hold_out(
 
 
 def covering(circles: Circles, wanted: npt.NDArray[np.bool_]) -> list[int]:
-    """A few circles that hold every wanted point at least once."""
+    """A few circles that hold every wanted point at least once: always the one that adds most."""
     left = wanted.copy()
-    out = []
-    if left.any():
-        for number in circles.needed(np.flatnonzero(left)).tolist():
-            members = circles.members(number)
-            if left[members].any():
-                left[members] = False
-                out.append(number)
-    return out
+    out: list[int] = []
+    if not left.any():
+        return out
+    numbers = circles.needed(np.flatnonzero(left)).tolist()
+    heap = [(-int(np.count_nonzero(left[circles.members(number)])), number) for number in numbers]
+    heapq.heapify(heap)
+    while left.any():
+        _, number = heapq.heappop(heap)
+        members = circles.members(number)
+        gain = int(np.count_nonzero(left[members]))  # it only shrinks, so an old value is an upper bound
+        if heap and -gain > heap[0][0]:
+            heapq.heappush(heap, (-gain, number))
+            continue
+        left[members] = False
+        out.append(number)
+    return sorted(out)
 
 
 def class_weights(count: npt.NDArray[Any], kind: str) -> npt.NDArray[np.float64]:
