@@ -46,7 +46,7 @@ class TilingOptions:
     buffer: float | None = None
     resume: bool = False
     retries: int = 2
-    most_points: int = 20_000_000
+    most_points: int = 5_000_000
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tile", float(self.tile))  # 20 and 20.0 are one run

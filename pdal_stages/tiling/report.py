@@ -55,7 +55,9 @@ def _headline(run: TiledRun) -> str:
     states = s["states"]
     remark = ", ".join(f"{states[k]} {text}" for k, text in _STATES.items() if states.get(k) and k != "done")
     figures = [("Tiles", f"{len(run.tiles):,}", "", remark)]
-    figures.append(("Points", f"{s.get('points', 0):,}", "", f"{s['dropped']:,} dropped" if s.get("dropped") else ""))
+    points = s.get("points", 0)
+    size, unit = (f"{points:,}", "") if points < 10_000_000 else (f"{points / 1e6:,.1f}", "million")
+    figures.append(("Points", size, unit, f"{s['dropped']:,} dropped" if s.get("dropped") else ""))
     if "seconds" in s:
         figures.append(("Time", _duration(s["seconds"]), "", f"{s['workers']} workers"))
         figures.append(("Speed", f"{s['points_per_second']:,.0f}", "points/s", ""))
@@ -69,7 +71,7 @@ _STATES = {"done": "done", "kept": "kept from an earlier run", "failed": "failed
 def _duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s" if minutes else f"{seconds:.1f} s"
+    return f"{hours} h {minutes:02d}" if hours else f"{minutes}:{rest:02d} min" if minutes else f"{seconds:.1f} s"
 
 
 def _failures(run: TiledRun) -> str:

@@ -19,6 +19,7 @@ from ..overrides import Override
 from ..progress import Progress
 from ..stages import registry
 from ..units import units_of_wkt
+from .assemble import MOST_AT_ONCE
 from .grid import Box, Grid, union
 from .options import TilingOptions
 from .plan import TilePlan, check_not_inputs, make_plan, outputs_for
@@ -675,7 +676,8 @@ def estimate_memory(read: int, count: int, files: int) -> float:
     count, files : int
         Points of all inputs and their number, where each becomes one output; else 0.
     """
-    return _BASE_MB + max(read * _TILE_BYTES + _BLOCKS_MB * 2**20, count / max(files, 1) * _FILE_BYTES) / 2**20
+    at_once = min(count / max(files, 1), MOST_AT_ONCE)
+    return _BASE_MB + max(read * _TILE_BYTES + _BLOCKS_MB * 2**20, at_once * _FILE_BYTES) / 2**20
 
 
 def _failure(answer: Any) -> tuple[str, bool]:

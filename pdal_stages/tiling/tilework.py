@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..asprs import LEGACY_LIMIT
 from ..errors import PipelineError, StageError
 from ..files import write_whole
 from ..pipeline import Pipeline
 from ..stages import registry
 from . import marks
-from .extract import Piece, cut, outside
+from .extract import Piece, cut
 from .grid import Grid, inside
 from .plan import MARGIN, ROW, SOURCE, later_reaches
 
@@ -69,10 +70,14 @@ class Results:
         For each dimension and source, values in the order of `rows`.
     cores : list of int
         For each source, how many own points went in.
+    legacy : bool
+        Whether the flag bits of LAS 1.0-1.3 sit inside `Classification`.
     """
 
-    def __init__(self, rows: list[NDArray], values: dict[str, list[NDArray]], cores: list[int]) -> None:
-        self.rows, self.values, self.cores = rows, values, cores
+    def __init__(
+        self, rows: list[NDArray], values: dict[str, list[NDArray]], cores: list[int], legacy: bool = False
+    ) -> None:
+        self.rows, self.values, self.cores, self.legacy = rows, values, cores, legacy
 
 
 @contextlib.contextmanager
@@ -197,6 +202,7 @@ def _head(task, grid, tile, pieces: list[Piece], sources, everything: bool) -> t
 def _collect(arrays, pieces, cores, creates, before) -> Results:
     """Results of the tile's own points, sorted as their pieces are."""
     names = [n for a in arrays[:1] for n in a.dtype.names]
+    legacy = not {"Synthetic", "Withheld", "ClassFlags"} & set(names) and all(_old_format(p.path) for p in pieces)
     if creates is not None:
         names = [n for n in creates if n in names]
     else:
@@ -226,7 +232,12 @@ def _collect(arrays, pieces, cores, creates, before) -> Results:
             values[name].append(column[order] if parts else column)
     if creates is None:
         values = _changed(values, rows, before)
-    return Results(rows, values, cores)
+    return Results(rows, values, cores, legacy)
+
+
+def _old_format(path: str) -> bool:
+    with open(path, "rb") as file:
+        return file.read(105)[104] & 0x3F <= 5
 
 
 def _changed(values, rows, before) -> dict[str, list[NDArray]]:
@@ -314,8 +325,7 @@ def _class_counts(results: Results) -> dict[str, int]:
     counts = np.zeros(256, np.int64)
     for column in results.values.get("Classification", ()):
         if len(column):
-            counts += np.bincount(np.asarray(column, np.uint8), minlength=256)
+            codes = np.asarray(column, np.uint8)
+            counts += np.bincount(codes & LEGACY_LIMIT if results.legacy else codes, minlength=256)
     return {str(c): int(counts[c]) for c in np.flatnonzero(counts)}
 
-
-__all__ = ["Results", "outside", "run_tile", "scratch"]
