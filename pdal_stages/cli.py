@@ -21,6 +21,9 @@ _OVERRIDES = (
     "--filters.name.option=VALUE for all stages of a type."
 )
 
+#: Lines of PDAL's log that are shown without -v.
+_SAID = 10
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code (0 fine, 1 an error, 2 wrong usage, 130 interrupted)."""
@@ -201,9 +204,7 @@ def _pipeline(options: argparse.Namespace) -> int | None:
     _check_metadata(options)
     _end_at_once(options)
     pipeline.execute(arrays=False)
-    _after(pipeline, options.metadata)
-    if options.verbose and pipeline.log:
-        print(pipeline.log, file=sys.stderr)
+    _after(pipeline, options.metadata, verbose=bool(options.verbose))
     return None
 
 
@@ -215,9 +216,17 @@ def _check_metadata(options: argparse.Namespace) -> None:
         check_writable(options.metadata, "metadata")
 
 
-def _after(pipeline, metadata: str | None) -> None:
+def _after(pipeline, metadata: str | None, verbose: bool = False) -> None:
     from .files import write_whole
 
+    # What PDAL calls an error although it goes on: a reader that sets what it cannot read to 0, say.
+    said = pipeline.log.strip().splitlines()
+    for line in said if verbose else said[:_SAID]:
+        print(f"pdal-stages: PDAL says: {line}", file=sys.stderr)
+    if len(said) > _SAID and not verbose:
+        print(f"pdal-stages: PDAL says {len(said) - _SAID:,} more lines; -v shows them", file=sys.stderr)
+    for remark in pipeline.remarks:
+        print(f"pdal-stages: {remark}", file=sys.stderr)
     for place, reports in pipeline.reports:
         for report in reports:
             for key in ("warning", "note"):

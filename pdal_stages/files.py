@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-import struct
 import tempfile
 from pathlib import Path
 
 from .errors import StageError
+from .lasfile import is_short
 
 
 def partial_name(path: str | os.PathLike) -> Path:
@@ -45,7 +45,7 @@ def check_complete(path: str | os.PathLike, name: str | os.PathLike) -> None:
     path = Path(path)
     try:
         size = path.stat().st_size
-        short = _las_is_short(path, size) if path.suffix.lower() in (".las", ".laz") else None
+        short = is_short(path, size) if path.suffix.lower() in (".las", ".laz") else None
         full = not short and hasattr(os, "statvfs") and os.statvfs(path).f_bavail == 0 and short is None
     except OSError as error:
         raise StageError("the output file cannot be read back", found=f"{name}: {error}") from error
@@ -55,30 +55,6 @@ def check_complete(path: str | os.PathLike, name: str | os.PathLike) -> None:
             found=f"{name}: {size:,} bytes were written",
             cure="Make room on the disk (or raise the limit on file sizes)",
         )
-
-
-def _las_is_short(path: Path, size: int) -> bool | None:
-    """Whether a LAS or LAZ file ends before its points do; None where it is no LAS file."""
-    with open(path, "rb") as file:
-        head = file.read(375)
-        if len(head) < 227 or head[:4] != b"LASF":
-            return True if size < 227 else None
-        minor, (offset,) = head[25], struct.unpack_from("<I", head, 96)
-        kind, length = head[104], struct.unpack_from("<H", head, 105)[0]
-        count = struct.unpack_from("<I", head, 107)[0]
-        if minor >= 4 and len(head) >= 255:
-            count = struct.unpack_from("<Q", head, 247)[0]
-        if not kind & 0x80:  # points of a fixed length
-            return offset + count * length > size
-        file.seek(offset)
-        place = file.read(8)
-        if len(place) < 8:
-            return True
-        table = struct.unpack("<q", place)[0]  # of LAZ chunks, written last
-        if table == -1:  # a stream that could not be rewound has it at its end
-            file.seek(size - 8)
-            table = struct.unpack("<q", file.read(8))[0]
-        return not offset + 8 <= table <= size - 8
 
 
 def check_writable(path: str | os.PathLike, what: str = "output") -> None:

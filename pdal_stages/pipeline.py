@@ -14,6 +14,7 @@ from typing import Any
 from . import pdal_env, runtime
 from .errors import PipelineError, StageError
 from .files import check_complete, check_writable, partial_name
+from .lasfile import check_readable, odd_text
 from .leftovers import removed_if_killed
 from .lowering import Lowered, lower
 from .overrides import Override, apply_overrides
@@ -53,6 +54,7 @@ class Pipeline:
         self.arrays: list = []
         self.log = ""
         self.reports: list[tuple[str, list[dict[str, Any]]]] = []
+        self.remarks: list[str] = []
 
     @property
     def json(self) -> str:
@@ -61,6 +63,7 @@ class Pipeline:
 
     def validate(self) -> None:
         """Check outputs and let PDAL check its own stages' options, without reading points."""
+        self._check_inputs()
         for stage in self.lowered.stages:
             if _is_writer(stage, self.lowered.stages):
                 check_writable(stage["filename"])
@@ -80,6 +83,7 @@ class Pipeline:
         StageError
             What went wrong, where, and the cure.
         """
+        self._check_inputs()
         stages, renames = _partial_outputs(self.lowered.stages)
         for ours in self.lowered.ours:
             runtime.remember_stdout(ours.label)
@@ -96,12 +100,18 @@ class Pipeline:
                     self.reports.append((ours.place, reports))
             _rename(renames)
         except StageError as error:
+            for partial, final in renames if isinstance(error.found, str) else ():
+                error.found = str(error.found).replace(str(partial), str(final))
             raise failure or self._located(error) from None
         finally:
             _discard(renames)
         self.metadata = _named_metadata(result.metadata, self.reports)
         self.arrays, self.log = result.arrays, result.log
         return result.count
+
+    def _check_inputs(self) -> None:
+        """Look at the headers of LAS files: PDAL takes damaged ones for whole, or crashes."""
+        self.remarks = [r for path in _las_inputs(self.lowered.stages) if (r := check_readable(path))]
 
     def _models(self) -> list[str]:
         """Where models are being written: what to remove if the process is killed meanwhile."""
@@ -112,6 +122,15 @@ class Pipeline:
         """PDAL's words, with the line of the stage that they name and the nearest stage there is."""
         if not isinstance(error, PipelineError) or error.where is not None:
             return error
+        if _NOT_UTF8.search(str(error.found)):
+            for path in _las_inputs(self.lowered.stages):
+                if (odd := odd_text(path)) is not None:
+                    return PipelineError(
+                        f"the {odd[0]} in the LAS file is not UTF-8, which PDAL's filters.python cannot take",
+                        where=path,
+                        found=str(odd[1])[1:],
+                        cure=f"Write the file anew first: pdal translate {path} clean.laz",
+                    )
         named = _STAGE_TYPE.search(str(error.found or ""))
         if named is None:
             return error
@@ -134,6 +153,22 @@ def run_pipeline(source: str | Path | list | dict, overrides: Iterable[Override]
 
 
 _STAGE_TYPE = re.compile(r"\b(?:readers|filters|writers)\.\w+")
+
+
+_NOT_UTF8 = re.compile(r"returned a result with an exception set|UnicodeDecodeError|codec can't decode")
+
+
+def _las_inputs(stages: list[dict[str, Any]]) -> list[str]:
+    """Local LAS and LAZ files that are read, patterns filled in."""
+    found: list[str] = []
+    for index, stage in enumerate(stages):
+        name, kind = stage.get("filename"), stage.get("type", "")
+        if not isinstance(name, str) or "://" in name or (not kind and 0 < index == len(stages) - 1):
+            continue
+        if kind == "readers.las" or (not kind and name.lower().endswith((".las", ".laz"))):
+            names = sorted(glob.glob(name)) if not os.path.exists(name) else [name]
+            found += [n for n in names if os.path.isfile(n)]
+    return found
 
 
 def _is_writer(stage: dict[str, Any], stages: list[dict[str, Any]]) -> bool:

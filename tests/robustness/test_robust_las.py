@@ -1,0 +1,227 @@
+"""LAS and LAZ files of every version and point format, damaged ones, and dimensions whose names are ours."""
+
+from __future__ import annotations
+
+import struct
+import subprocess
+
+import laspy
+import numpy as np
+import pytest
+from conftest import scene
+from robustness_kit import job
+
+pytestmark = pytest.mark.pdal
+
+STAGES = [{"type": "filters.hag_minima"}, {"type": "filters.multiscalefeatures", "neighborhoods": "c1", "feature_set": "Linearity"}]
+
+
+def pipeline(tmp_path, source, model, *stages, **writer):
+    """Heights, one feature, classes, to out.las; "forward" keeps version and point format."""
+    return job(
+        tmp_path,
+        {"type": "readers.las", "filename": str(source), "use_eb_vlr": True},
+        *(stages or (*STAGES, {"type": "filters.modelclassifier", "model": str(model)})),
+        {"type": "writers.las", "filename": str(tmp_path / "out.las"), "extra_dims": "all", "forward": "all", **writer},
+    )
+
+
+def check(tmp_path, n=600):
+    out = laspy.read(tmp_path / "out.las")
+    assert len(out) == n
+    assert np.isin(out.classification, [2, 6]).all() and np.mean(np.asarray(out.classification) == scene()["Classification"]) > 0.8
+    assert np.allclose(np.asarray(out["HeightAboveGround"]).max(), 5, atol=0.3)
+    return out
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize(
+    ("version", "point_format"),
+    [(v, f) for v, top in ((0, 1), (1, 1), (2, 3), (3, 5), (4, 10)) for f in range(top + 1) if v in (0, 4) or f == top],
+)
+def test_versions_and_formats(cell, tmp_path, write_las, model, version, point_format, suffix):
+    waves = point_format in (4, 5, 9, 10)
+    if waves and suffix == ".laz":
+        pytest.skip("lazrs does not write LAZ with wave packets")
+    source = tmp_path / f"in{suffix}"
+    if version <= 1 and suffix == ".laz":
+        pytest.skip("laspy does not write LAZ of LAS 1.0 and 1.1")
+    source = write_las(source, scene(), point_format=point_format, minor_version=max(version, 2) if not waves or version == 4 else 3)
+    if version <= 1:
+        data = bytearray(source.read_bytes())
+        data[25] = version
+        source.write_bytes(bytes(data))
+    it = cell("LAS files", f"LAS 1.{version}, point format {point_format}, {suffix[1:].upper()}")
+    done = it.command("pipeline", pipeline(tmp_path, source, model))
+    if waves and done.code:  # not every PDAL reads or writes wave packets
+        it.refused(done, "format")
+        return
+    kept = version >= 1
+    it.runs(done, "classes; version and point format are kept" if kept else "classes; written as LAS 1.2, as PDAL writes no LAS 1.0")
+    out = check(tmp_path)
+    assert (out.header.version.minor, out.header.point_format.id) == (version if kept else 2, point_format)
+
+
+@pytest.mark.parametrize("kind", ["u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8"])
+def test_extra_bytes_of_every_type(cell, tmp_path, write_las, model, kind):
+    values = np.arange(600).astype(kind)
+    source = write_las(tmp_path / "in.las", {**scene(), "Mine": values}, point_format=6)
+    cell("LAS files", f"extra bytes of type {np.dtype(kind).name}").runs(
+        ["pipeline", pipeline(tmp_path, source, model)], "come out as they went in"
+    )
+    assert np.array_equal(check(tmp_path)["Mine"], values)
+
+
+def test_scaled_extra_bytes(cell, tmp_path, model):
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales, header.offsets = np.full(3, 0.001), [500_000, 5_400_000, 0]
+    header.add_extra_dim(laspy.ExtraBytesParams(name="Scaled", type="i2", scales=np.array([0.01]), offsets=np.array([5.0])))
+    las = laspy.LasData(header)
+    data = scene()
+    las.x, las.y, las.z, las.classification = data["X"], data["Y"], data["Z"], data["Classification"]
+    las["Scaled"] = np.arange(600) * 0.01
+    las.write(tmp_path / "in.las")
+    cell("LAS files", "extra bytes with a scale and an offset").runs(
+        ["pipeline", pipeline(tmp_path, tmp_path / "in.las", model)], "come out with the same values"
+    )
+    assert np.allclose(check(tmp_path)["Scaled"], las["Scaled"])
+
+
+OURS = ["HeightAboveGround", "Reliability", "Linearity_c1", "Margin", "Probability_2"]
+
+
+@pytest.mark.parametrize("kind", ["u1", "i2", "u4", "i8", "f4", "f8"])
+def test_dimensions_named_like_ours(cell, tmp_path, write_las, model, kind):
+    """An earlier run's, or another program's: overwritten, with the fractions kept whatever the type was."""
+    before = {name: np.full(600, 77).astype(kind) for name in OURS}
+    source = write_las(tmp_path / "in.las", {**scene(), **before}, point_format=6)
+    classify = {"type": "filters.modelclassifier", "model": str(model), "margin": True, "probabilities": True}
+    it = cell("LAS files", f"dimensions named like ours of type {np.dtype(kind).name}")
+    it.runs(["pipeline", pipeline(tmp_path, source, model, *STAGES, classify)], "are overwritten, fractions kept")
+    out = check(tmp_path)
+    clean = write_las(tmp_path / "in.las", scene(), point_format=6)
+    (tmp_path / "out.las").unlink()
+    it.command("pipeline", pipeline(tmp_path, clean, model, *STAGES, classify))
+    fresh = check(tmp_path)
+    for name in OURS:
+        assert np.allclose(out[name], fresh[name], rtol=1e-6), name
+    assert np.ptp(np.asarray(fresh["Linearity_c1"])) > 0.1
+
+
+def test_a_height_of_another_type_and_where(cell, tmp_path, write_las, model):
+    before = {"HeightAboveGround": np.full(600, 77, np.uint8)}
+    source = write_las(tmp_path / "in.las", {**scene(), **before}, point_format=6)
+    stage = {"type": "filters.hag_minima", "where": "Classification == 2"}
+    cell("LAS files", "'where' over a dimension that is there already").runs(
+        ["pipeline", pipeline(tmp_path, source, model, stage)], "points outside keep their value"
+    )
+    out = laspy.read(tmp_path / "out.las")
+    ground = scene()["Classification"] == 2
+    assert (np.asarray(out["HeightAboveGround"])[~ground] == 77).all()
+    assert (np.asarray(out["HeightAboveGround"])[ground] < 1).all()
+
+
+def test_only_gps_time(cell, tmp_path, write_las, model):
+    source = write_las(tmp_path / "in.las", {**scene(), "GpsTime": np.linspace(1e8, 1e8 + 5, 600)}, point_format=1)
+    cell("LAS files", "GPS time and no colours").runs(["pipeline", pipeline(tmp_path, source, model)], "times are kept")
+    assert np.array_equal(check(tmp_path).gps_time, np.linspace(1e8, 1e8 + 5, 600))
+
+
+# ---- damaged files -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture()
+def good(tmp_path, write_las):
+    return write_las(tmp_path / "in.las", scene(), point_format=3)
+
+
+def damaged(path, edit):
+    data = bytearray(path.read_bytes())
+    path.write_bytes(bytes(edit(data) or data))
+    return path
+
+
+def header(name, value):
+    places = {"count": ("<I", 107), "offset": ("<I", 96), "length": ("<H", 105), "format": ("<B", 104), "vlrs": ("<I", 100),
+              "minor": ("<B", 25), "signature": ("<4s", 0), "scale": ("<d", 131), "header": ("<H", 94)}  # fmt: skip
+    kind, at = places[name]
+
+    def edit(data):
+        struct.pack_into(kind, data, at, value)
+
+    return edit
+
+
+DAMAGED = [
+    ("LAS: empty file", None),
+    ("LAS: cut in the header", lambda d: d[:100]),
+    ("LAS: cut in the points", lambda d: d[: len(d) // 2]),
+    ("LAS: cut in the last point", lambda d: d[:-3]),
+    ("LAS: more points in the header than in the file", header("count", 6000)),
+    ("LAS: four billion points in the header", header("count", 2**32 - 1)),
+    ("LAS: points that begin beyond the end", header("offset", 10**9)),
+    ("LAS: points that begin in the header", header("offset", 10)),
+    ("LAS: point length of 0", header("length", 0)),
+    ("LAS: point length shorter than the format", header("length", 10)),
+    ("LAS: point format 77", header("format", 77)),
+    ("LAS: version 1.9", header("minor", 9)),
+    ("LAS: another signature", header("signature", b"NOPE")),
+    ("LAS: a million records before the points", header("vlrs", 10**6)),
+    ("LAS: scale of NaN", header("scale", float("nan"))),
+    ("LAS: scale of infinity", header("scale", float("inf"))),
+    ("LAS: a text file named .las", lambda d: b"X Y Z\n1 2 3\n" * 50),
+]
+
+
+@pytest.mark.parametrize(("case", "edit"), DAMAGED, ids=[row[0] for row in DAMAGED])
+def test_damaged_las(cell, tmp_path, model, good, case, edit):
+    if edit is None:
+        good.write_bytes(b"")
+    else:
+        damaged(good, edit)
+    it = cell("LAS files", case)
+    says = "no LAS file" if case.rpartition(" ")[2] in ("file", "header", "signature", ".las") and "points" not in case else "damaged"
+    it.refused(["pipeline", pipeline(tmp_path, good, model)], "in.las", says)
+
+
+def test_fewer_points_in_the_header(cell, tmp_path, good, model):
+    damaged(good, header("count", 100))
+    done = cell("LAS files", "LAS: fewer points in the header than in the file").runs(
+        ["pipeline", pipeline(tmp_path, good, model, *STAGES)], "the points of the header, and a remark on the bytes beyond"
+    )
+    assert "bytes beyond the 100 points" in done.err
+    assert len(laspy.read(tmp_path / "out.las")) == 100
+
+
+LAZ = [
+    ("LAZ: cut in the header", lambda d: d[:100]),
+    ("LAZ: cut in the points", lambda d: d[: len(d) // 2]),
+    ("LAZ: cut in the chunk table", lambda d: d[:-4]),
+    ("LAZ: chunk table beyond the end", None),
+    ("LAZ: more points in the header than in the file", header("count", 60_000)),
+]
+
+
+@pytest.mark.parametrize(("case", "edit"), LAZ, ids=[row[0] for row in LAZ])
+def test_damaged_laz(cell, tmp_path, write_las, model, case, edit):
+    source = write_las(tmp_path / "in.laz", scene(), point_format=3)
+    if edit is None:
+        offset = struct.unpack_from("<I", source.read_bytes(), 96)[0]
+        damaged(source, lambda d: struct.pack_into("<q", d, offset, 10**12))
+    else:
+        damaged(source, edit)
+    it = cell("LAS files", case)
+    it.refused(["pipeline", pipeline(tmp_path, source, model)])
+
+
+def test_header_texts_in_latin_1(cell, tmp_path, good, model, pdal_program):
+    damaged(good, lambda d: d.__setitem__(slice(26, 58), "Vermessungsb\u00fcro".encode("latin-1").ljust(32, b"\0")))
+    it = cell("LAS files", "header texts in Latin-1")
+    done = it.command("pipeline", pipeline(tmp_path, good, model))
+    if done.code == 0:  # not every PDAL stumbles
+        it.runs(done, "classes")
+    else:
+        it.refused(done, "the system identifier", "not UTF-8", "Vermessungsb", "pdal translate")
+        subprocess.run([pdal_program, "translate", good, tmp_path / "clean.las"], check=True)
+        assert it.command("pipeline", pipeline(tmp_path, tmp_path / "clean.las", model)).code == 0
+    check(tmp_path)
