@@ -65,15 +65,21 @@ def test_modelclassifier_applies_a_network(cloud, model, tmp_path, pdal_module):
 
 
 @pytest.mark.pdal
-def test_tiles_give_the_labels_of_the_whole(cloud, model, tmp_path, pdal_module):
+def test_tiles_give_the_labels_of_the_whole(cloud, tmp_path, pdal_module):
+    """Heights above ground included, which neighbors need too."""
     laspy = pytest.importorskip("laspy")
     from pdal_stages.tiling import run_tiled
 
-    path = cloud[0]
+    path, model = cloud[0], tmp_path / "heights.model"
+    net = dataclasses.replace(
+        random_net(("Z", "HeightAboveGround"), seed=4), mean=(0.2, 1.0), scale=(0.3, 2.0)
+    )
+    model_of(net).save(model)
 
     def stages(out):
         return [
             str(path),
+            {"type": "filters.hag_minima"},
             {"type": "filters.modelclassifier", "model": str(model), "variance": True},
             {
                 "type": "writers.las",
