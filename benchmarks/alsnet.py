@@ -29,7 +29,7 @@ from classification import MERGED, SCENES, figures, read, with_height
 
 from pdal_stages.accuracy import Accuracy
 from pdal_stages.alsnet import CONFIGURATIONS
-from pdal_stages.classifier import Model, TrainingCloud, TrainingOptions, load_model, train
+from pdal_stages.classifier import Model, TrainingCloud, TrainingOptions, train
 
 #: Side of the squares a tenth of which keeps its labels, metres.
 PATCH = 10.0
@@ -239,6 +239,9 @@ def main() -> None:
         "--transfer-network", type=json.loads, default={}, help="other options for the second part"
     )
     parser.add_argument("--source", type=Path, help="model to transfer from, instead of training on Delft")
+    parser.add_argument(
+        "--start", choices=("both", "source", "nothing"), default="both", help="what of --transfer"
+    )
     parser.add_argument("--forest", action="store_true", help="the forest instead")
     parser.add_argument("--kernels", nargs="*", metavar="CONFIGURATION", help="times of one batch instead")
     parser.add_argument("--train", nargs="+", type=Path, help="labelled LAS or LAZ files instead of a scene")
@@ -294,22 +297,25 @@ def transfer(args) -> list[dict]:
     with tempfile.TemporaryDirectory() as folder:
         source = args.source or Path(folder) / "delft.model"
         out = []
-        if not args.source:
+        if not args.source and args.start != "nothing":
             model, notes = trained(
                 cloud_of(args.data, "delft", "train"), list(SCENES["delft"]), args.network, args, "delft"
             )
             model.save(source)
             out.append(notes)
-        load_model(source)
         cloud, test = (
             tenth(cloud_of(args.data, "montpellier", "train")),
             cloud_of(args.data, "montpellier", "test"),
         )
         second = {"validation": 0, "histogram_threshold": 100, **args.network, **args.transfer_network}
-        for what, start in (("a tenth, after Delft", str(source)), ("a tenth, from nothing", None)):
+        starts = {"source": ("a tenth, after Delft", str(source)), "nothing": ("a tenth, from nothing", None)}
+        for kind, (what, start) in starts.items():
+            if args.start not in ("both", kind):
+                continue
             what = f"montpellier: alsNet, {what}"
-            options = {**second, "start_from": start}
-            model, notes = trained(cloud, list(SCENES["montpellier"]), options, args, what)
+            model, notes = trained(
+                cloud, list(SCENES["montpellier"]), {**second, "start_from": start}, args, what
+            )
             out += [notes, judge(model, test, MERGED["montpellier"], args.threads, what)]
         return out
 
