@@ -305,7 +305,7 @@ def test_an_unreachable_scheduler(tmp_path, folder):
 
 def test_a_scheduler_that_runs_already(tmp_path, folder, expected):
     distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(n_workers=WORKERS, threads_per_worker=1, dashboard_address=None) as cluster:
+    with distributed.LocalCluster(n_workers=WORKERS, threads_per_worker=1, dashboard_address="127.0.0.1:0") as cluster:
         run = run_tiled(pipeline(folder, tmp_path / "o_#.laz"), 20, scheduler=cluster.scheduler_address)
     assert not run.failures and run.summary["workers"] == WORKERS
     check_same(tmp_path, expected)

@@ -13,6 +13,7 @@ from .work import perform
 
 #: Seconds to wait for the first worker.
 _WAIT = 120
+_PURPOSE = "working in several processes (--workers)"
 
 
 class Here:
@@ -48,12 +49,20 @@ class OnDask:
     def __init__(self, options: TilingOptions) -> None:
         self._options = options
         self._stack = contextlib.ExitStack()
+        self._distributed: Any = None
         self.threads = options.threads
         self.slots = options.local_workers
         self.address = options.scheduler
 
     def __enter__(self) -> OnDask:
-        distributed = optional_import("distributed", "dask", "working in several processes (--workers)")
+        optional_import("distributed", "dask", _PURPOSE)  # said now, not after reading all inputs
+        if self._options.scheduler:
+            self._start()
+        return self
+
+    def _start(self) -> None:
+        """Find or start the workers: processes of this machine only when there is work."""
+        distributed = optional_import("distributed", "dask", _PURPOSE)
         import dask
 
         o = self._options
@@ -93,7 +102,7 @@ class OnDask:
                         threads_per_worker=1,
                         processes=True,
                         memory_limit=0,  # a tile's memory is stated; pausing in mid-tile helps nobody
-                        dashboard_address=None,
+                        dashboard_address="127.0.0.1:0",
                         silence_logs=40,
                     )
                 )
@@ -108,7 +117,6 @@ class OnDask:
             self._stack.close()
             raise
         self._distributed = distributed
-        return self
 
     def __exit__(self, *exc: object) -> None:
         self._stack.close()
@@ -123,12 +131,16 @@ class OnDask:
         tasks : callable
             Gives the next (key, JSON) or None when there is none now; asked again after every answer.
         busy : callable
-            Unused here; whether more tasks may come.
+            Whether there is a task.
 
         Notes
         -----
         As many tasks are out as there are workers, so that one that kills its worker takes no other along.
         """
+        if not busy():
+            return
+        if self._distributed is None:
+            self._start()
         finished = self._distributed.as_completed(loop=self._client.loop)
         keys: dict[str, Any] = {}
         futures: dict[str, Any] = {}

@@ -350,7 +350,7 @@ class _Run:
             return (source, mark), json.dumps(task)
 
         with Progress(total, "reading the inputs", enabled=self._shown()) as progress:
-            for (source, mark), answer in pool.run(tasks, lambda: False):
+            for (source, mark), answer in pool.run(tasks, lambda: bool(waiting)):
                 reason, again = _failure(answer)
                 if reason:
                     tries[source.path] = tries.get(source.path, 0) + 1
