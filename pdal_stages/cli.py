@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import json
 import os
+import re
 import signal
 import sys
 import threading
@@ -21,6 +22,7 @@ _OVERRIDES = (
     "--filters.name.option=VALUE for all stages of a type."
 )
 
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 #: Lines of PDAL's log that are shown without -v.
 _SAID = 10
 
@@ -50,7 +52,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Exception as error:
         if debug:
             raise
-        print(f"pdal-stages: {error if isinstance(error, StageError) else _unforeseen(error)}", file=sys.stderr)
+        message = str(error if isinstance(error, StageError) else _unforeseen(error))
+        # Names and texts from files may hold characters that command a terminal.
+        print(f"pdal-stages: {_CONTROL.sub(lambda m: ascii(m.group())[1:-1], message)}", file=sys.stderr)
         return 1
 
 

@@ -16,7 +16,7 @@ from .errors import StageError
 
 #: Bytes of a point of each format, without extra bytes (LAS 1.4 R15, tables 7 to 18).
 POINT_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
-_CURE = "Get the file again from its source; if it is all there is, repair it with a tool made for that (e.g. lasinfo -repair)"
+_CURE = "Get the file again from its source, or repair it with a tool made for that (e.g. lasinfo -repair)"
 
 
 @dataclass(frozen=True)

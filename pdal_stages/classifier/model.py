@@ -333,6 +333,7 @@ def load_model(path: str | os.PathLike) -> Model:
     try:
         return _assemble(manifest, arrays)
     except ModelError as error:
+        error.cure = error.cure or modelfile.CURE
         raise error.at(str(path)) from None
     except OptionError as error:  # a feature or neighborhood of another release
         raise ModelError("the model's features are not known here", where=str(path), found=error) from error
@@ -345,9 +346,12 @@ def _assemble(manifest: dict[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) 
     )
     names = manifest["feature_names"]
     if list(plan.names) != names or list(plan.dimensions) != manifest["dimensions"]:
+        pairs = zip([*names, *manifest["dimensions"]], [*plan.names, *plan.dimensions], strict=False)
+        first = next((f"'{a}' where '{b}' belongs" for a, b in pairs if a != b), None)
         raise ModelError(
-            "the model's feature names are not those its neighborhoods give in this release",
-            found=f"{len(names)} and {len(plan.names)} features",
+            "the model's features, or their order, are not those its neighborhoods give in this release",
+            found=first or f"{len(names)} features, {len(plan.names)} belong",
+            cure="Train the model again with this release",
         )
     priors = manifest.get("priors")
     if priors is not None and len(priors["factors"]) != len(manifest["classes"]):

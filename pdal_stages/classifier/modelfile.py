@@ -34,7 +34,8 @@ RATIO_LIMIT, ALLOWANCE = 60, 4 << 20
 #: A file's members, and the largest file.
 MEMBER_LIMIT, FILE_LIMIT = 64, (1 << 32) - 1
 
-_CURE = "Train the model again, or copy the file again if it was damaged on its way"
+#: What helps against most of what can be wrong with a file.
+CURE = "Train the model again, or copy the file again if it was damaged on its way"
 _END = struct.Struct("<4s4H2LH")  # zip's end of central directory
 _BAD = (
     zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError, struct.error,
@@ -133,17 +134,18 @@ def read(path: str | os.PathLike, rules_of) -> tuple[dict[str, Any], dict[str, n
             with zipfile.ZipFile(stream) as archive:
                 return _read(archive, size, rules_of)
     except StageError as error:
+        error.cure = error.cure or CURE
         raise error.at(str(path)) from error.__cause__
     except (*_BAD, RecursionError, MemoryError) as error:
         text = f"{type(error).__name__}: {error}"[:200]
-        raise ModelError("the model file cannot be read", where=str(path), found=text, cure=_CURE) from error
+        raise ModelError("the model file cannot be read", where=str(path), found=text, cure=CURE) from error
 
 
 def _check_end(stream) -> int:
     """The file's size, after a look at zip's last record: how long is the list zipfile is about to load?"""
     size = stream.seek(0, os.SEEK_END)
     if size < _END.size:
-        raise ModelError("this is not a model file", found=f"{size} bytes", cure=_CURE)
+        raise ModelError("this is not a model file", found=f"{size} bytes", cure=CURE)
     if size > FILE_LIMIT:
         raise ModelError("the model file is larger than 4 GiB", found=f"{size:,} bytes")
     tail = min(size, _END.size + 20)
@@ -151,15 +153,15 @@ def _check_end(stream) -> int:
     data = stream.read(tail)
     signature, disk, first, here, total, length, offset, comment = _END.unpack(data[-_END.size :])
     if signature != b"PK\x05\x06" or comment:
-        raise ModelError("this is not a model file, or it is cut short", cure=_CURE)
+        raise ModelError("this is not a model file, or it is cut short", cure=CURE)
     if data[: -_END.size].startswith(b"PK\x06\x07"):
-        raise ModelError("the model file is a zip of a kind that is not used here", found="zip64", cure=_CURE)
+        raise ModelError("the model file is a zip of a kind that is not used here", found="zip64", cure=CURE)
     if disk or first or here != total or not 1 <= total <= MEMBER_LIMIT or length > MEMBER_LIMIT * 512:
         raise ModelError(
-            "the model file's list of members is not right", found=f"{total} members", cure=_CURE
+            "the model file's list of members is not right", found=f"{total} members", cure=CURE
         )
     if offset + length + _END.size != size:
-        raise ModelError("the model file has bytes that belong to nothing", cure=_CURE)
+        raise ModelError("the model file has bytes that belong to nothing", cure=CURE)
     stream.seek(0)
     return size
 
@@ -170,10 +172,10 @@ def _read(
     members: dict[str, zipfile.ZipInfo] = {}
     for info in archive.infolist():
         if info.filename in members:
-            raise ModelError("the model file has a member twice", found=repr(info.filename), cure=_CURE)
+            raise ModelError("the model file has a member twice", found=repr(info.filename), cure=CURE)
         if info.flag_bits & 0x1 or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise ModelError(
-                "a member is packed in a way not used here", found=repr(info.filename), cure=_CURE
+                "a member is packed in a way not used here", found=repr(info.filename), cure=CURE
             )
         members[info.filename] = info
     declared = sum(info.file_size for info in members.values())
@@ -181,10 +183,10 @@ def _read(
         raise ModelError(
             "the model file would unpack to far more than a model does",
             found=f"{declared:,} bytes from {size:,}",
-            cure=_CURE,
+            cure=CURE,
         )
     if MANIFEST not in members:
-        raise ModelError("this is not a model file", found=f"a zip without {MANIFEST}", cure=_CURE)
+        raise ModelError("this is not a model file", found=f"a zip without {MANIFEST}", cure=CURE)
     if members[MANIFEST].file_size > MANIFEST_LIMIT:
         raise ModelError("the manifest is too large", found=f"{members[MANIFEST].file_size:,} bytes")
     manifest = parse(_unpack(archive, members[MANIFEST]))
@@ -194,14 +196,14 @@ def _read(
     if len(expected) != 1 + len(table) or expected != set(members):
         odd = sorted(expected ^ set(members))
         raise ModelError(
-            "the members and the manifest's list of arrays differ", found=odd[:3] or None, cure=_CURE
+            "the members and the manifest's list of arrays differ", found=odd[:3] or None, cure=CURE
         )
     arrays = {}
     for name, entry in table.items():
         data = _unpack(archive, members[entry["file"]])
         if hashlib.sha256(data).hexdigest() != entry["sha256"]:
             raise ModelError(
-                f"the array '{name}' is not the one that was stored", found="another SHA-256", cure=_CURE
+                f"the array '{name}' is not the one that was stored", found="another SHA-256", cure=CURE
             )
         array = from_bytes(data, _rule(rules, name), name)
         if list(array.shape) != entry["shape"] or array.dtype.newbyteorder("<").str != entry["dtype"]:
@@ -211,7 +213,7 @@ def _read(
         arrays[name] = array
     missing = [name for name in rules if not name.endswith("*") and name not in arrays]
     if missing:
-        raise ModelError("the model file lacks an array", found=missing[0], cure=_CURE)
+        raise ModelError("the model file lacks an array", found=missing[0], cure=CURE)
     return manifest, arrays
 
 
@@ -221,14 +223,14 @@ def _rule(rules: Mapping[str, ArrayRule], name: str) -> ArrayRule:
     for pattern, rule in rules.items():
         if pattern.endswith("*") and name.startswith(pattern[:-1]):
             return rule
-    raise ModelError("the model file has an array its algorithm does not know", found=repr(name), cure=_CURE)
+    raise ModelError("the model file has an array its algorithm does not know", found=repr(name), cure=CURE)
 
 
 def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
     with archive.open(info) as stream:
         data = stream.read(info.file_size + 1)  # never more than was declared; the CRC is checked at the end
         if len(data) != info.file_size or stream.read(1):
-            raise ModelError("a member has another size than declared", found=repr(info.filename), cure=_CURE)
+            raise ModelError("a member has another size than declared", found=repr(info.filename), cure=CURE)
     return data
 
 
@@ -240,9 +242,9 @@ def parse(data: bytes) -> dict[str, Any]:
     try:
         manifest = json.loads(data.decode("utf-8"), object_pairs_hook=_unique, parse_constant=_constant)
     except RecursionError:
-        raise ModelError("the manifest is nested too deeply", cure=_CURE) from None
+        raise ModelError("the manifest is nested too deeply", cure=CURE) from None
     except (UnicodeDecodeError, ValueError) as error:
-        raise ModelError("the manifest is not valid JSON", found=str(error)[:200], cure=_CURE) from None
+        raise ModelError("the manifest is not valid JSON", found=str(error)[:200], cure=CURE) from None
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ModelError("this is not a model file", found="a manifest of something else")
     if manifest.get("version") != VERSION:
@@ -260,10 +262,10 @@ def validate(manifest: Mapping[str, Any]) -> None:
     try:
         error = next(_validator().iter_errors(manifest), None)
     except RecursionError:
-        raise ModelError("the manifest is nested too deeply", cure=_CURE) from None
+        raise ModelError("the manifest is nested too deeply", cure=CURE) from None
     if error is not None:
         place = "/".join(str(part)[:60] for part in error.absolute_path) or "(the whole)"
-        raise ModelError(f"the manifest is not valid at {place}", found=error.message[:200], cure=_CURE)
+        raise ModelError(f"the manifest is not valid at {place}", found=error.message[:200], cure=CURE)
 
 
 @lru_cache(maxsize=1)

@@ -80,6 +80,8 @@ class Stage(ABC):
                 Expression(values["where"])
             cls.check(values)
         except StageError as error:
+            if error.where and not error.where.startswith(place):  # a file the stage reads
+                error.where = f"{place}: {error.where}"
             raise error.at(place) from None
         return values
 

@@ -1,0 +1,170 @@
+"""Model files that are missing, damaged, of another version, hostile, or made for other points."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import pickle
+import zipfile
+
+import laspy
+import numpy as np
+import pytest
+from conftest import scene
+from robustness_kit import job
+
+import pdal_stages as ps
+from pdal_stages.errors import ModelError
+
+pytestmark = pytest.mark.pdal
+
+
+def repack(path, target, edit, compression=zipfile.ZIP_DEFLATED):
+    """A copy with manifest or members edited, checksums put right."""
+    with zipfile.ZipFile(path) as archive:
+        members = {info.filename: archive.read(info) for info in archive.infolist()}
+    head = json.loads(members.pop("manifest.json"))
+    edit(head, members)
+    for entry in head.get("arrays", {}).values() if isinstance(head.get("arrays"), dict) else ():
+        if entry.get("file") in members:
+            entry["sha256"] = hashlib.sha256(members[entry["file"]]).hexdigest()
+    with zipfile.ZipFile(target, "w", compression) as archive:
+        archive.writestr("manifest.json", json.dumps(head))
+        for name, data in members.items():
+            archive.writestr(name, data)
+    return target
+
+
+def swap_names(head, members):
+    names = head["feature_names"]
+    names[0], names[1] = names[1], names[0]
+
+
+def wild_threshold(head, members):
+    name = head["arrays"]["threshold"]["file"]  # the first node of the first tree
+    start = 10 + int.from_bytes(members[name][8:10], "little")
+    members[name] = members[name][:start] + np.float32("nan").tobytes() + members[name][start + 4 :]
+
+
+def wild_feature(head, members):
+    name = head["arrays"]["feature"]["file"]
+    whole = members[name]
+    start = 10 + int.from_bytes(whole[8:10], "little")
+    size = np.dtype(head["arrays"]["feature"]["dtype"]).itemsize
+    members[name] = whole[:start] + (20_000).to_bytes(size, "little") + whole[start + size :]
+
+
+def bomb(head, members):
+    from pdal_stages.classifier.arrays import to_bytes
+
+    members[head["arrays"]["threshold"]["file"]] = to_bytes(np.zeros(30_000_000, np.float32))
+    head["arrays"]["threshold"]["shape"] = [30_000_000]
+
+
+class Evil:
+    def __reduce__(self):
+        return (open, ("/tmp/should-not-exist-pdal-stages", "w"))
+
+
+#: case, edit of a good file (bytes -> bytes, or of manifest and members), what the message must hold
+BROKEN = [
+    ("model of version 2", lambda h, m: h.update(version=2), ["version", "Update pdal-stages"]),
+    ("model of an algorithm that is not known", lambda h, m: h.update(algorithm="xgboost"), ["algorithm", "xgboost"]),
+    ("model with features in another order", swap_names, ["features"]),
+    ("model with a feature this release lacks", lambda h, m: h["feature_names"].__setitem__(0, "Magic_c1"), ["features"]),
+    ("model with a neighborhood that is none", lambda h, m: h["features"].update(neighborhoods=["q5"]), [""]),
+    ("model without its classes", lambda h, m: h.pop("classes"), ["classes"]),
+    ("model with class code 300", lambda h, m: h["classes"][0].update(code=300), ["classes"]),
+    ("model with an array missing", lambda h, m: m.pop(h["arrays"]["threshold"]["file"]), ["differ"]),
+    ("model with a member too many", lambda h, m: m.update({"../../evil.py": b"x"}), ["differ"]),
+    ("model whose threshold is NaN", wild_threshold, [""]),
+    ("model whose trees ask for feature 20,000", wild_feature, [""]),
+    ("model that unpacks to far more (zip bomb)", bomb, ["far more"]),
+    ("model cut in half", lambda d: d[: len(d) // 2], ["cut short"]),
+    ("model without its last byte", lambda d: d[:-1], ["not a model file"]),
+    ("model with one byte changed", lambda d: d[:2000] + bytes([d[2000] ^ 255]) + d[2001:], [""]),
+    ("empty model file", lambda d: b"", ["not a model file"]),
+    ("LAS file as the model", lambda d: b"LASF" + bytes(5000), ["not a model file"]),
+    ("pickle as the model", lambda d: pickle.dumps(Evil()), ["not a model file"]),
+    ("pickle inside the model", lambda h, m: m.update({h["arrays"]["threshold"]["file"]: pickle.dumps(Evil())}), [""]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("case", "edit", "says"), BROKEN, ids=[row[0] for row in BROKEN])
+def test_broken_models(cell, tmp_path, cloud, model, case, edit, says):
+    target = tmp_path / "broken.model"
+    if edit.__code__.co_argcount == 1:
+        target.write_bytes(edit(model.read_bytes()))
+    else:
+        repack(model, target, edit)
+    message = cell("Models", case).refused(["classify", cloud, tmp_path / "out.las", "--model", target], "broken.model", *says)
+    path = job(tmp_path, str(cloud), {"type": "filters.modelclassifier", "model": str(target)})
+    again = cell("Models", case).command("pipeline", path)
+    assert again.code == 1 and "job.json, line 3: filters.modelclassifier" in again.err and "Traceback" not in again.err
+    assert cell("Models", case).command("model", target).code == 1
+    with pytest.raises(ModelError) as caught:
+        ps.Filter.modelclassifier(model=str(target))
+    assert str(caught.value) in message or "broken.model" in str(caught.value)
+    import os
+
+    assert not os.path.exists("/tmp/should-not-exist-pdal-stages")
+
+
+def test_models_that_are_not_there(cell, tmp_path, cloud):
+    words = ["classify", cloud, tmp_path / "out.las", "--model"]
+    cell("Models", "model that is not there").refused([*words, tmp_path / "nix.model"], "nix.model", "no such model file", "Check the path")
+    cell("Models", "folder as the model").refused([*words, tmp_path], "not a file")
+    cell("Models", "model name that is empty").refused([*words, ""], "model")
+    cell("Models", "NUL in the model's name").refused([*words, "a\0b"], "model")
+
+
+def trained(tmp_path, source, name="m.model", **more):
+    ps.run_pipeline(
+        [{"type": "readers.las", "filename": str(source), "use_eb_vlr": True}, {"type": "filters.hag_minima"},
+         {"type": "writers.classifiermodel", "filename": str(tmp_path / name), "neighborhoods": "c1,s2", "trees": 5,
+          "feature_set": "covariance,geometric", "count": 100, **more}]
+    )  # fmt: skip
+    return tmp_path / name
+
+
+def test_other_dimensions(cell, tmp_path, write_las, cloud):
+    data = scene()
+    data["Amplitude"] = np.where(data["Classification"] == 6, 3.0, 1.0).astype("f4")
+    source = write_las(tmp_path / "with.las", data, point_format=3)
+    model = trained(tmp_path, source, dimensions=["Amplitude"])
+    cell("Models", "model trained on an extra dimension that the points lack").refused(
+        ["classify", cloud, tmp_path / "out.las", "--model", model], "'Amplitude' is missing"
+    )
+    job_ = job(tmp_path, str(cloud), {"type": "filters.modelclassifier", "model": str(trained(tmp_path, cloud, "h.model"))})
+    cell("Models", "model that needs heights, without the stage that makes them").refused(
+        ["pipeline", job_], "'HeightAboveGround' is missing", "filters.hag_minima"
+    )
+    cell("Models", "model trained on an extra dimension that the points have").runs(
+        ["classify", source, tmp_path / "out.las", "--model", model], "classes"
+    )
+    assert np.mean(np.asarray(laspy.read(tmp_path / "out.las").classification) == data["Classification"]) > 0.95
+
+
+def test_trained_in_feet(cell, tmp_path, write_las, cloud):
+    from test_robust_clouds import WKT
+
+    feet = scene(seed=5)
+    for axis in "XYZ":
+        feet[axis] = feet[axis] / 0.304800609601219
+    source = write_las(tmp_path / "feet.las", feet, point_format=6, wkt=WKT["us-ft"], scale=1e-4)
+    model = trained(tmp_path, source)
+    cell("Models", "model trained on points in feet, applied to metres").runs(
+        ["classify", cloud, tmp_path / "out.las", "--model", model], "classes: features are metres whatever the file's unit"
+    )
+    assert np.mean(np.asarray(laspy.read(tmp_path / "out.las").classification) == scene()["Classification"]) > 0.9
+
+
+def test_a_model_that_changes_between_runs(cell, tmp_path, cloud, model):
+    copy = tmp_path / "m.model"
+    copy.write_bytes(model.read_bytes())
+    words = ["classify", cloud, tmp_path / "out.las", "--model", copy]
+    it = cell("Models", "model file that is damaged between two runs of one process")
+    assert it.command(*words).code == 0
+    (tmp_path / "out.las").unlink()
+    copy.write_bytes(model.read_bytes()[:-50])
+    it.refused(words, "m.model")
