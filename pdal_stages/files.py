@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import tempfile
 from pathlib import Path
 
@@ -46,7 +47,7 @@ def check_complete(path: str | os.PathLike, name: str | os.PathLike) -> None:
     try:
         size = path.stat().st_size
         short = is_short(path, size) if path.suffix.lower() in (".las", ".laz") else None
-        full = not short and hasattr(os, "statvfs") and os.statvfs(path).f_bavail == 0 and short is None
+        full = short is None and disk_is_full(path)
     except OSError as error:
         raise StageError("the output file cannot be read back", found=f"{name}: {error}") from error
     if short or full:
@@ -57,15 +58,24 @@ def check_complete(path: str | os.PathLike, name: str | os.PathLike) -> None:
         )
 
 
+def disk_is_full(path: str | os.PathLike) -> bool:
+    """Whether no room is left where a file is; False where the system does not say."""
+    try:
+        return hasattr(os, "statvfs") and os.statvfs(path).f_bavail == 0
+    except OSError:
+        return False
+
+
 def check_writable(path: str | os.PathLike, what: str = "output") -> None:
     """Refuse an output path whose folder is missing or read-only, before any work is done."""
     folder = Path(path).absolute().parent
     if len(Path(path).name.encode(errors="surrogateescape")) > _LONGEST_NAME:
         raise StageError(f"the name of the {what} file is longer than {_LONGEST_NAME} bytes", found=str(path))
     if not folder.is_dir():
-        raise StageError(
-            f"the folder of the {what} file does not exist", found=str(folder), cure="Create it first"
-        )
+        cure = "Create it first"
+        if not str(folder).isascii() and sys.getfilesystemencoding() != "utf-8":
+            cure = f"Set PYTHONUTF8=1: this locale's file names are {sys.getfilesystemencoding()}"
+        raise StageError(f"the folder of the {what} file does not exist", found=str(folder), cure=cure)
     if Path(path).is_dir():
         raise StageError(f"the {what} file names a folder", found=str(path), cure="Give a file name")
     if not os.access(folder, os.W_OK):

@@ -29,8 +29,8 @@ class LasHeader:
     compressed : bool
     header_bytes, offset : int
         Size of the header, and where points (or LAZ chunks) begin.
-    records : int
-        Variable-length records before the points.
+    records, records_after : int
+        Variable-length records before and after the points.
     count : int
     scales, offsets : tuple of float
     texts : dict
@@ -44,6 +44,7 @@ class LasHeader:
     header_bytes: int
     offset: int
     records: int
+    records_after: int
     count: int
     scales: tuple[float, ...]
     offsets: tuple[float, ...]
@@ -62,16 +63,16 @@ def read_header(path: str | os.PathLike) -> LasHeader | None:
     if len(head) < 227 or head[:4] != b"LASF":
         return None
     size, offset, records, kind, length, count = struct.unpack_from("<HIIBHI", head, 94)
-    minor = head[25]
+    minor, after = head[25], 0
     if minor >= 4 and size >= 375 and len(head) >= 255:
-        count = struct.unpack_from("<Q", head, 247)[0]
+        after, count = struct.unpack_from("<IQ", head, 243)
     numbers = struct.unpack_from("<6d", head, 131)
     texts = {
         "system identifier": head[26:58].split(b"\0")[0],
         "generating software": head[58:90].split(b"\0")[0],
     }
     return LasHeader(
-        minor, kind & 0x3F, length, bool(kind & 0xC0), size, offset, records, count, numbers[:3], numbers[3:], texts
+        minor, kind & 0x3F, length, bool(kind & 0xC0), size, offset, records, after, count, numbers[:3], numbers[3:], texts
     )  # fmt: skip
 
 
@@ -147,7 +148,9 @@ def is_short(path: str | os.PathLike, size: int) -> bool | None:
     if header is None:
         return True if size < 227 else None
     if not header.compressed:
-        return header.end_of_points > size
+        # The count is written last: none of it, but points and no records after them, is a header left behind.
+        unfinished = not header.count and not header.records_after and size >= header.offset + header.point_bytes
+        return unfinished or header.end_of_points > size
     return bool(header.count) and not header.offset + 8 <= _chunk_table(path, size, header) <= size - 8
 
 

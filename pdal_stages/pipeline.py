@@ -13,7 +13,7 @@ from typing import Any
 
 from . import pdal_env, runtime
 from .errors import PipelineError, StageError
-from .files import check_complete, check_writable, partial_name
+from .files import check_complete, check_writable, disk_is_full, partial_name
 from .lasfile import check_readable, odd_text
 from .leftovers import removed_if_killed
 from .lowering import Lowered, lower
@@ -102,6 +102,8 @@ class Pipeline:
         except StageError as error:
             for partial, final in renames if isinstance(error.found, str) else ():
                 error.found = str(error.found).replace(str(partial), str(final))
+                if error.cure is None and disk_is_full(partial):
+                    error.cure = f"The disk of {final} is full: make room"
             raise failure or self._located(error) from None
         finally:
             _discard(renames)

@@ -105,9 +105,8 @@ class Cell:
         everything = done.out + done.err
         assert done.code == code, (done.code, everything)
         assert "Traceback" not in everything, everything
-        lines = [line for line in done.err.splitlines() if line.startswith("pdal-stages: ")]
-        assert lines, done.err
-        message = done.err[done.err.index(lines[-1]) :].strip()
+        assert "pdal-stages: " in done.err, done.err
+        message = done.err[done.err.rindex("pdal-stages: ") :].strip()  # PDAL may have begun the line
         for text in says:
             assert text in message, (text, message)
         left = self._files() - self.before
