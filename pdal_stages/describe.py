@@ -64,7 +64,8 @@ def stage_options(type_name: str, *, as_json: bool = False) -> str:
             shown = (
                 ",".join(map(str, option.default)) if isinstance(option.default, tuple) else option.default
             )
-            head += f" [{str(shown).lower() if isinstance(shown, bool) else shown}{' ' + option.unit if option.unit else ''}]"
+            unit = f" {option.unit}" if option.unit else ""
+            head += f" [{str(shown).lower() if isinstance(shown, bool) else shown}{unit}]"
         lines += [head, textwrap.fill(help_text, 80, initial_indent=" " * 6, subsequent_indent=" " * 6), ""]
     return "\n".join(lines)
 

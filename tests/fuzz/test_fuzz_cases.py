@@ -1,0 +1,64 @@
+"""The fuzzers' findings, and a short run of random changes to good inputs, without atheris."""
+
+from __future__ import annotations
+
+import random
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+import targets
+
+HERE = Path(__file__).resolve().parent
+CASES = sorted(path for path in (HERE / "cases").rglob("*") if path.is_file())
+
+#: Changed inputs that are tried for each target.
+TRIES = {"pipeline": 1500, "model": 250}
+WORDS = [b"null", b"-1", b"1e999", b'"', b"[", b"}", b",", b"/*", b"\\u0000", b"\\ud800", b"\xff", b"kopt(9,2)", b"NaN", b"0", b'"inputs":5,']
+
+
+@pytest.mark.parametrize("path", CASES, ids=[f"{p.parent.name}-{p.name}" for p in CASES])
+def test_findings_stay_fixed(path):
+    assert targets.TARGETS[path.parent.name](path.read_bytes()) in ("refused", "lowered", "loaded")
+
+
+def change(data: bytes, rng: random.Random, others: list[bytes]) -> bytes:
+    """One to five random changes: bytes, words, pieces cut out, doubled or taken from another input."""
+    out = bytearray(data)
+    for _ in range(rng.randint(1, 5)):
+        at, to = sorted(rng.randrange(len(out) + 1) for _ in range(2))
+        to = min(to, at + 40)
+        kind = rng.randrange(6)
+        if kind == 0 and out:
+            out[at % len(out)] ^= 1 << rng.randrange(8)
+        elif kind == 1:
+            out[at:at] = rng.choice(WORDS)
+        elif kind == 2:
+            del out[at:to]
+        elif kind == 3:
+            out[at:at] = out[at:to]
+        elif kind == 4:
+            other = rng.choice(others)
+            start = rng.randrange(len(other))
+            out[at:to] = other[start : start + rng.randint(1, 60)]
+        else:
+            out[at:to] = rng.choice(WORDS)
+    return bytes(out)
+
+
+@pytest.mark.parametrize("name", sorted(targets.TARGETS))
+def test_changed_inputs_are_refused_or_right(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rng, seeds = random.Random(7), targets.seeds(name)
+    seen = {targets.TARGETS[name](seed) for seed in seeds}
+    for _ in range(TRIES[name]):
+        data = change(rng.choice(seeds), rng, seeds)
+        try:
+            seen.add(targets.TARGETS[name](data))
+        except BaseException:
+            (tmp_path / "finding").write_bytes(data)  # pytest keeps the folder
+            raise
+    assert len(seen) == 2  # both ways were taken
+    assert not list(tmp_path.iterdir())  # parsing writes nothing
