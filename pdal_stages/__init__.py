@@ -26,6 +26,7 @@ _WHERE = {
     "make_town": "synthetic",
     "parse_neighborhoods": "neighborhoods",
     "run_pipeline": "pipeline",
+    "run_tiled": "tiling",
     "train": "classifier",
     "write_accuracy_report": "report",
 }
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from .report import write_accuracy_report
     from .synthetic import make_town
     from .terrain import hag_minima
+    from .tiling import run_tiled
 
 
 def __getattr__(name: str):

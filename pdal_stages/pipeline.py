@@ -104,6 +104,8 @@ class Pipeline:
                 error.found = str(error.found).replace(str(partial), str(final))
                 if error.cure is None and disk_is_full(partial):
                     error.cure = f"The disk of {final} is full: make room"
+            if failure is not None and failure.what == runtime.INTERRUPTED:
+                raise KeyboardInterrupt from None
             raise failure or self._located(error) from None
         finally:
             _discard(renames)

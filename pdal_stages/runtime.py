@@ -26,6 +26,9 @@ TRAMPOLINE = (
     "    return run_stage(globals(), ins, outs)\n"
 )
 
+#: What an error says when Ctrl-C came while a stage ran; the runners turn it back into KeyboardInterrupt.
+INTERRUPTED = "interrupted"
+
 _lock = threading.Lock()
 _reports: dict[str, list[dict[str, Any]]] = {}
 _failures: dict[str, StageError] = {}
@@ -105,7 +108,7 @@ def _as_stage_error(error: BaseException, where: str) -> StageError:
             cure="Lower 'memory', work in tiles (--tile), or take fewer features",
         )
     if isinstance(error, KeyboardInterrupt):
-        return StageError("interrupted", where=where)
+        return StageError(INTERRUPTED, where=where)
     failure = StageError(
         f"{type(error).__name__}: {error}", where=where, cure="Run with --debug and report it"
     )

@@ -534,3 +534,15 @@ def test_labels_are_unique(cloud):
     stages = [str(cloud), {"type": "filters.hag_minima"}, {"type": "filters.hag_minima", "cell": 10}]
     labels = [o.label for _ in range(3) for o in ps.Pipeline(stages).lowered.ours]
     assert len(set(labels)) == 6
+
+
+def test_ctrl_c_in_a_stage_is_an_interrupt(cloud, monkeypatch, tmp_path):
+    from pdal_stages.stages.hag_minima import HagMinima
+
+    def interrupted(points, options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(HagMinima, "run", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        ps.run_pipeline([str(cloud), {"type": "filters.hag_minima"}, str(tmp_path / "o.laz")])
+    assert not list(tmp_path.glob("*o.laz*"))
