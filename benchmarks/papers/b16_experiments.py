@@ -93,7 +93,7 @@ def report(runs: list[dict[str, Any]]) -> str:
     text = []
     for name in dict.fromkeys(run["scene"] for run in runs):
         here = choose(runs, scene=name)
-        text.append(f"### {name}\n")
+        text.append(f"## {name}\n")
         for key, words in (
             ("kappa", "Kappa"),
             ("oa", "Overall accuracy"),
@@ -190,7 +190,7 @@ def main() -> None:
             args.seeds,
             args.threads,
         )
-    finish(args, runs, report(runs))
+    finish(args, runs, "[B16]'s experiments", report(runs))
 
 
 if __name__ == "__main__":

@@ -26,6 +26,9 @@ from pdal_stages.terrain import hag_minima
 #: Scene -> classes trained and scored; points of other classes are neighbors only.
 SCENES = {"montpellier": (2, 3, 4, 5, 6), "delft": (1, 2, 6)}
 
+#: Parts of a result that --json leaves out.
+BULKY = ("clouds", "importance")
+
 
 # ---- clouds ------------------------------------------------------------------------------------------------
 
@@ -354,10 +357,15 @@ def opened(args: argparse.Namespace, name: str, context: Mapping[str, Any]) -> t
     return cache, Results(None if args.cache is None else args.cache / f"{name}.jsonl", context)
 
 
-def finish(args: argparse.Namespace, runs: list[dict[str, Any]], text: str, **more: Any) -> None:
-    """Write results and tables where the user wants them."""
+def finish(args: argparse.Namespace, runs: list[dict[str, Any]], title: str, text: str, **more: Any) -> None:
+    """Write results and tables where the user wants them; lists of one run stand on one line."""
+    command = Path(sys.argv[0]).name
+    made = f"Written by `benchmarks/papers/{command}`; figures in per cent, mean ± deviation over seeds."
+    text = f"# {title}\n\n{made}\n\n{text}"
     if args.json:
-        args.json.write_text(json.dumps({"machine": machine(), **more, "runs": runs}, indent=1) + "\n")
+        lines = ",\n".join(json.dumps({k: v for k, v in run.items() if k not in BULKY}) for run in runs)
+        head = json.dumps({"machine": machine(), **more})
+        args.json.write_text(f'{head[:-1]},\n"runs": [\n{lines}\n]}}\n')
     if args.tables:
         args.tables.write_text(text)
     else:

@@ -119,7 +119,7 @@ def report(runs: list[dict[str, Any]]) -> str:
     text = []
     for name in dict.fromkeys(run["scene"] for run in runs):
         here = choose(runs, scene=name)
-        text.append(f"### {name}\n")
+        text.append(f"## {name}\n")
         rows = []
         for what in dict.fromkeys((run["kind"], run["count"]) for run in here if run["target"] is None):
             some = choose(here, kind=what[0], count=what[1], target=None)
@@ -229,7 +229,7 @@ def main() -> None:
         runs += run_scene(
             scene, Results(path, {**scenes.context(scene), "experiment": EXPERIMENT}), args, targets
         )
-    finish(args, runs, report(runs))
+    finish(args, runs, "[W18]'s questions", report(runs))
 
 
 if __name__ == "__main__":
