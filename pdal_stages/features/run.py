@@ -68,6 +68,7 @@ class Run:
         if self.adaptive is not None:
             cost = cost + self.adaptive.query_ns
             scratch += self.adaptive.scratch_bytes
+        cost = cost * self._distinct_share()
         self.threads = int(max(1, min(self.threads, 0.5 * budget // scratch)))
         # Two results per thread may wait (map_blocks) and one is being made; copies of points double a block.
         row = 8 * len(self.engine.plan.names) + ROW_BYTES
@@ -75,6 +76,18 @@ class Run:
         total = float(cost @ np.diff(self.grid.cell_start))
         most = min(BLOCK_NS, max(total / (4 * self.threads), 5e6))
         self.starts = cut_blocks(self.grid.cell_start, cost, most, int(min(max(rows, 64), MOST_ROWS)))
+
+    def _distinct_share(self) -> np.ndarray:
+        """Of each cell's queries the share that is computed: copies of a query lie side by side and cost nothing."""
+        grid = self.grid
+        copy = np.zeros(len(grid), np.bool_)
+        copy[1:] = grid.x[1:] == grid.x[:-1]
+        for axis in (grid.y, grid.z):
+            copy[1:] &= axis[1:] == axis[:-1]
+        if not copy.any():
+            return np.ones(1)
+        copies = np.add.reduceat(copy, grid.cell_start[:-1], dtype=np.int64)
+        return 1.0 - copies / np.diff(grid.cell_start)
 
     def compute(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, dict[str, dict[str, int]]]:
         """Positions (in the user's order) and values of the sorted queries first..last, and what to report."""
