@@ -255,7 +255,7 @@ def _number(text: str) -> Any:
 
 def _brief(info: dict[str, Any]) -> dict[str, Any]:
     """The part of a model's description that fits in a pipeline's metadata."""
-    keep = ("strategy", "classes", "scores", "oob_score", "parameters")
+    keep = ("strategy", "classes", "accuracy", "parameters")
     return {key: _plain(info[key]) for key in keep if key in info}
 
 
