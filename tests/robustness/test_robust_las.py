@@ -225,3 +225,21 @@ def test_header_texts_in_latin_1(cell, tmp_path, good, model, pdal_program):
         subprocess.run([pdal_program, "translate", good, tmp_path / "clean.las"], check=True)
         assert it.command("pipeline", pipeline(tmp_path, tmp_path / "clean.las", model)).code == 0
     check(tmp_path)
+
+
+TILED = [
+    ("cut in the points", lambda d: d[: len(d) // 2], "it is cut short"),
+    ("point length of 0", header("length", 0), "points are shorter than their format"),
+    ("a text file named .las", lambda d: b"X Y Z\n1 2 3\n" * 50, "not a LAS or LAZ file"),
+]
+
+
+@pytest.mark.parametrize(("case", "edit", "says"), TILED, ids=[row[0] for row in TILED])
+def test_damaged_in_tiles(cell, tmp_path, good, case, edit, says):
+    damaged(good, edit)
+    path = job(tmp_path, str(good), STAGES[0], str(tmp_path / "out.las"))
+    it = cell("LAS files", f"LAS in tiles: {case}")
+    done = it.command("pipeline", path, "--tile", "20")
+    it.before = it._files()  # the marks of the run stay, for --resume
+    it.refused(done, "in.las", says)
+    assert not (tmp_path / "out.las").exists()
