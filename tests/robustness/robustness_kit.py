@@ -181,8 +181,8 @@ FUZZED = [
     "",
     "The two parsers of this package, of pipelines and of model files, are fuzzed with atheris",
     "(`python tests/fuzz/fuzz.py pipeline -max_total_time=1800`, and `model`). Inputs that once failed are kept in",
-    "`tests/fuzz/cases` and run with the tests, beside a short run of random changes. Last long run, 30 minutes each on",
-    "half a core: 777,222 pipelines with one finding (a number beyond a double went on as `Infinity`; fixed), 243,974",
+    "`tests/fuzz/cases` and run with the tests, beside a short run of random changes. Last long run, 30 minutes each, both on",
+    "one busy core: 777,222 pipelines with one finding (a number beyond a double went on as `Infinity`; fixed), 243,974",
     "model files with none.",
     "",
 ]
