@@ -131,7 +131,7 @@ def test_links_between_pages_lead_somewhere():
     "script", sorted((ROOT / "docs" / "gallery").glob("[0-9]*.py")), ids=lambda p: p.stem
 )
 def test_gallery_scripts_run(script, tmp_path):
-    environment = {**os.environ, "GALLERY_SIZE": "50", "GALLERY_OUTPUT": str(tmp_path)}
+    environment = {**os.environ, "GALLERY_SIZE": "80", "GALLERY_OUTPUT": str(tmp_path)}
     done = subprocess.run(
         [sys.executable, str(script)], env=environment, capture_output=True, text=True, timeout=300
     )
