@@ -296,9 +296,7 @@ def main() -> None:
     options = parser(__doc__)
     options.add_argument("--clouds", type=int, help="only the first so many test clouds")
     options.add_argument("--curve-seeds", type=int, default=3)
-    options.add_argument(
-        "--other-seeds", type=int, default=3, help="of other trainings; heights and halves: one"
-    )
+    options.add_argument("--other-seeds", type=int, default=3, help="of other trainings, heights and halves")
     args = options.parse_args()
     if args.data is None:
         options.error("name the folder of the clouds: --data DIR, or PDAL_STAGES_DATA")
@@ -328,9 +326,10 @@ def main() -> None:
             for sampling, height in kinds
             for n in TOKENS
         ]
-    if args.other_seeds:
-        todo += [{"name": n, "seed": 0, "height": height, **more} for height in HEIGHTS[1:] for n in TOKENS]
-        todo += [{"name": n, "seed": 0, "height": "range", **more} for n in HALVES]
+        todo += [
+            {"name": n, "seed": seed, "height": height, **more} for height in HEIGHTS[1:] for n in TOKENS
+        ]
+        todo += [{"name": n, "seed": seed, "height": "range", **more} for n in HALVES]
     for seed in range(args.curve_seeds):
         for depth in (None, 2):
             todo += [

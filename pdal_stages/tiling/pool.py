@@ -135,30 +135,45 @@ class OnDask:
 
         Notes
         -----
-        As many tasks are out as there are workers, so that one that kills its worker takes no other along.
+        As many tasks are out as there are workers. While a killed worker starts anew, two may sit on one; so a task
+        whose worker was killed is tried once more with nothing beside it before it is blamed.
         """
         if not busy():
             return
         if self._distributed is None:
             self._start()
         finished = self._distributed.as_completed(loop=self._client.loop)
-        keys: dict[str, Any] = {}
+        keys: dict[str, tuple[Any, str]] = {}
         futures: dict[str, Any] = {}
+        suspects: list[tuple[Any, str]] = []
+        alone: tuple[Any, str] | None = None
         try:
             while True:
-                while len(keys) < self._slots_now() and (task := tasks()) is not None:
+                waiting: list[tuple[Any, str]] = []
+                if alone is None:
+                    while len(keys) + len(waiting) < self._slots_now() and (task := tasks()) is not None:
+                        waiting.append(task)
+                    if not keys and not waiting:
+                        if not suspects:
+                            return
+                        alone = suspects.pop(0)
+                        waiting.append(alone)
+                for task in waiting:
                     future = self._client.submit(perform, task[1], pure=False, retries=0)
-                    keys[future.key], futures[future.key] = task[0], future
+                    keys[future.key], futures[future.key] = task, future
                     finished.add(future)
-                if not keys:
-                    return
                 future = next(finished)
-                key = keys.pop(future.key)
+                task = keys.pop(future.key)
                 futures.pop(future.key)
                 error = future.exception()
                 answer = error if error is not None else future.result()
                 future.release()
-                yield key, answer
+                if alone is None and isinstance(error, self._distributed.KilledWorker):
+                    # It may only have waited on a worker that another tile killed: judge it by itself.
+                    suspects.append(task)
+                    continue
+                alone = None
+                yield task[0], answer
         finally:
             if futures:
                 with contextlib.suppress(Exception):
