@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import PipelineError, StageError
-from ..lasfile import check_readable
 from .grid import Box
 from .tindex import locations
 
@@ -147,7 +146,6 @@ def las_header(path: str) -> Header:
         raise StageError(
             "the input is not a LAS or LAZ file", where=path, found=f"{head[:4]!r} as first bytes"
         )
-    check_readable(path)
     (count,) = struct.unpack_from("<I", head, 107)
     if head[25] >= 4 and len(head) >= 255:
         (count,) = struct.unpack_from("<Q", head, 247)
