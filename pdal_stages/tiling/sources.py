@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import PipelineError, StageError
+from ..lasfile import check_readable
 from .grid import Box
 from .tindex import locations
 
@@ -146,6 +147,10 @@ def las_header(path: str) -> Header:
         raise StageError(
             "the input is not a LAS or LAZ file", where=path, found=f"{head[:4]!r} as first bytes"
         )
+    # Points shorter than any format's: PDAL would crash. A file cut short keeps its header, so that the tiles
+    # beside it are known to lack neighbors.
+    if struct.unpack_from("<H", head, 105)[0] < 20:
+        check_readable(path)
     (count,) = struct.unpack_from("<I", head, 107)
     if head[25] >= 4 and len(head) >= 255:
         (count,) = struct.unpack_from("<Q", head, 247)
