@@ -423,7 +423,7 @@ class _Run:
             if source.path in self.index:
                 out.jobs = [by_tile[i, j] for i, j, _ in self.index[source.path]["tiles"]]
             if source.path in self.unreadable:
-                out.state, out.reason = "failed", "its input cannot be read"
+                out.state, out.reason = "failed", f"its input cannot be read: {source.path}"
             out.mark = fingerprint(
                 source.path,
                 source.stamp(),
