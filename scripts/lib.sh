@@ -128,8 +128,12 @@ packages() {
   installed ca-certificates || cp "$BUNDLE" "$STATE/trusted.crt" 2>/dev/null || true
   step "apt: ${missing[*]:0:4}$([ ${#missing[@]} -le 4 ] || echo " and $((${#missing[@]} - 4)) more")" \
     apt_root apt-get -q -o DPkg::Lock::Timeout=300 -o Acquire::Retries=3 install -y --no-install-recommends "${missing[@]}"
-  # A list of certificates put there by hand, as containers behind a proxy have it, was just replaced by Debian's:
-  # let pip go on with the one it had
+  keep_trust
+}
+
+# keep_trust: where a list of certificates was put there by hand, as in containers behind a proxy, installing
+# Debian's package ca-certificates replaces it. Let pip go on with the one it had.
+keep_trust() {
   if [ -e "$STATE/trusted.crt" ] && ! cmp -s "$BUNDLE" "$STATE/trusted.crt" && [ "${PIP_CERT:-$BUNDLE}" = "$BUNDLE" ]; then
     export PIP_CERT=$STATE/trusted.crt
   fi
