@@ -24,7 +24,7 @@ from .grid import Box, Grid, union
 from .options import TilingOptions
 from .plan import TilePlan, check_not_inputs, make_plan, outputs_for
 from .pool import Here, OnDask, open_pool
-from .sources import Header, Source, find_sources, read_header
+from .sources import Header, Source, check_source, find_sources, read_header
 from .store import Store, fingerprint
 
 #: Memory of a worker: programs and model, a tile's point, a file's point, and the `memory` option of our stages.
@@ -205,18 +205,23 @@ class _Run:
         for source in self.sources:
             try:
                 found[source.path] = read_header(source)
+                check_source(source)
             except StageError as error:
                 self.unreadable[source.path] = str(error)
-        if not found:
-            raise StageError(
-                "none of the inputs can be read", found=next(iter(self.unreadable.values()), "no input")
-            )
-        if self.unreadable:
+        if len(self.unreadable) == len(self.sources):
+            raise self._none_readable()
+        lost = len(self.sources) - len(found)
+        if lost:
             self.notes.append(
-                f"{len(self.unreadable)} inputs have no readable header, so nobody knows where they lie: tiles beside "
+                f"{lost} inputs have no readable header, so nobody knows where they lie: tiles beside "
                 "them may lack neighbors. Once they can be read, --resume runs those tiles again"
             )
         return found
+
+    def _none_readable(self) -> StageError:
+        return StageError(
+            "none of the inputs can be read", found=next(iter(self.unreadable.values()), "no input")
+        )
 
     def _per(self) -> str:
         files = all(s.kind == "las" for s in self.sources)
@@ -225,26 +230,16 @@ class _Run:
         return ("file" if files else "tile") if self.options.per == "auto" else self.options.per
 
     def _unit(self) -> float:
-        """Metres per unit of the coordinates."""
-        first = next(s for s in self.sources if s.path in self.headers)
-        name = first.path
-        if first.kind == "ept" and "://" not in name:
-            name = f"ept://{name.removesuffix('/ept.json')}"
-        reader = {**first.reader, "filename": name}
-        if first.kind == "las":
-            reader["count"] = 1
-        else:
-            x0, y0, _, _ = self.headers[first.path].box
-            reader["bounds"] = f"([{x0!r}, {x0 + 1!r}], [{y0!r}, {y0 + 1!r}])"
-        try:
-            metadata = pdal_env.execute([reader], arrays=False).metadata.get("metadata", {})
-        except PipelineError as error:
-            self.unreadable.setdefault(first.path, str(error))
-            return (
-                1.0
-                if not self.plan.unit
-                else units_of_wkt("", horizontal=self.plan.unit, vertical="").horizontal
-            )
+        """Metres per unit of the coordinates, as the first input says that PDAL can read."""
+        metadata = None
+        for first in (s for s in self.sources if s.path not in self.unreadable):
+            try:
+                metadata = self._metadata(first)
+                break
+            except PipelineError as error:
+                self.unreadable[first.path] = str(error)
+        if metadata is None:
+            raise self._none_readable()
         node = metadata.get(first.reader["type"], {})
         srs = (node[0] if isinstance(node, list) else node).get("srs", {})
         wkt = str(srs.get("compoundwkt") or srs.get("wkt") or "")
@@ -255,6 +250,18 @@ class _Run:
             if needed and self.plan.halo:
                 raise
             return 1.0
+
+    def _metadata(self, source: Source) -> dict[str, Any]:
+        """What PDAL's reader says of an input, with as few points read as it can."""
+        reader = {**source.reader, "filename": source.path}
+        if source.kind == "las":
+            reader["count"] = 1
+        else:
+            if "://" not in source.path:
+                reader["filename"] = f"ept://{source.path.removesuffix('/ept.json')}"
+            x0, y0, _, _ = self.headers[source.path].box
+            reader["bounds"] = f"([{x0!r}, {x0 + 1!r}], [{y0!r}, {y0 + 1!r}])"
+        return pdal_env.execute([reader], arrays=False).metadata.get("metadata", {})
 
     def _place_sources(self) -> None:
         """Where readable headers or indexes say that inputs lie; thousands of them are compared at once."""
@@ -331,7 +338,7 @@ class _Run:
     def _index_all(self, store: Store, pool: Here | OnDask) -> None:
         waiting: deque[tuple[Source, str]] = deque()
         for source in self.sources:
-            if source.kind != "las" or source.path not in self.headers:
+            if source.kind != "las" or source.path in self.unreadable:
                 continue
             mark = fingerprint(source.path, source.stamp(), self.grid.size)
             known = store.index(mark)

@@ -136,6 +136,18 @@ def read_header(source: Source) -> Header:
     return _ept_header(source) if source.kind == "ept" else las_header(source.path)
 
 
+def check_source(source: Source) -> None:
+    """Refuse an input whose header does not fit its file. Where it lies is known all the same.
+
+    Raises
+    ------
+    StageError
+        If the file is damaged.
+    """
+    if source.kind == "las":
+        check_readable(source.path)
+
+
 def las_header(path: str) -> Header:
     """Number of points and bounding box in the header of a LAS or LAZ file."""
     try:
@@ -147,10 +159,6 @@ def las_header(path: str) -> Header:
         raise StageError(
             "the input is not a LAS or LAZ file", where=path, found=f"{head[:4]!r} as first bytes"
         )
-    # Points shorter than any format's: PDAL would crash. A file cut short keeps its header, so that the tiles
-    # beside it are known to lack neighbors.
-    if struct.unpack_from("<H", head, 105)[0] < 20:
-        check_readable(path)
     (count,) = struct.unpack_from("<I", head, 107)
     if head[25] >= 4 and len(head) >= 255:
         (count,) = struct.unpack_from("<Q", head, 247)
