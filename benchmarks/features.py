@@ -18,6 +18,7 @@ that only reads, with one thread.
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import os
 import platform
@@ -371,6 +372,18 @@ def versions() -> dict[str, str]:
     return found
 
 
+def machine() -> str:
+    """The processor, as Linux names it, and how many of its cores are on offer."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    flags = next((line.split() for line in lines if line.startswith("flags")), [])
+    vectors = next((name for name in ("avx512f", "avx2", "avx") if name in flags), "")
+    return ", ".join(filter(None, [names[0] if names else platform.machine(), f"{os.cpu_count()} cores", vectors]))
+
+
 def plot(clouds: dict[str, tuple[int, list[dict]]], path: Path) -> None:
     """Median CPU microseconds a point of every case, a bar each."""
     import matplotlib
@@ -426,7 +439,10 @@ def main() -> None:
     options = parser.parse_args()
     threads = resolve_threads(options.threads)
     warmup()
-    text, data = "", {"versions": versions(), "threads": threads, "machine": platform.machine()}
+    if options.write and importlib.util.find_spec("matplotlib") is None:
+        parser.error("--write draws a plot, which needs matplotlib: pip install -e '.[benchmarks]'")
+    text, shown = "", {}
+    data: dict = {"versions": versions(), "threads": threads, "machine": machine()}
     if options.scaling:
         data["scaling"] = scaling(options.density, threads)
         text = scaling_table(data["scaling"])
@@ -434,7 +450,7 @@ def main() -> None:
         text = profile(load(options.cloud[0], options.points, options.density))
         data["profile"] = text
     else:
-        clouds, shown = {}, {}
+        clouds = {}
         for name in options.cloud:
             xyz = load(name, options.points, options.density)
             label = Path(name).stem
@@ -442,14 +458,15 @@ def main() -> None:
             shown[label] = len(xyz), clouds[label]
             text += table(label, xyz, clouds[label], threads) + "\n"
         data["clouds"] = clouds
-        if options.write:
-            plot(shown, options.write.with_suffix(".png"))
-    text += "\n" + ", ".join(f"{name} {number}" for name, number in data["versions"].items()) + "\n"
+    text += "\n" + ", ".join(f"{name} {number}" for name, number in data["versions"].items())
+    text += f"; {data['machine']}\n"
     print(text)
     if options.json:
         options.json.write_text(json.dumps(data, indent=1) + "\n")
     if options.write:
         options.write.write_text(text)
+        if shown:
+            plot(shown, options.write.with_suffix(".png"))
 
 
 if __name__ == "__main__":

@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 import os
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO, NamedTuple
 
 from .errors import StageError
 
@@ -152,6 +154,71 @@ def is_short(path: str | os.PathLike, size: int) -> bool | None:
         unfinished = not header.count and not header.records_after and size >= header.offset + header.point_bytes
         return unfinished or header.end_of_points > size
     return bool(header.count) and not header.offset + 8 <= _chunk_table(path, size, header) <= size - 8
+
+
+def supersede_copc(path: str | os.PathLike) -> bool:
+    """Mark COPC records that do not describe this file, which PDAL forwards from a COPC input with the others.
+
+    Readers of COPC would look for an octree where there is none. The records get the id with which LAS 1.4 (R15,
+    section 2.5, "Superseded") negates a record in place.
+
+    Returns
+    -------
+    bool
+        Whether there were any.
+    """
+    header = read_header(path)
+    if header is None:
+        return False
+    with open(path, "r+b") as file:
+        copc = [r for r in _records(file, header) if r.user == b"copc"]
+        if not copc:
+            return False
+        root = None
+        for record in copc:
+            if record.number == 1 and record.length >= 48:
+                file.seek(record.data + 40)
+                (root,) = struct.unpack("<Q", file.read(8))
+        if any(r.after and root is not None and 0 <= root - r.data < r.length for r in copc):
+            return False
+        for record in copc:
+            file.seek(record.place + 2)
+            file.write(_SUPERSEDED)
+    return True
+
+
+#: User and record id of a record that no longer counts.
+_SUPERSEDED = b"LASF_Spec".ljust(16, b"\0") + struct.pack("<H", 7)
+
+
+class _Record(NamedTuple):
+    """A variable-length record: where its head is, whose it is, where its data are; `after` the points or before."""
+
+    place: int
+    user: bytes
+    number: int
+    data: int
+    length: int
+    after: bool
+
+
+def _records(file: BinaryIO, header: LasHeader) -> Iterator[_Record]:
+    """The records of a file, as far as they are all there."""
+    place = header.header_bytes
+    for index in range(header.records + header.records_after):
+        after = index >= header.records
+        if index == header.records:
+            file.seek(235)
+            (place,) = struct.unpack("<Q", file.read(8))
+        size = 60 if after else 54
+        file.seek(place)
+        head = file.read(size)
+        if len(head) < size:
+            return
+        (number,) = struct.unpack_from("<H", head, 18)
+        (length,) = struct.unpack_from("<Q" if after else "<H", head, 20)
+        yield _Record(place, head[2:18].split(b"\0")[0], number, place + size, length, after)
+        place += size + length
 
 
 def _chunk_table(path: str | os.PathLike, size: int, header: LasHeader) -> int:

@@ -92,7 +92,7 @@ def execute(stages: list[dict[str, Any]], *, arrays: bool = True) -> Execution:
     pdal = bindings()
     stdout = sys.stdout
     try:
-        pipeline = pdal.Pipeline(json.dumps(stages))
+        pipeline = pdal.Pipeline(json.dumps(adapted(stages)))
         count = pipeline.execute()
     except RuntimeError as error:
         raise translate(str(error)) from None
@@ -138,6 +138,37 @@ def _metadata(pipeline) -> dict[str, Any]:
 
 
 # ---- what differs between versions ---------------------------------------------------------------
+
+
+def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Stages that this PDAL knows: before 2.4 a COPC file is read as the LAZ file that it is too.
+
+    Raises
+    ------
+    PipelineError
+        If only a reader of COPC could do what its options ask for.
+    """
+    if version() >= (2, 4, 0):
+        return stages
+    out = []
+    for stage in stages:
+        if isinstance(stage, dict) and stage.get("type") == "readers.copc":
+            beyond = [name for name in stage if name in _COPC_OPTIONS]
+            if beyond:
+                raise PipelineError(
+                    f"PDAL {'.'.join(map(str, version()))} reads COPC files whole, without {', '.join(beyond)}",
+                    where="readers.copc",
+                    found=str(stage.get("filename", "")),
+                    cure="Use PDAL 2.4 or later, or filters.crop after the reader",
+                )
+            stage = {**{k: v for k, v in stage.items() if k not in _COPC_TUNING}, "type": "readers.las"}
+        out.append(stage)
+    return out
+
+
+#: Options of readers.copc that choose points, and those that only make it faster.
+_COPC_OPTIONS = ("bounds", "polygon", "ogr", "resolution", "origin")
+_COPC_TUNING = ("requests", "keep_alive", "header", "query", "vlr", "fix_dims", "srs_vlr_order")
 
 
 @cache

@@ -14,7 +14,7 @@ from typing import Any
 from . import pdal_env, runtime
 from .errors import PipelineError, StageError
 from .files import check_complete, check_writable, disk_is_full, partial_name
-from .lasfile import check_readable, odd_text
+from .lasfile import check_readable, odd_text, supersede_copc
 from .leftovers import removed_if_killed
 from .lowering import Lowered, lower
 from .overrides import Override, apply_overrides
@@ -169,7 +169,7 @@ def _las_inputs(stages: list[dict[str, Any]]) -> list[str]:
         name, kind = stage.get("filename"), stage.get("type", "")
         if not isinstance(name, str) or "://" in name or (not kind and 0 < index == len(stages) - 1):
             continue
-        if kind == "readers.las" or (not kind and name.lower().endswith((".las", ".laz"))):
+        if kind in ("readers.las", "readers.copc") or (not kind and name.lower().endswith((".las", ".laz"))):
             names = sorted(glob.glob(name)) if not os.path.exists(name) else [name]
             found += [n for n in names if os.path.isfile(n)]
     return found
@@ -227,6 +227,8 @@ def _rename(renames: list[tuple[Path, Path]]) -> None:
                 number = path.name[len(before) : len(path.name) - len(after)]
                 target = final.with_name(final.name.replace("#", number, 1))
             check_complete(path, target)
+            if path.suffix.lower() in (".las", ".laz"):
+                supersede_copc(path)
             moves.append((path, target))
     for path, target in moves:
         try:
@@ -247,7 +249,7 @@ def _discard(renames: list[tuple[Path, Path]]) -> None:
 def _validate_with_pdal(stages: list[dict[str, Any]]) -> None:
     import subprocess
 
-    text = json.dumps({"pipeline": stages})
+    text = json.dumps({"pipeline": pdal_env.adapted(stages)})
     done = subprocess.run(
         [pdal_env.program(), "pipeline", "--validate", "--stdin"],
         input=text,

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from pathlib import Path
 
 import laspy
 import numpy as np
 import pytest
 
-from pdal_stages.overrides import parse_overrides
+from pdal_stages import pdal_env
+from pdal_stages.overrides import apply_overrides, parse_overrides
 from pdal_stages.pipeline import Pipeline
 from pdal_stages.synthetic import TownOptions, write_town
+from pdal_stages.tiling import run_tiled
 
 pytestmark = pytest.mark.pdal
 FOLDER = Path(__file__).resolve().parent.parent / "pipelines"
@@ -48,8 +51,11 @@ def test_none_is_forgotten():
     tested = {
         "normalise", "features", "features-for-viewers", "train", "train-binary", "classify", "classify-with-rejection",
         "evaluate", "train-on-smrf-ground", "classify-on-smrf-ground", "tiles-to-tiles",
+        "copc-to-tiles", "tile-index-to-tiles",
     }  # fmt: skip
     assert {f.stem for f in FILES} == tested
+    listed = (FOLDER.parent / "docs" / "how-to.md").read_text()
+    assert all(f"`{f.name}`" in listed for f in FILES)
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
@@ -139,3 +145,61 @@ def test_tiles_to_tiles(town, models, tmp_path):
     parts = [laspy.read(p) for p in sorted(tmp_path.glob("classified_*.laz"))]
     assert len(parts) >= 4
     assert sum(len(p) for p in parts) == len(laspy.read(town))
+
+
+def test_copc_to_tiles(models, tmp_path):
+    """Whole, and in tiles; the octree's records do not stay in files that are no COPC."""
+    source = Path(__file__).parent / "data" / "town.copc.laz"
+    words = [f"--stage.input.filename={source}", f"--stage.classifier.model={models / 'classes.model'}"]
+    run("copc-to-tiles", *words, f"--stage.output.filename={tmp_path}/whole.laz")
+    whole, before = laspy.read(tmp_path / "whole.laz"), laspy.read(source)
+    assert len(whole) == len(before)
+    assert [v.user_id for v in before.header.vlrs][0] == "copc"
+    assert not any(v.user_id == "copc" for v in [*whole.header.vlrs, *(whole.evlrs or [])])
+    tiled = run_tiled(
+        _with("copc-to-tiles", *words, f"--stage.output.filename={tmp_path}/t_#.laz"), 15, per="tile", workers=0
+    )
+    assert not tiled.failures
+    _same_points([whole], [laspy.read(p) for p in sorted(tmp_path.glob("t_*.laz"))])
+
+
+def test_tile_index_to_tiles(town, models, tmp_path):
+    Pipeline(
+        [
+            str(town),
+            {"type": "filters.splitter", "length": 40, "origin_x": 500000, "origin_y": 5400000},
+            {"type": "writers.las", "filename": str(tmp_path / "in_#.laz"), "forward": "all"},
+        ]
+    ).execute()
+    index = tmp_path / "survey.gpkg"
+    files = sorted(str(p) for p in tmp_path.glob("in_*.laz"))
+    subprocess.run(
+        [pdal_env.program(), "tindex", "create", str(index), "--stdin", "-f", "GPKG", "--lyr_name", "pdal"],
+        input="\n".join(files), text=True, check=True, capture_output=True,
+    )  # fmt: skip
+    words = [f"--stage.input.filename={index}", f"--stage.classifier.model={models / 'classes.model'}"]
+    run("tile-index-to-tiles", *words, f"--stage.output.filename={tmp_path}/whole.laz")
+    tiled = run_tiled(
+        _with("tile-index-to-tiles", *words, f"--stage.output.filename={tmp_path}/t_#.laz"), 25, per="tile", workers=0
+    )
+    assert not tiled.failures and tiled.summary["inputs"] == len(files) > 2
+    _same_points(
+        [laspy.read(tmp_path / "whole.laz")], [laspy.read(p) for p in sorted(tmp_path.glob("t_*.laz"))]
+    )
+
+
+def _with(name, *words):
+    return apply_overrides(json.loads((FOLDER / f"{name}.json").read_text()), parse_overrides(words)[0])
+
+
+def _same_points(some, others):
+    """The same points with the same classes and reliabilities, in any order."""
+
+    def table(parts):
+        columns = [
+            np.concatenate([np.asarray(part[name]) for part in parts])
+            for name in ("X", "Y", "Z", "classification", "Reliability")
+        ]
+        return np.column_stack(columns)[np.lexsort(columns)]
+
+    np.testing.assert_array_equal(table(some), table(others))

@@ -190,6 +190,10 @@ class _Run:
         self.notes = list(plan.notes)
         self.unreadable: dict[str, str] = {}
         self.sources = find_sources(plan.readers)
+        if any("t_srs" in reader for reader in plan.readers):
+            self.notes.append(
+                "readers.tindex: in tiles points keep the reference of their file, t_srs is left out"
+            )
         self.headers = self._headers()
         self.per = self._per()
         self.unit = self._unit()

@@ -18,6 +18,8 @@ from .tindex import locations
 
 #: Readers of files whose points can be fetched by number.
 _LAS = ("readers.las", "readers.copc")
+#: Options of readers.tindex that choose files or points, or change them.
+_TINDEX_QUERIES = ("bounds", "polygon", "where", "sql", "count", "srs_column")
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,14 @@ def find_sources(readers: list[dict[str, Any]]) -> list[Source]:
         name = str(reader.get("filename", ""))
         kind = reader["type"]
         if kind == "readers.tindex":
+            ignored = [o for o in _TINDEX_QUERIES if o in reader]
+            if ignored:
+                raise PipelineError(
+                    "in tiles all files of a tile index are read, whole",
+                    where=kind,
+                    found=", ".join(ignored),
+                    cure="Leave these options out, or make an index of the files you mean",
+                )
             options = {k: v for k, v in reader.items() if k in ("override_srs", "default_srs")}
             paths = locations(name, str(reader.get("tindex_name", "location")))
             reader = {"type": "readers.las", **options}
