@@ -154,7 +154,7 @@ def test_copc_to_tiles(models, tmp_path):
     run("copc-to-tiles", *words, f"--stage.output.filename={tmp_path}/whole.laz")
     whole, before = laspy.read(tmp_path / "whole.laz"), laspy.read(source)
     assert len(whole) == len(before)
-    assert [v.user_id for v in before.header.vlrs][0] == "copc"
+    assert next(v.user_id for v in before.header.vlrs) == "copc"
     assert not any(v.user_id == "copc" for v in [*whole.header.vlrs, *(whole.evlrs or [])])
     tiled = run_tiled(
         _with("copc-to-tiles", *words, f"--stage.output.filename={tmp_path}/t_#.laz"), 15, per="tile", workers=0
