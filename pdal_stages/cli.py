@@ -155,6 +155,7 @@ def _parser() -> argparse.ArgumentParser:
     command = add("model", _model, "Print what a model file is")
     command.add_argument("file")
     command.add_argument("--showjson", action="store_true", help="Everything, as JSON")
+    command.add_argument("--html", help="Write a page with its scores, training curve and importances to this file")
 
     command = add("demo", _demo, "Generate a town, train on one half, classify the other")
     command.add_argument("folder", nargs="?", default="pdal-stages-demo", help="Where results go")
@@ -329,6 +330,10 @@ def _model(options: argparse.Namespace) -> None:
     from .classifier import load_model
 
     model = load_model(options.file)
+    if options.html:
+        from .model_report import write_model_report
+
+        write_model_report(options.html, model, Path(options.file).name)
     if options.showjson:
         print(json.dumps(model.describe(), indent=2, default=str))
     else:

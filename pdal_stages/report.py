@@ -123,7 +123,7 @@ def accuracy_page(
         html.section("Settings", html.settings(settings, "What was compared")) if settings else "",
         _definitions(accuracy),
         subtitle=subtitle,
-        footer=f"{date or _today()}, pdal_stages {_version()}",
+        footer=footer(date),
     )
 
 
@@ -413,6 +413,11 @@ def _definitions(a: Accuracy) -> str:
         "larger.",
     ]
     return html.section("How the figures are defined", *(html.paragraph(t, "note") for t in lines))
+
+
+def footer(date: str | None = None) -> str:
+    """When a page was made, and by which version."""
+    return f"{date or _today()}, pdal_stages {_version()}"
 
 
 def _today() -> str:
