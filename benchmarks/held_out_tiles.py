@@ -19,8 +19,13 @@ from sklearn.ensemble import RandomForestClassifier
 import pdal_stages as ps
 
 CODES = (2, 3, 4, 5, 6)
-SETS = {"560 features": True, "covariance and geometric": False}
-SPLITS = {"560 features": (0.1,), "covariance and geometric": ("sqrt", 0.1)}
+#: Name -> (with shape distributions, with HeightAboveLowest, features tried at a split)
+SETS = {
+    "560 features": (True, False, (0.1,)),
+    "560 and HeightAboveLowest": (True, True, (0.1,)),
+    "covariance and geometric": (False, False, ("sqrt", 0.1)),
+    "the same and HeightAboveLowest": (False, True, ("sqrt", 0.1)),
+}
 WEIGHTS = (0.0, 0.1, 0.2, 0.3)
 
 
@@ -57,12 +62,13 @@ def main() -> None:
         test = rng.choice(np.flatnonzero((tile == held) & known), 12_000, replace=False)
         queries = np.concatenate([train, test])
         table = ps.compute_features(
-            xyz, queries, "weinmann2018", "all", dimensions={"HeightAboveGround": height[queries]}
+            xyz, queries, "weinmann2018", "all,HeightAboveLowest", dimensions={"HeightAboveGround": height[queries]}
         )
         shape = np.array([name[:2] in ("A3", "D1", "D2", "D3", "D4") for name in table.names])
-        for name, with_shapes in SETS.items():
-            values = table.values if with_shapes else table.values[:, ~shape]
-            for split in SPLITS[name]:
+        lowest = np.array([name.startswith("HeightAboveLowest") for name in table.names])
+        for name, (with_shapes, with_lowest, splits) in SETS.items():
+            values = table.values[:, (with_shapes | ~shape) & (with_lowest | ~lowest)]
+            for split in splits:
                 forest = RandomForestClassifier(
                     options.trees, max_features=split, n_jobs=-1, random_state=options.seed
                 )

@@ -102,8 +102,8 @@ def _curve(rows: Any) -> str:
     rows = [r for r in rows if isinstance(r, dict)] if isinstance(rows, list) else []
     charts = []
     for key, title, share in (("loss", "Loss", False), ("mean_f1", "Mean F1 on the ground held out", True)):
-        points = [(_number(r.get("epoch")), _number(r.get(key))) for r in rows]
-        points = [(a, b) for a, b in points if a is not None and b is not None]
+        pairs = [(_number(r.get("epoch")), _number(r.get(key))) for r in rows]
+        points = [(a, b) for a, b in pairs if a is not None and b is not None]
         if len(points) > 1:
             charts.append(_chart(points, title, share))
     if not charts:

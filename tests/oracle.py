@@ -20,7 +20,7 @@ COVARIANCE = (
     "EigenvalueSum",
     "SurfaceVariation",
 )
-GEOMETRIC = ("Density", "Verticality", "HeightRange", "HeightStd")
+GEOMETRIC = ("Density", "Verticality", "HeightRange", "HeightStd", "HeightAboveLowest")
 METRICS = ("A3", "D1", "D2", "D3", "D4")
 
 # ---- members -----------------------------------------------------------------------------------------------
@@ -80,8 +80,8 @@ def entropy(members):
     return float(-sum(v * math.log(v) for v in e if v > 0.0))
 
 
-def features(members, volume):
-    """The twelve covariance and geometric features; `volume` is what Density divides by."""
+def features(members, volume, q):
+    """The features made of moments; `volume` is what Density divides by, `q` the query."""
     if not len(members):
         out = dict.fromkeys((*COVARIANCE, *GEOMETRIC), 0.0)
         return {**out, "SurfaceVariation": 1.0 / 3.0}
@@ -90,6 +90,7 @@ def features(members, volume):
         "Density": len(members) / volume if volume else 0.0,
         "HeightRange": z.max() - z.min(),
         "HeightStd": z.std(),
+        "HeightAboveLowest": q[2] - members[:, 2].min(),
     }
     if len(members) < 3 or (members == members[0]).all():
         return {**dict.fromkeys((*COVARIANCE, "Verticality"), 0.0), "SurfaceVariation": 1.0 / 3.0, **out}
@@ -120,12 +121,12 @@ def normal_gap(members):
 
 def of_cylinder(xyz, q, radius):
     """Features of a cylinder."""
-    return features(cylinder(xyz, q, radius), math.pi * radius**2)
+    return features(cylinder(xyz, q, radius), math.pi * radius**2, q)
 
 
 def of_sphere(xyz, q, radius):
     """Features of a sphere."""
-    return features(sphere(xyz, q, radius), 4.0 / 3.0 * math.pi * radius**3)
+    return features(sphere(xyz, q, radius), 4.0 / 3.0 * math.pi * radius**3, q)
 
 
 def ball_volume(radius):

@@ -18,7 +18,7 @@ from pdal_stages.features.plan import FeaturePlan
 from pdal_stages.features.ropt import curvature_block, curvature_threshold, radii_of, ropt_block
 from pdal_stages.features.shapes import no_shapes
 
-TWELVE = [*oracle.COVARIANCE, *oracle.GEOMETRIC]
+CHECKED = [*oracle.COVARIANCE, *oracle.GEOMETRIC]
 NO_SEEDS = np.zeros(0, np.uint64)
 
 
@@ -235,14 +235,14 @@ def test_other_ranges_and_a_cap(k_min, k_max, cap):
 def test_features_of_kopt_and_k():
     for xyz in (CLOUDS["town"], CLOUDS["utm"]):
         at = np.arange(0, len(xyz), 40)
-        got = compute_features(xyz, at, "kopt,k50", ["covariance", "geometric", "Radius"])
+        got = compute_features(xyz, at, "kopt,k50", ["covariance", *oracle.GEOMETRIC, "Radius"])
         for i, q in enumerate(xyz[at]):
             for token, (members, r) in (
                 ("kopt", oracle.kopt(xyz, q)[:2]),
                 ("k50", oracle.nearest(xyz, q, 50)),
             ):
-                expected = oracle.features(members, oracle.ball_volume(r))
-                for name in TWELVE:
+                expected = oracle.features(members, oracle.ball_volume(r), q)
+                for name in CHECKED:
                     if name == "Verticality" and oracle.normal_gap(members) < 1e-7:
                         continue
                     value = float(got[f"{name}_{token}"][i])
@@ -305,12 +305,12 @@ def test_radii():
 def test_features_of_ropt():
     xyz = CLOUDS["town"]
     at = np.arange(0, len(xyz), 60)
-    got = compute_features(xyz, at, "ropt(0.4,2,0.1)", ["covariance", "geometric", "Radius"])
+    got = compute_features(xyz, at, "ropt(0.4,2,0.1)", ["covariance", *oracle.GEOMETRIC, "Radius"])
     for i, q in enumerate(xyz[at]):
         r = oracle_ropt(xyz, q, radii_of(0.4, 2, 0.1))[0]
         expected = oracle.of_sphere(xyz, q, r)
-        assert got.values[i, -1] == np.float32(r)
-        for name in TWELVE:
+        assert got["Radius_ropt0_4_2_0_1"][i] == np.float32(r)
+        for name in CHECKED:
             if name == "Verticality" and oracle.normal_gap(oracle.sphere(xyz, q, r)) < 1e-7:
                 continue
             column = got.names.index(f"{name}_ropt0_4_2_0_1")

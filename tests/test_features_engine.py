@@ -19,7 +19,7 @@ from pdal_stages.progress import Progress
 
 #: Every kind of neighborhood, small enough for small clouds.
 KINDS = "c1,c2.5,s1.5,s4,k8,kopt(5,30),ropt(0.5,1.5,0.25),copt"
-MOMENTS = "covariance,Density,Verticality,HeightRange,HeightStd"
+MOMENTS = "covariance,Density,Verticality,HeightRange,HeightStd,HeightAboveLowest"
 
 
 @pytest.fixture(scope="module")

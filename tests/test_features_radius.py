@@ -9,7 +9,7 @@ import pytest
 from pdal_stages.features import compute_features
 from pdal_stages.neighborhoods import parse_neighborhoods
 
-TWELVE = [*oracle.COVARIANCE, *oracle.GEOMETRIC]
+CHECKED = [*oracle.COVARIANCE, *oracle.GEOMETRIC]
 RTOL = 1e-5
 #: Where a true value is 0 (a perfect plane), rounding leaves e3 of 1e-15, whose cube root is 1e-5.
 ATOL = {"Omnivariance": 3e-5}
@@ -28,10 +28,10 @@ def check(xyz, queries, radii=(1.0, 2.5), kinds="cs", atol=1e-9, results=None):
             volume = math.pi * radius**2 if kind == "c" else oracle.ball_volume(radius)
             for i, q in enumerate(coordinates):
                 members = oracle.cylinder(xyz, q, radius) if kind == "c" else oracle.sphere(xyz, q, radius)
-                expected = oracle.features(members, volume)
+                expected = oracle.features(members, volume, q)
                 where = f"{suffix}, query {i}, {len(members)} members"
                 assert round(float(results[f"Density_{suffix}"][i]) * volume) == len(members), where
-                for name in TWELVE:
+                for name in CHECKED:
                     got = float(results[f"{name}_{suffix}"][i])
                     if name == "Verticality" and (len(members) < 3 or oracle.normal_gap(members) < 1e-7):
                         assert 0.0 <= got <= 1.0, where  # no normal to speak of

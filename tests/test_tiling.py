@@ -138,6 +138,20 @@ def test_one_file_comes_back_bit_for_bit(tmp_path, town_file, model_file, whole)
     assert (tmp_path / "out.laz").read_bytes() == whole.read_bytes()
 
 
+def test_smoothed_over_seams(tmp_path, town_file, model_file):
+    """Points beside the tile are classified too, as far as smoothing looks."""
+
+    def job(output):
+        stages = clouds.stages([town_file], output, model_file)
+        stages[-2].update(smooth=1.5, margin=True)
+        return stages
+
+    ps.Pipeline(job(tmp_path / "whole.laz")).execute(arrays=False)
+    run = run_tiled(job(tmp_path / "out.laz"), 30, workers=0)
+    assert not run.failures
+    clouds.same_points(tmp_path / "whole.laz", tmp_path / "out.laz")
+
+
 def test_two_worker_processes_give_the_same(tmp_path, town_file, model_file, whole):
     pytest.importorskip("distributed")
     run = run_tiled(clouds.stages([town_file], tmp_path / "out.laz", model_file), 45, workers=min(2, _cores()))

@@ -178,7 +178,7 @@ def figures(matrix: npt.NDArray[np.int64], codes: Sequence[int]) -> dict[str, An
         "overall_accuracy": accuracy.overall_accuracy,
         "kappa": accuracy.kappa,
         "mean_f1": accuracy.mean_f1,
-        "f1": {str(one.code): one.f1 for one in accuracy.per_class},
+        "f1": {str(one.code): one.f1 if one.support else None for one in accuracy.per_class},
     }
 
 

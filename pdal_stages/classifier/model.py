@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ..errors import ModelError, OptionError
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
-from . import modelfile, summary
+from . import modelfile, smoothing, summary
 from .algorithms import algorithm
 from .dimensions import gather, required
 
@@ -200,6 +200,7 @@ class Model:
         variance: bool = False,
         reject_below: float | None = None,
         rejected_code: int | None = None,
+        smooth: float = 0.0,
         progress: Any = None,
     ) -> Prediction:
         """Classify a cloud: features are computed block by block and classified at once.
@@ -225,12 +226,16 @@ class Model:
             Points less reliable than this are not given the winning class, and are counted.
         rejected_code : int, optional
             Class of rejected points, instead of their old one.
+        smooth : float
+            Metres, 0 for none: probabilities become half the point's own, half the mean over the classified
+            points in a sphere of that radius around it. Classes, reliability and margin follow from these.
         progress : object, optional
             Handed to the feature engine.
         """
         xyz = np.asarray(xyz, dtype=np.float64)
         n = len(xyz)
         threshold = _checked_reject(reject_below)
+        radius = smoothing.checked_radius(smooth)
         if rejected_code is not None and (isinstance(rejected_code, bool) or not 0 <= rejected_code <= 255):
             raise OptionError("'rejected_code' must be a class code from 0 to 255", found=rejected_code)
         rows = _rows(where, n)
@@ -252,14 +257,18 @@ class Model:
         count = n if rows is None else len(rows)
         codes = self.codes
 
-        def classify(values, _rows):
-            return decide(self._weigh(self.algorithm.predict_proba(values)))
+        def weighed(values, _rows):
+            return self._weigh(self.algorithm.predict_proba(values))
 
         def decide(p):
             best = p.argmax(axis=1)
             win = np.take_along_axis(p, best[:, None], axis=1)[:, 0]
             second = np.partition(p, -2, axis=1)[:, -2] if margin and p.shape[1] > 1 else np.zeros(len(p))
             return codes[best], win, win - second, p if probabilities else None
+
+        def classify(values, _rows):
+            p = weighed(values, _rows)
+            return smoothing.count_shares(p) if radius else decide(p)
 
         rejected = 0
         counted: dict[str, Any] = {}
@@ -268,7 +277,7 @@ class Model:
             found = self.algorithm.predict_cloud(
                 xyz, fed, rows, threads=threads, memory_mb=memory_mb, progress=progress
             )
-            blocks = [(chosen, decide(found.mean))]
+            blocks = [(chosen, smoothing.count_shares(found.mean) if radius else decide(found.mean))]
             counted.update(found.report)
             if variances is not None:
                 variances[chosen] = found.variance
@@ -289,6 +298,9 @@ class Model:
                 progress=progress,
                 apply=classify,
             )
+        if radius and count:
+            counted["smooth"] = radius
+            blocks = _smoothed(xyz, rows, blocks, len(self.classes), radius, threads, decide)
         for at, (code, win, lead, p) in blocks:
             reliability[at] = win
             if margins is not None:
@@ -402,6 +414,23 @@ def _rows(where: npt.ArrayLike | None, n: int) -> npt.NDArray[np.int64] | None:
             "'where' must be one true or false per point", found=f"{mask.dtype} of shape {mask.shape}"
         )
     return None if mask.all() else np.flatnonzero(mask)
+
+
+def _smoothed(xyz, rows, blocks, classes: int, radius: float, threads: int | None, decide: Any):
+    """Blocks of decisions on smoothed probabilities, once those of all points are there."""
+    shares = np.zeros((len(xyz), classes), np.uint16)
+    for at, block in blocks:
+        shares[at] = block
+    if rows is not None:
+        shares = shares[rows]
+    means = smoothing.smooth(xyz if rows is None else xyz[rows], shares, radius, threads)
+    for start in range(0, len(means), _DECIDED):
+        part = slice(start, start + _DECIDED)
+        yield part if rows is None else rows[part], decide(means[part])
+
+
+#: Points decided on at a time.
+_DECIDED = 500_000
 
 
 def _codes_now(current: npt.ArrayLike, n: int) -> npt.NDArray[np.uint8]:

@@ -24,7 +24,9 @@ class TrainingOptions:
     neighborhoods : str or sequence of str
         Preset or tokens, as for features.
     feature_set : str or sequence of str
-        Which features, as for features.
+        Which features, as for features. The default adds to the papers' the height above the lowest point of each
+        neighborhood [HWS16], which tells low vegetation from sloping ground: on held-out training tiles it brings
+        1.5 per cent of overall accuracy and 5 of mean F1 (docs/benchmarks.md).
     dimensions : sequence of str
         Dimensions of the points used as features beside the geometric ones. HeightAboveGround alone by
         default: Intensity depends on sensor, flying height and calibration, and return numbers
@@ -72,7 +74,7 @@ class TrainingOptions:
     """
 
     neighborhoods: Any = "weinmann2018"
-    feature_set: Any = "all"
+    feature_set: Any = ("all", "HeightAboveLowest")
     dimensions: Sequence[str] = ("HeightAboveGround",)
     classes: Any = None
     strategy: str = "multiclass"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from ..errors import ModelError, OptionError
-from ..features.names import GROUPS
+from ..features.names import GROUPS, RELATIVE
 
 if TYPE_CHECKING:
     from .model import Model
@@ -16,6 +16,7 @@ GROUPINGS = ("column", "feature", "group", "neighborhood", "dimension")
 def columns(model: Model) -> list[tuple[str, str, str]]:
     """(feature, group, neighborhood token) of every column; a histogram's bins are one feature."""
     group_of = {name: group for group in ("covariance", "geometric", "shapes") for name in GROUPS[group]}
+    group_of.update(dict.fromkeys(RELATIVE, "geometric"))
     out = []
     for part in model.plan.layout:
         for name in part.at:

@@ -15,7 +15,7 @@ from .bins import ShapeBins
 from .index import Grid
 from .jit import CompilationNote, njit
 from .kdtree import KdTree, build_tree
-from .moments import BATCH, MOMENTS, finish
+from .moments import BATCH, FEATURES, MOMENTS, finish
 from .names import MOMENT_FEATURES, SHAPE_FEATURES
 from .optimal import kopt_block
 from .plan import Columns, FeaturePlan
@@ -93,7 +93,7 @@ class AdaptiveNeighborhoods:
             table, radius, _ = self._compute(spec, *one, 0, 0.0, shapes)
             few, copies = np.zeros(1, np.int64), np.ones(1, np.int64)
             nowhere = np.full(len(spec.columns), -1, np.int64)
-            write_columns(table, radius, few, copies, nowhere, np.zeros((1, 1), np.float32))
+            write_columns(table, radius, one[2], few, copies, nowhere, np.zeros((1, 1), np.float32))
 
     def fit_copt(self, threads: int | None = None) -> float:
         """The curvature from which on a point is scattered, from all points of the cloud [H17]."""
@@ -155,7 +155,7 @@ class AdaptiveNeighborhoods:
             else:
                 shapes = no_shapes()
             table, radius, reach = self._compute(spec, qx, qy, qz, seed, copt_threshold, shapes)
-            write_columns(table, radius, few[number : number + 1], copies, spec.columns, out)
+            write_columns(table, radius, qz, few[number : number + 1], copies, spec.columns, out)
             if spec.shaped:
                 wanted = spec.shape_columns >= 0
                 out[:, spec.shape_columns[wanted]] = shapes.counts[:, wanted]
@@ -189,18 +189,19 @@ class AdaptiveNeighborhoods:
 
 
 @njit
-def write_columns(table, radius, few, copies, columns, out):
+def write_columns(table, radius, heights, few, copies, columns, out):
     """Write the features of neighborhoods with individual radii from their moments.
 
     Parameters
     ----------
     table : (12, m) float64 array
         Moments about the queries.
-    radius : (m,) float64 array
+    radius, heights : (m,) float64 arrays
+        Of the neighborhoods, and z of the queries.
     few : (1,) int64 array
         Raised by the number of queries with fewer than three members.
     copies : (m,) int64 array
-    columns : (13,) int64 array
+    columns : (14,) int64 array
         Where in `out` each feature of ``moments.finish`` goes, and the radius; -1: nowhere.
     out : (m, F) float32 array
     """
@@ -210,14 +211,15 @@ def write_columns(table, radius, few, copies, columns, out):
         for j in range(count):
             r = max(radius[start + j], LEAST_RADIUS)
             volumes[j] = 4.0 / 3.0 * math.pi * r * r * r
-        values = finish(table, start, count, volumes, few, copies[start : start + count])
-        for f in range(MOMENTS):
+        part = slice(start, start + count)
+        values = finish(table, start, count, volumes, heights[part], few, copies[part])
+        for f in range(FEATURES):
             if columns[f] >= 0:
                 for j in range(count):
                     out[start + j, columns[f]] = values[f, j]
-        if columns[MOMENTS] >= 0:
+        if columns[FEATURES] >= 0:
             for j in range(count):
-                out[start + j, columns[MOMENTS]] = radius[start + j]
+                out[start + j, columns[FEATURES]] = radius[start + j]
 
 
 def _spec(columns: Columns) -> _Spec:

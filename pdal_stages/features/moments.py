@@ -23,6 +23,9 @@ from .jit import njit
 N, SX, SY, SZ, SXX, SXY, SXZ, SYY, SYZ, SZZ, LOW, HIGH = range(12)
 MOMENTS = 12
 
+#: Features made of them.
+FEATURES = 13
+
 #: Queries whose moments are held at a time: small enough for the second-level cache.
 BATCH = 256
 
@@ -124,8 +127,8 @@ def add_shared(inner, dx, dy, dz, out, j):
 
 
 @njit
-def finish(moments, start, count, volumes, few, copies):
-    """The twelve covariance and geometric features of `count` neighborhoods, from their moments.
+def finish(moments, start, count, volumes, heights, few, copies):
+    """The thirteen features made of moments, of `count` neighborhoods, from their moments.
 
     Parameters
     ----------
@@ -135,6 +138,8 @@ def finish(moments, start, count, volumes, few, copies):
         Which columns of it: at most BATCH of them.
     volumes : (count,) float64 array
         Area of the cylinder's base or volume of the sphere: what Density divides by.
+    heights : (count,) float64 array
+        z of the queries.
     few : (1,) int64 array
         Raised by the number of queries whose neighborhood has fewer than three points.
     copies : (count,) int64 array
@@ -142,18 +147,18 @@ def finish(moments, start, count, volumes, few, copies):
 
     Returns
     -------
-    (12, BATCH) float64 array, of which `count` columns are filled
+    (13, BATCH) float64 array, of which `count` columns are filled
         Linearity, Planarity, Scattering, Omnivariance, Anisotropy, Eigenentropy, EigenvalueSum,
-        SurfaceVariation, Density, Verticality, HeightRange, HeightStd.
+        SurfaceVariation, Density, Verticality, HeightRange, HeightStd, HeightAboveLowest.
 
     Notes
     -----
     With fewer than three points, or points that all coincide, eigen-features and Verticality are 0 and
-    SurfaceVariation is 1/3 [H17]; HeightRange and HeightStd are what the points there are have; with none
+    SurfaceVariation is 1/3 [H17]; the heights are what the points there are have; with none
     (queries that are not points of the cloud) they are 0.
     """
     # Made here and of a constant shape: rows known not to overlap let the loop be vectorised.
-    out = np.empty((MOMENTS, WIDTH))
+    out = np.empty((FEATURES, WIDTH))
     for j in range(count):
         i = start + j
         n = moments[N, i]
@@ -180,6 +185,7 @@ def finish(moments, start, count, volumes, few, copies):
         out[9, j] = 1.0 - nz if real else 0.0
         out[10, j] = moments[HIGH, i] - moments[LOW, i] if n > 0.0 else 0.0
         out[11, j] = math.sqrt(max(zz, 0.0)) if apart else 0.0
+        out[12, j] = heights[j] - moments[LOW, i] if n > 0.0 else 0.0
     for j in range(count):
         if moments[N, start + j] < 3.0:
             few[0] += copies[j]

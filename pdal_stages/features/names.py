@@ -1,7 +1,8 @@
 """Feature names, their order and groups, and what each is: the one table that plans, docs and schemas read.
 
 Definitions use the eigenvalues l1 >= l2 >= l3 >= 0 of a neighborhood's covariance matrix (divisor n) and
-e_i = l_i / (l1 + l2 + l3). Sources: [B16] Blomley et al. 2016; [W18] Weinmann et al. 2018; [H17] He et al. 2017.
+e_i = l_i / (l1 + l2 + l3). Sources: [B16] Blomley et al. 2016; [W18] Weinmann et al. 2018; [H17] He et al. 2017;
+[HWS16] Hackel, Wegner, Schindler 2016, ISPRS Annals III-3 (their "height below").
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ GEOMETRIC = {
     "HeightStd": "standard deviation of z (divisor n), metres",
     "Radius": "the chosen size in metres; kopt, ropt and copt only",
 }
+#: What the papers' sets of features lack, and "all" therefore leaves out.
+RELATIVE = {"HeightAboveLowest": "z of the point minus the lowest z of the neighborhood, metres [HWS16]"}
 SHAPES = {
     "A3": "angle between two pulled points seen from a third",
     "D1": "distance of a pulled point from the centroid",
@@ -38,15 +41,15 @@ SHAPES = {
 SHAPE_BINS = 10
 
 #: Columns of the moment kernels, in their order.
-MOMENT_FEATURES = (*COVARIANCE, "Density", "Verticality", "HeightRange", "HeightStd")
+MOMENT_FEATURES = (*COVARIANCE, "Density", "Verticality", "HeightRange", "HeightStd", "HeightAboveLowest")
 SHAPE_FEATURES = tuple(f"{metric}_{b}" for metric in SHAPES for b in range(SHAPE_BINS))
 
 #: Every feature of an adaptive neighborhood, in order; the others lack Radius.
-ALL_FEATURES = (*COVARIANCE, *GEOMETRIC, *SHAPE_FEATURES)
+ALL_FEATURES = (*COVARIANCE, *GEOMETRIC, *SHAPE_FEATURES, *RELATIVE)
 
 #: Words for several features at once.
 GROUPS: dict[str, tuple[str, ...]] = {
-    "all": ALL_FEATURES,
+    "all": (*COVARIANCE, *GEOMETRIC, *SHAPE_FEATURES),
     "covariance": tuple(COVARIANCE),
     "geometric": tuple(GEOMETRIC),
     "shapes": SHAPE_FEATURES,
@@ -62,7 +65,7 @@ def describe(feature: str) -> str:
     metric, _, number = feature.partition("_")
     if metric in SHAPES and number:
         return f"share of 255 pulls in bin {number} of 10: {SHAPES[metric]}"
-    return {**COVARIANCE, **GEOMETRIC, **SHAPES}[feature]
+    return {**COVARIANCE, **GEOMETRIC, **SHAPES, **RELATIVE}[feature]
 
 
 def parse_feature_set(spec: str | Iterable[str]) -> tuple[str, ...]:
@@ -94,7 +97,7 @@ def parse_feature_set(spec: str | Iterable[str]) -> tuple[str, ...]:
                 cure = suggest(word, (*GROUPS, *ALL_FEATURES))
                 raise OptionError(
                     f"unknown feature or group '{word}'",
-                    cure=f"{cure}Groups: {', '.join(GROUPS)}; features: {', '.join((*COVARIANCE, *GEOMETRIC))}",
+                    cure=f"{cure}Groups: {', '.join(GROUPS)}; features: {', '.join((*COVARIANCE, *GEOMETRIC, *RELATIVE))}",
                 )
             name = head + word[len(head) :].lower()
         found[name] = None

@@ -8,7 +8,20 @@ import numpy as np
 
 from .candidates import FAR, LANES, count_candidates, fill_strip, gather, half_widths
 from .jit import njit
-from .moments import BATCH, MOMENTS, SX, SY, SZ, WIDTH, N, add_shared, cylinder_sums, finish, sphere_sums
+from .moments import (
+    BATCH,
+    FEATURES,
+    MOMENTS,
+    SX,
+    SY,
+    SZ,
+    WIDTH,
+    N,
+    add_shared,
+    cylinder_sums,
+    finish,
+    sphere_sums,
+)
 from .shapes import shape_counts, shape_values
 
 #: Columns of cells whose queries share one table of where points begin.
@@ -70,7 +83,7 @@ def radius_block(
         :func:`width_table` of the radii.
     wanted : (r, 2) int64 array
         Number of the cylinder and of the sphere of each radius in `columns`, or -1.
-    columns : (k, 12) int64 array
+    columns : (k, 13) int64 array
         Column of each neighborhood's features in `out`, or -1.
     shaped : (k,) bool array
         Whether shape distributions are wanted of a neighborhood.
@@ -148,8 +161,10 @@ def radius_block(
                 if number >= 0:
                     volumes[:] = math.pi * r * r if kind == 0 else 4.0 / 3.0 * math.pi * r * r * r
                     tally = few[number : number + 1]
-                    values = finish(moments[number], 0, stop - start, volumes, tally, copies[start:stop])
-                    for f in range(MOMENTS):
+                    values = finish(
+                        moments[number], 0, stop - start, volumes, qz[start:stop], tally, copies[start:stop]
+                    )
+                    for f in range(FEATURES):
                         column = columns[number, f]
                         if column >= 0:
                             for j in range(stop - start):

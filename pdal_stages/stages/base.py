@@ -105,6 +105,11 @@ class Stage(ABC):
         return 0.0
 
     @classmethod
+    def inner_reach(cls, options: dict[str, Any]) -> float:
+        """How far apart, in metres, points use each other's results of this very stage; part of the halo."""
+        return 0.0
+
+    @classmethod
     def largest_class(cls, options: dict[str, Any]) -> int:
         """The largest class code the stage may write to `Classification` (0: none)."""
         return 0

@@ -51,7 +51,10 @@ class ClassifierModel(Stage):
             "Neighborhoods: tokens (c2, s1, k50, kopt, ropt, copt) or a preset (blomley2016, weinmann2018, he2017)",
         ),
         Option(
-            "feature_set", "list", ("all",), "Groups (covariance, geometric, shapes, all) or single features"
+            "feature_set",
+            "list",
+            _default("feature_set"),
+            "Groups (covariance, geometric, shapes, all) or single features. 'all' is the papers' set",
         ),
         Option(
             "dimensions",

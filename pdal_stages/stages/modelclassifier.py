@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..classifier import Model, load_model
+from ..classifier.smoothing import FARTHEST
 from ..errors import OptionError
 from ..progress import Progress
 from .base import Stage
@@ -54,6 +55,15 @@ class ModelClassifier(Stage):
             maximum=255,
         ),
         Option(
+            "smooth",
+            "number",
+            0.0,
+            "Average probabilities with those of the points in a sphere of this radius, half and half; 0: do not",
+            minimum=0,
+            maximum=FARTHEST,
+            unit="m",
+        ),
+        Option(
             "memory",
             "integer",
             512,
@@ -65,13 +75,15 @@ class ModelClassifier(Stage):
     details = """
 Computes the features the model needs block by block and classifies them at once, so memory does not grow with their
 number. A model asked for a dimension that the points lack names the dimension and the stage that makes it.
-`Reliability` is the probability of the winning class. With LAS 1.0-1.3 the synthetic, key-point and withheld flags of
-each point stay. Codes above 31 need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked
-before any work is done.
+`Reliability` is the probability of the winning class. `smooth` (1 m, say)
+makes classes calmer: a point's probabilities become half its own and half the mean over its neighbors, as far as
+these are classified too; class, reliability and margin follow.
+With LAS 1.0-1.3 the synthetic, key-point and withheld flags of each point stay. Codes above 31
+need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before any work is done.
 """
     dimensions_help = """- Reads: X, Y, Z, `Classification`, and what the model names (`pdal-stages model FILE`)
 - Writes: `Classification` (uint8_t), `Reliability` (float); on request `Margin`, `Variance` and `Probability_<code>` (float)
-- Halo: that of the model's neighborhoods"""
+- Halo: that of the model's neighborhoods, and `smooth`"""
     before = ({"type": "filters.hag_minima"},)
     after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)
     example = {"type": "filters.modelclassifier", "model": "town.model"}
@@ -114,7 +126,11 @@ before any work is done.
 
     @classmethod
     def halo(cls, options: dict[str, Any]) -> float:
-        return cls.model(options).halo
+        return cls.model(options).halo + cls.inner_reach(options)
+
+    @classmethod
+    def inner_reach(cls, options: dict[str, Any]) -> float:
+        return options["smooth"] + 0.001 if options["smooth"] else 0.0  # a distance rounds
 
     @classmethod
     def largest_class(cls, options: dict[str, Any]) -> int:
@@ -140,6 +156,7 @@ before any work is done.
                 variance=options["variance"],
                 reject_below=options["reject_below"],
                 rejected_code=options["rejected_code"],
+                smooth=options["smooth"],
                 progress=progress,
             )
         values: dict[str, NDArray] = {

@@ -119,7 +119,7 @@ def make_plan(source: Any, overrides: Iterable[Override], options: TilingOptions
     creates: list[str] | None = None
     if not foreign:
         made = ((k, v) for k, v in zip(kinds, parsed, strict=True) if k is not None and v is not None)
-        creates = sorted({name for kind, values in made for name in kind.creates(values)})
+        creates = list(dict.fromkeys(name for kind, values in made for name in kind.creates(values)))
     notes = []
     if any(k is None and t not in PER_POINT for k, t in zip(kinds, (s["type"] for s in head), strict=True)):
         notes.append(
@@ -265,7 +265,7 @@ def _prepare(head, kinds, parsed, reaches) -> list[dict[str, Any]]:
             for option in kind.all_options():
                 if option.kind == "filename" and stage.get(option.name):
                     stage[option.name] = str(Path(stage[option.name]).absolute())
-            later = sum(reaches[place + 1 :])
+            later = sum(reaches[place + 1 :]) + kind.inner_reach(values)
             if kind.type in _WHERE_CHOOSES:
                 seen = f"{MARGIN} <= {later!r}" if later > 0 else f"{MARGIN} < 0"
                 stage["where"] = f"({values['where']}) && ({seen})" if values["where"] else seen
