@@ -94,7 +94,7 @@ def figures(accuracy: Accuracy) -> dict[str, float]:
     return {name: round(100 * getattr(accuracy, name), 2) for name in names}
 
 
-def score(data: Path, scene: str, options: TrainingOptions, progress: bool) -> dict:
+def score(data: Path, scene: str, options: TrainingOptions, smooth: float, progress: bool) -> dict:
     """Train on the training part, classify the test part, compare."""
     timer = Timer()
     with timer("read"):
@@ -107,7 +107,7 @@ def score(data: Path, scene: str, options: TrainingOptions, progress: bool) -> d
     with timer("train"):
         model = train([TrainingCloud(xyz, labels, dimensions, name=scene)], options, progress)
     with timer("classify"):
-        prediction = model.predict(test, test_dimensions, threads=options.threads)
+        prediction = model.predict(test, test_dimensions, threads=options.threads, smooth=smooth)
     reference, merged = truth, MERGED[scene]
     classes: tuple[int, ...] = SCENES[scene]
     if options.strategy == "binary":
@@ -122,6 +122,7 @@ def score(data: Path, scene: str, options: TrainingOptions, progress: bool) -> d
         "features": len(model.plan.names),
         "dimensions": list(options.dimensions),
         "prior_weight": options.prior_weight,
+        "smooth": smooth,
         "strategy": options.strategy,
         "target": options.target,
         **figures(result),
@@ -277,12 +278,13 @@ def main() -> None:
     parser.add_argument("--scene", nargs="+", choices=sorted(SCENES), default=sorted(SCENES, reverse=True))
     parser.add_argument("--count", nargs="+", type=int, default=[TrainingOptions.count])
     parser.add_argument("--neighborhoods", default="weinmann2018")
-    parser.add_argument("--feature-set", default="all")
+    parser.add_argument("--feature-set", default=",".join(TrainingOptions.feature_set))
     parser.add_argument("--dimensions", default="HeightAboveGround", help="comma-separated")
     parser.add_argument("--trees", type=int, default=TrainingOptions.trees)
     parser.add_argument("--leaf", type=int, default=TrainingOptions.min_samples_leaf)
     parser.add_argument("--prior-weight", type=float, default=TrainingOptions.prior_weight)
     parser.add_argument("--max-features", type=number, default=TrainingOptions.max_features)
+    parser.add_argument("--smooth", type=float, default=0.0, help="radius in metres")
     parser.add_argument("--target", type=int, help="binary: this class against the rest")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int)
@@ -316,7 +318,7 @@ def main() -> None:
             if args.tune:
                 results += tune(Path(args.data), scene, options, args.folds, args.block, args.quick)
             else:
-                results.append(score(Path(args.data), scene, options, args.progress))
+                results.append(score(Path(args.data), scene, options, args.smooth, args.progress))
     if args.json:
         import numba
         import sklearn

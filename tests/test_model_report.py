@@ -1,0 +1,81 @@
+"""The page about a model file: what it shows for a forest and a network, and what odd manifests do to it."""
+
+import json
+from html.parser import HTMLParser
+
+import pytest
+from test_classifier_training import SMALL, scene
+
+from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
+from pdal_stages.cli import main
+from pdal_stages.model_report import model_page
+
+
+class _Balance(HTMLParser):
+    """Open tags must be closed."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.text = [], []
+
+    def handle_starttag(self, tag, attrs):
+        if tag not in ("meta", "img", "br", "path", "rect", "circle", "link"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        if tag not in ("path", "rect", "circle"):
+            assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def read(page):
+    parser = _Balance()
+    parser.feed(page)
+    assert not parser.open
+    return " ".join(parser.text)
+
+
+@pytest.fixture(scope="module")
+def searched():
+    xyz, label, dimensions = scene(n=4000)
+    options = TrainingOptions(**{**SMALL, "trees": (5, 10)}, folds=3, block_size=10)
+    return train([TrainingCloud(xyz, label, dimensions, "a<b>.laz")], options, progress=False)
+
+
+def test_a_forest(searched, tmp_path, capsys):
+    searched.save(tmp_path / "town.model")
+    assert main(["model", str(tmp_path / "town.model"), "--html", str(tmp_path / "m.html")]) == 0
+    said = capsys.readouterr().out
+    words = read((tmp_path / "m.html").read_text())
+    assert "Model town.model" in words and "3 folds of blocks of 10 m" in words and "a<b>.laz" in words
+    for row in searched.info["accuracy"]["cross_validation"]["tried"]:
+        assert f"{100 * row['overall_accuracy']:.2f}" in words
+    assert "By neighborhood" in words and "Epoch" not in words and "random_forest" in said
+
+
+@pytest.mark.parametrize(
+    ("curve", "shown"),
+    [
+        ([{"epoch": 1, "loss": 1.2, "mean_f1": 0.4}, {"epoch": 2, "loss": 0.7, "mean_f1": 0.625}], "62.5 %"),
+        ([{"epoch": 1, "loss": 1.0}, {"epoch": 2, "loss": 0.0}], "Best: 0 in epoch 2"),
+        ([{"epoch": 1, "loss": 0.5}], None),
+        ([{"epoch": "<b>", "loss": float("nan")}, 7, None, {"epoch": 2, "loss": True}], None),
+        ("no list", None),
+    ],
+)
+def test_the_curve_of_a_network(searched, curve, shown):
+    words = read(model_page(_with(searched, curve), "x"))
+    assert ("Epoch" in words) == (shown is not None)
+    assert shown is None or shown in words
+
+
+def _with(model, curve):
+    import copy
+
+    other = copy.copy(model)
+    info = json.loads(json.dumps(model.info))
+    info["training"]["curve"] = curve
+    object.__setattr__(other, "info", info)
+    return other
