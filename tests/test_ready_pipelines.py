@@ -161,6 +161,10 @@ def test_copc_to_tiles(models, tmp_path):
     )
     assert not tiled.failures
     _same_points([whole], [laspy.read(p) for p in sorted(tmp_path.glob("t_*.laz"))])
+    tiled = run_tiled(_with("copc-to-tiles", *words, f"--stage.output.filename={tmp_path}/f_#.laz"), 15, workers=0)
+    (one,) = [laspy.read(p) for p in tmp_path.glob("f_*.laz")]
+    assert not tiled.failures and not any(v.user_id == "copc" for v in [*one.header.vlrs, *(one.evlrs or [])])
+    np.testing.assert_array_equal(one.points.array, whole.points.array)
 
 
 def test_tile_index_to_tiles(town, models, tmp_path):

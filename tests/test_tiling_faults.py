@@ -19,8 +19,8 @@ import tiling_clouds as clouds
 from pdal_stages.errors import OptionError, StageError
 from pdal_stages.parallel import available_threads
 from pdal_stages.tiling import run_tiled
-from pdal_stages.tiling.assemble import check_whole
 from pdal_stages.tiling.store import Store
+from pdal_stages.tiling.tail import check_whole
 
 pytestmark = pytest.mark.pdal
 WORKERS = min(2, available_threads())

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
+from ..classifier.clouds import TrainingCloud, class_positions
 from ..classifier.dimensions import gather
 from ..classifier.model import Model
 from ..classifier.options import TrainingOptions
-from ..classifier.training import TrainingCloud, class_positions
 from ..errors import OptionError
 from ..features.index import check_xyz
 from .training import LabelledCloud, train_network

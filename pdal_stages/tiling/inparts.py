@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import StageError
-from .assemble import check_whole, gather, run_tail, stamp
 from .cloudindex import BLOCK, open_las, read_block
 from .extract import finish, plain_header
-from .tilework import scratch
+from .scratch import scratch
+from .tail import check_whole, gather, run_tail, stamp
 
 
 def write_in_parts(task: dict[str, Any], most: int) -> dict[str, Any] | None:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
-import shutil
-import tempfile
 import uuid
 from pathlib import Path
 from typing import Any
@@ -20,9 +17,11 @@ from ..files import write_whole
 from ..pipeline import Pipeline
 from ..stages import registry
 from . import marks
+from .assemble import write_tile
 from .extract import Piece, cut
 from .grid import Grid, inside
 from .plan import MARGIN, ROW, SOURCE, later_reaches
+from .scratch import scratch
 
 #: How often a tile is read again with wider surroundings.
 _WIDENINGS = 3
@@ -51,8 +50,6 @@ def run_tile(task: dict[str, Any]) -> dict[str, Any]:
         if task.get("result"):
             _save(Path(task["result"]), head, keys, pieces)
         else:
-            from .assemble import write_tile
-
             report.update(write_tile(task, head, pieces, folder))
     if task.get("done"):
         write_whole(task["done"], json.dumps({**report, "fingerprint": task["fingerprint"]}).encode())
@@ -78,16 +75,6 @@ class Results:
         self, rows: list[NDArray], values: dict[str, list[NDArray]], cores: list[int], legacy: bool = False
     ) -> None:
         self.rows, self.values, self.cores, self.legacy = rows, values, cores, legacy
-
-
-@contextlib.contextmanager
-def scratch(folder: str):
-    """A temporary folder that is gone afterwards."""
-    made = tempfile.mkdtemp(prefix="tile-", dir=folder)
-    try:
-        yield made
-    finally:
-        shutil.rmtree(made, ignore_errors=True)
 
 
 def _settle(task: dict[str, Any], folder: str) -> tuple[Results, list[str], list[Piece], dict[str, Any]]:
