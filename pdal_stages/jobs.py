@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from .asprs import LEGACY_LIMIT
 from .errors import DimensionError, StageError
 from .overrides import Override
 
@@ -66,6 +67,7 @@ def attach_reference(
     StageError
         If they do not hold the same points.
     """
+    from . import pdal_env
     from .overrides import apply_overrides
     from .pipeline import Pipeline
     from .stages.accuracy import AccuracyStage
@@ -75,7 +77,11 @@ def attach_reference(
     for name in (source, reference):
         pipeline = Pipeline([_reader(name, "input")])
         pipeline.execute()
-        both.append(np.concatenate(pipeline.arrays) if pipeline.arrays else np.empty(0))
+        array = np.concatenate(pipeline.arrays) if pipeline.arrays else np.empty(0)
+        both.append(array)
+        names = array.dtype.names or ()
+        if "Classification" in names and pdal_env.flags_inside_classification(names, pipeline.metadata):
+            array["Classification"] &= LEGACY_LIMIT
     mine, true = both
     if len(mine) != len(true):
         raise StageError(

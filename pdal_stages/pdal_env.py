@@ -197,10 +197,12 @@ def flags_inside_classification(dimensions, metadata: Any) -> bool:
 
 
 def _values(node: Any, name: str) -> list[Any]:
-    """All values of metadata nodes with a name, in the form filters.python hands over."""
+    """All values of a name in metadata, as filters.python hands them over (nodes) or a pipeline gives them (a dict)."""
+    if isinstance(node, list):
+        return [value for child in node for value in _values(child, name)]
     if not isinstance(node, dict):
         return []
     own = [node.get("value")] if node.get("name") == name else []
-    for child in node.get("children") or []:
-        own += _values(child, name)
+    for key, child in node.items():
+        own += [child] if key == name and not isinstance(child, dict | list) else _values(child, name)
     return own

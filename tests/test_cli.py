@@ -178,6 +178,24 @@ def test_train_model_classify_accuracy(cloud, tmp_path, capsys):
     assert (tmp_path / "a.html").stat().st_size > 10_000
 
 
+def test_flags_of_old_files_are_no_classes(tmp_path, capsys, write_las, random_cloud):
+    """PDAL 2.2 reads the key-point flag of LAS 1.2 into the class: 5 becomes 69."""
+    xyz = random_cloud(60)
+    codes = np.tile([2, 5], 30).astype(np.uint8)
+    path = write_las(
+        tmp_path / "a.las", dict(zip("XYZ", xyz.T, strict=True), Classification=codes), point_format=1
+    )
+    flagged = laspy.read(path)
+    flagged.key_point = np.arange(60) % 3 == 0
+    flagged.write(tmp_path / "b.las")
+    for one, other in (("a", "b"), ("b", "a")):
+        words = [tmp_path / f"{one}.las", "--reference", tmp_path / f"{other}.las", "--json", tmp_path / "a.json"]
+        code, _, err = run(capsys, "accuracy", *words)
+        assert code == 0, err
+        figures = json.loads((tmp_path / "a.json").read_text())
+        assert figures["overall_accuracy"] == 1 and figures["predicted_outside_reference"]["points"] == 0
+
+
 def test_other_points_cannot_be_compared(cloud, tmp_path, capsys, write_las):
     other = write_las(tmp_path / "o.las", {"X": [1.0, 2.0], "Y": [1.0, 2.0], "Z": [0.0, 0.0]}, point_format=3)
     code, _, err = run(capsys, "accuracy", other, "--reference", cloud)
