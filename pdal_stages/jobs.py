@@ -77,7 +77,7 @@ def attach_reference(
     for name in (source, reference):
         pipeline = Pipeline([_reader(name, "input")])
         pipeline.execute()
-        array = np.concatenate(pipeline.arrays) if pipeline.arrays else np.empty(0)
+        array: Any = np.concatenate(pipeline.arrays) if pipeline.arrays else np.empty(0)
         both.append(array)
         names = array.dtype.names or ()
         if "Classification" in names and pdal_env.flags_inside_classification(names, pipeline.metadata):
