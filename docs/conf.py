@@ -25,6 +25,7 @@ html_theme_options = {
     "page_width": "1100px",
     "sidebar_width": "240px",
 }
-html_static_path: list[str] = []
+html_static_path = ["static"]
+html_css_files = ["custom.css"]
 autodoc_member_order = "bysource"
 suppress_warnings = ["myst.xref_missing"]

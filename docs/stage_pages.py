@@ -80,7 +80,8 @@ def _row(stage: type[Stage], option) -> str:
         bounds.append(f"at most {option.maximum:g}")
     if bounds:
         text += f" ({' and '.join(bounds)})"
-    return f"| `{option.name}` | {default} | {text.replace('|', '&#124;')} |"
+    text = text.replace("<", "&lt;").replace("|", "&#124;")
+    return f"| `{option.name}` | {default} | {text} |"
 
 
 def index() -> str:
