@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .engine import FeatureEngine
 
 #: Estimated nanoseconds a block may take on one core: Ctrl-C waits for the blocks in work.
-BLOCK_NS = 2.5e8
+BLOCK_NS = 1.5e8
 
 #: Rows of a block, whatever the memory allows; bytes of a row besides its features.
 MOST_ROWS = 65_536
