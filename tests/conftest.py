@@ -23,6 +23,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from functools import cache
@@ -30,6 +31,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+# nohup and background jobs of scripts ignore signals, and so would all that tests start and interrupt.
+for _ignored, _usual in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.SIG_DFL)):
+    _number = getattr(signal, _ignored, None)
+    if _number is not None and signal.getsignal(_number) is signal.SIG_IGN:
+        signal.signal(_number, _usual)
 
 ROOT = Path(__file__).resolve().parent.parent
 REQUIRED = {word.strip() for word in os.environ.get("PDAL_STAGES_REQUIRE", "").split(",") if word.strip()}
