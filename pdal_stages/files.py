@@ -82,8 +82,8 @@ def check_writable(path: str | os.PathLike, what: str = "output") -> None:
         raise StageError(f"the folder of the {what} file cannot be written to", found=str(folder))
 
 
-def write_whole(path: str | os.PathLike, content: bytes) -> None:
-    """Write a file so that it is either complete or absent.
+def write_whole(path: str | os.PathLike, content: bytes) -> Path:
+    """Write a file so that it is either complete or absent; its path.
 
     Raises
     ------
@@ -106,6 +106,7 @@ def write_whole(path: str | os.PathLike, content: bytes) -> None:
     except BaseException:
         Path(name).unlink(missing_ok=True)
         raise
+    return path
 
 
 def _umask() -> int:

@@ -11,6 +11,7 @@ import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -167,7 +168,7 @@ def supersede_copc(path: str | os.PathLike) -> bool:
     bool
         Whether there were any.
     """
-    header = read_header(path)
+    header = read_header(path) if Path(path).suffix.lower() in (".las", ".laz") else None
     if header is None:
         return False
     with open(path, "r+b") as file:
@@ -197,6 +198,7 @@ class _Record(NamedTuple):
     place: int
     user: bytes
     number: int
+    title: bytes
     data: int
     length: int
     after: bool
@@ -217,7 +219,8 @@ def _records(file: BinaryIO, header: LasHeader) -> Iterator[_Record]:
             return
         (number,) = struct.unpack_from("<H", head, 18)
         (length,) = struct.unpack_from("<Q" if after else "<H", head, 20)
-        yield _Record(place, head[2:18].split(b"\0")[0], number, place + size, length, after)
+        user, title = head[2:18].split(b"\0")[0], head[size - 32 :].split(b"\0")[0]
+        yield _Record(place, user, number, title, place + size, length, after)
         place += size + length
 
 
@@ -240,14 +243,8 @@ def odd_text(path: str | os.PathLike) -> tuple[str, bytes] | None:
             return None
         texts = list(header.texts.items())
         with open(path, "rb") as file:
-            file.seek(header.header_bytes)
-            for _ in range(min(header.records, 1000)):
-                head = file.read(54)
-                if len(head) < 54:
-                    break
-                texts.append(("description of a record", head[22:54].split(b"\0")[0]))
-                texts.append(("user of a record", head[2:18].split(b"\0")[0]))
-                file.seek(struct.unpack_from("<H", head, 20)[0], os.SEEK_CUR)
+            for record in islice(_records(file, header), min(header.records, 1000)):
+                texts += [("description of a record", record.title), ("user of a record", record.user)]
     except (OSError, ValueError):
         return None
     for what, text in texts:

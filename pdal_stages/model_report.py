@@ -37,8 +37,7 @@ def write_model_report(path: str | os.PathLike[str], model: Model, name: str = "
     StageError
         If it cannot be written.
     """
-    write_whole(path, model_page(model, name).encode())
-    return Path(path)
+    return write_whole(path, model_page(model, name).encode())
 
 
 def model_page(model: Model, name: str = "") -> str:

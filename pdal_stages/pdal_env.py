@@ -148,7 +148,8 @@ def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
     PipelineError
         If only a reader of COPC could do what its options ask for.
     """
-    if version() >= (2, 4, 0):
+    copc = any(isinstance(stage, dict) and stage.get("type") == "readers.copc" for stage in stages)
+    if not copc or version() >= (2, 4, 0):
         return stages
     out = []
     for stage in stages:

@@ -227,8 +227,7 @@ def _rename(renames: list[tuple[Path, Path]]) -> None:
                 number = path.name[len(before) : len(path.name) - len(after)]
                 target = final.with_name(final.name.replace("#", number, 1))
             check_complete(path, target)
-            if path.suffix.lower() in (".las", ".laz"):
-                supersede_copc(path)
+            supersede_copc(path)
             moves.append((path, target))
     for path, target in moves:
         try:

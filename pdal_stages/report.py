@@ -88,8 +88,7 @@ def write_accuracy_report(
         section=section,
         date=date,
     )
-    write_whole(path, text.encode())
-    return Path(path)
+    return write_whole(path, text.encode())
 
 
 def accuracy_page(

@@ -257,9 +257,6 @@ class Model:
         count = n if rows is None else len(rows)
         codes = self.codes
 
-        def weighed(values, _rows):
-            return self._weigh(self.algorithm.predict_proba(values))
-
         def decide(p):
             best = p.argmax(axis=1)
             win = np.take_along_axis(p, best[:, None], axis=1)[:, 0]
@@ -267,7 +264,7 @@ class Model:
             return codes[best], win, win - second, p if probabilities else None
 
         def classify(values, _rows):
-            p = weighed(values, _rows)
+            p = self._weigh(self.algorithm.predict_proba(values))
             return smoothing.count_shares(p) if radius else decide(p)
 
         rejected = 0

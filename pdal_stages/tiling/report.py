@@ -23,8 +23,7 @@ def write_report(path: str | os.PathLike[str], run: TiledRun, title: str = "Run 
     StageError
         Where it cannot be written.
     """
-    write_whole(path, page(run, title).encode())
-    return Path(path)
+    return write_whole(path, page(run, title).encode())
 
 
 def page(run: TiledRun, title: str = "Run in tiles") -> str:

@@ -235,14 +235,13 @@ class _Run:
 
     def _unit(self) -> float:
         """Metres per unit of the coordinates, as the first input says that PDAL can read."""
-        metadata = None
         for first in (s for s in self.sources if s.path not in self.unreadable):
             try:
                 metadata = self._metadata(first)
                 break
             except PipelineError as error:
                 self.unreadable[first.path] = str(error)
-        if metadata is None:
+        else:
             raise self._none_readable()
         node = metadata.get(first.reader["type"], {})
         srs = (node[0] if isinstance(node, list) else node).get("srs", {})

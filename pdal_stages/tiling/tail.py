@@ -110,8 +110,7 @@ def run_tail(readers, injected, tail, outputs: list[str]) -> dict[str, Any]:
         run = pdal_env.execute(stages, arrays=False)
         for partial, final in partials:
             check_whole(partial, final, run.count)
-            if final.suffix.lower() in (".las", ".laz"):
-                supersede_copc(partial)
+            supersede_copc(partial)
         for partial, final in partials:
             os.replace(partial, final)
     except OSError as error:
