@@ -27,7 +27,7 @@ import laspy
 import numpy as np
 from classification import MERGED, SCENES, figures, read, with_height
 
-from pdal_stages.accuracy import Accuracy
+from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.alsnet import CONFIGURATIONS
 from pdal_stages.classifier import Model, TrainingCloud, TrainingOptions, train
 
@@ -163,8 +163,8 @@ def kernels(configuration: str) -> dict:
     """CPU seconds of one batch, part by part, on one thread."""
     from threadpoolctl import threadpool_limits
 
+    from pdal_stages.alsnet.farthest import ball_query, farthest_points, three_nearest
     from pdal_stages.alsnet.pyramid import build, scramble
-    from pdal_stages.alsnet.sampling import ball_query, farthest_points, three_nearest
     from pdal_stages.alsnet.weights import Folded, fresh
 
     one = CONFIGURATIONS[configuration]

@@ -25,14 +25,14 @@ from pathlib import Path
 import laspy
 import numpy as np
 
-from pdal_stages.accuracy import Accuracy
+from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 from pdal_stages.classifier.crossval import block_folds, split
 from pdal_stages.classifier.forest import Forest
 from pdal_stages.classifier.growing import TreeOptions, grow
 from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.features import FeatureEngine, FeaturePlan
-from pdal_stages.terrain import hag_minima
+from pdal_stages.terrain.minima import hag_minima
 
 SCENES = {"montpellier": (2, 3, 4, 5, 6), "delft": (1, 2, 6)}
 MERGED = {"montpellier": {5: [3, 4]}, "delft": None}

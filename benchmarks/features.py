@@ -34,8 +34,8 @@ from pathlib import Path
 
 import numpy as np
 
+from pdal_stages.base.threads import resolve_threads
 from pdal_stages.features import FeatureEngine, FeaturePlan, compute_features, warmup
-from pdal_stages.parallel import resolve_threads
 
 RADII = (1.0, 2.0, 3.0, 5.0)
 TWELVE = "covariance,Density,Verticality,HeightRange,HeightStd"
@@ -381,7 +381,9 @@ def machine() -> str:
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     flags = next((line.split() for line in lines if line.startswith("flags")), [])
     vectors = next((name for name in ("avx512f", "avx2", "avx") if name in flags), "")
-    return ", ".join(filter(None, [names[0] if names else platform.machine(), f"{os.cpu_count()} cores", vectors]))
+    return ", ".join(
+        filter(None, [names[0] if names else platform.machine(), f"{os.cpu_count()} cores", vectors])
+    )
 
 
 def plot(clouds: dict[str, tuple[int, list[dict]]], path: Path) -> None:

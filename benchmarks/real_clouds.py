@@ -19,10 +19,11 @@ from pathlib import Path
 import laspy
 import numpy as np
 
-from pdal_stages import __version__, pdal_env
-from pdal_stages.accuracy import Accuracy
-from pdal_stages.overrides import parse_overrides
-from pdal_stages.pipeline import Pipeline
+from pdal_stages import __version__
+from pdal_stages.accuracy.measures import Accuracy
+from pdal_stages.pipeline import pdal as pdal_env
+from pdal_stages.pipeline.overrides import parse_overrides
+from pdal_stages.pipeline.run import Pipeline
 
 PIPELINES = Path(__file__).resolve().parent.parent / "pipelines"
 CLOUDS = {

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 import pdal_stages as ps
-from pdal_stages import pdal_env
+from pdal_stages.pipeline import pdal as pdal_env
 
 SMRF = [{"type": "filters.assign", "assignment": "Classification[:]=0"}, {"type": "filters.smrf"}]
 METHODS: dict[str, list[dict]] = {

@@ -22,9 +22,9 @@ import laspy
 import numpy as np
 
 import pdal_stages as ps
-from pdal_stages.parallel import available_threads
+from pdal_stages.base.threads import available_threads
 from pdal_stages.synthetic import TownOptions, write_town
-from pdal_stages.terrain import hag_minima
+from pdal_stages.terrain.minima import hag_minima
 from pdal_stages.tiling import run_tiled
 
 #: Points the survey of Vorarlberg holds [WM19], and the workers of an imagined cluster.
@@ -69,7 +69,9 @@ def model(folder: Path, neighborhoods: str, features: str, trees: int) -> Path:
             count=1000,
             trees=trees,
         )
-        cloud = ps.TrainingCloud(made.xyz, made.classification, {"HeightAboveGround": hag_minima(*made.xyz.T)})
+        cloud = ps.TrainingCloud(
+            made.xyz, made.classification, {"HeightAboveGround": hag_minima(*made.xyz.T)}
+        )
         ps.train([cloud], options, progress=False).save(path)
     return path
 
@@ -89,9 +91,13 @@ def main() -> None:
     o = p.parse_args()
     o.folder.mkdir(exist_ok=True)
     trained = model(o.folder, o.neighborhoods, o.features, o.trees)
-    print(f"{platform.platform()}, {available_threads()} cores, Python {platform.python_version()}, tiles of {o.tile:g} m")
+    print(
+        f"{platform.platform()}, {available_threads()} cores, Python {platform.python_version()}, tiles of {o.tile:g} m"
+    )
     print(f"{o.neighborhoods}, {o.features}, {o.trees} trees; output per {o.per}, {o.workers} workers")
-    print(f"{'points':>12} {'tiles':>6} {'wall s':>8} {'cpu s':>8} {'points/cpu s':>13} {'worker MB':>10} {'parent MB':>10}")
+    print(
+        f"{'points':>12} {'tiles':>6} {'wall s':>8} {'cpu s':>8} {'points/cpu s':>13} {'worker MB':>10} {'parent MB':>10}"
+    )
     found = []
     for words in o.points:
         source = town(o.folder, words, o.density)

@@ -9,41 +9,42 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-__version__ = "0.1.0"
+from .base.version import __version__
 
 _WHERE = {
     "Accuracy": "accuracy",
-    "Filter": "native",
+    "Filter": "pipeline.native",
     "Model": "classifier",
     "Pipeline": "pipeline",
-    "StageError": "errors",
+    "StageError": "base.errors",
     "TrainingCloud": "classifier",
     "TrainingOptions": "classifier",
-    "Writer": "native",
+    "Writer": "pipeline.native",
     "compute_features": "features",
     "hag_minima": "terrain",
     "load_model": "classifier",
     "make_town": "synthetic",
-    "parse_neighborhoods": "neighborhoods",
+    "parse_neighborhoods": "features.neighborhoods",
     "run_pipeline": "pipeline",
+    "run_stage": "pipeline.runtime",
     "run_tiled": "tiling",
     "train": "classifier",
-    "write_accuracy_report": "report",
+    "write_accuracy_report": "reports",
 }
 
 __all__ = [*_WHERE, "__version__"]
 
 if TYPE_CHECKING:
-    from .accuracy import Accuracy
+    from .accuracy.measures import Accuracy
+    from .base.errors import StageError
     from .classifier import Model, TrainingCloud, TrainingOptions, load_model, train
-    from .errors import StageError
     from .features import compute_features
-    from .native import Filter, Writer
-    from .neighborhoods import parse_neighborhoods
+    from .features.neighborhoods import parse_neighborhoods
     from .pipeline import Pipeline, run_pipeline
-    from .report import write_accuracy_report
+    from .pipeline.native import Filter, Writer
+    from .reports.accuracypage import write_accuracy_report
     from .synthetic import make_town
-    from .terrain import hag_minima
+    from .terrain.minima import hag_minima
     from .tiling import run_tiled
 
 

@@ -13,9 +13,9 @@ import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from . import __version__
-from .errors import StageError
-from .overrides import parse_overrides
+from .base.errors import StageError
+from .base.version import __version__
+from .pipeline.overrides import parse_overrides
 
 _OVERRIDES = (
     "Options of stages are set as in PDAL: --stage.TAG.option=VALUE for stages with a tag, "
@@ -100,22 +100,32 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def add(name: str, run: Callable, help: str, overrides: bool = False) -> argparse.ArgumentParser:
-        command = commands.add_parser(name, help=help, description=help + ".", epilog=_OVERRIDES if overrides else None)
+        command = commands.add_parser(
+            name, help=help, description=help + ".", epilog=_OVERRIDES if overrides else None
+        )
         command.set_defaults(run=run, takes_overrides=overrides)
         return command
 
     command = add("pipeline", _pipeline, "Run a pipeline that may hold stages of ours", overrides=True)
     _pipeline_input(command)
     command.add_argument("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
-    command.add_argument("--validate", action="store_true", help="Check the pipeline without reading points, then stop")
-    command.add_argument("--progress", action=argparse.BooleanOptionalAction, default=None, help="Show progress")
-    command.add_argument("--nostream", action="store_true", help="Accepted for PDAL's sake: our stages never stream")
+    command.add_argument(
+        "--validate", action="store_true", help="Check the pipeline without reading points, then stop"
+    )
+    command.add_argument(
+        "--progress", action=argparse.BooleanOptionalAction, default=None, help="Show progress"
+    )
+    command.add_argument(
+        "--nostream", action="store_true", help="Accepted for PDAL's sake: our stages never stream"
+    )
     command.add_argument("-v", "--verbose", action="count", default=0, help="Print PDAL's log")
     from .tiling.command import add_arguments
 
     add_arguments(command)
 
-    command = add("expand", _expand, "Print the plain PDAL JSON, which stock 'pdal pipeline' runs", overrides=True)
+    command = add(
+        "expand", _expand, "Print the plain PDAL JSON, which stock 'pdal pipeline' runs", overrides=True
+    )
     _pipeline_input(command)
     command.add_argument("-o", "--output", metavar="FILE", help="Write it to a file instead")
 
@@ -134,7 +144,9 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("input", help="A file PDAL can read")
     command.add_argument("output", help="A file PDAL can write; other dimensions and the header are kept")
     command.add_argument("--model", required=True, help="The model file")
-    command.add_argument("--where", help="Only classify points for which this holds; the others serve as neighbors")
+    command.add_argument(
+        "--where", help="Only classify points for which this holds; the others serve as neighbors"
+    )
     command.add_argument("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
 
     command = add("train", _train, "Train a model on labelled clouds", overrides=True)
@@ -155,7 +167,9 @@ def _parser() -> argparse.ArgumentParser:
     command = add("model", _model, "Print what a model file is")
     command.add_argument("file")
     command.add_argument("--showjson", action="store_true", help="Everything, as JSON")
-    command.add_argument("--html", help="Write a page with its scores, training curve and importances to this file")
+    command.add_argument(
+        "--html", help="Write a page with its scores, training curve and importances to this file"
+    )
 
     command = add("demo", _demo, "Generate a town, train on one half, classify the other")
     command.add_argument("folder", nargs="?", default="pdal-stages-demo", help="Where results go")
@@ -169,13 +183,15 @@ def _parser() -> argparse.ArgumentParser:
 
 def _pipeline_input(command: argparse.ArgumentParser) -> None:
     command.add_argument("file", nargs="?", help="Pipeline JSON file")
-    command.add_argument("-i", "--input", dest="file_option", metavar="FILE", help="The same, as PDAL's --input")
+    command.add_argument(
+        "-i", "--input", dest="file_option", metavar="FILE", help="The same, as PDAL's --input"
+    )
     command.add_argument("-s", "--stdin", action="store_true", help="Read the pipeline from standard input")
 
 
 def _source(options: argparse.Namespace) -> str | Path:
     if options.stdin:
-        from .pipelinefile import decode
+        from .pipeline.read import decode
 
         raw = getattr(sys.stdin, "buffer", None)
         return (decode(raw.read(), "standard input") if raw is not None else sys.stdin.read()) or " "
@@ -186,8 +202,8 @@ def _source(options: argparse.Namespace) -> str | Path:
 
 
 def _build(options: argparse.Namespace):
-    from .pipeline import Pipeline
-    from .pipelinefile import parse_pipeline
+    from .pipeline.read import parse_pipeline
+    from .pipeline.run import Pipeline
 
     source = _source(options)
     read = parse_pipeline(source, "standard input") if isinstance(source, str) else source
@@ -215,14 +231,14 @@ def _pipeline(options: argparse.Namespace) -> int | None:
 
 def _check_metadata(options: argparse.Namespace) -> None:
     """Before the work, not after it."""
-    from .files import check_writable
+    from .base.files import check_writable
 
     if options.metadata:
         check_writable(options.metadata, "metadata")
 
 
 def _after(pipeline, metadata: str | None, verbose: bool = False) -> None:
-    from .files import write_whole
+    from .base.files import write_whole
 
     # What PDAL calls an error although it goes on: a reader that sets what it cannot read to 0, say.
     said = pipeline.log.strip().splitlines()
@@ -242,7 +258,7 @@ def _after(pipeline, metadata: str | None, verbose: bool = False) -> None:
 
 
 def _expand(options: argparse.Namespace) -> None:
-    from .files import write_whole
+    from .base.files import write_whole
 
     text = _build(options).json + "\n"
     if options.output:
@@ -257,20 +273,20 @@ def _validate(options: argparse.Namespace) -> None:
 
 
 def _drivers(options: argparse.Namespace) -> None:
-    from . import describe
+    from .pipeline import describe
 
     print(describe.drivers(ours_only=options.ours, as_json=options.showjson), end="")
 
 
 def _options(options: argparse.Namespace) -> None:
-    from . import describe
+    from .pipeline import describe
 
     print(describe.stage_options(options.stage, as_json=options.showjson), end="")
 
 
 def _classify(options: argparse.Namespace) -> None:
-    from .jobs import classify_pipeline
-    from .pipeline import Pipeline
+    from .pipeline.jobs import classify_pipeline
+    from .pipeline.run import Pipeline
 
     _check_metadata(options)
     stages = classify_pipeline(options.input, options.output, options.model, where=options.where)
@@ -284,9 +300,12 @@ def _classify(options: argparse.Namespace) -> None:
 
 
 def _class_counts(report: dict) -> str:
-    from .asprs import class_name
+    from .base.asprs import class_name
 
-    lines = [f"  {int(code):3d} {class_name(int(code)):28s} {n:>12,}" for code, n in report.get("classes", {}).items()]
+    lines = [
+        f"  {int(code):3d} {class_name(int(code)):28s} {n:>12,}"
+        for code, n in report.get("classes", {}).items()
+    ]
     if report.get("rejected"):
         lines.append(f"  rejected: {report['rejected']:,}")
     return "\n".join(lines)
@@ -294,8 +313,8 @@ def _class_counts(report: dict) -> str:
 
 def _train(options: argparse.Namespace) -> None:
     from .classifier import load_model
-    from .jobs import train_pipeline
-    from .pipeline import Pipeline
+    from .pipeline.jobs import train_pipeline
+    from .pipeline.run import Pipeline
 
     extra = {k: v for k in ("classes", "neighborhoods", "count") if (v := getattr(options, k)) is not None}
     # Overrides for the model writer reach the job before it decides whether heights are needed.
@@ -310,14 +329,21 @@ def _train(options: argparse.Namespace) -> None:
 
 
 def _accuracy(options: argparse.Namespace) -> None:
-    from .jobs import accuracy_pipeline, attach_reference
-    from .pipeline import Pipeline
+    from .pipeline.jobs import accuracy_pipeline, attach_reference
+    from .pipeline.run import Pipeline
 
-    reference_dimension = options.reference_dimension or ("Classification" if options.reference else "Reference")
+    reference_dimension = options.reference_dimension or (
+        "Classification" if options.reference else "Reference"
+    )
     outputs = {k: v for k in ("json", "html") if (v := getattr(options, k))}
     if options.reference:
         attach_reference(
-            options.input, options.reference, options.dimension, reference_dimension, options.overrides, **outputs
+            options.input,
+            options.reference,
+            options.dimension,
+            reference_dimension,
+            options.overrides,
+            **outputs,
         )
         return
     stages = accuracy_pipeline(options.input, options.dimension, reference_dimension, **outputs)
@@ -331,7 +357,7 @@ def _model(options: argparse.Namespace) -> None:
 
     model = load_model(options.file)
     if options.html:
-        from .model_report import write_model_report
+        from .reports.modelpage import write_model_report
 
         write_model_report(options.html, model, Path(options.file).name)
     if options.showjson:
@@ -341,7 +367,7 @@ def _model(options: argparse.Namespace) -> None:
 
 
 def _demo(options: argparse.Namespace) -> None:
-    from .demo import run_demo
+    from .synthetic.demo import run_demo
 
     run_demo(options.folder, size=options.size, density=options.density, seed=options.seed)
 

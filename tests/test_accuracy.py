@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from sklearn import metrics
 
-from pdal_stages.accuracy import Accuracy, wilson
-from pdal_stages.errors import OptionError, StageError
-from pdal_stages.grading import BINS, Grading
+from pdal_stages.accuracy.confidence import BINS, Grading
+from pdal_stages.accuracy.measures import Accuracy, wilson
+from pdal_stages.base.errors import OptionError, StageError
 
-SCHEMA = json.loads(files("pdal_stages").joinpath("schemas/accuracy-1.json").read_text())
+SCHEMA = json.loads(files("pdal_stages").joinpath("accuracy/accuracy-1.json").read_text())
 CODES = (0, 1, 2, 5, 6, 64, 255)
 
 
@@ -323,8 +323,8 @@ def test_strided_and_list_inputs():
 def test_more_points_than_one_chunk(monkeypatch):
     reference, predicted, reliability = town(2000)
     whole = Accuracy.from_labels(reference, predicted, reliability=reliability)
-    monkeypatch.setattr("pdal_stages.accuracy.CHUNK", 7)
-    monkeypatch.setattr("pdal_stages.labels.CHUNK", 7)
+    monkeypatch.setattr("pdal_stages.accuracy.measures.CHUNK", 7)
+    monkeypatch.setattr("pdal_stages.accuracy.labels.CHUNK", 7)
     parts = Accuracy.from_labels(reference, predicted, reliability=reliability)
     np.testing.assert_array_equal(whole.matrix, parts.matrix)
     assert whole.table() == parts.table()

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from pdal_stages.alsnet import CONFIGURATIONS, Circles, parse_configuration
 from pdal_stages.alsnet.circles import REACH, density, halo, spacing_for
+from pdal_stages.alsnet.farthest import ball_query, farthest_points, three_nearest
 from pdal_stages.alsnet.pyramid import build, scramble, stack
-from pdal_stages.alsnet.sampling import ball_query, farthest_points, three_nearest
-from pdal_stages.errors import OptionError
+from pdal_stages.base.errors import OptionError
 
 # ---- references ------------------------------------------------------------------------------------------
 

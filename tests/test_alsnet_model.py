@@ -14,8 +14,8 @@ from pdal_stages.alsnet import AlsNet, Circles
 from pdal_stages.alsnet.algorithm import make_pyramid
 from pdal_stages.alsnet.pyramid import build, scramble
 from pdal_stages.alsnet.weights import Folded, check
+from pdal_stages.base.errors import DimensionError, ModelError, OptionError
 from pdal_stages.classifier import load_model, modelfile
-from pdal_stages.errors import DimensionError, ModelError, OptionError
 
 INPUTS = ("Z", "HeightAboveGround", "Intensity")
 
@@ -282,8 +282,8 @@ def test_check_accepts_what_fresh_makes():
 def test_where_no_torch_is_training_says_what_to_install(monkeypatch):
     import sys
 
+    from pdal_stages.base.errors import DependencyError
     from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
-    from pdal_stages.errors import DependencyError
 
     monkeypatch.setitem(sys.modules, "torch", None)
     monkeypatch.delitem(sys.modules, "pdal_stages.alsnet.network", raising=False)

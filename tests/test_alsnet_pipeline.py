@@ -9,8 +9,8 @@ import pytest
 from alsnet_scenes import TINY, model_of, random_net, scene
 
 import pdal_stages as ps
+from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier import load_model
-from pdal_stages.errors import OptionError
 from pdal_stages.stages import registry
 
 WRITER = "writers.classifiermodel"

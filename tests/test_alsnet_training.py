@@ -14,8 +14,8 @@ from pdal_stages.alsnet import checkpoint as checkpoints
 from pdal_stages.alsnet.augment import Augmentation
 from pdal_stages.alsnet.pyramid import build
 from pdal_stages.alsnet.schedule import choose, class_weights, covering, hold_out, spread
+from pdal_stages.base.errors import DependencyError, ModelError, OptionError
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, train
-from pdal_stages.errors import DependencyError, ModelError, OptionError
 
 needs_torch = pytest.mark.skipif(
     importlib.util.find_spec("torch") is None,
@@ -162,7 +162,7 @@ def test_resumed_training_equals_one_without_a_break(tmp_path):
     whole = fit(clouds, **setting)
     path = str(tmp_path / "run.checkpoint")
 
-    from pdal_stages.alsnet import training
+    from pdal_stages.alsnet import epochs as training
 
     class Stop(Exception):
         pass
@@ -279,7 +279,7 @@ def test_masked_points_are_seen_but_not_trained_on():
 def test_variance_and_margin_mark_errors_on_real_data(data_dir):
     """[WM19] find that errors have a large variance over the batches and a small margin."""
     laspy = pytest.importorskip("laspy")
-    from pdal_stages.terrain import hag_minima
+    from pdal_stages.terrain.minima import hag_minima
 
     def read(part):
         tiles = [laspy.read(path) for path in sorted((data_dir / "montpellier").glob(f"{part}_*.laz"))]

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier.classes import ClassMap, as_labels
-from pdal_stages.classifier.options import TrainingOptions
-from pdal_stages.errors import OptionError
+from pdal_stages.classifier.trainoptions import TrainingOptions
 
 
 def test_default_takes_every_label_that_names_a_kind_of_object():

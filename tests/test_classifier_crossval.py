@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 
+from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier.crossval import block_folds, choose, search, split
 from pdal_stages.classifier.growing import TreeOptions
-from pdal_stages.errors import OptionError
 
 
 @settings(max_examples=30, deadline=None)

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from sklearn.ensemble import ExtraTreesClassifier, RandomForestClassifier
 from sklearn.tree import DecisionTreeClassifier
 
+from pdal_stages.base.errors import ModelError
 from pdal_stages.classifier.forest import MAX_DEPTH, Forest, float32_at_most
 from pdal_stages.classifier.growing import TreeOptions, grow
-from pdal_stages.errors import ModelError
 
 
 def data(n=600, features=17, classes=4, seed=0):

@@ -16,11 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.ensemble import RandomForestClassifier
 
+from pdal_stages.base.errors import ModelError
 from pdal_stages.classifier import modelfile
 from pdal_stages.classifier.algorithms import algorithm
 from pdal_stages.classifier.arrays import ArrayRule, from_bytes, to_bytes
 from pdal_stages.classifier.forest import Forest
-from pdal_stages.errors import ModelError
 
 FEATURES = 6
 

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier.sampling import coordinate_hash, draw_samples, spread
-from pdal_stages.errors import OptionError
 
 
 def chosen(clouds, samples):

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_classifier_training import SMALL, scene
 
+from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 from pdal_stages.classifier.smoothing import WHOLE, count_shares, smooth
-from pdal_stages.errors import OptionError
 
 
 def plain(xyz, shares, radius):
@@ -63,7 +63,9 @@ def test_a_heap_of_copies_takes_no_time():
     shares = random_shares(np.random.default_rng(1), len(xyz))
     got = smooth(xyz, shares, 2.0)
     mean = shares.sum(axis=0, dtype=float) / shares.sum(dtype=float)
-    np.testing.assert_allclose(got, 0.5 * shares / shares.sum(axis=1, keepdims=True) + 0.5 * mean, atol=3 / WHOLE)
+    np.testing.assert_allclose(
+        got, 0.5 * shares / shares.sum(axis=1, keepdims=True) + 0.5 * mean, atol=3 / WHOLE
+    )
 
 
 def test_no_points_and_wrong_radii():

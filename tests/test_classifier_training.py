@@ -5,16 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from pdal_stages.classifier import (
-    Model,
-    Prediction,
-    TrainingCloud,
-    TrainingOptions,
-    load_model,
-    train,
-)
+from pdal_stages.base.errors import DimensionError, ModelError, OptionError, StageError
+from pdal_stages.classifier import Model, Prediction, TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.classifier.sampling import draw_samples
-from pdal_stages.errors import DimensionError, ModelError, OptionError, StageError
 from pdal_stages.features import FeatureEngine
 
 SMALL = {

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 import pdal_stages as ps
-from pdal_stages.errors import ModelError
-from pdal_stages.lowering import lower
-from pdal_stages.pipelinefile import parse_pipeline
+from pdal_stages.base.errors import ModelError
+from pdal_stages.pipeline.lowering import lower
+from pdal_stages.pipeline.read import parse_pipeline
 from pdal_stages.stages import registry
 from pdal_stages.stages.base import Stage
 from pdal_stages.stages.points import Points

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdal_stages.errors import DimensionError, OptionError
-from pdal_stages.expression import Expression
+from pdal_stages.base.errors import DimensionError, OptionError
+from pdal_stages.stages.where import Expression
 
 ARRAYS = {
     "X": np.array([0.0, 1.0, 2.0, 3.0]),

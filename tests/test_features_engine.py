@@ -12,10 +12,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pdal_stages.errors import DimensionError, OptionError, StageError
+from pdal_stages.base.errors import DimensionError, OptionError, StageError
+from pdal_stages.base.progress import Progress
 from pdal_stages.features import FeatureEngine, FeaturePlan, ShapeBins, compute_features
 from pdal_stages.features.names import ALL_FEATURES, GROUPS, describe
-from pdal_stages.progress import Progress
 
 #: Every kind of neighborhood, small enough for small clouds.
 KINDS = "c1,c2.5,s1.5,s4,k8,kopt(5,30),ropt(0.5,1.5,0.25),copt"
@@ -468,12 +468,12 @@ def test_without_a_writable_folder(tmp_path):
 def test_cached_code_follows_the_kernels_it_calls(tmp_path):
     """numba alone keeps code compiled with an old version of a function of another module."""
     (tmp_path / "outer.py").write_text(
-        "from inner import value\nfrom pdal_stages.features.jit import njit\n@njit\ndef f():\n    return value()\n"
+        "from inner import value\nfrom pdal_stages.base.jit import njit\n@njit\ndef f():\n    return value()\n"
     )
     found = []
     for number in (1, 1, 2):
         (tmp_path / "inner.py").write_text(
-            f"from pdal_stages.features.jit import njit\n@njit\ndef value():\n    return {number}\n"
+            f"from pdal_stages.base.jit import njit\n@njit\ndef value():\n    return {number}\n"
         )
         code = "from outer import f; print(f(), sum(f.stats.cache_hits.values()))"
         found.append(run_python(code, PYTHONPATH=str(tmp_path), PYTHONDONTWRITEBYTECODE="1").split())

@@ -7,7 +7,7 @@ import oracle
 import pytest
 
 from pdal_stages.features import compute_features
-from pdal_stages.neighborhoods import parse_neighborhoods
+from pdal_stages.features.neighborhoods import parse_neighborhoods
 
 CHECKED = [*oracle.COVARIANCE, *oracle.GEOMETRIC]
 RTOL = 1e-5

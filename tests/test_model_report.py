@@ -8,7 +8,7 @@ from test_classifier_training import SMALL, scene
 
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 from pdal_stages.cli import main
-from pdal_stages.model_report import model_page
+from pdal_stages.reports.modelpage import model_page
 
 
 class _Balance(HTMLParser):

@@ -21,7 +21,7 @@ import scenes  # noqa: E402
 import tables  # noqa: E402
 import w18  # noqa: E402
 
-from pdal_stages.errors import StageError  # noqa: E402
+from pdal_stages.base.errors import StageError  # noqa: E402
 from pdal_stages.features import FeaturePlan, compute_features  # noqa: E402
 
 #: The town's ASPRS codes -> labels of the Vaihingen files that they stand in for.
@@ -156,8 +156,8 @@ def test_pts_that_is_none(tmp_path, text, message):
 @pytest.mark.pdal
 def test_pts_through_pdal(folder, tmp_path, monkeypatch):
     """The commands of docs/papers.md for clouds that cannot be had, on a stand-in with the same format."""
-    from pdal_stages.overrides import parse_overrides
-    from pdal_stages.pipeline import Pipeline
+    from pdal_stages.pipeline.overrides import parse_overrides
+    from pdal_stages.pipeline.run import Pipeline
 
     monkeypatch.chdir(tmp_path)
 

@@ -11,11 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from pdal_stages import picture
-from pdal_stages.asprs import class_color, class_name
-from pdal_stages.errors import StageError
-from pdal_stages.picture import raster, text
-from pdal_stages.picture.views import RIGHT, WRONG, nice_step
+from pdal_stages.base.asprs import class_color, class_name
+from pdal_stages.base.errors import StageError
+from pdal_stages.reports import lettering as text
+from pdal_stages.reports import png, raster
+from pdal_stages.reports import views as picture
+from pdal_stages.reports.views import RIGHT, WRONG, nice_step
 
 
 def read_png(data: bytes) -> np.ndarray:
@@ -63,22 +64,22 @@ def block(n=40, step=0.5, origin=(0.0, 0.0)):
 @settings(max_examples=40, deadline=None)
 @given(st.tuples(st.integers(1, 12), st.integers(1, 12)).flatmap(lambda s: arrays(np.uint8, (*s, 3))))
 def test_png_holds_the_pixels(rgb):
-    assert np.array_equal(read_png(picture.write_png(None, rgb)), rgb)
+    assert np.array_equal(read_png(png.write_png(None, rgb)), rgb)
 
 
 def test_png_file_is_the_bytes_and_appears_whole(tmp_path):
     rgb = np.random.default_rng(0).integers(0, 256, (20, 30, 3), dtype=np.uint8)
-    data = picture.write_png(tmp_path / "a.png", rgb)
-    assert (tmp_path / "a.png").read_bytes() == data == picture.write_png(None, rgb[:, ::-1][:, ::-1])
+    data = png.write_png(tmp_path / "a.png", rgb)
+    assert (tmp_path / "a.png").read_bytes() == data == png.write_png(None, rgb[:, ::-1][:, ::-1])
     with pytest.raises(StageError, match="cannot be written"):
-        picture.write_png(tmp_path / "no" / "a.png", rgb)
+        png.write_png(tmp_path / "no" / "a.png", rgb)
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
 
 
 @pytest.mark.parametrize("bad", [np.zeros((4, 4)), np.zeros((4, 4, 3)), np.zeros((0, 4, 3), np.uint8)])
 def test_png_refuses_what_is_no_picture(bad):
     with pytest.raises(StageError, match="uint8"):
-        picture.write_png(None, bad)
+        png.write_png(None, bad)
 
 
 # ---- from above --------------------------------------------------------------------------------------------
@@ -235,9 +236,9 @@ def test_every_letter_has_ink_and_widths_add_up():
 
 def test_text_is_cut_at_the_edges_and_shortened():
     canvas = np.full((20, 30, 3), 255, dtype=np.uint8)
-    picture.draw_text(canvas, -5, -5, "Ground")
-    picture.draw_text(canvas, 25, 15, "Ground")
-    picture.draw_text(canvas, 500, 500, "Ground")
+    text.draw_text(canvas, -5, -5, "Ground")
+    text.draw_text(canvas, 25, 15, "Ground")
+    text.draw_text(canvas, 500, 500, "Ground")
     assert (canvas < 255).any() and canvas.shape == (20, 30, 3)
     short = text.fit_text("a rather long caption", 60)
     assert short.endswith("..") and text.text_size(short)[0] <= 60

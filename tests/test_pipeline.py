@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import pdal_stages as ps
-from pdal_stages.errors import DimensionError, OptionError, PipelineError
-from pdal_stages.terrain import hag_minima
+from pdal_stages.base.errors import DimensionError, OptionError, PipelineError
+from pdal_stages.terrain.minima import hag_minima
 
 pytestmark = pytest.mark.pdal
 
@@ -126,7 +126,7 @@ def test_door_1_expanded_runs_in_stock_pdal(cloud, tmp_path, pdal_program):
         ]
     )
     (tmp_path / "plain.json").write_text(pipeline.json)
-    assert "pdal_stages.runtime" in pipeline.json
+    assert "from pdal_stages import run_stage" in pipeline.json
     done = subprocess.run(
         [pdal_program, "pipeline", str(tmp_path / "plain.json")], capture_output=True, text=True
     )
@@ -151,7 +151,7 @@ def test_door_2_python_objects(cloud, pdal_module, model):
 
 
 def test_door_3_filters_python_by_hand(cloud, pdal_module):
-    source = "from pdal_stages.runtime import run_stage\ndef f(ins, outs):\n    return run_stage(globals(), ins, outs)\n"
+    source = "from pdal_stages import run_stage\ndef f(ins, outs):\n    return run_stage(globals(), ins, outs)\n"
     stages = [
         str(cloud),
         {
@@ -270,7 +270,7 @@ def test_codes_above_31_need_las_14(cloud, tmp_path, wide_model):
 
 
 def test_codes_above_31_in_laz_14(cloud, tmp_path, wide_model):
-    from pdal_stages import pdal_env
+    from pdal_stages.pipeline import pdal as pdal_env
 
     out = tmp_path / "out.laz"
     stages = [

@@ -10,9 +10,9 @@ import laspy
 import numpy as np
 import pytest
 
-from pdal_stages import pdal_env
-from pdal_stages.overrides import apply_overrides, parse_overrides
-from pdal_stages.pipeline import Pipeline
+from pdal_stages.pipeline import pdal as pdal_env
+from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
+from pdal_stages.pipeline.run import Pipeline
 from pdal_stages.synthetic import TownOptions, write_town
 from pdal_stages.tiling import run_tiled
 
@@ -157,11 +157,16 @@ def test_copc_to_tiles(models, tmp_path):
     assert next(v.user_id for v in before.header.vlrs) == "copc"
     assert not any(v.user_id == "copc" for v in [*whole.header.vlrs, *(whole.evlrs or [])])
     tiled = run_tiled(
-        _with("copc-to-tiles", *words, f"--stage.output.filename={tmp_path}/t_#.laz"), 15, per="tile", workers=0
+        _with("copc-to-tiles", *words, f"--stage.output.filename={tmp_path}/t_#.laz"),
+        15,
+        per="tile",
+        workers=0,
     )
     assert not tiled.failures
     _same_points([whole], [laspy.read(p) for p in sorted(tmp_path.glob("t_*.laz"))])
-    tiled = run_tiled(_with("copc-to-tiles", *words, f"--stage.output.filename={tmp_path}/f_#.laz"), 15, workers=0)
+    tiled = run_tiled(
+        _with("copc-to-tiles", *words, f"--stage.output.filename={tmp_path}/f_#.laz"), 15, workers=0
+    )
     (one,) = [laspy.read(p) for p in tmp_path.glob("f_*.laz")]
     assert not tiled.failures and not any(v.user_id == "copc" for v in [*one.header.vlrs, *(one.evlrs or [])])
     np.testing.assert_array_equal(one.points.array, whole.points.array)
@@ -184,7 +189,10 @@ def test_tile_index_to_tiles(town, models, tmp_path):
     words = [f"--stage.input.filename={index}", f"--stage.classifier.model={models / 'classes.model'}"]
     run("tile-index-to-tiles", *words, f"--stage.output.filename={tmp_path}/whole.laz")
     tiled = run_tiled(
-        _with("tile-index-to-tiles", *words, f"--stage.output.filename={tmp_path}/t_#.laz"), 25, per="tile", workers=0
+        _with("tile-index-to-tiles", *words, f"--stage.output.filename={tmp_path}/t_#.laz"),
+        25,
+        per="tile",
+        workers=0,
     )
     assert not tiled.failures and tiled.summary["inputs"] == len(files) > 2
     _same_points(

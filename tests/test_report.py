@@ -11,14 +11,14 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from pdal_stages import html
-from pdal_stages.accuracy import Accuracy
-from pdal_stages.accuracy_text import percent
-from pdal_stages.errors import StageError
-from pdal_stages.html_style import HEAT, PALETTE
-from pdal_stages.indexed_png import indexed_png
-from pdal_stages.report import _nice, accuracy_page, write_accuracy_report
-from pdal_stages.report_maps import _scene, _section_line
+from pdal_stages.accuracy.measures import Accuracy
+from pdal_stages.accuracy.text import percent
+from pdal_stages.base.errors import StageError
+from pdal_stages.reports import html
+from pdal_stages.reports.accuracypage import _nice, accuracy_page, write_accuracy_report
+from pdal_stages.reports.indexed import indexed_png
+from pdal_stages.reports.maps import _scene, _section_line
+from pdal_stages.reports.style import HEAT, PALETTE
 
 VOID = {"meta", "img", "br"}
 

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pdal_stages import synthetic
-from pdal_stages.errors import OptionError, StageError
+from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.synthetic import Town, TownOptions, make_town, town_chunks, write_town
 from pdal_stages.synthetic import raycast as rays
 from pdal_stages.synthetic.flight import Chunk, Flight

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdal_stages.errors import OptionError, StageError
-from pdal_stages.terrain import MinimaTerrain, hag_minima
+from pdal_stages.base.errors import OptionError, StageError
+from pdal_stages.terrain.minima import MinimaTerrain, hag_minima
 
 
 def slow_hag(x, y, z, cell, resolution):

@@ -13,15 +13,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pdal_stages as ps
-from pdal_stages.errors import OptionError, PipelineError, StageError
+from pdal_stages.base.errors import OptionError, PipelineError, StageError
 from pdal_stages.synthetic.srs import wkt
 from pdal_stages.tiling import TilingOptions, run_tiled
 from pdal_stages.tiling.cloudindex import index_las, runs
 from pdal_stages.tiling.extract import cut, plain_header
 from pdal_stages.tiling.grid import Grid, inside, touch
 from pdal_stages.tiling.marks import terrain_reach
-from pdal_stages.tiling.plan import make_plan
 from pdal_stages.tiling.sources import find_sources, las_header
+from pdal_stages.tiling.tileplan import make_plan
 from pdal_stages.tiling.tindex import locations
 
 pytestmark = pytest.mark.pdal
@@ -92,21 +92,42 @@ def test_boxes_touch_on_their_edges():
 def test_a_cut_is_the_files_own_bytes(tmp_path, random_cloud, write_las, suffix, point_format):
     xyz = random_cloud(120_000, seed=1, extent=(100, 100, 5))
     xyz = xyz[np.argsort(xyz[:, 0], kind="stable")]  # so that blocks are compact
-    arrays = dict(zip("XYZ", xyz.T, strict=True)) | {"Intensity": np.arange(len(xyz)) % 65536, "Extra": xyz[:, 0]}
-    path = write_las(tmp_path / f"cloud{suffix}", arrays, point_format=point_format, wkt=WKT if point_format == 6 else None)
+    arrays = dict(zip("XYZ", xyz.T, strict=True)) | {
+        "Intensity": np.arange(len(xyz)) % 65536,
+        "Extra": xyz[:, 0],
+    }
+    path = write_las(
+        tmp_path / f"cloud{suffix}", arrays, point_format=point_format, wkt=WKT if point_format == 6 else None
+    )
     index = index_las(str(path), 25.0)
     assert index["count"] == len(xyz) and sum(n for _, _, n in index["tiles"]) == len(xyz)
     assert len(runs(index["boxes"], (0, 0, 10, 100))) == 1
     target = tmp_path / "piece.las"
-    piece = cut(str(path), index["boxes"], index["count"], Grid(25.0), (1, 2), 3.0, str(target), str(tmp_path / "core.las"))
+    piece = cut(
+        str(path),
+        index["boxes"],
+        index["count"],
+        Grid(25.0),
+        (1, 2),
+        3.0,
+        str(target),
+        str(tmp_path / "core.las"),
+    )
     las, all_ = laspy.read(target), laspy.read(path)
     expected = np.flatnonzero((xyz[:, 0] >= 22) & (xyz[:, 0] <= 53) & (xyz[:, 1] >= 47) & (xyz[:, 1] <= 78))
     assert np.array_equal(piece.index, expected)
     assert las.points.array.tobytes() == all_.points.array[expected].tobytes()
-    core = (xyz[expected, 0] >= 25) & (xyz[expected, 0] < 50) & (xyz[expected, 1] >= 50) & (xyz[expected, 1] < 75)
+    core = (
+        (xyz[expected, 0] >= 25)
+        & (xyz[expected, 0] < 50)
+        & (xyz[expected, 1] >= 50)
+        & (xyz[expected, 1] < 75)
+    )
     assert np.array_equal(piece.margin < 0, core)
     assert len(laspy.read(tmp_path / "core.las")) == np.count_nonzero(core)
-    assert [v.record_id for v in las.header.vlrs] == [v.record_id for v in all_.header.vlrs if v.record_id != 22204]
+    assert [v.record_id for v in las.header.vlrs] == [
+        v.record_id for v in all_.header.vlrs if v.record_id != 22204
+    ]
     assert len(plain_header(str(path))[0]) == las.header.offset_to_point_data
 
 
@@ -154,7 +175,9 @@ def test_smoothed_over_seams(tmp_path, town_file, model_file):
 
 def test_two_worker_processes_give_the_same(tmp_path, town_file, model_file, whole):
     pytest.importorskip("distributed")
-    run = run_tiled(clouds.stages([town_file], tmp_path / "out.laz", model_file), 45, workers=min(2, _cores()))
+    run = run_tiled(
+        clouds.stages([town_file], tmp_path / "out.laz", model_file), 45, workers=min(2, _cores())
+    )
     assert not run.failures and run.summary["workers"] * run.summary["threads_per_worker"] <= _cores()
     clouds.same_points(whole, tmp_path / "out.laz")
 
@@ -178,7 +201,7 @@ def test_large_files_are_written_in_parts(tmp_path, town_file, model_file, whole
 
 
 def _cores() -> int:
-    from pdal_stages.parallel import available_threads
+    from pdal_stages.base.threads import available_threads
 
     return available_threads()
 
@@ -194,7 +217,10 @@ def test_input_files_that_do_not_match_the_tiles(tmp_path, town_file, model_file
         piece = laspy.LasData(laspy.LasHeader(version="1.4", point_format=(6, 7, 6)[number]))
         piece.header.vlrs = las.header.vlrs
         piece.header.global_encoding.wkt = True
-        piece.header.offsets, piece.header.scales = np.array([number * 1000.0, 5_400_000.0, 7.0]), np.full(3, 0.001)
+        piece.header.offsets, piece.header.scales = (
+            np.array([number * 1000.0, 5_400_000.0, 7.0]),
+            np.full(3, 0.001),
+        )
         rows = np.flatnonzero(part == number)
         record = laspy.ScaleAwarePointRecord.zeros(len(rows), header=piece.header)
         piece.points = record
@@ -219,7 +245,9 @@ def test_input_files_that_do_not_match_the_tiles(tmp_path, town_file, model_file
         assert made.header.point_format.id == given_.header.point_format.id
         for name in ("classification", "HeightAboveGround", "Reliability", "gps_time", "intensity"):
             assert np.array_equal(made[name], expected[names.get(name, name)]), (number, name)
-    run = run_tiled([*pipeline[:-1], {**pipeline[-1], "filename": str(tmp_path / "t_#.laz")}], 30, workers=0, per="tile")
+    run = run_tiled(
+        [*pipeline[:-1], {**pipeline[-1], "filename": str(tmp_path / "t_#.laz")}], 30, workers=0, per="tile"
+    )
     assert not run.failures
     got = np.concatenate([_table(path) for path in sorted(tmp_path.glob("t_*.laz"))])
     parts = np.concatenate([_table(tmp_path / f"c_part{n}.laz") for n in range(3)])
@@ -231,8 +259,15 @@ def test_input_files_that_do_not_match_the_tiles(tmp_path, town_file, model_file
 
 def _table(path):
     las = laspy.read(path)
-    out = np.zeros(len(las), [("t", "f8"), ("x", "i8"), ("y", "i8"), ("z", "i8"), ("h", "f8"), ("c", "u1"), ("r", "f4")])
-    out["t"], out["h"], out["c"], out["r"] = las.gps_time, las.HeightAboveGround, las.classification, las.Reliability
+    out = np.zeros(
+        len(las), [("t", "f8"), ("x", "i8"), ("y", "i8"), ("z", "i8"), ("h", "f8"), ("c", "u1"), ("r", "f4")]
+    )
+    out["t"], out["h"], out["c"], out["r"] = (
+        las.gps_time,
+        las.HeightAboveGround,
+        las.classification,
+        las.Reliability,
+    )
     for name in "xyz":
         out[name] = np.round(np.asarray(las[name]) * 1000)
     return out
@@ -267,7 +302,9 @@ def test_flag_bits_of_old_formats_stay_and_are_not_counted(tmp_path, town_file, 
     number = np.arange(len(las))
     arrays = {"X": las.x, "Y": las.y, "Z": las.z, "Withheld": number % 2, "Synthetic": number % 3 == 0}
     path = write_las(tmp_path / "old.laz", arrays, point_format=1)
-    assert not (run := run_tiled(clouds.stages([path], tmp_path / "new.laz", model_file), 60, workers=0)).failures
+    assert not (
+        run := run_tiled(clouds.stages([path], tmp_path / "new.laz", model_file), 60, workers=0)
+    ).failures
     made = laspy.read(tmp_path / "new.laz")
     assert np.array_equal(made.withheld, np.arange(len(las)) % 2)
     assert np.array_equal(made.synthetic, np.arange(len(las)) % 3 == 0)
@@ -283,8 +320,12 @@ def test_delft_comes_back_bit_for_bit(tmp_path, data_dir, model_file):
     x, y = np.asarray(las.x), np.asarray(las.y)
     part = las[(x < x.min() + 45) & (y < y.min() + 45)]
     part.write(tmp_path / "delft.laz")
-    ps.Pipeline(clouds.stages([tmp_path / "delft.laz"], tmp_path / "whole.laz", model_file)).execute(arrays=False)
-    run = run_tiled(clouds.stages([tmp_path / "delft.laz"], tmp_path / "tiled.laz", model_file), 25, workers=0)
+    ps.Pipeline(clouds.stages([tmp_path / "delft.laz"], tmp_path / "whole.laz", model_file)).execute(
+        arrays=False
+    )
+    run = run_tiled(
+        clouds.stages([tmp_path / "delft.laz"], tmp_path / "tiled.laz", model_file), 25, workers=0
+    )
     assert not run.failures and len(run.tiles) >= 4
     assert (tmp_path / "whole.laz").read_bytes() == (tmp_path / "tiled.laz").read_bytes()
 
@@ -417,7 +458,12 @@ def test_only_seen_points_are_computed(tmp_path, town_file, model_file):
 def test_tile_indexes_are_read(tmp_path, town_file, pdal_program, model_file, whole):
     import subprocess
 
-    for name, driver in (("a.shp", "ESRI Shapefile"), ("b.gpkg", "GPKG"), ("c.sqlite", "SQLite"), ("d.geojson", "GeoJSON")):
+    for name, driver in (
+        ("a.shp", "ESRI Shapefile"),
+        ("b.gpkg", "GPKG"),
+        ("c.sqlite", "SQLite"),
+        ("d.geojson", "GeoJSON"),
+    ):
         subprocess.run(
             [pdal_program, "tindex", "create", tmp_path / name, town_file, "-f", driver, "--fast_boundary"],
             check=True,
@@ -505,10 +551,14 @@ def test_reports(tmp_path, town_file, model_file):
 
 
 def test_a_failed_tile_is_crossed_out():
-    from pdal_stages.tiling.report import page
-    from pdal_stages.tiling.run import Job, TiledRun
+    from pdal_stages.tiling.runpage import page
+    from pdal_stages.tiling.tiledrun import Job, TiledRun
 
-    jobs = [Job((0, 0), "0_0", 5, [], state="done", report={"points": 5, "read": 9, "buffer": 1.0, "seconds": 2.0})]
+    jobs = [
+        Job(
+            (0, 0), "0_0", 5, [], state="done", report={"points": 5, "read": 9, "buffer": 1.0, "seconds": 2.0}
+        )
+    ]
     jobs.append(Job((1, 0), "10_0", 5, [], state="failed", reason="<odd> & broken"))
     summary = {"tile": 10.0, "points": 5, "states": {"done": 1, "kept": 0, "failed": 1}, "classes": {}}
     text = page(TiledRun(jobs, [], {}, [], summary))

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import tiling_clouds as clouds
 
-from pdal_stages.errors import OptionError, StageError
-from pdal_stages.parallel import available_threads
+from pdal_stages.base.errors import OptionError, StageError
+from pdal_stages.base.threads import available_threads
 from pdal_stages.tiling import run_tiled
 from pdal_stages.tiling.store import Store
 from pdal_stages.tiling.tail import check_whole
@@ -55,7 +55,18 @@ def pipeline(folder: Path, output: Path, *own: dict) -> list:
 
 def command(job: Path, stages: list, *flags: str, tile: int = 20, **popen) -> subprocess.Popen:
     job.write_text(json.dumps(stages))
-    words = [sys.executable, "-m", "pdal_stages.cli", "pipeline", str(job), "--tile", str(tile), "--buffer", "0", *flags]
+    words = [
+        sys.executable,
+        "-m",
+        "pdal_stages.cli",
+        "pipeline",
+        str(job),
+        "--tile",
+        str(tile),
+        "--buffer",
+        "0",
+        *flags,
+    ]
     return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **popen)
 
 
@@ -104,7 +115,9 @@ def test_failing_tiles_are_tried_again_a_bounded_number_of_times(tmp_path, folde
     count = tmp_path / "count"
     body = "if ins['X'].min() < 1 and ins['Y'].min() < 1:\n"
     body += f"    open({str(count)!r}, 'a').write('x')\n    raise ValueError('odd')"
-    run = run_tiled(pipeline(folder, tmp_path / "o_#.laz", python_filter(body)), 20, workers=0, retries=3, buffer=0.0)
+    run = run_tiled(
+        pipeline(folder, tmp_path / "o_#.laz", python_filter(body)), 20, workers=0, retries=3, buffer=0.0
+    )
     assert len(count.read_text()) == 4
     assert [what for what, _ in run.failures] == ["tile 0_0", str(tmp_path / "o_west.laz")]
     assert "odd" in run.failures[0][1] and "tile 0_0 failed" in run.failures[1][1]
@@ -141,7 +154,9 @@ def test_full_disk_leaves_nothing_half_written(tmp_path, folder, expected):
 def test_full_file_system(tmp_path, folder, expected):
     small = tmp_path / "small"
     small.mkdir()
-    made = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(small)], capture_output=True, check=False)
+    made = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(small)], capture_output=True, check=False
+    )
     if made.returncode:
         pytest.skip("mounting a small file system needs root")
     try:
@@ -305,9 +320,9 @@ def test_an_unreachable_scheduler(tmp_path, folder):
 
 def test_a_scheduler_that_runs_already(tmp_path, folder, expected):
     distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(n_workers=WORKERS, threads_per_worker=1, dashboard_address="127.0.0.1:0") as cluster:
+    with distributed.LocalCluster(
+        n_workers=WORKERS, threads_per_worker=1, dashboard_address="127.0.0.1:0"
+    ) as cluster:
         run = run_tiled(pipeline(folder, tmp_path / "o_#.laz"), 20, scheduler=cluster.scheduler_address)
     assert not run.failures and run.summary["workers"] == WORKERS
     check_same(tmp_path, expected)
-
-

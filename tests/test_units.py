@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pdal_stages.errors import OptionError, StageError
-from pdal_stages.units import parse_wkt, units_of_wkt
+from pdal_stages.base.errors import OptionError, StageError
+from pdal_stages.base.units import parse_wkt, units_of_wkt
 
 GEOGCS = (
     'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.25]],UNIT["degree",0.0174532925199433]]'

@@ -8,7 +8,7 @@ import laspy
 import numpy as np
 
 import pdal_stages as ps
-from pdal_stages.terrain import hag_minima
+from pdal_stages.terrain.minima import hag_minima
 
 #: Heights of coarse cells of 5 m, so that surroundings stay small beside small tiles.
 CELL = 5
@@ -26,7 +26,9 @@ def town(size: float = 90.0, density: float = 4.0, seed: int = 5):
     return made, xyz, ~hole
 
 
-def model(path: Path, neighborhoods: str = "c1,s2,kopt", feature_set: str = "covariance,geometric,D1_3_c1") -> Path:
+def model(
+    path: Path, neighborhoods: str = "c1,s2,kopt", feature_set: str = "covariance,geometric,D1_3_c1"
+) -> Path:
     """A small model, trained on another town."""
     made = ps.make_town(60.0, 4.0, seed=9)
     options = ps.TrainingOptions(

@@ -16,8 +16,8 @@ import scenes
 from kit import Cache, Results, draw, figures, finish, grow_forest, limits, note, parser, predict
 from tables import choose, spread, table, values
 
-from pdal_stages.accuracy import Accuracy
-from pdal_stages.asprs import class_name
+from pdal_stages.accuracy.measures import Accuracy
+from pdal_stages.base.asprs import class_name
 from pdal_stages.features.names import GROUPS
 
 NEIGHBORHOODS = {

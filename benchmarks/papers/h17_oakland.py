@@ -38,7 +38,7 @@ from kit import (
 )
 from tables import choose, spread, table, values
 
-from pdal_stages.accuracy import Accuracy
+from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.features import FeaturePlan
 from pdal_stages.features.ropt import curvature_threshold
 

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 
 import pdal_stages
-from pdal_stages.accuracy import Accuracy
+from pdal_stages.accuracy.measures import Accuracy
+from pdal_stages.base.progress import Progress
 from pdal_stages.classifier.forest import Forest
 from pdal_stages.features import FeatureEngine, FeaturePlan, ShapeBins
-from pdal_stages.progress import Progress
-from pdal_stages.terrain import hag_minima
+from pdal_stages.terrain.minima import hag_minima
 
 #: Scene -> classes trained and scored; points of other classes are neighbors only.
 SCENES = {"montpellier": (2, 3, 4, 5, 6), "delft": (1, 2, 6)}

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from kit import Cloud
 
-from pdal_stages.errors import StageError
+from pdal_stages.base.errors import StageError
 
 COLUMNS = "X Y Z Intensity ReturnNumber NumberOfReturns Classification"
 

@@ -18,8 +18,8 @@ import scenes
 from kit import Cache, Results, figures, finish, note, parser
 from tables import choose, spread, table, values
 
-from pdal_stages.accuracy import Accuracy
-from pdal_stages.asprs import class_name
+from pdal_stages.accuracy.measures import Accuracy
+from pdal_stages.base.asprs import class_name
 from pdal_stages.classifier.forest import Forest
 from pdal_stages.classifier.growing import TreeOptions, grow
 from pdal_stages.classifier.sampling import draw_samples

@@ -3,7 +3,7 @@
 from _common import save, town
 
 import pdal_stages as ps
-from pdal_stages.picture import top_view
+from pdal_stages.reports.views import top_view
 
 points = town()
 height = ps.hag_minima(points.x, points.y, points.z)

@@ -4,7 +4,7 @@ import numpy as np
 from _common import save, town
 
 import pdal_stages as ps
-from pdal_stages.picture import top_view
+from pdal_stages.reports.views import top_view
 
 points = town()
 table = ps.compute_features(points.xyz, neighborhoods="c1,c2,c5", feature_set="SurfaceVariation")

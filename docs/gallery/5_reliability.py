@@ -4,7 +4,7 @@ import numpy as np
 from _common import halves, save, town
 
 import pdal_stages as ps
-from pdal_stages.picture import top_view
+from pdal_stages.reports.views import top_view
 
 points = town(seed=2)
 west, east = halves(points)

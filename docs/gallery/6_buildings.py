@@ -4,7 +4,7 @@ import numpy as np
 from _common import save, town
 
 import pdal_stages as ps
-from pdal_stages.picture import section_view
+from pdal_stages.reports.views import section_view
 
 
 def with_height(points):
@@ -13,9 +13,16 @@ def with_height(points):
 
 learned, other = town(seed=3), town(seed=4)
 options = ps.TrainingOptions(
-    neighborhoods="c1,c2,c5,s2", feature_set="covariance,geometric", strategy="binary", target=6, count=3000, trees=50
+    neighborhoods="c1,c2,c5,s2",
+    feature_set="covariance,geometric",
+    strategy="binary",
+    target=6,
+    count=3000,
+    trees=50,
 )
-model = ps.train([ps.TrainingCloud(learned.xyz, learned.classification, with_height(learned))], options, progress=False)
+model = ps.train(
+    [ps.TrainingCloud(learned.xyz, learned.classification, with_height(learned))], options, progress=False
+)
 found = model.predict(other.xyz, with_height(other)).classification == 6
 true = other.classification == 6
 print(f"recall {np.mean(found[true]):.3f}, precision {np.mean(true[found]):.3f}")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pdal_stages.indexed_png import indexed_png
+from pdal_stages.reports.indexed import indexed_png
 from pdal_stages.synthetic import Town, make_town
 
 #: Tests set a smaller town and another folder.

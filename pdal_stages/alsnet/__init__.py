@@ -3,7 +3,7 @@
 from .algorithm import AlsNet, InputPlan
 from .circles import Circles
 from .configuration import CONFIGURATIONS, Configuration, Level, parse_configuration
-from .options import NetworkOptions
+from .networkoptions import NetworkOptions
 
 __all__ = [
     "CONFIGURATIONS",

@@ -14,10 +14,10 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from ..base.errors import ModelError, OptionError, StageError
+from ..base.threads import map_blocks, resolve_threads
 from ..classifier.arrays import ArrayRule
-from ..errors import ModelError, OptionError, StageError
 from ..features.index import check_xyz
-from ..parallel import map_blocks, resolve_threads
 from . import circles as circles_
 from .circles import Circles
 from .configuration import Configuration, parse_configuration

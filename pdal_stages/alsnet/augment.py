@@ -7,7 +7,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from .options import NetworkOptions
+from .networkoptions import NetworkOptions
 
 #: Fewest points thinning leaves.
 LEAST = 16

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..base.errors import ModelError
+from ..base.files import write_whole
 from ..classifier.arrays import ArrayRule, from_bytes, to_bytes
-from ..errors import ModelError
-from ..files import write_whole
 
 FORMAT = "pdal-stages alsnet checkpoint 1"
 STATE = "state.json"

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import OptionError
+from ..base.errors import OptionError
 
 #: Circles each point is in, on average, in a cloud of even density.
 COVERAGE = 4.0

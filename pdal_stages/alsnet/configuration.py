@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from ..errors import OptionError, suggest
+from ..base.errors import OptionError, suggest
 
 #: A configuration's largest number of shared layers: a model file holds 63 arrays.
 MAX_LAYERS = 60

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import optional_import
+from ..base.errors import optional_import
 from .configuration import Configuration
 from .pyramid import Pyramid
 from .weights import EPSILON, Weights

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from ..classifier.sampling import coordinate_hash
 from .configuration import Configuration
-from .sampling import ball_query, farthest_points, three_nearest
+from .farthest import ball_query, farthest_points, three_nearest
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..base.errors import OptionError
 from ..classifier import crossval
-from ..errors import OptionError
 from .circles import Circles
 
 #: A batch of a cloud: (cloud, circle).

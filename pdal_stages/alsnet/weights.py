@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 from .configuration import Configuration
 from .pyramid import Pyramid
 

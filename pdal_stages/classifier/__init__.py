@@ -3,7 +3,7 @@
 from .clouds import TrainingCloud
 from .forest import Forest
 from .model import Model, Prediction, load_model
-from .options import TrainingOptions
 from .training import train
+from .trainoptions import TrainingOptions
 
 __all__ = ["Forest", "Model", "Prediction", "TrainingCloud", "TrainingOptions", "load_model", "train"]

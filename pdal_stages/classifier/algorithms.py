@@ -19,7 +19,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 
 #: Word in the manifest -> module and class.
 ALGORITHMS = {

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 
 _HEADER = re.compile(
     rb"\{'descr': '([<|][iufb][1248])', 'fortran_order': False, "

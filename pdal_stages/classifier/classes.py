@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..asprs import NAMES, NOISE, UNLABELLED, class_name
-from ..errors import OptionError, suggest
+from ..base.asprs import NAMES, NOISE, UNLABELLED, class_name
+from ..base.errors import OptionError, suggest
 
 #: Labels that are no class of their own unless `classes` names them: never classified, unclassified,
 #: noise, and 12, which before LAS 1.4 marked overlap of flight strips, not a kind of object.

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import OptionError
+from ..base.errors import OptionError
 from .classes import LEFT_OUT, ClassMap, as_labels
-from .options import TrainingOptions
+from .trainoptions import TrainingOptions
 
 
 @dataclass(frozen=True, eq=False)

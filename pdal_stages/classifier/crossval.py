@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..accuracy import Accuracy
-from ..errors import OptionError
-from ..progress import Progress
+from ..accuracy.measures import Accuracy
+from ..base.errors import OptionError
+from ..base.progress import Progress
 from .growing import TreeOptions, grow
 
 #: A smaller forest is preferred if its mean F1 is within this of the best.

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import DimensionError
+from ..base.errors import DimensionError
 
 #: What every point has: the feature engine takes these from the coordinates.
 COORDINATES = ("X", "Y", "Z")

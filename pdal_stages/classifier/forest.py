@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 from . import walk as kernels
 from .arrays import ArrayRule
 

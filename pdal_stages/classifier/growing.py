@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..parallel import map_blocks
-from ..progress import Progress
+from ..base.progress import Progress
+from ..base.threads import map_blocks
 
 #: Rows scored in one go: a copy of them is made.
 _ROWS = 8192

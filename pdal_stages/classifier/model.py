@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ModelError, OptionError
+from ..base.errors import ModelError, OptionError
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from . import modelfile, smoothing, summary
 from .algorithms import algorithm

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-from ..errors import ModelError, StageError
+from ..base.errors import ModelError, StageError
 from .arrays import ArrayRule, from_bytes, to_bytes
 
 FORMAT = "pdal-stages model"
@@ -157,9 +157,7 @@ def _check_end(stream) -> int:
     if data[: -_END.size].startswith(b"PK\x06\x07"):
         raise ModelError("the model file is a zip of a kind that is not used here", found="zip64", cure=CURE)
     if disk or first or here != total or not 1 <= total <= MEMBER_LIMIT or length > MEMBER_LIMIT * 512:
-        raise ModelError(
-            "the model file's list of members is not right", found=f"{total} members", cure=CURE
-        )
+        raise ModelError("the model file's list of members is not right", found=f"{total} members", cure=CURE)
     if offset + length + _END.size != size:
         raise ModelError("the model file has bytes that belong to nothing", cure=CURE)
     stream.seek(0)
@@ -272,7 +270,7 @@ def validate(manifest: Mapping[str, Any]) -> None:
 def _validator():
     import jsonschema
 
-    text = resources.files("pdal_stages").joinpath(f"schemas/model-{VERSION}.json").read_text("utf-8")
+    text = resources.files(__package__).joinpath(f"model-{VERSION}.json").read_text("utf-8")
     return jsonschema.Draft202012Validator(json.loads(text))
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import OptionError
+from ..base.errors import OptionError
 
 #: Side of a cell of the curve in metres.
 CELL = 0.5

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import OptionError
+from ..base.errors import OptionError
+from ..base.jit import njit
+from ..base.threads import map_blocks
 from ..features.index import build_grid, check_xyz
-from ..features.jit import njit
-from ..parallel import map_blocks
 
 #: Probability 1.
 WHOLE = 65535

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from ..errors import ModelError, OptionError
+from ..base.errors import ModelError, OptionError
 from ..features.names import GROUPS, RELATIVE
 
 if TYPE_CHECKING:

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .. import __version__
-from ..errors import DimensionError, OptionError
+from ..base.errors import DimensionError, OptionError
+from ..base.progress import Progress
+from ..base.threads import map_blocks
+from ..base.version import __version__
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
-from ..parallel import map_blocks
-from ..progress import Progress
 from . import crossval
 from .classes import ClassMap
 from .clouds import TrainingCloud, class_positions
@@ -25,8 +25,8 @@ from .dimensions import gather, required
 from .forest import Forest
 from .growing import TreeOptions, grow
 from .model import Model
-from .options import TrainingOptions
 from .sampling import Samples, draw_samples
+from .trainoptions import TrainingOptions
 
 
 def train(
@@ -51,7 +51,7 @@ def train(
     if not clouds:
         raise OptionError("no training cloud was given")
     if options.algorithm == "alsnet":
-        from ..alsnet.model import train_model
+        from ..alsnet.networkmodel import train_model
 
         return train_model(clouds, options, progress)
     started = time.perf_counter()

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..features.jit import njit
+from ..base.jit import njit
 
 #: Rows that walk a tree together.
 LANES = 16

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..parallel import map_blocks
+from ..base.jit import CompilationNote, njit
+from ..base.threads import map_blocks
 from .bins import ShapeBins
 from .index import Grid
-from .jit import CompilationNote, njit
 from .kdtree import KdTree, build_tree
 from .moments import BATCH, FEATURES, MOMENTS, finish
 from .names import MOMENT_FEATURES, SHAPE_FEATURES

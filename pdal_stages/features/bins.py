@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import OptionError
+from ..base.errors import OptionError
 
 #: The metrics, in the order of the rows of all threshold arrays.
 METRICS = ("A3", "D1", "D2", "D3", "D4")

@@ -13,8 +13,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
+from ..base.jit import njit
 from .index import SPARE
-from .jit import njit
 
 #: Coordinates of padding points: the square is still finite, and larger than any squared radius.
 FAR = 1e150

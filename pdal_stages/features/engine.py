@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import OptionError, StageError
-from ..parallel import map_blocks, resolve_threads
-from ..progress import Progress
+from ..base.errors import OptionError, StageError
+from ..base.progress import Progress
+from ..base.threads import map_blocks, resolve_threads
+from .blocks import Run, compile_once
 from .plan import FeaturePlan
-from .run import Run, compile_once
 
 if TYPE_CHECKING:
     from .adaptive import AdaptiveNeighborhoods
@@ -277,7 +277,7 @@ class FeatureTable:
     def __getitem__(self, name: str) -> np.ndarray:
         """The column of that name, a view."""
         if name not in self.names:
-            from ..errors import suggest
+            from ..base.errors import suggest
 
             raise KeyError(f"no feature '{name}' in this table. {suggest(name, self.names)}".strip())
         return self.values[:, self.names.index(name)]

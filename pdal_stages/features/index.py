@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import StageError
-from .jit import njit
+from ..base.errors import StageError
+from ..base.jit import njit
 
 #: Coordinates beyond this many metres are no point cloud (and would overflow cell numbers).
 LIMIT = 1e12

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .jit import njit
+from ..base.jit import njit
 
 #: A leaf holds at most this many points.
 LEAF = 24

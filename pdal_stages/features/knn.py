@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .jit import njit
+from ..base.jit import njit
 from .kdtree import STACK, bounding_box, farthest2, gather, halve
 
 #: Queries that share one set of candidates.

@@ -15,9 +15,9 @@ import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
+from ..base.jit import njit
 from .candidates import from_order_bits, order_bits
 from .eigen import covariance_features, eigen3
-from .jit import njit
 
 #: Rows of a moment table: count, sums, products, lowest and highest height (as ordered integers).
 N, SX, SY, SZ, SXX, SXY, SXZ, SYY, SYZ, SZZ, LOW, HIGH = range(12)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from ..errors import OptionError, suggest
+from ..base.errors import OptionError, suggest
 
 #: Feature -> definition, in the order of the columns.
 COVARIANCE = {

@@ -21,9 +21,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..base.jit import FAST, njit
 from .candidates import from_order_bits, order_bits
 from .eigen import eigenentropy, eigenvalues3, log_fast
-from .jit import FAST, njit
 from .knn import CROWD, ROOM, make_rows, make_scratch, next_rows, start_search
 from .moments import COINCIDENT, HIGH, LOW, SX, SXX, SXY, SXZ, SY, SYY, SYZ, SZ, SZZ, N
 from .shapes import COUNTS, VALUES, shape_counts, shape_values

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from ..errors import OptionError
-from ..neighborhoods import Neighborhood, parse_neighborhoods, preset_dimensions
+from ..base.errors import OptionError
 from .names import ALL_FEATURES, GROUPS, WITH_DIMENSIONS, parse_feature_set
+from .neighborhoods import Neighborhood, parse_neighborhoods, preset_dimensions
 
 #: Halo of neighborhoods whose size is a number of points, metres: see :attr:`FeaturePlan.halo`.
 POINTS_HALO = 15.0

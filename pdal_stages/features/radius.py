@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
+from ..base.jit import njit
 from .candidates import FAR, LANES, count_candidates, fill_strip, gather, half_widths
-from .jit import njit
 from .moments import (
     BATCH,
     FEATURES,

@@ -18,8 +18,8 @@ import math
 
 import numpy as np
 
+from ..base.jit import njit
 from .eigen import eigenvalues3
-from .jit import njit
 from .kdtree import bounding_box, gather
 from .knn import make_groups, make_scratch
 from .moments import COINCIDENT

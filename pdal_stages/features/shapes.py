@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .jit import njit
+from ..base.jit import njit
 
 #: Random pulls per neighborhood [B16].
 PULLS = 255

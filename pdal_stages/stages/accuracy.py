@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..accuracy import Accuracy
-from ..errors import StageError
-from ..files import check_writable, write_whole
+from ..accuracy.measures import Accuracy
+from ..base.errors import StageError
+from ..base.files import check_writable, write_whole
 from .base import Stage
 from .options import Option
 from .points import Points
@@ -64,7 +64,7 @@ present, add a reliability curve and the error by margin.
 
     @classmethod
     def check(cls, options: dict[str, Any]) -> None:
-        from ..labels import code_list, merging
+        from ..accuracy.labels import code_list, merging
 
         for name in ("classes", "ignore"):
             code_list([_number(c) for c in options[name]], name)
@@ -129,7 +129,7 @@ present, add a reliability curve and the error by margin.
 
 
 def _report(points, inside, reference, predicted, accuracy: Accuracy, options: dict[str, Any]) -> None:
-    from ..report import write_accuracy_report
+    from ..reports.accuracypage import write_accuracy_report
 
     importances = None
     settings: dict[str, Any] = {k: v for k, v in options.items() if k in _SHOWN}

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from numpy.typing import NDArray
 
-from ..errors import OptionError, StageError
+from ..base.errors import OptionError, StageError
 from .options import Option, parse_options
 from .points import Points
 
@@ -71,11 +71,11 @@ class Stage(ABC):
             values = parse_options(cls.all_options(), given)
             for name in ("horizontal_unit", "vertical_unit"):
                 if values[name]:
-                    from ..units import named_unit
+                    from ..base.units import named_unit
 
                     named_unit(values[name], name)
             if values["where"] is not None:
-                from ..expression import Expression
+                from .where import Expression
 
                 Expression(values["where"])
             cls.check(values)

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.errors import StageError
+from ..base.files import check_writable
 from ..classifier import TrainingCloud, TrainingOptions, train
-from ..errors import StageError
-from ..files import check_writable
 from .base import Stage
 from .options import Option
 from .points import Points
@@ -208,7 +208,7 @@ merged first. `label` names the dimension that holds the classes.
 
         training = cls.training_options(options)
         if training.algorithm == "alsnet":
-            from ..alsnet.model import input_names
+            from ..alsnet.networkmodel import input_names
 
             return input_names(training.alsnet.coordinates, training.dimensions)
         plan = FeaturePlan.parse(

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..asprs import NOISE
-from ..errors import OptionError
-from ..terrain import MinimaTerrain
+from ..base.asprs import NOISE
+from ..base.errors import OptionError
+from ..terrain.minima import MinimaTerrain
 from .base import Stage
 from .options import Option
 from .points import Points

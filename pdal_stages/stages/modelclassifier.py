@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.errors import OptionError
+from ..base.progress import Progress
 from ..classifier import Model, load_model
 from ..classifier.smoothing import FARTHEST
-from ..errors import OptionError
-from ..progress import Progress
 from .base import Stage
 from .options import Option
 from .points import Points

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DimensionError, OptionError, StageError
+from ..base.errors import DimensionError, OptionError, StageError
+from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
-from ..neighborhoods import parse_neighborhoods
-from ..progress import Progress
+from ..features.neighborhoods import parse_neighborhoods
 from .base import Stage, plan_error
 from .options import Option
 from .points import Points
@@ -198,7 +198,7 @@ def _read_bins(path: str | None) -> tuple[ShapeBins | None, float | None]:
 
 
 def _write_bins(path: str, engine: FeatureEngine) -> None:
-    from ..files import write_whole
+    from ..base.files import write_whole
 
     content = {
         "format": "pdal_stages thresholds 1",

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ..errors import OptionError, suggest
+from ..base.errors import OptionError, suggest
 
 _JSON_TYPES = {
     "number": "number",

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..asprs import LEGACY_LIMIT
-from ..errors import DimensionError, StageError
-from ..expression import Expression
-from ..units import Units, units_of_wkt
+from ..base.asprs import LEGACY_LIMIT
+from ..base.errors import DimensionError, StageError
+from ..base.units import Units, units_of_wkt
+from .where import Expression
 
 #: Which stage makes a dimension that a user may lack.
 MAKERS = {

@@ -6,10 +6,10 @@ import importlib
 import pkgutil
 from functools import cache
 
-from ..errors import PipelineError, suggest
+from ..base.errors import PipelineError, suggest
 from .base import Stage
 
-_SUPPORT = {"base", "options", "points", "registry"}
+_SUPPORT = {"base", "options", "points", "registry", "where"}
 
 
 @cache

@@ -8,8 +8,8 @@ import math
 import sys
 import time
 
-from ..asprs import class_name
-from ..errors import OptionError, StageError
+from ..base.asprs import class_name
+from ..base.errors import OptionError, StageError
 from .las import write_town
 from .town import TownOptions
 
@@ -106,7 +106,8 @@ def main(argv: list[str] | None = None) -> int:
 def _picture(cloud: str, picture: str) -> None:
     import laspy
 
-    from ..picture import legend, present_classes, top_view, write_png
+    from ..reports.png import write_png
+    from ..reports.views import legend, present_classes, top_view
 
     las = laspy.read(cloud)
     import numpy as np

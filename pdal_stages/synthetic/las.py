@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from .. import __version__
-from ..errors import DependencyError, OptionError, StageError
+from ..base.errors import DependencyError, OptionError, StageError
+from ..base.version import __version__
 from .materials import RGB
 from .srs import geo_keys, wkt
 from .town import Town, TownOptions, town_chunks

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..features.jit import njit
+from ..base.jit import njit
 from .random import value_noise
 
 PITCH_U, PITCH_V = 58.0, 68.0

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ..features.jit import njit
+from ..base.jit import njit
 from . import plan as _plan
 from .materials import CODE
 from .plan import ground

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..features.jit import njit
+from ..base.jit import njit
 from .materials import CODE
 
 CONVEX, ELLIPSOID, CONE, ROD = range(4)

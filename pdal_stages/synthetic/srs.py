@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import struct
 
-from ..errors import OptionError
+from ..base.errors import OptionError
 
 _ETRS89 = (
     'GEOGCS["ETRS89",DATUM["European_Terrestrial_Reference_System_1989",'

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
-from ..errors import OptionError
-from ..features.jit import CompilationNote
-from ..parallel import map_blocks, resolve_threads
-from ..progress import Progress
+from ..base.errors import OptionError
+from ..base.jit import CompilationNote
+from ..base.progress import Progress
+from ..base.threads import map_blocks, resolve_threads
 from .blocks import Blocks
 from .flight import Chunk, Flight
 from .materials import REFLECTANCE
@@ -263,7 +263,7 @@ def _options(options: TownOptions | None, changes: dict) -> TownOptions:
     known = {f.name for f in fields(TownOptions)}
     for name in changes:
         if name not in known:
-            from ..errors import suggest
+            from ..base.errors import suggest
 
             raise OptionError(
                 f"unknown option '{name}'",
@@ -327,7 +327,7 @@ def make_town(
     srs : str
         ``EPSG:`` code for the files written, or ``none``.
     threads : int, optional
-        See :func:`pdal_stages.parallel.resolve_threads`.
+        See :func:`pdal_stages.base.threads.resolve_threads`.
 
     Returns
     -------

@@ -1,6 +1,6 @@
 """Pipelines over inputs of any number and size: tiles with a halo, run on Dask, written seamlessly."""
 
-from .options import TilingOptions
-from .run import TiledRun, run_tiled
+from .settings import TilingOptions
+from .tiledrun import TiledRun, run_tiled
 
 __all__ = ["TiledRun", "TilingOptions", "run_tiled"]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import StageError
+from ..base.errors import StageError
 from .grid import Box, Grid, touch
 
 #: Points of a block: LAZ is compressed in pieces of so many.

@@ -11,31 +11,47 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from ..errors import OptionError, StageError
-from ..files import check_writable, write_whole
-from .options import PER, TilingOptions
-from .run import TiledRun, run_tiled
+from ..base.errors import OptionError, StageError
+from ..base.files import check_writable, write_whole
+from .settings import PER, TilingOptions
+from .tiledrun import TiledRun, run_tiled
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """Add the flags to the parser of ``pipeline``."""
     group = command.add_argument_group("large areas", "Run the pipeline in tiles; see docs/large-areas.md.")
-    group.add_argument("--tile", type=float, metavar="SIZE", help="Side of the tiles, in the unit of the coordinates")
     group.add_argument(
-        "--workers", type=int, metavar="N", help="Processes; 0: this one alone, without Dask (default: half the cores)"
+        "--tile", type=float, metavar="SIZE", help="Side of the tiles, in the unit of the coordinates"
     )
-    group.add_argument("--scheduler", default="", metavar="ADDRESS", help="A running Dask scheduler, tcp://HOST:8786")
     group.add_argument(
-        "--per", choices=PER, default="auto", help="One output for each input file, or for each tile (auto: file)"
+        "--workers",
+        type=int,
+        metavar="N",
+        help="Processes; 0: this one alone, without Dask (default: half the cores)",
+    )
+    group.add_argument(
+        "--scheduler", default="", metavar="ADDRESS", help="A running Dask scheduler, tcp://HOST:8786"
+    )
+    group.add_argument(
+        "--per",
+        choices=PER,
+        default="auto",
+        help="One output for each input file, or for each tile (auto: file)",
     )
     group.add_argument(
         "--buffer", type=float, metavar="METRES", help="Surroundings for PDAL filters that look at neighbors"
     )
-    group.add_argument("--resume", action="store_true", help="Keep what an earlier run into this folder finished")
+    group.add_argument(
+        "--resume", action="store_true", help="Keep what an earlier run into this folder finished"
+    )
     group.add_argument("--retries", type=int, default=2, metavar="N", help="Tries again of a failed tile (2)")
     group.add_argument("--dry-run", action="store_true", help="Show tiles and an estimate, and stop")
     group.add_argument(
-        "--report", action="append", default=[], metavar="FILE", help="Write a report, .html or .json; may be repeated"
+        "--report",
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="Write a report, .html or .json; may be repeated",
     )
 
 
@@ -76,8 +92,8 @@ def run_command(options: argparse.Namespace, source: str | Path) -> int:
         retries=options.retries,
     )
     if options.validate:
-        from ..pipeline import Pipeline
-        from .plan import make_plan
+        from ..pipeline.run import Pipeline
+        from .tileplan import make_plan
 
         make_plan(source, options.overrides, chosen)
         Pipeline(source, options.overrides).validate()
@@ -141,7 +157,9 @@ def _print_dry(run: TiledRun) -> None:
     s = run.summary
     print(f"{len(run.tiles)} tiles of {s['tile']:g}, each read with {s['buffer_metres']:g} m of surroundings")
     print(f"{s['inputs']} inputs, {s['points']:,} points; one output for each {s['per']}")
-    print(f"about {s['points_read_by_a_tile']:,} points read for a tile, {s['points_of_largest_tile']:,} its own at most")
+    print(
+        f"about {s['points_read_by_a_tile']:,} points read for a tile, {s['points_of_largest_tile']:,} its own at most"
+    )
     memory, rate = s["memory_mb_of_a_worker"], s["assumed_points_per_core_second"]
     print(f"up to {memory:,.0f} MB for each of {s['workers']} workers with {s['threads_per_worker']} threads")
     print(f"roughly {s['core_hours']:.2f} core hours at {rate:,} points/s and core; the model decides")
@@ -162,6 +180,6 @@ def _write_report(name: str, run: TiledRun) -> None:
         except StageError as error:
             raise error.at("--report") from None
         return
-    from .report import write_report
+    from .runpage import write_report
 
     write_report(name, run)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .. import pdal_env
+from ..pipeline import pdal as pdal_env
 from .cloudindex import index_las
 from .grid import Grid
 from .sources import las_header, read_ept

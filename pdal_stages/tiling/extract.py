@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import StageError
+from ..base.errors import StageError
 from .cloudindex import BLOCK, open_las, read_block, runs
 from .grid import Box, Grid
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import OptionError, StageError
+from ..base.errors import OptionError, StageError
 
 #: Most tiles of a run.
 _MOST = 10_000_000

@@ -7,7 +7,7 @@ import uuid
 from pathlib import Path
 from typing import Any
 
-from ..errors import StageError
+from ..base.errors import StageError
 from .cloudindex import BLOCK, open_las, read_block
 from .extract import finish, plain_header
 from .scratch import scratch
@@ -58,7 +58,9 @@ def write_in_parts(task: dict[str, Any], most: int) -> dict[str, Any] | None:
 
 
 def _uncompressed(tail: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [{k: v for k, v in s.items() if k != "compression"} if s["type"] == "writers.las" else s for s in tail]
+    return [
+        {k: v for k, v in s.items() if k != "compression"} if s["type"] == "writers.las" else s for s in tail
+    ]
 
 
 def _copy(path: str, start: int, end: int, target: str) -> None:

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from .. import pdal_env, runtime
+from ..pipeline import pdal as pdal_env
+from ..pipeline import runtime
 
 #: PDAL cannot take an exception such as KeyboardInterrupt from a Python filter; our stages catch it.
 _CAUGHT = runtime._run.__code__

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import pdal_env
-from ..runtime import _wkt
+from ..pipeline import pdal as pdal_env
+from ..pipeline.runtime import _wkt
 from ..stages.points import Points
-from .plan import MARGIN, ROW, SOURCE
+from .tileplan import MARGIN, ROW, SOURCE
 
 #: Dimension -> rows (None: all) and their values.
 Injected = Mapping[str, tuple[NDArray[np.int64] | None, NDArray]]

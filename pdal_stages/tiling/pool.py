@@ -6,9 +6,9 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from ..errors import StageError, optional_import
+from ..base.errors import StageError, optional_import
 from .interrupts import gentle
-from .options import TilingOptions
+from .settings import TilingOptions
 from .work import perform
 
 #: Seconds to wait for the first worker.

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..errors import PipelineError, StageError
-from ..lasfile import check_readable
+from ..base.errors import PipelineError, StageError
+from ..base.las import check_readable
 from .grid import Box
 from .tindex import locations
 

@@ -12,8 +12,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from ..errors import StageError
-from ..files import write_whole
+from ..base.errors import StageError
+from ..base.files import write_whole
 
 #: The folder beside the outputs.
 FOLDER = ".pdal-stages"

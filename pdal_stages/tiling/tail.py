@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import pdal_env
-from ..errors import StageError
-from ..lasfile import supersede_copc
+from ..base.errors import StageError
+from ..base.las import supersede_copc
+from ..pipeline import pdal as pdal_env
 from . import marks
 from .cloudindex import open_las, read_block
 

@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..asprs import LEGACY_LIMIT
-from ..errors import PipelineError, StageError
-from ..files import write_whole
-from ..pipeline import Pipeline
+from ..base.asprs import LEGACY_LIMIT
+from ..base.errors import PipelineError, StageError
+from ..base.files import write_whole
+from ..pipeline.run import Pipeline
 from ..stages import registry
 from . import marks
 from .assemble import write_tile
 from .extract import Piece, cut
 from .grid import Grid, inside
-from .plan import MARGIN, ROW, SOURCE, later_reaches
 from .scratch import scratch
+from .tileplan import MARGIN, ROW, SOURCE, later_reaches
 
 #: How often a tile is read again with wider surroundings.
 _WIDENINGS = 3
@@ -189,7 +189,9 @@ def _head(task, grid, tile, pieces: list[Piece], sources, everything: bool) -> t
 def _collect(arrays, pieces, cores, creates, before) -> Results:
     """Results of the tile's own points, sorted as their pieces are."""
     names = [n for a in arrays[:1] for n in a.dtype.names]
-    legacy = not {"Synthetic", "Withheld", "ClassFlags"} & set(names) and all(_old_format(p.path) for p in pieces)
+    legacy = not {"Synthetic", "Withheld", "ClassFlags"} & set(names) and all(
+        _old_format(p.path) for p in pieces
+    )
     if creates is not None:
         names = [n for n in creates if n in names]
     else:
@@ -315,4 +317,3 @@ def _class_counts(results: Results) -> dict[str, int]:
             codes = np.asarray(column, np.uint8)
             counts += np.bincount(codes & LEGACY_LIMIT if results.legacy else codes, minlength=256)
     return {str(c): int(counts[c]) for c in np.flatnonzero(counts)}
-

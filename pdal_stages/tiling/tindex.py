@@ -7,7 +7,7 @@ import sqlite3
 import struct
 from pathlib import Path
 
-from ..errors import StageError
+from ..base.errors import StageError
 
 
 def locations(path: str, column: str = "location") -> list[str]:

@@ -9,7 +9,14 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
-from ..errors import DependencyError, DimensionError, ModelError, OptionError, PipelineError, StageError
+from ..base.errors import (
+    DependencyError,
+    DimensionError,
+    ModelError,
+    OptionError,
+    PipelineError,
+    StageError,
+)
 
 #: One tile at a time in a process: PDAL's threads are ours, and memory is stated for one.
 _one = threading.Lock()

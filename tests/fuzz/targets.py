@@ -19,12 +19,12 @@ from pathlib import Path
 
 import numpy as np
 
+from pdal_stages.base.errors import StageError
 from pdal_stages.classifier import modelfile
 from pdal_stages.classifier.model import _assemble
-from pdal_stages.errors import StageError
-from pdal_stages.lowering import lower
-from pdal_stages.overrides import apply_overrides, parse_overrides
-from pdal_stages.pipelinefile import decode, parse_pipeline
+from pdal_stages.pipeline.lowering import lower
+from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
+from pdal_stages.pipeline.read import decode, parse_pipeline
 
 #: CPU seconds one input may take; beyond it is a finding (the largest inputs of the fuzzers are a few kB).
 PATIENCE = 10.0
@@ -37,7 +37,9 @@ def pipeline(data: bytes) -> str:
         source = parse_pipeline(decode(data, "fuzz.json"), "fuzz.json")
         assert len(source.lines) == len(source.stages)
         assert all(line >= 1 for line in source.lines)
-        overrides, _ = parse_overrides(["--stage.a.cell=5", "--filters.hag_minima.resolution=0.25"][: len(data) % 3])
+        overrides, _ = parse_overrides(
+            ["--stage.a.cell=5", "--filters.hag_minima.resolution=0.25"][: len(data) % 3]
+        )
         with contextlib.suppress(StageError):  # one that fits no stage
             source.stages = apply_overrides(source.stages, overrides)
         lowered = lower(source)
@@ -45,7 +47,10 @@ def pipeline(data: bytes) -> str:
         again = json.loads(json.dumps(lowered.stages, allow_nan=False))
         assert again == lowered.stages
         types = [str(stage.get("type", "")) for stage in lowered.stages]
-        assert not any(t in ("filters.hag_minima", "filters.multiscalefeatures", "writers.classifiermodel") for t in types)
+        assert not any(
+            t in ("filters.hag_minima", "filters.multiscalefeatures", "writers.classifiermodel")
+            for t in types
+        )
         assert types.count("filters.python") >= len(lowered.ours)
         assert len(types) >= len(source.stages)
         outcome = "lowered"
@@ -144,7 +149,11 @@ def model(data: bytes) -> str:
         values = np.random.default_rng(1).normal(size=(50, len(made.plan.names))).astype(np.float32)
         shares = made.algorithm.predict_proba(values)
         assert shares.shape == (50, len(made.classes))
-        assert np.isfinite(shares).all() and (shares >= 0).all() and np.allclose(shares.sum(axis=1), 1, atol=1e-5)
+        assert (
+            np.isfinite(shares).all()
+            and (shares >= 0).all()
+            and np.allclose(shares.sum(axis=1), 1, atol=1e-5)
+        )
         outcome = "loaded"
     except StageError as error:
         assert str(error).strip().endswith((".", "?", "!")) and "Traceback" not in str(error)
@@ -164,7 +173,9 @@ def seeds(name: str) -> list[bytes]:
         good = good_model()
         manifest = good[modelfile.MANIFEST]
         whole = packed(good)
-        return [b"\0" + whole, b"\1" + manifest, b"\2" + manifest] + [bytes([k]) + b"\0" * 8 for k in range(3, 12)]
+        return [b"\0" + whole, b"\1" + manifest, b"\2" + manifest] + [
+            bytes([k]) + b"\0" * 8 for k in range(3, 12)
+        ]
     ready = sorted((Path(__file__).resolve().parents[2] / "pipelines").glob("*.json"))
     return [path.read_bytes() for path in ready] + [
         b'["a.las",{"type":"filters.hag_minima","tag":"a","cell":20,"where":"Z > 3 && !(Classification == 7)"},"b.laz"]',

@@ -62,7 +62,9 @@ class Cell:
 
     def __post_init__(self) -> None:
         assert self.group in GROUPS and "|" not in self.case
-        assert WRITE_TO or self.case in listed(), f"'{self.case}' is not in {TABLE.name}: write the table anew"
+        assert WRITE_TO or self.case in listed(), (
+            f"'{self.case}' is not in {TABLE.name}: write the table anew"
+        )
 
     # ---- commands ------------------------------------------------------------------------------------------
 
@@ -92,7 +94,9 @@ class Cell:
             timeout=options.pop("timeout", 300),
             **options,
         )
-        return Done(done.returncode, done.stdout.decode(errors="replace"), done.stderr.decode(errors="replace"))
+        return Done(
+            done.returncode, done.stdout.decode(errors="replace"), done.stderr.decode(errors="replace")
+        )
 
     def _files(self) -> set[Path]:
         return {path for path in self.folder.rglob("*") if path.is_file()}
@@ -119,7 +123,9 @@ class Cell:
         done = words if isinstance(words, Done) else self.command(*words)
         assert done.code == 0, done.err
         assert "Traceback" not in done.out + done.err
-        left = [path for path in self._files() - self.before if ".partial-" in path.name or path.suffix == ".tmp"]
+        left = [
+            path for path in self._files() - self.before if ".partial-" in path.name or path.suffix == ".tmp"
+        ]
         assert not left
         self.note("result", result)
         return done
@@ -151,7 +157,7 @@ def write_table(path: Path) -> None:
     """The page of the docs."""
     import platform
 
-    from pdal_stages import pdal_env
+    from pdal_stages.pipeline import pdal as pdal_env
 
     kinds = [row[2] for row in SEEN]
     version = ".".join(map(str, pdal_env.version()))
@@ -170,7 +176,14 @@ def write_table(path: Path) -> None:
     for group in GROUPS:
         rows = [row for row in SEEN if row[0] == group]
         if rows:
-            lines += [f"## {group}", "", f"{len(rows)} cases.", "", "| case | ends in | what a user sees |", "|---|---|---|"]
+            lines += [
+                f"## {group}",
+                "",
+                f"{len(rows)} cases.",
+                "",
+                "| case | ends in | what a user sees |",
+                "|---|---|---|",
+            ]
             lines += [f"| {case} | {kind} | {text} |" for _, case, kind, text in rows] + [""]
     lines += FUZZED
     path.write_text("\n".join(lines), encoding="utf-8")

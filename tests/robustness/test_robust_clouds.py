@@ -11,7 +11,7 @@ from robustness_kit import job
 from scipy.spatial import cKDTree
 
 import pdal_stages as ps
-from pdal_stages.errors import StageError
+from pdal_stages.base.errors import StageError
 
 pytestmark = pytest.mark.pdal
 
@@ -34,7 +34,9 @@ def random(n, seed=3, size=(20.0, 20.0, 5.0)):
 
 def wall():
     rng = np.random.default_rng(2)
-    return np.column_stack([np.full(400, 3.0), rng.uniform(0, 8, 400).round(2), rng.uniform(0, 20, 400).round(2)])
+    return np.column_stack(
+        [np.full(400, 3.0), rng.uniform(0, 8, 400).round(2), rng.uniform(0, 20, 400).round(2)]
+    )
 
 
 #: case, coordinates
@@ -78,7 +80,9 @@ def check_output(path, count):
     for name in out.point_format.extra_dimension_names:
         values = np.asarray(out[name])
         assert np.isfinite(values).all(), name
-        if name.startswith(("Linearity", "Planarity", "Scattering", "Anisotropy", "Verticality", "Reliability")):
+        if name.startswith(
+            ("Linearity", "Planarity", "Scattering", "Anisotropy", "Verticality", "Reliability")
+        ):
             assert values.min() >= 0 and values.max() <= 1 + 1e-6, name
     return out
 
@@ -128,7 +132,9 @@ def test_no_points(cell, tmp_path, write_las, model):
                {"type": "writers.las", "filename": str(tmp_path / "out.las")})  # fmt: skip
     cell("Clouds", "0 points").runs(["pipeline", path], "an output without points")
     assert len(laspy.read(tmp_path / "out.las")) == 0
-    train = job(tmp_path, str(source), HAG, {"type": "writers.classifiermodel", "filename": str(tmp_path / "m")})
+    train = job(
+        tmp_path, str(source), HAG, {"type": "writers.classifiermodel", "filename": str(tmp_path / "m")}
+    )
     cell("Clouds", "training on 0 points").refused(["pipeline", train], "no points to train on")
     judge = job(tmp_path, str(source), {"type": "filters.ferry", "dimensions": "Classification=>Reference"},
                 {"type": "filters.accuracy"})  # fmt: skip
@@ -148,8 +154,18 @@ def test_training_on_odd_clouds(cell, tmp_path, write_las):
             it.runs(["pipeline", path], "a model")
             (tmp_path / "m").unlink()
 
-    train("training on points of one class", random(100), "writers.classifiermodel", Classification=np.full(100, 2, np.uint8))
-    train("training on unclassified points", random(100), "writers.classifiermodel", Classification=np.zeros(100, np.uint8))
+    train(
+        "training on points of one class",
+        random(100),
+        "writers.classifiermodel",
+        Classification=np.full(100, 2, np.uint8),
+    )
+    train(
+        "training on unclassified points",
+        random(100),
+        "writers.classifiermodel",
+        Classification=np.zeros(100, np.uint8),
+    )
     train("training on 2 points", ODD["2 points"])
     train("training where all points are equal", ODD["all points equal"])
 
@@ -188,18 +204,29 @@ def test_not_finite(cell, tmp_path, pdal_module, model, case, row):
     if "not finite" in done.err:
         it.refused(done, "coordinates are not finite", "1 of 51 points", "filters.range")
     elif done.code == 0:  # PDAL 2.2 reads the word as 0, and says so
-        it.runs(done, "PDAL's readers.text sets it to 0, and its words are shown: Can't convert field 'inf' to numeric value")
+        it.runs(
+            done,
+            "PDAL's readers.text sets it to 0, and its words are shown: Can't convert field 'inf' to numeric value",
+        )
         assert "Can't convert field" in done.err and "on line 52" in done.err
     else:
         it.refused(done, "in.txt")
 
 
 def test_stray_points_beyond_any_grid(cell, tmp_path, pdal_module, write_las, model):
-    for case, far in (("one stray point 1e9 m away", 1e9), ("one stray point 1e15 m away", 1e15), ("one stray point 1e300 m away", 1e300)):
+    for case, far in (
+        ("one stray point 1e9 m away", 1e9),
+        ("one stray point 1e15 m away", 1e15),
+        ("one stray point 1e300 m away", 1e300),
+    ):
         xyz = np.vstack([random(300), [[far, -far, 3.0]]])
         it = cell("Clouds", case)
         np.savetxt(tmp_path / "in.txt", xyz, fmt="%.3f", delimiter=",", header="X,Y,Z", comments="")
-        stages = [HAG, {**FEATURES, "feature_set": "covariance,geometric"}, {"type": "filters.modelclassifier", "model": str(model)}]
+        stages = [
+            HAG,
+            {**FEATURES, "feature_set": "covariance,geometric"},
+            {"type": "filters.modelclassifier", "model": str(model)},
+        ]
         path = job(tmp_path, {"type": "readers.text", "filename": str(tmp_path / "in.txt")}, *stages,
                    {"type": "writers.text", "filename": str(tmp_path / "out.csv"), "order": "Z,HeightAboveGround"})  # fmt: skip
         done = it.command("pipeline", path)
@@ -218,7 +245,9 @@ def test_many_duplicates(cell, tmp_path, write_las, model):
     source = las(tmp_path / "in.las", xyz, write_las)
     path = job(tmp_path, str(source), HAG, {"type": "filters.modelclassifier", "model": str(model)},
                {"type": "writers.las", "filename": str(tmp_path / "out.las"), "extra_dims": "all", "forward": "all"})  # fmt: skip
-    cell("Clouds", "20,000 copies of one point among others").runs(["pipeline", path], "classes; copies get the same")
+    cell("Clouds", "20,000 copies of one point among others").runs(
+        ["pipeline", path], "classes; copies get the same"
+    )
     out = check_output(tmp_path / "out.las", len(xyz))
     assert len(np.unique(out.classification[200:])) == 1 and len(np.unique(out["Reliability"][200:])) == 1
 
@@ -235,7 +264,8 @@ def test_noise_below_ground(cell, tmp_path, write_las):
                {"type": "writers.las", "filename": str(tmp_path / "out.las"), "extra_dims": "all", "forward": "all"})  # fmt: skip
     meta = tmp_path / "m.json"
     cell("Clouds", "noise (classes 7 and 18) below ground").runs(
-        ["pipeline", path, "--metadata", meta], "noise forms no terrain, is counted, and gets its (negative) height"
+        ["pipeline", path, "--metadata", meta],
+        "noise forms no terrain, is counted, and gets its (negative) height",
     )
     height = np.asarray(laspy.read(tmp_path / "out.las")["HeightAboveGround"])
     assert height[:400].min() > -0.11 and height[:400].max() < 0.11 and (height[400:] < -34).all()
@@ -250,7 +280,9 @@ def test_water_gap_is_counted(cell, tmp_path, write_las):
     source = las(tmp_path / "in.las", ODD["a gap of water wider than a cell"], write_las)
     path = job(tmp_path, str(source), HAG)
     meta = tmp_path / "m.json"
-    cell("Clouds", "empty cells at a gap").runs(["pipeline", path, "--metadata", meta], "filled, and counted in the metadata")
+    cell("Clouds", "empty cells at a gap").runs(
+        ["pipeline", path, "--metadata", meta], "filled, and counted in the metadata"
+    )
     assert json.loads(meta.read_text())["metadata"]["filters.hag_minima"]["interpolated_cells"] > 0
 
 
@@ -316,18 +348,30 @@ def test_degrees_without_a_reference(cell, tmp_path, write_las):
     arrays = {"X": xyz[:, 0], "Y": xyz[:, 1], "Z": xyz[:, 2]}
     source = write_las(tmp_path / "in.las", arrays, scale=1e-7)
     path = job(tmp_path, str(source), HAG)
-    done = cell("Clouds", "degrees without a spatial reference").runs(["pipeline", path], "a warning that coordinates look like degrees")
+    done = cell("Clouds", "degrees without a spatial reference").runs(
+        ["pipeline", path], "a warning that coordinates look like degrees"
+    )
     assert "look like degrees" in done.err
 
 
 def test_labels_that_are_none(cell, tmp_path, write_las):
-    arrays = {"Weight": np.full(100, 2.5), "Big": np.full(100, 300, np.int32), "Negative": np.full(100, -1, np.int8)}
+    arrays = {
+        "Weight": np.full(100, 2.5),
+        "Big": np.full(100, 300, np.int32),
+        "Negative": np.full(100, -1, np.int8),
+    }
     source = las(tmp_path / "in.las", random(100), write_las, **arrays)
     for name, says in (("Weight", "2.5"), ("Big", "300"), ("Negative", "-1"), ("None", "is missing")):
         path = job(tmp_path, {"type": "readers.las", "filename": str(source), "use_eb_vlr": True}, HAG,
                    {"type": "writers.classifiermodel", "filename": str(tmp_path / "m"), "label": name})  # fmt: skip
-        case = {"Weight": "labels that are fractions", "Big": "labels above 255", "Negative": "labels below 0"}.get(name)
-        cell("Clouds", case or "labels of a dimension that is missing").refused(["pipeline", path], name, says)
+        case = {
+            "Weight": "labels that are fractions",
+            "Big": "labels above 255",
+            "Negative": "labels below 0",
+        }.get(name)
+        cell("Clouds", case or "labels of a dimension that is missing").refused(
+            ["pipeline", path], name, says
+        )
 
 
 def test_stage_error_in_a_thread_is_the_same(cloud):

@@ -51,7 +51,9 @@ def without_rights() -> dict:
 def mounted(folder: Path, options: str):
     """A small file system in memory, where that is allowed."""
     folder.mkdir(exist_ok=True)
-    done = subprocess.run(["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)], capture_output=True, text=True)
+    done = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)], capture_output=True, text=True
+    )
     if done.returncode:
         pytest.skip(f"no file system can be mounted here: {done.stderr.strip()}")
     try:
@@ -61,7 +63,12 @@ def mounted(folder: Path, options: str):
 
 
 def simple(tmp_path, cloud, out="out.las"):
-    return job(tmp_path, str(cloud), HAG, {"type": "writers.las", "filename": str(tmp_path / out), "extra_dims": "all"})
+    return job(
+        tmp_path,
+        str(cloud),
+        HAG,
+        {"type": "writers.las", "filename": str(tmp_path / out), "extra_dims": "all"},
+    )
 
 
 # ---- PDAL and Python packages --------------------------------------------------------------------------------
@@ -71,7 +78,9 @@ def test_no_python_pdal(cell, tmp_path, cloud):
     path = simple(tmp_path, cloud)
     it = cell("Environment", "python-pdal is not installed")
     without = prepared("import sys", "sys.modules['pdal'] = None")
-    it.refused(it.process("pipeline", path, command=without), "python-pdal cannot be imported", "conda install")
+    it.refused(
+        it.process("pipeline", path, command=without), "python-pdal cannot be imported", "conda install"
+    )
     it = cell("Environment", "numpy-level functions without PDAL")
     done = it.process(command=[*AFTER, "import sys; sys.modules['pdal'] = None\nimport pdal_stages as ps\n"
                                "assert ps.hag_minima([1., 2.], [1., 2.], [3., 5.])[1] == 2"])  # fmt: skip
@@ -81,12 +90,24 @@ def test_no_python_pdal(cell, tmp_path, cloud):
 def test_no_pdal_program(cell, tmp_path, cloud):
     path = simple(tmp_path, cloud)
     it = cell("Environment", "the program 'pdal' is not on PATH")
-    lines = "import sys, pdal_stages.pdal_env as e", "sys.executable = '/nowhere/python'", "e.shutil.which = lambda *a: None"
+    lines = (
+        "import sys, pdal_stages.pipeline.pdal as e",
+        "sys.executable = '/nowhere/python'",
+        "e.shutil.which = lambda *a: None",
+    )
     it.refused(it.process("drivers", command=prepared(*lines)), "'pdal' is not on PATH", "conda install")
     it.refused(it.process("validate", path, command=prepared(*lines)), "'pdal' is not on PATH")
 
 
-@pytest.mark.parametrize("kind", ["an empty folder", "a folder that is not there", "a plugin that is no library", "a plugin for another Python"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "an empty folder",
+        "a folder that is not there",
+        "a plugin that is no library",
+        "a plugin for another Python",
+    ],
+)
 def test_driver_path(cell, tmp_path, cloud, kind):
     drivers = tmp_path / "drivers"
     plugin = drivers / "libpdal_plugin_filter_python.so"
@@ -99,7 +120,9 @@ def test_driver_path(cell, tmp_path, cloud, kind):
         if compiler is None:
             pytest.skip("no C compiler to build a plugin that needs a Python that is not here")
         source = tmp_path / "plugin.c"
-        source.write_text("extern void Py_NoSuchPython_Ever(void);\nvoid PF_initPlugin(void) { Py_NoSuchPython_Ever(); }\n")
+        source.write_text(
+            "extern void Py_NoSuchPython_Ever(void);\nvoid PF_initPlugin(void) { Py_NoSuchPython_Ever(); }\n"
+        )
         subprocess.run([compiler, "-shared", "-fPIC", "-o", plugin, source], check=True)
     it = cell("Environment", f"PDAL_DRIVER_PATH names {kind}")
     done = it.process("pipeline", simple(tmp_path, cloud), env={"PDAL_DRIVER_PATH": str(drivers)})
@@ -147,11 +170,20 @@ def test_no_rights(cell, open_folder, write_las):
     it = cell("Environment", "no right to write the output's folder")
     it.refused(it.process("pipeline", path, **words), "cannot be written to")
     it = cell("Environment", "no right to write the model's folder")
-    train = job(open_folder, str(source), HAG, {"type": "writers.classifiermodel", "filename": str(closed / "m")}, name="t.json")
+    train = job(
+        open_folder,
+        str(source),
+        HAG,
+        {"type": "writers.classifiermodel", "filename": str(closed / "m")},
+        name="t.json",
+    )
     it.refused(it.process("pipeline", train, **words), "cannot be written to")
     it = cell("Environment", "no right to write the metadata's folder")
     plain = job(open_folder, str(source), HAG, name="p.json")
-    it.refused(it.process("pipeline", plain, "--metadata", closed / "m.json", **words), "metadata file cannot be written to")
+    it.refused(
+        it.process("pipeline", plain, "--metadata", closed / "m.json", **words),
+        "metadata file cannot be written to",
+    )
     it = cell("Environment", "no right to read the input")
     source.chmod(0o000)
     it.refused(it.process("pipeline", plain, **words), "in.las")
@@ -170,13 +202,31 @@ def test_read_only_home(cell, open_folder, write_las):
     for folder in (package, *package.rglob("*")):
         folder.chmod(0o555 if folder.is_dir() else 0o444)
     stage = {"type": "filters.multiscalefeatures", "neighborhoods": "c1", "feature_set": "Linearity"}
-    path = job(open_folder, str(source), stage, {"type": "writers.las", "filename": str(open_folder / "out.las"), "extra_dims": "all"})
-    for case, temporary in (("read-only HOME and installation", open_folder), ("nowhere to keep compiled code", "/proc")):
+    path = job(
+        open_folder,
+        str(source),
+        stage,
+        {"type": "writers.las", "filename": str(open_folder / "out.las"), "extra_dims": "all"},
+    )
+    for case, temporary in (
+        ("read-only HOME and installation", open_folder),
+        ("nowhere to keep compiled code", "/proc"),
+    ):
         it = cell("Environment", case)
-        environment = {"HOME": "/proc", "XDG_CACHE_HOME": "/proc/cache", "PYTHONPATH": str(open_folder / "lib"), "NUMBA_CACHE_DIR": None}
+        environment = {
+            "HOME": "/proc",
+            "XDG_CACHE_HOME": "/proc/cache",
+            "PYTHONPATH": str(open_folder / "lib"),
+            "NUMBA_CACHE_DIR": None,
+        }
         command = prepared("import tempfile", f"tempfile.tempdir = {str(temporary)!r}")
         done = it.process("pipeline", path, env=environment, cwd=open_folder, command=command, **nobody)
-        it.runs(done, "kernels are compiled for this run" if "nowhere" in case else "compiled code is kept in the temporary folder")
+        it.runs(
+            done,
+            "kernels are compiled for this run"
+            if "nowhere" in case
+            else "compiled code is kept in the temporary folder",
+        )
         assert len(laspy.read(open_folder / "out.las")) == 600
         (open_folder / "out.las").unlink()
         assert bool(list(open_folder.glob("pdal-stages-cache-*/**/*.nbc"))) == ("HOME" in case)
@@ -194,7 +244,9 @@ def test_disk_full(cell, tmp_path, write_las, suffix):
     source = big(tmp_path, write_las)
     with mounted(tmp_path / "small", "size=200k") as small:
         path = job(tmp_path, str(source), HAG, str(small / f"out.{suffix}"))
-        cell("Environment", f"disk full while writing .{suffix}").refused(["pipeline", path], f"out.{suffix}", "ake room")
+        cell("Environment", f"disk full while writing .{suffix}").refused(
+            ["pipeline", path], f"out.{suffix}", "ake room"
+        )
         assert not list(small.iterdir())
 
 
@@ -202,7 +254,9 @@ def test_disk_full_of_other_files(cell, tmp_path, cloud):
     with mounted(tmp_path / "small", "size=20k") as small:
         (small / "filler").write_bytes(bytes(20 << 10))
         path = job(tmp_path, str(cloud), HAG)
-        cell("Environment", "disk full while writing metadata").refused(["pipeline", path, "--metadata", small / "m.json"], "m.json", "No space left")
+        cell("Environment", "disk full while writing metadata").refused(
+            ["pipeline", path, "--metadata", small / "m.json"], "m.json", "No space left"
+        )
         train = job(tmp_path, str(cloud), HAG, {"type": "writers.classifiermodel", "filename": str(small / "m"), "count": 50, "trees": 3,
                                                 "neighborhoods": "c1", "feature_set": "covariance"})  # fmt: skip
         cell("Environment", "disk full while writing a model").refused(["pipeline", train], "No space left")
@@ -229,7 +283,12 @@ def test_standard_output_is_full(cell, tmp_path, cloud):
     it = cell("Environment", "standard output on a full disk")
     it.before = it._files() | {simple(tmp_path, cloud)}
     with open("/dev/full", "w") as full:
-        done = subprocess.run([sys.executable, "-m", "pdal_stages.cli", "drivers", "--ours"], stdout=full, stderr=subprocess.PIPE, text=True)
+        done = subprocess.run(
+            [sys.executable, "-m", "pdal_stages.cli", "drivers", "--ours"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
     assert done.returncode == 1 and "No space left" in done.stderr and "Traceback" not in done.stderr
     it.note("error", done.stderr.strip().removeprefix("pdal-stages: "))
 
@@ -264,7 +323,11 @@ def test_file_name_that_is_not_utf8(cell, tmp_path, cloud, model):
     except OSError:
         pytest.skip("this file system has UTF-8 names only")
     it = cell("Environment", "file name in Latin-1")
-    it.refused(it.process("classify", tmp_path / name, tmp_path / "out.las", "--model", model), "not valid UTF-8", "rename the file")
+    it.refused(
+        it.process("classify", tmp_path / name, tmp_path / "out.las", "--model", model),
+        "not valid UTF-8",
+        "rename the file",
+    )
 
 
 def test_one_core(cell, tmp_path, cloud):
@@ -274,10 +337,15 @@ def test_one_core(cell, tmp_path, cloud):
                {"type": "writers.las", "filename": str(tmp_path / "one.las"), "extra_dims": "all"})  # fmt: skip
     it = cell("Environment", "one core allowed")
     core = sorted(os.sched_getaffinity(0))[0]
-    it.runs(it.process("pipeline", path, preexec_fn=lambda: os.sched_setaffinity(0, {core})), "the same values as with all")
+    it.runs(
+        it.process("pipeline", path, preexec_fn=lambda: os.sched_setaffinity(0, {core})),
+        "the same values as with all",
+    )
     (tmp_path / "job.json").write_text((tmp_path / "job.json").read_text().replace("one.las", "all.las"))
     assert it.command("pipeline", path).code == 0
-    assert np.array_equal(laspy.read(tmp_path / "one.las")["Linearity_c1"], laspy.read(tmp_path / "all.las")["Linearity_c1"])
+    assert np.array_equal(
+        laspy.read(tmp_path / "one.las")["Linearity_c1"], laspy.read(tmp_path / "all.las")["Linearity_c1"]
+    )
 
 
 def test_no_threads_to_be_had(cell, tmp_path, cloud):
@@ -315,16 +383,28 @@ def test_signals(cell, tmp_path, write_las, name, where):
     out = tmp_path / "out.las"
     out.write_bytes(b"an older result")
     if where == "while PDAL writes":
-        faux = {"type": "readers.faux", "count": 3_000_000, "mode": "uniform", "bounds": "([0,1],[0,1],[0,1])"}
+        faux = {
+            "type": "readers.faux",
+            "count": 3_000_000,
+            "mode": "uniform",
+            "bounds": "([0,1],[0,1],[0,1])",
+        }
         sort = [{"type": "filters.sort", "dimension": axis} for axis in "XYZ" * 60]
         path = job(tmp_path, faux, *sort, {"type": "writers.las", "filename": str(out)})
     else:
-        faux = {"type": "readers.faux", "count": 3_000_000, "mode": "uniform", "bounds": "([0,100],[0,100],[0,9])"}
+        faux = {
+            "type": "readers.faux",
+            "count": 3_000_000,
+            "mode": "uniform",
+            "bounds": "([0,100],[0,100],[0,9])",
+        }
         stage = {"type": "filters.multiscalefeatures", "neighborhoods": "c5,kopt", "feature_set": "all"}
         path = job(tmp_path, faux, stage, {"type": "writers.las", "filename": str(out), "extra_dims": "all"})
     process = started(tmp_path, path)
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-    assert wait_for(lambda: process.poll() is not None or (children.exists() and children.read_text().strip()))
+    assert wait_for(
+        lambda: process.poll() is not None or (children.exists() and children.read_text().strip())
+    )
     time.sleep(1.0)
     half = tmp_path / f".out.partial-{process.pid}.las"
     if not half.exists():
@@ -350,8 +430,12 @@ def test_json_of_metadata_is_whole(cell, tmp_path, cloud):
     meta = tmp_path / "meta.json"
     meta.write_text("older")
     path = job(tmp_path, str(cloud), {**HAG, "ignore_classes": list(range(256))}, str(tmp_path / "o.las"))
-    cell("Environment", "older output and metadata when a run fails").refused(["pipeline", path, "--metadata", meta], "no terrain")
+    cell("Environment", "older output and metadata when a run fails").refused(
+        ["pipeline", path, "--metadata", meta], "no terrain"
+    )
     assert meta.read_text() == "older"
     path = job(tmp_path, str(cloud), HAG)
-    cell("Environment", "older output and metadata when a run fails").command("pipeline", path, "--metadata", meta)
+    cell("Environment", "older output and metadata when a run fails").command(
+        "pipeline", path, "--metadata", meta
+    )
     assert "filters.hag_minima" in json.loads(meta.read_text())["metadata"]

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from robustness_kit import job
 
-from pdal_stages.errors import PipelineError, StageError
-from pdal_stages.lowering import lower
-from pdal_stages.pipelinefile import parse_pipeline
+from pdal_stages.base.errors import PipelineError, StageError
+from pdal_stages.pipeline.lowering import lower
+from pdal_stages.pipeline.read import parse_pipeline
 
 STAGE = b'{"type": "filters.hag_minima"}'
 
@@ -84,15 +84,21 @@ GOOD = [
 def test_taken(cell, tmp_path, case, text):
     path = tmp_path / "job.json"
     path.write_bytes(text)
-    done = cell("Pipeline JSON", case).runs(["expand", path, "-o", tmp_path / "plain.json"], "is read as PDAL reads it")
+    done = cell("Pipeline JSON", case).runs(
+        ["expand", path, "-o", tmp_path / "plain.json"], "is read as PDAL reads it"
+    )
     plain = json.loads((tmp_path / "plain.json").read_text())
     assert not done.out and plain["pipeline"][-1]["type"] == "filters.python"
 
 
 def test_files_that_cannot_be_read(cell, tmp_path, capfd):
-    cell("Pipeline JSON", "file that is not there").refused(["pipeline", tmp_path / "nix.json"], "No such file")
+    cell("Pipeline JSON", "file that is not there").refused(
+        ["pipeline", tmp_path / "nix.json"], "No such file"
+    )
     cell("Pipeline JSON", "folder for a file").refused(["pipeline", tmp_path], "Is a directory")
-    cell("Pipeline JSON", "file name of 5,000 characters").refused(["pipeline", "x" * 5000], "File name too long")
+    cell("Pipeline JSON", "file name of 5,000 characters").refused(
+        ["pipeline", "x" * 5000], "File name too long"
+    )
     cell("Pipeline JSON", "endless file").refused(["pipeline", "/dev/zero"], "too large")
 
 
@@ -111,7 +117,9 @@ def test_the_line_is_the_stages(cell, tmp_path):
              '{"type": "filters.hag_minima",', '"cell": 0}]']  # fmt: skip
     path = tmp_path / "job.json"
     path.write_text("\n".join(lines))
-    cell("Pipeline JSON", "mistake in a stage that spans lines").refused(["expand", path], "job.json, line 7:")
+    cell("Pipeline JSON", "mistake in a stage that spans lines").refused(
+        ["expand", path], "job.json, line 7:"
+    )
 
 
 def test_names_and_spaces(cell, tmp_path, cloud):
@@ -120,7 +128,9 @@ def test_names_and_spaces(cell, tmp_path, cloud):
     source = folder / "in put.las"
     source.write_bytes(cloud.read_bytes())
     path = job(folder, str(source), {"type": "filters.hag_minima"}, str(folder / "o\u00fct [1].las"))
-    cell("Environment", "spaces, quotes and non-ASCII characters in paths").runs(["pipeline", path], "the file is written")
+    cell("Environment", "spaces, quotes and non-ASCII characters in paths").runs(
+        ["pipeline", path], "the file is written"
+    )
     assert (folder / "o\u00fct [1].las").stat().st_size > 1000
 
 
@@ -132,7 +142,9 @@ values = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
     max_leaves=8,
 )  # fmt: skip
-names = st.sampled_from(["type", "tag", "inputs", "filename", "cell", "where", "neighborhoods", "classes", "x"])
+names = st.sampled_from(
+    ["type", "tag", "inputs", "filename", "cell", "where", "neighborhoods", "classes", "x"]
+)
 types = st.sampled_from(["filters.hag_minima", "filters.multiscalefeatures", "writers.classifiermodel",
                          "filters.accuracy", "filters.range", "readers.las", "writers.las", ""])  # fmt: skip
 stages = st.builds(
@@ -156,7 +168,7 @@ def test_any_json_is_lowered_or_refused(given_stages, as_object, indent):
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.text(max_size=10).filter(lambda s: "\0" not in s), min_size=1, max_size=5), st.data())
 def test_comments_between_change_nothing(texts, data):
-    comment = st.sampled_from(["", " ", "\n", "// c \" [ /*\n", "/* \" // \n ] */", "/**/"])
+    comment = st.sampled_from(["", " ", "\n", '// c " [ /*\n', '/* " // \n ] */', "/**/"])
     text = "".join(
         data.draw(comment) + part
         for at, word in enumerate(texts)

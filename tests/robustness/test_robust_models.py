@@ -14,7 +14,7 @@ from conftest import scene
 from robustness_kit import job
 
 import pdal_stages as ps
-from pdal_stages.errors import ModelError
+from pdal_stages.base.errors import ModelError
 
 pytestmark = pytest.mark.pdal
 
@@ -97,10 +97,16 @@ def test_broken_models(cell, tmp_path, cloud, model, case, edit, says):
         target.write_bytes(edit(model.read_bytes()))
     else:
         repack(model, target, edit)
-    message = cell("Models", case).refused(["classify", cloud, tmp_path / "out.las", "--model", target], "broken.model", *says)
+    message = cell("Models", case).refused(
+        ["classify", cloud, tmp_path / "out.las", "--model", target], "broken.model", *says
+    )
     path = job(tmp_path, str(cloud), {"type": "filters.modelclassifier", "model": str(target)})
     again = cell("Models", case).command("pipeline", path)
-    assert again.code == 1 and "job.json, line 3: filters.modelclassifier" in again.err and "Traceback" not in again.err
+    assert (
+        again.code == 1
+        and "job.json, line 3: filters.modelclassifier" in again.err
+        and "Traceback" not in again.err
+    )
     assert cell("Models", case).command("model", target).code == 1
     with pytest.raises(ModelError) as caught:
         ps.Filter.modelclassifier(model=str(target))
@@ -112,7 +118,9 @@ def test_broken_models(cell, tmp_path, cloud, model, case, edit, says):
 
 def test_models_that_are_not_there(cell, tmp_path, cloud):
     words = ["classify", cloud, tmp_path / "out.las", "--model"]
-    cell("Models", "model that is not there").refused([*words, tmp_path / "nix.model"], "nix.model", "no such model file", "Check the path")
+    cell("Models", "model that is not there").refused(
+        [*words, tmp_path / "nix.model"], "nix.model", "no such model file", "Check the path"
+    )
     cell("Models", "folder as the model").refused([*words, tmp_path], "not a file")
     cell("Models", "model name that is empty").refused([*words, ""], "model")
     cell("Models", "NUL in the model's name").refused([*words, "a\0b"], "model")
@@ -135,14 +143,20 @@ def test_other_dimensions(cell, tmp_path, write_las, cloud):
     cell("Models", "model trained on an extra dimension that the points lack").refused(
         ["classify", cloud, tmp_path / "out.las", "--model", model], "'Amplitude' is missing"
     )
-    job_ = job(tmp_path, str(cloud), {"type": "filters.modelclassifier", "model": str(trained(tmp_path, cloud, "h.model"))})
+    job_ = job(
+        tmp_path,
+        str(cloud),
+        {"type": "filters.modelclassifier", "model": str(trained(tmp_path, cloud, "h.model"))},
+    )
     cell("Models", "model that needs heights, without the stage that makes them").refused(
         ["pipeline", job_], "'HeightAboveGround' is missing", "filters.hag_minima"
     )
     cell("Models", "model trained on an extra dimension that the points have").runs(
         ["classify", source, tmp_path / "out.las", "--model", model], "classes"
     )
-    assert np.mean(np.asarray(laspy.read(tmp_path / "out.las").classification) == data["Classification"]) > 0.95
+    assert (
+        np.mean(np.asarray(laspy.read(tmp_path / "out.las").classification) == data["Classification"]) > 0.95
+    )
 
 
 def test_trained_in_feet(cell, tmp_path, write_las, cloud):
@@ -154,9 +168,13 @@ def test_trained_in_feet(cell, tmp_path, write_las, cloud):
     source = write_las(tmp_path / "feet.las", feet, point_format=6, wkt=WKT["us-ft"], scale=1e-4)
     model = trained(tmp_path, source)
     cell("Models", "model trained on points in feet, applied to metres").runs(
-        ["classify", cloud, tmp_path / "out.las", "--model", model], "classes: features are metres whatever the file's unit"
+        ["classify", cloud, tmp_path / "out.las", "--model", model],
+        "classes: features are metres whatever the file's unit",
     )
-    assert np.mean(np.asarray(laspy.read(tmp_path / "out.las").classification) == scene()["Classification"]) > 0.9
+    assert (
+        np.mean(np.asarray(laspy.read(tmp_path / "out.las").classification) == scene()["Classification"])
+        > 0.9
+    )
 
 
 def test_a_model_that_changes_between_runs(cell, tmp_path, cloud, model):

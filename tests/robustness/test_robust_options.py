@@ -6,7 +6,7 @@ import pytest
 from robustness_kit import job
 
 import pdal_stages as ps
-from pdal_stages.errors import StageError
+from pdal_stages.base.errors import StageError
 
 pytestmark = pytest.mark.pdal
 
@@ -34,7 +34,12 @@ WRONG = [
     ("length of 1e300", HAG, {"cell": 1e300}, ["at most 10000 m", "1e+300"]),
     ("number too large for a double", HAG, {"cell": "1e999"}, ["option 'cell' must be a number", "1e999"]),
     ("text NaN for a number", HAG, {"cell": "nan"}, ["option 'cell' must be a number"]),
-    ("resolution larger than cell", HAG, {"cell": 1, "resolution": 5}, ["not be larger than 'cell'", "Swap them"]),
+    (
+        "resolution larger than cell",
+        HAG,
+        {"cell": 1, "resolution": 5},
+        ["not be larger than 'cell'", "Swap them"],
+    ),
     ("class code of 300", HAG, {"ignore_classes": [300]}, ["class codes of 0 to 255", "300"]),
     ("class code of -1", HAG, {"ignore_classes": "-1"}, ["class codes of 0 to 255", "-1"]),
     ("nested list", HAG, {"ignore_classes": [[7]]}, ["must be a list, or text separated by commas"]),
@@ -43,19 +48,34 @@ WRONG = [
     ("negative threads", HAG, {"threads": -2}, ["option 'threads' must be at least 0"]),
     ("a million threads", HAG, {"threads": 1_000_000}, ["option 'threads'", "at most 1024"]),
     ("memory of 1 MB", FEATURES, {"memory": 1}, ["option 'memory' must be at least 16 MB"]),
-    ("empty list of neighborhoods", FEATURES, {"neighborhoods": []}, ["is an empty list", "Name at least one"]),
+    (
+        "empty list of neighborhoods",
+        FEATURES,
+        {"neighborhoods": []},
+        ["is an empty list", "Name at least one"],
+    ),
     ("empty text of neighborhoods", FEATURES, {"neighborhoods": ""}, ["is an empty list"]),
     ("only commas", FEATURES, {"neighborhoods": ",,,"}, ["is an empty list"]),
     ("empty list of features", FEATURES, {"feature_set": []}, ["'feature_set' is an empty list"]),
     ("unknown neighborhood", FEATURES, {"neighborhoods": "q5"}, ["option 'neighborhoods'", "q5"]),
-    ("misspelt preset", FEATURES, {"neighborhoods": "weinman2018"}, ["option 'neighborhoods'", "weinmann2018"]),
+    (
+        "misspelt preset",
+        FEATURES,
+        {"neighborhoods": "weinman2018"},
+        ["option 'neighborhoods'", "weinmann2018"],
+    ),
     ("contradictory kopt(100,10)", FEATURES, {"neighborhoods": "kopt(100,10)"}, ["kopt(100,10)"]),
     ("kopt with one number", FEATURES, {"neighborhoods": "kopt(10)"}, ["kopt(10)"]),
     ("kopt of a million neighbors", FEATURES, {"neighborhoods": "kopt(10,1000000)"}, ["kopt(10,1000000)"]),
     ("neighborhood without a radius", FEATURES, {"neighborhoods": "c"}, ["option 'neighborhoods'"]),
     ("radius of 0", FEATURES, {"neighborhoods": "c0"}, ["option 'neighborhoods'", "c0"]),
     ("negative radius", FEATURES, {"neighborhoods": "s-1"}, ["option 'neighborhoods'", "s-1"]),
-    ("radius of 1e9 m", FEATURES, {"neighborhoods": "c1000000000"}, ["option 'neighborhoods'", "c1000000000"]),
+    (
+        "radius of 1e9 m",
+        FEATURES,
+        {"neighborhoods": "c1000000000"},
+        ["option 'neighborhoods'", "c1000000000"],
+    ),
     ("unit in a radius", FEATURES, {"neighborhoods": "c2m"}, ["option 'neighborhoods'", "c2m"]),
     ("number for a neighborhood", FEATURES, {"neighborhoods": 5}, ["option 'neighborhoods'", "5"]),
     ("unknown feature", FEATURES, {"feature_set": "Linarity"}, ["option 'feature_set'", "Linearity"]),
@@ -81,7 +101,12 @@ WRONG = [
     ("share of 2", TRAIN, {"filename": "m", "max_samples": 2}, ["option 'max_samples'", "at most 1"]),
     ("no file name", TRAIN, {}, ["option 'filename' is required"]),
     ("empty file name", TRAIN, {"filename": ""}, ["option 'filename' is empty"]),
-    ("model in a folder that is not there", TRAIN, {"filename": "no/such/m"}, ["folder", "does not exist", "Create it"]),
+    (
+        "model in a folder that is not there",
+        TRAIN,
+        {"filename": "no/such/m"},
+        ["folder", "does not exist", "Create it"],
+    ),
     ("model named as a folder", TRAIN, {"filename": "."}, ["names a folder"]),
     ("accuracy of no class", ACCURACY, {"classes": "ground"}, ["ground"]),
     ("merge that is no mapping", ACCURACY, {"merge": [5]}, ["option 'merge' must be a mapping"]),
@@ -92,8 +117,15 @@ WRONG = [
 @pytest.mark.parametrize(("case", "stage", "options", "says"), WRONG, ids=[row[0] for row in WRONG])
 def test_wrong_options(cell, tmp_path, monkeypatch, case, stage, options, says):
     monkeypatch.chdir(tmp_path)
-    path = job(tmp_path, "in.las", {"type": stage, "tag": "t", **options}, {"type": "writers.las", "filename": "o.las"})
-    message = cell("Options", case).refused(["pipeline", path], f"job.json, line 3: {stage} (tag 't'):", *says)
+    path = job(
+        tmp_path,
+        "in.las",
+        {"type": stage, "tag": "t", **options},
+        {"type": "writers.las", "filename": "o.las"},
+    )
+    message = cell("Options", case).refused(
+        ["pipeline", path], f"job.json, line 3: {stage} (tag 't'):", *says
+    )
     # The objects of python-pdal say the same, without the file.
     family, _, name = stage.partition(".")
     with pytest.raises(StageError) as caught:
@@ -131,14 +163,20 @@ def test_wrong_stages(cell, tmp_path, monkeypatch, cloud, case, stages, says):
     monkeypatch.chdir(tmp_path)
     path = job(tmp_path, str(cloud), *stages, {"type": "writers.las", "filename": "o.las"})
     if says is None:
-        done = cell("Options", case).runs(["pipeline", path], "a warning: 'where' holds for none of the 600 points")
+        done = cell("Options", case).runs(
+            ["pipeline", path], "a warning: 'where' holds for none of the 600 points"
+        )
         assert "'where' holds for none of the 600 points: Z > 1e6" in done.err
     else:
         cell("Options", case).refused(["pipeline", path], *says)
 
 
 OVERRIDES = [
-    ("--stage.TAG that matches nothing", ["--stage.hite.cell=5"], ["no stage of the pipeline has the tag 'hite'"]),
+    (
+        "--stage.TAG that matches nothing",
+        ["--stage.hite.cell=5"],
+        ["no stage of the pipeline has the tag 'hite'"],
+    ),
     ("--filters.name that matches nothing", ["--filters.hag_nn.count=5"], ["has the type 'filters.hag_nn'"]),
     ("override without a value", ["--stage.t.cell"], ["has no value", "Write --stage.t.cell=VALUE"]),
     ("override out of range", ["--stage.t.cell=-1"], ["must be more than 0"]),
@@ -195,4 +233,6 @@ RIGHT = [
 def test_right_after_all(cell, tmp_path, monkeypatch, cloud, case, options):
     monkeypatch.chdir(tmp_path)
     path = job(tmp_path, str(cloud), {"type": HAG, **options})
-    cell("Options", case).runs(["expand", path], "is taken: " + ", ".join(f"`{k}`: {v!r}" for k, v in options.items()))
+    cell("Options", case).runs(
+        ["expand", path], "is taken: " + ", ".join(f"`{k}`: {v!r}" for k, v in options.items())
+    )

@@ -23,7 +23,11 @@ def stock(cell, case, pdal_program, folder, pipeline, *says):
     for word in says:
         assert word in text, (word, text)
     text = text.replace("\\'", "'").replace("\\n", "\n")
-    message = text[text.index("pdal_stages.errors.") :].partition(": ")[2] if "pdal_stages.errors." in text else text
+    message = (
+        text[text.index("pdal_stages.base.errors.") :].partition(": ")[2]
+        if "pdal_stages.base.errors." in text
+        else text
+    )
     cell("Clouds", case + ", through stock `pdal pipeline`").note("error", message)
 
 
@@ -33,7 +37,15 @@ def test_errors_through_stock_pdal(cell, tmp_path, pdal_program, cloud, model):
     stock(cell, "NaN in X", pdal_program, tmp_path, ps.Pipeline([{"type": "readers.text", "filename": str(text)}, HAG]).json,
           "not finite", "1 of 2 points")  # fmt: skip
     judge = ps.Pipeline([str(cloud), {"type": "filters.accuracy", "tag": "judge"}]).json
-    stock(cell, "a dimension that is missing", pdal_program, tmp_path, judge, "filters.accuracy (tag", "is missing")
+    stock(
+        cell,
+        "a dimension that is missing",
+        pdal_program,
+        tmp_path,
+        judge,
+        "filters.accuracy (tag",
+        "is missing",
+    )
     plain = json.loads(ps.Pipeline([str(cloud), HAG]).json)
     plain["pipeline"][1]["pdalargs"]["options"]["cell"] = "wide"
     stock(cell, "an option changed by hand", pdal_program, tmp_path, json.dumps(plain), "must be a number")
@@ -64,6 +76,8 @@ def test_arrays_of_python_pdal(cell, pdal_module):
             continue
         assert count == len(array)
         assert np.array_equal(pipeline.arrays[0]["X"], array["X"]), case
-        assert np.allclose(pipeline.arrays[0]["HeightAboveGround"], ps.hag_minima(array["X"], array["Y"], array["Z"]))
+        assert np.allclose(
+            pipeline.arrays[0]["HeightAboveGround"], ps.hag_minima(array["X"], array["Y"], array["Z"])
+        )
         cell("Clouds", case).note("result", "the right heights")
     assert pdal

@@ -1,0 +1,5 @@
+"""How well classes agree with a reference: measures, confidence, text."""
+
+from .measures import Accuracy
+
+__all__ = ["Accuracy"]

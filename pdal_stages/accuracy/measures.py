@@ -1,0 +1,501 @@
+"""Accuracy of a classification against reference labels: confusion matrix and all measures of it.
+
+Measures of [B16] section 4.3 and [W18] section 4.3: overall accuracy, Cohen's kappa, mean class recall
+and precision, per-class recall, precision, F1, and mean F1; intersection over union beside them.
+
+Rules for what is not defined, so that no figure is ever NaN:
+
+- Means are over the classes present in the reference.
+- A class present in the reference that was never predicted has precision 0 and F1 0.
+- A class with no reference points (named in `classes`, or predicted only) has recall None; its
+  precision, where it was predicted, is 0.
+- Kappa is None where chance alone would agree on everything (one class, predicted throughout).
+- A predicted class that is no class of the reference (1 where points were rejected, say) gets a column
+  of its own, and its points count as errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from math import sqrt
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..base.asprs import class_name
+from ..base.errors import StageError
+from .confidence import Grading
+from .labels import (
+    CHUNK,
+    MAX_CLASSES,
+    as_codes,
+    code_list,
+    int_keys,
+    listing,
+    lookup,
+    mask,
+    merging,
+    moved,
+    named,
+    placed,
+    present,
+    same_length,
+)
+
+FORMAT = "pdal-stages accuracy"
+VERSION = 1
+
+
+def wilson(hits: int, n: int, z: float = 1.959964) -> tuple[float, float] | None:
+    """Wilson's score interval of a share (95 % by default); None where n is 0.
+
+    It takes the points as independent. Neighboring points of a scan are not, so the true
+    uncertainty is larger: read it as a lower bound.
+    """
+    if n == 0:
+        return None
+    p = hits / n
+    middle = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+@dataclass(frozen=True)
+class ClassFigures:
+    """The figures of one class; shares are between 0 and 1, None where they are not defined."""
+
+    code: int
+    name: str
+    support: int  #: reference points
+    predicted: int  #: points given this class
+    correct: int
+    recall: float | None
+    precision: float | None
+    f1: float | None
+    iou: float | None
+    recall_interval: tuple[float, float] | None
+    precision_interval: tuple[float, float] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Accuracy:
+    """A confusion matrix and the measures drawn from it.
+
+    Make one with :meth:`from_labels` or :meth:`from_confusion`. Two of them add (tiles), and
+    ``sum(tiles)`` works.
+
+    Attributes
+    ----------
+    classes : tuple of int
+        Codes of the matrix's rows: the classes of the reference, ascending.
+    extra : tuple of int
+        Codes of the columns after those: classes that were predicted but are not in the reference.
+    matrix : (K, K + E) int64
+        Points; rows are the reference, columns the prediction.
+    names : mapping of code to name
+    left_out : mapping of code to count
+        Reference points that were not compared, by their reference class.
+    merged : mapping of code to code
+        Classes that were taken as another one on both sides.
+    reliability, margin : Grading or None
+        How well the two confidences tell right from wrong.
+    """
+
+    classes: tuple[int, ...]
+    extra: tuple[int, ...]
+    matrix: npt.NDArray[np.int64]
+    names: Mapping[int, str] = field(default_factory=dict)
+    left_out: Mapping[int, int] = field(default_factory=dict)
+    reliability: Grading | None = None
+    margin: Grading | None = None
+    merged: Mapping[int, int] = field(default_factory=dict)
+
+    # ---- making one ----------------------------------------------------------------------------------
+
+    @classmethod
+    def from_labels(
+        cls,
+        reference: npt.ArrayLike,
+        predicted: npt.ArrayLike,
+        classes: Iterable[int] | None = None,
+        names: Mapping[int, str] | None = None,
+        ignore: Iterable[int] = (),
+        reliability: npt.ArrayLike | None = None,
+        margin: npt.ArrayLike | None = None,
+        merge: Mapping[Any, Any] | None = None,
+        allow_empty: bool = False,
+    ) -> Accuracy:
+        """Compare two label arrays.
+
+        Parameters
+        ----------
+        reference, predicted : (n,) arrays
+            Class codes, whole numbers from 0 to 65535.
+        classes : iterable of int, optional
+            Classes of the reference to compare; reference points of any other class are left out and
+            counted. By default every class found in the reference.
+        names : mapping, optional
+            Code to name, where it is not ASPRS's own.
+        ignore : iterable of int
+            Reference classes to leave out and count (0 and 1, say).
+        reliability, margin : (n,) arrays, optional
+            Winning probability, and winning minus second, both from 0 to 1.
+        merge : mapping, optional
+            Classes to take as one, on both sides and before `classes` and `ignore` are looked at:
+            ``{5: [3, 4]}`` or ``{3: 5, 4: 5}``.
+        allow_empty : bool
+            Whether no point to compare is allowed (a tile without reference points, to be added to others).
+
+        Raises
+        ------
+        StageError
+            Arrays of different lengths, labels that are no class codes, or nothing left to compare.
+        """
+        ref, pred = as_codes(reference, "reference"), as_codes(predicted, "prediction")
+        same_length(ref, {"prediction": pred})
+        confidences: dict[str, npt.NDArray[Any]] = {}
+        for key, values in (("reliability", reliability), ("margin", margin)):
+            if values is not None:
+                confidences[key] = np.asarray(values).reshape(-1)
+        same_length(ref, confidences)
+
+        to, called = merging(merge)
+        found = present(ref, to)
+        dropped = set(code_list(ignore, "ignore"))
+        wanted = set(code_list(classes, "classes")) if classes is not None else set(found)
+        rows = tuple(sorted(wanted - dropped))
+        left = {code: n for code, n in found.items() if code not in rows}
+        if not allow_empty and sum(found.values()) == sum(left.values()):
+            raise StageError(
+                "no point to compare: every reference point is left out" if left else "no point to compare",
+                found=f"reference classes {listing(found)}" if found else "0 points",
+                cure="Name classes the reference has, or ignore fewer" if left else None,
+            )
+        columns = rows + tuple(sorted(set(present(pred, to, where=mask(ref, to, rows))) - set(rows)))
+        for what, listed in (("reference", rows), ("prediction", columns)):
+            if len(listed) > MAX_CLASSES:
+                raise StageError(
+                    f"the {what} has more different values than a class dimension has",
+                    found=f"{len(listed):,} values",
+                    cure="Check which dimension is compared",
+                )
+
+        row_of, column_of = lookup(rows, to), lookup(columns, to)
+        matrix = np.zeros((len(rows), len(columns)), np.int64)
+        graded = {key: Grading.empty() for key in confidences}
+        for start in range(0, len(ref), CHUNK):
+            part = slice(start, start + CHUNK)
+            i = row_of[ref[part]]
+            kept = i >= 0
+            i, j = i[kept], column_of[pred[part]][kept]
+            matrix += np.bincount(i * len(columns) + j, minlength=matrix.size).reshape(matrix.shape)
+            for key, values in confidences.items():
+                graded[key] += Grading.from_values(values[part][kept], i == j, key)
+        return cls(
+            rows,
+            columns[len(rows) :],
+            matrix,
+            named(columns + tuple(left), {**called, **int_keys(names)}),
+            left,
+            graded.get("reliability"),
+            graded.get("margin"),
+            moved(to),
+        )
+
+    @classmethod
+    def from_confusion(
+        cls,
+        matrix: npt.ArrayLike,
+        classes: Sequence[int],
+        extra: Sequence[int] = (),
+        names: Mapping[int, str] | None = None,
+        left_out: Mapping[int, int] | None = None,
+    ) -> Accuracy:
+        """Take a confusion matrix as it is.
+
+        Parameters
+        ----------
+        matrix : (K, K + E) array of whole numbers
+            Rows are the reference, columns the prediction: `classes` first, then `extra`.
+        classes, extra, names, left_out
+            As in the attributes.
+        """
+        rows, more = code_list(classes, "classes"), code_list(extra, "extra")
+        counts = np.asarray(matrix)
+        if counts.shape != (len(rows), len(rows) + len(more)) or not rows:
+            raise StageError(
+                "the confusion matrix does not fit its classes",
+                found=f"shape {counts.shape} for {len(rows)} classes and {len(more)} extra columns",
+                cure="Give one row per class, and one column per class and extra class",
+            )
+        if len(set(rows + more)) != len(rows) + len(more):
+            raise StageError("a class stands twice in the confusion matrix", found=rows + more)
+        whole = np.array(counts, dtype=np.int64)
+        if (whole != counts).any() or (whole < 0).any():
+            raise StageError("a confusion matrix holds counts: whole numbers of 0 or more")
+        order, tail = np.argsort(rows), np.argsort(more).astype(int) + len(rows)
+        whole = whole[order][:, np.concatenate([order, tail]).astype(int)]
+        left = {int(c): int(n) for c, n in (left_out or {}).items()}
+        codes = tuple(sorted(rows)) + tuple(sorted(more))
+        return cls(
+            codes[: len(rows)], codes[len(rows) :], whole, named(codes + tuple(left), int_keys(names)), left
+        )
+
+    def merge(self, mapping: Mapping[Any, Any], names: Mapping[int, str] | None = None) -> Accuracy:
+        """The accuracy with some classes taken as one: ``{5: [3, 4]}`` or ``{3: 5, 4: 5}``.
+
+        Confusions inside a merged class become right, so the gradings of reliability and margin, which
+        do not know them, are dropped; use `merge` of :meth:`from_labels` to keep them.
+        """
+        to, called = merging(mapping)
+        rows = tuple(sorted({int(to[c]) for c in self.classes}))
+        columns = rows + tuple(sorted({int(to[c]) for c in self.columns} - set(rows)))
+        left: dict[int, int] = {}
+        for code, n in self.left_out.items():
+            left[int(to[code])] = left.get(int(to[code]), 0) + n
+        clash = sorted(set(left) & set(rows))
+        if clash:
+            raise StageError(
+                "merging joins a compared class with one that was left out",
+                found=f"class {clash[0]}",
+                cure="Compare the labels again with this merge",
+            )
+        known = {c: n for c, n in self.names.items() if int(to[c]) == c}
+        return Accuracy(
+            rows,
+            columns[len(rows) :],
+            placed(self.matrix, [to[c] for c in self.classes], [to[c] for c in self.columns], rows, columns),
+            named(columns + tuple(left), {**known, **called, **int_keys(names)}),
+            left,
+            merged={**{c: int(to[t]) for c, t in self.merged.items()}, **moved(to)},
+        )
+
+    def __add__(self, other: Accuracy) -> Accuracy:
+        if not isinstance(other, Accuracy):
+            return NotImplemented
+        rows = tuple(sorted(set(self.classes) | set(other.classes)))
+        columns = rows + tuple(sorted((set(self.columns) | set(other.columns)) - set(rows)))
+        left = {
+            c: self.left_out.get(c, 0) + other.left_out.get(c, 0)
+            for c in sorted(set(self.left_out) | set(other.left_out))
+        }
+        clash = sorted(set(left) & set(rows))
+        if clash:
+            raise StageError(
+                "two accuracies do not add: one compares a class that the other leaves out",
+                found=f"class {clash[0]}",
+                cure="Compare both with the same 'classes' and 'ignore'",
+            )
+        if self.merged != other.merged and self.points and other.points:
+            raise StageError(
+                "two accuracies do not add: they merge different classes",
+                found=f"{dict(self.merged)} and {dict(other.merged)}",
+                cure="Compare both with the same 'merge'",
+            )
+        graded = {}
+        for key in ("reliability", "margin"):
+            a, b = getattr(self, key), getattr(other, key)
+            if a is not None and b is not None:
+                graded[key] = a + b
+            elif a is None and b is None:
+                graded[key] = None
+            else:
+                have, lack = (self, other) if b is None else (other, self)
+                # An empty tile has nothing to grade; anything else would be a curve of only some points.
+                graded[key] = getattr(have, key) if lack.points == 0 else None
+        return Accuracy(
+            rows,
+            columns[len(rows) :],
+            placed(self.matrix, self.classes, self.columns, rows, columns)
+            + placed(other.matrix, other.classes, other.columns, rows, columns),
+            {**other.names, **self.names},
+            left,
+            graded["reliability"],
+            graded["margin"],
+            {**other.merged, **self.merged},
+        )
+
+    def __radd__(self, other: object) -> Accuracy:
+        return self if other == 0 else NotImplemented  # sum() starts with 0
+
+    def __repr__(self) -> str:
+        what = f"overall_accuracy={self.overall_accuracy:.4f}" if self.points else "empty"
+        return f"<Accuracy of {self.points:,} points, classes {list(self.classes)}: {what}>"
+
+    # ---- the matrix ----------------------------------------------------------------------------------
+
+    @property
+    def columns(self) -> tuple[int, ...]:
+        """Codes of the matrix's columns."""
+        return self.classes + self.extra
+
+    @cached_property
+    def points(self) -> int:
+        """Points compared."""
+        return int(self.matrix.sum())
+
+    @cached_property
+    def correct(self) -> int:
+        """Points whose class is right."""
+        return int(np.trace(self.matrix))
+
+    @property
+    def left_out_points(self) -> int:
+        """Points with a reference class that is not compared."""
+        return sum(self.left_out.values())
+
+    @cached_property
+    def extra_points(self) -> int:
+        """Points given a class the reference does not have."""
+        return int(self.matrix[:, len(self.classes) :].sum())
+
+    @cached_property
+    def by_reference(self) -> npt.NDArray[np.float64]:
+        """Each row as shares of the reference class: its diagonal is recall. Empty rows are 0."""
+        total = self.matrix.sum(axis=1, keepdims=True)
+        return np.divide(self.matrix, total, out=np.zeros(self.matrix.shape), where=total > 0)
+
+    @cached_property
+    def by_prediction(self) -> npt.NDArray[np.float64]:
+        """Each column as shares of the predicted class: its diagonal is precision. Empty columns are 0."""
+        total = self.matrix.sum(axis=0, keepdims=True)
+        return np.divide(self.matrix, total, out=np.zeros(self.matrix.shape), where=total > 0)
+
+    # ---- measures ------------------------------------------------------------------------------------
+
+    def _checked(self) -> None:
+        if self.points == 0:
+            raise StageError("no point was compared, so there is no accuracy", found="0 points")
+
+    @property
+    def overall_accuracy(self) -> float:
+        """Share of points whose class is right."""
+        self._checked()
+        return self.correct / self.points
+
+    @property
+    def overall_accuracy_interval(self) -> tuple[float, float]:
+        """Wilson's 95 % interval of the overall accuracy; see :func:`wilson` for what it leaves out."""
+        self._checked()
+        return wilson(self.correct, self.points)  # type: ignore[return-value]
+
+    @property
+    def kappa(self) -> float | None:
+        """Cohen's kappa: agreement beyond chance; None where chance agrees on everything."""
+        self._checked()
+        n, k = self.points, len(self.classes)
+        rows = [int(v) for v in self.matrix.sum(axis=1)]
+        columns = [int(v) for v in self.matrix.sum(axis=0)[:k]]
+        chance = sum(r * c for r, c in zip(rows, columns, strict=True))  # exact whole numbers
+        return (self.correct * n - chance) / (n * n - chance) if chance != n * n else None
+
+    @property
+    def mean_class_recall(self) -> float:
+        """MCR [B16]: the mean of the classes' recall."""
+        return self._mean("recall")
+
+    @property
+    def mean_class_precision(self) -> float:
+        """MCP [B16]: the mean of the classes' precision."""
+        return self._mean("precision")
+
+    @property
+    def mean_f1(self) -> float:
+        """Mean F1 [W18]: the unweighted mean of the classes' F1."""
+        return self._mean("f1")
+
+    @property
+    def mean_iou(self) -> float:
+        """The mean of the classes' intersection over union."""
+        return self._mean("iou")
+
+    def _mean(self, name: str) -> float:
+        self._checked()
+        values = [getattr(f, name) for f in self.per_class if f.support]
+        return float(sum(0.0 if v is None else v for v in values) / len(values))
+
+    @cached_property
+    def per_class(self) -> tuple[ClassFigures, ...]:
+        """The figures of every class of the reference."""
+        figures = []
+        for i, code in enumerate(self.classes):
+            support, given = int(self.matrix[i].sum()), int(self.matrix[:, i].sum())
+            hit = int(self.matrix[i, i])
+            figures.append(
+                ClassFigures(
+                    code=code,
+                    name=self.name(code),
+                    support=support,
+                    predicted=given,
+                    correct=hit,
+                    recall=hit / support if support else None,
+                    precision=hit / given if given else (0.0 if support else None),
+                    f1=2 * hit / (support + given) if support + given else None,
+                    iou=hit / (support + given - hit) if support + given else None,
+                    recall_interval=wilson(hit, support),
+                    precision_interval=wilson(hit, given),
+                )
+            )
+        return tuple(figures)
+
+    @property
+    def recall(self) -> dict[int, float | None]:
+        """Class code to recall (completeness)."""
+        return {f.code: f.recall for f in self.per_class}
+
+    @property
+    def precision(self) -> dict[int, float | None]:
+        """Class code to precision (correctness)."""
+        return {f.code: f.precision for f in self.per_class}
+
+    @property
+    def f1(self) -> dict[int, float | None]:
+        """Class code to F1."""
+        return {f.code: f.f1 for f in self.per_class}
+
+    @property
+    def iou(self) -> dict[int, float | None]:
+        """Class code to intersection over union."""
+        return {f.code: f.iou for f in self.per_class}
+
+    @property
+    def support(self) -> dict[int, int]:
+        """Class code to reference points."""
+        return {f.code: f.support for f in self.per_class}
+
+    def confusions(self, most: int | None = None) -> list[tuple[int, int, int]]:
+        """The errors, largest first: (reference class, predicted class, points)."""
+        k = len(self.classes)
+        wrong = self.matrix.copy()
+        wrong[np.arange(k), np.arange(k)] = 0
+        i, j = np.nonzero(wrong)
+        order = np.argsort(-wrong[i, j], kind="stable")[:most]
+        pairs = zip(i[order], j[order], strict=True)
+        return [(self.classes[a], self.columns[b], int(wrong[a, b])) for a, b in pairs]
+
+    def name(self, code: int) -> str:
+        """A class's name."""
+        return self.names.get(code) or class_name(code)
+
+    # ---- output --------------------------------------------------------------------------------------
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as JSON types; ``accuracy-1.json`` describes it."""
+        from .text import as_dict
+
+        return as_dict(self)
+
+    def table(self, confusion: str = "by_reference") -> str:
+        """The figures as aligned text, in percent.
+
+        Parameters
+        ----------
+        confusion : {"by_reference", "by_prediction", "counts", "none"}
+            How the confusion matrix is given.
+        """
+        from .text import as_table
+
+        return as_table(self, confusion)

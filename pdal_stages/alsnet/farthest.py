@@ -1,0 +1,192 @@
+"""Kernels of the set abstraction: farthest point sampling, ball query, three nearest.
+
+None holds a matrix of all distances. Results depend on the order of the points only where distances are exactly
+equal (the smaller index wins); callers put the points in an order that follows from their coordinates.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from ..base.jit import njit
+
+#: Points of a bucket of the farthest point sampling.
+BUCKET = 64
+
+
+def farthest_points(xyz: npt.NDArray[np.float64], count: int, start: int = 0) -> npt.NDArray[np.int64]:
+    """Farthest point sampling: each point chosen is the one farthest from those already chosen.
+
+    Exact. Points are kept in buckets that follow a space-filling curve; a bucket whose box is farther from the
+    new point than its own farthest point cannot change and is passed over (the idea of QuickFPS, Han et al. 2023).
+
+    Parameters
+    ----------
+    xyz : (n, 3) float64
+    count : int
+        How many; at most n.
+    start : int
+        The first one.
+
+    Returns
+    -------
+    (count,) int64
+        Indices in the order they were chosen, each once (points that coincide included).
+    """
+    n = len(xyz)
+    if not 0 < count <= n or not 0 <= start < n:
+        raise ValueError(f"{count} of {n} points from {start}")
+    low = xyz.min(axis=0)
+    span = float((xyz.max(axis=0) - low).max())
+    cells = ((xyz - low) * (1023.0 / span if span > 0 else 0.0)).astype(np.int64)
+    order = np.argsort(_interleave(cells), kind="stable")
+    return _farthest(np.ascontiguousarray(xyz[order]), order, count, int(np.flatnonzero(order == start)[0]))
+
+
+def _interleave(cells: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Morton code of three 10-bit numbers."""
+    out = np.zeros(len(cells), np.int64)
+    for axis in range(3):
+        v = cells[:, axis]
+        for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
+            v = (v | (v << shift)) & mask
+        out |= v << axis
+    return out
+
+
+@njit
+def _farthest(p, order, count, first):
+    n = len(p)
+    buckets = (n + BUCKET - 1) // BUCKET
+    far = np.full(n, np.inf)
+    low = np.empty((buckets, 3))
+    high = np.empty((buckets, 3))
+    best = np.full(buckets, np.inf)
+    place = np.empty(buckets, np.int64)
+    for b in range(buckets):
+        lo, hi = b * BUCKET, min(n, (b + 1) * BUCKET)
+        place[b] = lo
+        for axis in range(3):
+            low[b, axis] = high[b, axis] = p[lo, axis]
+            for i in range(lo + 1, hi):
+                low[b, axis] = min(low[b, axis], p[i, axis])
+                high[b, axis] = max(high[b, axis], p[i, axis])
+    out = np.empty(count, np.int64)
+    now = first
+    for k in range(count):
+        out[k] = order[now]
+        far[now] = -1.0  # never chosen again, even where points coincide
+        x, y, z = p[now, 0], p[now, 1], p[now, 2]
+        own = now // BUCKET
+        top, at = -2.0, 0
+        for b in range(buckets):
+            dx = max(low[b, 0] - x, x - high[b, 0], 0.0)
+            dy = max(low[b, 1] - y, y - high[b, 1], 0.0)
+            dz = max(low[b, 2] - z, z - high[b, 2], 0.0)
+            if b == own or dx * dx + dy * dy + dz * dz < best[b]:
+                value, where = -2.0, 0
+                for i in range(b * BUCKET, min(n, (b + 1) * BUCKET)):
+                    dx, dy, dz = p[i, 0] - x, p[i, 1] - y, p[i, 2] - z
+                    d = dx * dx + dy * dy + dz * dz
+                    if d < far[i]:
+                        far[i] = d
+                    if far[i] > value or (far[i] == value and order[i] < order[where]):
+                        value, where = far[i], i
+                best[b], place[b] = value, where
+            if best[b] > top or (best[b] == top and order[place[b]] < order[at]):
+                top, at = best[b], place[b]
+        now = at
+    return out
+
+
+def ball_query(
+    xyz: npt.NDArray[np.float64], centres: npt.NDArray[np.int64], radius: float, samples: int
+) -> npt.NDArray[np.int32]:
+    """The first `samples` points, by index, within `radius` of each centre.
+
+    A centre is within its own ball, so none is empty. A ball with fewer points repeats its first one, which a
+    maximum over the ball does not notice (as PointNet++ does).
+
+    Parameters
+    ----------
+    xyz : (n, 3) float64
+    centres : (m,) int64
+        Rows of `xyz`.
+    radius : float
+        Points at exactly this distance count.
+    samples : int
+
+    Returns
+    -------
+    (m, samples) int32
+    """
+    low = xyz[:, :2].min(axis=0)
+    span = float((xyz[:, :2].max(axis=0) - low).max())
+    cell = max(radius, span / 1024.0)
+    column = np.floor((xyz[:, :2] - low) / cell).astype(np.int64)
+    width, height = (int(c) + 1 for c in column.max(axis=0))
+    key = column[:, 1] * width + column[:, 0]
+    order = np.argsort(key, kind="stable")
+    start = np.searchsorted(key[order], np.arange(width * height + 1))
+    return _ball(
+        np.ascontiguousarray(xyz), centres, column, order, start, width, height, float(radius), samples
+    )
+
+
+@njit
+def _ball(p, centres, column, order, start, width, height, radius, samples):
+    out = np.empty((len(centres), samples), np.int32)
+    limit = radius * radius
+    for m in range(len(centres)):
+        c = centres[m]
+        count = 0
+        cx, cy = column[c, 0], column[c, 1]
+        row = out[m]
+        for iy in range(max(cy - 1, 0), min(cy + 2, height)):
+            lo, hi = start[iy * width + max(cx - 1, 0)], start[iy * width + min(cx + 1, width - 1) + 1]
+            for j in range(lo, hi):
+                i = order[j]
+                if count == samples and i >= row[count - 1]:
+                    continue
+                dx, dy, dz = p[i, 0] - p[c, 0], p[i, 1] - p[c, 1], p[i, 2] - p[c, 2]
+                if dx * dx + dy * dy + dz * dz > limit:
+                    continue
+                at = count if count < samples else samples - 1
+                while at > 0 and row[at - 1] > i:
+                    row[at] = row[at - 1]
+                    at -= 1
+                row[at] = i
+                if count < samples:
+                    count += 1
+        for k in range(count, samples):
+            row[k] = row[0]
+    return out
+
+
+def three_nearest(
+    xyz: npt.NDArray[np.float64], coarse: npt.NDArray[np.float64]
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
+    """The three nearest coarse points of each point, and weights by inverse squared distance.
+
+    Parameters
+    ----------
+    xyz : (n, 3) float64
+    coarse : (m, 3) float64
+
+    Returns
+    -------
+    index : (n, 3) int32
+    weight : (n, 3) float32
+        They sum to 1. Where there are fewer than three coarse points the rest weigh nothing.
+    """
+    from scipy.spatial import cKDTree
+
+    k = min(3, len(coarse))
+    distance, near = cKDTree(coarse).query(xyz, k=[1, 2, 3][:k])
+    index = np.zeros((len(xyz), 3), np.int32)
+    weight = np.zeros((len(xyz), 3))
+    index[:, :k] = near
+    weight[:, :k] = 1.0 / np.maximum(distance * distance, 1e-10)
+    weight /= weight.sum(axis=1, keepdims=True)
+    return index, weight.astype(np.float32)

@@ -1,0 +1,114 @@
+"""From labelled clouds to a model with a network in it: what ``classifier.train`` does for ``alsnet``."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..base.errors import OptionError
+from ..base.version import __version__
+from ..classifier.clouds import TrainingCloud, class_positions
+from ..classifier.dimensions import gather
+from ..classifier.model import Model
+from ..classifier.trainoptions import TrainingOptions
+from ..features.index import check_xyz
+from .epochs import LabelledCloud, train_network
+
+
+def train_model(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool = True) -> Model:
+    """Train a network and wrap it as a model.
+
+    Parameters
+    ----------
+    clouds : sequence of TrainingCloud
+        A batch sees only its own cloud.
+    options : TrainingOptions
+        With ``algorithm="alsnet"``.
+    progress : bool
+    """
+    from .network import torch  # before any work: says what to install where it is missing
+
+    started = time.perf_counter()
+    network = options.alsnet
+    inputs = input_names(network.coordinates, options.dimensions)
+    checked = [check_xyz(np.asarray(cloud.xyz), cloud.name) for cloud in clouds]
+    classes, positions = class_positions(clouds, options)
+    labelled: list[LabelledCloud] = []
+    notes: dict[str, int] = {}
+    for cloud, xyz, position in zip(clouds, checked, positions, strict=True):
+        values, counted = gather(inputs, cloud.dimensions, len(xyz), where=cloud.name)
+        for name, number in counted.items():
+            notes[name] = notes.get(name, 0) + number
+        labelled.append(LabelledCloud(xyz, position, values))
+    trained = train_network(
+        labelled, inputs, classes, network, seed=options.seed, threads=options.threads, progress=progress
+    )
+    used = [np.bincount(p[p >= 0], minlength=len(classes.codes)) for p in positions]
+    count = np.sum(used, axis=0)
+    low, high = zip(*(_range(name, labelled) for name in inputs), strict=True)
+    info: dict[str, Any] = {
+        "strategy": options.strategy,
+        "target": options.target,
+        "background": options.background if options.strategy == "binary" else None,
+        "classes": [
+            {
+                "code": code,
+                "name": name,
+                "labels": list(labels),
+                "available": int(m),
+                "samples": int(m),
+                "duplicates": 0,
+            }
+            for code, name, labels, m in zip(classes.codes, classes.names, classes.labels, count, strict=True)
+        ],
+        "training": {
+            "clouds": [{"name": os.path.basename(c.name), "points": len(c.xyz)} for c in clouds],
+            "count": int(count.sum()),
+            "seed": options.seed,
+            "samples": int(count.sum()),
+            **trained.notes,
+            **{name: number for name, number in notes.items() if number},
+        },
+        "percentiles": {"low": list(low), "high": list(high), "limited": False},
+        "accuracy": {"out_of_bag": None, "cross_validation": None},
+        "importances": None,
+        "created_by": {
+            "pdal_stages": __version__,
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            "torch": str(torch.__version__),
+        },
+    }
+    seconds = {**trained.seconds, "whole": round(time.perf_counter() - started, 3)}
+    plan = trained.net.plan
+    pairs = list(zip(classes.codes, classes.names, strict=True))
+    return Model(plan, trained.net, pairs, None, None, options.seed, info, seconds)
+
+
+def input_names(coordinates: str, dimensions: Sequence[str]) -> tuple[str, ...]:
+    """The network's inputs: coordinates from the batch's centre, then dimensions.
+
+    Raises
+    ------
+    OptionError
+        There are none.
+    """
+    names = tuple(dict.fromkeys([*coordinates, *dimensions]))
+    if not names:
+        raise OptionError(
+            "a network needs at least one input", cure="Name a dimension, or set 'coordinates' to Z or XYZ"
+        )
+    return names
+
+
+def _range(name: str, clouds: Sequence[LabelledCloud]) -> tuple[float, float]:
+    """Smallest and largest value of an input; 0 and 0 for coordinates, which depend on the batch."""
+    if name in ("X", "Y", "Z"):
+        return 0.0, 0.0
+    parts = [np.asarray(cloud.dimensions[name], np.float64) for cloud in clouds if len(cloud.xyz)]
+    return min(float(part.min()) for part in parts), max(float(part.max()) for part in parts)

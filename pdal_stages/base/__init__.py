@@ -1,0 +1,1 @@
+"""What every room stands on: errors, checks, files, LAS headers, threads, progress, units."""

@@ -1,0 +1,257 @@
+"""LAS and LAZ headers, looked at before PDAL reads the file and after it wrote one.
+
+PDAL reads a file that is cut short as if it were whole, giving points made of nothing, and some damaged headers
+end the process. What a header says is therefore held against the size of the file first.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from .errors import StageError
+
+#: Bytes of a point of each format, without extra bytes (LAS 1.4 R15, tables 7 to 18).
+POINT_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
+_CURE = "Get the file again from its source, or repair it with a tool made for that (e.g. lasinfo -repair)"
+
+
+@dataclass(frozen=True)
+class LasHeader:
+    """What a header says of the size of its file.
+
+    Attributes
+    ----------
+    minor, point_format, point_bytes : int
+    compressed : bool
+    header_bytes, offset : int
+        Size of the header, and where points (or LAZ chunks) begin.
+    records, records_after : int
+        Variable-length records before and after the points.
+    count : int
+    scales, offsets : tuple of float
+    texts : dict
+        The texts of the header, as bytes.
+    """
+
+    minor: int
+    point_format: int
+    point_bytes: int
+    compressed: bool
+    header_bytes: int
+    offset: int
+    records: int
+    records_after: int
+    count: int
+    scales: tuple[float, ...]
+    offsets: tuple[float, ...]
+    texts: dict[str, bytes]
+
+    @property
+    def end_of_points(self) -> int:
+        """Bytes a file that is not compressed must have."""
+        return self.offset + self.count * self.point_bytes
+
+
+def read_header(path: str | os.PathLike) -> LasHeader | None:
+    """The header of a LAS or LAZ file; None where the file is too short for one, or is something else."""
+    with open(path, "rb") as file:
+        head = file.read(375)
+    if len(head) < 227 or head[:4] != b"LASF":
+        return None
+    size, offset, records, kind, length, count = struct.unpack_from("<HIIBHI", head, 94)
+    minor, after = head[25], 0
+    if minor >= 4 and size >= 375 and len(head) >= 255:
+        after, count = struct.unpack_from("<IQ", head, 243)
+    numbers = struct.unpack_from("<6d", head, 131)
+    texts = {
+        "system identifier": head[26:58].split(b"\0")[0],
+        "generating software": head[58:90].split(b"\0")[0],
+    }
+    return LasHeader(
+        minor, kind & 0x3F, length, bool(kind & 0xC0), size, offset, records, after, count, numbers[:3], numbers[3:], texts
+    )  # fmt: skip
+
+
+def check_readable(path: str | os.PathLike) -> str | None:
+    """Refuse a LAS or LAZ file whose header cannot be right; a remark where it only looks odd.
+
+    Raises
+    ------
+    StageError
+        What is wrong with the file; files that cannot be opened are left to PDAL.
+    """
+    try:
+        size = Path(path).stat().st_size
+        header = read_header(path)
+        table = _chunk_table(path, size, header) if header is not None and header.compressed else 0
+    except (OSError, ValueError):
+        return None
+    if header is None:
+        raise StageError(
+            "this is no LAS file", where=str(path), found=f"{size:,} bytes without a LAS header", cure=_CURE
+        )
+    wrong = _what_is_wrong(header, size, table)
+    if wrong:
+        raise StageError(f"the LAS file is damaged: {wrong[0]}", where=str(path), found=wrong[1], cure=_CURE)
+    beyond = size - header.end_of_points
+    if not header.compressed and header.minor <= 2 and beyond >= header.point_bytes:
+        return (
+            f"{path}: the file holds {beyond:,} bytes beyond the {header.count:,} points that its header counts; "
+            "they are not read"
+        )
+    return None
+
+
+def _what_is_wrong(header: LasHeader, size: int, table: int) -> tuple[str, str] | None:
+    if header.minor > 5:
+        return "its version is not known", f"LAS 1.{header.minor}"
+    if header.point_format >= len(POINT_BYTES):
+        return "its point format is not known", f"point format {header.point_format}"
+    least = POINT_BYTES[header.point_format]
+    if header.point_bytes < least:
+        return (
+            "its points are shorter than their format",
+            f"{header.point_bytes} bytes, format {header.point_format} has {least}",
+        )
+    if header.header_bytes < 227 or not header.header_bytes <= header.offset:
+        return (
+            "its points begin inside the header",
+            f"header of {header.header_bytes} bytes, points at {header.offset}",
+        )
+    if header.records * 54 > header.offset - header.header_bytes:
+        return (
+            "it counts more records than there is room for",
+            f"{header.records:,} records before the points",
+        )
+    if not all(math.isfinite(v) and v != 0 for v in header.scales) or not all(
+        map(math.isfinite, header.offsets)
+    ):
+        return "its scales or offsets are no numbers", f"scales {header.scales}, offsets {header.offsets}"
+    if header.count and header.offset > size:
+        return "it is cut short", f"{size:,} bytes, points begin at {header.offset:,}"
+    if header.compressed:
+        if header.count and not header.offset + 8 <= table <= size - 8:
+            return "it is cut short", f"{size:,} bytes, its table of chunks should be at {table:,}"
+    elif header.end_of_points > size:
+        held = max(0, size - header.offset) // header.point_bytes
+        return "it is cut short", f"{held:,} whole points, its header counts {header.count:,}"
+    return None
+
+
+def is_short(path: str | os.PathLike, size: int) -> bool | None:
+    """Whether a file just written ends before its points do; None where it is no LAS file."""
+    header = read_header(path)
+    if header is None:
+        return True if size < 227 else None
+    if not header.compressed:
+        # The count is written last: none of it, but points and no records after them, is a header left behind.
+        unfinished = (
+            not header.count and not header.records_after and size >= header.offset + header.point_bytes
+        )
+        return unfinished or header.end_of_points > size
+    return bool(header.count) and not header.offset + 8 <= _chunk_table(path, size, header) <= size - 8
+
+
+def supersede_copc(path: str | os.PathLike) -> bool:
+    """Mark COPC records that do not describe this file, which PDAL forwards from a COPC input with the others.
+
+    Readers of COPC would look for an octree where there is none. The records get the id with which LAS 1.4 (R15,
+    section 2.5, "Superseded") negates a record in place.
+
+    Returns
+    -------
+    bool
+        Whether there were any.
+    """
+    header = read_header(path) if Path(path).suffix.lower() in (".las", ".laz") else None
+    if header is None:
+        return False
+    with open(path, "r+b") as file:
+        copc = [r for r in _records(file, header) if r.user == b"copc"]
+        if not copc:
+            return False
+        root = None
+        for record in copc:
+            if record.number == 1 and record.length >= 48:
+                file.seek(record.data + 40)
+                (root,) = struct.unpack("<Q", file.read(8))
+        if any(r.after and root is not None and 0 <= root - r.data < r.length for r in copc):
+            return False
+        for record in copc:
+            file.seek(record.place + 2)
+            file.write(_SUPERSEDED)
+    return True
+
+
+#: User and record id of a record that no longer counts.
+_SUPERSEDED = b"LASF_Spec".ljust(16, b"\0") + struct.pack("<H", 7)
+
+
+class _Record(NamedTuple):
+    """A variable-length record: where its head is, whose it is, where its data are; `after` the points or before."""
+
+    place: int
+    user: bytes
+    number: int
+    title: bytes
+    data: int
+    length: int
+    after: bool
+
+
+def _records(file: BinaryIO, header: LasHeader) -> Iterator[_Record]:
+    """The records of a file, as far as they are all there."""
+    place = header.header_bytes
+    for index in range(header.records + header.records_after):
+        after = index >= header.records
+        if index == header.records:
+            file.seek(235)
+            (place,) = struct.unpack("<Q", file.read(8))
+        size = 60 if after else 54
+        file.seek(place)
+        head = file.read(size)
+        if len(head) < size:
+            return
+        (number,) = struct.unpack_from("<H", head, 18)
+        (length,) = struct.unpack_from("<Q" if after else "<H", head, 20)
+        user, title = head[2:18].split(b"\0")[0], head[size - 32 :].split(b"\0")[0]
+        yield _Record(place, user, number, title, place + size, length, after)
+        place += size + length
+
+
+def _chunk_table(path: str | os.PathLike, size: int, header: LasHeader) -> int:
+    """Where a LAZ file's table of chunks is, which is written last; -1 where that is not in the file."""
+    with open(path, "rb") as file:
+        file.seek(header.offset)
+        place = file.read(8)
+        if len(place) == 8 and place == b"\xff" * 8:  # a stream that could not be rewound has it at its end
+            file.seek(size - 8)
+            place = file.read(8)
+    return struct.unpack("<q", place)[0] if len(place) == 8 else -1
+
+
+def odd_text(path: str | os.PathLike) -> tuple[str, bytes] | None:
+    """A text of the header or of a record's head that is not UTF-8: (what, bytes)."""
+    try:
+        header = read_header(path)
+        if header is None:
+            return None
+        texts = list(header.texts.items())
+        with open(path, "rb") as file:
+            for record in islice(_records(file, header), min(header.records, 1000)):
+                texts += [("description of a record", record.title), ("user of a record", record.user)]
+    except (OSError, ValueError):
+        return None
+    for what, text in texts:
+        try:
+            text.decode()
+        except UnicodeDecodeError:
+            return what, text
+    return None

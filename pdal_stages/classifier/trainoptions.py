@@ -1,0 +1,221 @@
+"""Options of training, checked once, before any work is done."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from ..base.errors import OptionError
+from ..base.threads import resolve_threads
+
+STRATEGIES = ("multiclass", "binary")
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """How a model is trained.
+
+    Attributes
+    ----------
+    neighborhoods : str or sequence of str
+        Preset or tokens, as for features.
+    feature_set : str or sequence of str
+        Which features, as for features. The default adds to the papers' the height above the lowest point of each
+        neighborhood [HWS16], which tells low vegetation from sloping ground: on held-out training tiles it brings
+        1.5 per cent of overall accuracy and 5 of mean F1 (docs/benchmarks.md).
+    dimensions : sequence of str
+        Dimensions of the points used as features beside the geometric ones. HeightAboveGround alone by
+        default: Intensity depends on sensor, flying height and calibration, and return numbers
+        on the sensor, so a model that uses them seldom fits another flight. ``ReturnRatio`` is
+        ReturnNumber / NumberOfReturns.
+    classes : None, str, sequence of int or mapping
+        Labels and what they become; see ``ClassMap.parse``.
+    strategy : {"multiclass", "binary"}
+        All classes, or `target` against all the others, which become `background`.
+    target, background : int
+        Codes of the binary strategy.
+    count : int
+        Samples of each class. A class with fewer points has them counted several times.
+    seed : int
+        Seed of everything random: sampling, bootstrap, splits, shape distributions.
+    trees, max_depth, min_samples_leaf : int, or a list of values to search (grid search)
+        `max_depth` None or 0: unlimited.
+    max_samples : float
+        Size of each tree's bootstrap sample, as a share of all samples.
+    max_features : "auto", "sqrt", "log2", int or float
+        Features tried at a split; a float is a share of them. Auto: a tenth, but at least the square root.
+    prior_weight : float
+        0: classes are taken as equally frequent, as they are sampled; rare ones are then called too often.
+        1: as frequent as in the training clouds; rare ones are then hardly called at all. Between: each class's
+        probability is multiplied by its frequency to this power. The default lies between what suits new ground
+        (held-out tiles gain up to 0.3 and more) and held-out blocks amid the training points (0 to 0.1).
+    scale : bool
+        Limit features to the 1st and 99th percentile of the samples, from 0 where the smallest value is 0
+        [B16 3.3].
+    folds : int
+        Folds of the spatial cross-validation; 0: none (5 where there is a grid to search).
+    block_size : float
+        Side of the cross-validation's blocks in metres.
+    gap : float or None
+        Training samples nearer than this (metres, in plan) to a validation sample are left out of that fold.
+        None: the largest radius of the neighborhoods.
+    algorithm : {"random_forest", "alsnet"}
+        A forest on features, or a network on the points themselves [WM19], which uses `dimensions`, `classes`,
+        `strategy`, `seed` and `threads` of these options and all of `alsnet`.
+    alsnet : mapping or NetworkOptions, optional
+        How the network is trained; see :class:`pdal_stages.alsnet.NetworkOptions`.
+    threads : int or None
+    memory_mb : float
+        For blocks of features under way; the matrix of all samples comes on top.
+    """
+
+    neighborhoods: Any = "weinmann2018"
+    feature_set: Any = ("all", "HeightAboveLowest")
+    dimensions: Sequence[str] = ("HeightAboveGround",)
+    classes: Any = None
+    strategy: str = "multiclass"
+    target: int | None = None
+    background: int = 1
+    count: int = 10_000
+    seed: int = 0
+    trees: int | Sequence[int] = 100
+    max_depth: int | Sequence[int | None] | None = None
+    min_samples_leaf: int | Sequence[int] = 1
+    max_samples: float = 1.0
+    max_features: str | int | float = "auto"
+    prior_weight: float = 0.2
+    scale: bool = True
+    folds: int = 0
+    block_size: float = 25.0
+    gap: float | None = None
+    algorithm: str = "random_forest"
+    alsnet: Any = None
+    threads: int | None = None
+    memory_mb: float = 512.0
+
+    def __post_init__(self) -> None:
+        set_ = object.__setattr__
+        for name, low, high in (("count", 1, 10**8), ("seed", 0, 2**63 - 1), ("folds", 0, 1000)):
+            set_(self, name, _whole(name, getattr(self, name), low, high))
+        for name, low, high in (("trees", 1, 10_000), ("min_samples_leaf", 1, 10**6)):
+            _values(name, getattr(self, name), low, high)
+        _values("max_depth", self.max_depth, 1, 10_000, none=True)
+        if self.folds == 1:
+            raise OptionError("'folds' must be 0 or at least 2", found=1)
+        if self.strategy not in STRATEGIES:
+            raise OptionError(
+                "'strategy' is not known",
+                found=repr(self.strategy),
+                cure=f"Choose one of {', '.join(STRATEGIES)}",
+            )
+        self._check_algorithm()
+        if self.strategy == "binary" and self.target is None:
+            raise OptionError("the binary strategy needs 'target', the code of the class to find")
+        if self.strategy == "multiclass" and self.target is not None:
+            raise OptionError("'target' means something only with strategy 'binary'", found=self.target)
+        if self.target is not None:
+            set_(self, "target", _whole("target", self.target, 0, 255))
+        set_(self, "background", _whole("background", self.background, 0, 255))
+        _number("max_samples", self.max_samples, 0.0, 1.0)
+        _number("block_size", self.block_size, 0.0, 1e6)
+        _number("memory_mb", self.memory_mb, 0.0, 1e9)
+        if self.prior_weight != 0:
+            _number("prior_weight", self.prior_weight, 0.0, 1.0)
+        if self.gap is not None and self.gap != 0:
+            _number("gap", self.gap, 0.0, 1e6)
+        m = self.max_features
+        if isinstance(m, str):
+            good = m in ("auto", "sqrt", "log2")
+        elif isinstance(m, float | np.floating):
+            good = 0.0 < m <= 1.0
+        else:
+            good = isinstance(m, int | np.integer) and not isinstance(m, bool) and m >= 1
+        if not good:
+            raise OptionError(
+                "'max_features' must be auto, sqrt, log2, a number of features, or a share up to 1.0",
+                found=repr(m),
+            )
+        names = self.dimensions
+        names = (
+            tuple(part.strip() for part in names.split(",") if part.strip())
+            if isinstance(names, str)
+            else names
+        )
+        if not all(isinstance(name, str) for name in names):
+            raise OptionError("'dimensions' must be a list of names", found=repr(self.dimensions))
+        set_(self, "dimensions", tuple(dict.fromkeys(names)))
+        if not isinstance(self.scale, bool):
+            raise OptionError("'scale' must be true or false", found=repr(self.scale))
+        resolve_threads(self.threads)
+
+    def _check_algorithm(self) -> None:
+        from .algorithms import ALGORITHMS
+
+        if self.algorithm not in ALGORITHMS:
+            raise OptionError(
+                "'algorithm' is not known",
+                found=repr(self.algorithm),
+                cure=f"Choose one of {', '.join(ALGORITHMS)}",
+            )
+        if self.alsnet and self.algorithm != "alsnet":
+            raise OptionError("'alsnet' means something only with algorithm 'alsnet'", found=self.algorithm)
+        if self.algorithm == "alsnet":
+            from ..alsnet.networkoptions import NetworkOptions
+
+            if self.alsnet is not None and not isinstance(self.alsnet, Mapping | NetworkOptions):
+                raise OptionError("'alsnet' must be a mapping of options", found=repr(self.alsnet)[:60])
+            if not isinstance(self.alsnet, NetworkOptions):
+                object.__setattr__(self, "alsnet", NetworkOptions.from_dict(self.alsnet or {}))
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> TrainingOptions:
+        """Options by name; an unknown name is an error."""
+        from ..base.errors import suggest
+
+        known = [f.name for f in fields(cls)]
+        for name in values:
+            if name not in known:
+                raise OptionError(f"unknown training option '{name}'", cure=suggest(name, known))
+        return cls(**values)
+
+    def candidates(self) -> list[dict[str, Any]]:
+        """Every combination of `max_depth` and `min_samples_leaf` to search."""
+        return [
+            {"max_depth": depth, "min_samples_leaf": leaf}
+            for depth in _values("max_depth", self.max_depth, 1, 10_000, none=True)
+            for leaf in _values("min_samples_leaf", self.min_samples_leaf, 1, 10**6)
+        ]
+
+    def tree_counts(self) -> list[int]:
+        """Numbers of trees to search, ascending."""
+        return sorted(set(_values("trees", self.trees, 1, 10_000)))
+
+    @property
+    def searches(self) -> bool:
+        """Whether there is more than one combination to try."""
+        return len(self.candidates()) * len(self.tree_counts()) > 1
+
+
+def _whole(name: str, value: Any, low: int, high: int) -> int:
+    good = isinstance(value, int | np.integer | float | np.floating) and not isinstance(value, bool)
+    if not good or not math.isfinite(value) or int(value) != value or not low <= value <= high:
+        raise OptionError(f"'{name}' must be a whole number from {low} to {high}", found=repr(value))
+    return int(value)
+
+
+def _number(name: str, value: Any, above: float, high: float) -> None:
+    good = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    if not good or not above < value <= high:  # NaN fails too
+        raise OptionError(f"'{name}' must be more than {above:g} and at most {high:g}", found=repr(value))
+
+
+def _values(name: str, value: Any, low: int, high: int, none: bool = False) -> list[Any]:
+    """One value or a list of them, each a whole number (or unlimited: None or 0)."""
+    many = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]
+    if not many:
+        raise OptionError(f"'{name}' is an empty list", cure="Give a number")
+    return [None if none and (v is None or v == 0) else _whole(name, v, low, high) for v in many]

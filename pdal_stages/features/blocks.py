@@ -1,0 +1,249 @@
+"""One pass of an engine over queries: sorted like the cloud, cut into blocks, computed by threads."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..base.errors import DimensionError, OptionError, StageError
+from ..base.progress import Progress
+from ..base.threads import map_blocks, resolve_threads
+from .plan import FeaturePlan
+
+if TYPE_CHECKING:
+    from .engine import FeatureEngine
+
+#: Estimated nanoseconds a block may take on one core: Ctrl-C waits for the blocks in work.
+BLOCK_NS = 1.5e8
+
+#: Rows of a block, whatever the memory allows; bytes of a row besides its features.
+MOST_ROWS = 65_536
+ROW_BYTES = 1_000
+
+#: What makes a dimension that is asked for and missing.
+MAKERS = {
+    "HeightAboveGround": "Put filters.hag_minima before this stage; in Python, hag_minima(x, y, z) makes it"
+}
+
+
+class Run:
+    """One pass over queries: sorted like the cloud, cut into blocks."""
+
+    def __init__(self, engine: FeatureEngine, queries, dimensions, threads, memory_mb) -> None:
+        self.engine = engine
+        self.indices, coordinates = _queries(queries, engine._cloud)
+        count = len(engine) if coordinates is None else len(coordinates)
+        self.dimensions = _dimensions(engine.plan, dimensions, count)
+        if coordinates is None:
+            self.grid = engine._grid
+        else:
+            from .index import build_grid
+
+            self.grid = build_grid(coordinates, engine.plan.cell)
+        if not isinstance(memory_mb, int | float) or not memory_mb >= 16:
+            raise OptionError("'memory_mb' must be a number of 16 or more", found=memory_mb)
+        self.threads = resolve_threads(threads)
+        self.starts = np.zeros(1, np.int64)
+        if not count:
+            return
+        if not len(engine):
+            raise StageError("the cloud has no points", found=f"{count} queries")
+        engine.fit()
+        self.fixed, self.adaptive = engine._prepared()
+        if len(self.fixed):
+            compile_once("fixed")
+        self.candidates = self.fixed.candidates(self.grid.rows_of_cells(), self.grid.cell_ix)
+        self._cut(float(memory_mb) * 2**20)
+
+    def _cut(self, budget: float) -> None:
+        """Cut the queries into blocks of bounded rows and time; use fewer threads where scratch is large."""
+        from .index import cut_blocks
+
+        cost = self.fixed.cost(self.candidates) if len(self.fixed) else np.zeros(len(self.candidates))
+        scratch = float(self.fixed.scratch_bytes(int(self.candidates.max())))
+        if self.adaptive is not None:
+            cost = cost + self.adaptive.query_ns
+            scratch += self.adaptive.scratch_bytes
+        cost = cost * self._distinct_share()
+        self.threads = int(max(1, min(self.threads, 0.5 * budget // scratch)))
+        # Two results per thread may wait (map_blocks) and one is being made; copies of points double a block.
+        row = 8 * len(self.engine.plan.names) + ROW_BYTES
+        rows = (budget - self.threads * scratch) / ((2 * self.threads + 1) * row)
+        total = float(cost @ np.diff(self.grid.cell_start))
+        most = min(BLOCK_NS, max(total / (4 * self.threads), 5e6))
+        self.starts = cut_blocks(self.grid.cell_start, cost, most, int(min(max(rows, 64), MOST_ROWS)))
+
+    def _distinct_share(self) -> np.ndarray:
+        """Of each cell's queries the share that is computed: copies of a query lie side by side and cost nothing."""
+        grid = self.grid
+        copy = np.zeros(len(grid), np.bool_)
+        copy[1:] = grid.x[1:] == grid.x[:-1]
+        for axis in (grid.y, grid.z):
+            copy[1:] &= axis[1:] == axis[:-1]
+        if not copy.any():
+            return np.ones(1)
+        copies = np.add.reduceat(copy, grid.cell_start[:-1], dtype=np.int64)
+        return 1.0 - copies / np.diff(grid.cell_start)
+
+    def compute(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, dict[str, dict[str, int]]]:
+        """Positions (in the user's order) and values of the sorted queries first..last, and what to report."""
+        engine, grid = self.engine, self.grid
+        qx, qy, qz = grid.x[first:last], grid.y[first:last], grid.z[first:last]
+        new = np.empty(last - first, np.bool_)
+        new[:1] = True
+        new[1:] = (qx[1:] != qx[:-1]) | (qy[1:] != qy[:-1]) | (qz[1:] != qz[:-1])
+        at = np.flatnonzero(new)
+        copies = np.diff(at, append=last - first)
+        if len(at) < last - first:
+            qx, qy, qz = qx[at], qy[at], qz[at]
+        width = len(engine.plan.names)
+        values = np.empty((len(at), width), np.float32)
+        tally: dict[str, dict[str, int]] = {}
+        if len(self.fixed):
+            a = np.searchsorted(grid.cell_start, first, "right") - 1
+            b = np.searchsorted(grid.cell_start, last, "left")
+            few = np.zeros(len(self.fixed), np.int64)
+            self.fixed.fill(
+                qx, qy, qz, copies, engine.bins, engine.seed, int(self.candidates[a:b].max()), few, values
+            )
+            tally["fewer_than_three"] = dict(zip(self.fixed.tokens, few.tolist(), strict=True))
+        if self.adaptive is not None:
+            few = np.zeros(len(self.adaptive.tokens), np.int64)
+            far = np.zeros(len(self.adaptive.tokens), np.int64)
+            self.adaptive.fill(
+                qx, qy, qz, copies, engine.bins, engine.seed, engine.copt_threshold, few, far, values
+            )
+            tally.setdefault("fewer_than_three", {}).update(
+                zip(self.adaptive.tokens, few.tolist(), strict=True)
+            )
+            if engine.plan.unbounded:
+                tally["beyond_halo"] = {
+                    t: n for t, n in zip(self.adaptive.tokens, far.tolist(), strict=True) if n
+                }
+        if len(at) < last - first:
+            values = np.repeat(values, copies, axis=0)
+        positions = grid.order[first:last].astype(np.int64)
+        for column, name in enumerate(engine.plan.dimensions, width - len(engine.plan.dimensions)):
+            given = self.dimensions.get(name)
+            if given is None:
+                values[:, column] = {"X": grid.x, "Y": grid.y, "Z": grid.z}[name][first:last]
+            else:
+                values[:, column] = given[positions]
+        return positions, values, tally
+
+    def iterate(self, compute, progress) -> Iterator[tuple[np.ndarray, Any]]:
+        blocks = list(zip(self.starts[:-1].tolist(), self.starts[1:].tolist(), strict=True))
+        own = Progress(len(self.grid), "features") if progress is True else None
+        bar = own if own is not None else progress or None
+        report = self.engine.report
+        try:
+            for rows, result, count, tally in map_blocks(compute, blocks, self.threads):
+                with self.engine._lock:
+                    report["queries"] += count
+                    for key, counts in tally.items():
+                        for token, n in counts.items():
+                            report[key][token] = report[key].get(token, 0) + n
+                if bar is not None:
+                    bar.update(count)
+                yield rows, result
+        finally:
+            if own is not None:
+                own.close()
+
+
+def _queries(queries, cloud: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Indices into the cloud (where the queries are such) and coordinates (None: those of the cloud)."""
+    if queries is None:
+        return None, None
+    array = np.asarray(queries)
+    if array.ndim == 2:
+        from .index import check_xyz
+
+        return None, check_xyz(array, "queries")
+    if array.ndim != 1 or array.dtype.kind not in "iu":
+        if array.size == 0 and array.ndim == 1:
+            array = array.astype(np.int64)
+        else:
+            cure = "Use np.flatnonzero(mask)" if array.dtype.kind == "b" else None
+            raise OptionError(
+                "'queries' must be indices of points or (m, 3) coordinates",
+                found=f"dtype {array.dtype}, shape {array.shape}",
+                cure=cure,
+            )
+    array = array.astype(np.int64, copy=False)
+    outside = np.count_nonzero((array < 0) | (array >= len(cloud)))
+    if outside:
+        raise OptionError(f"'queries' has indices outside the cloud of {len(cloud)} points", found=outside)
+    return array, cloud[array]
+
+
+def _dimensions(
+    plan: FeaturePlan, given: Mapping[str, npt.ArrayLike] | None, count: int
+) -> dict[str, np.ndarray]:
+    given = given or {}
+    found = {}
+    for name in plan.dimensions:
+        if name not in given:
+            if name in ("X", "Y", "Z"):
+                continue
+            there = ", ".join(map(str, given)) or "none"
+            raise DimensionError(
+                f"the dimension '{name}' is needed as a feature but missing",
+                found=there,
+                cure=MAKERS.get(name, f"Give dimensions={{'{name}': values}}, or leave it out of the plan"),
+            )
+        values = np.asarray(given[name])
+        if values.shape != (count,) or values.dtype.kind not in "fiub":
+            raise DimensionError(
+                f"the dimension '{name}' must have one number per query",
+                found=f"shape {values.shape}, dtype {values.dtype}, for {count} queries",
+            )
+        found[name] = values
+    return found
+
+
+# ---- compilation -------------------------------------------------------------------------------------------
+
+_compiled: set[str] = set()
+_compile_lock = threading.Lock()
+
+
+def compile_once(what: str) -> None:
+    """Load or compile a set of kernels on next to no data, saying so on stderr where it takes long."""
+    with _compile_lock:
+        if what in _compiled:
+            return
+        from ..base.jit import CompilationNote
+
+        with CompilationNote():
+            _COMPILERS[what]()
+        _compiled.add(what)
+
+
+def _compile_index() -> None:
+    from .index import build_grid
+
+    build_grid(np.zeros((2, 3)), 1.0)
+
+
+def _compile_fixed() -> None:
+    from .bins import ShapeBins
+    from .fixed import FixedRadius
+    from .index import build_grid, cut_blocks
+
+    grid = build_grid(np.zeros((1, 3)), 1.0)
+    none = np.zeros(0)
+    fixed = FixedRadius(grid, FeaturePlan.parse("c1,s1", "Density"))
+    cut_blocks(grid.cell_start, fixed.cost(fixed.candidates(grid.rows_of_cells(), grid.cell_ix)), 1.0, 1)
+    out = np.zeros((0, 2), np.float32)
+    fixed.fill(none, none, none, np.zeros(0, np.int64), ShapeBins({}), 0, 1, np.zeros(2, np.int64), out)
+
+
+_COMPILERS = {
+    "index": _compile_index,
+    "fixed": _compile_fixed,
+}

@@ -1,0 +1,220 @@
+"""Neighborhood tokens (``c2``, ``s1``, ``k50``, ``kopt``, ``ropt``, ``copt``) and presets, parsed and checked.
+
+One token is used alike in options, dimension suffixes, model files and documents. Sources:
+[B16] Blomley, Jutzi, Weinmann 2016, doi:10.5194/isprsannals-III-3-169-2016; [W18] Weinmann, Blomley,
+Weinmann, Jutzi 2018 (DGPF); [H17] He, Chen, Wang, Liu 2017, ISPRS Archives XLII-2/W7.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from ..base.errors import OptionError, suggest
+
+#: Preset name -> (neighborhood tokens, the points' own dimensions it uses as features).
+PRESETS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "blomley2016": (("c1", "c2", "c3", "c5", "kopt"), ("Z",)),
+    "weinmann2018": (
+        ("c1", "c2", "c3", "c5", "s1", "s2", "s3", "s5", "kopt"),
+        ("HeightAboveGround",),
+    ),
+    "he2017": (("copt",), ()),
+}
+
+KOPT_DEFAULT = (10.0, 100.0)  # k_min, k_max [B16]
+ROPT_DEFAULT = (0.25, 2.0, 0.05)  # r_min, r_max, step in metres [H17]
+COPT_REACH = 3.0  # metres: the cap of the scattered branch, the largest radius copt looks at [H17]
+MAX_K = 10_000
+MIN_RADIUS, MAX_RADIUS = 0.001, 100_000.0  # metres
+
+_KNOWN = ("c2", "s1", "k50", "kopt", "ropt", "copt", *PRESETS)
+_TOKEN = re.compile(
+    r"(?P<head>kopt|ropt|copt|c|s|k)(?P<value>\d+(?:\.\d*)?|\.\d+)?(?:\((?P<inner>[^()]*)\))?"
+)
+_CURE = (
+    "Write c2 (vertical cylinder of 2 m radius), s1 (sphere of 1 m), k50 (50 nearest), "
+    "kopt, kopt(10,100), ropt, ropt(0.25,2,0.05), copt, or a preset: " + ", ".join(PRESETS)
+)
+
+
+@dataclass(frozen=True)
+class Neighborhood:
+    """One neighborhood definition. Make it with :func:`parse_neighborhoods`.
+
+    Attributes
+    ----------
+    kind : str
+        ``cylinder``, ``sphere``, ``knn``, ``kopt``, ``ropt`` or ``copt``.
+    parameters : tuple of float
+        Cylinder and sphere: (radius in metres,); knn: (k,); kopt: (k_min, k_max);
+        ropt: (r_min, r_max, step) in metres; copt: ().
+    """
+
+    kind: str
+    parameters: tuple[float, ...] = ()
+
+    @property
+    def token(self) -> str:
+        """The shortest token that parses to this neighborhood, e.g. ``c2.5`` or ``kopt(10,50)``."""
+        values = [_number(value) for value in self.parameters]
+        if self.kind in ("cylinder", "sphere", "knn"):
+            return {"cylinder": "c", "sphere": "s", "knn": "k"}[self.kind] + values[0]
+        default = {"kopt": KOPT_DEFAULT, "ropt": ROPT_DEFAULT}.get(self.kind, ())
+        if self.parameters == default:
+            return self.kind
+        return f"{self.kind}({','.join(values)})"
+
+    @property
+    def suffix(self) -> str:
+        """The token made safe for a dimension name: ``c2_5``, ``kopt``, ``kopt10_50``."""
+        return self.token.replace("(", "").replace(")", "").replace(",", "_").replace(".", "_")
+
+    @property
+    def reach(self) -> float | None:
+        """The farthest a member can be, in metres; ``None`` where a number of points decides."""
+        if self.kind in ("cylinder", "sphere"):
+            return self.parameters[0]
+        if self.kind == "ropt":
+            return self.parameters[1]
+        return COPT_REACH if self.kind == "copt" else None
+
+    @property
+    def adaptive(self) -> bool:
+        """Whether the size is chosen point by point (and so is a feature, ``Radius``)."""
+        return self.kind in ("kopt", "ropt", "copt")
+
+    def __str__(self) -> str:
+        return self.token
+
+
+def parse_neighborhoods(spec: str | Neighborhood | Iterable[str | Neighborhood]) -> list[Neighborhood]:
+    """Parse presets and tokens into neighborhoods, in the order given, each one once.
+
+    Parameters
+    ----------
+    spec : str or iterable
+        ``"weinmann2018"``, ``"c1, c2.5, kopt(10,50)"``, or a list of such words.
+
+    Raises
+    ------
+    OptionError
+        For an unknown word or a parameter that makes no sense; it names the word.
+
+    Examples
+    --------
+    >>> [str(n) for n in parse_neighborhoods("c2.0, s.5, c2, kopt(10,100)")]
+    ['c2', 's0.5', 'kopt']
+    """
+    found: dict[str, Neighborhood] = {}
+    for word in _words(spec):
+        if isinstance(word, Neighborhood):
+            found.setdefault(word.token, word)
+            continue
+        for token in PRESETS[word][0] if word in PRESETS else (word,):
+            one = _parse_token(token)
+            found.setdefault(one.token, one)
+    if not found:
+        raise OptionError("no neighborhood was given", found=repr(spec), cure=_CURE)
+    suffixes: dict[str, str] = {}
+    for token, one in found.items():  # ropt(1,2.5,1) and ropt(1.2,5,1) would share dimension names
+        if suffixes.setdefault(one.suffix, token) != token:
+            raise OptionError(
+                f"'{suffixes[one.suffix]}' and '{token}' would both be called ..._{one.suffix}",
+                cure="Use them in two stages",
+            )
+    return list(found.values())
+
+
+def preset_dimensions(spec: str | Neighborhood | Iterable[str | Neighborhood]) -> tuple[str, ...]:
+    """The points' own dimensions that the presets named in `spec` use as features."""
+    names: dict[str, None] = {}
+    for word in _words(spec):
+        if isinstance(word, str) and word in PRESETS:
+            names.update(dict.fromkeys(PRESETS[word][1]))
+    return tuple(names)
+
+
+def _words(spec) -> list:
+    if isinstance(spec, Neighborhood):
+        return [spec]
+    if isinstance(spec, str):
+        # A comma inside parentheses belongs to the token.
+        return [w.strip().lower() for w in re.split(r",(?![^()]*\))", spec) if w.strip()]
+    try:
+        items = list(spec)
+    except TypeError:
+        raise OptionError(
+            "'neighborhoods' must be text or a list of text", found=repr(spec), cure=_CURE
+        ) from None
+    words: list = []
+    for item in items:
+        if not isinstance(item, str | Neighborhood):
+            raise OptionError("a neighborhood must be written as text", found=repr(item), cure=_CURE)
+        words.extend(_words(item))
+    return words
+
+
+def _parse_token(text: str) -> Neighborhood:
+    word = "".join(text.split())
+    match = _TOKEN.fullmatch(word)
+    if match is None:
+        raise OptionError(f"unknown neighborhood '{text}'", cure=suggest(word, _KNOWN) + _CURE)
+    head, value, inner = match["head"], match["value"], match["inner"]
+    if head in ("c", "s", "k"):
+        if value is None or inner is not None:
+            raise OptionError(f"the neighborhood '{text}' needs a size, as in {head}2", cure=_CURE)
+        return _sized(text, head, float(value))
+    if value is not None:
+        raise OptionError(f"unknown neighborhood '{text}'", cure=_CURE)
+    return _adaptive(text, head, inner)
+
+
+def _sized(text: str, head: str, size: float) -> Neighborhood:
+    if head == "k":
+        if size != int(size) or not 1 <= size <= MAX_K:
+            raise OptionError(f"k must be a whole number from 1 to {MAX_K}", found=text)
+        return Neighborhood("knn", (size,))
+    if not (MIN_RADIUS <= size <= MAX_RADIUS):
+        raise OptionError(f"a radius must be from {MIN_RADIUS} to {MAX_RADIUS:g} metres", found=text)
+    return Neighborhood("cylinder" if head == "c" else "sphere", (_rounded(size),))
+
+
+def _adaptive(text: str, head: str, inner: str | None) -> Neighborhood:
+    try:
+        values = tuple(float(v) for v in inner.split(",")) if inner else ()
+    except ValueError:
+        raise OptionError("the values in parentheses must be numbers", found=text, cure=_CURE) from None
+    if not all(math.isfinite(v) for v in values):
+        raise OptionError("the values in parentheses must be finite", found=text)
+    if head == "kopt":
+        values = values or KOPT_DEFAULT
+        if len(values) != 2 or any(v != int(v) for v in values) or not 2 <= values[0] <= values[1] <= MAX_K:
+            raise OptionError(
+                f"kopt takes two whole numbers, kopt(k_min,k_max), 2 <= k_min <= k_max <= {MAX_K}", found=text
+            )
+    elif head == "ropt":
+        values = values or ROPT_DEFAULT
+        if len(values) != 3 or not (
+            MIN_RADIUS <= values[0] <= values[1] <= MAX_RADIUS and values[2] >= MIN_RADIUS
+        ):
+            raise OptionError(
+                f"ropt takes metres, ropt(r_min,r_max,step), each at least {MIN_RADIUS}, r_min <= r_max",
+                found=text,
+            )
+        if (values[1] - values[0]) / values[2] > 1000:
+            raise OptionError("ropt may try at most 1000 radii", found=text, cure="Make the step larger")
+    elif values:
+        raise OptionError("copt takes no values", found=text, cure="Write copt")
+    return Neighborhood(head, tuple(_rounded(v) for v in values))
+
+
+def _rounded(value: float) -> float:
+    """The value its token prints: two radii are one neighborhood exactly when their tokens are equal."""
+    return float(_number(value))
+
+
+def _number(value: float) -> str:
+    return f"{value:.6f}".rstrip("0").rstrip(".")

@@ -1,0 +1,316 @@
+"""Our pipeline JSON to plain PDAL JSON: each stage of ours becomes a ``filters.python`` in place.
+
+The pipeline is never split, so the LAS header, metadata, spatial reference, tags and
+inputs work as PDAL makes them work.
+"""
+
+from __future__ import annotations
+
+import copy
+import uuid
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..base.asprs import LEGACY_LIMIT
+from ..base.errors import OptionError, PipelineError, StageError, suggest
+from ..stages import registry
+from ..stages.base import Stage
+from .read import PipelineSource
+from .runtime import TRAMPOLINE, place
+
+#: Options of every PDAL stage that a lowered stage hands on.
+_PDAL_OWN = ("tag", "inputs", "user_data", "log")
+#: Stages after which several views are what the user asked for.
+_SPLITTERS = {"filters.splitter", "filters.chipper", "filters.divider", "filters.groupby", "filters.returns"}
+_LAS_WRITERS = ("writers.las", "writers.copc")
+
+
+@dataclass
+class LoweredStage:
+    """One of our stages after lowering.
+
+    Attributes
+    ----------
+    stage : type
+        The stage class.
+    options : dict
+        Parsed options.
+    tag : str or None
+    label : str
+        The unique `module` label, under which the runtime keeps reports.
+    index : int
+        Place in the lowered list.
+    """
+
+    stage: type[Stage]
+    options: dict[str, Any]
+    tag: str | None
+    label: str
+    index: int
+
+    @property
+    def place(self) -> str:
+        return place(self.stage.type, self.tag)
+
+
+@dataclass
+class Lowered:
+    """A plain PDAL pipeline, and which of its stages are ours."""
+
+    stages: list[dict[str, Any]]
+    ours: list[LoweredStage] = field(default_factory=list)
+
+    @property
+    def halo(self) -> float:
+        """Metres of neighboring points a tile needs for all of our stages, one after the other."""
+        return sum(s.stage.halo(s.options) for s in self.ours)
+
+
+def lower(source: PipelineSource) -> Lowered:
+    """Lower a pipeline.
+
+    Raises
+    ------
+    PipelineError, OptionError
+        Where a stage type or option of ours is wrong; PDAL's own stages are left to PDAL.
+    """
+    stages: list[dict[str, Any]] = []
+    for index, given in enumerate(source.stages):
+        stages.append(_as_object(given))
+        _refuse_near_miss(stages[-1], source.where(index))
+    views = _Views()
+    out = Lowered([])
+    tags = {str(s["tag"]) for s in stages if "tag" in s}
+    for index, stage in enumerate(stages):
+        type_name = stage.get("type", "")
+        where = source.where(index)
+        if type_name not in registry.stages():
+            views.add(stage, last=0 < index == len(stages) - 1)
+            out.stages.append(stage)
+            continue
+        try:
+            if views.unmerged(stage):
+                merge: dict[str, Any] = {"type": "filters.merge"}
+                if "inputs" in stage:
+                    merge["inputs"] = stage.pop("inputs")
+                    merge["tag"] = _fresh_tag(tags)
+                    stage["inputs"] = [merge["tag"]]
+                views.add(merge)
+                out.stages.append(merge)
+            lowered = _lower_stage(stage, len(out.stages))
+        except StageError as error:
+            raise _with_line(error, where) from None
+        views.add(stage)
+        out.ours.append(lowered)
+        out.stages.append(_python_stage(stage, lowered))
+    _check_writers(out)
+    return out
+
+
+def _as_object(given: Any) -> dict[str, Any]:
+    """File names stand for readers and writers; PDAL tells which, so they stay without a type."""
+    if isinstance(given, dict):
+        return copy.deepcopy(given)
+    return {"filename": given}
+
+
+def _refuse_near_miss(stage: dict[str, Any], where: str) -> None:
+    """A mistyped type of ours would reach PDAL, whose message cannot name our stages."""
+    type_name = stage.get("type", "")
+    if type_name in registry.stages() or not type_name:
+        return
+    near = suggest(type_name, registry.stages())
+    ours = {name.partition(".")[2] for name in registry.stages()}
+    word = type_name.rpartition(".")[2]
+    if word in ours or (near and _distance_is_typo(type_name)):
+        raise PipelineError(f"there is no stage '{type_name}'", where=where, cure=near or None)
+
+
+def _distance_is_typo(type_name: str) -> bool:
+    """Whether a type is a misspelling of one of ours, not another PDAL stage such as filters.hag_nn."""
+    import difflib
+
+    close = difflib.get_close_matches(type_name, list(registry.stages()), n=1, cutoff=0.88)
+    return bool(close)
+
+
+def _lower_stage(stage: dict[str, Any], index: int) -> LoweredStage:
+    kind = registry.get(stage["type"])
+    tag = stage.get("tag")
+    given = {k: v for k, v in stage.items() if k not in ("type", *_PDAL_OWN)}
+    options = kind.parse(given, place(kind.type, tag))
+    label = f"pdal_stages_{kind.type.replace('.', '_')}_{uuid.uuid4().hex[:12]}"
+    return LoweredStage(kind, options, tag, label, index)
+
+
+def python_stage(kind: type[Stage], given: dict[str, Any], **own: Any) -> tuple[dict[str, Any], LoweredStage]:
+    """The ``filters.python`` object of one stage, for python-pdal objects."""
+    lowered = _lower_stage({"type": kind.type, **given, **own}, 0)
+    return _python_stage({"type": kind.type, **given, **own}, lowered), lowered
+
+
+def _python_stage(stage: dict[str, Any], lowered: LoweredStage) -> dict[str, Any]:
+    given = {k: v for k, v in stage.items() if k not in ("type", *_PDAL_OWN)}
+    arguments = {"stage": lowered.stage.type, "label": lowered.label, "options": given}
+    if lowered.tag:
+        arguments["tag"] = lowered.tag
+    out: dict[str, Any] = {
+        "type": "filters.python",
+        "module": lowered.label,
+        "function": "stage",
+        "source": TRAMPOLINE,
+        "pdalargs": arguments,
+    }
+    creates = lowered.stage.creates(lowered.options)
+    if creates:
+        out["add_dimension"] = [f"{name}={kind}" for name, kind in creates.items()]
+    out.update({key: stage[key] for key in _PDAL_OWN if key in stage})
+    return out
+
+
+def _fresh_tag(tags: set[str]) -> str:
+    number = 1
+    while f"pdal_stages_merge_{number}" in tags:
+        number += 1
+    tags.add(f"pdal_stages_merge_{number}")
+    return f"pdal_stages_merge_{number}"
+
+
+def _with_line(error: StageError, where: str) -> StageError:
+    error.where = f"{where}: {error.where}" if error.where else where
+    return error
+
+
+class _Views:
+    """Follows PDAL's wiring to see where points of several readers are still apart."""
+
+    def __init__(self) -> None:
+        self._waiting: list[int] = []  # views of stages not yet taken as an input
+        self._tagged: dict[str, int] = {}
+
+    def _inputs(self, stage: dict[str, Any]) -> int:
+        names = stage.get("inputs")
+        if names is None:
+            return sum(self._waiting)
+        names = [names] if isinstance(names, str) else names
+        return sum(self._tagged.get(str(n), 1) for n in names)
+
+    def unmerged(self, stage: dict[str, Any]) -> bool:
+        """Whether views of more than one reader would reach the stage."""
+        return self._inputs(stage) > 1
+
+    def add(self, stage: dict[str, Any], last: bool = False) -> None:
+        type_name = str(stage.get("type", ""))
+        filename = str(stage.get("filename", ""))
+        # A bare file name is read, unless it is the last stage of several: then it is written.
+        reader = type_name.startswith("readers.") or (not type_name and not last)
+        if reader:
+            count = 2 if any(c in filename for c in "*?[") else 1
+            self._waiting.append(count)
+        else:
+            count = self._inputs(stage)
+            if type_name == "filters.merge" or type_name in _SPLITTERS:
+                count = 1  # one cloud, or pieces the user asked for
+            if "inputs" not in stage:
+                self._waiting = []
+            self._waiting.append(count)
+        if "tag" in stage:
+            self._tagged[str(stage["tag"])] = count
+
+
+def _check_writers(lowered: Lowered) -> None:
+    """Class codes must fit the LAS files written later, and extra dimensions one LAS record."""
+    for ours in lowered.ours:
+        largest = ours.stage.largest_class(ours.options)
+        extra = _extra_dimensions(ours)
+        for writer in lowered.stages[ours.index + 1 :]:
+            if not _writes_las(writer):
+                continue
+            if largest > LEGACY_LIMIT:
+                _check_codes(ours, largest, writer, lowered.stages[: ours.index])
+            if extra and str(writer.get("extra_dims", "")).strip() == "all":
+                from ..stages.multiscalefeatures import fits_las, too_many_for_las
+
+                if not fits_las(extra):
+                    raise too_many_for_las(extra).at(ours.place)
+
+
+def _extra_dimensions(ours: LoweredStage) -> int:
+    counter = getattr(ours.stage, "extra_dimensions", None)
+    return counter(ours.options) if counter else 0
+
+
+def _writes_las(stage: dict[str, Any]) -> bool:
+    type_name = stage.get("type", "")
+    suffix = Path(str(stage.get("filename", ""))).suffix.lower()
+    return type_name in _LAS_WRITERS or (not type_name and suffix in (".las", ".laz"))
+
+
+def _check_codes(
+    ours: LoweredStage, largest: int, writer: dict[str, Any], before: list[dict[str, Any]]
+) -> None:
+    from . import pdal as pdal_env
+
+    if writer.get("type") == "writers.copc":
+        return
+    minor, format_id = _las_version(writer, before)
+    if format_id <= 5:
+        raise OptionError(
+            f"class codes above {LEGACY_LIMIT} do not fit the LAS file that writers.las would write "
+            f"(LAS 1.{minor}, dataformat_id {format_id})",
+            where=ours.place,
+            found=f"code {largest}",
+            cure='Give writers.las "minor_version": 4 and "dataformat_id": 6 (7 with colours, 8 with near infrared)',
+        )
+    compressed = str(writer.get("compression", "")).lower() not in ("", "none", "false") or str(
+        writer.get("filename", "")
+    ).lower().endswith(".laz")
+    if compressed and not pdal_env.writes_extended_classes_to_laz():
+        raise OptionError(
+            f"this PDAL cannot write class codes above {LEGACY_LIMIT} to LAZ 1.4: they would come out wrong",
+            where=ours.place,
+            found=f"code {largest}, PDAL {'.'.join(map(str, pdal_env.version()))}",
+            cure="Write .las and compress it afterwards, or use PDAL 2.3 or later",
+        )
+
+
+def _las_version(writer: dict[str, Any], before: list[dict[str, Any]]) -> tuple[int, int]:
+    """(minor_version, dataformat_id) the writer will use: its options, the forwarded header, PDAL's defaults."""
+    from . import pdal as pdal_env
+
+    minor, format_id = pdal_env.las_writer_defaults()
+    forward = str(writer.get("forward", ""))
+    headers = [h for h in (_las_header(s) for s in before) if h is not None]
+    if headers and ("all" in forward or "header" in forward or "minor_version" in forward):
+        if len({h[0] for h in headers}) == 1:
+            minor = headers[0][0]
+        if len({h[1] for h in headers}) == 1:
+            format_id = headers[0][1]
+    return _whole(writer.get("minor_version"), minor), _whole(writer.get("dataformat_id"), format_id)
+
+
+def _whole(value: Any, otherwise: int) -> int:
+    """An option of PDAL's as a whole number; what is none is left for PDAL to refuse."""
+    try:
+        return otherwise if value is None else int(value)
+    except (TypeError, ValueError, OverflowError):
+        return otherwise
+
+
+def _las_header(stage: dict[str, Any]) -> tuple[int, int] | None:
+    """Version and point format in a LAS file's first bytes; None where it cannot be read here."""
+    type_name = stage.get("type", "")
+    if type_name not in ("", "readers.las", "readers.copc"):
+        return None
+    path = Path(str(stage.get("filename", "")))
+    try:
+        if not path.is_file():  # a pipe or device must not be read here
+            return None
+        with open(path, "rb") as file:
+            head = file.read(105)
+    except (OSError, ValueError):
+        return None
+    if len(head) < 105 or head[:4] != b"LASF":
+        return None
+    return head[25], head[104] & 0x3F

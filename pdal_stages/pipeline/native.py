@@ -1,0 +1,59 @@
+"""python-pdal objects of our stages, to be joined with PDAL's by ``|``.
+
+``pdal.Reader.las("in.laz") | ps.Filter.hag_minima() | pdal.Writer.las("out.laz")``
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..stages import registry
+from . import pdal as pdal_env
+from . import runtime
+from .lowering import python_stage
+
+
+class _Family:
+    """Attribute access gives a maker per stage: ``Filter.hag_minima(cell=20, tag="h")``."""
+
+    def __init__(self, family: str) -> None:
+        self._family = family
+
+    def __getattr__(self, name: str):
+        if name.startswith("_"):
+            raise AttributeError(name)
+        kind = registry.get(f"{self._family}.{name}")
+
+        def make(filename: str | None = None, *, merge: Any = True, **options: Any):
+            if not isinstance(merge, bool):  # filters.accuracy has an option of this name
+                options["merge"], merge = merge, True
+            if filename is not None:
+                options["filename"] = filename
+            pdal = pdal_env.bindings()
+            merged = None
+            own = {key: options.pop(key) for key in ("tag", "inputs", "user_data", "log") if key in options}
+            if merge:
+                # Points of several readers must see each other; of one reader this costs nothing.
+                wired = {"inputs": own.pop("inputs")} if "inputs" in own else {}
+                merged = pdal.Filter(type="filters.merge", **wired)
+            stage, lowered = python_stage(kind, options, **own)
+            runtime.remember_stdout(lowered.label)
+            lowered_stage = pdal.Filter(**stage)
+            return merged | lowered_stage if merged is not None else lowered_stage
+
+        make.__name__ = name
+        make.__doc__ = (
+            f"{kind.summary}.\n\nOptions: {', '.join(o.name for o in kind.all_options())}; tag, inputs.\n"
+            "merge=False keeps point views apart (after filters.splitter, say)."
+        )
+        return make
+
+    def __dir__(self):
+        prefix = self._family + "."
+        return [name[len(prefix) :] for name in registry.stages() if name.startswith(prefix)]
+
+
+#: ``Filter.hag_minima(...)``, ``Filter.multiscalefeatures(...)``, ``Filter.modelclassifier(...)``, ...
+Filter = _Family("filters")
+#: ``Writer.classifiermodel(filename, ...)``
+Writer = _Family("writers")

@@ -1,0 +1,209 @@
+"""The one place that touches PDAL: running pipelines, versions, drivers, and what differs between versions."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+from ..base.errors import DependencyError, PipelineError
+
+INSTALL = (
+    "Install PDAL with its Python bindings: conda install -c conda-forge python-pdal pdal-plugins; on Debian or "
+    "Ubuntu see docs/install.md"
+)
+_DRIVER_CURE = (
+    "filters.python comes with the package pdal-plugins. Install it for this Python (pip install pdal-plugins), and "
+    "set PDAL_DRIVER_PATH to the folder that holds libpdal_plugin_filter_python"
+)
+
+
+@dataclass
+class Execution:
+    """What a run of a pipeline gave."""
+
+    count: int
+    metadata: dict[str, Any] = field(default_factory=dict)
+    arrays: list = field(default_factory=list)
+    log: str = ""
+
+
+def bindings():
+    """The module `pdal`; :class:`DependencyError` with the cure where it is absent or broken."""
+    try:
+        import pdal
+    except ImportError as error:
+        raise DependencyError(
+            "python-pdal cannot be imported", found=f"{sys.executable}: {error}", cure=INSTALL
+        ) from error
+    except (OSError, subprocess.SubprocessError) as error:  # it asks the program `pdal` for its drivers
+        raise DependencyError(
+            "python-pdal could not start the program 'pdal'",
+            found=str(error),
+            cure="Put pdal on PATH. " + INSTALL,
+        ) from error
+    return pdal
+
+
+@cache
+def version() -> tuple[int, int, int]:
+    """PDAL's version, e.g. (2, 2, 0)."""
+    numbers = re.findall(r"\d+", str(bindings().info.version))[:3]
+    major, minor, patch = (int(n) for n in (*numbers, "0", "0", "0")[:3])
+    return major, minor, patch
+
+
+def program() -> str:
+    """Path of the program `pdal`, the one beside this Python first."""
+    beside = os.path.join(os.path.dirname(sys.executable), "pdal")
+    found = beside if os.access(beside, os.X_OK) else shutil.which("pdal")
+    if not found:
+        raise DependencyError("the program 'pdal' is not on PATH", cure=INSTALL)
+    return found
+
+
+def ask_program(*arguments: str) -> str:
+    """What `pdal` prints for some arguments."""
+    done = subprocess.run([program(), *arguments], capture_output=True, text=True, check=False, timeout=120)
+    if done.returncode:
+        raise PipelineError(
+            f"pdal {' '.join(arguments)} failed", found=(done.stderr or done.stdout).strip()[-500:]
+        )
+    return done.stdout
+
+
+def execute(stages: list[dict[str, Any]], *, arrays: bool = True) -> Execution:
+    """Run a plain PDAL pipeline in this process.
+
+    Raises
+    ------
+    PipelineError
+        With PDAL's own words.
+    DependencyError
+        If python-pdal or filters.python is missing.
+    """
+    pdal = bindings()
+    stdout = sys.stdout
+    try:
+        pipeline = pdal.Pipeline(json.dumps(adapted(stages)))
+        count = pipeline.execute()
+    except RuntimeError as error:
+        raise translate(str(error)) from None
+    except MemoryError:
+        raise PipelineError(
+            "memory ran out", cure="Work in tiles (--tile), or read less, e.g. with filters.crop"
+        ) from None
+    except TypeError as error:  # json.dumps: a pipeline of Python objects that are not JSON
+        raise PipelineError("the pipeline holds what JSON cannot say", found=str(error)) from None
+    finally:
+        # A stage that raises leaves sys.stdout pointing into PDAL's log.
+        sys.stdout = stdout
+    return Execution(
+        count=int(count),
+        metadata=_metadata(pipeline),
+        arrays=list(pipeline.arrays) if arrays else [],
+        log=str(pipeline.log or ""),
+    )
+
+
+def translate(message: str) -> PipelineError | DependencyError:
+    """PDAL's error text as an error of ours, with a cure where the cause is known."""
+    text = message.strip()
+    if re.search(r"(create|load|find).*filters\.python", text) or (
+        "filters.python" in text and "driver" in text.lower()
+    ):
+        return DependencyError("PDAL has no filters.python", found=text, cure=_DRIVER_CURE)
+    if "ModuleNotFoundError" in text and "pdal_stages" in text:
+        return DependencyError(
+            "the Python that PDAL runs does not have pdal_stages",
+            found=text.splitlines()[-1],
+            cure="Install pdal_stages into the Python that the plugin of filters.python was built for",
+        )
+    return PipelineError("PDAL could not run the pipeline", found=text)
+
+
+def _metadata(pipeline) -> dict[str, Any]:
+    raw = pipeline.metadata  # text in older python-pdal, a dict in newer
+    if isinstance(raw, str):
+        with contextlib.suppress(ValueError):
+            raw = json.loads(raw)
+    return raw if isinstance(raw, dict) else {}
+
+
+# ---- what differs between versions ---------------------------------------------------------------
+
+
+def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Stages that this PDAL knows: before 2.4 a COPC file is read as the LAZ file that it is too.
+
+    Raises
+    ------
+    PipelineError
+        If only a reader of COPC could do what its options ask for.
+    """
+    copc = any(isinstance(stage, dict) and stage.get("type") == "readers.copc" for stage in stages)
+    if not copc or version() >= (2, 4, 0):
+        return stages
+    out = []
+    for stage in stages:
+        if isinstance(stage, dict) and stage.get("type") == "readers.copc":
+            beyond = [name for name in stage if name in _COPC_OPTIONS]
+            if beyond:
+                raise PipelineError(
+                    f"PDAL {'.'.join(map(str, version()))} reads COPC files whole, without {', '.join(beyond)}",
+                    where="readers.copc",
+                    found=str(stage.get("filename", "")),
+                    cure="Use PDAL 2.4 or later, or filters.crop after the reader",
+                )
+            stage = {**{k: v for k, v in stage.items() if k not in _COPC_TUNING}, "type": "readers.las"}
+        out.append(stage)
+    return out
+
+
+#: Options of readers.copc that choose points, and those that only make it faster.
+_COPC_OPTIONS = ("bounds", "polygon", "ogr", "resolution", "origin")
+_COPC_TUNING = ("requests", "keep_alive", "header", "query", "vlr", "fix_dims", "srs_vlr_order")
+
+
+@cache
+def las_writer_defaults() -> tuple[int, int]:
+    """(minor_version, dataformat_id) that this PDAL's `writers.las` uses where neither is given."""
+    described = ask_program("--options", "writers.las")
+    minor = re.search(r"minor_version \[(\d+)\]", described)
+    format_id = re.search(r"dataformat_id \[(\d+)\]", described)
+    return int(minor.group(1)) if minor else 4, int(format_id.group(1)) if format_id else 7
+
+
+def writes_extended_classes_to_laz() -> bool:
+    """Whether LAZ 1.4 can be written with class codes above 31 (PDAL 2.2 cannot)."""
+    return version() >= (2, 3, 0)
+
+
+def flags_inside_classification(dimensions, metadata: Any) -> bool:
+    """Whether the flag bits of LAS 1.0-1.3 sit inside `Classification`, as PDAL 2.2 reads them.
+
+    Newer versions have a dimension for each flag; LAS 1.4 formats have `ClassFlags`.
+    """
+    if any(name in dimensions for name in ("Synthetic", "Withheld", "ClassFlags")):
+        return False
+    formats = [int(v) for v in _values(metadata, "dataformat_id") if str(v).isdigit()]
+    return bool(formats) and all(f <= 5 for f in formats)
+
+
+def _values(node: Any, name: str) -> list[Any]:
+    """All values of a name in metadata, as filters.python hands them over (nodes) or a pipeline gives them (a dict)."""
+    if isinstance(node, list):
+        return [value for child in node for value in _values(child, name)]
+    if not isinstance(node, dict):
+        return []
+    own = [node.get("value")] if node.get("name") == name else []
+    for key, child in node.items():
+        own += [child] if key == name and not isinstance(child, dict | list) else _values(child, name)
+    return own

@@ -1,0 +1,306 @@
+"""Reading pipeline JSON as PDAL does, with errors that name the line."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..base.errors import PipelineError
+
+_LARGEST = 64 * 2**20
+_DEEPEST = 200
+
+
+@dataclass
+class PipelineSource:
+    """A parsed pipeline: its stages, and the line each begins on.
+
+    Attributes
+    ----------
+    stages : list
+        Objects or file names, as written.
+    lines : list of int
+        One per stage; 0 where it did not come from text.
+    name : str
+        The file, for messages; empty for text.
+    """
+
+    stages: list[Any]
+    lines: list[int]
+    name: str = ""
+
+    def where(self, index: int) -> str:
+        """``job.json, line 12`` or ``stage 3``."""
+        if self.lines[index]:
+            return f"{self.name or 'pipeline'}, line {self.lines[index]}"
+        return f"stage {index + 1}"
+
+
+def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
+    """A pipeline from a file name, JSON text, or Python lists and dicts.
+
+    Raises
+    ------
+    PipelineError
+        If the file cannot be read, is not JSON, or is no pipeline.
+    """
+    if isinstance(source, Path) or (isinstance(source, str) and not _looks_like_json(source)):
+        path = Path(source)
+        try:
+            with open(path, "rb") as file:
+                data = file.read(_LARGEST + 1)
+            if len(data) > _LARGEST:
+                raise PipelineError(
+                    "the pipeline file is too large to be one", where=str(path), found="over 64 MB"
+                )
+        except ValueError as error:  # a NUL, or half a surrogate pair
+            raise PipelineError(
+                "this cannot be the name of a pipeline file", found=f"{str(source)[:80]!r}: {error}"
+            ) from None
+        except OSError as error:
+            raise PipelineError(
+                "the pipeline file cannot be read", where=str(path)[:200], found=error.strerror or str(error)
+            ) from None
+        return parse_pipeline(decode(data, str(path)), str(path))
+    if isinstance(source, str):
+        return parse_pipeline(source)
+    stages = source.get("pipeline") if isinstance(source, dict) else source
+    if not isinstance(stages, list):
+        raise PipelineError("a pipeline is a list of stages, or an object with a list named 'pipeline'")
+    _check(stages, [0] * len(stages), "")
+    return PipelineSource(list(stages), [0] * len(stages))
+
+
+def decode(data: bytes, name: str) -> str:
+    """The text of a pipeline file, which is UTF-8, with or without a byte order mark."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        wide = data[:2] in (b"\xff\xfe", b"\xfe\xff")
+        raise PipelineError(
+            "the pipeline file is not UTF-8 text",
+            where=name,
+            found="UTF-16" if wide else f"byte {error.start} is 0x{data[error.start]:02x}",
+            cure="Save it as UTF-8",
+        ) from None
+
+
+def parse_pipeline(text: str, name: str = "") -> PipelineSource:
+    """Parse pipeline JSON text; comments are allowed, as PDAL allows them."""
+    clean = _without_comments(text.removeprefix("\ufeff"), name)
+    if not clean.strip():
+        raise PipelineError("the pipeline is empty", where=name or None)
+    _check_depth(clean, name)
+    try:
+        # parse_constant: NaN and Infinity are no JSON, and PDAL refuses them too.
+        value = json.loads(clean, parse_constant=_no_constant)
+    except json.JSONDecodeError as error:
+        raise PipelineError(
+            f"the pipeline is not valid JSON: {error.msg}",
+            where=f"{name or 'pipeline'}, line {error.lineno}, column {error.colno}",
+            found=_excerpt(clean, error.pos),
+            cure=_cure(clean, error),
+        ) from None
+    except (ValueError, RecursionError) as error:
+        raise PipelineError(
+            "the pipeline is not valid JSON", where=name or None, found=str(error)[:200]
+        ) from None
+    if isinstance(value, dict):
+        if not isinstance(value.get("pipeline"), list):
+            raise PipelineError(
+                "the pipeline has no list named 'pipeline'",
+                where=name or None,
+                found=f"an object with {', '.join(map(repr, value)) or 'nothing in it'}"[:200],
+                cure='Write {"pipeline": [...]}, or the list alone',
+            )
+        stages = value["pipeline"]
+    elif isinstance(value, list):
+        stages = value
+    else:
+        raise PipelineError(
+            "the pipeline must be a list or an object", where=name or None, found=type(value).__name__
+        )
+    lines = _lines(clean, len(stages), isinstance(value, dict))
+    _check(stages, lines, name)
+    return PipelineSource(stages, lines, name)
+
+
+def _check(stages: list, lines: list[int], name: str) -> None:
+    if not stages:
+        raise PipelineError("the pipeline has no stages", where=name or None)
+    for index, stage in enumerate(stages):
+        if not isinstance(stage, str | dict):
+            raise PipelineError(
+                "a stage is an object, or a file name",
+                where=PipelineSource(stages, lines, name).where(index),
+                found=json.dumps(stage, default=str)[:80],
+            )
+        where = PipelineSource(stages, lines, name).where(index)
+        _check_values(stage, where)
+        if not isinstance(stage, dict):
+            continue
+        for key, kinds, what in _SHAPES:
+            value = stage.get(key, "")
+            if not isinstance(value, kinds) or (
+                isinstance(value, list) and not all(isinstance(v, str) for v in value)
+            ):
+                raise PipelineError(
+                    f"a stage's '{key}' is {what}",
+                    where=where,
+                    found=json.dumps(value, default=str)[:80],
+                )
+
+
+#: What PDAL wants of the options that wire stages together.
+_SHAPES: tuple[tuple[str, tuple[type, ...], str], ...] = (
+    ("type", (str,), "text"),
+    ("tag", (str,), "text"),
+    ("inputs", (str, list), "a tag, or a list of tags"),
+)
+
+
+def _check_values(value: Any, where: str, depth: int = 0) -> None:
+    """Refuse what PDAL cannot be given.
+
+    It takes UTF-8 without NUL, but JSON can write half a surrogate pair, and file names may be other bytes; and it
+    takes numbers that a double holds.
+    """
+    if depth > _DEEPEST:
+        raise PipelineError(f"the pipeline is nested more than {_DEEPEST} levels deep", where=where)
+    if isinstance(value, str):
+        try:
+            good = "\0" not in value and bool(value.encode() or True)
+        except UnicodeEncodeError:
+            good = False
+        if not good:
+            raise PipelineError(
+                "a text is not valid UTF-8, or holds a NUL character",
+                where=where,
+                found=ascii(value[:80]),
+                cure="If it is a file's name, rename the file",
+            )
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise PipelineError("a number is not finite, or too large for a double", where=where, found=value)
+    elif isinstance(value, dict):
+        for key, inner in value.items():
+            _check_values(key, where, depth + 1)
+            _check_values(inner, where, depth + 1)
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            _check_values(inner, where, depth + 1)
+
+
+def _looks_like_json(text: str) -> bool:
+    start = text.lstrip("\ufeff \t\r\n")[:2]
+    return start[:1] in ("[", "{") or start in ("//", "/*")
+
+
+# The closing quote is optional, so that a match never fails: searching stays linear whatever the text.
+_STRING = r'"[^"\\\n]*(?:\\.[^"\\\n]*)*"?'
+_STRING_OR_COMMENT = re.compile(rf"{_STRING}|//|/\*")
+_STRING_OR_BRACKET = re.compile(rf"{_STRING}|[\[{{]|[\]}}]")
+
+
+def _without_comments(text: str, name: str = "") -> str:
+    """Comments as spaces, so that places stay."""
+    if "/" not in text:
+        return text
+    parts, at = [], 0
+    while (match := _STRING_OR_COMMENT.search(text, at)) is not None:
+        start, end = match.span()
+        if match.group() == "//":
+            end = text.find("\n", start)
+            end = len(text) if end < 0 else end
+        elif match.group() == "/*":
+            end = text.find("*/", start + 2) + 2
+            if end < 2:
+                raise PipelineError(
+                    "a comment that begins with /* does not end",
+                    where=f"{name or 'pipeline'}, line {text.count(chr(10), 0, start) + 1}",
+                    cure="Close it with */",
+                )
+        else:
+            parts.append(text[at:end])
+            at = end
+            continue
+        parts += [text[at:start], re.sub(r"[^\n]", " ", text[start:end])]
+        at = end
+    return "".join([*parts, text[at:]])
+
+
+def _check_depth(text: str, name: str) -> None:
+    depth = 0
+    for match in _STRING_OR_BRACKET.finditer(text):
+        mark = match.group()
+        if mark in "[{":
+            depth += 1
+            if depth > _DEEPEST:
+                raise PipelineError(
+                    f"the pipeline is nested more than {_DEEPEST} levels deep",
+                    where=f"{name or 'pipeline'}, line {text.count(chr(10), 0, match.start()) + 1}",
+                )
+        elif mark in "]}":
+            depth -= 1
+
+
+def _no_constant(word: str):
+    raise ValueError(f"{word} is not a JSON number")
+
+
+def _excerpt(text: str, position: int) -> str:
+    return repr(text[max(0, position - 20) : position + 20].strip())
+
+
+def _cure(text: str, error: json.JSONDecodeError) -> str | None:
+    before = text[: error.pos].rstrip()
+    after = text[error.pos :].lstrip()[:1]
+    if (before.endswith(",") and after in ("]", "}")) or (after == "," and before.endswith(",")):
+        return "Remove the comma before the closing bracket"
+    if after in ("]", "}") and "Illegal trailing comma" in error.msg:
+        return "Remove the comma before the closing bracket"
+    if after == "'" or (error.msg.startswith("Expecting property name") and after == "'"):
+        return 'JSON wants double quotes: "text"'
+    if error.msg == "Extra data":
+        return "A pipeline is one list or object; remove what follows it"
+    return None
+
+
+_SPACE = re.compile(r"[\s]*")
+
+
+def _lines(text: str, count: int, is_object: bool) -> list[int]:
+    """The line each stage begins on: walk the list item by item."""
+    decoder = json.JSONDecoder(parse_constant=_no_constant)
+
+    def skip(at: int) -> int:
+        match = _SPACE.match(text, at)
+        return match.end() if match else at
+
+    at = skip(0)
+    begin = at
+    if is_object:
+        at = skip(at + 1)
+        begin = -1
+        while text[at] != "}":
+            key, at = decoder.raw_decode(text, at)
+            at = skip(skip(at) + 1)
+            if key == "pipeline":  # of equal keys the last counts, as in json.loads
+                begin = at
+            _, at = decoder.raw_decode(text, at)
+            at = skip(at)
+            if text[at] == ",":
+                at = skip(at + 1)
+    lines: list[int] = []
+    at = skip(begin + 1)
+    line, counted = 1, 0
+    while len(lines) < count:
+        line += text.count("\n", counted, at)
+        counted = at
+        lines.append(line)
+        _, at = decoder.raw_decode(text, at)
+        at = skip(skip(at) + 1)
+    return lines

@@ -1,0 +1,294 @@
+"""Run a pipeline: read, override, validate, lower, execute, report; outputs whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import json
+import os
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from ..base.errors import PipelineError, StageError
+from ..base.files import check_complete, check_writable, disk_is_full, partial_name
+from ..base.las import check_readable, odd_text, supersede_copc
+from ..base.leftovers import removed_if_killed
+from . import pdal as pdal_env
+from . import runtime
+from .lowering import Lowered, lower
+from .overrides import Override, apply_overrides
+from .read import PipelineSource, read_pipeline
+
+
+class Pipeline:
+    """A PDAL pipeline that may hold stages of ours.
+
+    Parameters
+    ----------
+    source : str, Path, list, dict or PipelineSource
+        A file name, JSON text, the stages themselves, or what :func:`parse_pipeline` made of text.
+    overrides : iterable of Override, optional
+        Options set from outside (see :mod:`pdal_stages.pipeline.overrides`).
+
+    Raises
+    ------
+    PipelineError, OptionError
+        Everything about our stages that can be known before reading points.
+
+    Examples
+    --------
+    >>> import pdal_stages as ps
+    >>> pipeline = ps.Pipeline(["in.laz", {"type": "filters.hag_minima"}, "out.laz"])
+    >>> pipeline.execute()                                          # doctest: +SKIP
+    1065
+    """
+
+    def __init__(
+        self, source: str | Path | list | dict | PipelineSource, overrides: Iterable[Override] = ()
+    ) -> None:
+        read = source if isinstance(source, PipelineSource) else read_pipeline(source)
+        self.source = PipelineSource(apply_overrides(read.stages, overrides), read.lines, read.name)
+        self.lowered: Lowered = lower(self.source)
+        self.metadata: dict[str, Any] = {}
+        self.arrays: list = []
+        self.log = ""
+        self.reports: list[tuple[str, list[dict[str, Any]]]] = []
+        self.remarks: list[str] = []
+
+    @property
+    def json(self) -> str:
+        """The lowered pipeline, which stock ``pdal pipeline`` runs."""
+        return json.dumps({"pipeline": self.lowered.stages}, indent=2)
+
+    def validate(self) -> None:
+        """Check outputs and let PDAL check its own stages' options, without reading points."""
+        self._check_inputs()
+        for stage in self.lowered.stages:
+            if _is_writer(stage, self.lowered.stages):
+                check_writable(stage["filename"])
+        try:
+            _validate_with_pdal(self.lowered.stages)
+        except StageError as error:
+            raise self._located(error) from None
+
+    def execute(self, *, arrays: bool = True) -> int:
+        """Run the pipeline in this process; the number of points that came out.
+
+        Files are written under a hidden name and renamed at the end, so an output is whole
+        or absent, and an older one stays if the run fails.
+
+        Raises
+        ------
+        StageError
+            What went wrong, where, and the cure.
+        """
+        self._check_inputs()
+        stages, renames = _partial_outputs(self.lowered.stages)
+        for ours in self.lowered.ours:
+            runtime.remember_stdout(ours.label)
+        failure: StageError | None = None
+        try:
+            try:
+                with removed_if_killed([*map(_pattern, (p for p, _ in renames)), *self._models()]):
+                    result = pdal_env.execute(stages, arrays=arrays)
+            finally:
+                self.reports = []
+                for ours in self.lowered.ours:
+                    reports, failed = runtime.collect(ours.label)
+                    failure = failure or failed
+                    self.reports.append((ours.place, reports))
+            _rename(renames)
+        except StageError as error:
+            for partial, final in renames if isinstance(error.found, str) else ():
+                error.found = str(error.found).replace(str(partial), str(final))
+                if error.cure is None and disk_is_full(partial):
+                    error.cure = f"The disk of {final} is full: make room"
+            if failure is not None and failure.what == runtime.INTERRUPTED:
+                raise KeyboardInterrupt from None
+            raise failure or self._located(error) from None
+        finally:
+            _discard(renames)
+        self.metadata = _named_metadata(result.metadata, self.reports)
+        self.arrays, self.log = result.arrays, result.log
+        return result.count
+
+    def _check_inputs(self) -> None:
+        """Look at the headers of LAS files: PDAL takes damaged ones for whole, or crashes."""
+        self.remarks = [r for path in _las_inputs(self.lowered.stages) if (r := check_readable(path))]
+
+    def _models(self) -> list[str]:
+        """Where models are being written: what to remove if the process is killed meanwhile."""
+        names = (Path(o.options["filename"]) for o in self.lowered.ours if "filename" in o.options)
+        return [glob.escape(str(n.with_name(f".{n.name}.{os.getpid()}"))) + ".*" for n in names]
+
+    def _located(self, error: StageError) -> StageError:
+        """PDAL's words, with the line of the stage that they name and the nearest stage there is."""
+        if not isinstance(error, PipelineError) or error.where is not None:
+            return error
+        if _NOT_UTF8.search(str(error.found)):
+            for path in _las_inputs(self.lowered.stages):
+                if (odd := odd_text(path)) is not None:
+                    return PipelineError(
+                        f"the {odd[0]} in the LAS file is not UTF-8, which PDAL's filters.python cannot take",
+                        where=path,
+                        found=str(odd[1])[1:],
+                        cure=f"Write the file anew first: pdal translate {path} clean.laz",
+                    )
+        named = _STAGE_TYPE.search(str(error.found or ""))
+        if named is None:
+            return error
+        given = [s.get("type") if isinstance(s, dict) else None for s in self.source.stages]
+        if given.count(named.group()) == 1:
+            error.where = self.source.where(given.index(named.group()))
+        if error.cure is None and "Couldn't create" in str(error.found):
+            from . import describe
+
+            error.found = str(error.found).splitlines()[0]
+            error.cure = describe.nearest_stage(named.group())
+        return error
+
+
+def run_pipeline(source: str | Path | list | dict, overrides: Iterable[Override] = ()) -> Pipeline:
+    """Build, run and return a pipeline."""
+    pipeline = Pipeline(source, overrides)
+    pipeline.execute()
+    return pipeline
+
+
+_STAGE_TYPE = re.compile(r"\b(?:readers|filters|writers)\.\w+")
+
+
+_NOT_UTF8 = re.compile(r"returned a result with an exception set|UnicodeDecodeError|codec can't decode")
+
+
+def _las_inputs(stages: list[dict[str, Any]]) -> list[str]:
+    """Local LAS and LAZ files that are read, patterns filled in."""
+    found: list[str] = []
+    for index, stage in enumerate(stages):
+        name, kind = stage.get("filename"), stage.get("type", "")
+        if not isinstance(name, str) or "://" in name or (not kind and 0 < index == len(stages) - 1):
+            continue
+        if kind in ("readers.las", "readers.copc") or (not kind and name.lower().endswith((".las", ".laz"))):
+            names = sorted(glob.glob(name)) if not os.path.exists(name) else [name]
+            found += [n for n in names if os.path.isfile(n)]
+    return found
+
+
+def _is_writer(stage: dict[str, Any], stages: list[dict[str, Any]]) -> bool:
+    if "filename" not in stage or not isinstance(stage["filename"], str):
+        return False
+    type_name = stage.get("type", "")
+    if type_name:
+        return type_name.startswith("writers.") and "://" not in stage["filename"]
+    return len(stages) > 1 and stage is stages[-1]
+
+
+def _partial_outputs(stages: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[tuple[Path, Path]]]:
+    """Stages whose writers write beside the final name, and what to rename."""
+    out, renames = [], []
+    finals: set[Path] = set()
+    for stage in stages:
+        if _is_writer(stage, stages):
+            final = Path(stage["filename"])
+            check_writable(final)
+            if final.absolute() in finals:
+                raise PipelineError(
+                    "two writers write the same file", found=str(final), cure="Give each its own name"
+                )
+            finals.add(final.absolute())
+            partial = partial_name(final)
+            stage = {**stage, "filename": str(partial)}
+            renames.append((partial, final))
+        out.append(stage)
+    return out, renames
+
+
+def _pattern(partial: Path) -> str:
+    """What :func:`glob.glob` finds a writer's files by; one name with '#' stands for several."""
+    return glob.escape(str(partial)).replace("#", "*")
+
+
+def _expanded(partial: Path) -> list[Path]:
+    """Files a writer made."""
+    if "#" not in partial.name:
+        return [partial] if partial.exists() else []
+    return [Path(name) for name in sorted(glob.glob(_pattern(partial)))]
+
+
+def _rename(renames: list[tuple[Path, Path]]) -> None:
+    """Give every file its final name, after all of them were found complete."""
+    moves: list[tuple[Path, Path]] = []
+    for partial, final in renames:
+        for path in _expanded(partial):
+            target = final
+            if "#" in partial.name:
+                before, _, after = partial.name.partition("#")
+                number = path.name[len(before) : len(path.name) - len(after)]
+                target = final.with_name(final.name.replace("#", number, 1))
+            check_complete(path, target)
+            supersede_copc(path)
+            moves.append((path, target))
+    for path, target in moves:
+        try:
+            os.replace(path, target)
+        except OSError as error:
+            raise StageError(
+                "the output file could not be given its name", found=f"{target}: {error.strerror or error}"
+            ) from error
+
+
+def _discard(renames: list[tuple[Path, Path]]) -> None:
+    for partial, _ in renames:
+        for path in _expanded(partial):
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+
+
+def _validate_with_pdal(stages: list[dict[str, Any]]) -> None:
+    import subprocess
+
+    text = json.dumps({"pipeline": pdal_env.adapted(stages)})
+    done = subprocess.run(
+        [pdal_env.program(), "pipeline", "--validate", "--stdin"],
+        input=text,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    try:
+        verdict = json.loads(done.stdout)
+    except ValueError:
+        verdict = {"valid": done.returncode == 0, "error_detail": (done.stderr or done.stdout).strip()}
+    if not verdict.get("valid", False):
+        raise pdal_env.translate(str(verdict.get("error_detail") or "the pipeline is not valid"))
+
+
+def _named_metadata(
+    metadata: dict[str, Any], reports: list[tuple[str, list[dict[str, Any]]]]
+) -> dict[str, Any]:
+    """PDAL's metadata, with our stages under their own names instead of filters.python."""
+    inner = metadata.get("metadata")
+    if not isinstance(inner, dict):
+        return metadata
+    theirs = inner.pop("filters.python", None)
+    rest = [m for m in (theirs if isinstance(theirs, list) else [theirs]) if m and not _is_ours(m)]
+    if rest:
+        inner["filters.python"] = rest if len(rest) > 1 else rest[0]
+    for name, views in reports:
+        kind = name.partition(" ")[0]
+        for report in views:
+            if kind not in inner:
+                inner[kind] = report
+            else:
+                before = inner[kind] if isinstance(inner[kind], list) else [inner[kind]]
+                inner[kind] = [*before, report]
+    return metadata
+
+
+def _is_ours(node: Any) -> bool:
+    from ..stages.registry import stages
+
+    return isinstance(node, dict) and any(name in stages() for name in node)

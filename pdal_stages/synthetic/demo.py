@@ -1,0 +1,150 @@
+"""The main job on a generated town: train on one half, classify the other, say how well."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+
+from ..base.errors import StageError
+from ..base.files import write_whole
+from ..base.version import __version__
+
+#: Classes of the town that the demo tells apart; small ones are left to the reader.
+CLASSES = {
+    "2": "Ground",
+    "3": "Low vegetation",
+    "5": "High vegetation",
+    "6": "Building",
+    "14": "Wire - conductor (phase)",
+}
+
+
+def run_demo(folder: str | Path, *, size: float = 200.0, density: float = 7.0, seed: int = 1) -> dict:
+    """Generate, train, classify, compare, draw; the figures of :mod:`pdal_stages.accuracy.measures`.
+
+    Everything goes through PDAL, as a user's pipelines would. Files in `folder`:
+    ``town.laz``, ``town.model``, ``classified.laz``, ``accuracy.json``, ``accuracy.html``,
+    ``classified.png``, and the two pipelines. A second call with the same arguments finds
+    them and only prints the table.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    if not folder.is_dir():
+        raise StageError("the demo's folder cannot be made", found=str(folder))
+    settings = {"version": __version__, "size": size, "density": density, "seed": seed}
+    stamp = folder / "demo.json"
+    outputs = [
+        folder / n
+        for n in ("classified.laz", "classified.png", "accuracy.html", "accuracy.json", "table.txt")
+    ]
+    if _same(stamp, settings) and all(path.is_file() for path in outputs):
+        print(
+            f"{folder} holds the results of this very demo; delete the folder to run it again.",
+            file=sys.stderr,
+        )
+    else:
+        stamp.unlink(missing_ok=True)
+        _work(folder, size, density, seed)
+        write_whole(stamp, json.dumps(settings).encode())
+    print((folder / "table.txt").read_text(encoding="utf-8"))
+    for path in outputs[:3]:
+        print(path)
+    return json.loads((folder / "accuracy.json").read_text(encoding="utf-8"))
+
+
+def _same(stamp: Path, settings: dict) -> bool:
+    try:
+        return json.loads(stamp.read_text(encoding="utf-8")) == settings
+    except (OSError, ValueError):
+        return False
+
+
+def _work(folder: Path, size: float, density: float, seed: int) -> None:
+    import numpy as np
+
+    from ..pipeline.run import Pipeline
+    from . import TownOptions, write_town
+
+    town = folder / "town.laz"
+    with _Step(f"a town of {size:g} x {size:g} m at {density:g} points/m2 under a simulated flight"):
+        write_town(TownOptions(size=size, density=density, seed=seed), town)
+    bounds = Pipeline([str(town)])
+    bounds.execute()
+    x = bounds.arrays[0]["X"]
+    middle = float(np.floor((x.min() + x.max()) / 2))
+    train = [
+        {"type": "readers.las", "filename": str(town)},
+        {"type": "filters.range", "limits": f"X[:{middle})"},
+        {"type": "filters.hag_minima"},
+        {
+            "type": "writers.classifiermodel",
+            "filename": str(folder / "town.model"),
+            "classes": CLASSES,
+            "count": 5000,
+            "seed": seed,
+        },
+    ]
+    classify = [
+        {"type": "readers.las", "filename": str(town)},
+        {"type": "filters.range", "limits": f"X[{middle}:]"},
+        {"type": "filters.ferry", "dimensions": "Classification=>Reference"},
+        {"type": "filters.hag_minima"},
+        {"type": "filters.modelclassifier", "model": str(folder / "town.model"), "margin": True},
+        {
+            "type": "filters.accuracy",
+            "classes": [int(code) for code in CLASSES],
+            "json": str(folder / "accuracy.json"),
+            "html": str(folder / "accuracy.html"),
+            "model": str(folder / "town.model"),
+            "title": "Classification of the generated town",
+            "print": False,
+        },
+        {
+            "type": "writers.las",
+            "filename": str(folder / "classified.laz"),
+            "forward": "all",
+            "extra_dims": "all",
+        },
+    ]
+    for name, stages in (("train", train), ("classify", classify)):
+        write_whole(folder / f"{name}.json", (json.dumps(stages, indent=4) + "\n").encode())
+    with _Step("training on the western half"):
+        Pipeline(train).execute(arrays=False)
+    with _Step("classifying the eastern half"):
+        job = Pipeline(classify)
+        job.execute()
+    _results(folder, job.arrays[0])
+
+
+def _results(folder: Path, points) -> None:
+    import numpy as np
+
+    from ..accuracy.measures import Accuracy
+    from ..reports.png import write_png
+    from ..reports.views import triptych
+
+    keep = np.isin(points["Reference"], [int(code) for code in CLASSES])
+    x, y, z = (points[axis][keep] for axis in "XYZ")
+    reference = points["Reference"][keep].astype(np.uint8)
+    predicted = points["Classification"][keep].astype(np.uint8)
+    table = Accuracy.from_labels(reference, predicted).table()
+    write_whole(folder / "table.txt", (table + "\n").encode())
+    with _Step("drawing the picture"):
+        write_png(folder / "classified.png", triptych(x, y, z, predicted, reference))
+
+
+class _Step:
+    """Says what is being done, and how long it took."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+
+    def __enter__(self) -> None:
+        self.started = time.monotonic()
+        print(f"{self.text} ...", file=sys.stderr, flush=True)
+
+    def __exit__(self, kind, *_) -> None:
+        if kind is None:
+            print(f"  done in {time.monotonic() - self.started:.1f} s", file=sys.stderr, flush=True)

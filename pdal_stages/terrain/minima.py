@@ -1,0 +1,236 @@
+"""Height above a coarse terrain: the minima of a grid, interpolated [W18 section 3.2].
+
+The terrain is the lowest point of each cell of a coarse grid (20 m), interpolated
+bilinearly between cell centres and evaluated on a fine grid (0.5 m); a point's height is
+its z minus the value of the fine cell it falls in. Both grids are anchored to absolute
+coordinates (``floor(x / cell)``), so every tile of a survey sees the same cells. No raster
+is held: the fine value is computed where a point falls, and only cells with points and
+their neighbors are stored, so one stray coordinate costs one cell.
+
+[W18] Weinmann, Blomley, Weinmann, Jutzi (2018), DGPF: binary and multi-class
+classification of ALS point clouds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..base.errors import OptionError, StageError
+
+#: Largest cell index either side of zero; beyond it coordinates cannot be terrain.
+_INDEX_LIMIT = 2**31 - 2
+
+
+@dataclass
+class MinimaTerrain:
+    """The coarse terrain of a cloud: build with :meth:`fit`, read with :meth:`at`.
+
+    Attributes
+    ----------
+    cell, resolution : float
+        Side of a coarse and of a fine cell, in the unit of the coordinates.
+    report : dict
+        Counts: ``cells`` (with points), ``interpolated_cells`` (empty ones that were
+        needed), ``farthest_fill`` (distance to the nearest filled cell, the worst case),
+        ``unused_points`` (not finite, or excluded by the mask).
+    """
+
+    cell: float
+    resolution: float
+    report: dict = field(default_factory=dict)
+    _keys: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64), repr=False)
+    _minima: NDArray[np.float64] = field(default_factory=lambda: np.empty(0), repr=False)
+
+    @classmethod
+    def fit(
+        cls,
+        x: ArrayLike,
+        y: ArrayLike,
+        z: ArrayLike,
+        *,
+        cell: float = 20.0,
+        resolution: float = 0.5,
+        mask: ArrayLike | None = None,
+    ) -> MinimaTerrain:
+        """Take the lowest point of each coarse cell.
+
+        Parameters
+        ----------
+        x, y, z : array_like, shape (n,)
+            Coordinates, all three in one unit or z in its own.
+        cell, resolution : float
+            Sides of the coarse and the fine cells, in the unit of x and y.
+        mask : array_like of bool, shape (n,), optional
+            Points that may form the terrain; the others only receive heights.
+        """
+        _check_sizes(cell, resolution)
+        x, y, z = (np.asarray(a, np.float64) for a in (x, y, z))
+        usable = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
+        if mask is not None:
+            usable &= np.asarray(mask, bool)
+        terrain = cls(float(cell), float(resolution))
+        column, row = _cells(x[usable], cell), _cells(y[usable], cell)
+        key = _key(column, row)
+        order = np.argsort(key, kind="stable")
+        key = key[order]
+        if key.size:
+            starts = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
+            terrain._keys = key[starts]
+            terrain._minima = np.minimum.reduceat(z[usable][order], starts)
+        terrain.report = {
+            "cells": int(terrain._keys.size),
+            "interpolated_cells": 0,
+            "farthest_fill": 0.0,
+            "unused_points": int(x.size - np.count_nonzero(usable)),
+        }
+        return terrain
+
+    def at(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
+        """Terrain height where points fall: bilinear, at the centre of their fine cell.
+
+        Points that are not finite get NaN.
+
+        Raises
+        ------
+        StageError
+            If no point formed a terrain.
+        """
+        x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
+        out = np.full(x.shape, np.nan)
+        finite = np.isfinite(x) & np.isfinite(y)
+        if not finite.any():
+            return out
+        if self._keys.size == 0:
+            raise StageError(
+                "no terrain: none of the points may form one",
+                found=f"{x.size:,} points, all of them not finite, noise, or outside 'where'",
+                cure="Relax 'ignore_classes' or 'where'",
+            )
+        # Distinct fine cells first: many points share one.
+        fine_x = np.floor(x[finite] / self.resolution)
+        fine_y = np.floor(y[finite] / self.resolution)
+        u = (fine_x + 0.5) * (self.resolution / self.cell) - 0.5
+        v = (fine_y + 0.5) * (self.resolution / self.cell) - 0.5
+        i, j = np.floor(u), np.floor(v)
+        wu, wv = u - i, v - j
+        i, j = _bounded(i), _bounded(j)
+        corners = [_key(i + a, j + b) for b in (0, 1) for a in (0, 1)]
+        keys, values = self._filled(np.unique(np.concatenate([np.unique(k) for k in corners])))
+        z00, z10, z01, z11 = (values[np.searchsorted(keys, k)] for k in corners)
+        lower = z00 + (z10 - z00) * wu
+        upper = z01 + (z11 - z01) * wu
+        out[finite] = lower + (upper - lower) * wv
+        return out
+
+    def _filled(self, keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Values of the cells `keys`; empty ones by inverse squared distance to the nearest filled ones."""
+        place = np.minimum(np.searchsorted(self._keys, keys), self._keys.size - 1)
+        values = self._minima[place].copy()
+        empty = np.flatnonzero(self._keys[place] != keys)
+        if empty.size:
+            from scipy.spatial import cKDTree  # most clouds have no gaps: not loaded at start
+
+            filled_at = np.column_stack(_unkey(self._keys)).astype(np.float64)
+            wanted_at = np.column_stack(_unkey(keys[empty])).astype(np.float64)
+            nearest = cKDTree(filled_at).query(wanted_at, k=1)[0]
+            # All filled cells within reach of the nearest one: a set, so the outcome
+            # does not depend on how a search tree orders equal distances.
+            reach = nearest + 1.5
+            tree = cKDTree(filled_at)
+            for at, (centre, radius) in enumerate(zip(wanted_at, reach, strict=True)):
+                near = np.sort(tree.query_ball_point(centre, radius))
+                squared = ((filled_at[near] - centre) ** 2).sum(axis=1)
+                weight = 1.0 / squared**2
+                values[empty[at]] = np.dot(weight, self._minima[near]) / weight.sum()
+            self.report["interpolated_cells"] = int(empty.size)
+            self.report["farthest_fill"] = float(nearest.max() * self.cell)
+        return keys, values
+
+
+def hag_minima(
+    x: ArrayLike,
+    y: ArrayLike,
+    z: ArrayLike,
+    *,
+    cell: float = 20.0,
+    resolution: float = 0.5,
+    mask: ArrayLike | None = None,
+) -> NDArray[np.float64]:
+    """Height of every point above the coarse terrain of the cloud [W18 section 3.2].
+
+    Parameters
+    ----------
+    x, y, z : array_like, shape (n,)
+        Coordinates in metres (or any one unit, with `cell` and `resolution` in it too).
+    cell : float, default 20
+        Side of the coarse cells whose lowest points form the terrain.
+    resolution : float, default 0.5
+        Side of the fine cells on which the terrain is evaluated.
+    mask : array_like of bool, shape (n,), optional
+        Points that may form the terrain, e.g. all but noise.
+
+    Returns
+    -------
+    ndarray of float64, shape (n,)
+        z minus terrain; NaN only where a coordinate is not finite.
+
+    Raises
+    ------
+    OptionError
+        If a size is not positive, or `resolution` is larger than `cell`.
+    StageError
+        If no point may form the terrain, or shapes differ.
+
+    Examples
+    --------
+    >>> hag_minima([1.0, 2.0], [1.0, 2.0], [10.0, 13.5]).tolist()
+    [0.0, 3.5]
+    """
+    x, y, z = (np.asarray(a, np.float64) for a in (x, y, z))
+    if not (x.shape == y.shape == z.shape and x.ndim == 1):
+        raise StageError(
+            "x, y and z must be one-dimensional and of one length", found=(x.shape, y.shape, z.shape)
+        )
+    if x.size == 0:
+        _check_sizes(cell, resolution)
+        return np.empty(0)
+    terrain = MinimaTerrain.fit(x, y, z, cell=cell, resolution=resolution, mask=mask)
+    return z - terrain.at(x, y)
+
+
+def _check_sizes(cell: float, resolution: float) -> None:
+    for name, value in (("cell", cell), ("resolution", resolution)):
+        if not (np.isfinite(value) and value > 0):
+            raise OptionError(f"'{name}' must be a positive length", found=value)
+    if resolution > cell:
+        raise OptionError(
+            "'resolution' must not be larger than 'cell'",
+            found=f"resolution {resolution:g}, cell {cell:g}",
+            cure="Swap them, or lower 'resolution'",
+        )
+
+
+def _bounded(index: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Cell numbers as integers; refuses coordinates no survey has (they would wrap round)."""
+    if index.size and max(-index.min(), index.max()) > _INDEX_LIMIT - 1:
+        raise StageError(
+            "coordinates are too large for the grid",
+            found=f"a cell index of {float(np.abs(index).max()):.3g}",
+            cure="Remove stray points, e.g. with filters.crop or filters.range, or use a larger 'cell'",
+        )
+    return index.astype(np.int64)
+
+
+def _cells(coordinate: NDArray[np.float64], cell: float) -> NDArray[np.int64]:
+    return _bounded(np.floor(coordinate / cell))
+
+
+def _key(column: NDArray[np.int64], row: NDArray[np.int64]) -> NDArray[np.int64]:
+    return (row << 32) + (column + 2**31)
+
+
+def _unkey(key: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    return (key & 0xFFFFFFFF) - 2**31, key >> 32

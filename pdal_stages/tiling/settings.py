@@ -1,0 +1,84 @@
+"""How a pipeline is run in tiles."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from ..base.errors import OptionError
+from ..base.threads import available_threads
+
+#: Ways to cut the output.
+PER = ("auto", "file", "tile")
+
+
+@dataclass(frozen=True)
+class TilingOptions:
+    """How a pipeline is run in tiles.
+
+    Attributes
+    ----------
+    tile : float
+        Side of a tile, in the unit of the coordinates.
+    workers : int, optional
+        Worker processes; 0 works in this process, without Dask. Default: one for every two cores.
+    scheduler : str
+        Address of a running Dask scheduler (``tcp://host:8786``) instead of processes on this machine.
+    per : str
+        ``file`` writes one output for each input file, in that file's order of points; ``tile`` one for each
+        tile; ``auto`` is ``file`` for LAS and LAZ inputs and ``tile`` for others.
+    buffer : float, optional
+        Metres of surroundings each tile is read with, for PDAL filters that look at neighbors; it is added
+        to what our stages ask for.
+    resume : bool
+        Keep what an earlier run finished.
+    retries : int
+        How often a failed tile is tried again.
+    most_points : int
+        A tile whose neighborhoods turn out to reach farther than its surroundings is read again with wider
+        ones, up to so many points.
+    """
+
+    tile: float
+    workers: int | None = None
+    scheduler: str = ""
+    per: str = "auto"
+    buffer: float | None = None
+    resume: bool = False
+    retries: int = 2
+    most_points: int = 5_000_000
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "tile", float(self.tile))  # 20 and 20.0 are one run
+        if not (math.isfinite(self.tile) and self.tile > 0):
+            raise OptionError("--tile must be a positive length", found=self.tile)
+        if self.workers is not None and self.workers < 0:
+            raise OptionError("--workers must be a whole number of 0 or more", found=self.workers)
+        if self.workers is not None and self.scheduler:
+            raise OptionError(
+                "--workers starts processes on this machine, and --scheduler uses others",
+                cure="Give one of them",
+            )
+        if self.per not in PER:
+            raise OptionError(f"--per must be one of {', '.join(PER)}", found=repr(self.per))
+        if self.buffer is not None and not (math.isfinite(self.buffer) and self.buffer >= 0):
+            raise OptionError("--buffer must be a length of 0 or more, in metres", found=self.buffer)
+        if self.retries < 0:
+            raise OptionError("--retries must be a whole number of 0 or more", found=self.retries)
+        cores = available_threads()
+        if self.workers is not None and self.workers > cores:
+            raise OptionError(
+                "there are more workers than cores",
+                found=f"{self.workers} workers, {cores} cores",
+                cure=f"Give --workers {cores} or fewer",
+            )
+
+    @property
+    def local_workers(self) -> int:
+        """Worker processes on this machine."""
+        return max(1, available_threads() // 2) if self.workers is None else self.workers
+
+    @property
+    def threads(self) -> int:
+        """Threads of each local worker: workers times threads never exceed the cores."""
+        return max(1, available_threads() // max(1, self.local_workers))
