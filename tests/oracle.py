@@ -166,16 +166,22 @@ def ropt_radii(r_min=0.25, r_max=2.0, step=0.05):
     return [round(r_min + i * step, 9) for i in range(count)]
 
 
-def ropt(xyz, q, r_min=0.25, r_max=2.0, step=0.05):
-    """Members, radius and all entropies of the radius with the lowest eigenentropy [H17]."""
+def ropt(xyz, q, r_min=0.25, r_max=2.0, step=0.05, least=10):
+    """Members, radius and all entropies of the radius with the lowest eigenentropy [H17].
+
+    A radius that holds fewer than `least` points is not a candidate.
+    """
     radii = ropt_radii(r_min, r_max, step)
-    entropies = [entropy(sphere(xyz, q, r)) for r in radii]
+    spheres = [sphere(xyz, q, r) for r in radii]
+    entropies = [entropy(members) if len(members) >= least else math.inf for members in spheres]
     r = radii[_first_lowest(entropies)]
     return sphere(xyz, q, r), r, entropies
 
 
-def curvature(xyz, q, radius=1.0):
-    """Surface variation at `radius`, 1/3 where there are too few neighbors [H17 eq. 1]."""
+def curvature(xyz, q, radius=1.0, least=10):
+    """Surface variation at `radius`, 1/3 where there are fewer than `least` points [H17 eq. 1]."""
+    if len(sphere(xyz, q, radius)) < least:
+        return 1 / 3
     return of_sphere(xyz, q, radius)["SurfaceVariation"]
 
 

@@ -268,21 +268,23 @@ def test_copies_have_a_finite_density_and_no_structure():
 # ---- ropt --------------------------------------------------------------------------------------------------
 
 
-def oracle_ropt(xyz, q, radii):
-    entropies = [oracle.entropy(oracle.sphere(xyz, q, r)) for r in radii]
+def oracle_ropt(xyz, q, radii, least=10):
+    spheres = [oracle.sphere(xyz, q, r) for r in radii]
+    entropies = [oracle.entropy(members) if len(members) >= least else np.inf for members in spheres]
     return radii[oracle._first_lowest(entropies)], entropies
 
 
+@pytest.mark.parametrize("least", [3, 10])
 @pytest.mark.parametrize("cloud", CLOUDS)
-def test_ropt_is_the_oracle_s(cloud):
+def test_ropt_is_the_oracle_s(cloud, least):
     xyz = CLOUDS[cloud]
     queries = some(xyz, 40)
     m = len(queries)
     for radii in (radii_of(0.25, 2.0, 0.05), radii_of(1.5, 1.5, 1.0)):
         table, radius = np.zeros((12, m)), np.zeros(m)
-        ropt_block(tree_of(xyz), *columns(queries), radii, table, radius, NO_SEEDS, no_shapes())
+        ropt_block(tree_of(xyz), *columns(queries), radii, least, table, radius, NO_SEEDS, no_shapes())
         for i, q in enumerate(queries):
-            r, entropies = oracle_ropt(xyz, q, radii)
+            r, entropies = oracle_ropt(xyz, q, radii, least)
             assert table[0, i] == len(oracle.sphere(xyz, q, radius[i]))
             mine = entropies[list(radii).index(radius[i])]
             assert radius[i] == r or abs(mine - min(entropies)) < 2e-9, f"query {i}"
@@ -292,7 +294,7 @@ def test_members_at_exactly_a_radius_are_inside():
     xyz = np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0], [0, 0, 0.3], [0, 0, -0.3]])
     table, radius = np.zeros((12, 1)), np.zeros(1)
     radii = radii_of(0.25, 2.0, 0.05)
-    ropt_block(tree_of(xyz), *columns(xyz[:1]), radii, table, radius, NO_SEEDS, no_shapes())
+    ropt_block(tree_of(xyz), *columns(xyz[:1]), radii, 3, table, radius, NO_SEEDS, no_shapes())
     assert (radius[0], table[0, 0]) == (0.3, 5)
 
 
@@ -325,8 +327,10 @@ def test_curvature(cloud):
     xyz = CLOUDS[cloud]
     queries = some(xyz, 40)
     got = np.zeros(len(queries))
-    curvature_block(tree_of(xyz), *columns(queries), no_shapes(), got)
-    assert got == pytest.approx([oracle.curvature(xyz, q) for q in queries], rel=1e-9, abs=1e-12)
+    for least in (3, 10):
+        curvature_block(tree_of(xyz), *columns(queries), least, no_shapes(), got)
+        wanted = [oracle.curvature(xyz, q, least=least) for q in queries]
+        assert got == pytest.approx(wanted, rel=1e-9, abs=1e-12)
 
 
 @settings(max_examples=100, deadline=None)

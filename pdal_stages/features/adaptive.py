@@ -68,7 +68,7 @@ class AdaptiveNeighborhoods:
     """
 
     def __init__(self, grid: Grid, plan: FeaturePlan, threads: int | None = None) -> None:
-        self.grid, self.halo = grid, plan.halo
+        self.grid, self.halo, self.least = grid, plan.halo, plan.least_members
         fixed = ("cylinder", "sphere")
         self.specs = [_spec(c) for c in plan.layout if c.at and c.neighborhood.kind not in fixed]
         self.tokens = [spec.token for spec in self.specs]
@@ -103,7 +103,7 @@ class AdaptiveNeighborhoods:
         def compute(start: int) -> None:
             part = slice(start, start + CHUNK)
             x, y, z = grid.x[part], grid.y[part], grid.z[part]
-            curvature_block(self._tree, x, y, z, no_shapes(), curvatures[part])
+            curvature_block(self._tree, x, y, z, self.least, no_shapes(), curvatures[part])
 
         for _ in map_blocks(compute, range(0, len(grid), CHUNK), threads):
             pass
@@ -180,11 +180,25 @@ class AdaptiveNeighborhoods:
             k_min, k_max = int(spec.parameters[0]), int(spec.parameters[-1])
             kopt_block(self._tree, qx, qy, qz, k_min, k_max, math.inf, table, radius, reach, seeds, shapes)
         elif spec.kind == "ropt":
-            ropt_block(self._tree, qx, qy, qz, radii_of(*spec.parameters), table, radius, seeds, shapes)
+            radii = radii_of(*spec.parameters)
+            ropt_block(self._tree, qx, qy, qz, radii, self.least, table, radius, seeds, shapes)
         else:
             assert threshold is not None
             radii = radii_of(*COPT_RADII)
-            copt_block(self._tree, qx, qy, qz, threshold, radii, table, radius, seeds, shapes, no_shapes())
+            copt_block(
+                self._tree,
+                qx,
+                qy,
+                qz,
+                threshold,
+                radii,
+                self.least,
+                table,
+                radius,
+                seeds,
+                shapes,
+                no_shapes(),
+            )
         return table, radius, reach
 
 

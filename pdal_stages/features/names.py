@@ -53,6 +53,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "covariance": tuple(COVARIANCE),
     "geometric": tuple(GEOMETRIC),
     "shapes": SHAPE_FEATURES,
+    "he2017": ("Linearity", "Planarity", "Scattering", "SurfaceVariation", "Verticality", "HeightRange"),
     **{metric: tuple(f"{metric}_{b}" for b in range(SHAPE_BINS)) for metric in SHAPES},
 }
 

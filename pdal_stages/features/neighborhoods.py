@@ -26,6 +26,10 @@ PRESETS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 KOPT_DEFAULT = (10.0, 100.0)  # k_min, k_max [B16]
 ROPT_DEFAULT = (0.25, 2.0, 0.05)  # r_min, r_max, step in metres [H17]
+#: Members below which [H17]'s inadequate neighborhood begins: radii of ``ropt`` and ``copt`` with fewer are not
+#: candidates, and the curvature is 1/3. The paper gives no number; with ten, its c_t of 0.03 and the counts of its
+#: Table 1 come out (docs/papers.md), with three they do not.
+LEAST_MEMBERS = 10
 COPT_REACH = 3.0  # metres: the cap of the scattered branch, the largest radius copt looks at [H17]
 MAX_K = 10_000
 MIN_RADIUS, MAX_RADIUS = 0.001, 100_000.0  # metres

@@ -146,8 +146,8 @@ def _covariance(s, j):
 
 
 @njit
-def estimate_entropies(n, x, y, z, xx, xy, xz, yy, yz, zz, entropy, first, last):
-    """Estimate the eigenentropies of the candidates first..last - 1 into `entropy`."""
+def estimate_entropies(n, x, y, z, xx, xy, xz, yy, yz, zz, entropy, first, last, least):
+    """Estimate the eigenentropies of the candidates first..last - 1 of at least `least` members."""
     for j in range(first, last):
         w = 1.0 / n[j]
         a, b, c = x[j] * w, y[j] * w, z[j] * w
@@ -155,22 +155,26 @@ def estimate_entropies(n, x, y, z, xx, xy, xz, yy, yz, zz, entropy, first, last)
             xx[j] * w - a * a, xy[j] * w - a * b, xz[j] * w - a * c, yy[j] * w - b * b, yz[j] * w - b * c,
             zz[j] * w - c * c, COINCIDENT * w * (xx[j] + yy[j] + zz[j]),
         )  # fmt: skip
-        entropy[j] = value if n[j] >= LEAST else NEVER
+        entropy[j] = value if n[j] >= least else NEVER
 
 
 @njit
-def lowest_entropy(s, first, last):
+def lowest_entropy(s, first, last, least_members):
     """The candidate of first..last - 1 with the lowest eigenentropy; last - 1 where none qualifies.
 
     Parameters
     ----------
     s : Sums
         Moments of the candidates, in ascending size; n > 0.
+    least_members : int
+        Members a candidate needs.
     """
     if last - first <= 1:
         return last - 1
     entropy = s.entropy
-    estimate_entropies(s.n, s.x, s.y, s.z, s.xx, s.xy, s.xz, s.yy, s.yz, s.zz, entropy, first, last)
+    estimate_entropies(
+        s.n, s.x, s.y, s.z, s.xx, s.xy, s.xz, s.yy, s.yz, s.zz, entropy, first, last, least_members
+    )
     least = NEVER
     for j in range(first, last):
         least = min(least, entropy[j])
@@ -313,7 +317,7 @@ def kopt_into(tree, qx, qy, qz, target, k_min, k_max, cap2, table, radius, reach
                 continue
             take_members(tree, rows.at[row], found, qx[q], qy[q], qz[q], members)
             running_sums(members.x, members.y, members.z, found, s)
-            best = lowest_entropy(s, min(k_min, found - 1), found)
+            best = lowest_entropy(s, min(k_min, found - 1), found, LEAST)
             write_moments(s, best, members, best + 1, table, q)
             radius[q] = math.sqrt(rows.d2[row, best])
             if shapes.mode:

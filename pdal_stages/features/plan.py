@@ -10,7 +10,7 @@ from typing import Any
 
 from ..base.errors import OptionError
 from .names import ALL_FEATURES, GROUPS, WITH_DIMENSIONS, parse_feature_set
-from .neighborhoods import Neighborhood, parse_neighborhoods, preset_dimensions
+from .neighborhoods import LEAST_MEMBERS, Neighborhood, parse_neighborhoods, preset_dimensions
 
 #: Halo of neighborhoods whose size is a number of points, metres: see :attr:`FeaturePlan.halo`.
 POINTS_HALO = 15.0
@@ -47,11 +47,14 @@ class FeaturePlan:
         The words of the feature set: groups, features, or features of one neighborhood.
     dimensions : tuple of str
         The points' own dimensions used as features, after all others.
+    least_members : int
+        Points a radius of ``ropt`` and ``copt`` must hold, and the sphere of a curvature [H17].
     """
 
     neighborhoods: tuple[Neighborhood, ...]
     features: tuple[str, ...] = ("all",)
     dimensions: tuple[str, ...] = ()
+    least_members: int = LEAST_MEMBERS
 
     def __post_init__(self) -> None:
         self.layout  # noqa: B018  a plan with unusable words is refused when it is made
@@ -181,12 +184,17 @@ class FeaturePlan:
         """Whether a neighborhood's size is a number of points, so that no halo is sure to suffice."""
         return any(n.reach is None for n in self.neighborhoods)
 
+    @property
+    def _by_radius(self) -> bool:
+        return any(n.kind in ("ropt", "copt") for n in self.neighborhoods)
+
     def to_dict(self) -> dict[str, Any]:
         """A JSON-able description; :meth:`from_dict` reads it."""
         return {
             "neighborhoods": [n.token for n in self.neighborhoods],
             "features": list(self.features),
             "dimensions": list(self.dimensions),
+            **({"least_members": self.least_members} if self._by_radius else {}),
         }
 
     @classmethod
@@ -199,6 +207,13 @@ class FeaturePlan:
         for value in (tokens, words, dimensions):
             if not isinstance(value, list | tuple) or not all(isinstance(item, str) for item in value):
                 raise OptionError("a feature plan holds lists of text", found=repr(value)[:80])
+        # A model that does not say was trained when three members were enough.
+        least = data.get("least_members", 3)
+        if not isinstance(least, int) or isinstance(least, bool) or not 3 <= least <= 100:
+            raise OptionError("'least_members' of a feature plan is from 3 to 100", found=repr(least)[:20])
         return cls(
-            tuple(parse_neighborhoods(tokens)), parse_feature_set(words), tuple(dict.fromkeys(dimensions))
+            tuple(parse_neighborhoods(tokens)),
+            parse_feature_set(words),
+            tuple(dict.fromkeys(dimensions)),
+            least,
         )

@@ -5,8 +5,8 @@ variation) of the sphere of 1 m round the point: where it is at least c_t the po
 the best k of 10..50 within 3 m, otherwise it is *regular* and takes the best radius of 0.5..2 m. The
 threshold c_t follows from the curvatures of the whole cloud.
 
-A radius is a candidate where it holds at least ``optimal.LEAST`` points that do not all coincide; where no
-radius does, the largest is taken. Radii that hold the same points are equal, and the smallest wins.
+A radius is a candidate where it holds at least ``neighborhoods.LEAST_MEMBERS`` points that do not all coincide; where no
+radius does, the largest is taken. The curvature of a sphere with fewer is 1/3. Radii that hold the same points are equal, and the smallest wins.
 
 The tree must be built over a cloud in canonical order (``index.Grid``): sums run over the members in the
 order of their shell, then of the cloud.
@@ -24,7 +24,6 @@ from .kdtree import bounding_box, gather
 from .knn import make_groups, make_scratch
 from .moments import COINCIDENT
 from .optimal import (
-    LEAST,
     copy_column,
     kopt_into,
     lowest_entropy,
@@ -175,7 +174,7 @@ def _shell_sums(x, y, z, radii, ends, s):
 
 
 @njit
-def ropt_into(tree, qx, qy, qz, target, radii, table, radius, seeds, shapes):
+def ropt_into(tree, qx, qy, qz, target, radii, least, table, radius, seeds, shapes):
     """:func:`ropt_block` for the queries `target` (ndarray of int64) only; the others are left alone."""
     tx, ty, tz = qx[target], qy[target], qz[target]
     order, starts = make_groups(tx, ty, tz)
@@ -208,7 +207,7 @@ def ropt_into(tree, qx, qy, qz, target, radii, table, radius, seeds, shapes):
                     index[i] = scratch.ci[scratch.pos[i]]
                 take_members(tree, index, inside, qx[q], qy[q], qz[q], members)
                 _shell_sums(members.x, members.y, members.z, radii, ends, s)
-                best = lowest_entropy(s, 0, len(radii))
+                best = lowest_entropy(s, 0, len(radii), least)
                 write_moments(s, best, members, ends[best], table, q)
                 radius[q] = radii[best]
                 if shapes.mode:
@@ -220,7 +219,7 @@ def ropt_into(tree, qx, qy, qz, target, radii, table, radius, seeds, shapes):
 
 
 @njit
-def ropt_block(tree, qx, qy, qz, radii, table, radius, seeds, shapes):
+def ropt_block(tree, qx, qy, qz, radii, least, table, radius, seeds, shapes):
     """Moments, radius and shapes of the best of `radii` for a block of queries.
 
     Parameters
@@ -230,17 +229,19 @@ def ropt_block(tree, qx, qy, qz, radii, table, radius, seeds, shapes):
     qx, qy, qz : ndarray of float64, shape (m,)
     radii : ndarray of float64, shape (r,)
         Ascending and evenly spaced, metres; see :func:`radii_of`.
+    least : int
+        Members a radius must hold to be a candidate.
     table, radius, seeds, shapes
         As for :func:`optimal.kopt_block`; `radius` becomes the chosen one.
     """
-    ropt_into(tree, qx, qy, qz, np.arange(len(qx)), radii, table, radius, seeds, shapes)
+    ropt_into(tree, qx, qy, qz, np.arange(len(qx)), radii, least, table, radius, seeds, shapes)
 
 
 @njit
-def curvature_of(table, j):
-    """Surface variation of column j of a moment table; 1/3 for fewer than three or coinciding points."""
+def curvature_of(table, j, least):
+    """Surface variation of column j of a moment table; 1/3 for fewer than `least` or coinciding points."""
     n = table[0, j]
-    if n < LEAST:
+    if n < least:
         return SCATTERED
     w = 1.0 / n
     x, y, z = table[1, j] * w, table[2, j] * w, table[3, j] * w
@@ -252,32 +253,33 @@ def curvature_of(table, j):
 
 
 @njit
-def curvature_block(tree, qx, qy, qz, shapes, out):
+def curvature_block(tree, qx, qy, qz, least, shapes, out):
     """Curvature (surface variation of the sphere of 1 m) of a block of queries [H17].
 
     Parameters
     ----------
-    tree, qx, qy, qz
+    tree, qx, qy, qz, least
         As for :func:`ropt_block`.
     shapes : Shapes
         :func:`shapes.no_shapes`.
     out : ndarray of float64, shape (m,)
-        Out: 0 to 1/3; 1/3 where there are fewer than three points or all coincide.
+        Out: 0 to 1/3; 1/3 where there are fewer than `least` points or all coincide.
     """
     table, radius = np.empty((12, len(qx))), np.empty(len(qx))
     radii = np.array([CURVATURE_RADIUS])
-    ropt_into(tree, qx, qy, qz, np.arange(len(qx)), radii, table, radius, np.empty(0, np.uint64), shapes)
+    none = np.empty(0, np.uint64)
+    ropt_into(tree, qx, qy, qz, np.arange(len(qx)), radii, least, table, radius, none, shapes)
     for j in range(len(qx)):
-        out[j] = curvature_of(table, j)
+        out[j] = curvature_of(table, j, least)
 
 
 @njit
-def copt_block(tree, qx, qy, qz, threshold, radii, table, radius, seeds, shapes, none):
+def copt_block(tree, qx, qy, qz, threshold, radii, least, table, radius, seeds, shapes, none):
     """Moments, radius and shapes of the curvature-adaptive neighborhoods of a block of queries [H17].
 
     Parameters
     ----------
-    tree, qx, qy, qz, table, radius, seeds, shapes
+    tree, qx, qy, qz, least, table, radius, seeds, shapes
         As for :func:`ropt_block`; scattered points get the distance to the farthest member as radius.
     threshold : float
         See :func:`curvature_threshold`.
@@ -292,10 +294,10 @@ def copt_block(tree, qx, qy, qz, threshold, radii, table, radius, seeds, shapes,
         Which queries are scattered.
     """
     curvature = np.empty(len(qx))
-    curvature_block(tree, qx, qy, qz, none, curvature)
+    curvature_block(tree, qx, qy, qz, least, none, curvature)
     scattered = curvature >= threshold
     few, many = COPT_K
     cap2, reach, which = COPT_CAP * COPT_CAP, np.empty(len(qx)), np.flatnonzero(scattered)
     kopt_into(tree, qx, qy, qz, which, few, many, cap2, table, radius, reach, seeds, shapes)
-    ropt_into(tree, qx, qy, qz, np.flatnonzero(~scattered), radii, table, radius, seeds, shapes)
+    ropt_into(tree, qx, qy, qz, np.flatnonzero(~scattered), radii, least, table, radius, seeds, shapes)
     return scattered
