@@ -36,8 +36,8 @@ class _Family:
                 # Points of several readers must see each other; of one reader this costs nothing.
                 wired = {"inputs": own.pop("inputs")} if "inputs" in own else {}
                 merged = pdal.Filter(type="filters.merge", **wired)
-            stage, lowered = python_stage(kind, options, **own)
-            runtime.remember_stdout(lowered.label)
+            stage, _ = python_stage(kind, options, **own)
+            runtime.remember_stdout()
             lowered_stage = pdal.Filter(**stage)
             return merged | lowered_stage if merged is not None else lowered_stage
 

@@ -86,8 +86,7 @@ class Pipeline:
         """
         self._check_inputs()
         stages, renames = _partial_outputs(self.lowered.stages)
-        for ours in self.lowered.ours:
-            runtime.remember_stdout(ours.label)
+        runtime.remember_stdout()
         failure: StageError | None = None
         try:
             try:

@@ -2,6 +2,10 @@
 
 The script that PDAL executes is a few lines that call :func:`run_stage`; everything else
 lives here, in the installed package, where compiled code can be cached.
+
+No exception may reach ``filters.python``: it releases the exception, its type and its traceback twice,
+and Python dies of it then or minutes later. A stage that fails therefore returns normally and hands over
+one array under a name no dimension has, its message; PDAL refuses that with an error that holds the name.
 """
 
 from __future__ import annotations
@@ -20,9 +24,18 @@ from ..stages.points import Points
 from . import pdal as pdal_env
 
 #: What ``source`` of a lowered stage holds. PDAL sets the globals before each call.
-TRAMPOLINE = (
-    "from pdal_stages import run_stage\ndef stage(ins, outs):\n    return run_stage(globals(), ins, outs)\n"
-)
+TRAMPOLINE = """\
+def stage(ins, outs):
+    try:
+        from pdal_stages import run_stage
+    except Exception as error:  # raised, it would end the process
+        outs[f"{type(error).__name__}: {error}"] = None
+        return True
+    return run_stage(globals(), ins, outs)
+"""
+
+#: Around a stage's message in the name of the array that PDAL refuses.
+_OPENING, _CLOSING = "of a stage that failed:\n\n", "\n\n"
 
 #: What an error says when Ctrl-C came while a stage ran; the runners turn it back into KeyboardInterrupt.
 INTERRUPTED = "interrupted"
@@ -30,7 +43,7 @@ INTERRUPTED = "interrupted"
 _lock = threading.Lock()
 _reports: dict[str, list[dict[str, Any]]] = {}
 _failures: dict[str, StageError] = {}
-_stdout: dict[str, Any] = {}
+_usual_stdout: Any = sys.__stdout__
 _kept: list[Any] = []
 
 
@@ -40,7 +53,7 @@ def place(type_name: str, tag: str | None) -> str:
 
 
 def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
-    """Run one lowered stage on one point view.
+    """Run one lowered stage on one point view; True, also where it failed (see above).
 
     Parameters
     ----------
@@ -55,21 +68,17 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
     sys.modules.pop(label, None)  # PDAL's module object stays alive; the register need not grow
     try:
         report = _run(module, arguments, ins, outs)
+        module["out_metadata"] = _metadata_node(arguments["stage"], report)
     except BaseException as error:
         failure = _as_stage_error(error, place(arguments["stage"], arguments.get("tag")))
         with _lock:
             _failures[label] = failure
-            original = _stdout.pop(label, None)
-        if original is not None:  # PDAL restores it only where nothing is raised
-            sys.stdout = original
-            # PDAL remembers the object without holding it, until a run succeeds: it must not be freed.
-            if not any(kept is original for kept in _kept):
-                _kept.append(original)
-        # A class of our own, raised afresh: some exception types crash python-pdal at exit.
-        raise failure from None
-    with _lock:
-        _reports.setdefault(label, []).append(report)
-    module["out_metadata"] = _metadata_node(arguments["stage"], report)
+        outs.clear()
+        outs[f"{_OPENING}{_encodable(str(failure))}{_CLOSING}"] = None
+        restore_stdout()
+    else:
+        with _lock:
+            _reports.setdefault(label, []).append(report)
     return True
 
 
@@ -114,6 +123,11 @@ def _as_stage_error(error: BaseException, where: str) -> StageError:
     return failure
 
 
+def _encodable(text: str) -> str:
+    """Text that PDAL can take: file names may hold bytes that are not UTF-8, and C ends at a zero."""
+    return text.encode("utf-8", "replace").decode().replace("\0", "?")
+
+
 def _wkt(reference: Any) -> str:
     """The well-known text in PDAL's description of a spatial reference."""
     if isinstance(reference, dict):
@@ -141,20 +155,42 @@ def _metadata_node(name: str, report: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _leaf(name: str, value: str, kind: str) -> dict[str, Any]:
-    return {"name": name, "value": value, "type": kind, "description": "", "children": []}
+    return {"name": name, "value": _encodable(value), "type": kind, "description": "", "children": []}
 
 
 # ---- for the runners in the same process -----------------------------------------------------------
 
 
-def remember_stdout(label: str) -> None:
-    """Keep this process's ``sys.stdout``, to be put back if the stage raises."""
-    with _lock:
-        _stdout[label] = sys.stdout
+def remember_stdout() -> None:
+    """Keep this process's ``sys.stdout``, to be put back if a stage fails."""
+    global _usual_stdout
+    if not _redirected():
+        _usual_stdout = sys.stdout
+
+
+def restore_stdout() -> None:
+    """Put ``sys.stdout`` back: PDAL does so only after a run that succeeds, and its log is gone by now."""
+    if _redirected():
+        sys.stdout = _usual_stdout
+        # PDAL remembers the object without holding it, until a run succeeds: it must not be freed.
+        if not any(kept is _usual_stdout for kept in _kept):
+            _kept.append(_usual_stdout)
+
+
+def _redirected() -> bool:
+    return type(sys.stdout).__module__ == "redirector"  # PDAL's own type
+
+
+def message_of(text: str) -> str | None:
+    """A stage's own message in PDAL's error text, or None."""
+    start, end = text.find(_OPENING), text.rfind(_CLOSING)
+    return text[start + len(_OPENING) : end] if 0 <= start < end else None
 
 
 def collect(label: str) -> tuple[list[dict[str, Any]], StageError | None]:
     """Reports (one per point view) and the failure of a lowered stage, which are then forgotten."""
     with _lock:
-        _stdout.pop(label, None)
         return _reports.pop(label, []), _failures.pop(label, None)
+
+
+remember_stdout()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import pdal_stages as ps
+from pdal_stages.pipeline.runtime import message_of
 
 pytestmark = pytest.mark.pdal
 HAG = {"type": "filters.hag_minima"}
@@ -22,12 +23,8 @@ def stock(cell, case, pdal_program, folder, pipeline, *says):
     assert done.returncode == 1, (done.returncode, text)  # not a signal: PDAL's own filters abort on NaN
     for word in says:
         assert word in text, (word, text)
-    text = text.replace("\\'", "'").replace("\\n", "\n")
-    message = (
-        text[text.index("pdal_stages.base.errors.") :].partition(": ")[2]
-        if "pdal_stages.base.errors." in text
-        else text
-    )
+    message = message_of(text)
+    assert message, text
     cell("Clouds", case + ", through stock `pdal pipeline`").note("error", message)
 
 

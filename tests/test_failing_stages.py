@@ -1,0 +1,148 @@
+"""A stage that fails, again and again in one process: an exception that reached filters.python would end it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import pdal_stages as ps
+from pdal_stages.pipeline.runtime import TRAMPOLINE, message_of, run_stage
+
+pytestmark = pytest.mark.pdal
+
+CLOUD = """
+import gc, json, sys
+import numpy as np
+import pdal, pdal_stages as ps
+
+rng = np.random.default_rng(0)
+for name in ("good.txt", "bad.txt"):
+    rows = [f"{x:.2f},{y:.2f},{x:.2f},2" for x, y in rng.uniform(0, 30, (100, 2))]
+    rows[7] = rows[7] if name == "good.txt" else "nan,1,1,2"
+    with open(name, "w") as file:
+        file.write("\\n".join(["X,Y,Z,Classification", *rows, ""]))
+good, bad = ({"type": "readers.text", "filename": name} for name in ("good.txt", "bad.txt"))
+failures = 0
+"""
+#: Each fails once per turn, for several reasons, and counts the failures whose message is ours.
+OBJECTS = """
+kept = pdal.Reader(**bad) | ps.Filter.hag_minima(tag="kept")
+for turn in range(50):
+    for pipeline, says in (
+        (pdal.Reader(**bad) | ps.Filter.hag_minima(), "not finite"),
+        (kept, "(tag 'kept')"),
+        (pdal.Reader(**good) | ps.Filter.accuracy(merge=False), "'Reference' is missing"),
+    ):
+        try:
+            pipeline.execute()
+        except RuntimeError as error:
+            failures += says in str(error)
+        assert sys.stdout is sys.__stdout__
+    gc.collect()
+    (pdal.Reader(**good) | ps.Filter.hag_minima()).execute()
+assert failures == 150, failures
+"""
+RUNNER = """
+for turn in range(50):
+    for stages, says in (
+        ([bad, {"type": "filters.hag_minima"}], "not finite"),
+        ([good, {"type": "filters.accuracy"}], "'Reference' is missing"),
+        ([good, {"type": "filters.hag_minima", "where": "Height > 2"}], "'Height'"),
+    ):
+        try:
+            ps.run_pipeline(stages)
+        except ps.StageError as error:
+            failures += says in str(error)
+        assert sys.stdout is sys.__stdout__
+    gc.collect()
+    ps.run_pipeline([good, {"type": "filters.hag_minima"}])
+assert failures == 150, failures
+"""
+TEXTS = """
+for turn in range(50):
+    stages = ps.Pipeline([good, {"type": "filters.hag_minima"}]).lowered.stages
+    stages[1]["pdalargs"]["options"]["cell"] = "wide " + str(turn)
+    try:
+        pdal.Pipeline(json.dumps(stages)).execute()
+    except RuntimeError as error:
+        failures += "must be a number" in str(error)
+    gc.collect()
+assert failures == 50, failures
+"""
+
+
+@pytest.mark.parametrize(
+    "body", [OBJECTS, RUNNER, TEXTS], ids=["python-pdal objects", "the runner", "expanded JSON"]
+)
+def test_fifty_failing_pipelines(tmp_path, body):
+    script = CLOUD + body + "gc.collect()\nprint('survived')\n"
+    done = subprocess.run(
+        [sys.executable, "-X", "faulthandler", "-c", script],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=500,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert done.stdout == "survived\n"
+
+
+def test_bytes_of_file_names_in_a_message(monkeypatch):
+    """Names with bytes that are not UTF-8, and a zero: PDAL's C++ would take neither."""
+    from pdal_stages.stages.hag_minima import HagMinima
+
+    def fails(points, options):
+        raise ps.StageError("no file '\udcff\0'")
+
+    monkeypatch.setattr(HagMinima, "run", fails)
+    outs = {"HeightAboveGround": np.zeros(1)}
+    points = {name: np.zeros(1) for name in ("X", "Y", "Z", "HeightAboveGround")}
+    assert run_stage({"pdalargs": {"stage": "filters.hag_minima"}}, points, outs) is True
+    (name,) = outs
+    assert message_of(name) == "filters.hag_minima: no file '??'."
+
+
+def test_stock_pdal_says_it_and_fails(tmp_path, pdal_program):
+    text = tmp_path / "nan.txt"
+    text.write_text("X,Y,Z\n1,1,1\nnan,2,2\n")
+    plain = tmp_path / "plain.json"
+    plain.write_text(
+        ps.Pipeline(
+            [
+                {"type": "readers.text", "filename": str(text)},
+                {"type": "filters.hag_minima", "tag": "h"},
+                "out.las",
+            ]
+        ).json
+    )
+    done = subprocess.run(
+        [pdal_program, "pipeline", plain], cwd=tmp_path, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 1, (done.returncode, done.stderr)
+    assert message_of(done.stderr).startswith("filters.hag_minima (tag 'h'): coordinates are not finite")
+
+
+def test_a_python_without_the_package(tmp_path, pdal_program):
+    """The trampoline itself raises nothing, so that PDAL's message says what is missing."""
+    (tmp_path / "plain.json").write_text(
+        json.dumps(
+            [
+                {"type": "readers.faux", "count": 5, "mode": "ramp", "bounds": "([0,1],[0,1],[0,1])"},
+                {
+                    "type": "filters.python",
+                    "module": "any_name",
+                    "function": "stage",
+                    "source": TRAMPOLINE.replace("pdal_stages", "pdal_stages_elsewhere"),
+                },
+            ]
+        )
+    )
+    done = subprocess.run(
+        [pdal_program, "pipeline", tmp_path / "plain.json"], capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 1, (done.returncode, done.stderr)
+    assert "ModuleNotFoundError: No module named 'pdal_stages_elsewhere'" in done.stderr
