@@ -5,8 +5,9 @@ variation) of the sphere of 1 m round the point: where it is at least c_t the po
 the best k of 10..50 within 3 m, otherwise it is *regular* and takes the best radius of 0.5..2 m. The
 threshold c_t follows from the curvatures of the whole cloud.
 
-A radius is a candidate where it holds at least ``neighborhoods.LEAST_MEMBERS`` points that do not all coincide; where no
-radius does, the largest is taken. The curvature of a sphere with fewer is 1/3. Radii that hold the same points are equal, and the smallest wins.
+A radius is a candidate where it holds at least ``neighborhoods.LEAST_MEMBERS`` points that do not all coincide;
+where no radius does, the largest is taken. The curvature of a sphere with fewer is 1/3. Radii that hold the same
+points are equal, and the smallest wins.
 
 The tree must be built over a cloud in canonical order (``index.Grid``): sums run over the members in the
 order of their shell, then of the cloud.
