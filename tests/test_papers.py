@@ -236,7 +236,7 @@ def test_w18_run(scene):
             "scene": "town", "kind": "best tenth", "count": 100, "target": None, "seed": 0,
             **trainer.run(100, 0, chosen=best),
         },
-        {"scene": "town", "kind": "all", "count": 100, "target": 5, "seed": 0, **trainer.run(100, 0, target=5)},
+        {"scene": "town", "kind": "all", "count": 100, "target": "5", "seed": 0, **trainer.run(100, 0, target=(5,))},
     ]  # fmt: skip
     assert runs[2]["classes"] == [0, 5]
     assert runs[1]["oa"] > 60

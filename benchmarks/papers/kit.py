@@ -91,7 +91,7 @@ def code_fingerprint() -> str:
     """Changes whenever code that features depend on does."""
     root = Path(pdal_stages.__file__).parent
     digest = hashlib.sha256()
-    for path in sorted([*root.glob("features/*.py"), root / "neighborhoods.py", root / "terrain.py"]):
+    for path in sorted([*root.glob("features/*.py"), *root.glob("terrain/*.py")]):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:12]
 
@@ -208,10 +208,16 @@ def draw(labels: np.ndarray, classes: Sequence[int], count: int, seed: int) -> n
     return np.concatenate(rows)
 
 
-def limits(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """1st and 99th percentile of each column [B16 3.3]; trees need no scaling, but values beyond are cut off."""
+def limits(values: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """1st and 99th percentile of each shape measure, heights among them; histograms are not cut [B16 3.3, W18 3.2].
+
+    Trees need no scaling, but values beyond are cut off.
+    """
     low, high = np.percentile(values, [1, 99], axis=0).astype(np.float32)
-    return np.where(values.min(axis=0) == 0, np.float32(0), low), high
+    low = np.where(np.abs(values).min(axis=0) == 0, np.float32(0), low)
+    histogram = np.array([name.startswith(("A3_", "D1_", "D2_", "D3_", "D4_")) for name in names])
+    low[histogram], high[histogram] = -np.inf, np.inf
+    return low, high
 
 
 def grow_forest(
