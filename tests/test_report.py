@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import base64
+import io
 import re
-import struct
-import zlib
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.accuracy.text import percent
 from pdal_stages.base.errors import StageError
 from pdal_stages.reports import html
 from pdal_stages.reports.accuracypage import _nice, accuracy_page, write_accuracy_report
-from pdal_stages.reports.indexed import indexed_png
 from pdal_stages.reports.maps import _scene, _section_line
 from pdal_stages.reports.style import HEAT, PALETTE
 
@@ -232,46 +231,12 @@ def test_text_has_contrast(scheme):
 # ---- maps ------------------------------------------------------------------------------------------------
 
 
-def decode(png):
-    """A palette PNG without filters, as RGB (an independent reading of the format)."""
-    assert png[:8] == b"\x89PNG\r\n\x1a\n"
-    at, parts = 8, {}
-    while at < len(png):
-        n, kind = struct.unpack(">I4s", png[at : at + 8])
-        body = png[at + 8 : at + 8 + n]
-        assert struct.unpack(">I", png[at + 8 + n : at + 12 + n])[0] == zlib.crc32(kind + body)
-        parts[kind], at = body, at + 12 + n
-    width, height, depth, color = struct.unpack(">IIBB", parts[b"IHDR"][:10])
-    assert (depth, color) == (8, 3)
-    rows = np.frombuffer(zlib.decompress(parts[b"IDAT"]), np.uint8).reshape(height, width + 1)
-    assert not rows[:, 0].any()
-    return np.frombuffer(parts[b"PLTE"], np.uint8).reshape(-1, 3)[rows[:, 1:]]
-
-
-def test_palette_png_is_exact_for_few_colours():
-    rng = np.random.default_rng(0)
-    image = rng.integers(0, 256, (200, 3), dtype=np.uint8)[rng.integers(0, 200, (31, 17))]
-    np.testing.assert_array_equal(decode(indexed_png(image)), image)
-
-
-def test_palette_png_is_close_for_many_colours():
-    image = np.random.default_rng(0).integers(0, 256, (300, 200, 3), dtype=np.uint8)
-    assert np.abs(decode(indexed_png(image)).astype(int) - image).max() <= 32
-    ramp = np.zeros((256, 256, 3), np.uint8)
-    ramp[..., 0] = np.arange(256)
-    ramp[..., 1] = np.arange(256)[:, None] // 64
-    assert np.abs(decode(indexed_png(ramp)).astype(int) - ramp).max() <= 4
-
-
-def test_palette_png_refuses_other_arrays():
-    for image in (np.zeros((2, 2)), np.zeros((2, 2, 3)), np.zeros((0, 2, 3), np.uint8)):
-        with pytest.raises(StageError, match="height x width x 3"):
-            indexed_png(image)
-
-
 def embedded(text):
     found = re.findall(r'src="data:image/png;base64,([^"]+)"', text)
-    return [decode(base64.b64decode(data, validate=True)) for data in found]
+    return [
+        np.asarray(Image.open(io.BytesIO(base64.b64decode(data, validate=True))).convert("RGB"))
+        for data in found
+    ]
 
 
 def test_error_map_shows_the_errors(full):

@@ -15,7 +15,7 @@ from ..accuracy.text import percent
 from ..base.asprs import class_color
 from ..base.errors import StageError
 from . import html
-from .indexed import indexed_png
+from .pictures import png
 
 #: Most pixels across a map and in all of it, fewest along its longer side, and pixels across a section.
 MAP_WIDTH, MAP_PIXELS, MAP_LEAST = 820, 800_000, 240
@@ -173,7 +173,7 @@ def _codes_of(s: Scene) -> list[int]:
 
 def _figure(view: npt.NDArray[np.uint8], alt: str, heading: str, bar: str = "", overlay: str = "") -> str:
     tall, wide = view.shape[:2]
-    picture = html.image(indexed_png(view), alt, wide, tall, overlay)
+    picture = html.image(png(view, palette=True), alt, wide, tall, overlay)
     # A map is no taller than the window, so that it can be seen whole.
     style = f"max-width:calc(92vh*{wide / tall:.3f})" if tall > wide else ""
     return f'<figure style="{style}"><h3>{html.escape(heading)}</h3>{picture}{bar}</figure>'

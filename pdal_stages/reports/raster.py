@@ -130,7 +130,7 @@ def surface(x: np.ndarray, y: np.ndarray, z: np.ndarray, frame: Frame, gap: floa
     return Surface(frame, which, top, spacing)
 
 
-def _blur(image: np.ndarray, size: float) -> np.ndarray:
+def blur(image: np.ndarray, size: float) -> np.ndarray:
     """Gaussian blur; a wide one on an image made smaller first, which shows no difference."""
     factor = int(size / 3)
     if factor < 2:
@@ -156,19 +156,19 @@ def shading(s: Surface, strength: float = 1.0) -> np.ndarray:
     weight = known.astype(np.float32)
     widest = 0.1 * max(s.z.shape)  # wider shows nothing more
 
-    def blur(size: float) -> np.ndarray:
+    def height_around(size: float) -> np.ndarray:
         size = min(size, widest)
-        soft = [_blur(a, size) for a in (above, weight)]
+        soft = [blur(a, size) for a in (above, weight)]
         return soft[0] / np.maximum(soft[1], 1e-6)
 
-    fine = blur(0.45 * s.spacing)
+    fine = height_around(0.45 * s.spacing)
     gy, gx = np.gradient(fine, s.frame.pixel)
     gx, gy = gx * strength, -gy * strength  # rows run south
     sun = (0.5 * gx - 0.5 * gy + 0.75) / np.sqrt(1 + gx * gx + gy * gy) / 0.75
     metres = 1.0 / s.frame.pixel
     low = 0.0
     for size, share in ((1.5, 0.5), (6.0, 0.5)):
-        around = blur(max(size * metres, 1.2 * s.spacing))
+        around = height_around(max(size * metres, 1.2 * s.spacing))
         low = low + share * np.clip((fine - around) / (1.2 * size), -1, 1)
     light = 0.62 + 0.34 * np.clip(sun, 0, 1.35) + 0.22 * low
     return np.where(known, np.clip(light, 0.42, 1.18), 1.0)

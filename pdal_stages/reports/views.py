@@ -1,22 +1,20 @@
-"""Views of a cloud: from above by class, height, value or error; in section; and three side by side."""
+"""Views of a cloud: from above by class, height, value or error, and in section."""
 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 
 import numpy as np
+from PIL import Image, ImageDraw
 from scipy import ndimage
 
-from ..base.asprs import class_color, class_name
+from ..base.asprs import class_color
 from ..base.errors import StageError
-from ..base.jit import njit
-from .lettering import LARGE, draw_text, fit_text, text_size
-from .png import write_png
+from .pictures import fit_text, font
 from .raster import BACKGROUND, Frame, Surface, paint, shading, surface
 
-INK, FAINT = (34, 38, 44), (120, 124, 130)
+INK, FAINT, GRIDLINE = (34, 38, 44), (110, 114, 120), (226, 226, 222)
 RIGHT, WRONG, IGNORED = (196, 196, 192), (204, 24, 32), (232, 232, 228)
 
 # Colour ramps, as a few anchors: heights like a tinted map; values dark to bright with even lightness.
@@ -50,10 +48,13 @@ def ramp(values: np.ndarray, low: float, high: float, name: str = "value") -> np
     return np.round(out).astype(np.uint8)
 
 
-_COLORS = np.array([class_color(code) for code in range(256)], dtype=np.uint8)
+CLASS_COLORS = np.array([class_color(code) for code in range(256)], dtype=np.uint8)
+#: Discs of 5 and 21 pixels that a point of a section is drawn as.
+_SMALL_DOT = ndimage.generate_binary_structure(2, 1)
+_DOT = np.hypot(*np.mgrid[-2:3, -2:3]) <= 2.3
 
 
-def _columns(*arrays, names: Sequence[str]) -> list[np.ndarray]:
+def checked_columns(*arrays, names: Sequence[str]) -> list[np.ndarray]:
     out = [np.asarray(a) for a in arrays]
     size = out[0].shape
     for a, name in zip(out, names, strict=True):
@@ -73,7 +74,7 @@ def _columns(*arrays, names: Sequence[str]) -> list[np.ndarray]:
     return out
 
 
-def _class_codes(classes: np.ndarray) -> np.ndarray:
+def class_codes(classes: np.ndarray) -> np.ndarray:
     if classes.dtype.kind not in "iub" or (classes.size and (classes.min() < 0 or classes.max() > 255)):
         raise StageError(
             "classes must be whole numbers from 0 to 255",
@@ -83,7 +84,7 @@ def _class_codes(classes: np.ndarray) -> np.ndarray:
     return classes.astype(np.uint8)
 
 
-def _window(x, y, z, width: int) -> Surface:
+def window(x, y, z, width: int) -> Surface:
     if not 16 <= int(width) <= 20_000:
         raise StageError("'width' must be from 16 to 20000 pixels", where="picture", found=width)
     return surface(x, y, z, Frame.around(x, y, int(width)))
@@ -132,20 +133,20 @@ def top_view(
         raise StageError("give 'classes' or 'values', not both", where="picture")
     if classes is None and values is None:
         return height_view(x, y, z, width=width, shade=shade)
-    x, y, z, by = _columns(
+    x, y, z, by = checked_columns(
         x, y, z, classes if classes is not None else values, names=("x", "y", "z", "classes")
     )
-    s = _window(x, y, z, width)
+    s = window(x, y, z, width)
     if classes is not None:
-        shown = _COLORS[s.spread(_class_codes(by), 0)]
+        shown = CLASS_COLORS[s.spread(class_codes(by), 0)]
     else:
         by = by.astype(np.float64)
-        low, high = limits if limits is not None else _span(by)
+        low, high = limits if limits is not None else span(by)
         shown = ramp(s.spread(by, np.nan), low, high, colors)
     return paint(s, shown, shading(s) if shade else None)
 
 
-def _span(values: np.ndarray) -> tuple[float, float]:
+def span(values: np.ndarray) -> tuple[float, float]:
     finite = values[np.isfinite(values)]
     if not finite.size:
         return 0.0, 1.0
@@ -155,10 +156,9 @@ def _span(values: np.ndarray) -> tuple[float, float]:
 
 def height_view(x, y, z, *, width: int = 900, shade: bool = True, colors: str = "height") -> np.ndarray:
     """The cloud from above as a tinted, shaded relief of its heights; see :func:`top_view`."""
-    x, y, z = _columns(x, y, z, names=("x", "y", "z"))
-    s = _window(x, y, z, width)
-    low, high = _span(s.z[np.isfinite(s.z)])
-    return paint(s, ramp(s.z, low, high, colors), shading(s) if shade else None)
+    x, y, z = checked_columns(x, y, z, names=("x", "y", "z"))
+    s = window(x, y, z, width)
+    return paint(s, ramp(s.z, *span(s.z), colors), shading(s) if shade else None)
 
 
 def error_view(x, y, z, predicted, truth, *, ignore: Sequence[int] = (), width: int = 900) -> np.ndarray:
@@ -166,16 +166,16 @@ def error_view(x, y, z, predicted, truth, *, ignore: Sequence[int] = (), width: 
 
     A wrong point is drawn over right ones of the same pixel, so that no error hides under a roof or a crown.
     """
-    x, y, z, predicted, truth = _columns(
+    x, y, z, predicted, truth = checked_columns(
         x, y, z, predicted, truth, names=("x", "y", "z", "predicted", "truth")
     )
-    s = _window(x, y, z, width)
-    shown = _verdict(s, x, y, z, _class_codes(predicted), _class_codes(truth), ignore)
+    s = window(x, y, z, width)
+    shown = verdict(s, x, y, z, class_codes(predicted), class_codes(truth), ignore)
     return paint(s, shown, shading(s))
 
 
-def _verdict(s: Surface, x, y, z, predicted, truth, ignore) -> np.ndarray:
-    skip = np.isin(truth, np.asarray(list(ignore), dtype=np.int64))
+def verdict(s: Surface, x, y, z, predicted, truth, ignore) -> np.ndarray:
+    skip = np.isin(truth, list(ignore))
     wrong = (predicted != truth) & ~skip
     shown = np.array([RIGHT, WRONG, IGNORED], dtype=np.uint8)[
         s.spread(np.where(skip, 2, wrong).astype(np.int64), 0)
@@ -190,19 +190,6 @@ def _verdict(s: Surface, x, y, z, predicted, truth, ignore) -> np.ndarray:
         grow = min(int(0.4 * s.spacing), 5)  # about as large as a point's share of the surface
         shown[ndimage.binary_dilation(mask, iterations=grow) if grow else mask] = WRONG
     return shown
-
-
-@njit
-def _dots(out, left, row, color, radius):
-    height, width = out.shape[:2]
-    for n in range(left.size):
-        for dy in range(-radius, radius + 1):
-            for dx in range(-radius, radius + 1):
-                if dx * dx + dy * dy <= radius * radius + (1 if radius > 1 else 0):
-                    i, j = row[n] + dy, left[n] + dx
-                    if 0 <= i < height and 0 <= j < width:
-                        for c in range(3):
-                            out[i, j, c] = color[n, c]
 
 
 def section_view(
@@ -234,7 +221,7 @@ def section_view(
     exaggeration : float
         Vertical scale over horizontal scale.
     """
-    x, y, z = _columns(x, y, z, names=("x", "y", "z"))
+    x, y, z = checked_columns(x, y, z, names=("x", "y", "z"))
     frame = Frame.around(x, y, 1000)
     middle = frame.y0 + 0.5 * frame.pixel * frame.height
     start = (frame.x0, middle) if start is None else start
@@ -269,32 +256,34 @@ def section_view(
             found=f"{length:g} long, {high - low:g} high",
             cure="Give a longer line, or remove points far from the rest",
         )
-    out = np.empty((tall + bottom + above, width, 3), dtype=np.uint8)
-    out[:] = BACKGROUND
     base = above + tall - 4
+    canvas = Image.new("RGB", (width, tall + bottom + above), BACKGROUND)
+    pen = ImageDraw.Draw(canvas)
     step = nice_step(length / 8)
     for n in range(int(length / step) + 1):
         at = left + round(n * step * scale)
-        out[above : above + tall, at] = (226, 226, 222)
-        label = f"{n * step:g}"
-        draw_text(out, at - text_size(label)[0] // 2, above + tall + 6, label, color=FAINT)
+        pen.line((at, above, at, above + tall), GRIDLINE)
+        pen.text((at, above + tall + 8), f"{n * step:g}", FAINT, font(), anchor="ma")
     step = nice_step(max((high - low) / 5, 1e-6))
     for n in range(math.ceil(low / step), math.floor(high / step) + 1):
         at = base - round((n * step - low) * scale * exaggeration)
-        out[at, left : width - 16] = (226, 226, 222)
-        label = f"{n * step:g}"
-        draw_text(out, left - 8 - text_size(label)[0], at - 9, label, color=FAINT)
+        pen.line((left, at, width - 16, at), GRIDLINE)
+        pen.text((left - 8, at), f"{n * step:g}", FAINT, font(), anchor="rm")
+    if caption:
+        pen.text((left, 10), fit_text(caption, width - left - 16), INK, font())
     if classes is not None:
-        color = _COLORS[_class_codes(np.asarray(classes))[keep]]
+        color = CLASS_COLORS[class_codes(np.asarray(classes))[keep]]
     else:
         color = ramp(z[keep], low, high, "height")
-    spacing = math.sqrt(length * (high - low + 1) / keep.size) * scale
-    radius = 1 if spacing < 5 else 2
+    # The nearest point of each pixel, then the nearest of each disc around a pixel.
+    nearest = np.full((canvas.height, canvas.width), -1)
     column = left + np.round(s[keep] * scale).astype(np.int64)
     row = base - np.round((z[keep] - low) * scale * exaggeration).astype(np.int64)
-    _dots(out, column, row, np.ascontiguousarray(color), radius)
-    if caption:
-        draw_text(out, left, 10, fit_text(caption, width - left - 16), color=INK)
+    nearest[row, column] = np.arange(keep.size)
+    spacing = math.sqrt(length * (high - low + 1) / keep.size) * scale
+    nearest = ndimage.maximum_filter(nearest, footprint=_SMALL_DOT if spacing < 5 else _DOT)
+    out = np.array(canvas)
+    out[nearest >= 0] = color[nearest[nearest >= 0]]
     return out
 
 
@@ -302,143 +291,3 @@ def nice_step(rough: float) -> float:
     """1, 2 or 5 times a power of ten, at least about `rough`."""
     power = 10.0 ** math.floor(math.log10(rough))
     return next(m * power for m in (1, 2, 5, 10) if m * power >= rough * 0.999)
-
-
-def present_classes(*columns: np.ndarray) -> list[int]:
-    """Class codes found in any of the arrays, in order."""
-    found: set[int] = set()
-    for column in columns:
-        found |= set(
-            np.flatnonzero(np.bincount(_class_codes(np.asarray(column)).ravel(), minlength=256)).tolist()
-        )
-    return sorted(found)
-
-
-def legend(codes: Sequence[int], width: int, *, names: dict[int, str] | None = None, extra=()) -> np.ndarray:
-    """A band of colour patches with class names, in as many lines as the width needs.
-
-    Parameters
-    ----------
-    codes : sequence of int
-    width : int
-        Pixels.
-    names : dict, optional
-        Names that replace ASPRS's.
-    extra : sequence of (text, (r, g, b))
-        More patches, after the classes.
-    """
-    entries = [(f"{c} {(names or {}).get(c, class_name(c))}", tuple(_COLORS[c].tolist())) for c in codes]
-    entries += list(extra)
-    spots, left, line = [], 16, 0
-    for text, color in entries:
-        text = fit_text(text, width - 60)
-        need = 26 + text_size(text)[0] + 22
-        if left + need > width and left > 16:
-            left, line = 16, line + 1
-        spots.append((left, line, text, color))
-        left += need
-    out = np.empty((28 * (line + 1) + 8, width, 3), dtype=np.uint8)
-    out[:] = BACKGROUND
-    for left, line, text, color in spots:
-        top = 6 + 28 * line
-        out[top : top + 18, left : left + 18] = (90, 90, 90)
-        out[top + 1 : top + 17, left + 1 : left + 17] = color
-        draw_text(out, left + 26, top, text, color=INK)
-    return out
-
-
-def triptych(
-    x,
-    y,
-    z,
-    predicted,
-    truth=None,
-    *,
-    width: int = 1500,
-    captions: Sequence[str] | None = None,
-    ignore: Sequence[int] = (),
-    names: dict[int, str] | None = None,
-    unit: str = "m",
-    title: str | None = None,
-    path: str | os.PathLike | None = None,
-) -> np.ndarray:
-    """Heights, classes and errors side by side, with captions, a scale and a legend.
-
-    Parameters
-    ----------
-    x, y, z : (n,) float
-    predicted : (n,) integer
-    truth : (n,) integer, optional
-        Reference classes; without them the third panel is left out.
-    width : int
-        Pixels across all panels.
-    captions : sequence of str, optional
-        One a panel.
-    ignore : sequence of int
-        Reference classes left out of the errors.
-    names : dict, optional
-        Class names that replace ASPRS's.
-    unit : str
-        Unit of the coordinates, for the scale.
-    title : str, optional
-    path : path, optional
-        Where to write a PNG as well.
-
-    Returns
-    -------
-    (height, width, 3) uint8
-    """
-    x, y, z, predicted = _columns(x, y, z, predicted, names=("x", "y", "z", "predicted"))
-    predicted = _class_codes(predicted)
-    panels = 2 if truth is None else 3
-    gap = 12
-    each = (int(width) - gap * (panels + 1)) // panels
-    s = _window(x, y, z, each)
-    light = shading(s)
-    low, high = _span(s.z[np.isfinite(s.z)])
-    images = [
-        paint(s, ramp(s.z, low, high, "height"), light),
-        paint(s, _COLORS[s.spread(predicted, 0)], light),
-    ]
-    text = ["Heights (shaded)", "Predicted classes"]
-    extra: list[tuple[str, tuple[int, int, int]]] = []
-    if truth is not None:
-        (truth,) = _columns(truth, names=("truth",))
-        truth = _class_codes(truth)
-        if truth.shape != x.shape:
-            raise StageError("'truth' must be one value per point", where="picture", found=truth.shape)
-        images.append(paint(s, _verdict(s, x, y, z, predicted, truth, ignore), light))
-        scored = ~np.isin(truth, np.asarray(list(ignore), dtype=np.int64))
-        share = float((predicted[scored] == truth[scored]).mean()) if scored.any() else math.nan
-        text.append(f"Errors: {100 * (1 - share):.1f} % of {int(scored.sum()):,} points")
-        extra = [("right", RIGHT), ("wrong", WRONG)]
-    if captions is not None:
-        if len(captions) != panels:
-            raise StageError(
-                f"there are {panels} panels, so {panels} captions", where="triptych", found=len(captions)
-            )
-        text = list(captions)
-    tall = images[0].shape[0]
-    head = 38 if title else 6
-    band = legend(present_classes(predicted), int(width), names=names, extra=extra)
-    out = np.empty((head + 30 + tall + 36 + band.shape[0], int(width), 3), dtype=np.uint8)
-    out[:] = BACKGROUND
-    if title:
-        draw_text(out, gap, 7, fit_text(title, width - 2 * gap, LARGE), LARGE, INK)
-    for n, (image, words) in enumerate(zip(images, text, strict=True)):
-        left = gap + n * (each + gap)
-        draw_text(out, left + 2, head + 5, fit_text(words, each), color=INK)
-        out[head + 30 : head + 30 + tall, left : left + image.shape[1]] = image
-    _scale_bar(out, gap + 2, head + 30 + tall + 10, s.frame, each, unit)
-    out[-band.shape[0] :] = band
-    if path is not None:
-        write_png(path, out)
-    return out
-
-
-def _scale_bar(out: np.ndarray, left: int, top: int, frame: Frame, each: int, unit: str) -> None:
-    step = nice_step(0.2 * each * frame.pixel)
-    long = max(2, round(step / frame.pixel))
-    out[top + 5 : top + 10, left : left + long] = INK
-    out[top + 6 : top + 9, left + long // 2 : left + long - 1] = BACKGROUND
-    draw_text(out, left + long + 8, top - 1, f"{step:g} {unit}", color=INK)

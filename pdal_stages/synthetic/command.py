@@ -106,8 +106,9 @@ def main(argv: list[str] | None = None) -> int:
 def _picture(cloud: str, picture: str) -> None:
     import laspy
 
-    from ..reports.png import write_png
-    from ..reports.views import legend, present_classes, top_view
+    from ..reports.panels import legend, present_classes
+    from ..reports.pictures import write_png
+    from ..reports.views import top_view
 
     las = laspy.read(cloud)
     import numpy as np

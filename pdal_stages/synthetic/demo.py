@@ -122,8 +122,8 @@ def _results(folder: Path, points) -> None:
     import numpy as np
 
     from ..accuracy.measures import Accuracy
-    from ..reports.png import write_png
-    from ..reports.views import triptych
+    from ..reports.panels import triptych
+    from ..reports.pictures import write_png
 
     keep = np.isin(points["Reference"], [int(code) for code in CLASSES])
     x, y, z = (points[axis][keep] for axis in "XYZ")

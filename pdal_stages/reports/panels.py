@@ -1,0 +1,174 @@
+"""Views side by side: heights, classes and errors, with captions, a scale and a legend."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from ..base.asprs import class_name
+from ..base.errors import StageError
+from .pictures import LARGE, fit_text, font, text_width, write_png
+from .raster import BACKGROUND, paint, shading
+from .views import (
+    CLASS_COLORS,
+    INK,
+    RIGHT,
+    WRONG,
+    checked_columns,
+    class_codes,
+    nice_step,
+    ramp,
+    span,
+    verdict,
+    window,
+)
+
+_GAP = 12
+
+Entry = tuple[str, tuple[int, int, int]]
+
+
+def present_classes(*columns: np.ndarray) -> list[int]:
+    """Class codes found in any of the arrays, ascending."""
+    return sorted({int(code) for column in columns for code in np.unique(class_codes(np.asarray(column)))})
+
+
+def legend(
+    codes: Sequence[int],
+    width: int,
+    *,
+    names: Mapping[int, str] | None = None,
+    extra: Sequence[Entry] = (),
+) -> np.ndarray:
+    """A band of colour patches with class names, in as many lines as the width needs.
+
+    Parameters
+    ----------
+    codes : sequence of int
+    width : int
+        Pixels.
+    names : mapping of code to name, optional
+        Names that replace ASPRS's.
+    extra : sequence of (text, (r, g, b))
+        More patches, after the classes.
+
+    Returns
+    -------
+    (height, width, 3) uint8
+    """
+    names = names or {}
+    entries = [(f"{c} {names.get(c, class_name(c))}", tuple(CLASS_COLORS[c].tolist())) for c in codes]
+    spots, left, line = [], 16, 0
+    for text, color in [*entries, *extra]:
+        text = fit_text(text, width - 60)
+        need = 48 + text_width(text)
+        if left + need > width and left > 16:
+            left, line = 16, line + 1
+        spots.append((left, 6 + 28 * line, text, color))
+        left += need
+    band = Image.new("RGB", (width, 28 * (line + 1) + 8), BACKGROUND)
+    pen = ImageDraw.Draw(band)
+    for left, top, text, color in spots:
+        pen.rectangle((left, top, left + 17, top + 17), fill=color, outline=(90, 90, 90))
+        pen.text((left + 26, top + 9), text, INK, font(), anchor="lm")
+    return np.array(band)
+
+
+def triptych(
+    x,
+    y,
+    z,
+    predicted,
+    truth=None,
+    *,
+    width: int = 1500,
+    captions: Sequence[str] | None = None,
+    ignore: Sequence[int] = (),
+    names: Mapping[int, str] | None = None,
+    unit: str = "m",
+    title: str | None = None,
+    path: str | os.PathLike[str] | None = None,
+) -> np.ndarray:
+    """Heights, classes and errors side by side, with captions, a scale and a legend.
+
+    Parameters
+    ----------
+    x, y, z : (n,) float
+    predicted : (n,) integer
+    truth : (n,) integer, optional
+        Reference classes; without them there is no panel of errors.
+    width : int
+        Pixels across all panels.
+    captions : sequence of str, optional
+        One for each panel.
+    ignore : sequence of int
+        Reference classes left out of the errors.
+    names : mapping of code to name, optional
+        Class names that replace ASPRS's.
+    unit : str
+        Unit of the coordinates, for the scale.
+    title : str, optional
+    path : path, optional
+        Where to write a PNG as well.
+
+    Returns
+    -------
+    (height, width, 3) uint8
+    """
+    x, y, z, predicted = checked_columns(x, y, z, predicted, names=("x", "y", "z", "predicted"))
+    predicted = class_codes(predicted)
+    panels = 2 if truth is None else 3
+    each = (int(width) - _GAP * (panels + 1)) // panels
+    s = window(x, y, z, each)
+    light = shading(s)
+    images = [
+        paint(s, ramp(s.z, *span(s.z), "height"), light),
+        paint(s, CLASS_COLORS[s.spread(predicted, 0)], light),
+    ]
+    texts = ["Heights (shaded)", "Predicted classes"]
+    extra: list[Entry] = []
+    if truth is not None:
+        _, truth = checked_columns(x, truth, names=("x", "truth"))
+        truth = class_codes(truth)
+        images.append(paint(s, verdict(s, x, y, z, predicted, truth, ignore), light))
+        scored = ~np.isin(truth, list(ignore))
+        wrong = float((predicted[scored] != truth[scored]).mean()) if scored.any() else math.nan
+        texts.append(f"Errors: {100 * wrong:.1f} % of {int(scored.sum()):,} points")
+        extra = [("right", RIGHT), ("wrong", WRONG)]
+    if captions is not None:
+        if len(captions) != panels:
+            raise StageError(
+                f"there are {panels} panels, so {panels} captions", where="triptych", found=len(captions)
+            )
+        texts = list(captions)
+
+    band = legend(present_classes(predicted), int(width), names=names, extra=extra)
+    top = (38 if title else 6) + 30
+    below = top + images[0].shape[0]
+    sheet = Image.new("RGB", (int(width), below + 36 + band.shape[0]), BACKGROUND)
+    pen = ImageDraw.Draw(sheet)
+    if title:
+        pen.text((_GAP, 8), fit_text(title, int(width) - 2 * _GAP, LARGE), INK, font(LARGE))
+    for n, (image, text) in enumerate(zip(images, texts, strict=True)):
+        left = _GAP + n * (each + _GAP)
+        pen.text((left + 2, top - 14), fit_text(text, each), INK, font(), anchor="lm")
+        sheet.paste(Image.fromarray(image), (left, top))
+    _scale_bar(pen, _GAP + 2, below + 17, each, s.frame.pixel, unit)
+    sheet.paste(Image.fromarray(band), (0, below + 36))
+    out = np.array(sheet)
+    if path is not None:
+        write_png(path, out)
+    return out
+
+
+def _scale_bar(pen: ImageDraw.ImageDraw, left: int, y: int, most: int, pixel: float, unit: str) -> None:
+    """A bar of a round length, at most about half as long as `most` pixels; `pixel` in units of the map."""
+    length = nice_step(0.2 * most * pixel)
+    long = max(2, round(length / pixel))
+    pen.rectangle((left, y - 2, left + long - 1, y + 2), fill=INK)
+    pen.rectangle((left + long // 2, y - 1, left + long - 2, y + 1), fill=BACKGROUND)
+    pen.text((left + long + 8, y), f"{length:g} {unit}", INK, font(), anchor="lm")
