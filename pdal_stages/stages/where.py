@@ -2,8 +2,10 @@
 
 PDAL hands a filter with `where` only the points inside. Our stages need the points outside
 too, as neighbors, so they evaluate the expression themselves: comparisons
-(``== != < <= > >=``), ``&&``, ``||``, ``!``, arithmetic and parentheses over dimension
-names and numbers, with PDAL's precedence.
+(``== != < <= > >=``), ``&&``, ``||``, ``!``, arithmetic, parentheses and PDAL's functions over
+dimension names and numbers, with PDAL's precedence. What any PDAL from 2.2 to 2.10 takes is taken
+here with the same meaning, whatever PDAL is at hand; some of them refuse a little more:
+``(X + Y) == X`` and ``(Z) > 2`` from about 2.5 on, ``-X > 0`` and functions before.
 """
 
 from __future__ import annotations
@@ -21,14 +23,23 @@ _TOKEN = re.compile(
     r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
     r"|(?P<mark>&&|\|\||==|!=|<=|>=|[-+*/()<>!]))"
 )
-_LEVELS: tuple[tuple[str, ...], ...] = (
-    ("||",),
-    ("&&",),
-    ("==", "!="),
-    ("<", "<=", ">", ">="),
-    ("+", "-"),
-    ("*", "/"),
-)
+_COMPARISONS = ("==", "!=", "<", "<=", ">", ">=")
+_LEVELS: tuple[tuple[str, ...], ...] = (("||",), ("&&",), _COMPARISONS, ("+", "-"), ("*", "/"))
+_BOOLEAN = _LEVELS[0] + _LEVELS[1]
+_DEEPEST = 100
+
+
+def _divide(a, b):
+    """PDAL's division: by zero it gives NaN, not infinity."""
+    return np.where(np.equal(b, 0), np.nan, np.divide(a, b))
+
+
+def _round(a):
+    """C's rounding, halves away from zero."""
+    whole = np.trunc(a)
+    return np.where(np.abs(a - whole) >= 0.5, whole + np.sign(a), whole)
+
+
 _OPERATIONS = {
     "||": np.logical_or,
     "&&": np.logical_and,
@@ -41,10 +52,33 @@ _OPERATIONS = {
     "+": np.add,
     "-": np.subtract,
     "*": np.multiply,
-    "/": np.divide,
+    "/": _divide,
 }
-_BOOLEAN = {"||", "&&"}
-_DEEPEST = 100
+_LIMITS = np.finfo(np.float64)
+_CONSTANTS = {"nan": np.nan, "lowest": float(_LIMITS.min), "highest": float(_LIMITS.max)}
+_CONDITIONS = {
+    "isnan": np.isnan,
+    "ismin": lambda a: np.equal(a, _LIMITS.min),
+    "ismax": lambda a: np.equal(a, _LIMITS.max),
+}
+_FUNCTIONS = {
+    **{
+        name: getattr(np, name)
+        for name in ("floor", "ceil", "fabs", "sqrt", "sin", "cos", "tan", "sinh", "cosh")
+    },
+    **{name: getattr(np, name) for name in ("tanh", "log", "log2", "log10", "exp", "exp2")},
+    **{name: getattr(np, f"arc{name[1:]}") for name in ("asin", "acos", "atan", "asinh", "acosh")},
+    "abs": np.abs,
+    "round": _round,
+}
+#: Other names that PDAL takes for dimensions, in small letters.
+_ALIASES = {
+    "class": "Classification",
+    "cls": "Classification",
+    "hag": "HeightAboveGround",
+    "nearinfrared": "Infrared",
+    "scanangle": "ScanAngleRank",
+}
 
 
 @dataclass(frozen=True)
@@ -102,16 +136,10 @@ class Expression:
         DimensionError
             If it names a dimension the points do not have.
         """
-        for name in self.dimensions:
-            if name not in arrays:
-                raise DimensionError(
-                    f"'where' names the dimension '{name}', which the points do not have",
-                    found=", ".join(arrays),
-                    cure=suggest(name, arrays) or None,
-                )
+        values = {name: arrays[_find(name, arrays)] for name in self.dimensions}
         size = len(next(iter(arrays.values()))) if arrays else 0
         with np.errstate(all="ignore"):
-            return np.broadcast_to(np.asarray(_value(self._root, arrays), bool), (size,)).copy()
+            return np.broadcast_to(np.asarray(_value(self._root, values), bool), (size,)).copy()
 
     def _error(self, what: str, place: int) -> OptionError:
         return OptionError(
@@ -132,9 +160,9 @@ class Expression:
             mark = self._peek()
             self._at += 1
             right = self._level(level + 1)
-            if (mark in _BOOLEAN) != (left.truth and right.truth) and mark not in ("==", "!="):
+            if (left.truth, right.truth) != (mark in _BOOLEAN,) * 2:
                 raise self._error(f"'{mark}' does not fit its two sides", place)
-            left = _Node("op", mark, (left, right), truth=level < 4)
+            left = _Node("op", mark, (left, right), truth=level < 3)
         return left
 
     def _unary(self) -> _Node:
@@ -144,28 +172,64 @@ class Expression:
         self._at += 1
         if kind == "number":
             return _Node("number", float(word))
-        if kind == "name":
+        if kind == "name" and self._peek() != "(":
             return _Node("name", word)
         self._depth += 1
         if self._depth > _DEEPEST:
             raise self._error("it is nested too deeply", place)
         try:
+            if kind == "name":
+                return self._call(word, place)
             if word == "(":
-                inner = self._level(0)
-                if self._peek() != ")":
-                    raise self._error("a ')' is missing", place)
-                self._at += 1
-                return inner
+                return self._closed(self._level(0), place)
             if word == "!":
-                operand = self._unary()
+                # PDAL: before a comparison without parentheses it turns that round as a whole.
+                operand = self._unary() if self._peek() in ("(", "!") else self._level(2)
                 if not operand.truth:
                     raise self._error("'!' needs a condition after it, in parentheses", place)
                 return _Node("not", None, (operand,), truth=True)
             if word == "-":
-                return _Node("minus", None, (self._unary(),))
+                operand = self._unary()
+                if operand.truth:
+                    raise self._error("'-' needs a number after it", place)
+                return _Node("minus", None, (operand,))
         finally:
             self._depth -= 1
         raise self._error(f"'{word}' is not expected here", place)
+
+    def _closed(self, inner: _Node, place: int) -> _Node:
+        if self._peek() != ")":
+            raise self._error("a ')' is missing", place)
+        self._at += 1
+        return inner
+
+    def _call(self, name: str, place: int) -> _Node:
+        """A function of one number, or a constant of PDAL's."""
+        self._at += 1  # the parenthesis
+        if name in _CONSTANTS:
+            return self._closed(_Node("number", _CONSTANTS[name]), place)
+        if name not in _FUNCTIONS and name not in _CONDITIONS:
+            known = [*_FUNCTIONS, *_CONDITIONS, *_CONSTANTS]
+            raise self._error(f"'{name}' is not a function; known are {', '.join(known)}", place)
+        argument = self._level(0)
+        if argument.truth:
+            raise self._error(f"'{name}' needs a number", place)
+        return self._closed(_Node("call", name, (argument,), truth=name in _CONDITIONS), place)
+
+
+def _find(name: str, arrays: Mapping[str, NDArray]) -> str:
+    """The dimension a name means: PDAL takes known ones in any case, and some by another name."""
+    if name in arrays:
+        return name
+    wanted = _ALIASES.get(name.lower(), name).lower()
+    for known in arrays:
+        if known.lower() == wanted:
+            return known
+    raise DimensionError(
+        f"'where' names the dimension '{name}', which the points do not have",
+        found=", ".join(arrays),
+        cure=suggest(name, arrays) or None,
+    )
 
 
 def _names(node: _Node) -> set[str]:
@@ -184,4 +248,6 @@ def _value(node: _Node, arrays: Mapping[str, NDArray]):
         return np.logical_not(parts[0])
     if node.kind == "minus":
         return np.negative(parts[0])
+    if node.kind == "call":
+        return {**_FUNCTIONS, **_CONDITIONS}[str(node.value)](parts[0])
     return _OPERATIONS[str(node.value)](*parts)
