@@ -15,6 +15,7 @@ from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+from . import chunks
 from .errors import StageError
 
 #: Bytes of a point of each format, without extra bytes (LAS 1.4 R15, tables 7 to 18).
@@ -85,19 +86,23 @@ def check_readable(path: str | os.PathLike) -> str | None:
     Raises
     ------
     StageError
-        What is wrong with the file; files that cannot be opened are left to PDAL.
+        What is wrong with the file, or why it cannot be opened: PDAL says little then, or crashes.
     """
     try:
         size = Path(path).stat().st_size
         header = read_header(path)
         table = _chunk_table(path, size, header) if header is not None and header.compressed else 0
-    except (OSError, ValueError):
-        return None
+        wrong = None if header is None else _what_is_wrong(header, size, table)
+        if header is not None and header.compressed and header.count and not wrong:
+            wrong = _wrong_chunks(path, header, table)
+    except OSError as error:
+        raise StageError(
+            "the file cannot be read", where=str(path), found=error.strerror or str(error)
+        ) from None
     if header is None:
         raise StageError(
             "this is no LAS file", where=str(path), found=f"{size:,} bytes without a LAS header", cure=_CURE
         )
-    wrong = _what_is_wrong(header, size, table)
     if wrong:
         raise StageError(f"the LAS file is damaged: {wrong[0]}", where=str(path), found=wrong[1], cure=_CURE)
     beyond = size - header.end_of_points
@@ -235,6 +240,31 @@ def _chunk_table(path: str | os.PathLike, size: int, header: LasHeader) -> int:
             file.seek(size - 8)
             place = file.read(8)
     return struct.unpack("<q", place)[0] if len(place) == 8 else -1
+
+
+def _wrong_chunks(path: str | os.PathLike, header: LasHeader, table: int) -> tuple[str, str] | None:
+    """What is wrong with the chunks of a LAZ file whose table is at `table`."""
+    with open(path, "rb") as file:
+        own = [r for r in _records(file, header) if r.user == b"laszip encoded" and r.number == 22204]
+        file.seek(own[0].data + 12 if own else 0)
+        points = file.read(4)
+        if not own or len(points) < 4:
+            return "it has no record of how it is compressed", "no 'laszip encoded' among its records"
+        (of_chunk,) = struct.unpack("<I", points)
+        file.seek(table)
+        begin = file.read(8)
+        file.seek(table)
+        # A number takes less than eight bytes, and a chunk has two at most.
+        data = file.read(
+            64 + 16 * min(chunks.MOST_DECODED, struct.unpack("<4xI", begin)[0] if len(begin) == 8 else 0)
+        )
+    return chunks.what_is_wrong(
+        data,
+        table - header.offset - 8,
+        points=header.count,
+        point_bytes=header.point_bytes,
+        chunk_points=None if of_chunk in (0, 2**32 - 1) else of_chunk,
+    )
 
 
 def odd_text(path: str | os.PathLike) -> tuple[str, bytes] | None:

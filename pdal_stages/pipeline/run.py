@@ -114,8 +114,16 @@ class Pipeline:
         return result.count
 
     def _check_inputs(self) -> None:
-        """Look at the headers of LAS files: PDAL takes damaged ones for whole, or crashes."""
-        self.remarks = [r for path in _las_inputs(self.lowered.stages) if (r := check_readable(path))]
+        """Open what is read, and look at the headers of LAS files: PDAL takes damaged ones for whole, or crashes."""
+        for path in _inputs(self.lowered.stages):
+            try:
+                with open(path, "rb"):
+                    pass
+            except OSError as error:
+                raise PipelineError(
+                    "the file cannot be read", where=path, found=error.strerror or str(error)
+                ) from None
+        self.remarks = [r for path in _inputs(self.lowered.stages, las=True) if (r := check_readable(path))]
 
     def _models(self) -> list[str]:
         """Where models are being written: what to remove if the process is killed meanwhile."""
@@ -127,7 +135,7 @@ class Pipeline:
         if not isinstance(error, PipelineError) or error.where is not None:
             return error
         if _NOT_UTF8.search(str(error.found)):
-            for path in _las_inputs(self.lowered.stages):
+            for path in _inputs(self.lowered.stages, las=True):
                 if (odd := odd_text(path)) is not None:
                     return PipelineError(
                         f"the {odd[0]} in the LAS file is not UTF-8, which PDAL's filters.python cannot take",
@@ -162,14 +170,17 @@ _STAGE_TYPE = re.compile(r"\b(?:readers|filters|writers)\.\w+")
 _NOT_UTF8 = re.compile(r"returned a result with an exception set|UnicodeDecodeError|codec can't decode")
 
 
-def _las_inputs(stages: list[dict[str, Any]]) -> list[str]:
-    """Local LAS and LAZ files that are read, patterns filled in."""
+def _inputs(stages: list[dict[str, Any]], *, las: bool = False) -> list[str]:
+    """Local files that are read, patterns filled in; only LAS and LAZ files with `las`."""
     found: list[str] = []
     for index, stage in enumerate(stages):
         name, kind = stage.get("filename"), stage.get("type", "")
         if not isinstance(name, str) or "://" in name or (not kind and 0 < index == len(stages) - 1):
             continue
-        if kind in ("readers.las", "readers.copc") or (not kind and name.lower().endswith((".las", ".laz"))):
+        is_las = kind in ("readers.las", "readers.copc") or (
+            not kind and name.lower().endswith((".las", ".laz"))
+        )
+        if is_las or (not las and (not kind or kind.startswith("readers."))):
             names = sorted(glob.glob(name)) if not os.path.exists(name) else [name]
             found += [n for n in names if os.path.isfile(n)]
     return found
