@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from pdal_stages.base.errors import StageError
 from pdal_stages.stages import registry
 from pdal_stages.stages.base import Stage
 
@@ -16,7 +17,7 @@ FOLDER = Path(__file__).resolve().parent / "stages"
 
 def page(stage: type[Stage]) -> str:
     """One stage in the shape of PDAL's stage pages."""
-    options = stage.parse({k: v for k, v in stage.example.items() if k != "type"}) if _parses(stage) else None
+    made = _example(stage)
     lines = [f"# {stage.type}", "", f"{stage.summary}.", ""]
     doc = (stage.details or "").strip()
     if doc:
@@ -32,14 +33,13 @@ def page(stage: type[Stage]) -> str:
         "",
     ]
     lines += ["## Dimensions", ""]
-    if options is not None:
-        reads = stage.reads(options)
-        creates = stage.creates(options)
+    if made is not None:
+        reads, creates = made.reads(), made.creates()
         lines += [
             f"- Reads: X, Y, Z{''.join(f', {name}' for name in reads)}",
             f"- Writes: {', '.join(f'`{name}` ({kind})' for name, kind in list(creates.items())[:8]) or 'none'}"
             + (f" and {len(creates) - 8} more" if len(creates) > 8 else ""),
-            f"- Halo: {stage.halo(options):g} m round a tile, with the example's options",
+            f"- Halo: {made.halo():g} m round a tile, with the example's options",
             "",
         ]
     elif stage.dimensions_help:
@@ -50,12 +50,11 @@ def page(stage: type[Stage]) -> str:
     return "\n".join(lines)
 
 
-def _parses(stage: type[Stage]) -> bool:
+def _example(stage: type[Stage]) -> Stage | None:
     try:
-        stage.parse({k: v for k, v in stage.example.items() if k != "type"})
-    except Exception:  # an example that names a file which is not here
-        return False
-    return True
+        return stage({k: v for k, v in stage.example.items() if k != "type"})
+    except StageError:  # an example that names a file which is not here
+        return None
 
 
 def _row(stage: type[Stage], option) -> str:

@@ -139,12 +139,12 @@ def test_one_word_trains_a_network(cloud, tmp_path, pdal_module):
 
 def test_stage_options(model, tmp_path):
     classifier, writer = registry.get("filters.modelclassifier"), registry.get(WRITER)
-    options = classifier.parse({"model": str(model), "variance": True})
-    assert classifier.creates(options)["Variance"] == "float"
-    assert classifier.halo(options) == load_model(model).halo
+    made = classifier({"model": str(model), "variance": True})
+    assert made.creates()["Variance"] == "float"
+    assert made.halo() == load_model(model).halo
     given = {"filename": str(tmp_path / "m"), "algorithm": "alsnet", "alsnet": {"coordinates": "XYZ"}}
-    assert writer.reads(writer.parse(given)) == ["Classification", "HeightAboveGround"]
+    assert writer(given).reads() == ["Classification", "HeightAboveGround"]
     with pytest.raises(OptionError, match="epochs"):
-        writer.parse({**given, "alsnet": {"epochs": -1}})
+        writer({**given, "alsnet": {"epochs": -1}})
     with pytest.raises(OptionError, match="algorithm"):
-        writer.parse({**given, "algorithm": "resnet"})
+        writer({**given, "algorithm": "resnet"})

@@ -19,7 +19,6 @@ from pdal_stages.pipeline.lowering import lower
 from pdal_stages.pipeline.read import parse_pipeline
 from pdal_stages.stages import registry
 from pdal_stages.stages.base import Stage
-from pdal_stages.stages.points import Points
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -88,7 +87,7 @@ def test_the_worked_example_of_a_stage_works(monkeypatch):
     (stage,) = [
         v for v in vars(module).values() if isinstance(v, type) and issubclass(v, Stage) and v is not Stage
     ]
-    options = stage.parse({"medium": 3})
+    made = stage({"medium": 3})
     arrays = {
         "X": np.zeros(5),
         "Y": np.zeros(5),
@@ -96,8 +95,8 @@ def test_the_worked_example_of_a_stage_works(monkeypatch):
         "Classification": np.array([5, 5, 5, 2, 3], np.uint8),
         "HeightAboveGround": np.array([0.1, 1.0, 9.0, 9.0, 2.5]),
     }
-    points = Points(arrays, options=options)
-    assert stage.run(points, options)["Classification"].tolist() == [3, 4, 5, 2, 4]
+    points = made.points(arrays)
+    assert made.run(points)["Classification"].tolist() == [3, 4, 5, 2, 4]
     assert points.report["changed"] == 3
     assert "medium" in stage.schema()["properties"]
 

@@ -539,7 +539,7 @@ def test_labels_are_unique(cloud):
 def test_ctrl_c_in_a_stage_is_an_interrupt(cloud, monkeypatch, tmp_path):
     from pdal_stages.stages.hag_minima import HagMinima
 
-    def interrupted(points, options):
+    def interrupted(stage, points):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(HagMinima, "run", interrupted)

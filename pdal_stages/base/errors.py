@@ -42,6 +42,11 @@ class StageError(Exception):
             self.where = where
         return self
 
+    def within(self, place: str) -> StageError:
+        """The same error, with the place put before what it names already."""
+        self.where = f"{place}: {self.where}" if self.where else place
+        return self
+
     def __reduce__(self):  # keeps the keyword arguments across process borders (Dask)
         return (_rebuild, (type(self), self.what, self.where, self.found, self.cure))
 
@@ -69,6 +74,10 @@ class ModelError(StageError):
 
 class PipelineError(StageError):
     """A pipeline cannot be parsed, validated, lowered or run."""
+
+
+class InterruptedStage(StageError):
+    """Ctrl-C came while a stage ran inside PDAL; the runners turn it back into KeyboardInterrupt."""
 
 
 class DependencyError(StageError):

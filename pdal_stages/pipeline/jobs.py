@@ -17,11 +17,10 @@ def classify_pipeline(
     source: str, target: str, model: str, *, where: str | None = None
 ) -> list[dict[str, Any]]:
     """Read, give heights if the model wants them, classify, write with everything else kept."""
-    from ..classifier import load_model
+    from ..stages.modelclassifier import loaded_model
 
-    loaded = load_model(model)
     stages: list[dict[str, Any]] = [_reader(source, "input")]
-    if "HeightAboveGround" in loaded.required_dimensions:
+    if "HeightAboveGround" in loaded_model(model).required_dimensions:
         stages.append({"type": "filters.hag_minima"})
     classifier: dict[str, Any] = {"type": "filters.modelclassifier", "model": model}
     if where:
@@ -35,12 +34,11 @@ def train_pipeline(sources: Iterable[str], model: str, **options: Any) -> list[d
     """Read labelled files, give heights if wanted, train, write the model."""
     from ..stages.classifiermodel import ClassifierModel
 
-    writer = {"type": ClassifierModel.type, "filename": model, **options}
-    parsed = ClassifierModel.parse({k: v for k, v in writer.items() if k != "type"})
+    writer = {"filename": model, **options}
     stages: list[dict[str, Any]] = [_reader(name, f"input{i}") for i, name in enumerate(sources, 1)]
-    if "HeightAboveGround" in ClassifierModel.reads(parsed):
+    if "HeightAboveGround" in ClassifierModel(writer).reads():
         stages.append({"type": "filters.hag_minima"})
-    stages.append(writer)
+    stages.append({"type": ClassifierModel.type, **writer})
     return stages
 
 
@@ -68,7 +66,6 @@ def attach_reference(
         If they do not hold the same points.
     """
     from ..stages.accuracy import AccuracyStage
-    from ..stages.points import Points
     from . import pdal as pdal_env
     from .overrides import apply_overrides
     from .run import Pipeline
@@ -100,12 +97,12 @@ def attach_reference(
     for array, name, file in ((mine, dimension, source), (true, reference_dimension, reference)):
         if name not in (array.dtype.names or ()):
             raise DimensionError(f"the dimension '{name}' is missing", where=file)
-    stage = apply_overrides([{"type": AccuracyStage.type, **outputs}], overrides)[0]
-    given = {k: v for k, v in stage.items() if k != "type"}
-    options = AccuracyStage.parse({**given, "dimension": "Classification", "reference": "Reference"})
+    (given,) = apply_overrides([{"type": AccuracyStage.type, **outputs}], overrides)
+    compared = {"dimension": "Classification", "reference": "Reference", "horizontal_unit": "m"}
+    stage = AccuracyStage({k: v for k, v in given.items() if k != "type"} | compared)
     arrays = {name: np.ascontiguousarray(mine[name]) for name in mine.dtype.names}
     arrays["Classification"], arrays["Reference"] = mine[dimension], true[reference_dimension]
-    AccuracyStage.run(Points(arrays, options={**options, "horizontal_unit": "m"}), options)
+    stage.run(stage.points(arrays))
 
 
 def _reader(source: str, tag: str) -> dict[str, Any]:

@@ -13,17 +13,19 @@ from pathlib import Path
 from typing import Any
 
 from ..base.asprs import LEGACY_LIMIT
-from ..base.errors import OptionError, PipelineError, StageError, suggest
+from ..base.errors import DimensionError, OptionError, PipelineError, StageError, suggest
 from ..stages import registry
 from ..stages.base import Stage
 from .read import PipelineSource
-from .runtime import TRAMPOLINE, place
+from .runtime import TRAMPOLINE, known, place
 
 #: Options of every PDAL stage that a lowered stage hands on.
-_PDAL_OWN = ("tag", "inputs", "user_data", "log")
+PDAL_OWN = ("tag", "inputs", "user_data", "log")
 #: Stages after which several views are what the user asked for.
 _SPLITTERS = {"filters.splitter", "filters.chipper", "filters.divider", "filters.groupby", "filters.returns"}
 _LAS_WRITERS = ("writers.las", "writers.copc")
+#: A variable-length record of LAS holds 65,535 bytes; an extra dimension's description takes 192.
+_MOST_EXTRA = 65_535 // 192
 
 
 @dataclass
@@ -32,26 +34,22 @@ class LoweredStage:
 
     Attributes
     ----------
-    stage : type
-        The stage class.
-    options : dict
-        Parsed options.
-    tag : str or None
+    stage : Stage
+    place : str
+        Its type and tag, for messages.
     label : str
-        The unique `module` label, under which the runtime keeps reports.
+        The unique `module` label, under which the runtime knows it.
     index : int
         Place in the lowered list.
+    plain : dict
+        The ``filters.python`` that PDAL runs.
     """
 
-    stage: type[Stage]
-    options: dict[str, Any]
-    tag: str | None
+    stage: Stage
+    place: str
     label: str
     index: int
-
-    @property
-    def place(self) -> str:
-        return place(self.stage.type, self.tag)
+    plain: dict[str, Any]
 
 
 @dataclass
@@ -64,7 +62,7 @@ class Lowered:
     @property
     def halo(self) -> float:
         """Metres of neighboring points a tile needs for all of our stages, one after the other."""
-        return sum(s.stage.halo(s.options) for s in self.ours)
+        return sum(ours.stage.halo() for ours in self.ours)
 
 
 def lower(source: PipelineSource) -> Lowered:
@@ -98,12 +96,12 @@ def lower(source: PipelineSource) -> Lowered:
                     stage["inputs"] = [merge["tag"]]
                 views.add(merge)
                 out.stages.append(merge)
-            lowered = _lower_stage(stage, len(out.stages))
+            lowered = lower_stage(stage, len(out.stages))
         except StageError as error:
-            raise _with_line(error, where) from None
+            raise error.within(where) from None
         views.add(stage)
         out.ours.append(lowered)
-        out.stages.append(_python_stage(stage, lowered))
+        out.stages.append(lowered.plain)
     _check_writers(out)
     return out
 
@@ -135,38 +133,28 @@ def _distance_is_typo(type_name: str) -> bool:
     return bool(close)
 
 
-def _lower_stage(stage: dict[str, Any], index: int) -> LoweredStage:
-    kind = registry.get(stage["type"])
-    tag = stage.get("tag")
-    given = {k: v for k, v in stage.items() if k not in ("type", *_PDAL_OWN)}
-    options = kind.parse(given, place(kind.type, tag))
+def lower_stage(given: dict[str, Any], index: int = 0) -> LoweredStage:
+    """One stage of ours, checked, and the ``filters.python`` that stands for it."""
+    kind = registry.get(given["type"])
+    named = place(kind.type, given.get("tag"))
+    options = {k: v for k, v in given.items() if k not in ("type", *PDAL_OWN)}
+    stage = kind(options, named)
     label = f"pdal_stages_{kind.type.replace('.', '_')}_{uuid.uuid4().hex[:12]}"
-    return LoweredStage(kind, options, tag, label, index)
-
-
-def python_stage(kind: type[Stage], given: dict[str, Any], **own: Any) -> tuple[dict[str, Any], LoweredStage]:
-    """The ``filters.python`` object of one stage, for python-pdal objects."""
-    lowered = _lower_stage({"type": kind.type, **given, **own}, 0)
-    return _python_stage({"type": kind.type, **given, **own}, lowered), lowered
-
-
-def _python_stage(stage: dict[str, Any], lowered: LoweredStage) -> dict[str, Any]:
-    given = {k: v for k, v in stage.items() if k not in ("type", *_PDAL_OWN)}
-    arguments = {"stage": lowered.stage.type, "label": lowered.label, "options": given}
-    if lowered.tag:
-        arguments["tag"] = lowered.tag
-    out: dict[str, Any] = {
+    arguments = {"stage": kind.type, "label": label, "options": options}
+    if given.get("tag"):
+        arguments["tag"] = given["tag"]
+    plain: dict[str, Any] = {
         "type": "filters.python",
-        "module": lowered.label,
+        "module": label,
         "function": "stage",
         "source": TRAMPOLINE,
         "pdalargs": arguments,
     }
-    creates = lowered.stage.creates(lowered.options)
-    if creates:
-        out["add_dimension"] = [f"{name}={kind}" for name, kind in creates.items()]
-    out.update({key: stage[key] for key in _PDAL_OWN if key in stage})
-    return out
+    if creates := stage.creates():
+        plain["add_dimension"] = [f"{name}={kind}" for name, kind in creates.items()]
+    plain.update({key: given[key] for key in PDAL_OWN if key in given})
+    known(label, stage)
+    return LoweredStage(stage, named, label, index, plain)
 
 
 def _fresh_tag(tags: set[str]) -> str:
@@ -175,11 +163,6 @@ def _fresh_tag(tags: set[str]) -> str:
         number += 1
     tags.add(f"pdal_stages_merge_{number}")
     return f"pdal_stages_merge_{number}"
-
-
-def _with_line(error: StageError, where: str) -> StageError:
-    error.where = f"{where}: {error.where}" if error.where else where
-    return error
 
 
 class _Views:
@@ -222,23 +205,21 @@ class _Views:
 def _check_writers(lowered: Lowered) -> None:
     """Class codes must fit the LAS files written later, and extra dimensions one LAS record."""
     for ours in lowered.ours:
-        largest = ours.stage.largest_class(ours.options)
-        extra = _extra_dimensions(ours)
+        largest, extra = ours.stage.largest_class(), len(ours.stage.creates())
         for writer in lowered.stages[ours.index + 1 :]:
             if not _writes_las(writer):
                 continue
             if largest > LEGACY_LIMIT:
                 _check_codes(ours, largest, writer, lowered.stages[: ours.index])
-            if extra and str(writer.get("extra_dims", "")).strip() == "all":
-                from ..stages.multiscalefeatures import fits_las, too_many_for_las
-
-                if not fits_las(extra):
-                    raise too_many_for_las(extra).at(ours.place)
-
-
-def _extra_dimensions(ours: LoweredStage) -> int:
-    counter = getattr(ours.stage, "extra_dimensions", None)
-    return counter(ours.options) if counter else 0
+            if extra > _MOST_EXTRA and str(writer.get("extra_dims", "")).strip() == "all":
+                raise DimensionError(
+                    f"LAS cannot hold so many extra dimensions: one record describes {_MOST_EXTRA} of them",
+                    where=ours.place,
+                    found=f"{extra} features",
+                    cure="Take fewer neighborhoods or features, write to a format without the limit (writers.text, "
+                    "writers.tiledb), or use writers.classifiermodel and filters.modelclassifier, which need no "
+                    "dimensions",
+                )
 
 
 def _writes_las(stage: dict[str, Any]) -> bool:

@@ -10,7 +10,7 @@ from typing import Any
 from ..stages import registry
 from . import pdal as pdal_env
 from . import runtime
-from .lowering import python_stage
+from .lowering import lower_stage
 
 
 class _Family:
@@ -29,17 +29,13 @@ class _Family:
                 options["merge"], merge = merge, True
             if filename is not None:
                 options["filename"] = filename
-            pdal = pdal_env.bindings()
-            merged = None
-            own = {key: options.pop(key) for key in ("tag", "inputs", "user_data", "log") if key in options}
-            if merge:
-                # Points of several readers must see each other; of one reader this costs nothing.
-                wired = {"inputs": own.pop("inputs")} if "inputs" in own else {}
-                merged = pdal.Filter(type="filters.merge", **wired)
-            stage, _ = python_stage(kind, options, **own)
+            # Points of several readers must see each other; of one reader merging costs nothing.
+            wired = {"inputs": options.pop("inputs")} if merge and "inputs" in options else {}
+            lowered = lower_stage({"type": kind.type, **options})
             runtime.remember_stdout()
-            lowered_stage = pdal.Filter(**stage)
-            return merged | lowered_stage if merged is not None else lowered_stage
+            made = pdal_env.python_object(lowered.plain)
+            made.made_from = lowered.stage  # or it would be forgotten, and options parsed again
+            return pdal_env.python_object({"type": "filters.merge", **wired}) | made if merge else made
 
         make.__name__ = name
         make.__doc__ = (

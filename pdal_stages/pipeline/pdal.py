@@ -113,6 +113,35 @@ def execute(stages: list[dict[str, Any]], *, arrays: bool = True) -> Execution:
     )
 
 
+def python_object(stage: dict[str, Any]):
+    """A filter as an object of python-pdal, to be joined by ``|``."""
+    return bindings().Filter(**stage)
+
+
+def validate(stages: list[dict[str, Any]]) -> None:
+    """Let the program `pdal` check stages and their options, without reading points.
+
+    Raises
+    ------
+    PipelineError, DependencyError
+        As :func:`execute`.
+    """
+    done = subprocess.run(
+        [program(), "pipeline", "--validate", "--stdin"],
+        input=json.dumps({"pipeline": adapted(stages)}),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    try:
+        verdict = json.loads(done.stdout)
+    except ValueError:
+        verdict = {"valid": done.returncode == 0, "error_detail": (done.stderr or done.stdout).strip()}
+    if not verdict.get("valid", False):
+        raise translate(str(verdict.get("error_detail") or "the pipeline is not valid"))
+
+
 def translate(message: str) -> PipelineError | DependencyError:
     """PDAL's error text as an error of ours, with a cure where the cause is known."""
     text = message.strip()

@@ -11,10 +11,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import PipelineError, StageError
+from ..base.errors import InterruptedStage, PipelineError, StageError
 from ..base.files import check_complete, check_writable, disk_is_full, partial_name
 from ..base.las import check_readable, odd_text, supersede_copc
 from ..base.leftovers import removed_if_killed
+from ..stages import registry
 from . import pdal as pdal_env
 from . import runtime
 from .lowering import Lowered, lower
@@ -69,7 +70,7 @@ class Pipeline:
             if _is_writer(stage, self.lowered.stages):
                 check_writable(stage["filename"])
         try:
-            _validate_with_pdal(self.lowered.stages)
+            pdal_env.validate(self.lowered.stages)
         except StageError as error:
             raise self._located(error) from None
 
@@ -104,7 +105,7 @@ class Pipeline:
                 error.found = str(error.found).replace(str(partial), str(final))
                 if error.cure is None and disk_is_full(partial):
                     error.cure = f"The disk of {final} is full: make room"
-            if failure is not None and failure.what == runtime.INTERRUPTED:
+            if isinstance(failure, InterruptedStage):
                 raise KeyboardInterrupt from None
             raise failure or self._located(error) from None
         finally:
@@ -127,7 +128,9 @@ class Pipeline:
 
     def _models(self) -> list[str]:
         """Where models are being written: what to remove if the process is killed meanwhile."""
-        names = (Path(o.options["filename"]) for o in self.lowered.ours if "filename" in o.options)
+        names = (
+            Path(o.stage.options["filename"]) for o in self.lowered.ours if "filename" in o.stage.options
+        )
         return [glob.escape(str(n.with_name(f".{n.name}.{os.getpid()}"))) + ".*" for n in names]
 
     def _located(self, error: StageError) -> StageError:
@@ -256,26 +259,6 @@ def _discard(renames: list[tuple[Path, Path]]) -> None:
                 path.unlink(missing_ok=True)
 
 
-def _validate_with_pdal(stages: list[dict[str, Any]]) -> None:
-    import subprocess
-
-    text = json.dumps({"pipeline": pdal_env.adapted(stages)})
-    done = subprocess.run(
-        [pdal_env.program(), "pipeline", "--validate", "--stdin"],
-        input=text,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
-    try:
-        verdict = json.loads(done.stdout)
-    except ValueError:
-        verdict = {"valid": done.returncode == 0, "error_detail": (done.stderr or done.stdout).strip()}
-    if not verdict.get("valid", False):
-        raise pdal_env.translate(str(verdict.get("error_detail") or "the pipeline is not valid"))
-
-
 def _named_metadata(
     metadata: dict[str, Any], reports: list[tuple[str, list[dict[str, Any]]]]
 ) -> dict[str, Any]:
@@ -299,6 +282,4 @@ def _named_metadata(
 
 
 def _is_ours(node: Any) -> bool:
-    from ..stages.registry import stages
-
-    return isinstance(node, dict) and any(name in stages() for name in node)
+    return isinstance(node, dict) and any(name in registry.stages() for name in node)

@@ -15,11 +15,13 @@ import sys
 import threading
 from collections.abc import Mapping
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 
-from ..base.errors import StageError
+from ..base.errors import InterruptedStage, StageError
 from ..stages import registry
+from ..stages.base import Stage
 from ..stages.points import Points
 from . import pdal as pdal_env
 
@@ -37,14 +39,13 @@ def stage(ins, outs):
 #: Around a stage's message in the name of the array that PDAL refuses.
 _OPENING, _CLOSING = "of a stage that failed:\n\n", "\n\n"
 
-#: What an error says when Ctrl-C came while a stage ran; the runners turn it back into KeyboardInterrupt.
-INTERRUPTED = "interrupted"
-
 _lock = threading.Lock()
 _reports: dict[str, list[dict[str, Any]]] = {}
 _failures: dict[str, StageError] = {}
 _usual_stdout: Any = sys.__stdout__
 _kept: list[Any] = []
+#: Stages made in this process, as long as someone holds them; in another process options are parsed anew.
+_made: WeakValueDictionary[str, Stage] = WeakValueDictionary()
 
 
 def place(type_name: str, tag: str | None) -> str:
@@ -67,7 +68,7 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
     label = str(arguments.get("label", ""))
     sys.modules.pop(label, None)  # PDAL's module object stays alive; the register need not grow
     try:
-        report = _run(module, arguments, ins, outs)
+        report = run_on_view(module, arguments, ins, outs)
         module["out_metadata"] = _metadata_node(arguments["stage"], report)
     except BaseException as error:
         failure = _as_stage_error(error, place(arguments["stage"], arguments.get("tag")))
@@ -82,20 +83,26 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
     return True
 
 
-def _run(module, arguments, ins, outs) -> dict[str, Any]:
-    stage = registry.get(arguments["stage"])
-    where = place(stage.type, arguments.get("tag"))
-    options = stage.parse(arguments.get("options", {}), where)
-    points = Points(
+def points_of(stage: Stage, module: Mapping[str, Any], ins: Mapping[str, Any]) -> Points:
+    """The points of a view, as a stage sees them, from what PDAL sets in a script's globals."""
+    return stage.points(
         ins,
         wkt=_wkt(module.get("spatialreference")),
-        options=options,
         legacy_flags=pdal_env.flags_inside_classification(ins, module.get("metadata")),
     )
-    for name in stage.reads(options):
+
+
+def run_on_view(module, arguments, ins, outs) -> dict[str, Any]:
+    """Run a stage on one view; its report. What it raises may be anything, Ctrl-C too."""
+    stage = _made.get(arguments.get("label", ""))
+    if stage is None:
+        kind = registry.get(arguments["stage"])
+        stage = kind(arguments.get("options", {}), place(kind.type, arguments.get("tag")))
+    points = points_of(stage, module, ins)
+    for name in stage.reads():
         if name not in ins:
             points.dimension(name)  # raises, naming the stage that makes it
-    for name, values in stage.run(points, options).items():
+    for name, values in stage.run(points).items():
         target = ins[name].dtype
         # PDAL copies raw memory: exactly this type, contiguous, one value per point.
         array = np.ascontiguousarray(values, dtype=target)
@@ -115,7 +122,7 @@ def _as_stage_error(error: BaseException, where: str) -> StageError:
             cure="Lower 'memory', work in tiles (--tile), or take fewer features",
         )
     if isinstance(error, KeyboardInterrupt):
-        return StageError(INTERRUPTED, where=where)
+        return InterruptedStage("interrupted", where=where)
     failure = StageError(
         f"{type(error).__name__}: {error}", where=where, cure="Run with --debug and report it"
     )
@@ -159,6 +166,11 @@ def _leaf(name: str, value: str, kind: str) -> dict[str, Any]:
 
 
 # ---- for the runners in the same process -----------------------------------------------------------
+
+
+def known(label: str, stage: Stage) -> None:
+    """Let a stage made in this process be found by its label."""
+    _made[label] = stage
 
 
 def remember_stdout() -> None:

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..accuracy.labels import code_list, merging
 from ..accuracy.measures import Accuracy
 from ..base.errors import StageError
 from ..base.files import check_writable, write_whole
 from .base import Stage
-from .options import Option
+from .modelclassifier import loaded_model
+from .options import option
 from .points import Points
 
 #: Options that the report lists.
@@ -25,24 +27,23 @@ class AccuracyStage(Stage):
     summary = "Compare a class dimension with a reference dimension; report as table, JSON and HTML"
     source = "[B16] section 4.3, [W18] section 4.3"
     where_help = "Only points inside are compared."
-    options = (
-        Option("dimension", "string", "Classification", "The classes to judge"),
-        Option("reference", "string", "Reference", "The true classes, e.g. kept with filters.ferry"),
-        Option("classes", "list", (), "Reference codes to compare; default: every one found"),
-        Option(
-            "ignore",
-            "list",
-            (0, 1),
-            "Reference codes left out (and counted); where 'classes' is given, only those left out by it",
-            may_be_empty=True,
-        ),
-        Option("merge", "mapping", None, 'Classes taken as one on both sides: {"5": [3, 4]}'),
-        Option("json", "filename", None, "Write the figures to this JSON file"),
-        Option("html", "filename", None, "Write a report with maps to this HTML file"),
-        Option("title", "string", "Classification accuracy", "Heading of the report"),
-        Option("model", "filename", None, "Model file whose importances the report shows"),
-        Option("print", "boolean", True, "Print the table on standard error"),
+    dimension: str = option("string", "Classification", "The classes to judge")
+    reference: str = option("string", "Reference", "The true classes, e.g. kept with filters.ferry")
+    classes: list = option("list", (), "Reference codes to compare; default: every one found")
+    ignore: list = option(
+        "list",
+        (0, 1),
+        "Reference codes left out (and counted); where 'classes' is given, only those left out by it",
+        may_be_empty=True,
     )
+    merge: dict | None = option("mapping", None, 'Classes taken as one on both sides: {"5": [3, 4]}')
+    json: str | None = option("filename", None, "Write the figures to this JSON file")
+    html: str | None = option("filename", None, "Write a report with maps to this HTML file")
+    title: str = option("string", "Classification accuracy", "Heading of the report")
+    model_file: str | None = option(
+        "filename", None, "Model file whose importances the report shows", name="model"
+    )
+    print_table: bool = option("boolean", True, "Print the table on standard error", name="print")
     details = """
 Prints the table of overall accuracy, kappa, mean class recall and precision, mean F1 and the figures of each class
 on standard error; `json` and `html` write them to files. Keep the labels before classifying with
@@ -62,37 +63,28 @@ present, add a reliability curve and the error by margin.
         "html": "accuracy.html",
     }
 
-    @classmethod
-    def check(cls, options: dict[str, Any]) -> None:
-        from ..accuracy.labels import code_list, merging
-
+    def check(self) -> None:
         for name in ("classes", "ignore"):
-            code_list([_number(c) for c in options[name]], name)
-        merging(options["merge"])
+            code_list(_codes(self.options[name]), name)
+        merging(self.merge)
         for name in ("json", "html"):
-            if options[name]:
-                check_writable(options[name], name)
-        if options["model"]:
-            from ..classifier import load_model
+            if self.options[name]:
+                check_writable(self.options[name], name)
+        if self.model_file:
+            loaded_model(self.model_file)
 
-            load_model(options["model"])
+    def reads(self) -> list[str]:
+        return [self.dimension, self.reference]
 
-    @classmethod
-    def reads(cls, options: dict[str, Any]) -> list[str]:
-        return [options["dimension"], options["reference"]]
-
-    @classmethod
-    def run(cls, points: Points, options: dict[str, Any]) -> dict[str, NDArray]:
+    def run(self, points: Points) -> dict[str, NDArray]:
         if points.count == 0:
             raise StageError(
                 "there are no points to compare",
                 cure="Check the reader's file and the filters before this stage",
             )
-        classes = [_number(c) for c in options["classes"]]
-        ignore = [] if classes else [_number(c) for c in options["ignore"]]
         inside = slice(None) if points.mask is None else points.mask
-        reference = points.codes_of(options["reference"])[inside]
-        predicted = points.codes_of(options["dimension"])[inside]
+        reference = points.codes_of(self.reference)[inside]
+        predicted = points.codes_of(self.dimension)[inside]
         graded = {
             name.lower(): np.asarray(points.arrays[name])[inside]
             for name in ("Reliability", "Margin")
@@ -101,19 +93,18 @@ present, add a reliability curve and the error by margin.
         accuracy = Accuracy.from_labels(
             reference,
             predicted,
-            classes=classes or None,
-            ignore=ignore,
-            merge=options["merge"],
+            classes=_codes(self.classes) or None,
+            ignore=[] if self.classes else _codes(self.ignore),
+            merge=self.merge,
             reliability=graded.get("reliability"),
             margin=graded.get("margin"),
         )
-        figures = accuracy.to_dict()
-        if options["print"]:
+        if self.print_table:
             print(accuracy.table(), file=sys.__stderr__ or sys.stderr)
-        if options["json"]:
-            write_whole(options["json"], (json.dumps(figures, indent=1) + "\n").encode())
-        if options["html"]:
-            _report(points, inside, reference, predicted, accuracy, options)
+        if self.json:
+            write_whole(self.json, (json.dumps(accuracy.to_dict(), indent=1) + "\n").encode())
+        if self.html:
+            self._write_page(self.html, accuracy, points.xyz[inside], reference, predicted)
         points.report.update(
             {
                 "compared": accuracy.points,
@@ -127,30 +118,28 @@ present, add a reliability curve and the error by margin.
         )
         return {}
 
+    def _write_page(
+        self, path: str, accuracy: Accuracy, xyz: NDArray, reference: NDArray, predicted: NDArray
+    ) -> None:
+        from ..reports.accuracypage import write_accuracy_report
 
-def _report(points, inside, reference, predicted, accuracy: Accuracy, options: dict[str, Any]) -> None:
-    from ..reports.accuracypage import write_accuracy_report
-
-    importances = None
-    settings: dict[str, Any] = {k: v for k, v in options.items() if k in _SHOWN}
-    if options["model"]:
-        from ..classifier import load_model
-
-        model = load_model(options["model"])
-        importances = model.importances("column")
-        settings["model"] = options["model"]
-    write_accuracy_report(
-        options["html"],
-        accuracy,
-        xyz=points.xyz[inside],
-        reference=reference,
-        predicted=predicted,
-        title=options["title"],
-        importances=importances,
-        settings=settings,
-    )
+        settings: dict[str, Any] = {k: v for k, v in self.options.items() if k in _SHOWN}
+        importances = None
+        if self.model_file:
+            importances = loaded_model(self.model_file).importances("column")
+            settings["model"] = self.model_file
+        write_accuracy_report(
+            path,
+            accuracy,
+            xyz=xyz,
+            reference=reference,
+            predicted=predicted,
+            title=self.title,
+            importances=importances,
+            settings=settings,
+        )
 
 
-def _number(value: Any) -> Any:
-    text = str(value).strip()
-    return int(text) if text.lstrip("-").isdigit() else value
+def _codes(given: list) -> list:
+    """Numbers for text that holds whole numbers; what else there is, is refused where codes are checked."""
+    return [int(text) if (text := str(v).strip()).lstrip("-").isdigit() else v for v in given]

@@ -1,4 +1,4 @@
-"""What a stage is: its type name, typed options, dimensions, halo, and what it does."""
+"""What a stage is: an object made once from checked options, which then answers every question about itself."""
 
 from __future__ import annotations
 
@@ -8,115 +8,113 @@ from typing import Any, ClassVar
 
 from numpy.typing import NDArray
 
-from ..base.errors import OptionError, StageError
-from .options import Option, parse_options
+from ..base.errors import StageError
+from ..base.units import named_unit
+from .options import Option, option, parse_options
 from .points import Points
-
-#: Options every stage of ours has.
-COMMON = (
-    Option(
-        "where",
-        "expression",
-        None,
-        "Points the stage acts on; the others stay as they are but serve as neighbors",
-    ),
-    Option("threads", "integer", 0, "Threads to use; 0 is every core on offer", minimum=0, maximum=1024),
-    Option(
-        "horizontal_unit",
-        "string",
-        "",
-        "Unit of x and y (metre, foot, us-ft), where the spatial reference is missing or wrong",
-    ),
-    Option(
-        "vertical_unit",
-        "string",
-        "",
-        "Unit of z, where the spatial reference does not say; otherwise as x and y",
-    ),
-)
+from .where import Expression
 
 
 class Stage(ABC):
     """Base of all stages; a subclass in a module of this package is a stage of the product.
 
-    Class attributes give the type name, one-line summary, declared options and the source
-    in the papers. Methods are called with parsed options.
+    A subclass gives its type name and a one-line summary, declares its options in its body, says what it reads,
+    creates and how far it looks, and does the work in :meth:`run`. A stage object holds parsed options as attributes;
+    what is costly to make of them (a plan, a model) belongs in a ``functools.cached_property``.
+
+    Parameters
+    ----------
+    given : mapping
+        Options as the user gave them, from JSON or from the command line.
+    place : str, optional
+        What errors call the stage; by default its type.
+
+    Attributes
+    ----------
+    options : dict
+        Every option's parsed value by its name.
+
+    Raises
+    ------
+    StageError
+        For options that are unknown, missing, wrong or contradictory, or name files that are; with `place` as where.
     """
 
     type: ClassVar[str]
     summary: ClassVar[str]
     source: ClassVar[str] = ""
-    options: ClassVar[tuple[Option, ...]] = ()
     example: ClassVar[dict[str, Any]] = {}
     #: Stages shown round the example in the docs.
     before: ClassVar[tuple[dict[str, Any], ...]] = ()
     after: ClassVar[tuple[Any, ...]] = ("output.laz",)
     #: Paragraphs of the docs page (Markdown).
     details: ClassVar[str] = ""
-    #: Dimensions, for the docs of a stage whose example cannot be parsed without a file.
+    #: Dimensions, for the docs of a stage whose example cannot be made without a file.
     dimensions_help: ClassVar[str] = ""
-    #: What `where` means here; None where the stage has no such option.
-    where_help: ClassVar[str | None] = ""
+    #: What `where` means here.
+    where_help: ClassVar[str] = ""
+
+    where: str | None = option(
+        "expression", None, "Points the stage acts on; the others stay as they are but serve as neighbors"
+    )
+    threads: int = option(
+        "integer", 0, "Threads to use; 0 takes every available core", minimum=0, maximum=1024
+    )
+    horizontal_unit: str = option(
+        "string", "", "Unit of x and y (metre, foot, us-ft), where the spatial reference is missing or wrong"
+    )
+    vertical_unit: str = option(
+        "string", "", "Unit of z, where the spatial reference does not say; otherwise that of x and y"
+    )
+
+    def __init__(self, given: Mapping[str, Any], place: str | None = None) -> None:
+        try:
+            self.options = parse_options(self.all_options(), given)
+            for name in ("horizontal_unit", "vertical_unit"):
+                if self.options[name]:
+                    named_unit(self.options[name], name)
+            self._condition = None if self.where is None else Expression(self.where)
+            self.check()
+        except StageError as error:
+            raise error.within(place or self.type) from None
 
     @classmethod
     def all_options(cls) -> tuple[Option, ...]:
         """The stage's own options, then those all stages share."""
-        return cls.options + COMMON
+        return tuple(
+            value for kind in cls.__mro__ for value in vars(kind).values() if isinstance(value, Option)
+        )
 
-    @classmethod
-    def parse(cls, given: Mapping[str, Any], where: str | None = None) -> dict[str, Any]:
-        """Parse and check options; errors name the stage (and tag) in `where`."""
-        place = where or cls.type
-        try:
-            values = parse_options(cls.all_options(), given)
-            for name in ("horizontal_unit", "vertical_unit"):
-                if values[name]:
-                    from ..base.units import named_unit
-
-                    named_unit(values[name], name)
-            if values["where"] is not None:
-                from .where import Expression
-
-                Expression(values["where"])
-            cls.check(values)
-        except StageError as error:
-            if error.where and not error.where.startswith(place):  # a file the stage reads
-                error.where = f"{place}: {error.where}"
-            raise error.at(place) from None
-        return values
-
-    @classmethod
-    def check(cls, options: dict[str, Any]) -> None:
+    def check(self) -> None:
         """Refuse options that contradict each other; read the files they name."""
 
-    @classmethod
-    def reads(cls, options: dict[str, Any]) -> list[str]:
+    def reads(self) -> list[str]:
         """Dimensions the points must have, beyond X, Y, Z."""
         return []
 
-    @classmethod
-    def creates(cls, options: dict[str, Any]) -> dict[str, str]:
+    def creates(self) -> dict[str, str]:
         """Dimensions made or overwritten: name -> PDAL type (``double``, ``float``, ``uint8_t``)."""
         return {}
 
-    @classmethod
-    def halo(cls, options: dict[str, Any]) -> float:
+    def halo(self) -> float:
         """How far beyond a tile, in metres, points can change the tile's results."""
         return 0.0
 
-    @classmethod
-    def inner_reach(cls, options: dict[str, Any]) -> float:
+    def inner_reach(self) -> float:
         """How far apart, in metres, points use each other's results of this very stage; part of the halo."""
         return 0.0
 
-    @classmethod
-    def largest_class(cls, options: dict[str, Any]) -> int:
+    def largest_class(self) -> int:
         """The largest class code the stage may write to `Classification` (0: none)."""
         return 0
 
-    @classmethod
+    def points(self, arrays: Mapping[str, NDArray], *, wkt: str = "", legacy_flags: bool = False) -> Points:
+        """PDAL's arrays as this stage sees them: with its `where` and its units."""
+        units = (self.horizontal_unit, self.vertical_unit)
+        return Points(arrays, wkt=wkt, where=self._condition, units=units, legacy_flags=legacy_flags)
+
     @abstractmethod
-    def run(cls, points: Points, options: dict[str, Any]) -> dict[str, NDArray]:
+    def run(self, points: Points) -> dict[str, NDArray]:
         """Do the work; return the dimensions that change, one value per point."""
 
     @classmethod
@@ -128,16 +126,10 @@ class Stage(ABC):
             "inputs": {"type": ["array", "string"]},
         }
         properties.update({option.name: option.schema() for option in cls.all_options()})
-        required = ["type"] + [o.name for o in cls.all_options() if o.required]
         return {
             "type": "object",
             "description": cls.summary,
             "properties": properties,
-            "required": required,
+            "required": ["type"] + [o.name for o in cls.all_options() if o.required],
             "additionalProperties": False,
         }
-
-
-def plan_error(option: str, error: StageError) -> OptionError:
-    """Name the option in an error raised by a numpy-level function."""
-    return OptionError(f"option '{option}': {error.what}", found=error.found, cure=error.cure)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,8 +12,11 @@ from numpy.typing import NDArray
 from ..base.errors import StageError
 from ..base.files import check_writable
 from ..classifier import TrainingCloud, TrainingOptions, train
+from ..classifier.classes import ClassMap
+from ..classifier.dimensions import required
+from ..features import FeaturePlan
 from .base import Stage
-from .options import Option
+from .options import option
 from .points import Points
 
 #: Options of this stage that are not the trainer's.
@@ -28,113 +33,88 @@ class ClassifierModel(Stage):
     summary = "Train a classifier on the labelled points that reach it, and write one model file"
     source = "[B16] sections 3.3-4.2, [W18] section 4.3, [WM19] for alsnet"
     where_help = "Samples are drawn from the points inside; all points are neighbors."
-    options = (
-        Option("filename", "filename", None, "The model file to write", required=True),
-        Option("label", "string", "Classification", "Dimension that holds the labels"),
-        Option(
-            "algorithm",
-            "string",
-            "random_forest",
-            "A forest on computed features, or a network on the points themselves (needs PyTorch)",
-            choices=("random_forest", "alsnet"),
-        ),
-        Option(
-            "alsnet",
-            "mapping",
-            None,
-            'Options of the network: {"configuration": "small", "epochs": 60, ...}; see the page on alsNet',
-        ),
-        Option(
-            "neighborhoods",
-            "list",
-            ("weinmann2018",),
-            "Neighborhoods: tokens (c2, s1, k50, kopt, ropt, copt) or a preset (blomley2016, weinmann2018, he2017)",
-        ),
-        Option(
-            "feature_set",
-            "list",
-            _default("feature_set"),
-            "Groups (covariance, geometric, shapes, all) or single features. 'all' is the papers' set",
-        ),
-        Option(
-            "dimensions",
-            "list",
-            ("HeightAboveGround",),
-            "Dimensions of the points used as features too (Intensity, ReturnNumber, NumberOfReturns, ReturnRatio)",
-            may_be_empty=True,
-        ),
-        Option(
-            "classes",
-            "mapping",
-            None,
-            'Labels and what they become: {"2": "Ground", "3,4,5": "5 Vegetation", "6": 6}, or a list of codes; '
-            "default: every label met except 0, 1, 7, 12 and 18",
-        ),
-        Option(
-            "strategy",
-            "string",
-            "multiclass",
-            "All classes at once, or 'target' against all others",
-            choices=("multiclass", "binary"),
-        ),
-        Option("target", "integer", None, "Class to find with the binary strategy", minimum=0, maximum=255),
-        Option("background", "integer", 1, "Code of all other classes with it", minimum=0, maximum=255),
-        Option(
-            "count",
-            "integer",
-            _default("count"),
-            "Samples of each class; smaller classes are duplicated",
-            minimum=1,
-        ),
-        Option(
-            "seed",
-            "integer",
-            0,
-            "Seed of sampling, trees and shape distributions",
-            minimum=0,
-            maximum=2**31 - 1,
-        ),
-        Option(
-            "trees",
-            "list",
-            (_default("trees"),),
-            "Number of trees; several values are searched by cross-validation",
-        ),
-        Option("max_depth", "list", (0,), "Depth of trees, 0 for no limit; several values are searched"),
-        Option(
-            "min_samples_leaf",
-            "list",
-            (_default("min_samples_leaf"),),
-            "Samples a leaf must have; several values are searched",
-        ),
-        Option(
-            "max_samples",
-            "number",
-            _default("max_samples"),
-            "Share of the samples each tree draws",
-            minimum=0,
-            exclusive=True,
-            maximum=1,
-        ),
-        Option(
-            "max_features",
-            "string",
-            _default("max_features"),
-            "Features tried at a split: auto (a tenth, at least the square root), sqrt, log2, a number or a share",
-        ),
-        Option(
-            "prior_weight",
-            "number",
-            _default("prior_weight"),
-            "0: all classes count as equally frequent, as they are sampled; 1: as frequent as in the training points",
-            minimum=0,
-            maximum=1,
-        ),
-        Option("folds", "integer", 0, "Folds of cross-validation over spatial blocks; 0 for none", minimum=0),
-        Option("block_size", "number", 25.0, "Side of those blocks", minimum=0, exclusive=True, unit="m"),
-        Option(
-            "memory", "integer", 512, "Memory for blocks of points, over the samples", minimum=16, unit="MB"
-        ),
+    filename: str = option("filename", None, "The model file to write", required=True)
+    label: str = option("string", "Classification", "Dimension that holds the labels")
+    algorithm: str = option(
+        "string",
+        "random_forest",
+        "A forest on computed features, or a network on the points themselves (needs PyTorch)",
+        choices=("random_forest", "alsnet"),
+    )
+    alsnet: dict | None = option(
+        "mapping",
+        None,
+        'Options of the network: {"configuration": "small", "epochs": 60, ...}; see the page on alsNet',
+    )
+    neighborhoods: list = option(
+        "list",
+        ("weinmann2018",),
+        "Neighborhoods: tokens (c2, s1, k50, kopt, ropt, copt) or a preset (blomley2016, weinmann2018, he2017)",
+    )
+    feature_set: list = option(
+        "list",
+        _default("feature_set"),
+        "Groups (covariance, geometric, shapes, all) or single features. 'all' is the papers' set",
+    )
+    dimensions: list = option(
+        "list",
+        ("HeightAboveGround",),
+        "Dimensions of the points used as features too (Intensity, ReturnNumber, NumberOfReturns, ReturnRatio)",
+        may_be_empty=True,
+    )
+    classes: dict | None = option(
+        "mapping",
+        None,
+        'Labels and what they become: {"2": "Ground", "3,4,5": "5 Vegetation", "6": 6}, or a list of codes; '
+        "default: every label met except 0, 1, 7, 12 and 18",
+    )
+    strategy: str = option(
+        "string",
+        "multiclass",
+        "All classes at once, or 'target' against all others",
+        choices=("multiclass", "binary"),
+    )
+    target: int | None = option(
+        "integer", None, "Class to find with the binary strategy", minimum=0, maximum=255
+    )
+    background: int = option("integer", 1, "Code of all other classes with it", minimum=0, maximum=255)
+    count: int = option(
+        "integer", _default("count"), "Samples of each class; smaller classes are duplicated", minimum=1
+    )
+    seed: int = option(
+        "integer", 0, "Seed of sampling, trees and shape distributions", minimum=0, maximum=2**31 - 1
+    )
+    trees: list = option(
+        "list", (_default("trees"),), "Number of trees; several values are searched by cross-validation"
+    )
+    max_depth: list = option("list", (0,), "Depth of trees, 0 for no limit; several values are searched")
+    min_samples_leaf: list = option(
+        "list", (_default("min_samples_leaf"),), "Samples a leaf must have; several values are searched"
+    )
+    max_samples: float = option(
+        "number",
+        _default("max_samples"),
+        "Share of the samples each tree draws",
+        minimum=0,
+        exclusive=True,
+        maximum=1,
+    )
+    max_features: str = option(
+        "string",
+        _default("max_features"),
+        "Features tried at a split: auto (a tenth, at least the square root), sqrt, log2, a number or a share",
+    )
+    prior_weight: float = option(
+        "number",
+        _default("prior_weight"),
+        "0: all classes count as equally frequent, as they are sampled; 1: as frequent as in the training points",
+        minimum=0,
+        maximum=1,
+    )
+    folds: int = option("integer", 0, "Folds of cross-validation over spatial blocks; 0 for none", minimum=0)
+    block_size: float = option("number", 25.0, "Side of those blocks", minimum=0, exclusive=True, unit="m")
+    memory: int = option(
+        "integer", 512, "Memory for blocks of points, over the samples", minimum=16, unit="MB"
     )
     details = """
 Samples `count` points of each class, spread over space; computes features for the samples only; fits the
@@ -154,87 +134,69 @@ merged first. `label` names the dimension that holds the classes.
         "count": 10000,
     }
 
-    @classmethod
-    def parse(cls, given, where=None):
-        # A list of codes is as good as a mapping.
-        classes = given.get("classes")
+    def __init__(self, given: Mapping[str, Any], place: str | None = None) -> None:
+        given = dict(given)
+        classes, share = given.get("classes"), given.get("max_features")
         if isinstance(classes, list | str) and not str(classes).lstrip().startswith("{"):
+            # A list of codes is as good as a mapping.
             codes = (
                 classes if isinstance(classes, list) else [c.strip() for c in classes.split(",") if c.strip()]
             )
-            given = {**given, "classes": {str(c): _code(c) for c in codes}}
-        share = given.get("max_features")
+            given["classes"] = {str(c): _code(c) for c in codes}
         if isinstance(share, int | float) and not isinstance(share, bool):
-            given = {**given, "max_features": str(share)}
-        return super().parse(given, where)
+            given["max_features"] = str(share)
+        super().__init__(given, place)
 
-    @classmethod
-    def training_options(cls, options: dict[str, Any]) -> TrainingOptions:
+    @cached_property
+    def training(self) -> TrainingOptions:
         """The trainer's options."""
-        values = {name: value for name, value in options.items() if name not in _OWN}
+        values = {name: value for name, value in self.options.items() if name not in _OWN}
         for name in ("trees", "max_depth", "min_samples_leaf"):
             numbers = [int(v) if str(v).strip().lstrip("-").isdigit() else v for v in values[name]]
             values[name] = numbers[0] if len(numbers) == 1 else numbers
         values["max_features"] = _number(values["max_features"])
-        return TrainingOptions(**values, threads=options["threads"], memory_mb=options["memory"])
+        return TrainingOptions(**values, threads=self.threads, memory_mb=self.memory)
 
-    @classmethod
-    def check(cls, options: dict[str, Any]) -> None:
-        from ..classifier.classes import ClassMap
-        from ..features import FeaturePlan
-
-        training = cls.training_options(options)
-        if training.algorithm == "alsnet":
-            cls._plan_dimensions(options)
-            if training.alsnet.checkpoint:
-                check_writable(training.alsnet.checkpoint, "checkpoint")
-        else:
-            FeaturePlan.parse(
-                training.neighborhoods, feature_set=training.feature_set, dimensions=training.dimensions
-            )
-        if training.classes is not None:
-            ClassMap.parse(training.classes)
-        check_writable(options["filename"], "model")
-
-    @classmethod
-    def reads(cls, options: dict[str, Any]) -> list[str]:
-        from ..classifier.dimensions import required
-
-        return [options["label"], *required(cls._plan_dimensions(options))]
-
-    @classmethod
-    def _plan_dimensions(cls, options: dict[str, Any]) -> tuple[str, ...]:
-        from ..features import FeaturePlan
-
-        training = cls.training_options(options)
-        if training.algorithm == "alsnet":
+    @cached_property
+    def inputs(self) -> tuple[str, ...]:
+        """Dimensions of the points that the features or the network take in."""
+        chosen = self.training
+        if chosen.algorithm == "alsnet":
             from ..alsnet.networkmodel import input_names
 
-            return input_names(training.alsnet.coordinates, training.dimensions)
-        plan = FeaturePlan.parse(
-            training.neighborhoods, feature_set=training.feature_set, dimensions=training.dimensions
-        )
-        return plan.dimensions
+            return input_names(chosen.alsnet.coordinates, chosen.dimensions)
+        return FeaturePlan.parse(
+            chosen.neighborhoods, feature_set=chosen.feature_set, dimensions=chosen.dimensions
+        ).dimensions
 
-    @classmethod
-    def run(cls, points: Points, options: dict[str, Any]) -> dict[str, NDArray]:
+    def check(self) -> None:
+        self.inputs  # noqa: B018  words that mean nothing are refused
+        if self.training.algorithm == "alsnet" and self.training.alsnet.checkpoint:
+            check_writable(self.training.alsnet.checkpoint, "checkpoint")
+        if self.training.classes is not None:
+            ClassMap.parse(self.training.classes)
+        check_writable(self.filename, "model")
+
+    def reads(self) -> list[str]:
+        return [self.label, *required(self.inputs)]
+
+    def run(self, points: Points) -> dict[str, NDArray]:
         if points.count == 0:
             raise StageError(
                 "there are no points to train on",
                 cure="Check the reader's file and the filters before this stage",
             )
-        needed = cls.reads(options)[1:]
         cloud = TrainingCloud(
             xyz=points.xyz,
-            labels=points.codes_of(options["label"]),
-            dimensions={name: points.dimension(name) for name in needed},
+            labels=points.codes_of(self.label),
+            dimensions={name: points.dimension(name) for name in required(self.inputs)},
             name="the points",
             mask=points.mask,
         )
-        model = train([cloud], cls.training_options(options))
-        model.save(options["filename"])
-        points.report.update({"model": options["filename"], **_brief(model.info), "seconds": model.seconds})
-        if options["algorithm"] == "alsnet":  # with the curve
+        model = train([cloud], self.training)
+        model.save(self.filename)
+        points.report.update({"model": self.filename, **_brief(model.info), "seconds": model.seconds})
+        if self.algorithm == "alsnet":  # with the curve
             points.report["training"] = _plain(model.info["training"])
         return {}
 

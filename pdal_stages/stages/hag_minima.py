@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,7 +9,7 @@ from ..base.asprs import NOISE
 from ..base.errors import OptionError
 from ..terrain.minima import MinimaTerrain
 from .base import Stage
-from .options import Option
+from .options import option
 from .points import Points
 
 
@@ -20,34 +18,29 @@ class HagMinima(Stage):
     summary = "Height above a coarse terrain: the minima of a grid, interpolated"
     source = "[W18] section 3.2"
     where_help = "Points outside neither form the terrain nor receive a height."
-    options = (
-        Option(
-            "cell",
-            "number",
-            20.0,
-            "Side of the coarse cells whose lowest points form the terrain; larger than the largest building's half width",
-            minimum=0,
-            exclusive=True,
-            maximum=10_000,
-            unit="m",
-        ),
-        Option(
-            "resolution",
-            "number",
-            0.5,
-            "Side of the fine cells on which the terrain is evaluated",
-            minimum=0,
-            exclusive=True,
-            maximum=10_000,
-            unit="m",
-        ),
-        Option(
-            "ignore_classes",
-            "list",
-            NOISE,
-            "Class codes that do not form the terrain (they still receive heights), e.g. noise below ground",
-            may_be_empty=True,
-        ),
+    cell: float = option(
+        "number",
+        20.0,
+        "Side of the coarse cells whose lowest points form the terrain; larger than the largest building's half width",
+        minimum=0,
+        exclusive=True,
+        maximum=10_000,
+        unit="m",
+    )
+    resolution: float = option(
+        "number",
+        0.5,
+        "Side of the fine cells on which the terrain is evaluated",
+        minimum=0,
+        exclusive=True,
+        maximum=10_000,
+        unit="m",
+    )
+    ignore_classes: list = option(
+        "list",
+        NOISE,
+        "Class codes that do not form the terrain (they still receive heights), e.g. noise below ground",
+        may_be_empty=True,
     )
     details = """
 The terrain is the lowest point of each cell of a coarse grid, interpolated bilinearly between cell centres and
@@ -63,44 +56,42 @@ the unit of Z.
     after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)
     example = {"type": "filters.hag_minima", "cell": 20, "resolution": 0.5}
 
-    @classmethod
-    def check(cls, options: dict[str, Any]) -> None:
-        if options["resolution"] > options["cell"]:
+    def check(self) -> None:
+        if self.resolution > self.cell:
             raise OptionError(
                 "option 'resolution' must not be larger than 'cell'",
-                found=f"resolution {options['resolution']:g}, cell {options['cell']:g}",
+                found=f"resolution {self.resolution:g}, cell {self.cell:g}",
                 cure="Swap them, or lower 'resolution'",
             )
-        for code in options["ignore_classes"]:
+        for code in self.ignore_classes:
             if str(code).strip() not in map(str, range(256)):
                 raise OptionError(
                     "option 'ignore_classes' must list class codes of 0 to 255", found=repr(code)
                 )
 
-    @classmethod
-    def creates(cls, options: dict[str, Any]) -> dict[str, str]:
+    def creates(self) -> dict[str, str]:
         return {"HeightAboveGround": "double"}
 
-    @classmethod
-    def halo(cls, options: dict[str, Any]) -> float:
+    def halo(self) -> float:
         # The bilinear patch reaches one and a half cells, whole cells are needed, and an
         # empty cell is filled from the nearest ones with points.
-        return 4.0 * options["cell"]
+        return 4.0 * self.cell
 
-    @classmethod
-    def run(cls, points: Points, options: dict[str, Any]) -> dict[str, NDArray]:
+    def forms_terrain(self, points: Points) -> NDArray[np.bool_]:
+        """Which points form the terrain; those left out for their class are counted."""
+        forms = np.ones(points.count, bool) if points.mask is None else points.mask.copy()
+        if "Classification" in points.arrays and self.ignore_classes:
+            noise = np.isin(points.class_codes, np.array([int(c) for c in self.ignore_classes], np.uint8))
+            points.report["ignored"] = int(np.count_nonzero(noise & forms))
+            forms &= ~noise
+        return forms
+
+    def run(self, points: Points) -> dict[str, NDArray]:
         if points.count == 0:
             return {"HeightAboveGround": np.empty(0)}
         x, y, z = points.xyz.T
-        forms = np.ones(points.count, bool) if points.mask is None else points.mask.copy()
-        if "Classification" in points.arrays and options["ignore_classes"]:
-            codes = np.array([int(c) for c in options["ignore_classes"]], np.uint8)
-            noise = np.isin(points.class_codes, codes)
-            points.report["ignored"] = int(np.count_nonzero(noise & forms))
-            forms &= ~noise
-        terrain = MinimaTerrain.fit(
-            x, y, z, cell=options["cell"], resolution=options["resolution"], mask=forms
-        )
+        forms = self.forms_terrain(points)
+        terrain = MinimaTerrain.fit(x, y, z, cell=self.cell, resolution=self.resolution, mask=forms)
         wanted = slice(None) if points.mask is None else points.mask
         height = np.array(points.arrays["HeightAboveGround"], np.float64)
         height[wanted] = (z[wanted] - terrain.at(x[wanted], y[wanted])) / points.units.vertical

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from ..base.progress import Progress
 from ..classifier import Model, load_model
 from ..classifier.smoothing import FARTHEST
 from .base import Stage
-from .options import Option
+from .options import option
 from .points import Points
 
 
@@ -23,54 +23,40 @@ class ModelClassifier(Stage):
     summary = "Apply a model file: compute what the model needs block by block, and write classes"
     source = "[B16] section 3.4, [W18] section 3.3, [WM19] for networks"
     where_help = "Points outside keep their class but still serve as neighbors."
-    options = (
-        Option("model", "filename", None, "The model file to apply", required=True),
-        Option(
-            "probabilities",
-            "boolean",
-            False,
-            "Also write the probability of each class, as Probability_<code>",
-        ),
-        Option("margin", "boolean", False, "Also write Margin, the winning probability minus the second"),
-        Option(
-            "variance",
-            "boolean",
-            False,
-            "Also write Variance, that of the probabilities over a network's batches (alsnet only)",
-        ),
-        Option(
-            "reject_below",
-            "number",
-            None,
-            "Points less reliable than this are not given the winning class, and are counted",
-            minimum=0,
-            maximum=1,
-        ),
-        Option(
-            "rejected_code",
-            "integer",
-            None,
-            "Class code of rejected points; default: they keep the class they had",
-            minimum=0,
-            maximum=255,
-        ),
-        Option(
-            "smooth",
-            "number",
-            0.0,
-            "Average probabilities with those of the points in a sphere of this radius, half and half; 0: do not",
-            minimum=0,
-            maximum=FARTHEST,
-            unit="m",
-        ),
-        Option(
-            "memory",
-            "integer",
-            512,
-            "Memory for blocks of points, over the cloud itself",
-            minimum=16,
-            unit="MB",
-        ),
+    model_file: str = option("filename", None, "The model file to apply", required=True, name="model")
+    probabilities: bool = option(
+        "boolean", False, "Also write the probability of each class, as Probability_<code>"
+    )
+    margin: bool = option("boolean", False, "Also write Margin, the winning probability minus the second")
+    variance: bool = option(
+        "boolean",
+        False,
+        "Also write Variance, that of the probabilities over a network's batches (alsnet only)",
+    )
+    reject_below: float | None = option(
+        "number",
+        None,
+        "Points less reliable than this are not given the winning class, and are counted",
+        minimum=0,
+        maximum=1,
+    )
+    rejected_code: int | None = option(
+        "integer",
+        None,
+        "Class code of rejected points; default: they keep the class they had",
+        minimum=0,
+        maximum=255,
+    )
+    smooth: float = option(
+        "number",
+        0.0,
+        "Smoothing radius: average each point's probabilities with its neighbors' mean; 0 disables",
+        minimum=0,
+        maximum=FARTHEST,
+        unit="m",
+    )
+    memory: int = option(
+        "integer", 512, "Memory for blocks of points, over the cloud itself", minimum=16, unit="MB"
     )
     details = """
 Computes the features the model needs block by block and classifies them at once, so memory does not grow with their
@@ -88,75 +74,65 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
     after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)
     example = {"type": "filters.modelclassifier", "model": "town.model"}
 
-    @classmethod
-    def check(cls, options: dict[str, Any]) -> None:
-        model = cls.model(options)
-        if options["variance"] and not getattr(model.algorithm, "whole_cloud", False):
+    def check(self) -> None:
+        algorithm = self.model.algorithm  # reads the file
+        if self.variance and not getattr(algorithm, "whole_cloud", False):
             raise OptionError(
                 "option 'variance' is for networks; this model is another",
-                found=model.algorithm.name,
+                found=algorithm.name,
                 cure="Use 'margin'",
             )
 
-    @classmethod
-    def model(cls, options: dict[str, Any]) -> Model:
-        """The loaded model; read once per process as long as the file stays the same."""
-        path = Path(options["model"])
-        try:
-            stat = path.stat()
-            stamp = (stat.st_mtime_ns, stat.st_size)
-        except OSError:
-            return load_model(path)  # says what is wrong
-        return _load(str(path), stamp)
+    @cached_property
+    def model(self) -> Model:
+        """The loaded model."""
+        return loaded_model(self.model_file)
 
-    @classmethod
-    def reads(cls, options: dict[str, Any]) -> list[str]:
-        return list(cls.model(options).required_dimensions)
+    @property
+    def plan(self) -> Any:
+        """The model's features."""
+        return self.model.plan
 
-    @classmethod
-    def creates(cls, options: dict[str, Any]) -> dict[str, str]:
+    def reads(self) -> list[str]:
+        return list(self.model.required_dimensions)
+
+    def creates(self) -> dict[str, str]:
         out = {"Classification": "uint8_t", "Reliability": "float"}
-        if options["margin"]:
+        if self.margin:
             out["Margin"] = "float"
-        if options["variance"]:
+        if self.variance:
             out["Variance"] = "float"
-        if options["probabilities"]:
-            out.update({f"Probability_{code}": "float" for code, _ in cls.model(options).classes})
+        if self.probabilities:
+            out.update({f"Probability_{code}": "float" for code, _ in self.model.classes})
         return out
 
-    @classmethod
-    def halo(cls, options: dict[str, Any]) -> float:
-        return cls.model(options).halo + cls.inner_reach(options)
+    def halo(self) -> float:
+        return self.model.halo + self.inner_reach()
 
-    @classmethod
-    def inner_reach(cls, options: dict[str, Any]) -> float:
-        return options["smooth"] + 0.001 if options["smooth"] else 0.0  # a distance rounds
+    def inner_reach(self) -> float:
+        return self.smooth + 0.001 if self.smooth else 0.0  # a distance rounds
 
-    @classmethod
-    def largest_class(cls, options: dict[str, Any]) -> int:
-        return max([code for code, _ in cls.model(options).classes] + [options["rejected_code"] or 0])
+    def largest_class(self) -> int:
+        return max([code for code, _ in self.model.classes] + [self.rejected_code or 0])
 
-    @classmethod
-    def run(cls, points: Points, options: dict[str, Any]) -> dict[str, NDArray]:
-        creates = cls.creates(options)
+    def run(self, points: Points) -> dict[str, NDArray]:
         if points.count == 0:
             return {}
-        model = cls.model(options)
         chosen = points.count if points.mask is None else int(np.count_nonzero(points.mask))
-        with Progress(chosen, cls.type) as progress:
-            found = model.predict(
+        with Progress(chosen, self.type) as progress:
+            found = self.model.predict(
                 points.xyz,
-                {name: points.dimension(name) for name in model.required_dimensions},
+                {name: points.dimension(name) for name in self.model.required_dimensions},
                 points.mask,
                 current=points.class_codes,
-                threads=options["threads"],
-                memory_mb=options["memory"],
-                probabilities=options["probabilities"],
-                margin=options["margin"],
-                variance=options["variance"],
-                reject_below=options["reject_below"],
-                rejected_code=options["rejected_code"],
-                smooth=options["smooth"],
+                threads=self.threads,
+                memory_mb=self.memory,
+                probabilities=self.probabilities,
+                margin=self.margin,
+                variance=self.variance,
+                reject_below=self.reject_below,
+                rejected_code=self.rejected_code,
+                smooth=self.smooth,
                 progress=progress,
             )
         values: dict[str, NDArray] = {
@@ -168,15 +144,25 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         if found.variance is not None:
             values["Variance"] = found.variance
         if found.probabilities is not None:
-            for column, (code, _) in enumerate(model.classes):
+            for column, (code, _) in enumerate(self.model.classes):
                 values[f"Probability_{code}"] = found.probabilities[:, column]
         if points.mask is not None:  # what was there before stays outside `where`
-            for name in creates:
+            for name in self.creates():
                 if name != "Classification":
                     values[name] = np.where(points.mask, values[name], points.arrays[name])
         values["Classification"] = points.with_codes(values["Classification"])
         points.report.update(found.report)
         return values
+
+
+def loaded_model(path: str) -> Model:
+    """A model file's model, read once per process as long as the file stays the same."""
+    try:
+        stat = Path(path).stat()
+        stamp = (stat.st_mtime_ns, stat.st_size)
+    except OSError:
+        return load_model(path)  # says what is wrong
+    return _load(path, stamp)
 
 
 @lru_cache(maxsize=4)

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import json
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import DimensionError, OptionError, StageError
+from ..base.errors import OptionError, StageError
 from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.neighborhoods import parse_neighborhoods
-from .base import Stage, plan_error
-from .options import Option
+from .base import Stage
+from .options import option
 from .points import Points
 
 #: Bytes a LAS extra-dimension name may have.
 _NAME_BYTES = 32
-#: A variable-length record holds 65,535 bytes; an extra dimension's description takes 192.
-_MOST_EXTRA = 65_535 // 192
 
 
 class MultiscaleFeatures(Stage):
@@ -28,43 +26,28 @@ class MultiscaleFeatures(Stage):
     summary = "Covariance, geometric and shape-distribution features of many neighborhoods"
     source = "[B16] sections 3.1-3.2, [W18] section 3.2, [H17] equations 1-3"
     where_help = "Features are computed for the points inside; all points are neighbors."
-    options = (
-        Option(
-            "neighborhoods",
-            "list",
-            ("c1", "c2", "c3", "c5", "kopt"),
-            "Neighborhoods: tokens (c2 cylinder, s1 sphere, k50 nearest, kopt, ropt, copt) or a preset "
-            "(blomley2016, weinmann2018, he2017)",
-        ),
-        Option(
-            "feature_set",
-            "list",
-            ("covariance", "geometric"),
-            "Groups (covariance, geometric, shapes, all) or single features (Linearity, A3, ...)",
-        ),
-        Option(
-            "seed",
-            "integer",
-            0,
-            "Seed of the random pulls of shape distributions",
-            minimum=0,
-            maximum=2**31 - 1,
-        ),
-        Option(
-            "bins",
-            "filename",
-            None,
-            "JSON file of shape-histogram thresholds and the curvature threshold: read where it exists, "
-            "otherwise fitted to these points and written, so that other tiles see the same ones",
-        ),
-        Option(
-            "memory",
-            "integer",
-            512,
-            "Memory for blocks of points, over the cloud itself",
-            minimum=16,
-            unit="MB",
-        ),
+    neighborhoods: list = option(
+        "list",
+        ("c1", "c2", "c3", "c5", "kopt"),
+        "Neighborhoods: tokens (c2 cylinder, s1 sphere, k50 nearest, kopt, ropt, copt) or a preset "
+        "(blomley2016, weinmann2018, he2017)",
+    )
+    feature_set: list = option(
+        "list",
+        ("covariance", "geometric"),
+        "Groups (covariance, geometric, shapes, all) or single features (Linearity, A3, ...)",
+    )
+    seed: int = option(
+        "integer", 0, "Seed of the random pulls of shape distributions", minimum=0, maximum=2**31 - 1
+    )
+    bins: str | None = option(
+        "filename",
+        None,
+        "JSON file of shape-histogram thresholds and the curvature threshold: read where it exists, "
+        "otherwise fitted to these points and written, so that other tiles see the same ones",
+    )
+    memory: int = option(
+        "integer", 512, "Memory for blocks of points, over the cloud itself", minimum=16, unit="MB"
     )
     details = """
 Each neighborhood is a token, which ends the dimension's name: `Linearity_c2` is the linearity in the vertical cylinder
@@ -81,22 +64,26 @@ features inside and need no dimensions at all.
         "feature_set": "covariance,geometric",
     }
 
-    @classmethod
-    def plan(cls, options: dict[str, Any]) -> FeaturePlan:
-        """The parsed neighborhoods and features, point dimensions of presets left out."""
-        plan = FeaturePlan.parse(options["neighborhoods"], feature_set=options["feature_set"])
-        return plan
+    @cached_property
+    def plan(self) -> FeaturePlan:
+        """The parsed neighborhoods and features."""
+        return FeaturePlan.parse(self.neighborhoods, feature_set=self.feature_set)
 
-    @classmethod
-    def check(cls, options: dict[str, Any]) -> None:
+    @cached_property
+    def columns(self) -> list[str]:
+        """Features to write: the point's own dimensions are there already."""
+        return [name for name in self.plan.names if name not in self.plan.dimensions]
+
+    def check(self) -> None:
+        option = "neighborhoods"
         try:
-            parse_neighborhoods(options["neighborhoods"])
+            parse_neighborhoods(self.neighborhoods)
+            option = "feature_set"
+            names = self.columns
         except StageError as error:
-            raise plan_error("neighborhoods", error) from None
-        try:
-            names = cls._columns(cls.plan(options))
-        except StageError as error:
-            raise plan_error("feature_set", error) from None
+            raise OptionError(
+                f"option '{option}': {error.what}", found=error.found, cure=error.cure
+            ) from None
         for name in names:
             if len(name.encode()) > _NAME_BYTES:
                 raise OptionError(
@@ -104,38 +91,19 @@ features inside and need no dimensions at all.
                     cure="Use shorter neighborhood tokens",
                 )
 
-    @staticmethod
-    def _columns(plan: FeaturePlan) -> list[str]:
-        """Features to write: the point's own dimensions are there already."""
-        return [name for name in plan.names if name not in plan.dimensions]
+    def creates(self) -> dict[str, str]:
+        return dict.fromkeys(self.columns, "float")
 
-    @classmethod
-    def extra_dimensions(cls, options: dict[str, Any]) -> int:
-        """How many extra dimensions a LAS writer would have to hold."""
-        return len(cls._columns(cls.plan(options)))
+    def halo(self) -> float:
+        return self.plan.halo
 
-    @classmethod
-    def creates(cls, options: dict[str, Any]) -> dict[str, str]:
-        return dict.fromkeys(cls._columns(cls.plan(options)), "float")
-
-    @classmethod
-    def halo(cls, options: dict[str, Any]) -> float:
-        return cls.plan(options).halo
-
-    @classmethod
-    def run(cls, points: Points, options: dict[str, Any]) -> dict[str, NDArray]:
-        plan = cls.plan(options)
-        names = cls._columns(plan)
+    def run(self, points: Points) -> dict[str, NDArray]:
+        plan, names = self.plan, self.columns
         if points.count == 0:
             return {name: np.empty(0, np.float32) for name in names}
-        bins, threshold = _read_bins(options["bins"])
+        bins, threshold = _read_bins(self.bins)
         engine = FeatureEngine(
-            points.xyz,
-            plan,
-            bins=bins,
-            copt_threshold=threshold,
-            seed=options["seed"],
-            threads=options["threads"],
+            points.xyz, plan, bins=bins, copt_threshold=threshold, seed=self.seed, threads=self.threads
         )
         queries = None if points.mask is None else np.flatnonzero(points.mask)
         own = {name: points.dimension(name) for name in plan.dimensions}
@@ -144,38 +112,18 @@ features inside and need no dimensions at all.
         columns = [plan.names.index(name) for name in names]
         out = {name: np.array(points.arrays[name], np.float32) for name in names}
         total = points.count if queries is None else len(queries)
-        with Progress(total, cls.type) as progress:
+        with Progress(total, self.type) as progress:
             for rows, values in engine.blocks(
-                queries,
-                dimensions=own,
-                threads=options["threads"],
-                memory_mb=options["memory"],
-                progress=progress,
-            ):
-                at = rows  # indices into the cloud, with queries too
+                queries, dimensions=own, threads=self.threads, memory_mb=self.memory, progress=progress
+            ):  # rows are indices into the cloud, with queries too
                 for name, column in zip(names, columns, strict=True):
-                    out[name][at] = values[:, column]
-        if options["bins"] and not Path(options["bins"]).exists():
-            _write_bins(options["bins"], engine)
+                    out[name][rows] = values[:, column]
+        if self.bins and not Path(self.bins).exists():
+            _write_bins(self.bins, engine)
         points.report.update(
             {"neighborhoods": len(plan.neighborhoods), "features": len(names), **engine.report}
         )
         return out
-
-
-def too_many_for_las(count: int) -> DimensionError:
-    """The error for more extra dimensions than one LAS record can describe."""
-    return DimensionError(
-        f"LAS cannot hold so many extra dimensions: one record describes {_MOST_EXTRA} of them",
-        found=f"{count} features",
-        cure="Take fewer neighborhoods or features, write to a format without the limit (writers.text, "
-        "writers.tiledb), or use writers.classifiermodel and filters.modelclassifier, which need no dimensions",
-    )
-
-
-def fits_las(count: int) -> bool:
-    """Whether a LAS file can describe so many extra dimensions."""
-    return count <= _MOST_EXTRA
 
 
 def _read_bins(path: str | None) -> tuple[ShapeBins | None, float | None]:

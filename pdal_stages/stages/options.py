@@ -34,17 +34,17 @@ _READABLE = {
 
 @dataclass(frozen=True)
 class Option:
-    """One option of a stage.
+    """One option of a stage; see :func:`option`. Read from a stage object it gives the parsed value.
 
     Attributes
     ----------
-    name, help : str
-        As the user types it, and one sentence that ends without a full stop.
     kind : str
         ``number``, ``integer``, ``string``, ``boolean``, ``filename``, ``expression``,
         ``list`` (a JSON list or comma-separated text) or ``mapping`` (a JSON object).
     default : object
         The value where the option is absent; None means "decided by the stage".
+    help : str
+        One sentence that ends without a full stop.
     minimum, maximum : float, optional
         Bounds of a number; `exclusive` leaves the lower one out.
     choices : tuple, optional
@@ -53,9 +53,10 @@ class Option:
         Shown beside the default.
     may_be_empty : bool
         Whether an empty list means "none".
+    name : str
+        As the user types it; by default the attribute's name.
     """
 
-    name: str
     kind: str
     default: Any
     help: str
@@ -66,6 +67,14 @@ class Option:
     unit: str = ""
     required: bool = False
     may_be_empty: bool = False
+    name: str = ""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        if not self.name:
+            object.__setattr__(self, "name", name)
+
+    def __get__(self, stage: Any, owner: type) -> Any:
+        return self if stage is None else stage.options[self.name]
 
     def schema(self) -> dict:
         """The option's JSON Schema."""
@@ -182,6 +191,14 @@ class Option:
             raise OptionError(
                 f"option '{self.name}' must be {' and '.join(bounds)}{unit}", found=f"{value:g}"
             )
+
+
+def option(kind: str, default: Any, help: str, **more: Any) -> Any:
+    """Declare an option in a stage's class body: ``cell: float = option("number", 20.0, "Side of the cells")``.
+
+    The annotation says what the parsed value is; all else is as for :class:`Option`.
+    """
+    return Option(kind, default, help, **more)
 
 
 def _split(text: str) -> list[str]:

@@ -35,8 +35,10 @@ class Points:
         PDAL's dimensions, one value per point.
     wkt : str
         The spatial reference, empty where there is none.
-    options : mapping
-        Parsed options of the stage (`where` and the units are read).
+    where : Expression, optional
+        Points the stage acts on.
+    units : (str, str)
+        Names of the horizontal and the vertical unit; empty where the spatial reference says it.
     legacy_flags : bool
         True where the three flag bits of LAS 1.0-1.3 sit inside `Classification`.
     """
@@ -46,23 +48,22 @@ class Points:
         arrays: Mapping[str, NDArray],
         *,
         wkt: str = "",
-        options: Mapping[str, Any] | None = None,
+        where: Expression | None = None,
+        units: tuple[str, str] = ("", ""),
         legacy_flags: bool = False,
     ) -> None:
-        options = options or {}
         self.arrays = arrays
         self.wkt = wkt
         self.legacy_flags = legacy_flags
         self.count = len(arrays["X"]) if "X" in arrays else 0
         self.report: dict[str, Any] = {"points": self.count}
-        self._units = (options.get("horizontal_unit") or "", options.get("vertical_unit") or "")
-        where = options.get("where")
+        self._units = units
         self.mask: NDArray[np.bool_] | None = None
-        if where:
-            self.mask = Expression(where).evaluate(arrays)
+        if where is not None:
+            self.mask = where.evaluate(arrays)
             self.report["where"] = int(np.count_nonzero(self.mask))
             if self.count and not self.report["where"]:
-                self.report["warning"] = f"'where' holds for none of the {self.count:,} points: {where}"
+                self.report["warning"] = f"'where' holds for none of the {self.count:,} points: {where.text}"
 
     @cached_property
     def units(self) -> Units:

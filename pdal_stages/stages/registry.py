@@ -42,10 +42,7 @@ def get(type_name: str) -> type[Stage]:
 def pipeline_schema() -> dict:
     """JSON Schema of a pipeline: our stages exactly, PDAL's by their type alone."""
     ours = [stage.schema() for stage in stages().values()]
-    theirs = {
-        "type": "object",
-        "properties": {"type": {"type": "string", "not": {"enum": list(stages())}}},
-    }
+    theirs = {"type": "object", "properties": {"type": {"type": "string", "not": {"enum": list(stages())}}}}
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "PDAL pipeline with pdal_stages",

@@ -12,7 +12,7 @@ from ..pipeline import pdal as pdal_env
 from ..pipeline import runtime
 
 #: PDAL cannot take an exception such as KeyboardInterrupt from a Python filter; our stages catch it.
-_CAUGHT = runtime._run.__code__
+_CAUGHT = runtime.run_on_view.__code__
 _EXECUTE = pdal_env.execute.__code__
 
 

@@ -10,9 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..pipeline import pdal as pdal_env
-from ..pipeline.runtime import _wkt
-from ..stages.points import Points
+from ..pipeline.runtime import points_of
 from .tileplan import MARGIN, ROW, SOURCE
 
 #: Dimension -> rows (None: all) and their values.
@@ -115,24 +113,16 @@ def terrain(module: dict[str, Any], ins: Mapping[str, NDArray], outs: dict[str, 
     from ..stages.hag_minima import HagMinima
 
     arguments = _arguments(module)
-    options = HagMinima.parse(arguments["options"])
-    points = Points(
-        ins,
-        wkt=_wkt(module.get("spatialreference")),
-        options=options,
-        legacy_flags=pdal_env.flags_inside_classification(ins, module.get("metadata")),
-    )
+    stage = HagMinima(arguments["options"])
+    points = points_of(stage, module, ins)
     unit = points.units.horizontal
     margin = ins[MARGIN]
     wanted = margin <= arguments["within"] if arguments["within"] > 0 else margin < 0
     if points.mask is not None:
         wanted &= points.mask
-    forms = np.ones(points.count, bool) if points.mask is None else points.mask.copy()
-    if "Classification" in ins and options["ignore_classes"]:
-        forms &= ~np.isin(points.class_codes, np.array([int(c) for c in options["ignore_classes"]], np.uint8))
     core = [c * unit for c in arguments["core"]]
     x, y = points.xyz[:, 0], points.xyz[:, 1]
-    need = terrain_reach(x, y, forms, wanted, options["cell"], options["resolution"], core)
+    need = terrain_reach(x, y, stage.forms_terrain(points), wanted, stage.cell, stage.resolution, core)
     token = arguments["token"]
     _needs[token] = max(_needs.get(token, 0.0), need)
     return True

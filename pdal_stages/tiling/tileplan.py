@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import OptionError, PipelineError, StageError
+from ..pipeline.lowering import PDAL_OWN
 from ..pipeline.overrides import Override
 from ..pipeline.run import Pipeline
 from ..stages import registry
@@ -117,19 +118,16 @@ def make_plan(source: Any, overrides: Iterable[Override], options: TilingOptions
                 cure="Reproject the files first, or put it after the last stage of pdal_stages",
             )
     kinds = [registry.stages().get(s["type"]) for s in head]
-    parsed = [None if k is None else k.parse(_given(s), s["type"]) for k, s in zip(kinds, head, strict=True)]
-    reaches = [
-        _reach(stage, kind, values, options) for stage, kind, values in zip(head, kinds, parsed, strict=True)
-    ]
-    unit = next((v["horizontal_unit"] for v in parsed if v is not None and v["horizontal_unit"]), "")
-    ready = _prepare(head, kinds, parsed, reaches)
+    ours = [None if k is None else k(given_options(s), s["type"]) for k, s in zip(kinds, head, strict=True)]
+    reaches = [_reach(stage, made, options) for stage, made in zip(head, ours, strict=True)]
+    unit = next((s.horizontal_unit for s in ours if s is not None and s.horizontal_unit), "")
+    ready = _prepare(head, ours, reaches)
     foreign = [
         s["type"] for s, k in zip(head, kinds, strict=True) if k is None and s["type"] != "filters.merge"
     ]
     creates: list[str] | None = None
     if not foreign:
-        made = ((k, v) for k, v in zip(kinds, parsed, strict=True) if k is not None and v is not None)
-        creates = list(dict.fromkeys(name for kind, values in made for name in kind.creates(values)))
+        creates = list(dict.fromkeys(name for s in ours if s is not None for name in s.creates()))
     notes = []
     if any(k is None and t not in PER_POINT for k, t in zip(kinds, (s["type"] for s in head), strict=True)):
         notes.append(
@@ -236,24 +234,25 @@ def _refuse_global(stage: dict[str, Any], where: str, options: TilingOptions) ->
         )
 
 
-def _given(stage: dict[str, Any]) -> dict[str, Any]:
-    return {k: v for k, v in stage.items() if k not in ("type", "tag", "inputs", "user_data", "log")}
+def given_options(stage: dict[str, Any]) -> dict[str, Any]:
+    """A stage's options without those that every stage of PDAL has."""
+    return {k: v for k, v in stage.items() if k not in ("type", *PDAL_OWN)}
 
 
-def _reach(stage: dict[str, Any], kind: type[Stage] | None, values: Any, options: TilingOptions) -> float:
-    if kind is None:
+def _reach(stage: dict[str, Any], made: Stage | None, options: TilingOptions) -> float:
+    if made is None:
         return 0.0 if stage["type"] in PER_POINT else float(options.buffer or 0.0)
-    if kind.type == "filters.multiscalefeatures":
-        _needs_thresholds(stage, kind, values)
-    return kind.halo(values)
+    if made.type == "filters.multiscalefeatures":
+        _needs_thresholds(stage, made)
+    return made.halo()
 
 
-def _needs_thresholds(stage: dict[str, Any], kind: Any, values: dict[str, Any]) -> None:
-    plan = kind.plan(values)
+def _needs_thresholds(stage: dict[str, Any], made: Any) -> None:
+    plan = made.plan
     copt = any(n.kind == "copt" for n in plan.neighborhoods)
     if not (plan.shapes or copt):
         return
-    path = values["bins"]
+    path = made.bins
     if path and Path(path).exists():
         return
     what = "shape distributions" if plan.shapes else "copt"
@@ -266,19 +265,19 @@ def _needs_thresholds(stage: dict[str, Any], kind: Any, values: dict[str, Any]) 
     )
 
 
-def _prepare(head, kinds, parsed, reaches) -> list[dict[str, Any]]:
+def _prepare(head, ours, reaches) -> list[dict[str, Any]]:
     """The head for a tile: absolute paths, and only points computed that someone will see."""
     out = []
-    for place, (stage, kind, values) in enumerate(zip(head, kinds, parsed, strict=True)):
+    for place, (stage, made) in enumerate(zip(head, ours, strict=True)):
         stage = dict(stage)
-        if kind is not None:
-            for option in kind.all_options():
+        if made is not None:
+            for option in made.all_options():
                 if option.kind == "filename" and stage.get(option.name):
                     stage[option.name] = str(Path(stage[option.name]).absolute())
-            later = sum(reaches[place + 1 :]) + kind.inner_reach(values)
-            if kind.type in _WHERE_CHOOSES:
+            later = sum(reaches[place + 1 :]) + made.inner_reach()
+            if made.type in _WHERE_CHOOSES:
                 seen = f"{MARGIN} <= {later!r}" if later > 0 else f"{MARGIN} < 0"
-                stage["where"] = f"({values['where']}) && ({seen})" if values["where"] else seen
+                stage["where"] = f"({made.where}) && ({seen})" if made.where else seen
         out.append(stage)
     return out
 
@@ -291,7 +290,7 @@ def later_reaches(head: list[dict[str, Any]], options_buffer: float) -> list[flo
         if kind is None:
             reaches.append(0.0 if stage["type"] in PER_POINT else options_buffer)
         else:
-            reaches.append(kind.halo(kind.parse(_given(stage))))
+            reaches.append(kind(given_options(stage)).halo())
     return [sum(reaches[i + 1 :]) for i in range(len(reaches))]
 
 

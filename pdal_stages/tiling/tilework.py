@@ -21,7 +21,7 @@ from .assemble import write_tile
 from .extract import Piece, cut
 from .grid import Grid, inside
 from .scratch import scratch
-from .tileplan import MARGIN, ROW, SOURCE, later_reaches
+from .tileplan import MARGIN, ROW, SOURCE, given_options, later_reaches
 
 #: How often a tile is read again with wider surroundings.
 _WIDENINGS = 3
@@ -164,10 +164,8 @@ def _head(task, grid, tile, pieces: list[Piece], sources, everything: bool) -> t
                 stage["threads"] = min(given, task["threads"]) if given else task["threads"]
             stages.append(stage)
             if stage["type"] == "filters.hag_minima" and not everything:
-                options = {
-                    k: v for k, v in stage.items() if k not in ("type", "tag", "inputs", "user_data", "log")
-                }
-                stages.append(marks.terrain_stage(token, place, options, later[place], list(grid.box(tile))))
+                box = list(grid.box(tile))
+                stages.append(marks.terrain_stage(token, place, given_options(stage), later[place], box))
         pipeline = Pipeline(stages)
         try:
             pipeline.execute(arrays=True)
@@ -262,14 +260,7 @@ def _far_neighbors(arrays, head, box, unit: float, threads: int) -> float:
         kind = registry.stages().get(stage["type"])
         if kind is None:
             continue
-        options = kind.parse({k: v for k, v in stage.items() if k not in ("type", "tag", "inputs")})
-        plan = (
-            kind.plan(options)
-            if hasattr(kind, "plan")
-            else kind.model(options).plan
-            if hasattr(kind, "model")
-            else None
-        )
+        plan = getattr(kind(given_options(stage)), "plan", None)
         for one in plan.neighborhoods if plan is not None else ():
             if one.reach is None:
                 most = max(most, int(one.parameters[-1] if one.kind == "knn" else one.parameters[1]))

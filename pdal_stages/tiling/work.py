@@ -12,6 +12,7 @@ from typing import Any
 from ..base.errors import (
     DependencyError,
     DimensionError,
+    InterruptedStage,
     ModelError,
     OptionError,
     PipelineError,
@@ -40,9 +41,9 @@ def perform(task: str) -> str:
         started, cpu = time.perf_counter(), time.process_time()
         try:
             result = _kinds()[given["kind"]](given)
+        except InterruptedStage:  # what a stage makes of Ctrl-C within PDAL
+            raise KeyboardInterrupt from None
         except StageError as error:
-            if error.what == "interrupted":  # what a stage makes of Ctrl-C within PDAL
-                raise KeyboardInterrupt from None
             result = {"error": {"reason": str(error), "again": _again(error)}}
         except MemoryError:
             result = {
