@@ -11,7 +11,7 @@ here with the same meaning, whatever PDAL is at hand; some of them refuse a litt
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,12 +56,12 @@ _OPERATIONS = {
 }
 _LIMITS = np.finfo(np.float64)
 _CONSTANTS = {"nan": np.nan, "lowest": float(_LIMITS.min), "highest": float(_LIMITS.max)}
-_CONDITIONS = {
+_CONDITIONS: dict[str, Callable] = {
     "isnan": np.isnan,
     "ismin": lambda a: np.equal(a, _LIMITS.min),
     "ismax": lambda a: np.equal(a, _LIMITS.max),
 }
-_FUNCTIONS = {
+_FUNCTIONS: dict[str, Callable] = {
     **{
         name: getattr(np, name)
         for name in ("floor", "ceil", "fabs", "sqrt", "sin", "cos", "tan", "sinh", "cosh")
