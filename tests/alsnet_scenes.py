@@ -61,4 +61,4 @@ def model_of(net, codes=(2, 5, 6)):
         "importances": None,
         "created_by": {"pdal_stages": "0.1.0"},
     }
-    return Model(net.plan, net, [(c, str(c)) for c in codes], None, None, 0, info)
+    return Model(net, [(c, str(c)) for c in codes], info)

@@ -16,6 +16,7 @@ from pdal_stages.alsnet.pyramid import build, scramble
 from pdal_stages.alsnet.weights import Folded, check
 from pdal_stages.base.errors import DimensionError, ModelError, OptionError
 from pdal_stages.classifier import load_model, modelfile
+from pdal_stages.classifier.algorithms import Question
 
 INPUTS = ("Z", "HeightAboveGround", "Intensity")
 
@@ -89,8 +90,9 @@ def test_probabilities_belong_to_points_not_to_their_order(seed, n):
 def test_averages_equal_a_hand_computation():
     xyz, _, dimensions = scene(1500, 20.0)
     net = net_with()
-    found = net.predict_cloud(xyz, dimensions)
-    columns = net.columns(xyz, dimensions)
+    answer = net.predict(Question(xyz, dimensions), lambda p: p)
+    (found,) = answer.blocks
+    columns = net.inputs_of(xyz, dimensions)
     np.testing.assert_allclose(columns[:, 1], (dimensions["HeightAboveGround"] - 1.0) / 2.0, rtol=1e-5)
     circles = Circles(xyz, TINY.points, net.spacing, columns)
     each = [[] for _ in xyz]
@@ -101,10 +103,10 @@ def test_averages_equal_a_hand_computation():
             each[row].append(p)
     assert [len(part) for part in each] == circles.coverage.tolist()
     for i, part in enumerate(each):
-        np.testing.assert_allclose(found.mean[i], np.mean(part, axis=0), rtol=1e-9)
+        np.testing.assert_allclose(found.result[i], np.mean(part, axis=0), rtol=1e-9)
         np.testing.assert_allclose(found.variance[i], np.var(part, axis=0).mean(), rtol=1e-6, atol=1e-12)
-    assert found.report["batches"] == len(circles)
-    assert found.report["batches_per_point"]["least"] == circles.coverage.min()
+    assert answer.report["batches"] == len(circles)
+    assert answer.report["batches_per_point"]["least"] == circles.coverage.min()
     assert found.variance[circles.coverage > 1].max() > 0
 
 
@@ -169,17 +171,12 @@ def test_missing_dimension_and_coordinates_that_are_none():
         model.predict(xyz, dimensions)
 
 
-def test_a_forest_has_no_variance_and_a_network_no_rows():
-    with pytest.raises(ModelError, match="clouds, not rows"):
-        model_of(net_with()).predict_features(np.zeros((2, 3)))
-
-
 def test_absurd_weights_give_an_error_not_nan():
     net = net_with()
     weights = {name: array * np.float32(1e30) for name, array in net.weights.items()}
     xyz, _, dimensions = scene(300, 8.0)
     with np.errstate(all="ignore"), pytest.raises(ModelError, match="not numbers"):
-        dataclasses.replace(net, weights=weights).predict_cloud(xyz, dimensions)
+        dataclasses.replace(net, weights=weights).predict(Question(xyz, dimensions), lambda p: p)
 
 
 # ---- files ------------------------------------------------------------------------------------------------

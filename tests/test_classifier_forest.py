@@ -135,7 +135,7 @@ def broken(change):
     arrays = small()
     change(arrays)
     with pytest.raises(ModelError) as caught:
-        Forest.from_arrays(arrays, {}, 5, 3)
+        Forest.from_arrays(arrays, 5, 3)
     return str(caught.value)
 
 

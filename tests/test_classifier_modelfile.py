@@ -108,7 +108,7 @@ def test_round_trip_equals_sklearn(tmp_path):
     modelfile.write(path, manifest(), made.arrays())
     read, arrays = modelfile.read(path, rules)
     assert {k: v for k, v in read.items() if k not in ("format", "version", "arrays")} == manifest()
-    again = Forest.from_arrays(arrays, read["parameters"], FEATURES, 3)
+    again = Forest.from_arrays(arrays, FEATURES, 3)
     assert np.array_equal(again.predict_proba(x), reference.predict_proba(x))
     assert np.array_equal(again.predict_proba(x).argmax(axis=1), reference.predict(x))
 

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier.sampling import coordinate_hash, draw_samples, spread
+from pdal_stages.base.hashing import coordinate_hash
+from pdal_stages.classifier.sampling import draw_samples, spread
 
 
 def chosen(clouds, samples):

@@ -1,13 +1,14 @@
 """Training and prediction on small clouds: labels, files, blocks, threads, where, rejection, dimensions."""
 
 import json
+import os
 
 import numpy as np
 import pytest
 
 from pdal_stages.base.errors import DimensionError, ModelError, OptionError, StageError
 from pdal_stages.classifier import Model, Prediction, TrainingCloud, TrainingOptions, load_model, train
-from pdal_stages.classifier.sampling import draw_samples
+from pdal_stages.classifier.forest import Forest
 from pdal_stages.features import FeatureEngine
 
 SMALL = {
@@ -81,31 +82,25 @@ def test_another_place_is_classified(trained, other):
     assert sum(result.report["classes"].values()) == len(xyz)
 
 
-def test_equals_sklearn_on_the_same_features(other):
+def test_equals_sklearn_on_the_same_features(other, monkeypatch):
     """The same features into scikit-learn's own trees: identical labels, identical probabilities."""
-    from pdal_stages.classifier import training
-
     xyz, label, dimensions = scene()
     kept = []
-    original = training.Forest.from_sklearn
-    training.Forest.from_sklearn = classmethod(  # type: ignore[method-assign, assignment]
-        lambda cls, trees, n: kept.extend(trees) or original(trees, n)
+    original = Forest.from_sklearn
+    monkeypatch.setattr(
+        Forest, "from_sklearn", classmethod(lambda cls, trees, n: kept.extend(trees) or original(trees, n))
     )
-    try:
-        model = train(
-            [TrainingCloud(xyz, label, dimensions)], TrainingOptions(**SMALL, prior_weight=0), progress=False
-        )
-    finally:
-        training.Forest.from_sklearn = original  # type: ignore[method-assign]
+    model = train(
+        [TrainingCloud(xyz, label, dimensions)], TrainingOptions(**SMALL, prior_weight=0), progress=False
+    )
     xyz, label, dimensions = other
-    engine = FeatureEngine(xyz, model.plan, bins=model.bins, copt_threshold=model.copt_threshold)
+    engine = FeatureEngine(xyz, model.plan, bins=model.algorithm.bins)
     values = engine.table(dimensions={"HeightAboveGround": dimensions["HeightAboveGround"]}).values
     expected = sum(tree.predict(values) for tree in kept) / len(kept)
     result = model.predict(xyz, dimensions, probabilities=True)
     assert np.array_equal(result.probabilities, expected.astype(np.float32))
     assert np.array_equal(result.classification, model.codes[expected.argmax(axis=1)])
-    labels, probabilities = model.predict_features(values)
-    assert np.array_equal(labels, result.classification) and np.array_equal(probabilities, expected)
+    assert np.array_equal(model.algorithm.predict_rows(values), expected)
 
 
 def test_blocks_and_threads_change_nothing(trained, other):
@@ -134,7 +129,7 @@ def test_training_does_not_depend_on_order_or_threads(trained, tmp_path):
     trained.save(tmp_path / "a")
     again.save(tmp_path / "b")
     # The samples come in another order, so only what is learnt from them as a set is equal ...
-    assert again.bins == trained.bins and again.info["classes"] == trained.info["classes"]
+    assert again.algorithm.bins == trained.algorithm.bins and again.info["classes"] == trained.info["classes"]
     # ... and, since samples are ordered along the curve, the whole file is.
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
@@ -210,11 +205,11 @@ def test_empty_cloud(trained):
 
 def test_wrong_features(trained):
     with pytest.raises(ModelError, match="features per point"):
-        trained.predict_features(np.zeros((3, 5)))
+        trained.algorithm.predict_rows(np.zeros((3, 5)))
     values = np.zeros((2, len(trained.plan.names)), np.float32)
     values[1, 3] = np.nan
     with pytest.raises(ModelError, match="not a finite"):
-        trained.predict_features(values)
+        trained.algorithm.predict_rows(values)
 
 
 # ---- dimensions ----------------------------------------------------------------------------------------
@@ -301,17 +296,17 @@ def test_several_clouds_are_sampled_together_but_are_not_neighbors():
     model = train(clouds, options, progress=False)
     assert [c["name"] for c in model.info["training"]["clouds"]] == ["a", "b"]
     swapped = train(clouds[::-1], options, progress=False)
-    assert swapped.bins == model.bins
-    assert np.array_equal(swapped.algorithm.threshold, model.algorithm.threshold)
+    assert swapped.algorithm.bins == model.algorithm.bins
+    assert np.array_equal(swapped.algorithm.forest.threshold, model.algorithm.forest.threshold)
     # Overlapping clouds: each sees its own points only.
     alone = train([clouds[0]], options, progress=False)
     twice = train(
         [clouds[0], TrainingCloud(a[0][:0], a[1][:0], {k: v[:0] for k, v in a[2].items()})], options, False
     )
-    assert np.array_equal(alone.algorithm.threshold, twice.algorithm.threshold)
+    assert np.array_equal(alone.algorithm.forest.threshold, twice.algorithm.forest.threshold)
 
 
-def test_errors_say_what_was_found():
+def test_errors_say_what_was_found(monkeypatch):
     xyz, label, dimensions = scene(n=500)
     cloud = TrainingCloud(xyz, label, dimensions)
     with pytest.raises(OptionError, match=r"class 9 .* has no samples .*2: "):
@@ -324,16 +319,10 @@ def test_errors_say_what_was_found():
         train([], TrainingOptions(**SMALL), progress=False)
     with pytest.raises(OptionError, match="mask"):
         train([TrainingCloud(xyz, label, dimensions, mask=label)], TrainingOptions(**SMALL), progress=False)
+    sysconf = os.sysconf
+    monkeypatch.setattr(os, "sysconf", lambda name: 1 if name == "SC_PHYS_PAGES" else sysconf(name))
     with pytest.raises(OptionError, match="do not fit in this machine's memory"):
-        many = TrainingOptions(**{**SMALL, "count": 10**8})
-        import pdal_stages.classifier.training as training
-
-        original, training.draw_samples = training.draw_samples, lambda *_: range(10**10)  # type: ignore
-        try:
-            train([cloud], many, progress=False)
-        finally:
-            training.draw_samples = original
-    assert training.draw_samples is draw_samples
+        train([cloud], TrainingOptions(**SMALL), progress=False)
 
 
 def test_binary():
@@ -382,7 +371,7 @@ def test_grid_search_with_blocks_held_out(tmp_path):
     found = model.info["accuracy"]["cross_validation"]
     assert found["folds"] == 3 and found["gap"] == 2.0 and len(found["tried"]) == 4
     assert found["chosen"] in found["tried"]
-    assert model.algorithm.n_trees == found["chosen"]["trees"]
+    assert model.algorithm.forest.n_trees == found["chosen"]["trees"]
     model.save(tmp_path / "m")
     assert load_model(tmp_path / "m").info["accuracy"]["cross_validation"]["chosen"] == found["chosen"]
 
@@ -391,7 +380,7 @@ def test_limits_to_percentiles_are_in_the_thresholds(trained):
     """No threshold lies beyond the percentiles: a value beyond goes the way its limit would [B16 3.3]."""
     low = np.array(trained.info["percentiles"]["low"], np.float32)
     high = np.array(trained.info["percentiles"]["high"], np.float32)
-    forest = trained.algorithm
+    forest = trained.algorithm.forest
     split = forest.feature >= 0
     column, limit = forest.feature[split], forest.threshold[split]
     assert (limit >= low[column]).all() and (limit < high[column]).all()

@@ -1,5 +1,6 @@
 """alsNet [WM19]: PointNet++ for airborne scans, in circular batches. Applying it needs NumPy; training, PyTorch."""
 
+from ..classifier.algorithms import register
 from .algorithm import AlsNet, InputPlan
 from .circles import Circles
 from .configuration import CONFIGURATIONS, Configuration, Level, parse_configuration
@@ -15,3 +16,5 @@ __all__ = [
     "NetworkOptions",
     "parse_configuration",
 ]
+
+register("alsnet", "pdal_stages.alsnet.algorithm:AlsNet", "pdal_stages.alsnet.networkmodel:NetworkTrainer")

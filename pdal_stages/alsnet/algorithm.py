@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +16,9 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError, OptionError, StageError
 from ..base.threads import map_blocks, resolve_threads
+from ..classifier.algorithms import Answer, Block, Column, Question
 from ..classifier.arrays import ArrayRule
+from ..classifier.dimensions import gather
 from ..features.index import check_xyz
 from . import circles as circles_
 from .circles import Circles
@@ -32,7 +34,7 @@ METRES = 10.0
 
 @dataclass(frozen=True)
 class InputPlan:
-    """What a network needs of the points; stands where a forest has its plan of features.
+    """What a network needs of the points.
 
     Attributes
     ----------
@@ -40,12 +42,13 @@ class InputPlan:
         Inputs in order. X, Y and Z are taken from the batch's centre.
     halo : float
         Metres around a tile that its results depend on.
+    neighborhoods : tuple
+        None: a network computes no features.
     """
 
     dimensions: tuple[str, ...]
     halo: float
-    neighborhoods: tuple = ()
-    layout: tuple = ()
+    neighborhoods: ClassVar[tuple] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -55,25 +58,6 @@ class InputPlan:
     def to_dict(self) -> dict[str, Any]:
         """As the manifest has it."""
         return {"neighborhoods": [], "features": [], "dimensions": list(self.dimensions)}
-
-
-@dataclass(frozen=True, eq=False)
-class CloudProbabilities:
-    """What a network says of a cloud's points.
-
-    Attributes
-    ----------
-    mean : (m, classes) float64
-        Mean probabilities over the batches a point is in.
-    variance : (m,) float64
-        Variance of a class's probability over those batches, mean over the classes; 0 in a single one.
-    report : dict
-        Counts for the metadata.
-    """
-
-    mean: npt.NDArray[np.float64]
-    variance: npt.NDArray[np.float64]
-    report: dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +86,7 @@ class AlsNet:
     n_classes: int
 
     name: ClassVar[str] = "alsnet"
-    #: A network is applied to clouds, not to rows of features.
-    whole_cloud: ClassVar[bool] = True
+    gives_variance: ClassVar[bool] = True
     rules: ClassVar[Mapping[str, ArrayRule]] = {
         "sa*": ArrayRule(("<f4",), 2),
         "fp*": ArrayRule(("<f4",), 2),
@@ -114,14 +97,10 @@ class AlsNet:
     # ---- file ----------------------------------------------------------------------------------------------
 
     @classmethod
-    def from_arrays(
-        cls,
-        arrays: Mapping[str, npt.NDArray[Any]],
-        parameters: Mapping[str, Any],
-        n_features: int,
-        n_classes: int,
-    ) -> AlsNet:
-        """Made from a model file's content, everything checked."""
+    def from_file(cls, manifest: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> AlsNet:
+        """Made from what a model file says, everything checked."""
+        names, parameters = manifest["feature_names"], manifest["parameters"]
+        n_features, n_classes = len(names), len(manifest["classes"])
         wanted = {"configuration", "spacing", "inputs", "weights"}
         if set(parameters) != wanted or not isinstance(parameters["inputs"], list):
             raise ModelError("the network's parameters are not right", found=sorted(map(str, parameters))[:6])
@@ -131,19 +110,15 @@ class AlsNet:
             raise ModelError("the network's configuration is not right", found=error) from None
         spacing = _finite(parameters["spacing"], "spacing", 1e-3, 1e6)
         entries = [_mapping(entry) for entry in parameters["inputs"]]
-        if len(entries) != n_features or not all(isinstance(entry.get("name"), str) for entry in entries):
-            raise ModelError(
-                "the network's inputs are not the model's", found=f"{len(entries)} and {n_features}"
-            )
+        if [entry.get("name") for entry in entries] != names or names != manifest["dimensions"]:
+            raise ModelError("the network's inputs are not the model's dimensions", found=repr(names)[:80])
         mean = tuple(_finite(entry.get("mean"), "mean", -1e12, 1e12) for entry in entries)
         scale = tuple(_finite(entry.get("scale"), "scale", 1e-12, 1e12) for entry in entries)
         needed = configuration.memory_mb(n_features)
         if needed > MOST_MB:
             raise ModelError("a batch of the network would need too much memory", found=f"{needed:,.0f} MB")
         check(arrays, configuration, n_features, n_classes)
-        return cls(
-            dict(arrays), configuration, tuple(e["name"] for e in entries), mean, scale, spacing, n_classes
-        )
+        return cls(dict(arrays), configuration, tuple(names), mean, scale, spacing, n_classes)
 
     def arrays(self) -> Weights:
         """What the file stores."""
@@ -161,16 +136,13 @@ class AlsNet:
             "weights": int(sum(array.size for array in self.weights.values())),
         }
 
-    @classmethod
-    def plan_of(cls, manifest: Mapping[str, Any]) -> InputPlan:
-        """The plan of a model file."""
-        parameters = _mapping(manifest["parameters"])
-        spacing = _finite(parameters.get("spacing"), "spacing", 1e-3, 1e6)
-        entries = parameters.get("inputs")
-        names = [_mapping(entry).get("name") for entry in entries] if isinstance(entries, list) else None
-        if names != manifest["dimensions"]:
-            raise ModelError("the network's inputs are not the model's dimensions", found=repr(names)[:80])
-        return InputPlan(tuple(manifest["dimensions"]), circles_.halo(spacing))
+    def fitted(self) -> dict[str, Any]:
+        """A network computes no features that anything would have to be fitted for."""
+        return {"shape_bins": None, "copt_threshold": None, "feature_seed": 0}
+
+    def columns(self) -> list[Column]:
+        """The inputs."""
+        return [Column(name, name, "dimension", "(dimension)") for name in self.inputs]
 
     @property
     def plan(self) -> InputPlan:
@@ -179,60 +151,49 @@ class AlsNet:
 
     # ---- applying ------------------------------------------------------------------------------------------
 
-    def predict_proba(self, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """Not possible: a network looks at neighbors."""
-        raise ModelError("a network classifies clouds, not rows of features", cure="Use Model.predict")
-
     @cached_property
     def folded(self) -> Folded:
         """The network, ready to apply."""
         return Folded(self.weights, self.configuration)
 
-    def columns(
+    def inputs_of(
         self, xyz: npt.NDArray[np.float64], dimensions: Mapping[str, npt.ArrayLike]
     ) -> npt.NDArray[np.float32]:
         """The inputs that do not depend on the batch, scaled; columns of X, Y and Z are left 0."""
         return scaled(xyz, dimensions, self.inputs, self.mean, self.scale)
 
-    def predict_cloud(
-        self,
-        xyz: npt.NDArray[np.float64],
-        dimensions: Mapping[str, npt.ArrayLike],
-        rows: npt.NDArray[np.int64] | None = None,
-        *,
-        threads: int | None = None,
-        memory_mb: float = 512.0,
-        progress: Any = None,
-    ) -> CloudProbabilities:
-        """Mean probabilities over all batches a point is in [WM19].
+    def predict(self, question: Question, finish: Callable[[npt.NDArray[np.float64]], Any]) -> Answer:
+        """Mean probabilities over all batches a point is in [WM19]; see ``Algorithm.predict``.
 
-        Parameters
-        ----------
-        xyz : (n, 3) float64
-            Coordinates in metres.
-        dimensions : mapping
-            Name to (n,) values of the inputs that are dimensions.
-        rows : (m,) int64, ascending, optional
-            Points wanted; all by default. The others are neighbors.
-        threads, memory_mb
-            Batches are computed side by side, as many as fit into the memory, at least one.
-        progress : object, optional
-            Its ``update`` is called with the points done.
+        Batches are computed side by side, as many as fit into the memory, at least one.
         """
-        xyz = check_xyz(xyz)
-        columns = self.columns(xyz, dimensions)
+        values, notes = gather(self.inputs, question.dimensions, len(question.xyz))
+        report: dict[str, Any] = {name: number for name, number in notes.items() if number}
+        if not question.count:
+            return Answer((), report)
+        mean, variance, counted = self._means(question, values)
+        rows = slice(None) if question.rows is None else question.rows
+        return Answer([Block(rows, finish(mean), variance)], {**report, **counted})
+
+    def _means(
+        self, question: Question, dimensions: Mapping[str, npt.ArrayLike]
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], dict[str, Any]]:
+        """Mean probabilities over the batches, a class's variance over them (mean over the classes), counts."""
+        rows, progress = question.rows, question.progress
+        xyz = check_xyz(question.xyz)
+        columns = self.inputs_of(xyz, dimensions)
         circles = Circles(xyz, self.configuration.points, self.spacing, columns)
         numbers = circles.needed(rows)
         n = len(xyz)
         place = np.arange(n) if rows is None else np.full(n, -1, np.int64)
         if rows is not None:
             place[rows] = np.arange(len(rows))
-        m = n if rows is None else len(rows)
+        m = question.count
         total = np.zeros((m, self.n_classes))
         squares = np.zeros(m)
         count = np.zeros(m, np.int64)
         each = self.configuration.memory_mb(len(self.inputs))
-        side_by_side = max(1, min(resolve_threads(threads), int(memory_mb / each)))
+        side_by_side = max(1, min(resolve_threads(question.threads), int(question.memory_mb / each)))
         apply = _Applier(self)
 
         def one(number: int):
@@ -255,7 +216,7 @@ class AlsNet:
                 seen += new
                 if progress is not None:
                     progress.update(new)
-        if m and not count.all():
+        if not count.all():
             raise StageError("a point is in no batch; this is a bug", found=int(np.count_nonzero(count == 0)))
         mean = total / np.maximum(count, 1)[:, None]
         variance = squares / np.maximum(count, 1) - (mean * mean).sum(axis=1)
@@ -263,12 +224,12 @@ class AlsNet:
         report = {
             "batches": len(numbers),
             "batches_per_point": {
-                "mean": round(float(count.mean()), 2) if m else 0.0,
-                "least": int(count.min()) if m else 0,
+                "mean": round(float(count.mean()), 2),
+                "least": int(count.min()),
             },
             "device": apply.device,
         }
-        return CloudProbabilities(mean, variance, report)
+        return mean, variance, report
 
 
 class _Applier:

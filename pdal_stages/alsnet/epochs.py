@@ -13,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import DependencyError, ModelError, OptionError
+from ..base.hashing import coordinate_hash
 from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
 from ..classifier import crossval
 from ..classifier.classes import ClassMap
-from ..classifier.sampling import coordinate_hash
 from . import checkpoint, schedule
 from .algorithm import AlsNet, make_pyramid, scaled
 from .augment import Augmentation

@@ -1,11 +1,11 @@
-"""From labelled clouds to a model with a network in it: what ``classifier.train`` does for ``alsnet``."""
+"""From labelled clouds to a model with a network in it: how ``alsnet`` is trained."""
 
 from __future__ import annotations
 
 import os
 import platform
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,19 +18,33 @@ from ..classifier.model import Model
 from ..classifier.trainoptions import TrainingOptions
 from ..features.index import check_xyz
 from .epochs import LabelledCloud, train_network
+from .networkoptions import NetworkOptions
 
 
-def train_model(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool = True) -> Model:
-    """Train a network and wrap it as a model.
+class NetworkTrainer:
+    """How ``alsnet`` is trained."""
 
-    Parameters
-    ----------
-    clouds : sequence of TrainingCloud
-        A batch sees only its own cloud.
-    options : TrainingOptions
-        With ``algorithm="alsnet"``.
-    progress : bool
-    """
+    @staticmethod
+    def own_options(given: Any) -> NetworkOptions:
+        """The options of the network."""
+        if isinstance(given, NetworkOptions):
+            return given
+        if given is not None and not isinstance(given, Mapping):
+            raise OptionError("'alsnet' must be a mapping of options", found=repr(given)[:60])
+        return NetworkOptions.from_dict(given or {})
+
+    @staticmethod
+    def inputs(options: TrainingOptions) -> tuple[str, ...]:
+        """Coordinates from the batch's centre, then dimensions."""
+        return input_names(options.alsnet.coordinates, options.dimensions)
+
+    @staticmethod
+    def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model:
+        """See :func:`pdal_stages.classifier.train`. A batch sees only its own cloud."""
+        return _train(clouds, options, progress)
+
+
+def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model:
     from .network import torch  # before any work: says what to install where it is missing
 
     started = time.perf_counter()
@@ -85,9 +99,7 @@ def train_model(clouds: Sequence[TrainingCloud], options: TrainingOptions, progr
         },
     }
     seconds = {**trained.seconds, "whole": round(time.perf_counter() - started, 3)}
-    plan = trained.net.plan
-    pairs = list(zip(classes.codes, classes.names, strict=True))
-    return Model(plan, trained.net, pairs, None, None, options.seed, info, seconds)
+    return Model(trained.net, list(zip(classes.codes, classes.names, strict=True)), info, seconds)
 
 
 def input_names(coordinates: str, dimensions: Sequence[str]) -> tuple[str, ...]:

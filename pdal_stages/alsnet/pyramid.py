@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ..classifier.sampling import coordinate_hash
+from ..base.hashing import coordinate_hash
 from .configuration import Configuration
 from .farthest import ball_query, farthest_points, three_nearest
 

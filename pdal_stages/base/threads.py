@@ -7,29 +7,21 @@ Python threads enter it together, and users do run pipelines in threads.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from pathlib import Path
+from functools import cache
 from threading import Event
 from typing import Any
 
 from .errors import OptionError
 
 
+@cache
 def available_threads() -> int:
     """Cores this process may use: its CPU affinity, bounded by a cgroup quota."""
-    try:
-        cores = len(os.sched_getaffinity(0))
-    except AttributeError:  # not Linux
-        cores = os.cpu_count() or 1
-    try:  # cgroup v2: "max 100000" or "150000 100000"
-        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
-        if quota != "max":
-            cores = min(cores, max(1, int(quota) // int(period)))
-    except (OSError, ValueError):
-        pass
-    return max(1, cores)
+    import joblib  # scikit-learn's own; not needed where the number is given
+
+    return joblib.cpu_count()
 
 
 def resolve_threads(threads: int | None) -> int:

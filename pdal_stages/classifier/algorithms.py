@@ -1,40 +1,217 @@
-"""The classifiers a model file can hold; adding one is adding a module and a line here.
+"""What a classifier of clouds is, whatever is inside: one interface, and the names under which kinds are known.
 
-An algorithm is a class with
-
-- ``name`` : str, the word in the manifest;
-- ``rules`` : dict of array name to ``ArrayRule``; a name that ends in ``*`` stands for many arrays;
-- ``from_arrays(arrays, parameters, n_features, n_classes)`` : made from a file, everything checked;
-- ``arrays()`` and ``parameters()`` : what a file stores;
-- ``predict_proba(values)`` : (n, features) float32 to (n, classes) float64, thread-safe and without the GIL.
-
-One that looks at neighbors by itself (a network) says ``whole_cloud = True`` and has instead of the last
-
-- ``plan_of(manifest)`` : what it needs of the points, in place of a plan of features;
-- ``predict_cloud(xyz, dimensions, rows, threads, memory_mb, progress)`` : mean probabilities, their variance, a report.
+A package brings its kinds by calling :func:`register` when it is imported. A model file, and an option, name a
+kind by its word; the packages of :data:`PACKAGES` are imported then, not before.
 """
 
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
 
 from ..base.errors import ModelError
+from .arrays import ArrayRule
 
-#: Word in the manifest -> module and class.
-ALGORITHMS = {
-    "random_forest": ("pdal_stages.classifier.forest", "Forest"),
-    "alsnet": ("pdal_stages.alsnet.algorithm", "AlsNet"),
-}
+if TYPE_CHECKING:
+    from .clouds import TrainingCloud
+    from .model import Model
+    from .trainoptions import TrainingOptions
+
+#: Packages that register kinds when they are imported.
+PACKAGES = ("pdal_stages.classifier", "pdal_stages.alsnet")
 
 
-def algorithm(name: str) -> Any:
-    """The class of an algorithm by its name."""
-    if name not in ALGORITHMS:
+class Inputs(Protocol):
+    """What a classifier looks at.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Its inputs, in order.
+    dimensions : tuple of str
+        Which of them, at the end, are dimensions of the points.
+    halo : float
+        Metres around a tile whose points the tile's results depend on.
+    """
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+    @property
+    def dimensions(self) -> tuple[str, ...]: ...
+    @property
+    def halo(self) -> float: ...
+    def to_dict(self) -> dict[str, Any]: ...
+
+
+class Column(NamedTuple):
+    """An input for people: its name, the feature it belongs to, that feature's group, and its neighborhood."""
+
+    name: str
+    feature: str
+    group: str
+    neighborhood: str
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """A cloud, and the points of it that are to be classified.
+
+    Attributes
+    ----------
+    xyz : (n, 3) float64
+        Coordinates in metres.
+    dimensions : mapping
+        Name to (n,) values.
+    rows : (m,) int64, ascending, or None
+        Points wanted, None for all. The others are neighbors.
+    threads, memory_mb
+        Cores to use, and memory for work under way.
+    progress : object or None
+        Its ``update`` is called with the points done.
+    """
+
+    xyz: npt.NDArray[np.float64]
+    dimensions: Mapping[str, npt.ArrayLike]
+    rows: npt.NDArray[np.int64] | None = None
+    threads: int | None = None
+    memory_mb: float = 512.0
+    progress: Any = None
+
+    @property
+    def count(self) -> int:
+        """Points wanted."""
+        return len(self.xyz) if self.rows is None else len(self.rows)
+
+
+class Block(NamedTuple):
+    """Some of the points wanted.
+
+    `rows` index the cloud, `result` is what the asker's function made of their probabilities, `variance` is the
+    (b,) variance of a class's probability where the algorithm has one.
+    """
+
+    rows: Any
+    result: Any
+    variance: npt.NDArray[np.floating] | None = None
+
+
+@dataclass(eq=False)
+class Answer:
+    """Blocks that hold every point wanted once, and what was counted, complete when all blocks are read."""
+
+    blocks: Iterable[Block]
+    report: dict[str, Any] = field(default_factory=dict)
+
+
+class Algorithm(Protocol):
+    """A trained classifier of clouds.
+
+    Attributes
+    ----------
+    name : str
+        The word in the manifest.
+    rules : mapping
+        Array of a model file to what it must be; a name that ends in ``*`` stands for many.
+    gives_variance : bool
+        Whether its blocks have a variance.
+    plan : Inputs
+    """
+
+    name: ClassVar[str]
+    rules: ClassVar[Mapping[str, ArrayRule]]
+    gives_variance: ClassVar[bool]
+
+    @property
+    def plan(self) -> Inputs: ...
+
+    @classmethod
+    def from_file(cls, manifest: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> Any:
+        """Made from what a model file says, everything checked."""
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """The arrays a model file stores."""
+
+    def parameters(self) -> dict[str, Any]:
+        """What a model file says about it beside."""
+
+    def fitted(self) -> dict[str, Any]:
+        """What training fitted to compute its inputs: ``shape_bins``, ``copt_threshold``, ``feature_seed``."""
+
+    def columns(self) -> Sequence[Column]:
+        """Its inputs, for people."""
+
+    def predict(self, question: Question, finish: Callable[[npt.NDArray[np.float64]], Any]) -> Answer:
+        """Classify.
+
+        Parameters
+        ----------
+        question : Question
+        finish : function
+            Called with the (b, classes) float64 probabilities of a block, which it may change, in a worker's
+            thread where there are any; its result stands in the block.
+        """
+
+
+class Trainer(Protocol):
+    """How a kind is trained."""
+
+    @staticmethod
+    def own_options(given: Any) -> Any:
+        """The kind's own options, checked; None where it has none."""
+
+    @staticmethod
+    def inputs(options: TrainingOptions) -> tuple[str, ...]:
+        """Dimensions it uses as inputs, X, Y and Z among them."""
+
+    @staticmethod
+    def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model: ...
+
+
+_KINDS: dict[str, tuple[str, str]] = {}
+
+
+def register(name: str, algorithm: str, trainer: str) -> None:
+    """Make a kind known.
+
+    Parameters
+    ----------
+    name : str
+        Its word in manifests and options.
+    algorithm, trainer : str
+        ``module:class`` of its :class:`Algorithm` and its :class:`Trainer`, imported when asked for.
+    """
+    _KINDS[name] = (algorithm, trainer)
+
+
+def algorithm_names() -> list[str]:
+    """The kinds there are."""
+    for package in PACKAGES:
+        importlib.import_module(package)
+    return list(_KINDS)
+
+
+def algorithm(name: str) -> type[Algorithm]:
+    """The class of a kind by its name; ModelError where there is none."""
+    if name not in algorithm_names():
         raise ModelError(
             "the model uses an algorithm this release does not know",
             found=repr(name)[:60],
             cure="Update pdal-stages",
         )
-    module, kind = ALGORITHMS[name]
-    return getattr(importlib.import_module(module), kind)
+    return _imported(_KINDS[name][0])
+
+
+def trainer(name: str) -> type[Trainer]:
+    """What trains a kind, by its name, which is one of :func:`algorithm_names`."""
+    algorithm_names()
+    return _imported(_KINDS[name][1])
+
+
+def _imported(place: str) -> Any:
+    module, _, name = place.partition(":")
+    return getattr(importlib.import_module(module), name)

@@ -1,15 +1,13 @@
-"""Arrays in and out of ``.npy`` bytes, with a strict header of one known form and nothing executed.
+"""Arrays in and out of ``.npy`` bytes: NumPy's own header reader, behind a check of sizes; nothing is unpickled.
 
-NumPy's own reader is not used on files from outside: it parses the header as Python source and
-allocates what the header says. Here the header must be, byte for byte, the one NumPy writes for a
-little-endian number array in C order, and its size must be the size of the bytes that follow.
+``np.load`` is not used on files from outside because it allocates what a header says. Here an array is a view
+of the bytes that are there, and its size must be theirs.
 """
 
 from __future__ import annotations
 
 import io
 import math
-import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,10 +16,6 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError
 
-_HEADER = re.compile(
-    rb"\{'descr': '([<|][iufb][1248])', 'fortran_order': False, "
-    rb"'shape': \(((?:\d{1,15}, ?)*\d{0,15},?)\), \} *\n"
-)
 _MAGIC = b"\x93NUMPY\x01\x00"
 
 
@@ -52,21 +46,22 @@ def to_bytes(array: npt.NDArray[Any]) -> bytes:
 
 def from_bytes(data: bytes, rule: ArrayRule, name: str) -> npt.NDArray[Any]:
     """The array in ``.npy`` bytes, if it is what `rule` says; a view of `data`, read-only."""
-    if data[:8] != _MAGIC or len(data) < 10:
+    if data[:8] != _MAGIC:
         raise ModelError("an array is not in the .npy format, version 1.0", found=name)
-    start = 10 + int.from_bytes(data[8:10], "little")
-    match = _HEADER.fullmatch(data[10:start])
-    if match is None:
-        raise ModelError("an array's header is not a plain number array's", found=name)
-    kind = match[1].decode()
-    shape = tuple(int(part) for part in match[2].split(b",") if part.strip())
-    if kind not in rule.dtypes or (rule.ndim is not None and len(shape) != rule.ndim):
+    stream = io.BytesIO(data)
+    stream.seek(len(_MAGIC))
+    try:
+        shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+    except (ValueError, RecursionError, MemoryError) as error:
+        raise ModelError(f"the header of the array '{name}' cannot be read", found=str(error)[:80]) from None
+    if fortran or dtype.str not in rule.dtypes or (rule.ndim is not None and len(shape) != rule.ndim):
         axes = "" if rule.ndim is None else f" with {rule.ndim} axes"
         raise ModelError(
-            f"the array '{name}' must be {' or '.join(rule.dtypes)}{axes}", found=f"{kind} {shape}"
+            f"the array '{name}' must be {' or '.join(rule.dtypes)}{axes}, in C order",
+            found=f"{dtype.str} {shape}",
         )
-    dtype = np.dtype(kind)
-    if math.prod(shape) * dtype.itemsize != len(data) - start:
+    start = stream.tell()
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(data) - start:
         raise ModelError(
             f"the array '{name}' has another size than its header says",
             found=f"shape {shape}, {len(data) - start:,} bytes",

@@ -61,7 +61,6 @@ class Forest:
     n_features: int
     depths: npt.NDArray[np.int32] = field(init=False)
 
-    name: ClassVar[str] = "random_forest"
     rules: ClassVar[Mapping[str, ArrayRule]] = {
         "tree_sizes": ArrayRule(("<i4",), 1),
         "feature": ArrayRule(("<i2", "<i4"), 1),
@@ -144,7 +143,6 @@ class Forest:
     def from_arrays(
         cls,
         arrays: Mapping[str, npt.NDArray[Any]],
-        parameters: Mapping[str, Any],
         n_features: int,
         n_classes: int,
     ) -> Forest:

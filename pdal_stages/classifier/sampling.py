@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OptionError
+from ..base.hashing import coordinate_hash
 
 #: Side of a cell of the curve in metres.
 CELL = 0.5
@@ -122,22 +123,6 @@ def curve_keys(xyz: npt.NDArray[np.float64], seed: int) -> npt.NDArray[Any]:
     keys["cell"] = _spread_bits(cells[:, 0]) | (_spread_bits(cells[:, 1]) << np.uint64(1))
     keys["hash"] = coordinate_hash(xyz, seed)
     return keys
-
-
-def coordinate_hash(xyz: npt.NDArray[np.float64], seed: int) -> npt.NDArray[np.uint64]:
-    """A 64-bit hash of each point's own coordinates and the seed (splitmix64)."""
-    bits = (np.ascontiguousarray(xyz, dtype=np.float64) + 0.0).view(np.uint64)  # -0.0 becomes 0.0
-    value = np.full(len(bits), np.uint64(seed & 0xFFFFFFFFFFFFFFFF), np.uint64)
-    for axis in range(bits.shape[1]):
-        value = _mix(value ^ bits[:, axis])
-    return value
-
-
-def _mix(value: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
-    value = value + np.uint64(0x9E3779B97F4A7C15)
-    value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return value ^ (value >> np.uint64(31))
 
 
 def _spread_bits(value: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:

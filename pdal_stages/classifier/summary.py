@@ -2,75 +2,55 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from ..base.errors import ModelError, OptionError
-from ..features.names import GROUPS, RELATIVE
-
-if TYPE_CHECKING:
-    from .model import Model
+from .algorithms import Column
 
 GROUPINGS = ("column", "feature", "group", "neighborhood", "dimension")
 
 
-def columns(model: Model) -> list[tuple[str, str, str]]:
-    """(feature, group, neighborhood token) of every column; a histogram's bins are one feature."""
-    group_of = {name: group for group in ("covariance", "geometric", "shapes") for name in GROUPS[group]}
-    group_of.update(dict.fromkeys(RELATIVE, "geometric"))
-    out = []
-    for part in model.plan.layout:
-        for name in part.at:
-            group = group_of[name]
-            out.append((name.split("_")[0] if group == "shapes" else name, group, part.neighborhood.token))
-    return out + [(name, "dimension", "(dimension)") for name in model.plan.dimensions]
-
-
-def importances(model: Model, by: str = "feature") -> dict[str, float]:
-    """See ``Model.importances``."""
+def importances(
+    values: Sequence[float] | None, columns: Sequence[Column], by: str = "feature"
+) -> dict[str, float]:
+    """See ``Model.importances``; one value per column."""
     if by not in GROUPINGS:
         raise OptionError(
             "importances are grouped by something unknown", found=by, cure=f"One of {GROUPINGS}"
         )
-    values = model.info.get("importances")
     if values is None:
         raise ModelError("the model file holds no importances")
     total: dict[str, float] = {}
-    for name, (feature, group, token), value in zip(model.plan.names, columns(model), values, strict=True):
-        key = {
-            "column": name,
-            "feature": feature,
-            "group": group,
-            "neighborhood": token,
-            "dimension": name if group == "dimension" else "(computed features)",
-        }[by]
+    for column, value in zip(columns, values, strict=True):
+        if by == "dimension":
+            key = column.name if column.group == "dimension" else "(computed features)"
+        else:
+            key = getattr(column, "name" if by == "column" else by)
         total[key] = total.get(key, 0.0) + value
     return dict(sorted(total.items(), key=lambda item: -item[1]))
 
 
-def describe(model: Model) -> dict[str, Any]:
-    """See ``Model.describe``."""
-    manifest = model.manifest()
-    for bulky in ("shape_bins", "percentiles", "importances"):
-        manifest.pop(bulky, None)
-    manifest["required_dimensions"] = list(model.required_dimensions)
-    if model.info.get("importances") is not None:
-        manifest["importances"] = {
-            by: {key: round(value, 6) for key, value in importances(model, by).items()}
+def describe(manifest: Mapping[str, Any], columns: Sequence[Column]) -> dict[str, Any]:
+    """A manifest for people: importances grouped, long tables left out."""
+    values = manifest.get("importances")
+    kept = {k: v for k, v in manifest.items() if k not in ("shape_bins", "percentiles", "importances")}
+    if values is not None:
+        kept["importances"] = {
+            by: {key: round(value, 6) for key, value in importances(values, columns, by).items()}
             for by in GROUPINGS[1:]
         }
-    return manifest
+    return kept
 
 
-def text(model: Model) -> str:
-    """The model as a page of text."""
-    info = model.info
-    p = model.algorithm.parameters()
-    tokens = " ".join(one.token for one in model.plan.neighborhoods)
+def text(info: Mapping[str, Any]) -> str:
+    """What :func:`describe` gives as a page of text."""
     lines = [
-        f"{model.algorithm.name}: " + ", ".join(f"{v:,} {k}" for k, v in p.items() if isinstance(v, int)),
-        f"features       {len(model.plan.names)}: {tokens}",
-        f"needs          {', '.join(model.required_dimensions) or 'coordinates only'}",
-        f"halo           {model.plan.halo:g} m",
+        f"{info['algorithm']}: "
+        + ", ".join(f"{v:,} {k}" for k, v in info["parameters"].items() if isinstance(v, int)),
+        f"features       {len(info['feature_names'])}: {' '.join(info['features']['neighborhoods'])}",
+        f"needs          {', '.join(info['required_dimensions']) or 'coordinates only'}",
+        f"halo           {info['halo']:g} m",
     ]
     training = info.get("training", {})
     if info.get("priors"):
@@ -90,9 +70,9 @@ def text(model: Model) -> str:
             f"{entry['duplicates']:>12,}{_percent(f1):>15}"
         )
     lines += ["", *_scores(info.get("accuracy", {}), training.get("held_out"))]
-    if info.get("importances") is not None:
+    if "importances" in info:
         for by in ("neighborhood", "group", "feature"):
-            top = list(importances(model, by).items())[:10]
+            top = list(info["importances"][by].items())[:10]
             lines.append(f"importance by {by:<13}" + ", ".join(f"{k} {100 * v:.1f} %" for k, v in top))
     return "\n".join(lines)
 

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ..base.errors import OptionError
+from ..base.errors import OptionError, suggest
 from ..base.threads import resolve_threads
+from .algorithms import algorithm_names, trainer
 
 STRATEGIES = ("multiclass", "binary")
 
@@ -153,29 +154,30 @@ class TrainingOptions:
         resolve_threads(self.threads)
 
     def _check_algorithm(self) -> None:
-        from .algorithms import ALGORITHMS
-
-        if self.algorithm not in ALGORITHMS:
+        names = algorithm_names()
+        if self.algorithm not in names:
             raise OptionError(
                 "'algorithm' is not known",
                 found=repr(self.algorithm),
-                cure=f"Choose one of {', '.join(ALGORITHMS)}",
+                cure=f"Choose one of {', '.join(names)}",
             )
-        if self.alsnet and self.algorithm != "alsnet":
-            raise OptionError("'alsnet' means something only with algorithm 'alsnet'", found=self.algorithm)
-        if self.algorithm == "alsnet":
-            from ..alsnet.networkoptions import NetworkOptions
+        for name in names:  # an algorithm's own options stand under its name
+            if name != self.algorithm and getattr(self, name, None):
+                raise OptionError(
+                    f"'{name}' means something only with algorithm '{name}'", found=self.algorithm
+                )
+        own = trainer(self.algorithm).own_options(getattr(self, self.algorithm, None))
+        if own is not None:
+            object.__setattr__(self, self.algorithm, own)
 
-            if self.alsnet is not None and not isinstance(self.alsnet, Mapping | NetworkOptions):
-                raise OptionError("'alsnet' must be a mapping of options", found=repr(self.alsnet)[:60])
-            if not isinstance(self.alsnet, NetworkOptions):
-                object.__setattr__(self, "alsnet", NetworkOptions.from_dict(self.alsnet or {}))
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Dimensions of the points that the classifier will use, X, Y and Z among them."""
+        return trainer(self.algorithm).inputs(self)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> TrainingOptions:
         """Options by name; an unknown name is an error."""
-        from ..base.errors import suggest
-
         known = [f.name for f in fields(cls)]
         for name in values:
             if name not in known:

@@ -29,6 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..base.hashing import GOLDEN, finalise
 from ..base.jit import njit
 
 #: Random pulls per neighborhood [B16].
@@ -98,22 +99,15 @@ def _shapes(mode: int, thresholds: np.ndarray, counts: int, values: int) -> Shap
     )
 
 
-@njit(forceinline=True)
-def _mix64(h):
-    """Finaliser of splitmix64."""
-    h ^= h >> np.uint64(30)
-    h *= np.uint64(0xBF58476D1CE4E5B9)
-    h ^= h >> np.uint64(27)
-    h *= np.uint64(0x94D049BB133111EB)
-    return h ^ (h >> np.uint64(31))
+_mix64 = njit(finalise, forceinline=True)
 
 
 @njit
 def _point_seeds(x, y, z, start, out):
     for i in range(len(out)):
         h = _mix64(start + x[i])
-        h = _mix64(h + np.uint64(0x9E3779B97F4A7C15) + y[i])
-        out[i] = _mix64(h + np.uint64(0x9E3779B97F4A7C15) + z[i])
+        h = _mix64(h + GOLDEN + y[i])
+        out[i] = _mix64(h + GOLDEN + z[i])
 
 
 def point_seeds(x: np.ndarray, y: np.ndarray, z: np.ndarray, seed: int, token: str) -> np.ndarray:

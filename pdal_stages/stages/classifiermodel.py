@@ -14,7 +14,6 @@ from ..base.files import check_writable
 from ..classifier import TrainingCloud, TrainingOptions, train
 from ..classifier.classes import ClassMap
 from ..classifier.dimensions import required
-from ..features import FeaturePlan
 from .base import Stage
 from .options import option
 from .points import Points
@@ -157,28 +156,16 @@ merged first. `label` names the dimension that holds the classes.
         values["max_features"] = _number(values["max_features"])
         return TrainingOptions(**values, threads=self.threads, memory_mb=self.memory)
 
-    @cached_property
-    def inputs(self) -> tuple[str, ...]:
-        """Dimensions of the points that the features or the network take in."""
-        chosen = self.training
-        if chosen.algorithm == "alsnet":
-            from ..alsnet.networkmodel import input_names
-
-            return input_names(chosen.alsnet.coordinates, chosen.dimensions)
-        return FeaturePlan.parse(
-            chosen.neighborhoods, feature_set=chosen.feature_set, dimensions=chosen.dimensions
-        ).dimensions
-
     def check(self) -> None:
-        self.inputs  # noqa: B018  words that mean nothing are refused
-        if self.training.algorithm == "alsnet" and self.training.alsnet.checkpoint:
+        self.training.inputs  # noqa: B018  words that mean nothing are refused
+        if self.training.alsnet is not None and self.training.alsnet.checkpoint:
             check_writable(self.training.alsnet.checkpoint, "checkpoint")
         if self.training.classes is not None:
             ClassMap.parse(self.training.classes)
         check_writable(self.filename, "model")
 
     def reads(self) -> list[str]:
-        return [self.label, *required(self.inputs)]
+        return [self.label, *required(self.training.inputs)]
 
     def run(self, points: Points) -> dict[str, NDArray]:
         if points.count == 0:
@@ -189,7 +176,7 @@ merged first. `label` names the dimension that holds the classes.
         cloud = TrainingCloud(
             xyz=points.xyz,
             labels=points.codes_of(self.label),
-            dimensions={name: points.dimension(name) for name in required(self.inputs)},
+            dimensions={name: points.dimension(name) for name in required(self.training.inputs)},
             name="the points",
             mask=points.mask,
         )

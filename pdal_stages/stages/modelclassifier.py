@@ -75,11 +75,11 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
     example = {"type": "filters.modelclassifier", "model": "town.model"}
 
     def check(self) -> None:
-        algorithm = self.model.algorithm  # reads the file
-        if self.variance and not getattr(algorithm, "whole_cloud", False):
+        able = self.model.gives_variance  # reads the file in any case
+        if self.variance and not able:
             raise OptionError(
                 "option 'variance' is for networks; this model is another",
-                found=algorithm.name,
+                found=self.model.algorithm.name,
                 cure="Use 'margin'",
             )
 

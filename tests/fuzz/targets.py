@@ -21,7 +21,7 @@ import numpy as np
 
 from pdal_stages.base.errors import StageError
 from pdal_stages.classifier import modelfile
-from pdal_stages.classifier.model import _assemble
+from pdal_stages.classifier.model import assemble
 from pdal_stages.pipeline.lowering import lower
 from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
 from pdal_stages.pipeline.read import decode, parse_pipeline
@@ -143,11 +143,11 @@ def model(data: bytes) -> str:
     try:
         path.write_bytes(content)
         manifest, arrays = modelfile.read(path, lambda name: algorithm(name).rules)
-        made = _assemble(manifest, arrays)
+        made = assemble(manifest, arrays)
         assert str(made) and made.describe() and made.halo >= 0
         made.importances()
         values = np.random.default_rng(1).normal(size=(50, len(made.plan.names))).astype(np.float32)
-        shares = made.algorithm.predict_proba(values)
+        shares = made.algorithm.predict_rows(values)
         assert shares.shape == (50, len(made.classes))
         assert (
             np.isfinite(shares).all()

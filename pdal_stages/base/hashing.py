@@ -1,0 +1,37 @@
+"""Numbers that look random and follow from what is hashed alone: splitmix64 (Steele, Lea, Flood 2014).
+
+:func:`finalise` serves NumPy arrays as it is, and kernels through ``njit(forceinline=True)(finalise)``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+#: What splitmix64 adds before it mixes.
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+
+
+def finalise(h):
+    """The finaliser of splitmix64: uint64 (an array, or in a kernel a number) to uint64."""
+    h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return h ^ (h >> np.uint64(31))
+
+
+def coordinate_hash(xyz: npt.NDArray[np.float64], seed: int) -> npt.NDArray[np.uint64]:
+    """A 64-bit hash of each point's own coordinates and the seed.
+
+    Parameters
+    ----------
+    xyz : (n, k) float64
+        Every bit counts, but -0.0 is 0.0.
+    seed : int
+    """
+    bits: npt.NDArray[Any] = (np.ascontiguousarray(xyz, dtype=np.float64) + 0.0).view(np.uint64)
+    value = np.full(len(bits), np.uint64(seed & 0xFFFFFFFFFFFFFFFF), np.uint64)
+    for axis in range(bits.shape[1]):
+        value = finalise((value ^ bits[:, axis]) + GOLDEN)
+    return value
