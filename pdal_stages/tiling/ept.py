@@ -30,11 +30,10 @@ def fetch(source: dict[str, Any], grid: Grid, tile: tuple[int, int], margin: flo
             axis = dimension["name"].lower()
             writer[f"scale_{axis}"] = dimension.get("scale", 0.001)
             writer[f"offset_{axis}"] = dimension.get("offset", 0.0)
-    path = source["path"]
     reader = {
         **source["reader"],
         "type": "readers.ept",
-        "filename": path if "://" in path else f"ept://{path.removesuffix('/ept.json')}",
+        "filename": source["path"],
         "bounds": f"([{x0!r}, {x1!r}], [{y0!r}, {y1!r}])",
     }
     run = pdal_env.execute([reader, writer], arrays=False)

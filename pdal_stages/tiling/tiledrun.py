@@ -261,8 +261,6 @@ class _Run:
         if source.kind == "las":
             reader["count"] = 1
         else:
-            if "://" not in source.path:
-                reader["filename"] = f"ept://{source.path.removesuffix('/ept.json')}"
             x0, y0, _, _ = self.headers[source.path].box
             reader["bounds"] = f"([{x0!r}, {x0 + 1!r}], [{y0!r}, {y0 + 1!r}])"
         return pdal_env.execute([reader], arrays=False).metadata.get("metadata", {})
