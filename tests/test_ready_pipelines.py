@@ -169,7 +169,9 @@ def test_copc_to_tiles(models, tmp_path):
     )
     (one,) = [laspy.read(p) for p in tmp_path.glob("f_*.laz")]
     assert not tiled.failures and not any(v.user_id == "copc" for v in [*one.header.vlrs, *(one.evlrs or [])])
-    np.testing.assert_array_equal(one.points.array, whole.points.array)
+    _same_points([whole], [one])
+    if pdal_env.version() < (2, 4, 0):  # later ones read COPC in an order of their own
+        np.testing.assert_array_equal(one.points.array, whole.points.array)
 
 
 def test_tile_index_to_tiles(town, models, tmp_path):
