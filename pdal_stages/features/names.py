@@ -60,6 +60,24 @@ GROUPS: dict[str, tuple[str, ...]] = {
 #: Groups that bring a preset's own dimensions (HeightAboveGround, Z) along.
 WITH_DIMENSIONS = ("all", "geometric")
 
+#: Words of PDAL's own filters that mean something else here, in small letters: (PDAL's spelling, what to write).
+OF_PDAL = {
+    "dimensionality": (
+        "Dimensionality",
+        "Write Linearity,Planarity,Scattering; PDAL's fourth, its own Verticality, is not computed here (Verticality is "
+        "1 - |nz|, PDAL's DemantkeVerticality)",
+    ),
+    "demantkeverticality": ("DemantkeVerticality", "It is Verticality here, 1 - |nz|"),
+    "optimalknn": (
+        "OptimalKNN",
+        'Give filters.multiscalefeatures "optimal": true, and kopt among its neighborhoods',
+    ),
+    "optimalradius": (
+        "OptimalRadius",
+        'Write Radius, or give filters.multiscalefeatures "optimal": true, with kopt among its neighborhoods',
+    ),
+}
+
 
 def describe(feature: str) -> str:
     """One line of what a feature is, for docs and schemas."""
@@ -94,6 +112,11 @@ def parse_feature_set(spec: str | Iterable[str]) -> tuple[str, ...]:
         name = known.get(word.lower())
         if name is None:  # a feature of one neighborhood keeps its suffix
             head = _longest_feature(word)
+            if word.lower() in OF_PDAL:
+                raise OptionError(
+                    f"'{OF_PDAL[word.lower()][0]}' is PDAL's word, not a feature",
+                    cure=OF_PDAL[word.lower()][1],
+                )
             if head is None:
                 cure = suggest(word, (*GROUPS, *ALL_FEATURES))
                 raise OptionError(

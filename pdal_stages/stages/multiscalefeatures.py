@@ -12,13 +12,17 @@ from numpy.typing import NDArray
 from ..base.errors import OptionError, StageError
 from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
-from ..features.neighborhoods import parse_neighborhoods
+from ..features.adaptive import LEAST_RADIUS
+from ..features.neighborhoods import Neighborhood, parse_neighborhoods
 from .base import Stage
 from .options import option
 from .points import Points
 
 #: Bytes a LAS extra-dimension name may have.
 _NAME_BYTES = 32
+#: What `optimal` writes, and the features of kopt that it follows from.
+_OPTIMAL = {"OptimalKNN": "uint64_t", "OptimalRadius": "double"}
+_OF_CHOSEN = ("Density", "Radius")
 
 
 class MultiscaleFeatures(Stage):
@@ -46,6 +50,11 @@ class MultiscaleFeatures(Stage):
         "JSON file of shape-histogram thresholds and the curvature threshold: read where it exists, "
         "otherwise fitted to these points and written, so that other tiles see the same ones",
     )
+    optimal: bool = option(
+        "boolean",
+        False,
+        "Also write the neighborhood that kopt chose as PDAL does: OptimalKNN (the point itself counted) and OptimalRadius",
+    )
     memory: int = option(
         "integer", 512, "Memory for blocks of points, over the cloud itself", minimum=16, unit="MB"
     )
@@ -66,13 +75,27 @@ features inside and need no dimensions at all.
 
     @cached_property
     def plan(self) -> FeaturePlan:
-        """The parsed neighborhoods and features."""
-        return FeaturePlan.parse(self.neighborhoods, feature_set=self.feature_set)
+        """The parsed neighborhoods and features, with what is needed of `chosen`."""
+        needed = [f"{name}_{self.chosen.suffix}" for name in _OF_CHOSEN] if self.chosen else []
+        return FeaturePlan.parse(self.neighborhoods, feature_set=[*self.feature_set, *needed])
+
+    @cached_property
+    def chosen(self) -> Neighborhood | None:
+        """The kopt whose choice is written as PDAL's OptimalKNN and OptimalRadius."""
+        found = [n for n in parse_neighborhoods(self.neighborhoods) if n.kind == "kopt"]
+        if not self.optimal:
+            return None
+        if len(found) != 1:
+            raise OptionError(
+                "option 'optimal' needs one neighborhood kopt", found=", ".join(map(str, self.neighborhoods))
+            )
+        return found[0]
 
     @cached_property
     def columns(self) -> list[str]:
         """Features to write: the point's own dimensions are there already."""
-        return [name for name in self.plan.names if name not in self.plan.dimensions]
+        asked = FeaturePlan.parse(self.neighborhoods, feature_set=self.feature_set)
+        return [name for name in asked.names if name not in asked.dimensions]
 
     def check(self) -> None:
         option = "neighborhoods"
@@ -84,6 +107,7 @@ features inside and need no dimensions at all.
             raise OptionError(
                 f"option '{option}': {error.what}", found=error.found, cure=error.cure
             ) from None
+        self.chosen  # noqa: B018  refused here where there is not one
         for name in names:
             if len(name.encode()) > _NAME_BYTES:
                 raise OptionError(
@@ -92,7 +116,7 @@ features inside and need no dimensions at all.
                 )
 
     def creates(self) -> dict[str, str]:
-        return dict.fromkeys(self.columns, "float")
+        return {**dict.fromkeys(self.columns, "float"), **(_OPTIMAL if self.optimal else {})}
 
     def halo(self) -> float:
         return self.plan.halo
@@ -100,7 +124,7 @@ features inside and need no dimensions at all.
     def run(self, points: Points) -> dict[str, NDArray]:
         plan, names = self.plan, self.columns
         if points.count == 0:
-            return {name: np.empty(0, np.float32) for name in names}
+            return {name: np.empty(0, np.float32) for name in self.creates()}
         bins, threshold = _read_bins(self.bins)
         engine = FeatureEngine(
             points.xyz, plan, bins=bins, copt_threshold=threshold, seed=self.seed, threads=self.threads
@@ -110,7 +134,10 @@ features inside and need no dimensions at all.
         if queries is not None:
             own = {name: values[queries] for name, values in own.items()}
         columns = [plan.names.index(name) for name in names]
-        out = {name: np.array(points.arrays[name], np.float32) for name in names}
+        out = {name: np.array(points.arrays[name]) for name in self.creates()}
+        of_chosen = (
+            [plan.names.index(f"{name}_{self.chosen.suffix}") for name in _OF_CHOSEN] if self.chosen else []
+        )
         total = points.count if queries is None else len(queries)
         with Progress(total, self.type) as progress:
             for rows, values in engine.blocks(
@@ -118,6 +145,11 @@ features inside and need no dimensions at all.
             ):  # rows are indices into the cloud, with queries too
                 for name, column in zip(names, columns, strict=True):
                     out[name][rows] = values[:, column]
+                if of_chosen:
+                    density, radius = values[:, of_chosen].T.astype(np.float64)
+                    ball = 4 / 3 * np.pi * np.maximum(radius, LEAST_RADIUS) ** 3
+                    out["OptimalKNN"][rows] = np.rint(density * ball)
+                    out["OptimalRadius"][rows] = radius / points.units.horizontal
         if self.bins and not Path(self.bins).exists():
             _write_bins(self.bins, engine)
         points.report.update(
