@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import pdal_stages as ps
+from pdal_stages.pipeline import runtime
 from pdal_stages.pipeline.runtime import TRAMPOLINE, message_of, run_stage
 
 pytestmark = pytest.mark.pdal
@@ -146,3 +147,31 @@ def test_a_python_without_the_package(tmp_path, pdal_program):
     )
     assert done.returncode == 1, (done.returncode, done.stderr)
     assert "ModuleNotFoundError: No module named 'pdal_stages_elsewhere'" in done.stderr
+
+
+def test_stages_that_pdal_leaves_out(tmp_path, monkeypatch):
+    """Newer PDAL does not call a filter where there are no points: what a stage says of that is said all the same."""
+    text = tmp_path / "in.txt"
+    text.write_text("X,Y,Z,Classification\n1,1,1,2\n2,2,2,2\n")
+    none = [{"type": "readers.text", "filename": str(text)}, {"type": "filters.range", "limits": "Z[5:]"}]
+    train = {"type": "writers.classifiermodel", "filename": str(tmp_path / "m"), "feature_set": "covariance"}
+    for stop in (False, True):
+        if stop:  # as if it had not been called
+            monkeypatch.setattr(runtime, "collect", lambda label: ([], None))
+        made = ps.run_pipeline(
+            [*none, {"type": "filters.hag_minima"}, {"type": "filters.multiscalefeatures"}]
+        )
+        assert made.reports[0][1][0]["points"] == 0
+        with pytest.raises(ps.StageError, match=r"writers\.classifiermodel.*no points to train on"):
+            ps.run_pipeline([*none, {"type": "filters.hag_minima"}, train])
+        with pytest.raises(ps.StageError, match="no points to compare"):
+            ps.run_pipeline(
+                [
+                    *none,
+                    {
+                        "type": "filters.accuracy",
+                        "reference": "Classification",
+                        "dimension": "Classification",
+                    },
+                ]
+            )

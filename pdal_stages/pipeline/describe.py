@@ -54,7 +54,9 @@ def stage_options(type_name: str, *, as_json: bool = False) -> str:
     for option in stage.all_options():
         help_text = option.help
         if option.name == "where" and stage.where_help:
-            help_text = f"Condition on points. {stage.where_help}"
+            help_text = (
+                f"A condition on points (PDAL's own filters do not see the others). {stage.where_help}"
+            )
         if option.choices:
             help_text += f" (one of: {', '.join(map(str, option.choices))})"
         head = f"  {option.name}"

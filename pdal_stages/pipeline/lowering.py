@@ -16,6 +16,7 @@ from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import DimensionError, OptionError, PipelineError, StageError, suggest
 from ..stages import registry
 from ..stages.base import Stage
+from .optionfile import settled
 from .read import PipelineSource
 from .runtime import TRAMPOLINE, known, place
 
@@ -137,6 +138,10 @@ def lower_stage(given: dict[str, Any], index: int = 0) -> LoweredStage:
     """One stage of ours, checked, and the ``filters.python`` that stands for it."""
     kind = registry.get(given["type"])
     named = place(kind.type, given.get("tag"))
+    try:
+        given = settled(given)
+    except StageError as error:
+        raise error.within(named) from None
     options = {k: v for k, v in given.items() if k not in ("type", *PDAL_OWN)}
     stage = kind(options, named)
     label = f"pdal_stages_{kind.type.replace('.', '_')}_{uuid.uuid4().hex[:12]}"

@@ -33,11 +33,22 @@ class PipelineSource:
     lines: list[int]
     name: str = ""
 
+    def __post_init__(self) -> None:
+        self.stages = [_with_plain_name(stage) for stage in self.stages]
+
     def where(self, index: int) -> str:
         """``job.json, line 12`` or ``stage 3``."""
         if self.lines[index]:
             return f"{self.name or 'pipeline'}, line {self.lines[index]}"
         return f"stage {index + 1}"
+
+
+def _with_plain_name(stage: Any) -> Any:
+    """A file name that says no more than a path, as text, which every PDAL takes (from 2.9 on it may be an object)."""
+    name = stage.get("filename") if isinstance(stage, dict) else None
+    if isinstance(name, dict) and set(name) == {"path"} and isinstance(name["path"], str):
+        return {**stage, "filename": name["path"]}
+    return stage
 
 
 def read_pipeline(source: str | Path | list | dict) -> PipelineSource:

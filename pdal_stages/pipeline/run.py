@@ -99,6 +99,9 @@ class Pipeline:
                     reports, failed = runtime.collect(ours.label)
                     failure = failure or failed
                     self.reports.append((ours.place, reports))
+            for ours, (_, reports) in zip(self.lowered.ours, self.reports, strict=True):
+                if not reports:  # newer PDAL leaves filters out where there are no points
+                    reports.append(runtime.run_on_nothing(ours.stage, ours.place))
             _rename(renames)
         except StageError as error:
             for partial, final in renames if isinstance(error.found, str) else ():

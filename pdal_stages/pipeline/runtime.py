@@ -112,6 +112,17 @@ def run_on_view(module, arguments, ins, outs) -> dict[str, Any]:
     return points.report
 
 
+def run_on_nothing(stage: Stage, where: str) -> dict[str, Any]:
+    """What a stage says of no points at all."""
+    names = ("X", "Y", "Z", *stage.reads(), *stage.creates())
+    points = stage.points({name: np.empty(0) for name in names})
+    try:
+        stage.run(points)
+    except StageError as error:
+        raise error.at(where) from None
+    return points.report
+
+
 def _as_stage_error(error: BaseException, where: str) -> StageError:
     if isinstance(error, StageError):
         return error.at(where)

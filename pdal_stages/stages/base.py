@@ -55,7 +55,9 @@ class Stage(ABC):
     where_help: ClassVar[str] = ""
 
     where: str | None = option(
-        "expression", None, "Points the stage acts on; the others stay as they are but serve as neighbors"
+        "expression",
+        None,
+        "Points the stage acts on; the others stay as they are but serve as neighbors (PDAL's own filters do not see them)",
     )
     threads: int = option(
         "integer", 0, "Threads to use; 0 takes every available core", minimum=0, maximum=1024
@@ -124,6 +126,8 @@ class Stage(ABC):
             "type": {"const": cls.type},
             "tag": {"type": "string"},
             "inputs": {"type": ["array", "string"]},
+            "option_file": {"type": "string"},
+            "where_merge": {"enum": ["auto", "true", True]},
         }
         properties.update({option.name: option.schema() for option in cls.all_options()})
         return {

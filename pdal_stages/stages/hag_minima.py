@@ -37,10 +37,12 @@ class HagMinima(Stage):
         unit="m",
     )
     ignore_classes: list = option(
-        "list",
+        "codes",
         NOISE,
-        "Class codes that do not form the terrain (they still receive heights), e.g. noise below ground",
+        "Class codes that do not form the terrain (they still receive heights), e.g. noise below ground; a range such "
+        "as Classification[7:7] too, and by PDAL's name, ignore",
         may_be_empty=True,
+        also="ignore",
     )
     details = """
 The terrain is the lowest point of each cell of a coarse grid, interpolated bilinearly between cell centres and
@@ -63,11 +65,6 @@ the unit of Z.
                 found=f"resolution {self.resolution:g}, cell {self.cell:g}",
                 cure="Swap them, or lower 'resolution'",
             )
-        for code in self.ignore_classes:
-            if str(code).strip() not in map(str, range(256)):
-                raise OptionError(
-                    "option 'ignore_classes' must list class codes of 0 to 255", found=repr(code)
-                )
 
     def creates(self) -> dict[str, str]:
         return {"HeightAboveGround": "double"}
@@ -81,7 +78,7 @@ the unit of Z.
         """Which points form the terrain; those left out for their class are counted."""
         forms = np.ones(points.count, bool) if points.mask is None else points.mask.copy()
         if "Classification" in points.arrays and self.ignore_classes:
-            noise = np.isin(points.class_codes, np.array([int(c) for c in self.ignore_classes], np.uint8))
+            noise = np.isin(points.class_codes, np.array(self.ignore_classes, np.uint8))
             points.report["ignored"] = int(np.count_nonzero(noise & forms))
             forms &= ~noise
         return forms

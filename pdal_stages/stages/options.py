@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +19,7 @@ _JSON_TYPES = {
     "filename": "string",
     "expression": "string",
     "list": "array",
+    "codes": "array",
     "mapping": "object",
 }
 _READABLE = {
@@ -28,6 +30,7 @@ _READABLE = {
     "filename": "a file name",
     "expression": 'a condition such as "Classification == 2"',
     "list": "a list, or text separated by commas",
+    "codes": "a list, or text separated by commas",
     "mapping": 'a mapping such as {"2": "Ground"}',
 }
 
@@ -40,7 +43,8 @@ class Option:
     ----------
     kind : str
         ``number``, ``integer``, ``string``, ``boolean``, ``filename``, ``expression``,
-        ``list`` (a JSON list or comma-separated text) or ``mapping`` (a JSON object).
+        ``list`` (a JSON list or comma-separated text), ``codes`` (a list of class codes, or of ranges as PDAL
+        writes them, ``Classification[7:7]``) or ``mapping`` (a JSON object).
     default : object
         The value where the option is absent; None means "decided by the stage".
     help : str
@@ -55,6 +59,8 @@ class Option:
         Whether an empty list means "none".
     name : str
         As the user types it; by default the attribute's name.
+    also : str
+        Another name it goes by, PDAL's.
     """
 
     kind: str
@@ -68,6 +74,7 @@ class Option:
     required: bool = False
     may_be_empty: bool = False
     name: str = ""
+    also: str = ""
 
     def __set_name__(self, owner: type, name: str) -> None:
         if not self.name:
@@ -79,7 +86,7 @@ class Option:
     def schema(self) -> dict:
         """The option's JSON Schema."""
         out: dict[str, Any] = {"description": self.help, "type": _JSON_TYPES[self.kind]}
-        if self.kind == "list":
+        if self.kind in ("list", "codes"):
             out["type"] = ["array", "string"]
         if self.kind in ("number", "integer", "boolean", "mapping"):
             out["type"] = [out["type"], "string"]  # PDAL takes numbers as text too
@@ -167,6 +174,28 @@ class Option:
             )
         return list(value)
 
+    def _parse_codes(self, value: Any) -> list[int]:
+        codes: list[int] = []
+        for item in self._parse_list(value.split(",") if isinstance(value, str) else value):
+            if not str(item).strip():
+                continue
+            span = _RANGE.fullmatch(str(item).strip())
+            if str(item).strip() in map(str, range(256)):
+                codes.append(int(item))
+            elif span is None:
+                raise OptionError(
+                    f"option '{self.name}' must list class codes of 0 to 255", found=repr(item),
+                    cure="Write 7,18 or, as PDAL has it, Classification[7:7]",
+                )  # fmt: skip
+            else:
+                out, opens, low, high, closes = span.groups()
+                inside = range(
+                    int(low or 0) + (opens == "(" and bool(low)),
+                    int(high or 255) + (closes == "]" or not high),
+                )
+                codes += [code for code in range(256) if (code in inside) != bool(out)]
+        return list(dict.fromkeys(codes))
+
     def _parse_mapping(self, value: Any) -> dict:
         if isinstance(value, str):
             try:
@@ -215,6 +244,10 @@ def _split(text: str) -> list[str]:
     return [p.strip() for p in parts if p.strip()]
 
 
+#: A range of classes as PDAL's filters write it: ``Classification[7:7]``, ``Classification(2:)``, ``Classification![2:2]``.
+_RANGE = re.compile(r"Classification\s*(!?)\s*([\[(])\s*(\d*)\s*:\s*(\d*)\s*([\])])", re.IGNORECASE)
+
+
 def parse_options(declared: Iterable[Option], given: Mapping[str, Any]) -> dict[str, Any]:
     """Every declared option with its value, given or default.
 
@@ -225,6 +258,13 @@ def parse_options(declared: Iterable[Option], given: Mapping[str, Any]) -> dict[
         value that does not fit.
     """
     known = {option.name: option for option in declared}
+    for option in known.values():
+        if option.also in given:
+            if option.name in given:
+                raise OptionError(
+                    f"options '{option.name}' and '{option.also}' are one and the same", cure="Give one"
+                )
+            given = {(option.name if name == option.also else name): value for name, value in given.items()}
     for name in given:
         if name not in known:
             raise OptionError(

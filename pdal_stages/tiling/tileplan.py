@@ -11,6 +11,7 @@ from typing import Any
 
 from ..base.errors import OptionError, PipelineError, StageError
 from ..pipeline.lowering import PDAL_OWN
+from ..pipeline.optionfile import settled
 from ..pipeline.overrides import Override
 from ..pipeline.run import Pipeline
 from ..stages import registry
@@ -147,7 +148,7 @@ def _object(stage: Any, index: int, count: int) -> dict[str, Any]:
             out["type"] = _driver(name, "writers")
         else:
             out["type"] = "readers.ept" if name.endswith("ept.json") else _driver(name, "readers")
-    return out
+    return settled(out) if out["type"] in registry.stages() else out
 
 
 def _driver(name: str, kind: str) -> str:
