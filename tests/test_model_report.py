@@ -1,6 +1,7 @@
 """The page about a model file: what it shows for a forest and a network, and what odd manifests do to it."""
 
 import json
+import re
 from html.parser import HTMLParser
 
 import pytest
@@ -40,7 +41,7 @@ def read(page):
 @pytest.fixture(scope="module")
 def searched():
     xyz, label, dimensions = scene(n=4000)
-    options = TrainingOptions(**{**SMALL, "trees": (5, 10)}, folds=3, block_size=10)
+    options = TrainingOptions(**{**SMALL, "trees": (5, 10)}, folds=3, block_size=10, prior_weight=0.5)
     return train([TrainingCloud(xyz, label, dimensions, "a<b>.laz")], options, progress=False)
 
 
@@ -52,6 +53,7 @@ def test_a_forest(searched, tmp_path, capsys):
     assert "Model town.model" in words and "3 folds of blocks of 10 m" in words and "a<b>.laz" in words
     for row in searched.info["accuracy"]["cross_validation"]["tried"]:
         assert f"{100 * row['overall_accuracy']:.2f}" in words
+    assert "Prior factor" in words and not re.search(r"\d\.\d{7,}", words)
     assert "By neighborhood" in words and "Epoch" not in words and "random_forest" in said
 
 

@@ -6,6 +6,7 @@ import base64
 import io
 import re
 from html.parser import HTMLParser
+from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -14,10 +15,10 @@ from PIL import Image
 from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.accuracy.text import percent
 from pdal_stages.base.errors import StageError
-from pdal_stages.reports import html
-from pdal_stages.reports.accuracypage import _nice, accuracy_page, write_accuracy_report
-from pdal_stages.reports.maps import _scene, _section_line
-from pdal_stages.reports.style import HEAT, PALETTE
+from pdal_stages.reports.accuracypage import accuracy_page, write_accuracy_report
+from pdal_stages.reports.charts import percent_axis
+from pdal_stages.reports.maps import Scene, densest_line, heights_to_draw
+from pdal_stages.reports.runpage import run_page
 
 VOID = {"meta", "img", "br"}
 
@@ -216,16 +217,25 @@ def contrast(a, b):
     return (b + 0.05) / (a + 0.05)
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_text_has_contrast(scheme):
-    p = {name: np.array(c, float) for name, c in PALETTE[scheme].items()}
+def palettes():
+    """The colours that the style sheet gives light, dark and printed pages, in that order."""
+    sheet = files("pdal_stages.reports").joinpath("templates/style.css").read_text()
+    blocks = re.findall(r":root \{(.*?)\}", sheet, re.S)
+    return [
+        {name: np.array(color.split(), float) for name, color in re.findall(r"--(\w+): ([\d ]+);", block)}
+        for block in blocks
+    ]
+
+
+@pytest.mark.parametrize("colors", palettes(), ids=["light", "dark", "print"])
+def test_text_has_contrast(colors):
     for text in ("ink", "muted"):
         for ground in ("page", "panel"):
-            assert contrast(p[text], p[ground]) >= 4.5
+            assert contrast(colors[text], colors[ground]) >= 4.5
     for heat in ("right", "wrong"):
-        cell = HEAT * p[heat] + (1 - HEAT) * p["page"]
-        assert contrast(p["ink"], cell) >= 4.5
-        assert contrast(p[heat], p["page"]) >= 3  # graphics
+        cell = 0.5 * colors[heat] + 0.5 * colors["page"]
+        assert contrast(colors["ink"], cell) >= 4.5
+        assert contrast(colors[heat], colors["page"]) >= 3  # graphics
 
 
 # ---- maps ------------------------------------------------------------------------------------------------
@@ -255,14 +265,12 @@ def test_error_map_shows_the_errors(full):
 
 def test_section_lies_where_the_errors_are(scene, accuracy):
     xyz, reference, predicted, _ = scene
-    line, depth, chosen = _section_line(_scene(accuracy, xyz, reference, predicted), None)
+    line = densest_line(Scene.of(accuracy, xyz, reference, predicted), depth=2.77)
     (x0, y0), (x1, y1) = np.subtract(line, (770_600, 6_277_500))
-    assert chosen
     assert abs(y0 - 12.5) < 1.5
     assert y0 == y1
     assert x0 < 14
     assert x1 > 26
-    assert depth == pytest.approx(8 * np.sqrt(60 * 40 / 20_000), rel=0.01)
 
 
 def test_maps_follow_the_merge():
@@ -315,7 +323,7 @@ def test_stray_heights_do_not_flatten_the_section(scene, accuracy):
     wrong = np.flatnonzero((reference == 6) & (predicted == 5))
     strayed[wrong[0], 2] += 5000
     text = accuracy_page(accuracy, xyz=strayed, reference=reference, predicted=predicted)
-    assert "1 points far above or below the others are not drawn" in Page(text).text
+    assert "Not drawn: 1 point far above or below the others." in Page(text).text
     assert embedded(text)[3].shape[0] < 800
 
 
@@ -377,41 +385,102 @@ def test_or_not_at_all(tmp_path, accuracy):
 
 @pytest.mark.parametrize("most", [0.0, 0.0001, 0.004, 0.05, 0.31, 0.5, 1.0])
 def test_axis_holds_its_values(most):
-    top, ticks = _nice(most)
+    top, ticks = percent_axis(most)
     assert top >= most
     assert 2 <= len(ticks) <= 6
     assert ticks[-1][0] == pytest.approx(top)
 
 
-def test_pieces_escape_what_they_are_given():
+# ---- the page of a tiled run -----------------------------------------------------------------------------
+
+
+def tiled(**changes):
+    """What a run after --resume reports: one tile done, one kept, one failed."""
     nasty = "<x>\"'&"
-    text = html.page(
-        nasty,
-        html.section(nasty, html.paragraph(nasty), note=nasty),
-        html.tiles([(nasty, nasty, nasty, nasty)]),
-        html.legend([((1, 2, 3), nasty)]),
-        html.table(
-            [nasty], [html.head(nasty, "row") + html.cell(nasty)], nasty, nasty, foot=html.cell(nasty)
-        ),
-        html.settings({nasty: {nasty: [nasty]}}),
-        html.bars({nasty: 0.5}),
-        html.figure(html.image(b"", nasty), nasty, nasty),
-        html.strip("", label=nasty),
-        html.details(nasty, ""),
-        html.chart(
-            alt=nasty,
-            x_label=nasty,
-            y_label=nasty,
-            x_ticks=[(0, nasty)],
-            y_ticks=[(0, nasty)],
-            bars=[(0, 1, 1, "bad", nasty)],
-            dots=[(0, 0, nasty)],
-            values=[(0, 0, nasty)],
-            lines=[([(0, 0), (1, 1)], "line")],
-        ),
-        subtitle=nasty,
-        footer=nasty,
-    )
-    page = Page(text)
+    done = {"points": 2000, "read": 2500, "buffer": 12.3456789, "seconds": 81.23456, "tries": 1}
+    return {
+        "pipeline": f"/jobs/{nasty}.json",
+        "models": [f"{nasty}.model"],
+        "started": "2024-05-06 07:08",
+        "inputs": 2,
+        "tile": 500.0,
+        "bounds": [770500.004999, 6277000.0, 772000.0, 6277500.0],
+        "buffer_metres": 12.3456789012,
+        "workers": 2,
+        "cpu_seconds": 3723.4567891,
+        "points": 2000,
+        "seconds": 90.123456,
+        "points_per_second": 22.191717,
+        "peak_mb_of_a_worker": 512.3456,
+        "dropped": 0,
+        "states": {"done": 1, "kept": 1, "failed": 1},
+        "classes": {"2": 4000, "6": 1000},
+        "notes": [nasty],
+        "failures": [{"what": nasty, "reason": nasty}],
+        "tiles": [
+            {"name": "770500_6277000", "tile": [1541, 12554], "state": "done", **done},
+            {"name": "771000_6277000", "tile": [1542, 12554], "state": "kept", "points": 3000, "tries": 0},
+            {
+                "name": nasty,
+                "tile": [1543, 12554],
+                "state": "failed",
+                "points": 5,
+                "tries": 3,
+                "reason": nasty,
+            },
+        ],
+        "outputs": [{"input": nasty, "output": [nasty], "state": "kept", "written": 3000}],
+        **changes,
+    }
+
+
+def test_a_run_tells_what_it_did_and_what_it_kept():
+    page = Page(run_page(tiled()))
+    for words in (
+        "1 kept from an earlier run, 1 failed",
+        "3,000 more kept from an earlier run",
+        "2024-05-06 07:08",
+        "x 770500.00 to 772000.00, y 6277000.00 to 6277500.00",
+        "771000_6277000 at 771000, 6277000: kept from an earlier run",
+        "12.3457",
+        "1 h 02",
+        "1:30 min",
+    ):
+        assert words in page.text
+    assert not re.search(r"\d\.\d{5,}", page.text)
+
+
+def test_nothing_of_a_run_becomes_markup():
+    page = Page(run_page(tiled()))
+    assert page.text.count("<x>\"'&") >= 8
     assert "x" not in {tag for tag, _ in page.tags}
-    assert page.text.count(nasty) >= 20
+
+
+def test_a_run_of_nothing_makes_a_page():
+    empty = tiled(tiles=[], outputs=[], failures=[], notes=[], classes={}, states={"waiting": 0}, bounds=None)
+    assert "Map of the tiles" not in Page(run_page(empty)).text
+
+
+# ---- what a section shows --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.01, 0.05, 0.3])
+def test_noise_does_not_empty_a_section(share):
+    rng = np.random.default_rng(3)
+    town = np.concatenate([rng.normal(50, 0.1, 8000), rng.uniform(50, 62, 2000)])
+    noise = rng.uniform(-2000, 4000, int(share * len(town)))
+    low, high = heights_to_draw(np.concatenate([town, noise]), 80.0)
+    assert low <= 49.8
+    assert high >= 61.9
+    assert high - low < 200
+
+
+def test_labelled_noise_does_not_empty_a_section(scene, accuracy):
+    xyz, reference, predicted, _ = scene
+    rng = np.random.default_rng(0)
+    noise = rng.random(len(xyz)) < 0.2
+    xyz, predicted = xyz.copy(), np.where(noise, 7, predicted)
+    xyz[noise, 2] += rng.uniform(-900, 900, noise.sum())
+    text = accuracy_page(accuracy, xyz=xyz, reference=reference, predicted=predicted)
+    assert "far above or below the others" in Page(text).text
+    assert embedded(text)[3].shape[0] < 800

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from pathlib import Path
 
 import laspy
 import numpy as np
@@ -548,19 +549,20 @@ def test_reports(tmp_path, town_file, model_file):
     drawn = dom.parseString(text[start:end])
     assert len(drawn.getElementsByTagName("rect")) == len(told["tiles"])
     assert "<script" not in text and "http" not in text.split("</style>")[1]
+    assert main([*words, *names, "--resume"]) == 1
+    text = (tmp_path / "r.html").read_text()
+    assert f"{len(told['tiles'])} kept from an earlier run" in text and "job.json" in text
+    assert Path(model_file).name in text and f"{told['points']:,} more kept from an earlier run" in text
 
 
 def test_a_failed_tile_is_crossed_out():
-    from pdal_stages.tiling.runpage import page
+    from pdal_stages.reports.runpage import run_page
     from pdal_stages.tiling.tiledrun import Job, TiledRun
 
-    jobs = [
-        Job(
-            (0, 0), "0_0", 5, [], state="done", report={"points": 5, "read": 9, "buffer": 1.0, "seconds": 2.0}
-        )
-    ]
+    report = {"points": 5, "read": 9, "buffer": 1.0, "seconds": 2.0}
+    jobs = [Job((0, 0), "0_0", 5, [], state="done", report=report)]
     jobs.append(Job((1, 0), "10_0", 5, [], state="failed", reason="<odd> & broken"))
     summary = {"tile": 10.0, "points": 5, "states": {"done": 1, "kept": 0, "failed": 1}, "classes": {}}
-    text = page(TiledRun(jobs, [], {}, [], summary))
+    text = run_page(TiledRun(jobs, [], {}, [], summary).to_dict())
     assert text.count("<rect") == 2 and text.count('d="M1.2') == 1
     assert "&lt;odd&gt; &amp; broken" in text and "<odd>" not in text

@@ -202,7 +202,8 @@ def test_unreadable_input(tmp_path, folder, expected):
     (inputs / "east.laz").write_bytes(good[: len(good) // 2])
     stages = pipeline(inputs, tmp_path / "o_#.laz")
     run = run_tiled(stages, 20, workers=0, retries=1)
-    assert any("east.laz" in what and "damaged" in why for what, why in run.failures)
+    ((what, why),) = run.failures  # told once, whatever waits for it
+    assert "east.laz" in what and "damaged" in why and "o_east.laz, o_west.laz" in why
     # West of x = 20 no tile sees the broken file; beside it, neighbors would be missing.
     states = {job.name: job.state for job in run.tiles}
     assert states["0_0"] == states["0_20"] == "done" and states["20_0"] == "failed"

@@ -9,16 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..accuracy.text import percent
-from ..base.asprs import class_color
 from ..base.files import write_whole
-from . import html
-from .accuracypage import footer
+from .charts import Chart
+from .page import render
 
 if TYPE_CHECKING:
     from ..classifier import Model
-
-#: Importances drawn of each grouping.
-MOST = 25
 
 
 def write_model_report(path: str | os.PathLike[str], model: Model, name: str = "") -> Path:
@@ -43,22 +39,24 @@ def write_model_report(path: str | os.PathLike[str], model: Model, name: str = "
 def model_page(model: Model, name: str = "") -> str:
     """The page of :func:`write_model_report` as text."""
     described = model.describe()
-    training = described["training"]
-    kind = described["algorithm"].replace("_", " ")
-    return html.page(
-        f"Model {name}".strip(),
-        _headline(described),
-        _classes(described),
-        _curve(training.get("curve")),
-        _tried(described["accuracy"].get("cross_validation")),
-        _importances(described.get("importances")),
-        html.section("What it is", html.settings(_settings(described), "Model and training")),
-        subtitle=f"{kind}, {len(model.plan.names):,} features of a point",
-        footer=footer(),
+    scores = described["accuracy"]
+    priors = (described.get("priors") or {}).get("factors")
+    return render(
+        "model.html",
+        title=f"Model {name}".strip(),
+        subtitle=f"{described['algorithm'].replace('_', ' ')}, {len(model.plan.names):,} features of a point",
+        model={"importances": None, **described},
+        scores=_scores(described),
+        out_of_bag=(scores.get("out_of_bag") or {}).get("f1") or {},
+        prior_factors=priors,
+        curves=_curves(described["training"].get("curve")),
+        crossed=scores.get("cross_validation"),
+        settings=_settings(described),
     )
 
 
-def _headline(d: Mapping[str, Any]) -> str:
+def _scores(d: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
+    """The headline figures: on the ground held out, cross-validated, or out of bag, whichever there is first."""
     held = d["training"].get("held_out")
     crossed = d["accuracy"].get("cross_validation")
     if isinstance(held, dict) and held:
@@ -68,129 +66,60 @@ def _headline(d: Mapping[str, Any]) -> str:
     elif d["accuracy"].get("out_of_bag"):
         row, remark = d["accuracy"]["out_of_bag"], "out of bag, flattered by neighboring samples"
     else:
-        return ""
-    figures = [
-        (title, percent(_number(row.get(key)), 1), "%", remark)
-        for title, key in (
-            ("Overall accuracy", "overall_accuracy"),
-            ("Kappa", "kappa"),
-            ("Mean F1", "mean_f1"),
-        )
+        return []
+    titles = {"overall_accuracy": "Overall accuracy", "kappa": "Kappa", "mean_f1": "Mean F1"}
+    return [
+        (title, percent(_finite_number(row.get(key)), 1), "%", remark if key == "overall_accuracy" else "")
+        for key, title in titles.items()
     ]
-    return html.section("At training", html.tiles(figures))
 
 
-def _classes(d: Mapping[str, Any]) -> str:
-    f1 = (d["accuracy"].get("out_of_bag") or {}).get("f1") or {}
-    header = ["Class", "Labels", "Points there were", "Samples", "Counted again", "F1 out of bag, %"]
-    rows = [
-        html.head(f"{c['code']} {c['name']}", "row", "text", html.swatch(class_color(c["code"])))
-        + html.cell(_listed(c["labels"]), "break")
-        + html.cell(f"{c['available']:,}")
-        + html.cell(f"{c['samples']:,}")
-        + html.cell(f"{c['duplicates']:,}")
-        + html.cell(percent(f1.get(str(c["code"])), 1))
-        for c in d["classes"]
-    ]
-    return html.section("Classes", html.table(header, rows, "What each class was trained on"))
-
-
-def _listed(labels: list[int], most: int = 12) -> str:
-    shown = ", ".join(map(str, labels[:most]))
-    return shown if len(labels) <= most else f"{shown} and {len(labels) - most} more"
-
-
-def _curve(rows: Any) -> str:
-    """Loss, and the scores on the ground held out, epoch by epoch."""
+def _curves(rows: Any) -> list[Chart]:
+    """Loss, and the mean F1 on the ground held out, epoch by epoch."""
     rows = [r for r in rows if isinstance(r, dict)] if isinstance(rows, list) else []
     charts = []
-    for key, title, share in (("loss", "Loss", False), ("mean_f1", "Mean F1 on the ground held out", True)):
-        pairs = [(_number(r.get("epoch")), _number(r.get(key))) for r in rows]
+    for key, title in (("loss", "Loss"), ("mean_f1", "Mean F1 on the ground held out")):
+        pairs = [(_finite_number(r.get("epoch")), _finite_number(r.get(key))) for r in rows]
         points = [(a, b) for a, b in pairs if a is not None and b is not None]
         if len(points) > 1:
-            charts.append(_chart(points, title, share))
-    if not charts:
-        return ""
-    return html.section(
-        "Training", html.grid(*charts), note="The weights kept are those of the epoch with the best mean F1."
-    )
+            charts.append(_curve(points, title, is_share=key == "mean_f1"))
+    return charts
 
 
-def _chart(points: list[tuple[float, float]], title: str, share: bool) -> str:
+def _curve(points: list[tuple[float, float]], title: str, is_share: bool) -> Chart:
     last = points[-1][0]
-    most = 1.0 if share else max(b for _, b in points) or 1.0
-    best = (max if share else min)(points, key=lambda p: p[1])
+    most = 1.0 if is_share else max(b for _, b in points) or 1.0
+    best = (max if is_share else min)(points, key=lambda p: p[1])
     step = max(1, math.ceil(last / 6))
-    said = f"{100 * best[1]:.1f} %" if share else f"{best[1]:.4g}"
-    return html.figure(
-        html.chart(
-            alt=f"{title} over {len(points)} epochs; best {said} in epoch {best[0]:g}",
-            x_label="Epoch",
-            y_label=f"{title}, %" if share else title,
-            x=(0.0, last),
-            y=(0.0, most),
-            x_ticks=[(float(e), str(e)) for e in range(0, int(last) + 1, step)],
-            y_ticks=[(most * i / 5, f"{20 * i}" if share else f"{most * i / 5:.2g}") for i in range(6)],
-            lines=[(points, "line")],
-            dots=[(*best, f"epoch {best[0]:g}: {said}")],
-        ),
-        f"Best: {said} in epoch {best[0]:g}.",
-        title,
+    said = f"{100 * best[1]:.1f} %" if is_share else f"{best[1]:.4g}"
+    return Chart(
+        heading=title,
+        caption=f"Best: {said} in epoch {best[0]:g}.",
+        alt=f"{title} over {len(points)} epochs; best {said} in epoch {best[0]:g}",
+        x_label="Epoch",
+        y_label=f"{title}, %" if is_share else title,
+        x=(0.0, last),
+        y=(0.0, most),
+        x_ticks=[(float(e), str(e)) for e in range(0, int(last) + 1, step)],
+        y_ticks=[(most * i / 5, f"{20 * i}" if is_share else f"{most * i / 5:.2g}") for i in range(6)],
+        lines=[(points, "line")],
+        dots=[(*best, f"epoch {best[0]:g}: {said}")],
     )
-
-
-def _tried(crossed: Mapping[str, Any] | None) -> str:
-    if not crossed:
-        return ""
-    rows = [
-        html.head(f"{r['trees']:,}", "row", "text")
-        + html.cell("unlimited" if r["max_depth"] is None else r["max_depth"])
-        + html.cell(f"{r['min_samples_leaf']:,}")
-        + "".join(html.cell(percent(r[k], 2)) for k in ("overall_accuracy", "kappa", "mean_f1"))
-        for r in crossed["tried"]
-    ]
-    header = ["Trees", "Depth", "Least samples of a leaf", "Overall accuracy, %", "Kappa, %", "Mean F1, %"]
-    note = (
-        f"{crossed['folds']} folds of blocks of {crossed['block_size']:g} m with a gap of {crossed['gap']:g} m "
-        "between training and validation, so that no point has neighbors on the other side."
-    )
-    return html.section("Tried in cross-validation", html.table(header, rows, "Scores"), note=note)
-
-
-def _importances(groups: Mapping[str, Mapping[str, float]] | None) -> str:
-    if not groups:
-        return ""
-    figures = [
-        html.figure(html.bars(dict(list(groups[by].items())[:MOST])), "", f"By {by}")
-        for by in ("neighborhood", "group", "feature")
-        if by in groups
-    ]
-    note = "Share of the decrease in impurity over all trees."
-    return html.section("Importances", html.grid(*figures), note=note)
 
 
 def _settings(d: Mapping[str, Any]) -> dict[str, Any]:
-    keep = (
-        "algorithm",
-        "parameters",
-        "features",
-        "required_dimensions",
-        "strategy",
-        "target",
-        "priors",
-        "created_by",
-    )
+    keep = ("algorithm", "parameters", "features", "required_dimensions", "strategy", "target", "created_by")
     out = {key: d[key] for key in keep if d.get(key) is not None}
+    if d.get("priors"):
+        out["prior_weight"] = d["priors"].get("weight")
     training = {k: v for k, v in d["training"].items() if k not in ("curve", "clouds", "held_out")}
     clouds = [f"{c['name']} ({c['points']:,} points)" for c in d["training"].get("clouds", [])]
-    return {**out, "training": {"clouds": _listed_names(clouds), **training}}
+    if len(clouds) > 20:
+        clouds = [*clouds[:20], f"and {len(clouds) - 20} more"]
+    return {**out, "training": {"clouds": clouds, **training}}
 
 
-def _listed_names(names: list[str], most: int = 20) -> list[str]:
-    return names if len(names) <= most else [*names[:most], f"and {len(names) - most} more"]
-
-
-def _number(value: Any) -> float | None:
+def _finite_number(value: Any) -> float | None:
     """A finite number, or None: the manifest's free parts may hold anything."""
     good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
     return float(value) if good else None

@@ -180,6 +180,6 @@ def _write_report(name: str, run: TiledRun) -> None:
         except StageError as error:
             raise error.at("--report") from None
         return
-    from .runpage import write_report
+    from ..reports.runpage import write_run_report
 
-    write_report(name, run)
+    write_run_report(name, run.to_dict())

@@ -56,6 +56,8 @@ class Job:
     report : dict
     reason : str
         Why it failed.
+    blocked_by : str
+        The unreadable input that it failed for, where that is the reason.
     """
 
     tile: tuple[int, int]
@@ -66,6 +68,7 @@ class Job:
     state: str = "waiting"
     report: dict[str, Any] = field(default_factory=dict)
     reason: str = ""
+    blocked_by: str = ""
     tries: int = 0
 
 
@@ -80,6 +83,7 @@ class Output:
     state: str = "waiting"
     report: dict[str, Any] = field(default_factory=dict)
     reason: str = ""
+    blocked_by: str = ""
     tries: int = 0
 
 
@@ -108,11 +112,25 @@ class TiledRun:
 
     @property
     def failures(self) -> list[tuple[str, str]]:
-        """What failed, and why: inputs, tiles, outputs."""
-        found = [(path, reason) for path, reason in self.unreadable.items()]
-        found += [(f"tile {job.name}", job.reason) for job in self.tiles if job.state == "failed"]
-        found += [(str(out.paths[0]), out.reason) for out in self.outputs if out.state == "failed"]
-        return found
+        """What failed, and why: inputs with all that waits for them, then other tiles and outputs."""
+        found = [
+            (path, reason.removeprefix(f"{path}: ") + self._blocked_by(path))
+            for path, reason in self.unreadable.items()
+        ]
+        found += [
+            (f"tile {t.name}", t.reason) for t in self.tiles if t.state == "failed" and not t.blocked_by
+        ]
+        return found + [
+            (str(o.paths[0]), o.reason) for o in self.outputs if o.state == "failed" and not o.blocked_by
+        ]
+
+    def _blocked_by(self, path: str) -> str:
+        """What was not made because an input cannot be read, in words."""
+        tiles = sum(job.blocked_by == path for job in self.tiles)
+        outputs = [out.paths[0].name for out in self.outputs if out.blocked_by == path]
+        parts = [f"{tiles} tile{'s' * (tiles != 1)} there"] if tiles else []
+        parts += [*outputs[:5], *([f"{len(outputs) - 5} more outputs"] if len(outputs) > 5 else [])]
+        return f" (not made because of it: {', '.join(parts)})" if parts else ""
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON-able report."""
@@ -188,6 +206,7 @@ class _Run:
         self.plan, self.options, self.show = plan, options, progress
         self.grid = Grid(options.tile)
         self.started = time.monotonic()
+        self.date = time.strftime("%Y-%m-%d %H:%M")
         self.notes = list(plan.notes)
         self.unreadable: dict[str, str] = {}
         self.sources = find_sources(plan.readers)
@@ -217,9 +236,10 @@ class _Run:
             raise self._none_readable()
         lost = len(self.sources) - len(found)
         if lost:
+            which = "1 input has" if lost == 1 else f"{lost} inputs have"
             self.notes.append(
-                f"{lost} inputs have no readable header, so nobody knows where they lie: tiles beside "
-                "them may lack neighbors. Once they can be read, --resume runs those tiles again"
+                f"{which} no readable header, so its place is not known: tiles beside it may lack neighbors. Once "
+                "it can be read, --resume runs those tiles again"
             )
         return found
 
@@ -393,7 +413,8 @@ class _Run:
             job = Job(tile, self.grid.name(tile), counts[tile], near)
             bad = [s.path for s in near if s.path in self.unreadable]
             if bad:
-                job.state, job.reason = "failed", f"an input here cannot be read: {self.unreadable[bad[0]]}"
+                job.state, job.blocked_by = "failed", bad[0]
+                job.reason = f"an input here cannot be read: {bad[0]}"
             jobs.append(job)
         for job in jobs:
             job.mark = fingerprint(
@@ -432,7 +453,8 @@ class _Run:
             if source.path in self.index:
                 out.jobs = [by_tile[i, j] for i, j, _ in self.index[source.path]["tiles"]]
             if source.path in self.unreadable:
-                out.state, out.reason = "failed", f"its input cannot be read: {source.path}"
+                out.state, out.blocked_by = "failed", source.path
+                out.reason = f"its input cannot be read: {source.path}"
             out.mark = fingerprint(
                 source.path,
                 source.stamp(),
@@ -527,11 +549,10 @@ class _Run:
             return
         failed = [job for job in out.jobs if job.state == "failed"]
         if failed:
-            out.state, out.reason = (
-                "failed",
-                f"tile {failed[0].name} failed"
-                + (f", and {len(failed) - 1} more of its tiles" if len(failed) > 1 else ""),
-            )
+            others = f", and {len(failed) - 1} more of its tiles" if len(failed) > 1 else ""
+            out.state, out.reason = "failed", f"tile {failed[0].name} failed{others}"
+            if all(job.blocked_by for job in failed):
+                out.blocked_by = failed[0].blocked_by
         else:
             out.state = "ready"
             waiting.appendleft(out)
@@ -589,6 +610,11 @@ class _Run:
     def _shown(self) -> bool | None:
         return self.show
 
+    def _what(self) -> dict[str, Any]:
+        """The pipeline, its models and the date, for the report."""
+        models = [str(stage["model"]) for stage in self.plan.head if "model" in stage]
+        return {"pipeline": self.plan.name, "models": models, "started": self.date}
+
     @staticmethod
     def _label(done: int, total: int) -> str:
         return f"{done} of {total} tiles"
@@ -611,6 +637,7 @@ class _Run:
         reports = [job.report for job in worked] + [out.report for out in outputs]
         peaks = [report.get("peak_mb", 0.0) for report in reports]
         summary = {
+            **self._what(),
             "tile": self.grid.size,
             "buffer_metres": self.halo,
             "metres_per_unit": self.unit,
@@ -657,6 +684,7 @@ class _Run:
         side = self.grid.size + 2 * self.halo / self.unit
         read = min(count, round(density * side * side))
         summary = {
+            **self._what(),
             "tile": self.grid.size,
             "buffer_metres": self.halo,
             "metres_per_unit": self.unit,

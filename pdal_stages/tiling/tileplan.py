@@ -78,6 +78,10 @@ class TilePlan:
         Dimensions the head changes; None where PDAL's filters in it make that unknown.
     unit : str
         `horizontal_unit` of our stages, empty for the spatial reference's.
+    notes : list of str
+        What the user should know.
+    name : str
+        The pipeline's file, or what else its source is called.
     """
 
     readers: list[dict[str, Any]]
@@ -87,6 +91,7 @@ class TilePlan:
     creates: list[str] | None
     unit: str = ""
     notes: list[str] = field(default_factory=list)
+    name: str = ""
 
     @property
     def writers(self) -> list[dict[str, Any]]:
@@ -135,7 +140,9 @@ def make_plan(source: Any, overrides: Iterable[Override], options: TilingOptions
             "filters of PDAL that look at neighbors were given --buffer; whether it suffices for a seamless result "
             "only they know"
         )
-    return TilePlan(readers, ready, [*tail, *writers], sum(reaches), creates, unit, notes)
+    return TilePlan(
+        readers, ready, [*tail, *writers], sum(reaches), creates, unit, notes, pipeline.source.name
+    )
 
 
 def _object(stage: Any, index: int, count: int) -> dict[str, Any]:

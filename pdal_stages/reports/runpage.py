@@ -1,0 +1,143 @@
+"""The report of a tiled run as one self-contained HTML page, made from what the run's JSON report holds."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ..base.asprs import class_name
+from ..base.files import write_whole
+from .page import duration, render
+
+#: Most tiles drawn, and most rows of the table of times.
+DRAWN, ROWS = 20_000, 200
+#: Settings shown, by their names in the report.
+_SETTINGS = {
+    "pipeline": "pipeline",
+    "models": "models",
+    "started": "started",
+    "inputs": "input files",
+    "bounds": "extent of the inputs",
+    "tile": "side of the tiles",
+    "buffer_metres": "surroundings, m",
+    "metres_per_unit": "metres per unit",
+    "per": "one output for each",
+    "workers": "workers",
+    "threads_per_worker": "threads of a worker",
+    "points_read": "points read with surroundings",
+    "points_read_by_a_tile": "points read for a tile",
+    "cpu_seconds": "processor time",
+}
+
+
+def write_run_report(path: str | os.PathLike[str], run: Mapping[str, Any]) -> Path:
+    """Write the page of :func:`run_page`, whole or not at all.
+
+    Raises
+    ------
+    StageError
+        If it cannot be written.
+    """
+    return write_whole(path, run_page(run).encode())
+
+
+def run_page(run: Mapping[str, Any], title: str = "Run in tiles") -> str:
+    """The page about a tiled run.
+
+    Parameters
+    ----------
+    run : mapping
+        What ``TiledRun.to_dict`` gives.
+    title : str
+    """
+    done = sorted((t for t in run["tiles"] if t["state"] == "done"), key=lambda t: -t["seconds"])
+    classes = run.get("classes") or {}
+    pipeline = f"{Path(run['pipeline']).name}, " if run.get("pipeline") else ""
+    return render(
+        "run.html",
+        title=title,
+        subtitle=f"{pipeline}{len(run['tiles']):,} tiles of {run['tile']:g}",
+        run=run,
+        figures=_figures(run),
+        what=_what(run),
+        plan=_plan(run["tiles"][:DRAWN], run["tile"]),
+        classes=[(int(code), class_name(int(code)), count) for code, count in classes.items()],
+        slowest=[(t, _corner(t["tile"], run["tile"])) for t in done[:ROWS]],
+        done=len(done),
+    )
+
+
+def _figures(run: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
+    """The headline: what this run did, and what it kept."""
+    states = run["states"]
+    named = {"kept": "kept from an earlier run", "failed": "failed", "waiting": "to do"}
+    rest = ", ".join(f"{states[k]:,} {text}" for k, text in named.items() if states.get(k))
+    tiles = f"{states['done']:,}" if "done" in states else f"{len(run['tiles']):,}"
+    kept = sum(t["points"] for t in run["tiles"] if t["state"] == "kept")
+    remarks = [f"{kept:,} more kept from an earlier run"] if kept else []
+    if run.get("dropped"):
+        remarks.append(f"{run['dropped']:,} dropped by filters")
+    points = run.get("points", 0)
+    size, unit = (f"{points:,}", "") if points < 10_000_000 else (f"{points / 1e6:,.1f}", "million")
+    out = [("Tiles", tiles, "", rest), ("Points", size, unit, "; ".join(remarks))]
+    if "seconds" in run:
+        out.append(("Time", duration(run["seconds"]), "", f"{run['workers']} workers"))
+        out.append(("Speed", f"{run['points_per_second']:,.0f}", "points/s", ""))
+        out.append(("Most memory of a worker", f"{run['peak_mb_of_a_worker']:,.0f}", "MB", ""))
+    return out
+
+
+def _what(run: Mapping[str, Any]) -> dict[str, Any]:
+    shown = {name: run[key] for key, name in _SETTINGS.items() if run.get(key) not in (None, "", [])}
+    if run.get("bounds"):
+        x0, y0, x1, y1 = run["bounds"]
+        shown[_SETTINGS["bounds"]] = f"x {x0:.2f} to {x1:.2f}, y {y0:.2f} to {y1:.2f}"
+    if "cpu_seconds" in run:
+        shown[_SETTINGS["cpu_seconds"]] = duration(run["cpu_seconds"])
+    return {key: f"{value:,}" if isinstance(value, int) else value for key, value in shown.items()}
+
+
+def _corner(tile: Sequence[int], side: float, right: int = 0, up: int = 0) -> str:
+    """The coordinates of a tile's lower left corner, or of another one."""
+    return f"{(tile[0] + right) * side:.10g}, {(tile[1] + up) * side:.10g}"
+
+
+def _plan(tiles: Sequence[Mapping[str, Any]], side: float) -> dict[str, Any] | None:
+    """Every tile as a square: darker took longer."""
+    if not tiles:
+        return None
+    columns, rows = zip(*(t["tile"] for t in tiles), strict=True)
+    left, low, right, top = min(columns), min(rows), max(columns), max(rows)
+    slowest = max((t["seconds"] for t in tiles if t["state"] == "done"), default=0.0)
+
+    def square(t: Mapping[str, Any]) -> dict[str, Any]:
+        seconds = t.get("seconds") if t["state"] == "done" else None
+        return {
+            "x": t["tile"][0] - left,
+            "y": top - t["tile"][1],
+            "name": t["name"],
+            "state": t["state"],
+            "corner": _corner(t["tile"], side),
+            "points": t["points"],
+            "seconds": seconds,
+            "shade": f"{0.25 + 0.75 * (seconds / slowest if slowest else 0.0):.2f}"
+            if seconds is not None
+            else "",
+            "reason": t.get("reason", ""),
+        }
+
+    wide, high = right - left + 1, top - low + 1
+    return {
+        "wide": wide,
+        "high": high,
+        "pixels": min(820, max(240, wide * 60)),
+        "tiles": [square(t) for t in tiles],
+        "failed": sum(t["state"] == "failed" for t in tiles),
+        "slowest": slowest,
+        "upper_left": _corner((left, top), side, up=1),
+        "upper_right": _corner((right, top), side, right=1, up=1),
+        "lower_left": _corner((left, low), side),
+        "lower_right": _corner((right, low), side, right=1),
+    }
