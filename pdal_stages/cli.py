@@ -85,7 +85,7 @@ def _unforeseen(error: Exception) -> StageError:
 
 
 def _end_at_once(options: argparse.Namespace) -> None:
-    """Ctrl-C ends the program although PDAL works: Python hears nothing meanwhile. Files are removed all the same."""
+    """Ctrl-C ends the program although PDAL works: Python hears nothing meanwhile. The next run sweeps up."""
     if options.is_program and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
@@ -325,7 +325,8 @@ def _train(options: argparse.Namespace) -> None:
     _end_at_once(options)
     pipeline.execute(arrays=False)
     _after(pipeline, None)
-    print(load_model(options.model))
+    if Path(options.model).is_file():  # not written into a pipe or device
+        print(load_model(options.model))
 
 
 def _accuracy(options: argparse.Namespace) -> None:

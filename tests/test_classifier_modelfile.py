@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.ensemble import RandomForestClassifier
 
-from pdal_stages.base.errors import ModelError
+from pdal_stages.base.errors import ModelError, StageError
 from pdal_stages.classifier import modelfile
 from pdal_stages.classifier.algorithms import algorithm
 from pdal_stages.classifier.arrays import ArrayRule, from_bytes, to_bytes
@@ -122,14 +122,14 @@ def test_same_model_same_bytes(tmp_path):
 def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, good, monkeypatch):
     before = good.read_bytes()
     monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
-    with pytest.raises(ModelError, match="disk full"):
+    with pytest.raises(StageError, match="disk full"):
         modelfile.write(good, manifest(), forest(1)[0].arrays())
     assert good.read_bytes() == before
     assert os.listdir(tmp_path) == ["good.model"]
 
 
 def test_a_folder_that_is_not_there(tmp_path):
-    with pytest.raises(ModelError, match="cannot be written"):
+    with pytest.raises(StageError, match="folder of the model file does not exist"):
         modelfile.write(tmp_path / "no" / "m.model", manifest(), forest()[0].arrays())
 
 

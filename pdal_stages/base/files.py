@@ -1,31 +1,328 @@
-"""Output files appear whole or not at all: written beside, then renamed."""
+"""Output files appear whole or not at all: written in a hidden folder beside their place, then renamed.
+
+The hidden folder has a random name, only its owner may enter it, and it is locked while its writer lives. What a killed
+writer left is therefore known to be dead, and goes when the next file is written to the same place.
+
+* An existing file is replaced; the new one takes over its mode, and its owner where that may be given.
+* A link is followed: the file it leads to is replaced, the link stays.
+* A device, pipe or terminal (``/dev/stdout``) is written into, once all is there.
+* A write-protected file, a folder, a socket and a block device are refused.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
+import shutil
+import stat
 import sys
 import tempfile
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 from .errors import StageError
 from .las import is_short
 
-
-def partial_name(path: str | os.PathLike) -> Path:
-    """A hidden name beside `path`, unique to this process, with the same suffix.
-
-    Writers choose their format by the suffix, so it stays.
-    """
-    path = Path(path)
-    tail = f".partial-{os.getpid()}{path.suffix}"
-    stem = path.stem
-    while len(f".{stem}{tail}".encode(errors="surrogateescape")) > _LONGEST_NAME and "#" not in stem[-1:]:
-        stem = stem[:-1]
-    return path.with_name(f".{stem}{tail}")
-
-
+#: How the hidden folders' names begin, and what the file in them is called that their writer holds locked.
+PREFIX, _LOCK = ".pdal-stages-partial-", ".lock"
+#: Seconds after which a hidden folder without that file is no longer taken for one just made.
+_GRACE = 3600.0
 #: Bytes a file's name may have, on every usual file system.
 _LONGEST_NAME = 255
+_swept: set[str] = set()
+
+
+# ---- before the work ---------------------------------------------------------------------------------------
+
+
+def check_writable(path: str | os.PathLike, what: str = "output") -> None:
+    """Refuse an output that cannot be written, before any work is done.
+
+    Raises
+    ------
+    StageError
+        If its folder is missing or read-only, its name is too long, or there is something that must not be replaced.
+    """
+    name = Path(path)
+    if is_stream(name):
+        if not os.access(name, os.W_OK) or stat.S_IFMT(os.stat(name).st_mode) in (
+            stat.S_IFBLK,
+            stat.S_IFSOCK,
+        ):
+            raise StageError(f"the {what} file is a device that cannot be written to", found=str(path))
+        return
+    real = _real(name)
+    if len(real.name.encode(errors="surrogateescape")) > _LONGEST_NAME:
+        raise StageError(f"the name of the {what} file is longer than {_LONGEST_NAME} bytes", found=str(path))
+    if not real.parent.is_dir():
+        cure = "Create it first"
+        if not str(real.parent).isascii() and sys.getfilesystemencoding() != "utf-8":
+            cure = f"Set PYTHONUTF8=1: this locale's file names are {sys.getfilesystemencoding()}"
+        raise StageError(f"the folder of the {what} file does not exist", found=str(real.parent), cure=cure)
+    if real.is_symlink():
+        raise StageError(f"the {what} file is a link that leads to itself", found=str(path))
+    if real.is_dir():
+        raise StageError(f"the {what} file names a folder", found=str(path), cure="Give a file name")
+    if not os.access(real.parent, os.W_OK):
+        raise StageError(f"the folder of the {what} file cannot be written to", found=str(real.parent))
+    if real.exists() and not (os.access(real, os.W_OK) and real.stat().st_mode & 0o222):
+        raise StageError(
+            f"the {what} file is write-protected",
+            found=str(path),
+            cure="Give another name, or change its mode",
+        )
+
+
+def is_stream(path: str | os.PathLike) -> bool:
+    """Whether a name stands for something to write into: a device, a pipe, or what this process has open."""
+    try:
+        kind = stat.S_IFMT(os.stat(path).st_mode)
+        return kind not in (stat.S_IFREG, stat.S_IFDIR) or (kind == stat.S_IFREG and _is_open(path))
+    except (OSError, ValueError):
+        return False
+
+
+def _is_open(path: str | os.PathLike) -> bool:
+    """Whether links lead to the system's list of open files, as ``/dev/stdout`` does."""
+    name = os.path.abspath(path)
+    for _ in range(40):
+        folder = os.path.realpath(os.path.dirname(name))
+        if folder.startswith(("/proc/", "/dev/fd")):
+            return True
+        if not os.path.islink(name):
+            return False
+        name = os.path.join(folder, os.readlink(name))
+    return False
+
+
+def _real(path: Path) -> Path:
+    """The file that a name leads to."""
+    try:
+        return Path(os.path.realpath(path))
+    except (OSError, ValueError):
+        return path.absolute()
+
+
+# ---- writing -----------------------------------------------------------------------------------------------
+
+
+def write_whole(path: str | os.PathLike, content: bytes, what: str = "output") -> Path:
+    """Write a file so that it is either complete or absent; its path.
+
+    Raises
+    ------
+    StageError
+        If it cannot be written; what was there before stays.
+    """
+    with whole_files(path, what=what) as (partial,), open(partial, "xb") as file:
+        file.write(content)
+    return Path(path)
+
+
+@contextlib.contextmanager
+def whole_files(
+    *paths: str | os.PathLike, what: str = "output", check: Callable[[Path, Path], None] | None = None
+) -> Iterator[list[Path]]:
+    """Give files to write to; on leaving, all of them get their names, or after an exception none.
+
+    Parameters
+    ----------
+    *paths : path
+        Where the files shall be. A name that holds '#' may become any number of files, as PDAL's writers
+        number them; files that a writer makes beside its own go with it.
+    what : str
+        What messages call them.
+    check : callable, optional
+        Called with each file that was written and the name it is to get, before any of them gets its name.
+
+    Yields
+    ------
+    list of Path
+        The same names in other folders. Nothing exists there yet.
+
+    Raises
+    ------
+    StageError
+        If a file cannot be written, or was not. Errors that come from inside name the true file, not the hidden one.
+    """
+    places: list[_Place] = []
+    inside = False
+    try:
+        for path in paths:
+            check_writable(path, what)
+            places.append(_Place(Path(path)))
+        inside = True
+        yield [place.partial for place in places]
+        inside = False
+        moves = [move for place in places for move in place.made()]
+        for made, target in moves:
+            check_writable(target, what)
+            if check is not None:
+                check(made, target)
+        for made, target in moves:
+            _give_name(made, target)
+    except StageError as error:
+        for place in places:
+            if isinstance(error.found, str):
+                error.found = error.found.replace(str(place.partial), str(place.path))
+            if error.cure is None and disk_is_full(place.folder):
+                error.cure = f"The disk of {place.path} is full: make room"
+        raise
+    except OSError as error:
+        named = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else ""
+        at = next((p.path for p in places if named.startswith(str(p.folder))), None)
+        if inside and named and at is None:  # of something that was read
+            raise
+        raise StageError(
+            f"the {what} file could not be written",
+            found=f"{at or paths[-1]}: {error.strerror or error}",
+            cure="Make room on the disk"
+            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+            else None,
+        ) from error
+    finally:
+        for place in places:
+            place.close()
+
+
+class _Place:
+    """A hidden folder in which one output is written.
+
+    Attributes
+    ----------
+    path : Path
+        The output's name as it was given.
+    folder, partial : Path
+        The hidden folder, and the file in it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        stream = is_stream(path)
+        parent = Path(tempfile.gettempdir()) if stream else _real(path).parent
+        if str(parent) not in _swept:
+            _swept.add(str(parent))
+            sweep(parent)
+        self.folder, self._lock = _locked_folder(parent)
+        self.partial = self.folder / path.name
+
+    def made(self) -> list[tuple[Path, Path]]:
+        """Files that were written, and the names they are to get."""
+        found = sorted(self.folder / name for name in os.listdir(self.folder) if name != _LOCK)
+        if self.partial not in found and "#" not in self.path.name:
+            raise StageError("the writer wrote no file", found=str(self.path))
+        return [(f, self.path if f == self.partial else self.path.with_name(f.name)) for f in found]
+
+    def close(self) -> None:
+        """Remove the folder and whatever it holds."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self._lock.close()
+
+
+def _give_name(made: Path, target: Path) -> None:
+    """Move a file to its place, or write it into what is there."""
+    if is_stream(target):
+        with open(made, "rb") as file:
+            _pour(file, target)
+        return
+    real = _real(target)
+    with contextlib.suppress(FileNotFoundError):
+        older = real.stat()
+        if hasattr(os, "chown") and (older.st_uid, older.st_gid) != (os.geteuid(), os.getegid()):
+            with contextlib.suppress(OSError):
+                os.chown(made, older.st_uid, older.st_gid)
+        os.chmod(made, stat.S_IMODE(older.st_mode))
+    os.replace(made, real)
+
+
+def _pour(file: Any, target: Path) -> None:
+    """Write a file into a device, a pipe, or what this process has open, at the place where that stands."""
+    there = os.stat(target)
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(AttributeError, OSError, ValueError):
+            if os.path.samestat(os.fstat(stream.fileno()), there):
+                stream.flush()
+                with open(stream.fileno(), "wb", closefd=False) as out:
+                    shutil.copyfileobj(file, out)
+                return
+    with open(os.open(target, os.O_WRONLY | os.O_APPEND), "wb") as out:
+        shutil.copyfileobj(file, out)
+
+
+# ---- hidden folders ----------------------------------------------------------------------------------------
+
+
+def _locked_folder(parent: Path) -> tuple[Path, Any]:
+    """A new folder that only we may enter, and the open file that says we live."""
+    while True:
+        folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent))
+        try:
+            lock = open(folder / _LOCK, "x+b")  # noqa: SIM115  open as long as the folder is
+        except FileNotFoundError:  # swept before it was locked
+            continue
+        except OSError:
+            folder.rmdir()
+            raise
+        with contextlib.suppress(OSError):  # a file system without locks: nothing is swept there
+            if not try_lock(lock) or not (folder / _LOCK).exists():
+                lock.close()
+                continue
+        return folder, lock
+
+
+def sweep(folder: str | os.PathLike) -> None:
+    """Remove what writers that live no more left in a folder; other users' and live writers' files stay."""
+    with contextlib.suppress(OSError):
+        for name in os.listdir(folder):
+            if name.startswith(PREFIX):
+                _remove_dead(Path(folder, name))
+
+
+def _remove_dead(folder: Path) -> None:
+    with contextlib.suppress(OSError):
+        found = os.lstat(folder)
+        if not stat.S_ISDIR(found.st_mode) or (hasattr(os, "geteuid") and found.st_uid != os.geteuid()):
+            return
+        try:
+            lock = os.fdopen(os.open(folder / _LOCK, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0)), "r+b")
+        except FileNotFoundError:
+            if time.time() - found.st_mtime > _GRACE:
+                shutil.rmtree(folder, ignore_errors=True)
+            return
+        with lock:
+            if try_lock(lock):
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+def try_lock(file: Any) -> bool:
+    """Lock an open file until it is closed or this process ends; False where another has it locked.
+
+    Raises
+    ------
+    OSError
+        If the file system has no locks.
+    """
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        import msvcrt
+
+        try:
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
+        except OSError:
+            return False
+        return True
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+# ---- what was written --------------------------------------------------------------------------------------
 
 
 def check_complete(path: str | os.PathLike, name: str | os.PathLike) -> None:
@@ -64,52 +361,3 @@ def disk_is_full(path: str | os.PathLike) -> bool:
         return hasattr(os, "statvfs") and os.statvfs(path).f_bavail == 0
     except OSError:
         return False
-
-
-def check_writable(path: str | os.PathLike, what: str = "output") -> None:
-    """Refuse an output path whose folder is missing or read-only, before any work is done."""
-    folder = Path(path).absolute().parent
-    if len(Path(path).name.encode(errors="surrogateescape")) > _LONGEST_NAME:
-        raise StageError(f"the name of the {what} file is longer than {_LONGEST_NAME} bytes", found=str(path))
-    if not folder.is_dir():
-        cure = "Create it first"
-        if not str(folder).isascii() and sys.getfilesystemencoding() != "utf-8":
-            cure = f"Set PYTHONUTF8=1: this locale's file names are {sys.getfilesystemencoding()}"
-        raise StageError(f"the folder of the {what} file does not exist", found=str(folder), cure=cure)
-    if Path(path).is_dir():
-        raise StageError(f"the {what} file names a folder", found=str(path), cure="Give a file name")
-    if not os.access(folder, os.W_OK):
-        raise StageError(f"the folder of the {what} file cannot be written to", found=str(folder))
-
-
-def write_whole(path: str | os.PathLike, content: bytes) -> Path:
-    """Write a file so that it is either complete or absent; its path.
-
-    Raises
-    ------
-    StageError
-        If it cannot be written; nothing is left under the final name.
-    """
-    path = Path(path)
-    check_writable(path)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.absolute().parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.chmod(name, 0o666 & ~_umask())
-        os.replace(name, path)
-    except OSError as error:
-        Path(name).unlink(missing_ok=True)
-        raise StageError(
-            "the file could not be written", found=f"{path}: {error.strerror or error}"
-        ) from error
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-    return path
-
-
-def _umask() -> int:
-    current = os.umask(0)
-    os.umask(current)
-    return current

@@ -21,6 +21,7 @@ from typing import Any
 import numpy.typing as npt
 
 from ..base.errors import ModelError, StageError
+from ..base.files import whole_files
 from .arrays import ArrayRule, from_bytes, to_bytes
 
 FORMAT = "pdal-stages model"
@@ -77,28 +78,23 @@ def write(
     text = json.dumps(whole, indent=1, ensure_ascii=False, allow_nan=False).encode() + b"\n"
     if len(text) > MANIFEST_LIMIT:
         raise ModelError("the manifest is too large", found=f"{len(text):,} bytes")
-    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        try:
-            with open(beside, "xb") as stream:
-                with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
-                    for name, data in ((MANIFEST, text), *members.items()):
-                        info = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
-                        info.compress_type = zipfile.ZIP_DEFLATED
-                        info.external_attr = 0o644 << 16
-                        archive.writestr(info, data)
-                stream.flush()
-                if stream.tell() > FILE_LIMIT:
-                    raise ModelError(
-                        "the model is larger than 4 GiB",
-                        cure="Raise min_samples_leaf or lower the number of trees",
-                    )
-                os.fsync(stream.fileno())
-            os.replace(beside, path)
-        finally:
-            beside.unlink(missing_ok=True)
-    except (OSError, zipfile.LargeZipFile) as error:
-        raise ModelError("the model file cannot be written", where=str(path), found=error) from error
+        with (
+            whole_files(path, what="model") as (partial,),
+            zipfile.ZipFile(partial, "x", zipfile.ZIP_DEFLATED, allowZip64=False, compresslevel=6) as archive,
+        ):
+            for name, data in ((MANIFEST, text), *members.items()):
+                info = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
+                info.compress_type = zipfile.ZIP_DEFLATED
+                info.external_attr = 0o644 << 16
+                archive.writestr(info, data)
+    except zipfile.LargeZipFile as error:
+        raise ModelError(
+            "the model is larger than 4 GiB",
+            where=str(path),
+            found=error,
+            cure="Raise min_samples_leaf or lower the number of trees",
+        ) from error
 
 
 # ---- reading -----------------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import glob
 import json
 import os
@@ -12,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import InterruptedStage, PipelineError, StageError
-from ..base.files import check_complete, check_writable, disk_is_full, partial_name
+from ..base.files import check_complete, check_writable, whole_files
 from ..base.las import check_readable, odd_text, supersede_copc
-from ..base.leftovers import removed_if_killed
 from ..stages import registry
 from . import pdal as pdal_env
 from . import runtime
@@ -77,7 +75,7 @@ class Pipeline:
     def execute(self, *, arrays: bool = True) -> int:
         """Run the pipeline in this process; the number of points that came out.
 
-        Files are written under a hidden name and renamed at the end, so an output is whole
+        Files are written in hidden folders and renamed at the end, so an output is whole
         or absent, and an older one stays if the run fails.
 
         Raises
@@ -86,33 +84,25 @@ class Pipeline:
             What went wrong, where, and the cure.
         """
         self._check_inputs()
-        stages, renames = _partial_outputs(self.lowered.stages)
         runtime.remember_stdout()
         failure: StageError | None = None
         try:
-            try:
-                with removed_if_killed([*map(_pattern, (p for p, _ in renames)), *self._models()]):
-                    result = pdal_env.execute(stages, arrays=arrays)
-            finally:
-                self.reports = []
-                for ours in self.lowered.ours:
-                    reports, failed = runtime.collect(ours.label)
-                    failure = failure or failed
-                    self.reports.append((ours.place, reports))
-            for ours, (_, reports) in zip(self.lowered.ours, self.reports, strict=True):
-                if not reports:  # newer PDAL leaves filters out where there are no points
-                    reports.append(runtime.run_on_nothing(ours.stage, ours.place))
-            _rename(renames)
+            with whole_files(*_outputs(self.lowered.stages), check=_finish) as partials:
+                try:
+                    result = pdal_env.execute(_with_outputs(self.lowered.stages, partials), arrays=arrays)
+                finally:
+                    self.reports = []
+                    for ours in self.lowered.ours:
+                        reports, failed = runtime.collect(ours.label)
+                        failure = failure or failed
+                        self.reports.append((ours.place, reports))
+                for ours, (_, reports) in zip(self.lowered.ours, self.reports, strict=True):
+                    if not reports:  # newer PDAL leaves filters out where there are no points
+                        reports.append(runtime.run_on_nothing(ours.stage, ours.place))
         except StageError as error:
-            for partial, final in renames if isinstance(error.found, str) else ():
-                error.found = str(error.found).replace(str(partial), str(final))
-                if error.cure is None and disk_is_full(partial):
-                    error.cure = f"The disk of {final} is full: make room"
             if isinstance(failure, InterruptedStage):
                 raise KeyboardInterrupt from None
             raise failure or self._located(error) from None
-        finally:
-            _discard(renames)
         self.metadata = _named_metadata(result.metadata, self.reports)
         self.arrays, self.log = result.arrays, result.log
         return result.count
@@ -128,13 +118,6 @@ class Pipeline:
                     "the file cannot be read", where=path, found=error.strerror or str(error)
                 ) from None
         self.remarks = [r for path in _inputs(self.lowered.stages, las=True) if (r := check_readable(path))]
-
-    def _models(self) -> list[str]:
-        """Where models are being written: what to remove if the process is killed meanwhile."""
-        names = (
-            Path(o.stage.options["filename"]) for o in self.lowered.ours if "filename" in o.stage.options
-        )
-        return [glob.escape(str(n.with_name(f".{n.name}.{os.getpid()}"))) + ".*" for n in names]
 
     def _located(self, error: StageError) -> StageError:
         """PDAL's words, with the line of the stage that they name and the nearest stage there is."""
@@ -201,65 +184,33 @@ def _is_writer(stage: dict[str, Any], stages: list[dict[str, Any]]) -> bool:
     return len(stages) > 1 and stage is stages[-1]
 
 
-def _partial_outputs(stages: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[tuple[Path, Path]]]:
-    """Stages whose writers write beside the final name, and what to rename."""
-    out, renames = [], []
-    finals: set[Path] = set()
-    for stage in stages:
-        if _is_writer(stage, stages):
-            final = Path(stage["filename"])
-            check_writable(final)
-            if final.absolute() in finals:
-                raise PipelineError(
-                    "two writers write the same file", found=str(final), cure="Give each its own name"
-                )
-            finals.add(final.absolute())
-            partial = partial_name(final)
-            stage = {**stage, "filename": str(partial)}
-            renames.append((partial, final))
-        out.append(stage)
-    return out, renames
+def _outputs(stages: list[dict[str, Any]]) -> list[Path]:
+    """Files that PDAL's writers write.
+
+    Raises
+    ------
+    PipelineError
+        If two of them are one.
+    """
+    found = [Path(stage["filename"]) for stage in stages if _is_writer(stage, stages)]
+    for number, final in enumerate(found):
+        if final.absolute() in (other.absolute() for other in found[:number]):
+            raise PipelineError(
+                "two writers write the same file", found=str(final), cure="Give each its own name"
+            )
+    return found
 
 
-def _pattern(partial: Path) -> str:
-    """What :func:`glob.glob` finds a writer's files by; one name with '#' stands for several."""
-    return glob.escape(str(partial)).replace("#", "*")
+def _with_outputs(stages: list[dict[str, Any]], names: list[Path]) -> list[dict[str, Any]]:
+    """Stages whose writers write to other names."""
+    waiting = iter(names)
+    return [{**s, "filename": str(next(waiting))} if _is_writer(s, stages) else s for s in stages]
 
 
-def _expanded(partial: Path) -> list[Path]:
-    """Files a writer made."""
-    if "#" not in partial.name:
-        return [partial] if partial.exists() else []
-    return [Path(name) for name in sorted(glob.glob(_pattern(partial)))]
-
-
-def _rename(renames: list[tuple[Path, Path]]) -> None:
-    """Give every file its final name, after all of them were found complete."""
-    moves: list[tuple[Path, Path]] = []
-    for partial, final in renames:
-        for path in _expanded(partial):
-            target = final
-            if "#" in partial.name:
-                before, _, after = partial.name.partition("#")
-                number = path.name[len(before) : len(path.name) - len(after)]
-                target = final.with_name(final.name.replace("#", number, 1))
-            check_complete(path, target)
-            supersede_copc(path)
-            moves.append((path, target))
-    for path, target in moves:
-        try:
-            os.replace(path, target)
-        except OSError as error:
-            raise StageError(
-                "the output file could not be given its name", found=f"{target}: {error.strerror or error}"
-            ) from error
-
-
-def _discard(renames: list[tuple[Path, Path]]) -> None:
-    for partial, _ in renames:
-        for path in _expanded(partial):
-            with contextlib.suppress(OSError):
-                path.unlink(missing_ok=True)
+def _finish(made: Path, final: Path) -> None:
+    """What remains to be done to a file that PDAL wrote, before it gets its name."""
+    check_complete(made, final)
+    supersede_copc(made)
 
 
 def _named_metadata(

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import DependencyError, OptionError, StageError
+from ..base.files import whole_files
 from ..base.version import __version__
 from .materials import RGB
 from .srs import geo_keys, wkt
@@ -147,9 +148,8 @@ def write_town(
         pieces = chained()
     header = _header(options, minor_version, dataformat_id, true_height)
     counts = np.zeros(256, dtype=np.int64)
-    beside = target.with_name(f".{target.stem}.part{target.suffix}")
-    try:
-        with laspy.open(beside, mode="w", header=header, do_compress=compress) as writer:
+    with whole_files(target) as (partial,):
+        with laspy.open(partial, mode="w", header=header, do_compress=compress) as writer:
             for piece in pieces:
                 writer.write_points(_record(writer.header, piece, dataformat_id, true_height))
                 counts += np.bincount(piece.classification, minlength=256)
@@ -157,11 +157,4 @@ def write_town(
             raise StageError(
                 "no pulse hit this town", where="write_town", cure="Give a larger 'size' or 'density'"
             )
-        os.replace(beside, target)
-    except OSError as error:
-        raise StageError(
-            "the file cannot be written", where=str(path), found=error.strerror or str(error)
-        ) from error
-    finally:
-        beside.unlink(missing_ok=True)
     return {int(code): int(counts[code]) for code in np.flatnonzero(counts)}

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-import uuid
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import StageError
+from ..base.files import whole_files
 from .cloudindex import BLOCK, open_las, read_block
 from .extract import finish, plain_header
 from .scratch import scratch
@@ -29,10 +29,15 @@ def write_in_parts(task: dict[str, Any], most: int) -> dict[str, Any] | None:
     source, count = task["source"], task["count"]
     writers = [s for s in task["tail"] if s["type"].startswith("writers.")]
     finals = [Path(p) for p in task["outputs"]]
-    partials = [p.with_name(f".{p.stem}.partial-{uuid.uuid4().hex[:12]}{p.suffix}") for p in finals]
-    joined = [_Joined(p) for p in partials]
+    joined: list[_Joined] = []
+
+    def check(made: Path, final: Path) -> None:
+        check_whole(made, final, joined[0].count)
+
     try:
-        with scratch(task["scratch"]) as folder:
+        with whole_files(*finals, check=check) as partials, contextlib.ExitStack() as stack:
+            joined += [stack.enter_context(contextlib.closing(_Joined(p))) for p in partials]
+            folder = stack.enter_context(scratch(task["scratch"]))
             for start in range(0, count, most):
                 end = min(count, start + most)
                 piece = os.path.join(folder, "part.las")
@@ -40,20 +45,10 @@ def write_in_parts(task: dict[str, Any], most: int) -> dict[str, Any] | None:
                 outputs = [os.path.join(folder, f"out{n}.las") for n in range(len(writers))]
                 reader = {**source["reader"], "type": "readers.las", "filename": piece}
                 run_tail([reader], [gather(task, start, end)], _uncompressed(task["tail"]), outputs)
-                if not all(j.add(output) for j, output in zip(joined, outputs, strict=True)):
-                    return None
-        for one in joined:
-            one.close()
-        for one, partial, final in zip(joined, partials, finals, strict=True):
-            check_whole(partial, final, one.count)
-        for partial, final in zip(partials, finals, strict=True):
-            os.replace(partial, final)
-    except OSError as error:
-        raise StageError("the output could not be written", found=error.strerror or str(error)) from error
-    finally:
-        for one, partial in zip(joined, partials, strict=True):
-            one.abandon()
-            partial.unlink(missing_ok=True)
+                for one, output in zip(joined, outputs, strict=True):
+                    one.add(output)
+    except _HeadersDifferError:
+        return None
     return {"outputs": [[str(p), *stamp(p)] for p in finals], "written": joined[0].count if joined else 0}
 
 
@@ -73,6 +68,10 @@ def _copy(path: str, start: int, end: int, target: str) -> None:
         finish(out, head, tail, end - start)
 
 
+class _HeadersDifferError(Exception):
+    """Parts cannot be joined."""
+
+
 class _Joined:
     """A LAS or LAZ file made of others with one header."""
 
@@ -81,8 +80,8 @@ class _Joined:
         self._writer: Any = None
         self._head: Any = None
 
-    def add(self, part: str) -> bool:
-        """Append the points of a file; False where its header differs."""
+    def add(self, part: str) -> None:
+        """Append the points of a file."""
         import laspy
 
         with open_las(part) as reader:
@@ -100,25 +99,15 @@ class _Joined:
                     self.path, mode="w", header=header, do_compress=self.path.suffix.lower() == ".laz"
                 )
             elif head != self._head:
-                return False
+                raise _HeadersDifferError
             total = int(header.point_count)
             for first in range(0, total, BLOCK):
                 self._writer.write_points(read_block(reader, part, first, min(BLOCK, total - first)))
             self.count += total
         os.unlink(part)
-        return True
 
     def close(self) -> None:
         """Finish the file."""
         if self._writer is not None:
             self._writer.close()
             self._writer = None
-
-    def abandon(self) -> None:
-        """Close the file whatever state it is in."""
-        writer, self._writer = self._writer, None
-        if writer is not None:
-            try:
-                writer.close()
-            except Exception:  # it is deleted anyway
-                return

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import StageError
-from ..base.files import write_whole
+from ..base.files import try_lock, write_whole
 
 #: The folder beside the outputs.
 FOLDER = ".pdal-stages"
@@ -70,30 +70,15 @@ class Store:
     def _take(self) -> None:
         path = self.folder / "lock"
         file = open(path, "a+", encoding="utf-8")  # noqa: SIM115  open as long as the lock is held
-        try:
-            import fcntl
-
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                file.seek(0)
-                who = file.read().strip() or "unknown"
-                file.close()
-                raise StageError(
-                    "another run is working in this output folder",
-                    found=who,
-                    cure="Wait for it, or write to another folder",
-                ) from None
-        except ImportError:  # Windows: an open file cannot be removed, so that serves
-            import msvcrt
-
-            try:
-                msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
-            except OSError:
-                file.close()
-                raise StageError(
-                    "another run is working in this output folder", found=str(self.folder)
-                ) from None
+        if not try_lock(file):
+            file.seek(0)
+            who = file.read().strip() or str(self.folder)
+            file.close()
+            raise StageError(
+                "another run is working in this output folder",
+                found=who,
+                cure="Wait for it, or write to another folder",
+            )
         file.seek(0)
         file.truncate()
         file.write(

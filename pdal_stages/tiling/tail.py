@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
+from ..base.files import whole_files
 from ..base.las import supersede_copc
 from ..pipeline import pdal as pdal_env
 from . import marks
@@ -96,30 +97,24 @@ def run_tail(readers, injected, tail, outputs: list[str]) -> dict[str, Any]:
             stages.append({**drop, "inputs": [f"all{number}"], "tag": f"put{number}"})
         inputs.append(f"put{number}")
     stages.append({"type": "filters.merge", "inputs": inputs, "tag": "merged"})
-    partials: list[tuple[Path, Path]] = []
-    waiting = list(outputs)
-    for stage in tail:
-        stage = {k: v for k, v in stage.items() if k != "inputs"}
-        if stage["type"].startswith("writers."):
-            final = Path(waiting.pop(0))
-            partial = final.with_name(f".{final.stem}.partial-{uuid.uuid4().hex[:12]}{final.suffix}")
-            partials.append((partial, final))
-            stage["filename"] = str(partial)
-        stages.append(stage)
+    finals = [Path(output) for output in outputs]
+
+    def finish(made: Path, final: Path) -> None:
+        check_whole(made, final, run.count)
+        supersede_copc(made)
+
     try:
-        run = pdal_env.execute(stages, arrays=False)
-        for partial, final in partials:
-            check_whole(partial, final, run.count)
-            supersede_copc(partial)
-        for partial, final in partials:
-            os.replace(partial, final)
-    except OSError as error:
-        raise StageError("the output could not be written", found=error.strerror or str(error)) from error
+        with whole_files(*finals, check=finish) as partials:
+            waiting = iter(partials)
+            for stage in tail:
+                stage = {k: v for k, v in stage.items() if k != "inputs"}
+                if stage["type"].startswith("writers."):
+                    stage["filename"] = str(next(waiting))
+                stages.append(stage)
+            run = pdal_env.execute(stages, arrays=False)
     finally:
         marks.forget(token)
-        for partial, _ in partials:
-            partial.unlink(missing_ok=True)
-    return {"outputs": [[str(final), *stamp(final)] for _, final in partials], "written": run.count}
+    return {"outputs": [[str(final), *stamp(final)] for final in finals], "written": run.count}
 
 
 def stamp(path: Path) -> list[int]:
@@ -135,8 +130,6 @@ def check_whole(partial: Path, final: Path, count: int) -> None:
     StageError
         Naming the output.
     """
-    if not partial.exists():
-        raise StageError("the writer wrote no file", found=str(final))
     with open(partial, "rb+") as file:
         os.fsync(file.fileno())  # some file systems report a full disk only here
     if final.suffix.lower() not in (".las", ".laz"):

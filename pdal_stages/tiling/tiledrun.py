@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import OptionError, PipelineError, StageError
+from ..base.files import sweep
 from ..base.progress import Progress
 from ..base.units import units_of_wkt
 from ..base.version import __version__
@@ -311,15 +312,12 @@ class _Run:
         with Store(folder) as store:
             if not self.options.resume:
                 store.clear()
-            for path in self._all_paths():
-                for left in path.parent.glob(f".{path.stem}.partial-*"):  # of a run that was killed
-                    left.unlink(missing_ok=True)
+            self._all_paths()
             try:
                 with open_pool(self.options) as pool:
                     return self._work(store, pool)
-            except KeyboardInterrupt:
-                self._sweep()
-                raise
+            finally:
+                sweep(folder)  # what workers left that were killed
 
     def _folder(self) -> Path:
         writers = self.plan.writers
@@ -338,13 +336,6 @@ class _Run:
         check_not_inputs(paths, [s.path for s in self.sources])
         return paths
 
-    def _sweep(self) -> None:
-        """Remove what stopped workers left beside the outputs."""
-        for writer in self.plan.writers:
-            path = Path(writer["filename"]).absolute()
-            for left in path.parent.glob(f".{path.stem.replace('#', '*')}.partial-*{path.suffix}"):
-                left.unlink(missing_ok=True)
-
     def _work(self, store: Store, pool: Here | OnDask) -> TiledRun:
         self._index_all(store, pool)
         jobs = self._jobs()
@@ -353,7 +344,6 @@ class _Run:
             self._tile_outputs(jobs)
         self._skip(store, jobs, outputs)
         self._run_jobs(store, pool, jobs, outputs)
-        self._sweep()
         self._clean(store, jobs, outputs)
         return self._result(jobs, outputs, pool)
 

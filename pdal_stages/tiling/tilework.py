@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import PipelineError, StageError
-from ..base.files import write_whole
+from ..base.files import whole_files, write_whole
 from ..pipeline.run import Pipeline
 from ..stages import registry
 from . import marks
@@ -286,19 +286,8 @@ def _save(path: Path, results: Results, keys: list[str], pieces: list[Piece]) ->
         content[f"{key}/core"] = np.array(results.cores[number])
         for name, columns in results.values.items():
             content[f"{key}/dim/{name}"] = columns[number]
-    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.npz")
-    try:
-        with open(partial, "wb") as file:
-            np.savez(file, **content)  # type: ignore[arg-type]
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    except OSError as error:
-        raise StageError(
-            "a tile's results could not be written", found=error.strerror or str(error)
-        ) from error
-    finally:
-        partial.unlink(missing_ok=True)
+    with whole_files(path, what="result") as (partial,):
+        np.savez(partial, **content)  # type: ignore[arg-type]
 
 
 def _class_counts(results: Results) -> dict[str, int]:
