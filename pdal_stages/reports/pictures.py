@@ -56,7 +56,7 @@ def png(rgb: npt.NDArray[np.uint8], palette: bool = False) -> bytes:
 
 def write_png(path: str | os.PathLike[str], rgb: npt.NDArray[np.uint8], palette: bool = False) -> Path:
     """Write an image as a PNG file, whole or not at all; see :func:`png`."""
-    return write_whole(path, png(rgb, palette))
+    return write_whole(path, png(rgb, palette), what="picture")
 
 
 @lru_cache
