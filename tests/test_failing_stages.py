@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 
@@ -147,6 +148,39 @@ def test_a_python_without_the_package(tmp_path, pdal_program):
     )
     assert done.returncode == 1, (done.returncode, done.stderr)
     assert "ModuleNotFoundError: No module named 'pdal_stages_elsewhere'" in done.stderr
+
+
+INTERRUPTED = """
+import os, signal, subprocess
+big = {"type": "readers.faux", "count": 2_000_000, "mode": "ramp", "bounds": "([0,30],[0,30],[0,3])"}
+ps.run_pipeline([good, {"type": "filters.hag_minima"}])  # Numba is imported, which Ctrl-C would break off
+for wait in (0, 0.1, 0.3, 0.6, 1):
+    kill = subprocess.Popen(["sh", "-c", f"sleep {wait}; kill -INT {os.getpid()}"])
+    try:
+        ps.run_pipeline([big, {"type": "filters.hag_minima"}])
+        kill.wait()
+        signal.pause()
+    except KeyboardInterrupt:
+        failures += 1
+    kill.wait()
+assert failures == 5, failures
+ps.run_pipeline([good, {"type": "filters.hag_minima"}])
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of Unix")
+def test_ctrl_c_in_a_notebook(tmp_path):
+    """Whenever it comes, PDAL at work or a stage of ours, the process goes on with KeyboardInterrupt."""
+    script = CLOUD + INTERRUPTED + "print('survived')\n"
+    done = subprocess.run(
+        [sys.executable, "-X", "faulthandler", "-c", script],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=500,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert done.stdout == "survived\n"
 
 
 def test_stages_that_pdal_leaves_out(tmp_path, monkeypatch):

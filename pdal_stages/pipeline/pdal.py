@@ -14,6 +14,7 @@ from functools import cache
 from typing import Any
 
 from ..base.errors import DependencyError, PipelineError
+from .interrupts import fragile
 
 INSTALL = (
     "Install PDAL with its Python bindings: conda install -c conda-forge python-pdal pdal-plugins; on Debian or "
@@ -79,6 +80,7 @@ def ask_program(*arguments: str) -> str:
     return done.stdout
 
 
+@fragile
 def execute(stages: list[dict[str, Any]], *, arrays: bool = True) -> Execution:
     """Run a plain PDAL pipeline in this process.
 

@@ -6,6 +6,7 @@ import glob
 import json
 import os
 import re
+import signal
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from ..base.las import check_readable, odd_text, supersede_copc
 from ..stages import registry
 from . import pdal as pdal_env
 from . import runtime
+from .interrupts import gentle
 from .lowering import Lowered, lower
 from .overrides import Override, apply_overrides
 from .read import PipelineSource, read_pipeline
@@ -89,7 +91,9 @@ class Pipeline:
         try:
             with whole_files(*_outputs(self.lowered.stages), check=_finish) as partials:
                 try:
-                    result = pdal_env.execute(_with_outputs(self.lowered.stages, partials), arrays=arrays)
+                    with gentle(signal.SIGINT) as interrupts:
+                        result = pdal_env.execute(_with_outputs(self.lowered.stages, partials), arrays=arrays)
+                        interrupts.check()
                 finally:
                     self.reports = []
                     for ours in self.lowered.ours:

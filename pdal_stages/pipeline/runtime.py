@@ -23,6 +23,7 @@ from ..base.errors import InterruptedStage, StageError
 from ..stages import registry
 from ..stages.base import Stage
 from ..stages.points import Points
+from . import interrupts
 from . import pdal as pdal_env
 
 #: What ``source`` of a lowered stage holds. PDAL sets the globals before each call.
@@ -92,8 +93,10 @@ def points_of(stage: Stage, module: Mapping[str, Any], ins: Mapping[str, Any]) -
     )
 
 
+@interrupts.catches
 def run_on_view(module, arguments, ins, outs) -> dict[str, Any]:
     """Run a stage on one view; its report. What it raises may be anything, Ctrl-C too."""
+    interrupts.check()
     stage = _made.get(arguments.get("label", ""))
     if stage is None:
         kind = registry.get(arguments["stage"])

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from ..base.errors import StageError, optional_import
-from .interrupts import gentle
+from ..pipeline.interrupts import gentle
 from .settings import TilingOptions
 from .work import perform
 
