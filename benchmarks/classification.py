@@ -128,7 +128,7 @@ def score(data: Path, scene: str, options: TrainingOptions, smooth: float, progr
         **figures(result),
         "f1": {str(one.code): round(100 * (one.f1 or 0), 2) for one in result.per_class},
         "merged": figures(result.merge(merged)) if merged else None,
-        "out_of_bag": model.info["accuracy"]["out_of_bag"]["overall_accuracy"],
+        "out_of_bag": model.info["passes"][-1]["out_of_bag"]["overall_accuracy"],
         "train_points": len(xyz),
         "samples": sum(entry["samples"] for entry in model.info["classes"]),
         "duplicates": sum(entry["duplicates"] for entry in model.info["classes"]),
@@ -136,7 +136,7 @@ def score(data: Path, scene: str, options: TrainingOptions, smooth: float, progr
         "points_per_second": round(len(test) / wall),
         "seconds": timer.rounded(),
         "train_seconds": {k: round(v, 1) for k, v in model.seconds.items()},
-        "forest": model.algorithm.parameters(),
+        "forest": model.manifest()["passes"][-1]["parameters"],
         "largest_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
         "importance": {k: round(v, 4) for k, v in model.importances("neighborhood").items()},
     }

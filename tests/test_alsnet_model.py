@@ -192,7 +192,7 @@ def test_saved_and_loaded_gives_the_same_labels(tmp_path):
     assert isinstance(again.algorithm, AlsNet) and again.halo == model.halo
     one, other = (m.predict(xyz, dimensions, probabilities=True) for m in (model, again))
     assert np.array_equal(one.probabilities, other.probabilities)
-    assert "alsnet" in str(again) and again.describe()["parameters"]["configuration"]["name"] == "test"
+    assert "alsnet" in str(again) and again.describe()["passes"][0]["parameters"]["configuration"]["name"] == "test"
 
 
 def rewritten(path, weights=None, **parameters):
@@ -201,7 +201,9 @@ def rewritten(path, weights=None, **parameters):
     model = model_of(net)
     arrays = {**net.arrays(), **(weights or {})}
     arrays = {name: array for name, array in arrays.items() if array is not None}
-    modelfile.write(path, {**model.manifest(), "parameters": {**net.parameters(), **parameters}}, arrays)
+    manifest = model.manifest()
+    manifest["passes"][0]["parameters"] = {**net.parameters(), **parameters}
+    modelfile.write(path, manifest, [arrays])
     return path
 
 
@@ -266,7 +268,7 @@ def test_the_file_is_data_only(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.model") as archive:
         names = archive.namelist()
         manifest = json.loads(archive.read("manifest.json"))
-    assert manifest["algorithm"] == "alsnet"
+    assert manifest["passes"][0]["algorithm"] == "alsnet"
     assert all(name == "manifest.json" or name.endswith(".npy") for name in names)
 
 

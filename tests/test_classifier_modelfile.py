@@ -36,15 +36,21 @@ def forest(seed=0, trees=4):
 
 def manifest(**changes):
     figures = {"overall_accuracy": 0.9, "kappa": 0.8, "mean_f1": 0.85, "f1": {"2": 0.9, "5": None}}
-    whole = {
+    only = {
         "algorithm": "random_forest",
         "parameters": {"trees": 4},
         "features": {"anything": "the engine writes"},
         "feature_names": [f"Feature{i}" for i in range(FEATURES)],
         "dimensions": [],
+        "context": [],
         "shape_bins": None,
         "copt_threshold": None,
         "feature_seed": 0,
+        "percentiles": {"low": [0.0] * FEATURES, "high": [1.0] * FEATURES, "limited": True},
+        "importances": [0.0] * FEATURES,
+        "out_of_bag": {**figures, "samples": 9},
+    }
+    whole = {
         "strategy": "multiclass",
         "target": None,
         "background": None,
@@ -53,12 +59,10 @@ def manifest(**changes):
             for c in (2, 5, 6)
         ],
         "training": {"clouds": [{"name": "a.laz", "points": 9}], "count": 9, "seed": 0, "samples": 27},
-        "percentiles": {"low": [0.0] * FEATURES, "high": [1.0] * FEATURES, "limited": True},
-        "accuracy": {"out_of_bag": {**figures, "samples": 9}, "cross_validation": None},
-        "importances": [0.0] * FEATURES,
+        "accuracy": {"cross_validation": None},
         "created_by": {"pdal_stages": "0.1.0"},
     }
-    return {**whole, **changes}
+    return {**whole, "passes": [{**only, **{k: v for k, v in changes.items() if k in only}}]}
 
 
 def rules(name):
@@ -68,7 +72,7 @@ def rules(name):
 @pytest.fixture
 def good(tmp_path):
     path = tmp_path / "good.model"
-    modelfile.write(path, manifest(), forest()[0].arrays())
+    modelfile.write(path, manifest(), [forest()[0].arrays()])
     return path
 
 
@@ -105,8 +109,8 @@ def refuse(path, text=".", seconds=10.0, megabytes=100):
 def test_round_trip_equals_sklearn(tmp_path):
     made, reference, x = forest()
     path = tmp_path / "m.model"
-    modelfile.write(path, manifest(), made.arrays())
-    read, arrays = modelfile.read(path, rules)
+    modelfile.write(path, manifest(), [made.arrays()])
+    read, (arrays,) = modelfile.read(path, rules)
     assert {k: v for k, v in read.items() if k not in ("format", "version", "arrays")} == manifest()
     again = Forest.from_arrays(arrays, FEATURES, 3)
     assert np.array_equal(again.predict_proba(x), reference.predict_proba(x))
@@ -115,7 +119,7 @@ def test_round_trip_equals_sklearn(tmp_path):
 
 def test_same_model_same_bytes(tmp_path):
     for name in ("a", "b"):
-        modelfile.write(tmp_path / name, manifest(), forest()[0].arrays())
+        modelfile.write(tmp_path / name, manifest(), [forest()[0].arrays()])
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
@@ -123,14 +127,14 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, good, monkeyp
     before = good.read_bytes()
     monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(StageError, match="disk full"):
-        modelfile.write(good, manifest(), forest(1)[0].arrays())
+        modelfile.write(good, manifest(), [forest(1)[0].arrays()])
     assert good.read_bytes() == before
     assert os.listdir(tmp_path) == ["good.model"]
 
 
 def test_a_folder_that_is_not_there(tmp_path):
     with pytest.raises(StageError, match="folder of the model file does not exist"):
-        modelfile.write(tmp_path / "no" / "m.model", manifest(), forest()[0].arrays())
+        modelfile.write(tmp_path / "no" / "m.model", manifest(), [forest()[0].arrays()])
 
 
 def test_no_pickle_on_the_way():
@@ -147,7 +151,7 @@ def test_the_documented_layout_is_enough_to_read_a_file(good):
     with zipfile.ZipFile(good) as archive:
         head = json.loads(archive.read("manifest.json"))
         a = {
-            name: np.load(io.BytesIO(archive.read(entry["file"])), allow_pickle=False)
+            name[2:]: np.load(io.BytesIO(archive.read(entry["file"])), allow_pickle=False)
             for name, entry in head["arrays"].items()
         }
     row = forest()[2][0]
@@ -189,7 +193,7 @@ def test_cut_short_anywhere(good):
 def test_a_flipped_byte_is_noticed_or_harmless(tmp_path_factory, at, flip, times):
     """Whatever byte is changed: an error, or exactly the model that was stored."""
     path = tmp_path_factory.mktemp("flip") / "m.model"
-    modelfile.write(path, manifest(), forest(trees=1)[0].arrays())
+    modelfile.write(path, manifest(), [forest(trees=1)[0].arrays()])
     want = modelfile.read(path, rules)
     data = bytearray(path.read_bytes())
     for k in range(times):
@@ -200,7 +204,7 @@ def test_a_flipped_byte_is_noticed_or_harmless(tmp_path_factory, at, flip, times
     except ModelError:
         return
     assert read == want[0]
-    assert all(np.array_equal(arrays[name], want[1][name]) for name in arrays)
+    assert all(np.array_equal(arrays[0][name], want[1][0][name]) for name in arrays[0])
 
 
 def test_members_are_exactly_those_listed(good, tmp_path):
@@ -239,7 +243,10 @@ def changed(path, edit, rehash=True):
     ("key", "value", "text"),
     [
         ("format", "something else", "not a model"),
-        ("version", 2, "version"),
+        ("version", 3, "version"),
+        ("version", 0, "version"),
+        ("version", True, "version"),
+        ("version", 1.5, "version"),
         ("version", "1", "version"),
         ("algorithm", "magic", "does not know"),
         ("algorithm", "os.system", "algorithm"),
@@ -254,11 +261,14 @@ def changed(path, edit, rehash=True):
     ],
 )
 def test_manifest_is_held_against_its_schema(good, key, value, text):
-    refuse(changed(good, lambda head, _: head.update({key: value})), text)
+    def edit(head, _):
+        (head if key in head or key == "extra" else head["passes"][0]).update({key: value})
+
+    refuse(changed(good, edit), text)
 
 
 def test_a_key_left_out(good):
-    refuse(changed(good, lambda head, _: head.pop("percentiles")), "percentiles")
+    refuse(changed(good, lambda head, _: head["passes"][0].pop("percentiles")), "percentiles")
 
 
 def test_manifests_that_are_no_manifest(good):
@@ -279,7 +289,7 @@ def test_manifests_that_are_no_manifest(good):
 
 def test_checksum(good):
     def edit(head, stored):
-        name = head["arrays"]["threshold"]["file"]
+        name = head["arrays"]["1.threshold"]["file"]
         stored[name] = stored[name][:-4] + b"\0\0\x80?"
 
     refuse(changed(good, edit, rehash=False), "SHA-256")
@@ -318,7 +328,7 @@ def test_hostile_arrays_are_refused(data, good):
         from_bytes(data, ArrayRule(("<f4",), 1), "threshold")
 
     def edit(head, stored):
-        stored[head["arrays"]["threshold"]["file"]] = data
+        stored[head["arrays"]["1.threshold"]["file"]] = data
 
     refuse(changed(good, edit))
 
@@ -336,8 +346,8 @@ def test_zip_bomb(good):
     stored = members(good)
 
     def edit(head, stored):
-        stored[head["arrays"]["threshold"]["file"]] = to_bytes(np.zeros(20_000_000, np.float32))
-        head["arrays"]["threshold"]["shape"] = [20_000_000]
+        stored[head["arrays"]["1.threshold"]["file"]] = to_bytes(np.zeros(20_000_000, np.float32))
+        head["arrays"]["1.threshold"]["shape"] = [20_000_000]
 
     bomb = changed(good, edit)
     assert bomb.stat().st_size < 1e6
@@ -376,14 +386,14 @@ def test_encrypted_flag(good):
 
 def test_forest_and_manifest_that_disagree(good):
     def shape(head, _):
-        head["arrays"]["threshold"]["shape"][0] += 1
+        head["arrays"]["1.threshold"]["shape"][0] += 1
 
     whole = good.read_bytes()
     refuse(changed(good, shape), "not what the manifest says")
     good.write_bytes(whole)
 
     def other(head, stored):
-        head["arrays"]["bonus"] = {**head["arrays"]["threshold"], "file": "arrays/bonus.npy"}
+        head["arrays"]["bonus"] = {**head["arrays"]["1.threshold"], "file": "arrays/bonus.npy"}
         stored["arrays/bonus.npy"] = stored["arrays/threshold.npy"]
 
     refuse(changed(good, other), "does not know")

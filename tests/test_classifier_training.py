@@ -94,13 +94,13 @@ def test_equals_sklearn_on_the_same_features(other, monkeypatch):
         [TrainingCloud(xyz, label, dimensions)], TrainingOptions(**SMALL, prior_weight=0), progress=False
     )
     xyz, label, dimensions = other
-    engine = FeatureEngine(xyz, model.plan, bins=model.algorithm.bins)
+    engine = FeatureEngine(xyz, model.plan, bins=model.algorithm.features.bins)
     values = engine.table(dimensions={"HeightAboveGround": dimensions["HeightAboveGround"]}).values
     expected = sum(tree.predict(values) for tree in kept) / len(kept)
     result = model.predict(xyz, dimensions, probabilities=True)
     assert np.array_equal(result.probabilities, expected.astype(np.float32))
     assert np.array_equal(result.classification, model.codes[expected.argmax(axis=1)])
-    assert np.array_equal(model.algorithm.predict_rows(values), expected)
+    assert np.array_equal(model.algorithm.probabilities(values), expected)
 
 
 def test_blocks_and_threads_change_nothing(trained, other):
@@ -129,7 +129,10 @@ def test_training_does_not_depend_on_order_or_threads(trained, tmp_path):
     trained.save(tmp_path / "a")
     again.save(tmp_path / "b")
     # The samples come in another order, so only what is learnt from them as a set is equal ...
-    assert again.algorithm.bins == trained.algorithm.bins and again.info["classes"] == trained.info["classes"]
+    assert (
+        again.algorithm.features.bins == trained.algorithm.features.bins
+        and again.info["classes"] == trained.info["classes"]
+    )
     # ... and, since samples are ordered along the curve, the whole file is.
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
@@ -205,11 +208,7 @@ def test_empty_cloud(trained):
 
 def test_wrong_features(trained):
     with pytest.raises(ModelError, match="features per point"):
-        trained.algorithm.predict_rows(np.zeros((3, 5)))
-    values = np.zeros((2, len(trained.plan.names)), np.float32)
-    values[1, 3] = np.nan
-    with pytest.raises(ModelError, match="not a finite"):
-        trained.algorithm.predict_rows(values)
+        trained.algorithm.probabilities(np.zeros((3, 5)))
 
 
 # ---- dimensions ----------------------------------------------------------------------------------------
@@ -255,7 +254,7 @@ def test_return_ratio_and_intensity(other):
 def test_counts_scores_and_importances(trained):
     classes = {entry["code"]: entry for entry in trained.info["classes"]}
     assert [entry["samples"] + entry["duplicates"] for entry in classes.values()] == [150] * 3
-    bag = trained.info["accuracy"]["out_of_bag"]
+    bag = trained.info["passes"][0]["out_of_bag"]
     assert 0.85 < bag["overall_accuracy"] <= 1 and set(bag["f1"]) == {"2", "5", "6"}
     for by in ("column", "feature", "group", "neighborhood", "dimension"):
         assert sum(trained.importances(by).values()) == pytest.approx(1)
@@ -296,7 +295,7 @@ def test_several_clouds_are_sampled_together_but_are_not_neighbors():
     model = train(clouds, options, progress=False)
     assert [c["name"] for c in model.info["training"]["clouds"]] == ["a", "b"]
     swapped = train(clouds[::-1], options, progress=False)
-    assert swapped.algorithm.bins == model.algorithm.bins
+    assert swapped.algorithm.features.bins == model.algorithm.features.bins
     assert np.array_equal(swapped.algorithm.forest.threshold, model.algorithm.forest.threshold)
     # Overlapping clouds: each sees its own points only.
     alone = train([clouds[0]], options, progress=False)
@@ -378,8 +377,8 @@ def test_grid_search_with_blocks_held_out(tmp_path):
 
 def test_limits_to_percentiles_are_in_the_thresholds(trained):
     """No threshold lies beyond the percentiles: a value beyond goes the way its limit would [B16 3.3]."""
-    low = np.array(trained.info["percentiles"]["low"], np.float32)
-    high = np.array(trained.info["percentiles"]["high"], np.float32)
+    low = np.array(trained.info["passes"][0]["percentiles"]["low"], np.float32)
+    high = np.array(trained.info["passes"][0]["percentiles"]["high"], np.float32)
     forest = trained.algorithm.forest
     split = forest.feature >= 0
     column, limit = forest.feature[split], forest.threshold[split]
@@ -399,19 +398,20 @@ def test_limits_to_percentiles_are_in_the_thresholds(trained):
 @pytest.mark.parametrize(
     "edit",
     [
-        lambda m: m["features"].update(neighborhoods=["c9"]),
-        lambda m: m["features"].update(neighborhoods=["__import__('os')"]),
-        lambda m: m.update(features={}),
-        lambda m: m.update(feature_names=m["feature_names"][::-1]),
-        lambda m: m.update(dimensions=[]),
-        lambda m: m["percentiles"].update(low=[0.0]),
-        lambda m: m.update(importances=[1.0]),
+        lambda m: m["passes"][0]["features"].update(neighborhoods=["c9"]),
+        lambda m: m["passes"][0]["features"].update(neighborhoods=["__import__('os')"]),
+        lambda m: m["passes"][0].update(features={}),
+        lambda m: m["passes"][0].update(feature_names=m["passes"][0]["feature_names"][::-1]),
+        lambda m: m["passes"][0].update(dimensions=[]),
+        lambda m: m["passes"][0].update(context=["box1"]),
+        lambda m: m["passes"][0]["percentiles"].update(low=[0.0]),
+        lambda m: m["passes"][0].update(importances=[1.0]),
         lambda m: m["priors"].update(factors=[1.0]),
         lambda m: m["classes"].reverse(),
         lambda m: m["classes"].pop(),
-        lambda m: m.update(shape_bins={"c1": 3}),
-        lambda m: m.update(shape_bins=None),
-        lambda m: m["shape_bins"].pop("c1"),
+        lambda m: m["passes"][0].update(shape_bins={"c1": 3}),
+        lambda m: m["passes"][0].update(shape_bins=None),
+        lambda m: m["passes"][0]["shape_bins"].pop("c1"),
     ],
 )
 def test_manifests_that_do_not_fit_themselves(trained, tmp_path, edit, other):
@@ -421,7 +421,7 @@ def test_manifests_that_do_not_fit_themselves(trained, tmp_path, edit, other):
 
     manifest = copy.deepcopy(trained.manifest())
     edit(manifest)
-    modelfile.write(tmp_path / "m", manifest, trained.algorithm.arrays())
+    modelfile.write(tmp_path / "m", manifest, [trained.algorithm.arrays()])
     with pytest.raises(ModelError):
         load_model(tmp_path / "m")
 

@@ -97,10 +97,12 @@ class AlsNet:
     # ---- file ----------------------------------------------------------------------------------------------
 
     @classmethod
-    def from_file(cls, manifest: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> AlsNet:
-        """Made from what a model file says, everything checked."""
-        names, parameters = manifest["feature_names"], manifest["parameters"]
-        n_features, n_classes = len(names), len(manifest["classes"])
+    def from_file(
+        cls, entry: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]], codes: Sequence[int]
+    ) -> AlsNet:
+        """Made from what a model file says of a pass, everything checked."""
+        names, parameters = entry["feature_names"], entry["parameters"]
+        n_features, n_classes = len(names), len(codes)
         wanted = {"configuration", "spacing", "inputs", "weights"}
         if set(parameters) != wanted or not isinstance(parameters["inputs"], list):
             raise ModelError("the network's parameters are not right", found=sorted(map(str, parameters))[:6])
@@ -109,11 +111,11 @@ class AlsNet:
         except OptionError as error:
             raise ModelError("the network's configuration is not right", found=error) from None
         spacing = _finite(parameters["spacing"], "spacing", 1e-3, 1e6)
-        entries = [_mapping(entry) for entry in parameters["inputs"]]
-        if [entry.get("name") for entry in entries] != names or names != manifest["dimensions"]:
+        entries = [_mapping(one) for one in parameters["inputs"]]
+        if [one.get("name") for one in entries] != names or names != entry["dimensions"] or entry["context"]:
             raise ModelError("the network's inputs are not the model's dimensions", found=repr(names)[:80])
-        mean = tuple(_finite(entry.get("mean"), "mean", -1e12, 1e12) for entry in entries)
-        scale = tuple(_finite(entry.get("scale"), "scale", 1e-12, 1e12) for entry in entries)
+        mean = tuple(_finite(one.get("mean"), "mean", -1e12, 1e12) for one in entries)
+        scale = tuple(_finite(one.get("scale"), "scale", 1e-12, 1e12) for one in entries)
         needed = configuration.memory_mb(n_features)
         if needed > MOST_MB:
             raise ModelError("a batch of the network would need too much memory", found=f"{needed:,.0f} MB")
@@ -125,7 +127,7 @@ class AlsNet:
         return dict(self.weights)
 
     def parameters(self) -> dict[str, Any]:
-        """What the manifest says."""
+        """What the manifest says of the network itself."""
         return {
             "configuration": self.configuration.to_dict(),
             "spacing": self.spacing,
@@ -136,11 +138,20 @@ class AlsNet:
             "weights": int(sum(array.size for array in self.weights.values())),
         }
 
-    def fitted(self) -> dict[str, Any]:
-        """A network computes no features that anything would have to be fitted for."""
-        return {"shape_bins": None, "copt_threshold": None, "feature_seed": 0}
+    def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
+        """What a model file says of it beside its arrays; nothing is fitted but the weights."""
+        return {
+            "parameters": self.parameters(),
+            "features": self.plan.to_dict(),
+            "feature_names": list(self.inputs),
+            "dimensions": list(self.inputs),
+            "context": [],
+            "shape_bins": None,
+            "copt_threshold": None,
+            "feature_seed": 0,
+        }
 
-    def columns(self) -> list[Column]:
+    def columns(self, codes: Sequence[int]) -> list[Column]:
         """The inputs."""
         return [Column(name, name, "dimension", "(dimension)") for name in self.inputs]
 

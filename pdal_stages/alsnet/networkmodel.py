@@ -88,9 +88,14 @@ def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: 
             **trained.notes,
             **{name: number for name, number in notes.items() if number},
         },
-        "percentiles": {"low": list(low), "high": list(high), "limited": False},
-        "accuracy": {"out_of_bag": None, "cross_validation": None},
-        "importances": None,
+        "accuracy": {"cross_validation": None},
+        "passes": [
+            {
+                "percentiles": {"low": list(low), "high": list(high), "limited": False},
+                "importances": None,
+                "out_of_bag": None,
+            }
+        ],
         "created_by": {
             "pdal_stages": __version__,
             "python": platform.python_version(),
@@ -99,7 +104,7 @@ def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: 
         },
     }
     seconds = {**trained.seconds, "whole": round(time.perf_counter() - started, 3)}
-    return Model(trained.net, list(zip(classes.codes, classes.names, strict=True)), info, seconds)
+    return Model((trained.net,), list(zip(classes.codes, classes.names, strict=True)), info, seconds)
 
 
 def input_names(coordinates: str, dimensions: Sequence[str]) -> tuple[str, ...]:

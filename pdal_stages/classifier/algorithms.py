@@ -130,19 +130,18 @@ class Algorithm(Protocol):
     def plan(self) -> Inputs: ...
 
     @classmethod
-    def from_file(cls, manifest: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> Any:
-        """Made from what a model file says, everything checked."""
+    def from_file(
+        cls, entry: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]], codes: Sequence[int]
+    ) -> Any:
+        """Made from what a model file says of a pass, everything checked; `codes` are the classes."""
+
+    def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
+        """What a model file says of it beside its arrays: what the schema asks of a pass, but for its scores."""
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """The arrays a model file stores."""
 
-    def parameters(self) -> dict[str, Any]:
-        """What a model file says about it beside."""
-
-    def fitted(self) -> dict[str, Any]:
-        """What training fitted to compute its inputs: ``shape_bins``, ``copt_threshold``, ``feature_seed``."""
-
-    def columns(self) -> Sequence[Column]:
+    def columns(self, codes: Sequence[int]) -> Sequence[Column]:
         """Its inputs, for people."""
 
     def predict(self, question: Question, finish: Callable[[npt.NDArray[np.float64]], Any]) -> Answer:

@@ -26,6 +26,8 @@ class TrainingCloud:
         Name to (n,) values, as the options' `dimensions` need.
     name : str
         For messages and the model file; a path is cut to its last part.
+    survey : str, optional
+        The flight it belongs to; by default it is one of its own.
     mask : (n,) bool, optional
         Points samples may be drawn from; all points serve as neighbors.
     """
@@ -35,6 +37,10 @@ class TrainingCloud:
     dimensions: Mapping[str, npt.ArrayLike] = field(default_factory=dict)
     name: str = "cloud"
     mask: npt.ArrayLike | None = None
+    survey: str | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "xyz", np.asarray(self.xyz, dtype=np.float64))
 
 
 def class_positions(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -14,18 +14,18 @@ from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.names import GROUPS, RELATIVE
 from .algorithms import Answer, Block, Column, Question
 from .arrays import ArrayRule
+from .context import Context
 from .dimensions import gather
 from .forest import Forest
 
 
 @dataclass(frozen=True, eq=False)
-class FeatureForest:
-    """A forest and the features it reads.
+class Features:
+    """Features and what training fitted to compute them.
 
     Attributes
     ----------
     plan : FeaturePlan
-    forest : Forest
     bins : ShapeBins or None
         Thresholds of the shape distributions' histograms.
     copt_threshold : float or None
@@ -36,18 +36,13 @@ class FeatureForest:
     Raises
     ------
     ModelError
-        Where something is missing that the features need, or the forest takes another number of them.
+        Where something is missing that the features need.
     """
 
     plan: FeaturePlan
-    forest: Forest
     bins: ShapeBins | None = None
     copt_threshold: float | None = None
     seed: int = 0
-
-    name: ClassVar[str] = "random_forest"
-    rules: ClassVar[Mapping[str, ArrayRule]] = Forest.rules
-    gives_variance: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         there = {} if self.bins is None else self.bins.to_dict()
@@ -58,40 +53,90 @@ class FeatureForest:
             if part.neighborhood.kind == "copt" and self.copt_threshold is None:
                 raise ModelError("the model lacks the curvature threshold of copt")
 
-    # ---- file ----------------------------------------------------------------------------------------------
-
-    @classmethod
-    def from_file(cls, manifest: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> FeatureForest:
-        """Made from what a model file says, everything checked."""
-        plan = FeaturePlan.from_dict(manifest["features"])
-        check_names(plan, manifest)
-        forest = Forest.from_arrays(arrays, len(plan.names), len(manifest["classes"]))
-        bins = manifest["shape_bins"]
-        return cls(
-            plan,
-            forest,
-            None if bins is None else ShapeBins.from_dict(bins),
-            manifest["copt_threshold"],
-            manifest["feature_seed"],
-        )
-
-    def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """The arrays a model file stores."""
-        return self.forest.arrays()
-
-    def parameters(self) -> dict[str, Any]:
-        """What a model file says about the forest beside its arrays."""
-        return self.forest.parameters()
-
-    def fitted(self) -> dict[str, Any]:
-        """What training fitted for the features."""
+    def to_dict(self) -> dict[str, Any]:
+        """As a manifest has it."""
         return {
+            "features": self.plan.to_dict(),
             "shape_bins": None if self.bins is None else self.bins.to_dict(),
             "copt_threshold": self.copt_threshold,
             "feature_seed": self.seed,
         }
 
-    def columns(self) -> Sequence[Column]:
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Features:
+        """From what a manifest says of a pass."""
+        bins = entry["shape_bins"]
+        return cls(
+            FeaturePlan.from_dict(entry["features"]),
+            None if bins is None else ShapeBins.from_dict(bins),
+            entry["copt_threshold"],
+            entry["feature_seed"],
+        )
+
+    def engine(self, xyz: npt.NDArray[np.float64], threads: int | None = None) -> FeatureEngine:
+        """What computes them over a cloud."""
+        return FeatureEngine(
+            xyz,
+            self.plan,
+            bins=self.bins,
+            copt_threshold=self.copt_threshold,
+            seed=self.seed,
+            threads=threads,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureForest:
+    """A forest and what it reads.
+
+    Attributes
+    ----------
+    features : Features
+    forest : Forest
+    context : Context or None
+        What it reads of the pass before, after the features.
+    """
+
+    features: Features
+    forest: Forest
+    context: Context | None = None
+
+    name: ClassVar[str] = "random_forest"
+    rules: ClassVar[Mapping[str, ArrayRule]] = Forest.rules
+    gives_variance: ClassVar[bool] = False
+
+    @property
+    def plan(self) -> FeaturePlan:
+        """Its features."""
+        return self.features.plan
+
+    # ---- file ----------------------------------------------------------------------------------------------
+
+    @classmethod
+    def from_file(
+        cls, entry: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]], codes: Sequence[int]
+    ) -> FeatureForest:
+        """Made from what a model file says of a pass, everything checked."""
+        features = Features.from_dict(entry)
+        context = Context(tuple(entry["context"])) if entry["context"] else None
+        check_names(features.plan, () if context is None else context.names(codes), entry)
+        return cls(features, Forest.from_arrays(arrays, len(entry["feature_names"]), len(codes)), context)
+
+    def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
+        """What a model file says of it beside its arrays."""
+        return {
+            "parameters": self.forest.parameters(),
+            "feature_names": [column.name for column in self.columns(codes)],
+            "dimensions": list(self.plan.dimensions),
+            "context": [] if self.context is None else list(self.context.tokens),
+            **self.features.to_dict(),
+        }
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """The arrays a model file stores."""
+        return self.forest.arrays()
+
+    def columns(self, codes: Sequence[int]) -> list[Column]:
         """The features; a histogram's bins are one feature."""
         group_of = {name: group for group in ("covariance", "geometric", "shapes") for name in GROUPS[group]}
         group_of.update(dict.fromkeys(RELATIVE, "geometric"))
@@ -102,65 +147,89 @@ class FeatureForest:
                 feature = name.split("_")[0] if group == "shapes" else name
                 found.append((feature, group, part.neighborhood.token))
         found += [(name, "dimension", "(dimension)") for name in self.plan.dimensions]
-        return [Column(name, *rest) for name, rest in zip(self.plan.names, found, strict=True)]
+        columns = [Column(name, *rest) for name, rest in zip(self.plan.names, found, strict=True)]
+        for token in () if self.context is None else self.context.tokens:
+            for name, code in zip(Context((token,)).names(codes), codes, strict=True):
+                columns.append(Column(name, f"Probability_{code}", "context", token))
+        return columns
 
     # ---- applying it ---------------------------------------------------------------------------------------
 
-    def predict_rows(self, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """Probabilities (n, classes) of rows of features, in the order of ``plan.names``."""
-        array = np.ascontiguousarray(values, dtype=np.float32)
-        if array.ndim != 2 or array.shape[1] != len(self.plan.names):
-            raise ModelError(
-                f"the model takes {len(self.plan.names)} features per point",
-                found=f"an array of shape {array.shape}",
-            )
-        if not np.isfinite(array).all():
-            raise ModelError(
-                "a feature is not a finite number", cure="Compute features with this package's own stage"
-            )
-        return self.forest.predict_proba(array)
+    def probabilities(
+        self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64] | None = None
+    ) -> npt.NDArray[np.float64]:
+        """Probabilities (b, classes) of points by their features and context; `rows`, which they are, plays no part."""
+        return self.forest.predict_proba(values)
 
     def predict(self, question: Question, finish: Callable[[npt.NDArray[np.float64]], Any]) -> Answer:
-        """Classify; see ``Algorithm.predict``."""
-        answer = Answer(())
-        fed, notes = gather(self.plan.dimensions, question.dimensions, len(question.xyz), question.rows)
-        answer.report.update({name: number for name, number in notes.items() if number})
-        if question.count:
-            answer.blocks = self._blocks(question, fed, finish, answer.report)
-        return answer
+        """Classify; see ``Algorithm.predict``. Not for one that reads context, which :class:`Passes` gives it."""
+        computing = Computing(self.features, question)
+        blocks = computing.blocks(question.rows, lambda values, rows: finish(self.probabilities(values)))
+        return Answer((Block(rows, result) for rows, result in blocks), computing.report)
 
-    def _blocks(self, question: Question, fed, finish, report: dict[str, Any]):
-        engine = FeatureEngine(
-            question.xyz,
-            self.plan,
-            bins=self.bins,
-            copt_threshold=self.copt_threshold,
-            seed=self.seed,
-            threads=question.threads,
-        )
-        for rows, result in engine.blocks(
-            queries=question.rows,
+
+class Computing:
+    """Features of a question's points, block by block.
+
+    Attributes
+    ----------
+    report : dict
+        What was counted.
+    """
+
+    def __init__(self, features: Features, question: Question) -> None:
+        self.features, self._question = features, question
+        self.report: dict[str, Any] = {}
+        self._engine: FeatureEngine | None = None
+        _, notes = gather(features.plan.dimensions, question.dimensions, len(question.xyz), question.rows)
+        self.report.update({name: number for name, number in notes.items() if number})
+
+    def blocks(
+        self,
+        rows: npt.NDArray[np.int64] | None,
+        apply: Callable[[npt.NDArray[np.float32], npt.NDArray[np.int64]], Any],
+        memory_share: float = 1.0,
+        counted: bool = True,
+        shown: bool = True,
+    ) -> Iterator[tuple[npt.NDArray[np.int64], Any]]:
+        """Yield (rows, ``apply(values, rows)``) for all rows (None: all points).
+
+        `apply` runs in workers' threads. Where not `counted`, the report does not change; the progress does where
+        `counted` and `shown`.
+        """
+        asked = self._question
+        if not (len(asked.xyz) if rows is None else len(rows)):
+            return
+        if self._engine is None:
+            self._engine = self.features.engine(asked.xyz, asked.threads)
+        engine = self._engine
+        fed, _ = gather(self.features.plan.dimensions, asked.dimensions, len(asked.xyz), rows)
+        before = {key: dict(value) for key, value in engine.report.items() if isinstance(value, dict)}
+        yield from engine.blocks(
+            queries=rows,
             dimensions=fed,
-            threads=question.threads,
-            memory_mb=question.memory_mb,
-            progress=question.progress,
-            apply=lambda values, _: finish(self.forest.predict_proba(values)),
-        ):
-            yield Block(rows, result)
+            threads=asked.threads,
+            memory_mb=max(asked.memory_mb * memory_share, 16.0),
+            progress=asked.progress if counted and shown else None,
+            apply=apply,
+        )
+        if not counted:
+            engine.report.update(before)
+            return
         for key in ("fewer_than_three", "beyond_halo"):
             if any(engine.report.get(key, {}).values()):
-                report[key] = {token: number for token, number in engine.report[key].items() if number}
+                self.report[key] = {token: number for token, number in engine.report[key].items() if number}
 
 
-def check_names(plan: FeaturePlan, manifest: Mapping[str, Any]) -> None:
-    """Refuse a manifest whose columns are not those its plan gives."""
-    names = manifest["feature_names"]
-    if list(plan.names) == names and list(plan.dimensions) == manifest["dimensions"]:
+def check_names(plan: FeaturePlan, context: Sequence[str], entry: Mapping[str, Any]) -> None:
+    """Refuse a pass whose columns are not those its plan and its context give."""
+    names, expected = entry["feature_names"], [*plan.names, *context]
+    if expected == names and list(plan.dimensions) == entry["dimensions"]:
         return
-    pairs = zip([*names, *manifest["dimensions"]], [*plan.names, *plan.dimensions], strict=False)
+    pairs = zip([*names, *entry["dimensions"]], [*expected, *plan.dimensions], strict=False)
     first = next((f"'{a}' where '{b}' belongs" for a, b in pairs if a != b), None)
     raise ModelError(
         "the model's features, or their order, are not those its neighborhoods give in this release",
-        found=first or f"{len(names)} features, {len(plan.names)} belong",
+        found=first or f"{len(names)} features, {len(expected)} belong",
         cure="Train the model again with this release",
     )

@@ -7,27 +7,31 @@ import os
 import platform
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..base.errors import DimensionError, OptionError
 from ..base.progress import Progress
-from ..base.threads import map_blocks
 from ..base.version import __version__
-from ..features import FeatureEngine, FeaturePlan, ShapeBins
+from ..features import FeaturePlan
 from . import crossval
 from .classes import ClassMap
 from .clouds import TrainingCloud, class_positions
+from .context import Context
 from .dimensions import gather, required
-from .featureforest import FeatureForest
+from .featureforest import FeatureForest, Features
+from .folds import point_folds
 from .forest import Forest
 from .growing import TreeOptions, grow
 from .model import Model
+from .outoffold import FoldForests, grow_folds, sample_context
+from .samplefeatures import fit, must_fit, percentiles, sample_features
 from .sampling import Samples, draw_samples
 from .trainoptions import TrainingOptions
+
+#: Trees of a forest that judges a fold, as a share of the final one's.
+FOLD_TREES = 0.25
 
 
 class ForestTrainer:
@@ -62,19 +66,29 @@ def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: 
         for name in required(plan.dimensions):
             if name not in cloud.dimensions:
                 gather((name,), cloud.dimensions, len(cloud.xyz), where=cloud.name)
-    classes, samples = _sample(clouds, options)
-    _must_fit(plan, len(samples))
-    values, fitted = _features(clouds, samples, plan, options, progress)
+    classes, positions = class_positions(clouds, options)
+    samples = draw_samples(
+        [(cloud.xyz, position) for cloud, position in zip(clouds, positions, strict=True)],
+        len(classes.codes),
+        options.count,
+        options.seed,
+    )
+    context = Context.parse(options.context)
+    must_fit(len(plan.names) + (options.passes > 1) * len(context.tokens) * len(classes.codes), len(samples))
+    share = np.bincount(samples.cloud, minlength=len(clouds)).tolist()
+    features = fit(clouds, share, plan, options)
+    values, notes = sample_features(clouds, samples, features, options, progress)
     timed = {"features": time.perf_counter() - started}
-    low, high = _percentiles(values, plan, options, samples)
+    limits = percentiles(values, plan, options)
     xy = np.empty((len(samples), 2))
     for number, cloud in enumerate(clouds):
         mine = samples.cloud == number
-        xy[mine] = np.asarray(cloud.xyz, dtype=np.float64)[samples.row[mine], :2]
+        xy[mine] = cloud.xyz[samples.row[mine], :2]
 
     chosen, validation = _validate(values, samples, xy, classes, plan, options, progress)
     started = time.perf_counter()
-    forest, importance, bag = _grow(values, samples, classes, chosen, options, progress)
+    passes = _Passes(clouds, positions, samples, xy, classes.codes, features, context, chosen, options)
+    passes.grow(values, limits, progress)
     timed["trees"] = time.perf_counter() - started
     info = {
         "strategy": options.strategy,
@@ -95,28 +109,15 @@ def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: 
             "max_features": options.max_features,
             "min_samples_leaf": chosen["min_samples_leaf"],
             "max_depth": chosen["max_depth"],
-            **fitted.notes,
+            **passes.notes,
+            **notes,
         },
         "priors": _priors(samples, len(classes.codes), float(options.prior_weight)),
-        "percentiles": {"low": low, "high": high, "limited": options.scale},
-        "accuracy": {"out_of_bag": bag, "cross_validation": validation},
-        "importances": importance,
+        "accuracy": {"cross_validation": validation},
+        "passes": passes.scores,
         "created_by": _versions(),
     }
-    made = FeatureForest(plan, forest, fitted.bins, fitted.copt_threshold, options.seed)
-    return Model(made, list(zip(classes.codes, classes.names, strict=True)), info, timed)
-
-
-# ---- samples -----------------------------------------------------------------------------------------------
-
-
-def _sample(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> tuple[ClassMap, Samples]:
-    classes, positions = class_positions(clouds, options)
-    inputs = [
-        (np.asarray(cloud.xyz, dtype=np.float64), position)
-        for cloud, position in zip(clouds, positions, strict=True)
-    ]
-    return classes, draw_samples(inputs, len(classes.codes), options.count, options.seed)
+    return Model(tuple(passes.made), list(zip(classes.codes, classes.names, strict=True)), info, timed)
 
 
 def _priors(samples: Samples, n_classes: int, weight: float) -> dict[str, Any] | None:
@@ -128,145 +129,18 @@ def _priors(samples: Samples, n_classes: int, weight: float) -> dict[str, Any] |
     return {"weight": weight, "factors": (factors / factors.max()).tolist()}
 
 
-def _must_fit(plan: FeaturePlan, n: int) -> None:
-    """An error where this machine cannot hold the matrix of all samples."""
-    needed = n * len(plan.names) * 4
-    try:
-        there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, OSError, ValueError):
-        return  # a system that does not tell
-    if needed > 0.8 * there:
-        raise OptionError(
-            f"{n:,} samples of {len(plan.names)} features do not fit in this machine's memory",
-            found=f"{needed / 2**30:.1f} GiB needed, {there / 2**30:.1f} GiB there",
-            cure="Lower 'count', or use fewer neighborhoods or features",
-        )
-
-
-# ---- features ----------------------------------------------------------------------------------------------
-
-
-@dataclass
-class _Fitted:
-    """What the feature engine fitted, and what it counted."""
-
-    bins: ShapeBins | None = None
-    copt_threshold: float | None = None
-    notes: dict[str, Any] = field(default_factory=dict)
-
-
-def _engine(
-    cloud: TrainingCloud, plan: FeaturePlan, options: TrainingOptions, fitted: _Fitted
-) -> FeatureEngine:
-    return FeatureEngine(
-        np.asarray(cloud.xyz, dtype=np.float64),
-        plan,
-        bins=fitted.bins,
-        copt_threshold=fitted.copt_threshold,
-        seed=options.seed,
-        threads=options.threads,
-    )
-
-
-def _fit(clouds: Sequence[TrainingCloud], share, plan: FeaturePlan, options: TrainingOptions) -> _Fitted:
-    """Histogram and curvature thresholds: the mean of each cloud's own, weighted by its samples."""
-    fitted = _Fitted()
-    engines = [_engine(c, plan, options, fitted).fit() for c, n in zip(clouds, share, strict=True) if n]
-    weight = [n / sum(share) for n in share if n]
-
-    def mean(values) -> float:  # exactly rounded, so the order of the clouds does not matter
-        return math.fsum(w * v for w, v in zip(weight, values, strict=True)) if len(weight) > 1 else values[0]
-
-    if engines[0].copt_threshold is not None:
-        fitted.copt_threshold = mean([e.copt_threshold for e in engines])
-    if engines[0].bins is not None:
-        each = [e.bins.to_dict() for e in engines if e.bins is not None]
-        fitted.bins = ShapeBins.from_dict(
-            {
-                token: {
-                    metric: [
-                        mean(values) for values in zip(*(one[token][metric] for one in each), strict=True)
-                    ]
-                    for metric in rows
-                }
-                for token, rows in each[0].items()
-            }
-        )
-    return fitted
-
-
-def _features(
-    clouds: Sequence[TrainingCloud],
-    samples: Samples,
-    plan: FeaturePlan,
-    options: TrainingOptions,
-    progress: bool,
-) -> tuple[npt.NDArray[np.float32], _Fitted]:
-    """The (samples, features) float32 matrix, filled cloud by cloud."""
-    values = np.empty((len(samples), len(plan.names)), np.float32)
-    share = np.bincount(samples.cloud, minlength=len(clouds)).tolist()
-    fitted = _fit(clouds, share, plan, options)
-    with Progress(len(samples), "features of the samples", enabled=None if progress else False) as bar:
-        for number, cloud in enumerate(clouds):
-            at = np.flatnonzero(samples.cloud == number)
-            if not len(at):
-                continue
-            at = at[np.argsort(samples.row[at], kind="stable")]
-            rows = samples.row[at]
-            engine = _engine(cloud, plan, options, fitted)
-            fed, notes = gather(plan.dimensions, cloud.dimensions, len(cloud.xyz), rows, cloud.name)
-            for name, n in notes.items():
-                fitted.notes[name] = fitted.notes.get(name, 0) + n
-            for part, block in engine.blocks(
-                queries=rows,
-                dimensions=fed,
-                threads=options.threads,
-                memory_mb=options.memory_mb,
-                progress=bar,
-            ):
-                values[at[np.searchsorted(rows, part)]] = block  # `part` are rows of the cloud
-    if not np.isfinite(values).all():
-        column = int(np.argmin(np.isfinite(values).all(axis=0)))
-        raise DimensionError(f"the feature {plan.names[column]} is not finite for some samples")
-    return values, fitted
-
-
-def _percentiles(
-    values: npt.NDArray[np.float32], plan: FeaturePlan, options: TrainingOptions, samples: Samples
-) -> tuple[list[float], list[float]]:
-    """1st and 99th percentile of each geometric feature, the values limited to them if so wanted.
-
-    [B16 3.3] scales features to [0, 1] between the two and cuts off what is beyond. Splits of a tree do not
-    change under scaling, so only the cut is done, on the training values: no threshold can then lie beyond
-    the percentiles, and a value beyond goes the way its limit would. Inference needs neither.
-    """
-    computed = len(plan.names) - len(plan.dimensions)
-    low = [0.0] * len(plan.names)
-    high = [1.0] * len(plan.names)
-    columns = range(len(plan.names))
-
-    def one(j: int) -> None:
-        column = values[:, j]
-        if j >= computed:  # dimensions keep their own scale
-            low[j], high[j] = float(column.min()), float(column.max())
-            return
-        first, last = np.percentile(column, [1.0, 99.0]).astype(np.float32)
-        if np.abs(column).min() == 0.0 and first >= 0.0 and column.min() >= 0.0:
-            first = np.float32(0.0)
-        low[j], high[j] = float(first), float(last)
-        if options.scale:
-            np.clip(column, first, last, out=column)
-
-    for _ in map_blocks(one, columns, options.threads):
-        pass
-    return low, high
-
-
 # ---- trees -------------------------------------------------------------------------------------------------
 
 
 def _tree_options(options: TrainingOptions, max_depth: int | None, min_samples_leaf: int) -> TreeOptions:
     return TreeOptions(max_depth, min_samples_leaf, float(options.max_samples), options.max_features)
+
+
+def _gap(plan: FeaturePlan, options: TrainingOptions) -> float:
+    """Metres between samples trained on and ground held out."""
+    if options.gap is not None:
+        return float(options.gap)
+    return max((one.reach or 0.0 for one in plan.neighborhoods), default=0.0)
 
 
 def _validate(
@@ -284,9 +158,7 @@ def _validate(
     folds = options.folds or (5 if options.searches else 0)
     if not folds:
         return {"trees": counts[-1], **candidates[0]}, None
-    gap = options.gap
-    if gap is None:
-        gap = max((one.reach or 0.0 for one in plan.neighborhoods), default=0.0)
+    gap = _gap(plan, options)
     rows = crossval.search(
         values,
         samples.label,
@@ -297,7 +169,7 @@ def _validate(
         counts,
         folds=folds,
         block_size=float(options.block_size),
-        gap=float(gap),
+        gap=gap,
         seed=options.seed,
         threads=options.threads,
         progress=progress,
@@ -306,53 +178,157 @@ def _validate(
     return chosen, {
         "folds": folds,
         "block_size": float(options.block_size),
-        "gap": float(gap),
+        "gap": gap,
         "tried": rows,
         "chosen": chosen,
     }
 
 
-def _grow(
-    values,
-    samples: Samples,
-    classes: ClassMap,
-    chosen: Mapping[str, Any],
-    options: TrainingOptions,
-    progress: bool,
-) -> tuple[Forest, list[float], dict[str, Any] | None]:
-    """(forest, importances, out-of-bag score)."""
-    n, k = len(samples), len(classes.codes)
-    total = np.zeros((n, k))
-    trees = []
-    importance = np.zeros(values.shape[1])
-    setting = _tree_options(options, chosen["max_depth"], chosen["min_samples_leaf"])
-    with Progress(chosen["trees"], "growing", "trees", enabled=None if progress else False) as bar:
-        for tree, rows, shares in grow(
-            values,
-            samples.label,
-            samples.weight,
-            chosen["trees"],
-            setting,
-            options.seed,
-            score="out of bag",
-            threads=options.threads,
-            progress=bar,
-        ):
-            trees.append(tree.tree_)
-            importance += tree.feature_importances_
-            total[rows] += shares
-    scored = total.sum(axis=1) > 0
-    bag = None
-    if scored.any():
-        matrix = np.zeros((k, k), np.int64)
-        np.add.at(matrix, (samples.label[scored], total[scored].argmax(axis=1)), samples.weight[scored])
-        bag = {**crossval.figures(matrix, classes.codes), "samples": int(np.count_nonzero(scored))}
-    whole = importance.sum()
-    return (
-        Forest.from_sklearn(trees, values.shape[1]),
-        (importance / whole if whole else importance).tolist(),
-        bag,
-    )
+class _Passes:
+    """Growing one forest after the other, each reading what the one before says of ground it has not seen."""
+
+    def __init__(
+        self,
+        clouds: Sequence[TrainingCloud],
+        positions: Sequence[npt.NDArray[np.int16]],
+        samples: Samples,
+        xy: npt.NDArray[np.float64],
+        codes: Sequence[int],
+        features: Features,
+        context: Context,
+        chosen: Mapping[str, Any],
+        options: TrainingOptions,
+    ) -> None:
+        self.clouds, self.samples, self.xy, self.codes = clouds, samples, xy, codes
+        self.features, self.context, self.chosen, self.options = features, context, chosen, options
+        self.setting = _tree_options(options, chosen["max_depth"], chosen["min_samples_leaf"])
+        self.made: list[FeatureForest] = []
+        self.scores: list[dict[str, Any]] = []
+        self.notes: dict[str, Any] = {}
+        if options.passes > 1:
+            self.fold, self.folds = point_folds(
+                [(cloud.xyz, position) for cloud, position in zip(clouds, positions, strict=True)],
+                [cloud.survey or cloud.name for cloud in clouds],
+                options.pass_folds,
+            )
+            self.notes["pass_folds"] = self.folds
+
+    def grow(
+        self, values: npt.NDArray[np.float32], limits: tuple[list[float], list[float]], progress: bool
+    ) -> None:
+        """Fill `made` and `scores`."""
+        columns, held_out = values, []
+        for number in range(self.options.passes):
+            if number:
+                held_out.append(self._hold_out(columns, number, progress))
+                columns = np.concatenate([values, self._context(held_out, progress)], axis=1)
+            forest, importances, bag = self._forest(columns, number, progress)
+            self.made.append(FeatureForest(self.features, forest, self.context if number else None))
+            low, high = (
+                [*side, *column.tolist()]
+                for side, column in zip(limits, _ends(columns[:, values.shape[1] :]), strict=True)
+            )
+            self.scores.append(
+                {
+                    "percentiles": {"low": low, "high": high, "limited": self.options.scale},
+                    "importances": importances,
+                    "out_of_bag": bag,
+                }
+            )
+
+    def _hold_out(self, columns: npt.NDArray[np.float32], number: int, progress: bool) -> list[Forest]:
+        """The pass before `number` once more, a forest without each fold."""
+        trees = max(1, math.ceil(self.chosen["trees"] * FOLD_TREES))
+        fold = np.empty(len(self.samples), np.int16)
+        for k in range(len(self.clouds)):
+            mine = self.samples.cloud == k
+            fold[mine] = self.fold[k][self.samples.row[mine]]
+        with Progress(
+            trees * self.folds,
+            f"pass {number} without each fold",
+            "trees",
+            enabled=None if progress else False,
+        ) as bar:
+            return grow_folds(
+                columns,
+                self.samples.label,
+                self.samples.weight,
+                self.xy,
+                fold,
+                self.folds,
+                trees,
+                self.setting,
+                gap=_gap(self.features.plan, self.options),
+                seed=self.options.seed,
+                threads=self.options.threads,
+                progress=bar,
+            )
+
+    def _context(self, held_out: Sequence[Sequence[Forest]], progress: bool) -> npt.NDArray[np.float32]:
+        """The samples' context, (samples, columns), by passes that have not seen them."""
+        classes = len(self.codes)
+        out = np.empty((len(self.samples), len(self.context.tokens) * classes), np.float32)
+        with Progress(
+            len(self.samples), f"context for pass {len(held_out) + 1}", enabled=None if progress else False
+        ) as bar:
+            for number, cloud in enumerate(self.clouds):
+                at, rows = self.samples.of_cloud(number)
+                if not len(at):
+                    continue
+                passes = [
+                    FoldForests(self.features, self.context if k else None, forests, self.fold[number])
+                    for k, forests in enumerate(held_out)
+                ]
+                out[at] = sample_context(
+                    cloud.xyz,
+                    cloud.dimensions,
+                    rows,
+                    passes,
+                    self.context,
+                    classes,
+                    threads=self.options.threads,
+                    memory_mb=self.options.memory_mb,
+                    progress=bar,
+                )
+        return out
+
+    def _forest(
+        self, values: npt.NDArray[np.float32], number: int, progress: bool
+    ) -> tuple[Forest, list[float], dict[str, Any] | None]:
+        """(forest, importances, out-of-bag score)."""
+        label, weight, n, k = self.samples.label, self.samples.weight, len(self.samples), len(self.codes)
+        total = np.zeros((n, k))
+        trees = []
+        importance = np.zeros(values.shape[1])
+        what = f"growing pass {number + 1}" if self.options.passes > 1 else "growing"
+        with Progress(self.chosen["trees"], what, "trees", enabled=None if progress else False) as bar:
+            for tree, rows, shares in grow(
+                values,
+                label,
+                weight,
+                self.chosen["trees"],
+                self.setting,
+                self.options.seed,
+                score="out of bag",
+                threads=self.options.threads,
+                progress=bar,
+            ):
+                trees.append(tree.tree_)
+                importance += tree.feature_importances_
+                total[rows] += shares
+        scored = total.sum(axis=1) > 0
+        bag = None
+        if scored.any():
+            matrix = np.zeros((k, k), np.int64)
+            np.add.at(matrix, (label[scored], total[scored].argmax(axis=1)), weight[scored])
+            bag = {**crossval.figures(matrix, self.codes), "samples": int(np.count_nonzero(scored))}
+        whole = importance.sum()
+        importances = (importance / whole if whole else importance).tolist()
+        return Forest.from_sklearn(trees, values.shape[1]), importances, bag
+
+
+def _ends(columns: npt.NDArray[np.float32]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    return columns.min(axis=0), columns.max(axis=0)
 
 
 def _versions() -> dict[str, str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,14 +13,14 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError, OptionError
 from . import modelfile, summary
-from .algorithms import Algorithm, Inputs, Question, algorithm
+from .algorithms import Inputs, Question, algorithm
 from .deciding import Outcome, Prediction, PredictionOptions, decide
 from .dimensions import required
+from .passes import Passes
 from .smoothing import count_shares, smooth
 
-# What a Model's algorithm keeps, and what a file adds.
-_OWN = {"format", "version", "algorithm", "parameters", "features", "feature_names", "dimensions", "arrays"}
-_OWN |= {"shape_bins", "copt_threshold", "feature_seed"}
+#: What a file says of a pass that its classifier does not need.
+_SCORES = ("percentiles", "importances", "out_of_bag")
 
 #: Points decided on at a time after smoothing.
 _DECIDED = 500_000
@@ -31,22 +32,28 @@ class Model:
 
     Attributes
     ----------
-    algorithm : Algorithm
-        The classifier itself, e.g. a :class:`FeatureForest`.
+    passes : tuple
+        The classifiers, e.g. a :class:`FeatureForest`; each but the first reads what the one before said.
     classes : list of (code, name)
         In the order of the columns of probabilities.
     info : dict
-        The rest of the manifest: how it was trained, scores, percentiles, importances.
+        The rest of the manifest: how it was trained, scores; ``info["passes"]`` has the percentiles, importances and
+        score of each pass.
     seconds : dict
         What training took, by part; not stored.
     """
 
-    algorithm: Algorithm
+    passes: tuple[Any, ...]
     classes: list[tuple[int, str]]
     info: dict[str, Any] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
 
     # ---- what it is ----------------------------------------------------------------------------------------
+
+    @cached_property
+    def algorithm(self) -> Any:
+        """What classifies clouds: the only pass, or all of them as one."""
+        return self.passes[0] if len(self.passes) == 1 else Passes(self.passes, len(self.classes))
 
     @property
     def plan(self) -> Inputs:
@@ -79,45 +86,51 @@ class Model:
         """Whether :meth:`predict` can return a variance."""
         return self.algorithm.gives_variance
 
-    def importances(self, by: str = "feature") -> dict[str, float]:
+    def importances(self, by: str = "feature", number: int = -1) -> dict[str, float]:
         """Mean decrease in impurity, summing to 1, largest first.
 
         Parameters
         ----------
         by : {"column", "feature", "group", "neighborhood", "dimension"}
             Every column; each feature over all neighborhoods (a histogram's bins together); covariance,
-            geometry and shape features; each neighborhood; or the points' own dimensions against all others.
+            geometry, shape features and context; each neighborhood; or the points' own dimensions against all
+            others.
+        number : int
+            Place of the pass in ``passes``; the last by default.
         """
-        return summary.importances(self.info.get("importances"), self.algorithm.columns(), by)
+        values = self.info["passes"][number]["importances"]
+        return summary.importances(values, self.passes[number].columns(self._codes), by)
 
     def describe(self) -> dict[str, Any]:
         """Everything about the model as plain data; ``str(model)`` is the same as text."""
         more = {"required_dimensions": list(self.required_dimensions), "halo": self.halo}
-        return summary.describe({**self.manifest(), **more}, self.algorithm.columns())
+        return summary.describe(
+            {**self.manifest(), **more}, [one.columns(self._codes) for one in self.passes]
+        )
 
     def __repr__(self) -> str:
-        return f"<Model {self.algorithm.name} of classes {[code for code, _ in self.classes]}>"
+        return f"<Model {self.algorithm.name} of classes {self._codes}>"
 
     def __str__(self) -> str:
         return summary.text(self.describe())
+
+    @property
+    def _codes(self) -> list[int]:
+        return [code for code, _ in self.classes]
 
     # ---- file ----------------------------------------------------------------------------------------------
 
     def manifest(self) -> dict[str, Any]:
         """What the model file says beside its arrays."""
-        return {
-            **self.info,
-            "algorithm": self.algorithm.name,
-            "parameters": self.algorithm.parameters(),
-            "features": self.plan.to_dict(),
-            "feature_names": list(self.plan.names),
-            "dimensions": list(self.plan.dimensions),
-            **self.algorithm.fitted(),
-        }
+        passes = [
+            {"algorithm": one.name, **one.to_file(self._codes), **scores}
+            for one, scores in zip(self.passes, self.info["passes"], strict=True)
+        ]
+        return {**self.info, "passes": passes}
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the model file: whole, or not at all."""
-        modelfile.write(path, self.manifest(), self.algorithm.arrays())
+        modelfile.write(path, self.manifest(), [one.arrays() for one in self.passes])
 
     # ---- applying it ---------------------------------------------------------------------------------------
 
@@ -211,24 +224,31 @@ def load_model(path: str | os.PathLike) -> Model:
         raise ModelError("the model's features are not known here", where=str(path), found=error) from error
 
 
-def assemble(manifest: dict[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> Model:
+def assemble(manifest: dict[str, Any], arrays: modelfile.Arrays) -> Model:
     """The model that a file's manifest and arrays describe; what they say is checked against each other."""
     classes = [(entry["code"], entry["name"]) for entry in manifest["classes"]]
     codes = [code for code, _ in classes]
     if sorted(set(codes)) != codes:
         raise ModelError("the model's classes must be ascending, each once", found=codes[:10])
-    made = algorithm(manifest["algorithm"]).from_file(manifest, arrays)
     priors = manifest.get("priors")
     if priors is not None and len(priors["factors"]) != len(classes):
         raise ModelError("the manifest's priors must have one factor per class", found=len(priors["factors"]))
-    for key, group in (
-        ("percentiles/low", manifest["percentiles"]["low"]),
-        ("percentiles/high", manifest["percentiles"]["high"]),
-        ("importances", manifest["importances"]),
-    ):
-        if group is not None and len(group) != len(made.plan.names):
-            raise ModelError(f"the manifest's {key} must have one value per feature", found=len(group))
-    return Model(made, classes, {key: value for key, value in manifest.items() if key not in _OWN})
+    passes = []
+    for number, entry in enumerate(manifest["passes"]):
+        made = algorithm(entry["algorithm"]).from_file(entry, arrays[number], codes)
+        if (number > 0) != bool(entry["context"]):
+            raise ModelError("every pass but the first must read context", found=f"pass {number + 1}")
+        for key, group in (
+            ("percentiles/low", entry["percentiles"]["low"]),
+            ("percentiles/high", entry["percentiles"]["high"]),
+            ("importances", entry["importances"]),
+        ):
+            if group is not None and len(group) != len(entry["feature_names"]):
+                raise ModelError(f"the manifest's {key} must have one value per feature", found=len(group))
+        passes.append(made)
+    info = {key: value for key, value in manifest.items() if key not in ("format", "version", "arrays")}
+    info["passes"] = [{key: entry[key] for key in _SCORES} for entry in manifest["passes"]]
+    return Model(tuple(passes), classes, info)
 
 
 def _smoothed(

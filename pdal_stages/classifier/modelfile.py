@@ -12,7 +12,7 @@ import os
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
@@ -24,8 +24,12 @@ from ..base.errors import ModelError, StageError
 from ..base.files import whole_files
 from .arrays import ArrayRule, from_bytes, to_bytes
 
+#: Arrays of each pass by their names.
+Arrays = list[dict[str, npt.NDArray[Any]]]
+
 FORMAT = "pdal-stages model"
-VERSION = 1
+#: Written; every one before is read.
+VERSION = 2
 MANIFEST = "manifest.json"
 
 #: A manifest's largest size in bytes, unpacked.
@@ -48,7 +52,7 @@ _BAD = (
 
 
 def write(
-    path: str | os.PathLike, manifest: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]
+    path: str | os.PathLike, manifest: Mapping[str, Any], passes: Sequence[Mapping[str, npt.NDArray[Any]]]
 ) -> None:
     """Write a model file; an existing one stays as it was until the new one is complete.
 
@@ -59,10 +63,13 @@ def write(
     path : path
     manifest : mapping
         Everything but ``arrays``, which is added here.
-    arrays : mapping
-        Name to array of numbers.
+    passes : sequence of mapping
+        Of each pass, name to array of numbers.
     """
     path = Path(path)
+    arrays = {
+        f"{number}.{name}": array for number, one in enumerate(passes, 1) for name, array in one.items()
+    }
     members = {f"arrays/{name}.npy": to_bytes(array) for name, array in arrays.items()}
     table = {
         name: {
@@ -100,19 +107,22 @@ def write(
 # ---- reading -----------------------------------------------------------------------------------------------
 
 
-def read(path: str | os.PathLike, rules_of) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
+def read(path: str | os.PathLike, rules_of) -> tuple[dict[str, Any], Arrays]:
     """Read a model file.
 
     Parameters
     ----------
     path : path
     rules_of : function
-        From the manifest's ``algorithm`` to its arrays' rules (name to :class:`ArrayRule`, a name that ends
+        From a pass's ``algorithm`` to its arrays' rules (name to :class:`ArrayRule`, a name that ends
         in ``*`` stands for many); raises for an algorithm it does not know.
 
     Returns
     -------
-    (manifest, arrays)
+    manifest : dict
+        As the newest version has it, whatever the file's.
+    arrays : list of dict
+        Of each pass.
 
     Raises
     ------
@@ -160,9 +170,7 @@ def _check_end(stream) -> int:
     return size
 
 
-def _read(
-    archive: zipfile.ZipFile, size: int, rules_of
-) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
+def _read(archive: zipfile.ZipFile, size: int, rules_of) -> tuple[dict[str, Any], Arrays]:
     members: dict[str, zipfile.ZipInfo] = {}
     for info in archive.infolist():
         if info.filename in members:
@@ -184,7 +192,7 @@ def _read(
     if members[MANIFEST].file_size > MANIFEST_LIMIT:
         raise ModelError("the manifest is too large", found=f"{members[MANIFEST].file_size:,} bytes")
     manifest = parse(_unpack(archive, members[MANIFEST]))
-    rules = rules_of(manifest["algorithm"])
+    rules = [rules_of(one["algorithm"]) for one in manifest["passes"]]
     table = manifest["arrays"]
     expected = {MANIFEST, *(entry["file"] for entry in table.values())}
     if len(expected) != 1 + len(table) or expected != set(members):
@@ -192,22 +200,26 @@ def _read(
         raise ModelError(
             "the members and the manifest's list of arrays differ", found=odd[:3] or None, cure=CURE
         )
-    arrays = {}
-    for name, entry in table.items():
+    arrays: Arrays = [{} for _ in rules]
+    for label, entry in table.items():
+        number, name = int(label[0]) - 1, label[2:]
+        if number >= len(rules):
+            raise ModelError("the model file has an array of a pass it does not have", found=repr(label))
         data = _unpack(archive, members[entry["file"]])
         if hashlib.sha256(data).hexdigest() != entry["sha256"]:
             raise ModelError(
                 f"the array '{name}' is not the one that was stored", found="another SHA-256", cure=CURE
             )
-        array = from_bytes(data, _rule(rules, name), name)
+        array = from_bytes(data, _rule(rules[number], name), name)
         if list(array.shape) != entry["shape"] or array.dtype.newbyteorder("<").str != entry["dtype"]:
             raise ModelError(
                 f"the array '{name}' is not what the manifest says", found=f"shape {array.shape}"
             )
-        arrays[name] = array
-    missing = [name for name in rules if not name.endswith("*") and name not in arrays]
-    if missing:
-        raise ModelError("the model file lacks an array", found=missing[0], cure=CURE)
+        arrays[number][name] = array
+    for there, needed in zip(arrays, rules, strict=True):
+        missing = [name for name in needed if not name.endswith("*") and name not in there]
+        if missing:
+            raise ModelError("the model file lacks an array", found=missing[0], cure=CURE)
     return manifest, arrays
 
 
@@ -232,7 +244,7 @@ def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
 
 
 def parse(data: bytes) -> dict[str, Any]:
-    """The manifest in `data`, valid by its schema."""
+    """The manifest in `data`, valid by its version's schema, as the newest version has it."""
     try:
         manifest = json.loads(data.decode("utf-8"), object_pairs_hook=_unique, parse_constant=_constant)
     except RecursionError:
@@ -241,20 +253,41 @@ def parse(data: bytes) -> dict[str, Any]:
         raise ModelError("the manifest is not valid JSON", found=str(error)[:200], cure=CURE) from None
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ModelError("this is not a model file", found="a manifest of something else")
-    if manifest.get("version") != VERSION:
+    if isinstance(manifest.get("version"), bool) or manifest.get("version") not in range(1, VERSION + 1):
         raise ModelError(
-            f"the model file has a version this release does not know (it knows {VERSION})",
+            f"the model file has a version this release does not know (it knows 1 to {VERSION})",
             found=f"version {str(manifest.get('version'))[:20]}",
             cure="Update pdal-stages",
         )
     validate(manifest)
-    return manifest
+    return _from_version_1(manifest) if manifest["version"] == 1 else manifest
+
+
+def _from_version_1(old: Mapping[str, Any]) -> dict[str, Any]:
+    """Version 1 had one pass, whose entries stood among the others."""
+    only = {key: old[key] for key in _PASS}
+    only |= {"context": [], "out_of_bag": old["accuracy"]["out_of_bag"]}
+    rest = {key: value for key, value in old.items() if key not in _PASS}
+    return {
+        **rest,
+        "version": VERSION,
+        "accuracy": {"cross_validation": old["accuracy"]["cross_validation"]},
+        "passes": [only],
+        "arrays": {f"1.{name}": entry for name, entry in old["arrays"].items()},
+    }
+
+
+#: What version 1 said of its one pass.
+_PASS = (
+    "algorithm", "parameters", "features", "feature_names", "dimensions", "shape_bins", "copt_threshold",
+    "feature_seed", "percentiles", "importances",
+)  # fmt: skip
 
 
 def validate(manifest: Mapping[str, Any]) -> None:
     """Hold a manifest against its JSON Schema."""
     try:
-        error = next(_validator().iter_errors(manifest), None)
+        error = next(_validator(manifest["version"]).iter_errors(manifest), None)
     except RecursionError:
         raise ModelError("the manifest is nested too deeply", cure=CURE) from None
     if error is not None:
@@ -262,11 +295,11 @@ def validate(manifest: Mapping[str, Any]) -> None:
         raise ModelError(f"the manifest is not valid at {place}", found=error.message[:200], cure=CURE)
 
 
-@lru_cache(maxsize=1)
-def _validator():
+@lru_cache
+def _validator(version: int):
     import jsonschema
 
-    text = resources.files(__package__).joinpath(f"model-{VERSION}.json").read_text("utf-8")
+    text = resources.files(__package__).joinpath(f"model-{version}.json").read_text("utf-8")
     return jsonschema.Draft202012Validator(json.loads(text))
 
 
@@ -278,4 +311,4 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _constant(word: str) -> None:
-    raise ValueError(f"{word} is no number")
+    raise ValueError(f"{word} is not a number")

@@ -47,6 +47,12 @@ class Samples:
     def __len__(self) -> int:
         return len(self.row)
 
+    def of_cloud(self, number: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """A cloud's samples: their places here, and their rows in the cloud, ascending."""
+        at = np.flatnonzero(self.cloud == number)
+        at = at[np.argsort(self.row[at], kind="stable")]
+        return at, self.row[at]
+
     def counts(self, position: int) -> dict[str, int]:
         """Points available, different points drawn, and duplicates of one class."""
         weight = self.weight[self.label == position]

@@ -31,24 +31,35 @@ def importances(
     return dict(sorted(total.items(), key=lambda item: -item[1]))
 
 
-def describe(manifest: Mapping[str, Any], columns: Sequence[Column]) -> dict[str, Any]:
-    """A manifest for people: importances grouped, long tables left out."""
-    values = manifest.get("importances")
-    kept = {k: v for k, v in manifest.items() if k not in ("shape_bins", "percentiles", "importances")}
-    if values is not None:
-        kept["importances"] = {
-            by: {key: round(value, 6) for key, value in importances(values, columns, by).items()}
-            for by in GROUPINGS[1:]
-        }
-    return kept
+def describe(manifest: Mapping[str, Any], columns: Sequence[Sequence[Column]]) -> dict[str, Any]:
+    """A manifest for people: importances grouped, long tables left out; `columns` of each pass."""
+    passes = []
+    for entry, its in zip(manifest["passes"], columns, strict=True):
+        values = entry["importances"]
+        kept = {k: v for k, v in entry.items() if k not in ("shape_bins", "percentiles", "importances")}
+        if values is not None:
+            kept["importances"] = {
+                by: {key: round(value, 6) for key, value in importances(values, its, by).items()}
+                for by in GROUPINGS[1:]
+            }
+        passes.append(kept)
+    return {**manifest, "passes": passes}
 
 
 def text(info: Mapping[str, Any]) -> str:
     """What :func:`describe` gives as a page of text."""
-    lines = [
-        f"{info['algorithm']}: "
-        + ", ".join(f"{v:,} {k}" for k, v in info["parameters"].items() if isinstance(v, int)),
-        f"features       {len(info['feature_names'])}: {' '.join(info['features']['neighborhoods'])}",
+    lines = []
+    for number, one in enumerate(info["passes"], 1):
+        if len(info["passes"]) > 1:
+            lines.append(f"pass {number}")
+        numbers = [f"{v:,} {k}" for k, v in one["parameters"].items() if isinstance(v, int)]
+        lines += [
+            f"{one['algorithm']}: {', '.join(numbers)}",
+            f"features       {len(one['feature_names'])}: {' '.join(one['features']['neighborhoods'])}",
+        ]
+        if one["context"]:
+            lines.append(f"context        {' '.join(one['context'])}")
+    lines += [
         f"needs          {', '.join(info['required_dimensions']) or 'coordinates only'}",
         f"halo           {info['halo']:g} m",
     ]
@@ -62,22 +73,24 @@ def text(info: Mapping[str, Any]) -> str:
     for cloud in training.get("clouds", []):
         lines.append(f"trained on     {cloud['name']}, {cloud['points']:,} points")
     lines += ["", f"{'class':<34}{'available':>12}{'samples':>10}{'duplicates':>12}{'F1 out of bag':>15}"]
-    bag = info.get("accuracy", {}).get("out_of_bag") or {}
+    bag = info["passes"][-1]["out_of_bag"] or {}
     for entry in info.get("classes", []):
         f1 = (bag.get("f1") or {}).get(str(entry["code"]))
         lines.append(
             f"{entry['code']:>3} {entry['name'][:29]:<30}{entry['available']:>12,}{entry['samples']:>10,}"
             f"{entry['duplicates']:>12,}{_percent(f1):>15}"
         )
-    lines += ["", *_scores(info.get("accuracy", {}), training.get("held_out"))]
-    if "importances" in info:
-        for by in ("neighborhood", "group", "feature"):
-            top = list(info["importances"][by].items())[:10]
+    lines += ["", *_scores(info, training.get("held_out"))]
+    for number, one in enumerate(info["passes"], 1):
+        if "importances" in one and len(info["passes"]) > 1:
+            lines.append(f"pass {number}")
+        for by in ("neighborhood", "group", "feature") if "importances" in one else ():
+            top = list(one["importances"][by].items())[:10]
             lines.append(f"importance by {by:<13}" + ", ".join(f"{k} {100 * v:.1f} %" for k, v in top))
     return "\n".join(lines)
 
 
-def _scores(accuracy: dict[str, Any], held_out: dict[str, Any] | None = None) -> list[str]:
+def _scores(info: Mapping[str, Any], held_out: dict[str, Any] | None = None) -> list[str]:
     """`held_out`: a network's own, over points as they lie."""
     names = ("overall_accuracy", "kappa", "mean_f1")
     if isinstance(held_out, dict) and all(isinstance(held_out.get(n), float | None) for n in names):
@@ -88,13 +101,11 @@ def _scores(accuracy: dict[str, Any], held_out: dict[str, Any] | None = None) ->
             "",
         ]
     lines = []
-    for key, label in (
-        ("cross_validation", "blocks held out"),
-        ("out_of_bag", "out of bag"),
-    ):
-        row = accuracy.get(key)
-        if key == "cross_validation" and row:
-            row = row["chosen"]
+    crossed = info["accuracy"]["cross_validation"]
+    rows = [("blocks held out", crossed and crossed["chosen"])]
+    for number, one in enumerate(info["passes"], 1):
+        rows.append((f"out of bag{f' {number}' if len(info['passes']) > 1 else ''}", one["out_of_bag"]))
+    for label, row in rows:
         if row:
             lines.append(
                 f"{label:<17}overall accuracy {_percent(row['overall_accuracy'])}, "

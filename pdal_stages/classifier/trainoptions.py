@@ -12,8 +12,13 @@ import numpy as np
 from ..base.errors import OptionError, suggest
 from ..base.threads import resolve_threads
 from .algorithms import algorithm_names, trainer
+from .context import Context
 
 STRATEGIES = ("multiclass", "binary")
+#: Most passes a model can have.
+MOST_PASSES = 3
+#: What passes after the first read of the surroundings.
+DEFAULT_CONTEXT = ("own", "box0.5", "boxvotes1", "columnvotes2", "columnvotes4")
 
 
 @dataclass(frozen=True)
@@ -64,6 +69,14 @@ class TrainingOptions:
     gap : float or None
         Training samples nearer than this (metres, in plan) to a validation sample are left out of that fold.
         None: the largest radius of the neighborhoods.
+    passes : int
+        1 to 3. Every pass after the first reads, beside the features, what the one before says all around
+        (`context`), and is trained on what it says of ground it has not seen.
+    context : sequence of str
+        What of the surroundings is read; see :class:`pdal_stages.classifier.context.Context`.
+    pass_folds : int
+        Parts of the training ground that are held out in turn for that: whole surveys where there are three or
+        more, else strips.
     algorithm : {"random_forest", "alsnet"}
         A forest on features, or a network on the points themselves [WM19], which uses `dimensions`, `classes`,
         `strategy`, `seed` and `threads` of these options and all of `alsnet`.
@@ -93,6 +106,9 @@ class TrainingOptions:
     folds: int = 0
     block_size: float = 25.0
     gap: float | None = None
+    passes: int = 1
+    context: Sequence[str] = DEFAULT_CONTEXT
+    pass_folds: int = 5
     algorithm: str = "random_forest"
     alsnet: Any = None
     threads: int | None = None
@@ -100,7 +116,13 @@ class TrainingOptions:
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
-        for name, low, high in (("count", 1, 10**8), ("seed", 0, 2**63 - 1), ("folds", 0, 1000)):
+        for name, low, high in (
+            ("count", 1, 10**8),
+            ("seed", 0, 2**63 - 1),
+            ("folds", 0, 1000),
+            ("passes", 1, MOST_PASSES),
+            ("pass_folds", 2, 100),
+        ):
             set_(self, name, _whole(name, getattr(self, name), low, high))
         for name, low, high in (("trees", 1, 10_000), ("min_samples_leaf", 1, 10**6)):
             _values(name, getattr(self, name), low, high)
@@ -114,6 +136,11 @@ class TrainingOptions:
                 cure=f"Choose one of {', '.join(STRATEGIES)}",
             )
         self._check_algorithm()
+        set_(self, "context", Context.parse(self.context).tokens)
+        if self.passes > 1 and not self.context:
+            raise OptionError(
+                "several passes need a context", found="an empty list", cure="Leave 'context' out"
+            )
         if self.strategy == "binary" and self.target is None:
             raise OptionError("the binary strategy needs 'target', the code of the class to find")
         if self.strategy == "multiclass" and self.target is not None:

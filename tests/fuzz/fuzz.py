@@ -56,7 +56,7 @@ def _dictionary(name: str, folder: Path) -> Path:
         import json
 
         manifest = json.loads(targets.good_model()["manifest.json"])
-        words |= {*manifest, *manifest["features"], *manifest["arrays"], "PK", "<f4", "|u1", "-1", "NaN"}
+        words |= {*manifest, *manifest["passes"][0], *manifest["passes"][0]["features"], *manifest["arrays"], "PK", "<f4", "|u1", "-1", "NaN"}
     path = folder / f"{name}.dict"
     escaped = [word.replace("\\", "\\\\").replace('"', '\\"') for word in sorted(words)]
     path.write_text("".join(f'"{word}"\n' for word in escaped))

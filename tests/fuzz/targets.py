@@ -147,7 +147,7 @@ def model(data: bytes) -> str:
         assert str(made) and made.describe() and made.halo >= 0
         made.importances()
         values = np.random.default_rng(1).normal(size=(50, len(made.plan.names))).astype(np.float32)
-        shares = made.algorithm.predict_rows(values)
+        shares = made.algorithm.probabilities(values)
         assert shares.shape == (50, len(made.classes))
         assert (
             np.isfinite(shares).all()

@@ -36,29 +36,29 @@ def repack(path, target, edit, compression=zipfile.ZIP_DEFLATED):
 
 
 def swap_names(head, members):
-    names = head["feature_names"]
+    names = head["passes"][0]["feature_names"]
     names[0], names[1] = names[1], names[0]
 
 
 def wild_threshold(head, members):
-    name = head["arrays"]["threshold"]["file"]  # the first node of the first tree
+    name = head["arrays"]["1.threshold"]["file"]  # the first node of the first tree
     start = 10 + int.from_bytes(members[name][8:10], "little")
     members[name] = members[name][:start] + np.float32("nan").tobytes() + members[name][start + 4 :]
 
 
 def wild_feature(head, members):
-    name = head["arrays"]["feature"]["file"]
+    name = head["arrays"]["1.feature"]["file"]
     whole = members[name]
     start = 10 + int.from_bytes(whole[8:10], "little")
-    size = np.dtype(head["arrays"]["feature"]["dtype"]).itemsize
+    size = np.dtype(head["arrays"]["1.feature"]["dtype"]).itemsize
     members[name] = whole[:start] + (20_000).to_bytes(size, "little") + whole[start + size :]
 
 
 def bomb(head, members):
     from pdal_stages.classifier.arrays import to_bytes
 
-    members[head["arrays"]["threshold"]["file"]] = to_bytes(np.zeros(30_000_000, np.float32))
-    head["arrays"]["threshold"]["shape"] = [30_000_000]
+    members[head["arrays"]["1.threshold"]["file"]] = to_bytes(np.zeros(30_000_000, np.float32))
+    head["arrays"]["1.threshold"]["shape"] = [30_000_000]
 
 
 class Evil:
@@ -68,14 +68,14 @@ class Evil:
 
 #: case, edit of a good file (bytes -> bytes, or of manifest and members), what the message must hold
 BROKEN = [
-    ("model of version 2", lambda h, m: h.update(version=2), ["version", "Update pdal-stages"]),
-    ("model of an algorithm that is not known", lambda h, m: h.update(algorithm="xgboost"), ["algorithm", "xgboost"]),
+    ("model of version 3", lambda h, m: h.update(version=3), ["version", "Update pdal-stages"]),
+    ("model of an algorithm that is not known", lambda h, m: h["passes"][0].update(algorithm="xgboost"), ["algorithm", "xgboost"]),
     ("model with features in another order", swap_names, ["features"]),
-    ("model with a feature this release lacks", lambda h, m: h["feature_names"].__setitem__(0, "Magic_c1"), ["features"]),
-    ("model with a neighborhood that is none", lambda h, m: h["features"].update(neighborhoods=["q5"]), [""]),
+    ("model with a feature this release lacks", lambda h, m: h["passes"][0]["feature_names"].__setitem__(0, "Magic_c1"), ["features"]),
+    ("model with a neighborhood that is none", lambda h, m: h["passes"][0]["features"].update(neighborhoods=["q5"]), [""]),
     ("model without its classes", lambda h, m: h.pop("classes"), ["classes"]),
     ("model with class code 300", lambda h, m: h["classes"][0].update(code=300), ["classes"]),
-    ("model with an array missing", lambda h, m: m.pop(h["arrays"]["threshold"]["file"]), ["differ"]),
+    ("model with an array missing", lambda h, m: m.pop(h["arrays"]["1.threshold"]["file"]), ["differ"]),
     ("model with a member too many", lambda h, m: m.update({"../../evil.py": b"x"}), ["differ"]),
     ("model whose threshold is NaN", wild_threshold, [""]),
     ("model whose trees ask for feature 20,000", wild_feature, [""]),
@@ -86,7 +86,7 @@ BROKEN = [
     ("empty model file", lambda d: b"", ["not a model file"]),
     ("LAS file as the model", lambda d: b"LASF" + bytes(5000), ["not a model file"]),
     ("pickle as the model", lambda d: pickle.dumps(Evil()), ["not a model file"]),
-    ("pickle inside the model", lambda h, m: m.update({h["arrays"]["threshold"]["file"]: pickle.dumps(Evil())}), [""]),
+    ("pickle inside the model", lambda h, m: m.update({h["arrays"]["1.threshold"]["file"]: pickle.dumps(Evil())}), [""]),
 ]  # fmt: skip
 
 

@@ -1,0 +1,212 @@
+"""Several passes as one classifier: each reads, beside its features, what the one before said all around."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .algorithms import Answer, Block, Question
+from .context import around
+from .featureforest import Computing, Features
+from .smoothing import count_shares
+from .sweep import Passed, Sweep
+
+#: Of the memory for work under way, what features that wait for the next pass may take.
+_KEPT = 0.5
+
+
+@dataclass(frozen=True)
+class JointInputs:
+    """What several passes look at.
+
+    Attributes
+    ----------
+    names, dimensions : tuple of str
+        Of all passes, each once.
+    halo : float
+        Metres around a tile: the passes' own, one after the other.
+    neighborhoods : tuple
+    """
+
+    names: tuple[str, ...]
+    dimensions: tuple[str, ...]
+    halo: float
+    neighborhoods: tuple[Any, ...]
+
+    @classmethod
+    def of(cls, passes: Sequence[Any]) -> JointInputs:
+        """The inputs of these passes; each after the first has a context."""
+
+        def joined(parts) -> tuple[Any, ...]:
+            return tuple(dict.fromkeys(item for part in parts for item in part))
+
+        halo = passes[0].plan.halo
+        for one in passes[1:]:
+            halo = max(one.plan.halo, halo + one.context.reach)
+        plans = [one.plan for one in passes]
+        return cls(
+            joined(plan.names for plan in plans),
+            joined(plan.dimensions for plan in plans),
+            halo,
+            joined(plan.neighborhoods for plan in plans),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Passes:
+    """Two or more passes.
+
+    Attributes
+    ----------
+    members : tuple
+        Any :class:`Algorithm`, then such as read context: with ``features``, ``context`` and
+        ``probabilities(values, rows)``, as a :class:`FeatureForest` has them.
+    classes : int
+    """
+
+    members: tuple[Any, ...]
+    classes: int
+
+    gives_variance = False
+
+    @property
+    def name(self) -> str:
+        """Of the last pass."""
+        return self.members[-1].name
+
+    @cached_property
+    def plan(self) -> JointInputs:
+        """What all passes look at."""
+        return JointInputs.of(self.members)
+
+    def predict(self, question: Question, finish: Callable[[npt.NDArray[np.float64]], Any]) -> Answer:
+        """Classify; see ``Algorithm.predict``."""
+        run = PassRun(self.members, self.classes, question)
+
+        def last(rows, values, context):
+            return finish(self.members[-1].probabilities(joined(values, context), rows))
+
+        return Answer((Block(rows, result) for rows, result in run.blocks(last)), run.report)
+
+
+class PassRun:
+    """Passes at work on one cloud.
+
+    Parameters
+    ----------
+    members : sequence
+        The passes. Of the last only `features` and `context` are looked at here.
+    classes : int
+    question : Question
+
+    Attributes
+    ----------
+    report : dict
+        What was counted, complete when all blocks are read.
+    """
+
+    def __init__(self, members: Sequence[Any], classes: int, question: Question) -> None:
+        self._members, self._classes, self._question = members, classes, question
+        self.report: dict[str, Any] = {}
+        rows = [question.rows]  # wanted of each pass
+        for one in members[:0:-1]:
+            rows.insert(0, around(question.xyz, rows[0], one.context))
+        self._rows = rows
+        self._computings: list[Computing] = []
+        for one in members:
+            if getattr(one, "features", None) is not None:
+                self._computing(one.features)
+
+    def _computing(self, features: Features) -> Computing:
+        """One for passes that read the same features, so that these are computed once."""
+        for one in self._computings:
+            if one.features is features or one.features.to_dict() == features.to_dict():
+                return one
+        self._computings.append(Computing(features, self._question))
+        self.report.update(self._computings[-1].report)
+        return self._computings[-1]
+
+    def blocks(
+        self, last: Callable[[npt.NDArray[np.int64], Any, npt.NDArray[np.float32]], Any]
+    ) -> Iterator[tuple[npt.NDArray[np.int64], Any]]:
+        """Yield (rows, ``last(rows, values, context)``) for all points asked for; called in workers' threads."""
+        if not self._question.count:
+            return
+        stream = self._first()
+        for number in range(1, len(self._members) - 1):
+            stream = self._handed_on(number, stream)
+        progress = self._question.progress
+        for rows, result in self._swept(len(self._members) - 1, stream, last):
+            if progress is not None:
+                progress.update(len(rows))
+            yield rows, result
+        for one in self._computings:
+            self.report.update(one.report)
+
+    def _first(self) -> Iterator[Passed]:
+        first, after = self._members[:2]
+        features = getattr(first, "features", None)
+        if features is None:
+            asked = self._question
+            inner = Question(asked.xyz, asked.dimensions, self._rows[0], asked.threads, asked.memory_mb)
+            answer = first.predict(inner, count_shares)
+            every = np.arange(len(asked.xyz))
+            for block in answer.blocks:
+                yield Passed(every[block.rows], block.result, None)
+            self.report.update(answer.report)
+            return
+        same = self._reads_same(first, after)
+
+        def apply(values, rows):
+            return count_shares(first.probabilities(values, rows)), values if same else None
+
+        for rows, (shares, values) in self._computing(features).blocks(
+            self._rows[0], apply, 1.0 - _KEPT, shown=False
+        ):
+            yield Passed(rows, shares, values)
+
+    def _handed_on(self, number: int, stream: Iterator[Passed]) -> Iterator[Passed]:
+        """A pass between the first and the last."""
+        one = self._members[number]
+        same = self._reads_same(one, self._members[number + 1])
+
+        def apply(rows, values, context):
+            shares = count_shares(one.probabilities(joined(values, context), rows))
+            return shares, values if same else None
+
+        for rows, (shares, values) in self._swept(number, stream, apply):
+            yield Passed(rows, shares, values)
+
+    def _swept(self, number: int, stream: Iterator[Passed], apply) -> Iterator[tuple[Any, Any]]:
+        one, asked = self._members[number], self._question
+        again = None
+        if one.features is not None:
+            computing = self._computing(one.features)
+
+            def again(rows, apply_again):
+                return computing.blocks(rows, apply_again, 1.0 - _KEPT, counted=False)
+
+        sweep = Sweep(
+            asked.xyz,
+            self._rows[number - 1],
+            self._rows[number],
+            one.context,
+            self._classes,
+            threads=asked.threads,
+            keep_bytes=asked.memory_mb * 2**20 * _KEPT / (len(self._members) - 1),
+            again=again,
+        )
+        return sweep.run(stream, apply)
+
+    def _reads_same(self, one: Any, after: Any) -> bool:
+        return after.features is not None and self._computing(one.features) is self._computing(after.features)
+
+
+def joined(values: npt.NDArray[np.float32], context: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Features and context side by side."""
+    return np.concatenate([values, context], axis=1)

@@ -1,0 +1,137 @@
+"""Features of the samples: fitted to the training clouds, computed cloud by cloud, limited to their percentiles."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..base.errors import DimensionError, OptionError
+from ..base.progress import Progress
+from ..base.threads import map_blocks
+from ..features import FeatureEngine, FeaturePlan, ShapeBins
+from .clouds import TrainingCloud
+from .dimensions import gather
+from .featureforest import Features
+from .sampling import Samples
+from .trainoptions import TrainingOptions
+
+
+def must_fit(columns: int, n: int) -> None:
+    """An error where this machine cannot hold the matrix of all samples."""
+    needed = n * columns * 4
+    try:
+        there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):
+        return  # a system that does not tell
+    if needed > 0.8 * there:
+        raise OptionError(
+            f"{n:,} samples of {columns} features do not fit in this machine's memory",
+            found=f"{needed / 2**30:.1f} GiB needed, {there / 2**30:.1f} GiB there",
+            cure="Lower 'count', or use fewer neighborhoods or features",
+        )
+
+
+def fit(
+    clouds: Sequence[TrainingCloud], share: Sequence[int], plan: FeaturePlan, options: TrainingOptions
+) -> Features:
+    """Histogram and curvature thresholds: the mean of each cloud's own, weighted by its `share` of the samples."""
+    each = []
+    for cloud, n in zip(clouds, share, strict=True):
+        if n:  # one index at a time
+            engine = FeatureEngine(cloud.xyz, plan, seed=options.seed, threads=options.threads).fit()
+            each.append((engine.bins, engine.copt_threshold))
+            del engine
+    weight = [n / sum(share) for n in share if n]
+
+    def mean(values) -> float:  # exactly rounded, so the order of the clouds does not matter
+        return math.fsum(w * v for w, v in zip(weight, values, strict=True)) if len(weight) > 1 else values[0]
+
+    bins, threshold = each[0]
+    if threshold is not None:
+        threshold = mean([value for _, value in each])
+    if bins is not None:
+        tables = [one.to_dict() for one, _ in each if one is not None]
+        bins = ShapeBins.from_dict(
+            {
+                token: {
+                    metric: [
+                        mean(values) for values in zip(*(one[token][metric] for one in tables), strict=True)
+                    ]
+                    for metric in rows
+                }
+                for token, rows in tables[0].items()
+            }
+        )
+    return Features(plan, bins, threshold, options.seed)
+
+
+def sample_features(
+    clouds: Sequence[TrainingCloud],
+    samples: Samples,
+    features: Features,
+    options: TrainingOptions,
+    progress: bool,
+) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
+    """The (samples, features) float32 matrix, filled cloud by cloud, and what was counted."""
+    names = features.plan.names
+    values = np.empty((len(samples), len(names)), np.float32)
+    notes: dict[str, Any] = {}
+    with Progress(len(samples), "features of the samples", enabled=None if progress else False) as bar:
+        for number, cloud in enumerate(clouds):
+            at, rows = samples.of_cloud(number)
+            if not len(at):
+                continue
+            engine = features.engine(cloud.xyz, options.threads)
+            fed, counted = gather(
+                features.plan.dimensions, cloud.dimensions, len(cloud.xyz), rows, cloud.name
+            )
+            for name, n in counted.items():
+                notes[name] = notes.get(name, 0) + n
+            for part, block in engine.blocks(
+                queries=rows,
+                dimensions=fed,
+                threads=options.threads,
+                memory_mb=options.memory_mb,
+                progress=bar,
+            ):
+                values[at[np.searchsorted(rows, part)]] = block  # `part` are rows of the cloud
+    if not np.isfinite(values).all():
+        column = int(np.argmin(np.isfinite(values).all(axis=0)))
+        raise DimensionError(f"the feature {names[column]} is not finite for some samples")
+    return values, notes
+
+
+def percentiles(
+    values: npt.NDArray[np.float32], plan: FeaturePlan, options: TrainingOptions
+) -> tuple[list[float], list[float]]:
+    """1st and 99th percentile of each geometric feature, the values limited to them if so wanted.
+
+    [B16 3.3] scales features to [0, 1] between the two and cuts off what is beyond. Splits of a tree do not
+    change under scaling, so only the cut is done, on the training values: no threshold can then lie beyond
+    the percentiles, and a value beyond goes the way its limit would. Inference needs neither.
+    """
+    computed = len(plan.names) - len(plan.dimensions)
+    low = [0.0] * len(plan.names)
+    high = [1.0] * len(plan.names)
+    columns = range(len(plan.names))
+
+    def one(j: int) -> None:
+        column = values[:, j]
+        if j >= computed:  # dimensions keep their own scale
+            low[j], high[j] = float(column.min()), float(column.max())
+            return
+        first, last = np.percentile(column, [1.0, 99.0]).astype(np.float32)
+        if np.abs(column).min() == 0.0 and first >= 0.0 and column.min() >= 0.0:
+            first = np.float32(0.0)
+        low[j], high[j] = float(first), float(last)
+        if options.scale:
+            np.clip(column, first, last, out=column)
+
+    for _ in map_blocks(one, columns, options.threads):
+        pass
+    return low, high

@@ -1,0 +1,162 @@
+"""From one pass to the next without holding a cloud's features: strip by strip, as soon as the strips beside are done.
+
+A pass hands over blocks of points in any order, best along y. What the next pass needs of a point's surroundings lies
+in the point's own strip and the two beside it. So a strip is worked on when these three are complete, with the
+features that were computed for it in the pass before, as far as memory held them; the others are computed again. That
+changes nothing but the time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ..base.threads import map_blocks
+from ..features.index import cell_numbers
+from .context import Context, Tables
+
+#: Points of strips that are worked on together, where there are so many.
+TOGETHER = 300_000
+
+#: rows of the cloud, their features, and the table of their context's columns -> whatever is wanted.
+Apply = Callable[[npt.NDArray[np.int64], Any, npt.NDArray[np.float32]], Any]
+
+
+class Passed(NamedTuple):
+    """A block of points a pass has done: rows of the cloud, their shares, and their features if they are at hand."""
+
+    rows: npt.NDArray[np.int64]
+    shares: npt.NDArray[np.uint16]
+    values: npt.NDArray[np.float32] | None
+
+
+class Sweep:
+    """The way from one pass to the next over one cloud.
+
+    Parameters
+    ----------
+    xyz : (n, 3) float64
+        Metres.
+    coming : (k,) int64 or None
+        Points the pass before hands over, each once; None for all. Those that :func:`context.around` names.
+    wanted : (m,) int64 or None
+        Points the next pass is to look at; None for all.
+    context : Context
+        What it reads of their surroundings.
+    classes : int
+    threads : int, optional
+    keep_bytes : float
+        Features held while their strips wait.
+    again : function, optional
+        ``again(rows, apply)`` computes the features of rows that were not kept and yields (rows, ``apply(values,
+        rows)``) block by block. None where the next pass reads no features.
+    """
+
+    def __init__(
+        self,
+        xyz: npt.NDArray[np.float64],
+        coming: npt.NDArray[np.int64] | None,
+        wanted: npt.NDArray[np.int64] | None,
+        context: Context,
+        classes: int,
+        *,
+        threads: int | None = None,
+        keep_bytes: float = 0.0,
+        again: Callable[..., Iterable[tuple[npt.NDArray[np.int64], Any]]] | None = None,
+    ) -> None:
+        self._xyz, self._context, self._threads, self._again = xyz, context, threads, again
+        self._room = keep_bytes
+        y = xyz[:, 1] if coming is None else xyz[coming, 1]
+        self._numbers, strip = np.unique(cell_numbers(y, context.strip), return_inverse=True)
+        small = np.int32 if len(xyz) < 2**31 else np.int64
+        order = np.argsort(strip, kind="stable").astype(small)
+        self._start = np.searchsorted(strip[order], np.arange(len(self._numbers) + 1))
+        self._order = order if coming is None else coming[order].astype(small)
+        self._place = np.zeros(len(xyz), small)  # of each row in the order of strips
+        self._place[self._order] = np.arange(len(self._order), dtype=small)
+        self._shares = np.zeros((len(self._order), classes), np.uint16)
+        self._wanted = None
+        if wanted is not None:
+            self._wanted = np.zeros(len(xyz), np.bool_)
+            self._wanted[wanted] = True
+        self._left = np.diff(self._start)  # points a strip still waits for
+        self._waiting: list[list[tuple[npt.NDArray[np.int64], Any]]] = [[] for _ in self._numbers]
+        self._done = np.zeros(len(self._numbers), np.bool_)
+
+    def run(self, blocks: Iterable[Passed], apply: Apply) -> Iterator[tuple[npt.NDArray[np.int64], Any]]:
+        """Yield (rows, ``apply(rows, values, context)``) for every wanted point once.
+
+        `apply` is called in workers' threads.
+        """
+        for block in blocks:
+            self._take(block)
+            ready = self._ready()
+            if len(ready) and (self._room <= 0.0 or self._points(ready) >= TOGETHER):
+                yield from self._work(ready, apply)
+        while len(ready := self._ready()):
+            most = np.searchsorted(np.cumsum(np.diff(self._start)[ready]), TOGETHER) + 1
+            yield from self._work(ready[:most], apply)
+
+    def _take(self, block: Passed) -> None:
+        """Store a block's shares, and what is wanted of it with the strips it lies in."""
+        at = self._place[block.rows]
+        self._shares[at] = block.shares
+        strip = np.searchsorted(self._start, at, side="right") - 1
+        np.subtract.at(self._left, strip, 1)
+        keep = np.arange(len(strip)) if self._wanted is None else np.flatnonzero(self._wanted[block.rows])
+        strip = strip[keep]
+        values = block.values if self._room > 0.0 else None
+        for number in np.unique(strip).tolist():
+            mine = keep[strip == number]
+            part = None if values is None else values if len(mine) == len(values) else values[mine]
+            if part is not None:
+                self._room -= part.nbytes
+            self._waiting[number].append((block.rows[mine], part))
+
+    def _ready(self) -> npt.NDArray[np.int64]:
+        """Strips that are complete, and so are those beside them, and that are not worked on yet."""
+        whole = self._left == 0
+        beside = np.diff(self._numbers) == 1
+        good = whole & ~self._done
+        good[1:] &= whole[:-1] | ~beside
+        good[:-1] &= whole[1:] | ~beside
+        return np.flatnonzero(good)
+
+    def _points(self, strips: npt.NDArray[np.int64]) -> int:
+        return int(np.diff(self._start)[strips].sum())
+
+    def _work(
+        self, strips: npt.NDArray[np.int64], apply: Apply
+    ) -> Iterator[tuple[npt.NDArray[np.int64], Any]]:
+        self._done[strips] = True
+        parts = [part for strip in strips for part in self._waiting[strip]]
+        for strip in strips:
+            self._waiting[strip] = []
+        if not parts:
+            return
+        first = self._start[max(strips[0] - 1, 0)]
+        last = self._start[min(strips[-1] + 2, len(self._numbers))]
+        window = slice(first, last)
+        tables = self._context.tables(self._xyz[self._order[window]], self._shares[window], self._threads)
+        kept = [part for part in parts if part[1] is not None or self._again is None]
+        missing = [part[0] for part in parts if part[1] is None and self._again is not None]
+
+        def one(part):
+            rows, values = part
+            return rows, apply(rows, values, self._columns(tables, rows, first))
+
+        yield from map_blocks(one, kept, self._threads)
+        self._room += sum(values.nbytes for _, values in kept if values is not None)
+        if missing and self._again is not None:
+            yield from self._again(
+                np.sort(np.concatenate(missing)),
+                lambda values, rows: apply(rows, values, self._columns(tables, rows, first)),
+            )
+
+    def _columns(self, tables: Tables, rows: npt.NDArray[np.int64], first: int) -> npt.NDArray[np.float32]:
+        out = np.empty((len(rows), len(self._context.tokens) * self._shares.shape[1]), np.float32)
+        tables.fill(self._place[rows].astype(np.int64) - first, out)
+        return out

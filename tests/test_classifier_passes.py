@@ -1,0 +1,239 @@
+"""Models of several passes: what they gain, and that nothing but the cloud decides what comes out."""
+
+import json
+
+import numpy as np
+import pytest
+from test_classifier_training import SMALL, scene
+
+from pdal_stages.base.errors import ModelError, OptionError
+from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, modelfile, train
+from pdal_stages.classifier.folds import point_folds
+from pdal_stages.features import FeatureEngine
+
+FEW = {
+    **SMALL,
+    "feature_set": "covariance",
+    "neighborhoods": "s1",
+    "trees": 8,
+    "context": ["own", "box1", "column4"],
+}
+
+
+def learnt(passes=2, **more):
+    xyz, label, dimensions = scene()
+    options = TrainingOptions(**{**FEW, **more}, passes=passes)
+    return train([TrainingCloud(xyz, label, dimensions, "a.laz")], options, progress=False)
+
+
+@pytest.fixture(scope="module")
+def two():
+    return learnt()
+
+
+@pytest.fixture(scope="module")
+def three():
+    return learnt(3, context=["own", "columnvotes2"])
+
+
+@pytest.fixture(scope="module")
+def other():
+    return scene(seed=7, n=5000)
+
+
+def same(a, b, rows=slice(None), other=slice(None)):
+    for name in ("classification", "reliability", "margin", "probabilities"):
+        one, two = getattr(a, name), getattr(b, name)
+        assert np.array_equal(one[rows], two[other]), name
+
+
+def everything(model, xyz, dimensions, where=None, **more):
+    return model.predict(xyz, dimensions, where, probabilities=True, margin=True, **more)
+
+
+def test_a_second_pass_sees_more_than_the_first(two, other):
+    xyz, label, dimensions = other
+    one = (learnt(1).predict(xyz, dimensions).classification == label).mean()
+    assert 1 - (two.predict(xyz, dimensions).classification == label).mean() < 0.5 * (1 - one)
+    assert two.halo == max(two.passes[0].plan.halo + 8.0, two.passes[1].plan.halo)
+    assert two.required_dimensions == ("HeightAboveGround",)
+
+
+def test_equals_passes_by_hand(two, other):
+    """Features, first forest, context by loops, second forest."""
+    from test_classifier_context import reference
+
+    from pdal_stages.classifier.smoothing import count_shares
+
+    xyz, _, dimensions = other
+    first, second = two.passes
+    engine = FeatureEngine(xyz, first.plan, bins=first.features.bins)
+    values = engine.table(dimensions={"HeightAboveGround": dimensions["HeightAboveGround"]}).values
+    shares = count_shares(first.forest.predict_proba(values))
+    rows = np.arange(0, len(xyz), 7)
+    columns = reference(xyz, shares, rows, second.context)
+    p = second.forest.predict_proba(np.hstack([values[rows], columns]))
+    p = p * two.factors
+    p /= p.sum(axis=1, keepdims=True)
+    assert np.array_equal(everything(two, xyz, dimensions).probabilities[rows], p.astype(np.float32))
+
+
+@pytest.mark.parametrize("name", ["two", "three"])
+def test_blocks_threads_memory_and_order_change_nothing(name, other, request):
+    model = request.getfixturevalue(name)
+    xyz, _, dimensions = other
+    whole = everything(model, xyz, dimensions, threads=1, memory_mb=2000)
+    same(whole, everything(model, xyz, dimensions, threads=3, memory_mb=32))
+    p = np.random.default_rng(0).permutation(len(xyz))
+    shuffled = everything(model, xyz[p], {k: v[p] for k, v in dimensions.items()}, threads=2)
+    same(whole, shuffled, p)
+
+
+@pytest.mark.parametrize("name", ["two", "three"])
+def test_where_and_tiles_change_nothing(name, other, request):
+    model = request.getfixturevalue(name)
+    xyz, _, dimensions = other
+    whole = everything(model, xyz, dimensions)
+    inner = (np.abs(xyz[:, :2] - 30) < 8).all(axis=1)
+    part = everything(model, xyz, dimensions, inner, current=np.full(len(xyz), 9))
+    same(whole, part, inner, inner)
+    assert (part.classification[~inner] == 9).all() and not part.reliability[~inner].any()
+    near = (np.abs(xyz[:, :2] - 30) < 8 + model.halo).all(axis=1)
+    assert not near.all()
+    tile = everything(model, xyz[near], {k: v[near] for k, v in dimensions.items()}, inner[near])
+    same(whole, tile, inner, inner[near])
+    none = everything(model, xyz, dimensions, np.zeros(len(xyz), bool))
+    assert none.classified == 0 and not none.classification.any()
+
+
+def test_features_that_are_not_kept_are_computed_again(two, other, monkeypatch):
+    from pdal_stages.classifier import passes
+
+    xyz, _, dimensions = other
+    kept = everything(two, xyz, dimensions)
+    monkeypatch.setattr(passes, "_KEPT", 0.0)
+    again = everything(two, xyz, dimensions)
+    same(kept, again)
+    assert kept.report == again.report
+
+
+def test_smoothing_rejection_and_empty_clouds(two, other):
+    xyz, label, dimensions = other
+    whole = everything(two, xyz, dimensions)
+    low = whole.reliability < np.float32(0.7)
+    some = two.predict(xyz, dimensions, reject_below=0.7, rejected_code=30)
+    assert low.sum() > 0 and (some.classification[low] == 30).all() and some.rejected == low.sum()
+    calm = two.predict(xyz, dimensions, smooth=1.0)
+    assert calm.report["smooth"] == 1.0 and (calm.classification == label).mean() > 0.8
+    assert len(two.predict(np.zeros((0, 3)), {"HeightAboveGround": np.zeros(0)}).classification) == 0
+    lone = two.predict(np.array([[1e6, 2e6, 3.0]]), {"HeightAboveGround": np.zeros(1)})
+    assert lone.classified == 1
+    with pytest.raises(OptionError, match="variance"):
+        two.predict(xyz, dimensions, variance=True)
+
+
+def test_binary():
+    model = learnt(strategy="binary", target=6)
+    xyz, label, dimensions = scene(seed=3)
+    found = model.predict(xyz, dimensions).classification
+    assert set(np.unique(found)) == {1, 6} and (found == np.where(label == 6, 6, 1)).mean() > 0.9
+
+
+def test_the_file_holds_all_passes(three, other, tmp_path):
+    xyz, _, dimensions = other
+    three.save(tmp_path / "m")
+    again = load_model(tmp_path / "m")
+    again.save(tmp_path / "n")
+    assert (tmp_path / "m").read_bytes() == (tmp_path / "n").read_bytes()
+    same(everything(three, xyz, dimensions), everything(again, xyz, dimensions))
+    assert again.halo == three.halo and str(again) == str(three)
+    described = json.loads(json.dumps(again.describe()))
+    assert [one["context"] for one in described["passes"]] == [[], ["own", "columnvotes2"], ["own", "columnvotes2"]]
+    assert set(described["passes"][1]["importances"]["group"]) == {"covariance", "dimension", "context"}
+    assert sum(again.importances("neighborhood", 2).values()) == pytest.approx(1)
+    assert "pass 3" in str(again) and "columnvotes2" in str(again)
+
+
+def test_training_depends_on_nothing_but_the_points(two, tmp_path):
+    xyz, label, dimensions = scene()
+    p = np.random.default_rng(1).permutation(len(xyz))
+    cloud = TrainingCloud(xyz[p], label[p], {k: v[p] for k, v in dimensions.items()}, "a.laz")
+    again = train([cloud], TrainingOptions(**FEW, passes=2, threads=3, memory_mb=40), progress=False)
+    two.save(tmp_path / "m")
+    again.save(tmp_path / "n")
+    assert (tmp_path / "m").read_bytes() == (tmp_path / "n").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda m: m["passes"].reverse(),
+        lambda m: m["passes"][1].update(context=[]),
+        lambda m: m["passes"][1].update(context=["own", "box1", "column2"]),
+        lambda m: m["passes"][1].update(context=["own", "sphere1"]),
+        lambda m: m["passes"][0].update(context=["own"]),
+        lambda m: m["passes"].pop(),
+        lambda m: m["passes"][1].update(algorithm="alsnet"),
+    ],
+)
+def test_hostile_passes_are_refused(two, tmp_path, edit):
+    manifest = json.loads(json.dumps(two.manifest()))
+    edit(manifest)
+    with pytest.raises(ModelError):
+        modelfile.write(tmp_path / "m", manifest, [one.arrays() for one in two.passes])
+        load_model(tmp_path / "m")
+
+
+def test_a_pass_may_come_from_elsewhere(two, other):
+    """The first pass may be any classifier of clouds: here one that hands over all points at once, like a network."""
+    from pdal_stages.classifier.algorithms import Answer, Block
+    from pdal_stages.classifier.passes import Passes
+
+    class Whole:
+        plan = two.passes[0].plan
+
+        def predict(self, question, finish):
+            answer = two.passes[0].predict(question, lambda p: p)
+            p = np.zeros((len(question.xyz), 3))
+            for block in answer.blocks:
+                p[block.rows] = block.result
+            rows = slice(None) if question.rows is None else question.rows
+            return Answer([Block(rows, finish(p[rows]))], {"batches": 1})
+
+    xyz, _, dimensions = other
+    model = type(two)((two.passes[0],), two.classes, two.info)
+    object.__setattr__(model, "algorithm", Passes((Whole(), two.passes[1]), 3))
+    same(everything(two, xyz, dimensions), everything(model, xyz, dimensions))
+    inner = (np.abs(xyz[:, :2] - 30) < 8).all(axis=1)
+    part = everything(model, xyz, dimensions, inner)
+    same(everything(two, xyz, dimensions), part, inner, inner)
+    assert part.report["batches"] == 1
+
+
+def test_folds_are_strips_or_whole_surveys():
+    random = np.random.default_rng(0)
+    a, b, c = (random.random((n, 3)) * (50, 20, 3) + shift for n, shift in ((900, 0), (500, 100), (700, 300)))
+    label = [np.where(random.random(len(x)) < 0.8, 1, -1) for x in (a, b, c)]
+    parts, folds = point_folds(list(zip((a, b), label, strict=False)), ("x", "y"), 4)
+    assert folds == 4
+    for xyz, mine, position in zip((a, b), parts, label, strict=False):
+        assert (np.diff(mine[np.argsort(xyz[:, 0])]) >= 0).all()
+        share = np.bincount(mine[position >= 0], minlength=4) / (position >= 0).sum()
+        assert np.allclose(share, 0.25, atol=0.01)
+    parts, folds = point_folds(list(zip((a, b, c), label, strict=True)), ("x", "y", "z"), 5)
+    assert folds == 3 and sorted(part[0] for part in parts) == [0, 1, 2]
+    assert all((part == part[0]).all() for part in parts)
+    parts, folds = point_folds(list(zip((a, b, c), label, strict=True)), ("x", "y", "x"), 5)
+    assert folds == 5 and set(parts[0]) == set(range(5))
+
+
+def test_options():
+    for bad in (
+        {"passes": 4},
+        {"passes": 0},
+        {"pass_folds": 1},
+        {"passes": 2, "context": []},
+        {"context": "box3"},
+    ):
+        with pytest.raises(OptionError):
+            TrainingOptions(**bad)
