@@ -358,7 +358,7 @@ def test_zip_bomb(good):
 def test_declared_size_is_not_believed(good):
     """A member that says it is small but unpacks to much: only what was declared is unpacked."""
     stored = members(good)
-    stored["arrays/threshold.npy"] = b"\0" * 50_000_000
+    stored["arrays/1.threshold.npy"] = b"\0" * 50_000_000
     pack(good, stored)
     data = bytearray(good.read_bytes())
     real = struct.pack("<L", 50_000_000)
@@ -393,7 +393,7 @@ def test_forest_and_manifest_that_disagree(good):
     good.write_bytes(whole)
 
     def other(head, stored):
-        head["arrays"]["bonus"] = {**head["arrays"]["1.threshold"], "file": "arrays/bonus.npy"}
-        stored["arrays/bonus.npy"] = stored["arrays/threshold.npy"]
+        head["arrays"]["1.bonus"] = {**head["arrays"]["1.threshold"], "file": "arrays/bonus.npy"}
+        stored["arrays/bonus.npy"] = stored["arrays/1.threshold.npy"]
 
     refuse(changed(good, other), "does not know")

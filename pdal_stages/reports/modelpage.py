@@ -39,18 +39,18 @@ def write_model_report(path: str | os.PathLike[str], model: Model, name: str = "
 def model_page(model: Model, name: str = "") -> str:
     """The page of :func:`write_model_report` as text."""
     described = model.describe()
-    scores = described["accuracy"]
+    last = described["passes"][-1]
     priors = (described.get("priors") or {}).get("factors")
     return render(
         "model.html",
         title=f"Model {name}".strip(),
-        subtitle=f"{described['algorithm'].replace('_', ' ')}, {len(model.plan.names):,} features of a point",
-        model={"importances": None, **described},
+        subtitle=f"{last['algorithm'].replace('_', ' ')}, {len(last['feature_names']):,} features of a point",
+        model=described,
         scores=_scores(described),
-        out_of_bag=(scores.get("out_of_bag") or {}).get("f1") or {},
+        out_of_bag=(last["out_of_bag"] or {}).get("f1") or {},
         prior_factors=priors,
         curves=_curves(described["training"].get("curve")),
-        crossed=scores.get("cross_validation"),
+        crossed=described["accuracy"]["cross_validation"],
         settings=_settings(described),
     )
 
@@ -58,13 +58,13 @@ def model_page(model: Model, name: str = "") -> str:
 def _scores(d: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     """The headline figures: on the ground held out, cross-validated, or out of bag, whichever there is first."""
     held = d["training"].get("held_out")
-    crossed = d["accuracy"].get("cross_validation")
+    crossed = d["accuracy"]["cross_validation"]
     if isinstance(held, dict) and held:
         row, remark = held, "on ground held out, which chose the epoch"
     elif crossed:
         row, remark = crossed["chosen"], "on blocks held out; classes weigh the same"
-    elif d["accuracy"].get("out_of_bag"):
-        row, remark = d["accuracy"]["out_of_bag"], "out of bag, flattered by neighboring samples"
+    elif d["passes"][-1]["out_of_bag"]:
+        row, remark = d["passes"][-1]["out_of_bag"], "out of bag, flattered by neighboring samples"
     else:
         return []
     titles = {"overall_accuracy": "Overall accuracy", "kappa": "Kappa", "mean_f1": "Mean F1"}
@@ -108,8 +108,11 @@ def _curve(points: list[tuple[float, float]], title: str, is_share: bool) -> Cha
 
 
 def _settings(d: Mapping[str, Any]) -> dict[str, Any]:
-    keep = ("algorithm", "parameters", "features", "required_dimensions", "strategy", "target", "created_by")
+    keep = ("required_dimensions", "halo", "strategy", "target", "created_by")
     out = {key: d[key] for key in keep if d.get(key) is not None}
+    for number, one in enumerate(d["passes"], 1):
+        what = {key: one[key] for key in ("algorithm", "parameters", "features", "context") if one[key]}
+        out |= {f"pass {number}": what} if len(d["passes"]) > 1 else what
     if d.get("priors"):
         out["prior_weight"] = d["priors"].get("weight")
     training = {k: v for k, v in d["training"].items() if k not in ("curve", "clouds", "held_out")}

@@ -14,6 +14,7 @@ from ..base.files import check_writable
 from ..classifier import TrainingCloud, TrainingOptions, train
 from ..classifier.classes import ClassMap
 from ..classifier.dimensions import required
+from ..classifier.trainoptions import MOST_PASSES
 from .base import Stage
 from .options import option
 from .points import Points
@@ -112,6 +113,25 @@ class ClassifierModel(Stage):
     )
     folds: int = option("integer", 0, "Folds of cross-validation over spatial blocks; 0 for none", minimum=0)
     block_size: float = option("number", 25.0, "Side of those blocks", minimum=0, exclusive=True, unit="m")
+    passes: int = option(
+        "integer",
+        _default("passes"),
+        "Forests one after the other, each reading what the one before says of a point's surroundings",
+        minimum=1,
+        maximum=MOST_PASSES,
+    )
+    context: list = option(
+        "list",
+        _default("context"),
+        "What passes after the first read: own, or box, boxvotes, column, columnvotes and a cell's side (box0.5)",
+    )
+    pass_folds: int = option(
+        "integer",
+        _default("pass_folds"),
+        "Parts of the training ground held out in turn to train the passes after the first",
+        minimum=2,
+        maximum=100,
+    )
     memory: int = option(
         "integer", 512, "Memory for blocks of points, over the samples", minimum=16, unit="MB"
     )
@@ -120,9 +140,11 @@ Samples `count` points of each class, spread over space; computes features for t
 percentiles and histogram thresholds; grows a Random Forest; writes [one model file](../model-file.md). A class with
 fewer points has them several times, and the counts are in the file. Lists in `trees`, `max_depth` and
 `min_samples_leaf` are searched by cross-validation over spatial blocks, so that neighbors never stand on both
-sides. With `"algorithm": "alsnet"` a network is trained instead, from `dimensions`, `classes`,
-`strategy`, `seed` and the options in `alsnet` ([alsNet](../alsnet.md)). Points of several readers are
-merged first. `label` names the dimension that holds the classes.
+sides. With `passes` 2, a second forest also reads the first one's [probabilities all around a
+point](../model-file.md#context), and is trained on what they are on ground the first has not seen. With
+`"algorithm": "alsnet"` a network is trained instead, from `dimensions`, `classes`, `strategy`, `seed` and the options
+in `alsnet` ([alsNet](../alsnet.md)). Points of several readers are merged first. `label` names the dimension that
+holds the classes.
 """
     before = ({"type": "filters.hag_minima"},)
     after = ()

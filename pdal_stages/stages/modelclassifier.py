@@ -160,7 +160,7 @@ def loaded_model(path: str) -> Model:
     try:
         stat = Path(path).stat()
         stamp = (stat.st_mtime_ns, stat.st_size)
-    except OSError:
+    except (OSError, ValueError):  # the latter for a name that holds a null
         return load_model(path)  # says what is wrong
     return _load(path, stamp)
 
