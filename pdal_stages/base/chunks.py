@@ -1,6 +1,6 @@
 """The table of chunks at the end of a LAZ file, decoded and held against the file.
 
-PDAL from about 2.4 on waits forever for a point that no chunk of the table holds, and ends the process where the
+PDAL from 2.7 on waits forever for a point that no chunk of the table holds, and ends the process where the
 table leads it astray. Layout: "LAZ specification 1.4", chunk table; coding: A. Said, Introduction to Arithmetic
 Coding, HP Labs HPL-2004-76.
 """

@@ -5,7 +5,7 @@ too, as neighbors, so they evaluate the expression themselves: comparisons
 (``== != < <= > >=``), ``&&``, ``||``, ``!``, arithmetic, parentheses and PDAL's functions over
 dimension names and numbers, with PDAL's precedence. What any PDAL from 2.2 to 2.10 takes is taken
 here with the same meaning, whatever PDAL is at hand; some of them refuse a little more:
-``(X + Y) == X`` and ``(Z) > 2`` from about 2.5 on, ``-X > 0`` and functions before.
+``(X + Y) == X`` and ``(Z) > 2`` the newer ones, functions those before 2.7 or 2.9.
 """
 
 from __future__ import annotations
