@@ -13,7 +13,9 @@ import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from .base import kinds
 from .base.errors import StageError
+from .base.outputs import Output, check_outputs
 from .base.version import __version__
 from .pipeline.overrides import parse_overrides
 
@@ -222,19 +224,15 @@ def _pipeline(options: argparse.Namespace) -> int | None:
         pipeline.validate()
         print(json.dumps({"valid": True, "error_detail": "", "streamable": False}, indent=2))
         return None
-    _check_metadata(options)
+    pipeline.check_outputs(*_metadata(options))
     _end_at_once(options)
     pipeline.execute(arrays=False)
     _after(pipeline, options.metadata, verbose=bool(options.verbose))
     return None
 
 
-def _check_metadata(options: argparse.Namespace) -> None:
-    """Before the work, not after it."""
-    from .base.files import check_writable
-
-    if options.metadata:
-        check_writable(options.metadata, "metadata")
+def _metadata(options: argparse.Namespace) -> list[Output]:
+    return [Output(options.metadata, "metadata", kinds.JSON)] if options.metadata else []
 
 
 def _after(pipeline, metadata: str | None, verbose: bool = False) -> None:
@@ -260,8 +258,10 @@ def _after(pipeline, metadata: str | None, verbose: bool = False) -> None:
 def _expand(options: argparse.Namespace) -> None:
     from .base.files import write_whole
 
-    text = _build(options).json + "\n"
+    pipeline = _build(options)
+    text = pipeline.json + "\n"
     if options.output:
+        check_outputs([Output(options.output, "output", kinds.JSON)], pipeline.inputs())
         write_whole(options.output, text.encode())
     else:
         sys.stdout.write(text)
@@ -288,9 +288,9 @@ def _classify(options: argparse.Namespace) -> None:
     from .pipeline.jobs import classify_pipeline
     from .pipeline.run import Pipeline
 
-    _check_metadata(options)
     stages = classify_pipeline(options.input, options.output, options.model, where=options.where)
     pipeline = Pipeline(stages, options.overrides)
+    pipeline.check_outputs(*_metadata(options))
     _end_at_once(options)
     count = pipeline.execute(arrays=False)
     _after(pipeline, options.metadata)
@@ -360,6 +360,7 @@ def _model(options: argparse.Namespace) -> None:
     if options.html:
         from .reports.modelpage import write_model_report
 
+        check_outputs([Output(options.html, "html", kinds.HTML)], [options.file])
         write_model_report(options.html, model, Path(options.file).name)
     if options.showjson:
         print(json.dumps(model.describe(), indent=2, default=str))

@@ -6,7 +6,7 @@ writer left is therefore known to be dead, and goes when the next file is writte
 * An existing file is replaced; the new one takes over its mode, and its owner where that may be given.
 * A link is followed: the file it leads to is replaced, the link stays.
 * A device, pipe or terminal (``/dev/stdout``) is written into, once all is there.
-* A write-protected file, a folder, a socket and a block device are refused.
+* A write-protected file, a file of another kind, a folder, a socket and a block device are refused.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from .errors import StageError
-from .las import is_short
+from .kinds import kind_of
 
 #: How the hidden folders' names begin, and what the file in them is called that their writer holds locked.
 PREFIX, _LOCK = ".pdal-stages-partial-", ".lock"
@@ -38,13 +38,22 @@ _swept: set[str] = set()
 # ---- before the work ---------------------------------------------------------------------------------------
 
 
-def check_writable(path: str | os.PathLike, what: str = "output") -> None:
+def check_writable(path: str | os.PathLike, what: str = "output", kind: str = "") -> None:
     """Refuse an output that cannot be written, before any work is done.
+
+    Parameters
+    ----------
+    path : path
+    what : str
+        What messages call it.
+    kind : str
+        The kind of file it will be, one of :mod:`pdal_stages.base.kinds`, where that is known.
 
     Raises
     ------
     StageError
-        If its folder is missing or read-only, its name is too long, or there is something that must not be replaced.
+        If its folder is missing or read-only, its name is too long, or what is there must not be replaced: a folder, a
+        write-protected file, a file that is known to be of another kind.
     """
     name = Path(path)
     if is_stream(name):
@@ -73,6 +82,13 @@ def check_writable(path: str | os.PathLike, what: str = "output") -> None:
             f"the {what} file is write-protected",
             found=str(path),
             cure="Give another name, or change its mode",
+        )
+    older = kind_of(real) if kind else ""
+    if older and older != kind:
+        raise StageError(
+            f"the {what} file would replace {older}",
+            found=str(path),
+            cure="Give another name, or remove that file first",
         )
 
 
@@ -159,7 +175,7 @@ def whole_files(
         inside = False
         moves = [move for place in places for move in place.made()]
         for made, target in moves:
-            check_writable(target, what)
+            check_writable(target, what, kind_of(made) or "a file of another kind")
             if check is not None:
                 check(made, target)
         for made, target in moves:
@@ -320,39 +336,6 @@ def try_lock(file: Any) -> bool:
     except BlockingIOError:
         return False
     return True
-
-
-# ---- what was written --------------------------------------------------------------------------------------
-
-
-def check_complete(path: str | os.PathLike, name: str | os.PathLike) -> None:
-    """Refuse a file that a writer could not finish: PDAL's do not notice that a disk is full.
-
-    Parameters
-    ----------
-    path : path
-        The file as it was written.
-    name : path
-        The name it is to get, for the message.
-
-    Raises
-    ------
-    StageError
-        If a LAS or LAZ file is shorter than its header says, or no space is left beside the file.
-    """
-    path = Path(path)
-    try:
-        size = path.stat().st_size
-        short = is_short(path, size) if path.suffix.lower() in (".las", ".laz") else None
-        full = short is None and disk_is_full(path)
-    except OSError as error:
-        raise StageError("the output file cannot be read back", found=f"{name}: {error}") from error
-    if short or full:
-        raise StageError(
-            "the output file could not be written completely",
-            found=f"{name}: {size:,} bytes were written",
-            cure="Make room on the disk (or raise the limit on file sizes)",
-        )
 
 
 def disk_is_full(path: str | os.PathLike) -> bool:

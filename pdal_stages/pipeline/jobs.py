@@ -10,6 +10,8 @@ import numpy as np
 
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import DimensionError, StageError
+from ..base.outputs import check_outputs
+from .filenames import stage_files
 from .overrides import Override
 
 
@@ -70,6 +72,10 @@ def attach_reference(
     from .overrides import apply_overrides
     from .run import Pipeline
 
+    (given,) = apply_overrides([{"type": AccuracyStage.type, **outputs}], overrides)
+    compared = {"dimension": "Classification", "reference": "Reference", "horizontal_unit": "m"}
+    stage = AccuracyStage({k: v for k, v in given.items() if k != "type"} | compared)
+    check_outputs(stage.outputs(), [source, reference, *stage_files(stage)])
     both: list[Any] = []
     for name in (source, reference):
         pipeline = Pipeline([_reader(name, "input")])
@@ -97,9 +103,6 @@ def attach_reference(
     for array, name, file in ((mine, dimension, source), (true, reference_dimension, reference)):
         if name not in (array.dtype.names or ()):
             raise DimensionError(f"the dimension '{name}' is missing", where=file)
-    (given,) = apply_overrides([{"type": AccuracyStage.type, **outputs}], overrides)
-    compared = {"dimension": "Classification", "reference": "Reference", "horizontal_unit": "m"}
-    stage = AccuracyStage({k: v for k, v in given.items() if k != "type"} | compared)
     arrays = {name: np.ascontiguousarray(mine[name]) for name in mine.dtype.names}
     arrays["Classification"], arrays["Reference"] = mine[dimension], true[reference_dimension]
     stage.run(stage.points(arrays))

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import glob
 import json
-import os
 import re
 import signal
 from collections.abc import Iterable
@@ -12,11 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import InterruptedStage, PipelineError, StageError
-from ..base.files import check_complete, check_writable, whole_files
+from ..base.files import whole_files
 from ..base.las import check_readable, odd_text, supersede_copc
+from ..base.outputs import Output, check_complete, check_outputs
 from ..stages import registry
 from . import pdal as pdal_env
 from . import runtime
+from .filenames import named_files, readers_files, stage_files, with_outputs, writers_outputs
 from .interrupts import gentle
 from .lowering import Lowered, lower
 from .overrides import Override, apply_overrides
@@ -66,13 +66,29 @@ class Pipeline:
     def validate(self) -> None:
         """Check outputs and let PDAL check its own stages' options, without reading points."""
         self._check_inputs()
-        for stage in self.lowered.stages:
-            if _is_writer(stage, self.lowered.stages):
-                check_writable(stage["filename"])
+        self.check_outputs()
         try:
             pdal_env.validate(self.lowered.stages)
         except StageError as error:
             raise self._located(error) from None
+
+    def check_outputs(self, *more: Output) -> None:
+        """Refuse outputs that cannot be written, that are inputs, or that replace files of another kind.
+
+        Parameters
+        ----------
+        *more : Output
+            What the caller will write beside the pipeline's own.
+        """
+        ours = [lowered.stage for lowered in self.lowered.ours]
+        outputs = [*writers_outputs(self.lowered.stages), *(o for stage in ours for o in stage.outputs())]
+        check_outputs([*outputs, *more], self.inputs())
+
+    def inputs(self) -> list[str]:
+        """Local files that are read: by readers, by other stages, and the pipeline itself."""
+        stages, ours = self.lowered.stages, [lowered.stage for lowered in self.lowered.ours]
+        named = [name for stage in ours for name in stage_files(stage)]
+        return [*readers_files(stages), *named_files(stages), *named, *filter(None, [self.source.name])]
 
     def execute(self, *, arrays: bool = True) -> int:
         """Run the pipeline in this process; the number of points that came out.
@@ -86,13 +102,15 @@ class Pipeline:
             What went wrong, where, and the cure.
         """
         self._check_inputs()
+        self.check_outputs()
+        outputs = [output.path for output in writers_outputs(self.lowered.stages)]
         runtime.remember_stdout()
         failure: StageError | None = None
         try:
-            with whole_files(*_outputs(self.lowered.stages), check=_finish) as partials:
+            with whole_files(*outputs, check=_finish) as partials:
                 try:
                     with gentle(signal.SIGINT) as interrupts:
-                        result = pdal_env.execute(_with_outputs(self.lowered.stages, partials), arrays=arrays)
+                        result = pdal_env.execute(with_outputs(self.lowered.stages, partials), arrays=arrays)
                         interrupts.check()
                 finally:
                     self.reports = []
@@ -113,7 +131,7 @@ class Pipeline:
 
     def _check_inputs(self) -> None:
         """Open what is read, and look at the headers of LAS files: PDAL takes damaged ones for whole, or crashes."""
-        for path in _inputs(self.lowered.stages):
+        for path in readers_files(self.lowered.stages):
             try:
                 with open(path, "rb"):
                     pass
@@ -121,14 +139,16 @@ class Pipeline:
                 raise PipelineError(
                     "the file cannot be read", where=path, found=error.strerror or str(error)
                 ) from None
-        self.remarks = [r for path in _inputs(self.lowered.stages, las=True) if (r := check_readable(path))]
+        self.remarks = [
+            r for path in readers_files(self.lowered.stages, las=True) if (r := check_readable(path))
+        ]
 
     def _located(self, error: StageError) -> StageError:
         """PDAL's words, with the line of the stage that they name and the nearest stage there is."""
         if not isinstance(error, PipelineError) or error.where is not None:
             return error
         if _NOT_UTF8.search(str(error.found)):
-            for path in _inputs(self.lowered.stages, las=True):
+            for path in readers_files(self.lowered.stages, las=True):
                 if (odd := odd_text(path)) is not None:
                     return PipelineError(
                         f"the {odd[0]} in the LAS file is not UTF-8, which PDAL's filters.python cannot take",
@@ -161,54 +181,6 @@ _STAGE_TYPE = re.compile(r"\b(?:readers|filters|writers)\.\w+")
 
 
 _NOT_UTF8 = re.compile(r"returned a result with an exception set|UnicodeDecodeError|codec can't decode")
-
-
-def _inputs(stages: list[dict[str, Any]], *, las: bool = False) -> list[str]:
-    """Local files that are read, patterns filled in; only LAS and LAZ files with `las`."""
-    found: list[str] = []
-    for index, stage in enumerate(stages):
-        name, kind = stage.get("filename"), stage.get("type", "")
-        if not isinstance(name, str) or "://" in name or (not kind and 0 < index == len(stages) - 1):
-            continue
-        is_las = kind in ("readers.las", "readers.copc") or (
-            not kind and name.lower().endswith((".las", ".laz"))
-        )
-        if is_las or (not las and (not kind or kind.startswith("readers."))):
-            names = sorted(glob.glob(name)) if not os.path.exists(name) else [name]
-            found += [n for n in names if os.path.isfile(n)]
-    return found
-
-
-def _is_writer(stage: dict[str, Any], stages: list[dict[str, Any]]) -> bool:
-    if "filename" not in stage or not isinstance(stage["filename"], str):
-        return False
-    type_name = stage.get("type", "")
-    if type_name:
-        return type_name.startswith("writers.") and "://" not in stage["filename"]
-    return len(stages) > 1 and stage is stages[-1]
-
-
-def _outputs(stages: list[dict[str, Any]]) -> list[Path]:
-    """Files that PDAL's writers write.
-
-    Raises
-    ------
-    PipelineError
-        If two of them are one.
-    """
-    found = [Path(stage["filename"]) for stage in stages if _is_writer(stage, stages)]
-    for number, final in enumerate(found):
-        if final.absolute() in (other.absolute() for other in found[:number]):
-            raise PipelineError(
-                "two writers write the same file", found=str(final), cure="Give each its own name"
-            )
-    return found
-
-
-def _with_outputs(stages: list[dict[str, Any]], names: list[Path]) -> list[dict[str, Any]]:
-    """Stages whose writers write to other names."""
-    waiting = iter(names)
-    return [{**s, "filename": str(next(waiting))} if _is_writer(s, stages) else s for s in stages]
 
 
 def _finish(made: Path, final: Path) -> None:

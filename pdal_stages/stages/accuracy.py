@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from ..accuracy.labels import code_list, merging
 from ..accuracy.measures import Accuracy
+from ..base import kinds
 from ..base.errors import StageError
 from ..base.files import check_writable, write_whole
+from ..base.outputs import Output
 from .base import Stage
 from .modelclassifier import loaded_model
 from .options import option
@@ -67,11 +69,14 @@ present, add a reliability curve and the error by margin.
         for name in ("classes", "ignore"):
             code_list(_codes(self.options[name]), name)
         merging(self.merge)
-        for name in ("json", "html"):
-            if self.options[name]:
-                check_writable(self.options[name], name)
+        for output in self.outputs():
+            check_writable(output.path, output.what, output.kind)
         if self.model_file:
             loaded_model(self.model_file)
+
+    def outputs(self) -> list[Output]:
+        found = [(self.json, "json", kinds.JSON), (self.html, "html", kinds.HTML)]
+        return [Output(path, what, kind) for path, what, kind in found if path]
 
     def reads(self) -> list[str]:
         return [self.dimension, self.reference]

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
+from ..base.outputs import Output
 from ..base.units import named_unit
 from .options import Option, option, parse_options
 from .points import Points
@@ -89,6 +90,10 @@ class Stage(ABC):
 
     def check(self) -> None:
         """Refuse options that contradict each other; read the files they name."""
+
+    def outputs(self) -> list[Output]:
+        """Files the stage will write."""
+        return []
 
     def reads(self) -> list[str]:
         """Dimensions the points must have, beyond X, Y, Z."""

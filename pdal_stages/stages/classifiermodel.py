@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base import kinds
 from ..base.errors import StageError
 from ..base.files import check_writable
+from ..base.outputs import Output
 from ..classifier import TrainingCloud, TrainingOptions, train
 from ..classifier.classes import ClassMap
 from ..classifier.dimensions import required
@@ -180,11 +182,16 @@ holds the classes.
 
     def check(self) -> None:
         self.training.inputs  # noqa: B018  words that mean nothing are refused
-        if self.training.alsnet is not None and self.training.alsnet.checkpoint:
-            check_writable(self.training.alsnet.checkpoint, "checkpoint")
         if self.training.classes is not None:
             ClassMap.parse(self.training.classes)
-        check_writable(self.filename, "model")
+        for output in self.outputs():
+            check_writable(output.path, output.what, output.kind)
+
+    def outputs(self) -> list[Output]:
+        found = [Output(self.filename, "model", kinds.MODEL)]
+        if self.training.alsnet is not None and self.training.alsnet.checkpoint:
+            found.append(Output(self.training.alsnet.checkpoint, "checkpoint", kinds.CHECKPOINT))
+        return found
 
     def reads(self) -> list[str]:
         return [self.label, *required(self.training.inputs)]

@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base import kinds
 from ..base.errors import OptionError, StageError
+from ..base.outputs import Output
 from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.adaptive import LEAST_RADIUS
@@ -114,6 +116,9 @@ features inside and need no dimensions at all.
                     f"the dimension name '{name}' is longer than the {_NAME_BYTES} bytes LAS allows",
                     cure="Use shorter neighborhood tokens",
                 )
+
+    def outputs(self) -> list[Output]:
+        return [Output(self.bins, "bins", kinds.JSON)] if self.bins and not Path(self.bins).exists() else []
 
     def creates(self) -> dict[str, str]:
         return {**dict.fromkeys(self.columns, "float"), **(_OPTIMAL if self.optimal else {})}

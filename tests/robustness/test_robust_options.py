@@ -149,7 +149,7 @@ STAGES = [
     ("where with a dimension that is missing", [{"type": HAG, "where": "Hight > 2"}], ["names the dimension 'Hight'"]),
     ("where that holds for no point", [{"type": HAG, "where": "Z > 1e6"}], None),
     ("minor_version that is no number", [{"type": HAG}, {"type": "writers.las", "filename": "p.las", "minor_version": "x"}], ["minor_version"]),
-    ("two writers of one file", [{"type": HAG}, {"type": "writers.las", "filename": "o.las"}], ["two writers write the same file"]),
+    ("two writers of one file", [{"type": HAG}, {"type": "writers.las", "filename": "o.las"}], ["two output files are one"]),
     ("output in a folder that is not there", [{"type": "writers.las", "filename": "no/o.las"}], ["does not exist", "Create it"]),
     ("output named as a folder", [{"type": "writers.las", "filename": "."}], ["names a folder"]),
     ("output name of 300 characters", [{"type": "writers.las", "filename": "x" * 296 + ".las"}], ["longer than 255 bytes"]),

@@ -1,0 +1,114 @@
+"""What a command is about to write, held against what it reads and what is there already; and what it wrote."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from .errors import StageError
+from .files import check_writable, disk_is_full, is_stream
+from .las import is_short
+
+
+@dataclass(frozen=True)
+class Output:
+    """A file to be written.
+
+    Attributes
+    ----------
+    path : str
+        In its name '#' stands for numbers.
+    what : str
+        What messages call it: ``output``, ``model``, ``metadata``.
+    kind : str
+        One of :mod:`pdal_stages.base.kinds`, where it is known beforehand.
+    """
+
+    path: str
+    what: str = "output"
+    kind: str = ""
+
+
+def check_outputs(outputs: Iterable[Output], inputs: Iterable[str | os.PathLike]) -> None:
+    """Refuse outputs that cannot be written, that are read, that are one file, or that would replace another kind.
+
+    Links are followed and hard links seen through.
+
+    Raises
+    ------
+    StageError
+        Naming the output.
+    """
+    read = {identity: os.fspath(path) for path in inputs if (identity := _identity(path)) is not None}
+    names = [Path(os.path.realpath(path)) for path in read.values()]
+    seen: dict[object, Output] = {}
+    for output in outputs:
+        check_writable(output.path, output.what, output.kind)
+        if is_stream(output.path):
+            continue
+        real = Path(os.path.realpath(output.path))
+        one = _identity(output.path) or real
+        hit = read.get(one) or _numbered(real, names)
+        if hit is not None:
+            raise StageError(
+                f"the {output.what} file is one of the inputs", found=str(hit), cure="Give it another name"
+            )
+        if one in seen:
+            raise StageError(
+                f"the {output.what} file is the {seen[one].what} file too"
+                if output.what != seen[one].what
+                else f"two {output.what} files are one",
+                found=output.path,
+                cure="Give each its own name",
+            )
+        seen[one] = output
+
+
+def _identity(path: str | os.PathLike) -> tuple[int, int] | None:
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):
+        return None
+    return found.st_dev, found.st_ino
+
+
+def _numbered(output: Path, inputs: list[Path]) -> Path | None:
+    """The input that a numbered output might become."""
+    if "#" not in output.name:
+        return None
+    before, _, after = output.name.partition("#")
+    pattern = re.compile(rf"{re.escape(before)}\d+{re.escape(after)}")
+    return next((p for p in inputs if p.parent == output.parent and pattern.fullmatch(p.name)), None)
+
+
+def check_complete(path: str | os.PathLike, name: str | os.PathLike) -> None:
+    """Refuse a file that a writer could not finish: PDAL's do not notice that a disk is full.
+
+    Parameters
+    ----------
+    path : path
+        The file as it was written.
+    name : path
+        The name it is to get, for the message.
+
+    Raises
+    ------
+    StageError
+        If a LAS or LAZ file is shorter than its header says, or no space is left beside the file.
+    """
+    path = Path(path)
+    try:
+        size = path.stat().st_size
+        short = is_short(path, size) if path.suffix.lower() in (".las", ".laz") else None
+        full = short is None and disk_is_full(path)
+    except OSError as error:
+        raise StageError("the output file cannot be read back", found=f"{name}: {error}") from error
+    if short or full:
+        raise StageError(
+            "the output file could not be written completely",
+            found=f"{name}: {size:,} bytes were written",
+            cure="Make room on the disk (or raise the limit on file sizes)",
+        )

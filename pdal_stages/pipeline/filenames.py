@@ -1,0 +1,93 @@
+"""The files that a pipeline reads and writes."""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections.abc import Iterator
+from typing import Any
+
+from ..base import kinds
+from ..base.outputs import Output
+from ..stages.base import Stage
+
+#: What stages of PDAL have that never names a file.
+_NO_FILES = ("type", "tag", "inputs", "user_data", "pdalargs")
+
+
+def readers_files(stages: list[dict[str, Any]], *, las: bool = False) -> list[str]:
+    """Local files that PDAL's readers read, patterns filled in; only LAS and LAZ files with `las`."""
+    found: list[str] = []
+    for index, stage in enumerate(stages):
+        name, kind = stage.get("filename"), stage.get("type", "")
+        if not isinstance(name, str) or "://" in name or (not kind and 0 < index == len(stages) - 1):
+            continue
+        is_las = kind in ("readers.las", "readers.copc") or (
+            not kind and name.lower().endswith((".las", ".laz"))
+        )
+        if is_las or (not las and (not kind or kind.startswith("readers."))):
+            names = sorted(glob.glob(name)) if not os.path.exists(name) else [name]
+            found += [n for n in names if os.path.isfile(n)]
+    return found
+
+
+def named_files(stages: list[dict[str, Any]]) -> list[str]:
+    """Files there are that options of PDAL's stages name, whichever the options: polygons, rasters, scripts."""
+    found: list[str] = []
+    for stage in stages:
+        own = ("filename",) if is_writer(stage, stages) else ()
+        for name, value in stage.items():
+            if name not in (*_NO_FILES, *own):
+                found += [text for text in _texts(value) if _is_file(text)]
+    return found
+
+
+def _texts(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list):
+        for inner in value.values() if isinstance(value, dict) else value:
+            yield from _texts(inner)
+
+
+def _is_file(text: str) -> bool:
+    try:
+        return os.path.isfile(text)
+    except ValueError:
+        return False
+
+
+def stage_files(stage: Stage) -> list[str]:
+    """Files that a stage of ours reads."""
+    written = {output.path for output in stage.outputs()}
+    given = [stage.options[o.name] for o in stage.all_options() if o.kind == "filename"]
+    return [name for name in given if name and name not in written]
+
+
+def is_writer(stage: dict[str, Any], stages: list[dict[str, Any]]) -> bool:
+    """Whether a stage writes a local file."""
+    name, kind = stage.get("filename"), stage.get("type", "")
+    if not isinstance(name, str) or "://" in name:
+        return False
+    if not kind.startswith("writers.") and (kind or len(stages) == 1 or stage is not stages[-1]):
+        return False
+    return kind not in ("", "writers.text") or name.upper() != "STDOUT"  # which PDAL prints
+
+
+def writers_outputs(stages: list[dict[str, Any]]) -> list[Output]:
+    """Files that PDAL's writers write."""
+    found = []
+    for stage in stages:
+        if is_writer(stage, stages):
+            name = stage["filename"]
+            las = stage.get("type") in ("writers.las", "writers.copc") or (
+                "type" not in stage and name.lower().endswith((".las", ".laz"))
+            )
+            found.append(Output(name, "output", kinds.LAS if las else ""))
+    return found
+
+
+def with_outputs(stages: list[dict[str, Any]], names: list[Any]) -> list[dict[str, Any]]:
+    """Stages whose writers write to other names."""
+    waiting = iter(names)
+    return [{**s, "filename": str(next(waiting))} if is_writer(s, stages) else s for s in stages]
