@@ -33,7 +33,8 @@ class _Family:
             wired = {"inputs": options.pop("inputs")} if merge and "inputs" in options else {}
             lowered = lower_stage({"type": kind.type, **options})
             runtime.remember_stdout()
-            made = pdal_env.python_object(lowered.plain)
+            said = ", ".join(f"{key}={value!r}" for key, value in options.items())
+            made = pdal_env.python_object(lowered.plain, f"{kind.type}({said})")
             made.made_from = lowered.stage  # or it would be forgotten, and options parsed again
             return pdal_env.python_object({"type": "filters.merge", **wired}) | made if merge else made
 

@@ -115,9 +115,12 @@ def execute(stages: list[dict[str, Any]], *, arrays: bool = True) -> Execution:
     )
 
 
-def python_object(stage: dict[str, Any]):
-    """A filter as an object of python-pdal, to be joined by ``|``."""
-    return bindings().Filter(**stage)
+def python_object(stage: dict[str, Any], shown: str = ""):
+    """A filter as an object of python-pdal, to be joined by ``|``; `shown` is what it prints as."""
+    kind = bindings().Filter
+    if shown:
+        kind = type("Filter", (kind,), {"__repr__": lambda _: shown})
+    return kind(**stage)
 
 
 def validate(stages: list[dict[str, Any]]) -> None:

@@ -1,0 +1,239 @@
+"""What newer versions of PDAL and python-pdal bring: each test knows which it needs, and says so where it skips."""
+
+from __future__ import annotations
+
+import json
+import logging
+from importlib import metadata as packages
+
+import laspy
+import numpy as np
+import pytest
+
+import pdal_stages as ps
+from pdal_stages.pipeline import pdal as pdal_env
+from pdal_stages.terrain import hag_minima
+
+pytestmark = pytest.mark.pdal
+HAG = {"type": "filters.hag_minima"}
+
+
+def needs(*version: int) -> None:
+    """Skip below a version of PDAL."""
+    if pdal_env.version() < version:
+        wanted, found = (".".join(map(str, v)) for v in (version, pdal_env.version()))
+        pytest.skip(f"needs PDAL {wanted}, found {found}")
+
+
+def needs_bindings(*version: int) -> None:
+    """Skip below a version of python-pdal."""
+    found = packages.version("pdal")
+    if tuple(int(n) for n in found.split(".")[:2]) < version:
+        pytest.skip(f"needs the bindings python-pdal {'.'.join(map(str, version))}, found {found}")
+
+
+def scene(n=2000, seed=3):
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0, 50, (2, n)).round(2)
+    high = (x > 20) & (y > 20)
+    return {
+        "X": x + 500_000,
+        "Y": y + 5_400_000,
+        "Z": np.where(high, 6.0, 0.0) + rng.normal(100, 0.05, n).round(2),
+        "Intensity": rng.integers(0, 999, n).astype(np.uint16),
+        "Classification": np.where(high, 6, 2).astype(np.uint8),
+        "GpsTime": np.arange(n, dtype=float),
+        "Mine": np.arange(n, dtype=np.int32),
+    }
+
+
+@pytest.fixture()
+def cloud(tmp_path, write_las):
+    return write_las(tmp_path / "in.laz", scene(), point_format=6, scale=0.01)
+
+
+@pytest.fixture(scope="module")
+def wide_model(tmp_path_factory, write_las):
+    """A model of ground and a class above 31."""
+    folder = tmp_path_factory.mktemp("wide")
+    source = write_las(folder / "train.las", scene(), point_format=6, scale=0.01)
+    trained = {"type": "writers.classifiermodel", "filename": str(folder / "m"), "neighborhoods": "c1", "count": 100,
+               "feature_set": "geometric", "dimensions": [], "classes": {"2": 2, "6": "64 Shed"}, "trees": 5}  # fmt: skip
+    ps.run_pipeline([str(source), trained])
+    return folder / "m"
+
+
+def heights(las):
+    return hag_minima(np.asarray(las.x), np.asarray(las.y), np.asarray(las.z))
+
+
+# ---- formats -----------------------------------------------------------------------------------------------
+
+
+def test_copc_is_written(cloud, tmp_path):
+    """With the header and the extra dimensions of the input and ours, and still a COPC file afterwards."""
+    needs(2, 4, 0)
+    out = tmp_path / "out.copc.laz"
+    writer = {"type": "writers.copc", "filename": str(out), "forward": "all", "extra_dims": "all"}
+    ps.run_pipeline([{"type": "readers.las", "filename": str(cloud), "use_eb_vlr": True}, HAG, writer])
+    before, after = laspy.read(cloud), laspy.read(out)
+    assert any(v.user_id == "copc" for v in after.header.vlrs)
+    assert not list(tmp_path.glob(".*"))
+    order, other = np.argsort(before.gps_time), np.argsort(after.gps_time)
+    for name in ("X", "Y", "Z", "intensity", "classification", "Mine"):
+        assert np.array_equal(np.asarray(after[name])[other], np.asarray(before[name])[order]), name
+    assert np.allclose(np.asarray(after["HeightAboveGround"])[other], heights(before)[order], atol=1e-5)
+    part = [
+        {"type": "readers.copc", "filename": str(out), "bounds": "([500000,500010],[5400000,5400010])"},
+        HAG,
+    ]
+    read = ps.run_pipeline(part).arrays[0]
+    assert 0 < len(read) < len(before) and read["X"].max() <= 500_010
+
+
+def test_las_14_unless_told_otherwise(cloud, tmp_path, wide_model):
+    needs(2, 8, 0)
+    assert pdal_env.las_writer_defaults() == (4, 7)
+    out = tmp_path / "out.las"
+    ps.run_pipeline([str(cloud), {"type": "filters.modelclassifier", "model": str(wide_model)}, str(out)])
+    las = laspy.read(out)
+    assert (las.header.version.minor, las.header.point_format.id) == (4, 7)
+    assert set(np.unique(las.classification)) == {2, 64}
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+def test_classes_above_31(cloud, tmp_path, wide_model, suffix):
+    if suffix == "laz":
+        needs(2, 3, 0)
+    out = tmp_path / f"out.{suffix}"
+    writer = {"type": "writers.las", "filename": str(out), "forward": "all"}
+    ps.run_pipeline([str(cloud), {"type": "filters.modelclassifier", "model": str(wide_model)}, writer])
+    assert set(np.unique(laspy.read(out).classification)) == {2, 64}
+
+
+@pytest.mark.parametrize("point_format", [1, 6])
+def test_flags_are_dimensions_of_their_own(tmp_path, write_las, wide_model, point_format):
+    needs(2, 6, 0)
+    arrays = scene()
+    rng = np.random.default_rng(8)
+    for name in ("Synthetic", "KeyPoint", "Withheld"):
+        arrays[name] = rng.integers(0, 2, len(arrays["X"])).astype(np.uint8)
+    source = write_las(tmp_path / "in.las", arrays, point_format=point_format, scale=0.01)
+    out = tmp_path / "out.las"
+    classify = {
+        "type": "filters.modelclassifier",
+        "model": str(wide_model),
+        "where": "Synthetic == 1 && Withheld == 0",
+    }
+    writer = {
+        "type": "writers.las",
+        "filename": str(out),
+        "forward": "all",
+        "minor_version": 4,
+        "dataformat_id": 6,
+    }
+    run = ps.run_pipeline(
+        [str(source), {"type": "filters.assign", "value": "Classification = 1"}, classify, writer]
+    )
+    array = run.arrays[0]
+    chosen = (array["Synthetic"] == 1) & (array["Withheld"] == 0)
+    assert (array["Classification"][~chosen] == 1).all()
+    assert set(np.unique(array["Classification"][chosen])) == {2, 64}
+    after = laspy.read(out)
+    for name, laspys in (("Synthetic", "synthetic"), ("KeyPoint", "key_point"), ("Withheld", "withheld")):
+        assert np.array_equal(np.asarray(after[laspys]), arrays[name]), name
+
+
+def test_pdals_expressions_after_a_stage_of_ours(cloud):
+    value = ["Classification = 1", "Classification = 9 WHERE HeightAboveGround > 3"]
+    array = ps.run_pipeline([str(cloud), HAG, {"type": "filters.assign", "value": value}]).arrays[0]
+    assert set(np.unique(array["Classification"])) == {1, 9}
+    assert np.array_equal(array["Classification"] == 9, array["HeightAboveGround"] > 3)
+
+
+# ---- python-pdal -------------------------------------------------------------------------------------------
+
+
+def test_objects_of_both_kinds_joined(cloud, pdal_module, tmp_path):
+    """In any order, from either side, and into a pipeline that is there already."""
+    reader, out = pdal_module.Reader.las(str(cloud)), tmp_path / "out.las"
+    features = ps.Filter.multiscalefeatures(neighborhoods="c1", feature_set="Verticality")
+    high = pdal_module.Filter.range(limits="HeightAboveGround[3:]")
+    writer = pdal_module.Writer.las(str(out), minor_version=4, extra_dims="all")
+    ours = ps.Filter.hag_minima() | features
+    for pipeline in (
+        reader | ours | high | writer,
+        reader | ps.Filter.hag_minima() | (features | high) | writer,
+    ):
+        count = pipeline.execute()
+        assert 0 < count < 2000 and len(laspy.read(out)) == count
+        assert {"HeightAboveGround", "Verticality_c1"} <= set(pipeline.arrays[0].dtype.names)
+        out.unlink()
+    grown = reader.pipeline()
+    grown |= ps.Filter.hag_minima()
+    assert grown.execute() == 2000
+
+
+def test_objects_say_what_they_are(pdal_module):
+    made = pdal_module.Reader.las("in.las") | ps.Filter.hag_minima(cell=15, tag="h")
+    stages = json.loads(made.toJSON() if hasattr(made, "toJSON") else made._get_json())
+    python = next(s for s in stages if s["type"] == "filters.python")
+    assert python["tag"] == "h" and python["pdalargs"]["stage"] == "filters.hag_minima"
+    assert python["pdalargs"]["options"] == {"cell": 15}
+    shown = repr(next(s for s in made.stages if s.type == "filters.python"))
+    assert "filters.hag_minima" in shown and "cell=15" in shown and "def stage" not in shown
+
+
+def test_arrays_and_logs(pdal_module):
+    points = np.zeros(400, [("X", "f8"), ("Y", "f8"), ("Z", "f8")])
+    points["X"], points["Y"] = np.random.default_rng(0).uniform(0, 30, (2, 400))
+    pipeline = pdal_module.Pipeline(ps.Filter.hag_minima().stages, arrays=[points])
+    pipeline.loglevel = logging.DEBUG
+    assert pipeline.execute() == 400
+    assert "filters.python" in pipeline.log
+    assert np.allclose(pipeline.arrays[0]["HeightAboveGround"], 0)
+
+
+def test_what_cannot_stream_says_so(cloud, pdal_module):
+    """Our stages see all points at once: python-pdal's iterators refuse, and the process goes on."""
+    pipeline = pdal_module.Reader.las(str(cloud)) | ps.Filter.hag_minima()
+    assert not pipeline.streamable
+    with pytest.raises(RuntimeError, match="stream"):
+        list(pipeline.iterator(chunk_size=100))
+    assert pipeline.execute() == 2000
+
+
+def test_data_frames(cloud, pdal_module):
+    needs_bindings(3, 2)
+    pandas = pytest.importorskip("pandas")
+    pipeline = pdal_module.Reader.las(str(cloud)) | ps.Filter.hag_minima()
+    pipeline.execute()
+    frame = pipeline.get_dataframe(0)
+    assert isinstance(frame, pandas.DataFrame) and frame["HeightAboveGround"].max() > 5
+    again = pdal_module.Pipeline(ps.Filter.hag_minima(cell=10).stages, dataframes=[frame[["X", "Y", "Z"]]])
+    assert again.execute() == 2000
+    assert np.allclose(
+        again.arrays[0]["HeightAboveGround"], hag_minima(*(frame[n].to_numpy() for n in "XYZ"), cell=10)
+    )
+
+
+def test_stream_handlers(pdal_module):
+    """Points that come in pieces reach our stage as one cloud."""
+    needs_bindings(3, 5)
+    rng = np.random.default_rng(2)
+    whole = np.zeros(900, [("X", "f8"), ("Y", "f8"), ("Z", "f8")])
+    for name in "XYZ":
+        whole[name] = rng.uniform(0, 40, 900)
+    buffer, sent = np.zeros(300, whole.dtype), iter((0, 300, 600))
+
+    def more() -> int:
+        start = next(sent, None)
+        if start is None:
+            return 0
+        buffer[:] = whole[start : start + 300]
+        return 300
+
+    pipeline = pdal_module.Pipeline(ps.Filter.hag_minima().stages, arrays=[buffer], stream_handlers=[more])
+    assert pipeline.execute() == 900
+    assert np.array_equal(pipeline.arrays[0]["X"], whole["X"])
+    assert np.allclose(pipeline.arrays[0]["HeightAboveGround"], hag_minima(*(whole[n] for n in "XYZ")))
