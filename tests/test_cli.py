@@ -5,13 +5,18 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections import Counter
 
 import laspy
 import numpy as np
 import pytest
 
+from pdal_stages.classifier import modelfile
 from pdal_stages.cli import main
+from pdal_stages.features import FeaturePlan
+from pdal_stages.pipeline import Pipeline
 from pdal_stages.stages import registry
+from pdal_stages.stages.modelclassifier import ModelClassifier
 
 pytestmark = pytest.mark.pdal
 
@@ -178,6 +183,30 @@ def test_train_model_classify_accuracy(cloud, tmp_path, capsys):
     assert (tmp_path / "a.html").stat().st_size > 10_000
 
 
+def test_classifying_does_each_thing_once(cloud, tmp_path, capsys, monkeypatch):
+    """The model is read once, its plan made once, options parsed once, however many questions are asked."""
+    model = tmp_path / "m.model"
+    words = ["--neighborhoods", "c1", "--count", 50, "--writers.classifiermodel.trees=2"]
+    assert run(capsys, "train", cloud, "--model", model, *words)[0] == 0
+    counts: Counter[str] = Counter()
+
+    def count(owner, name):
+        original = getattr(owner, name)
+
+        def counted(*given, **more):
+            counts[f"{owner.__name__}.{name}"] += 1
+            return original(*given, **more)
+
+        monkeypatch.setattr(owner, name, counted)
+
+    count(modelfile, "read")
+    count(FeaturePlan, "__post_init__")
+    count(ModelClassifier, "__init__")
+    count(Pipeline, "__init__")
+    assert run(capsys, "classify", cloud, tmp_path / "out.laz", "--model", model)[0] == 0
+    assert set(counts.values()) == {1} and len(counts) == 4
+
+
 def test_flags_of_old_files_are_no_classes(tmp_path, capsys, write_las, random_cloud):
     """PDAL 2.2 reads the key-point flag of LAS 1.2 into the class: 5 becomes 69."""
     xyz = random_cloud(60)
@@ -189,7 +218,13 @@ def test_flags_of_old_files_are_no_classes(tmp_path, capsys, write_las, random_c
     flagged.key_point = np.arange(60) % 3 == 0
     flagged.write(tmp_path / "b.las")
     for one, other in (("a", "b"), ("b", "a")):
-        words = [tmp_path / f"{one}.las", "--reference", tmp_path / f"{other}.las", "--json", tmp_path / "a.json"]
+        words = [
+            tmp_path / f"{one}.las",
+            "--reference",
+            tmp_path / f"{other}.las",
+            "--json",
+            tmp_path / "a.json",
+        ]
         code, _, err = run(capsys, "accuracy", *words)
         assert code == 0, err
         figures = json.loads((tmp_path / "a.json").read_text())

@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, PipelineError, StageError
 from pdal_stages.synthetic.srs import wkt
+from pdal_stages.terrain.minima import terrain_reach
 from pdal_stages.tiling import TilingOptions, run_tiled
-from pdal_stages.tiling.cloudindex import index_las, runs
+from pdal_stages.tiling.cloudindex import blocks_near, index_las
 from pdal_stages.tiling.extract import cut, plain_header
 from pdal_stages.tiling.grid import Grid, inside, touch
-from pdal_stages.tiling.marks import terrain_reach
 from pdal_stages.tiling.sources import find_sources, las_header
 from pdal_stages.tiling.tileplan import make_plan
 from pdal_stages.tiling.tindex import locations
@@ -100,20 +100,11 @@ def test_a_cut_is_the_files_own_bytes(tmp_path, random_cloud, write_las, suffix,
     path = write_las(
         tmp_path / f"cloud{suffix}", arrays, point_format=point_format, wkt=WKT if point_format == 6 else None
     )
-    index = index_las(str(path), 25.0)
-    assert index["count"] == len(xyz) and sum(n for _, _, n in index["tiles"]) == len(xyz)
-    assert len(runs(index["boxes"], (0, 0, 10, 100))) == 1
+    index = index_las(str(path), Grid(25.0))
+    assert index.count == len(xyz) and sum(n for _, _, n in index.tiles) == len(xyz)
+    assert blocks_near(index, (0, 0, 10, 100)) == [0]
     target = tmp_path / "piece.las"
-    piece = cut(
-        str(path),
-        index["boxes"],
-        index["count"],
-        Grid(25.0),
-        (1, 2),
-        3.0,
-        str(target),
-        str(tmp_path / "core.las"),
-    )
+    piece = cut(str(path), index, Grid(25.0), (1, 2), 3.0, str(target), str(tmp_path / "core.las"))
     las, all_ = laspy.read(target), laspy.read(path)
     expected = np.flatnonzero((xyz[:, 0] >= 22) & (xyz[:, 0] <= 53) & (xyz[:, 1] >= 47) & (xyz[:, 1] <= 78))
     assert np.array_equal(piece.index, expected)
@@ -124,7 +115,7 @@ def test_a_cut_is_the_files_own_bytes(tmp_path, random_cloud, write_las, suffix,
         & (xyz[expected, 1] >= 50)
         & (xyz[expected, 1] < 75)
     )
-    assert np.array_equal(piece.margin < 0, core)
+    assert np.array_equal(piece.own, np.flatnonzero(core))
     assert len(laspy.read(tmp_path / "core.las")) == np.count_nonzero(core)
     assert [v.record_id for v in las.header.vlrs] == [
         v.record_id for v in all_.header.vlrs if v.record_id != 22204
@@ -138,7 +129,7 @@ def test_index_refuses_what_is_cut_short(tmp_path, random_cloud, write_las):
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(StageError, match=r"damaged|cut short|cannot be read"):
-        index_las(str(path), 10.0)
+        index_las(str(path), Grid(10.0))
     path.write_bytes(b"not a cloud")
     with pytest.raises(StageError, match="not a LAS"):
         las_header(str(path))
@@ -158,6 +149,15 @@ def test_one_file_comes_back_bit_for_bit(tmp_path, town_file, model_file, whole)
     counted = np.bincount(np.asarray(laspy.read(whole).classification), minlength=7)
     assert run.summary["classes"] == {str(c): int(counted[c]) for c in np.flatnonzero(counted)}
     assert (tmp_path / "out.laz").read_bytes() == whole.read_bytes()
+
+
+def test_names_as_long_as_any(tmp_path, town_file):
+    """What is written beside an output must not have a longer name than it."""
+    for per in ("file", "tile"):
+        name = f"{per}_{'x' * (255 - len(f'{per}__500000_5400000.las'))}_#.las"
+        job = [str(town_file), {"type": "filters.hag_minima", "cell": 5}, str(tmp_path / name)]
+        assert not run_tiled(job, 90, workers=0, per=per).failures
+        assert list(tmp_path.glob(f"{per}_*.las"))
 
 
 def test_smoothed_over_seams(tmp_path, town_file, model_file):
@@ -335,14 +335,22 @@ def test_delft_comes_back_bit_for_bit(tmp_path, data_dir, model_file):
 
 
 def test_sparse_points_widen_the_surroundings(tmp_path, random_cloud, write_las):
-    """k nearest neighbors and the terrain reach beyond the halo; the tile is read again, wider."""
+    """k nearest neighbors and the terrain reach beyond the halo; the tile is read again, wider.
+
+    Nor do options that every PDAL stage has come in the way.
+    """
     xyz = random_cloud(900, seed=3, extent=(300, 300, 4))
     xyz = xyz[(np.abs(xyz[:, 0] - 150) > 40) | (xyz[:, 1] > 200)]
     path = write_las(tmp_path / "sparse.las", dict(zip("XYZ", xyz.T, strict=True)))
     pipeline = [
         str(path),
-        {"type": "filters.hag_minima", "cell": 4},
-        {"type": "filters.multiscalefeatures", "neighborhoods": "kopt", "feature_set": "Linearity,Radius"},
+        {"type": "filters.hag_minima", "cell": 4, "tag": "heights", "user_data": {"by": "me"}},
+        {
+            "type": "filters.multiscalefeatures",
+            "neighborhoods": "kopt",
+            "feature_set": "Linearity,Radius",
+            "user_data": {"by": "me"},
+        },
         {"type": "writers.las", "filename": str(tmp_path / "a.las"), "forward": "all", "extra_dims": "all"},
     ]
     ps.Pipeline(pipeline).execute(arrays=False)
@@ -368,13 +376,13 @@ def test_terrain_within_its_reach_is_the_whole_terrain(seed, density):
     if not wanted.any():
         return
     x, y, z = xyz.T
-    reach = terrain_reach(x, y, np.ones(len(x), bool), wanted, 8.0, 0.5, core)
+    reach = terrain_reach(x, y, np.ones(len(x), bool), wanted, core, 8.0, 0.5)
     near = (x >= 40 - reach) & (x <= 60 + reach) & (y >= 40 - reach) & (y <= 60 + reach)
     full, part = ps.hag_minima(x, y, z, cell=8.0), ps.hag_minima(x[near], y[near], z[near], cell=8.0)
     assert np.array_equal(full[wanted], part[wanted[near]])
     # What a smaller cut believes to need is never less than the truth.
     small = (x >= 38) & (x <= 62) & (y >= 38) & (y <= 62)
-    believed = terrain_reach(x[small], y[small], np.ones(small.sum(), bool), wanted[small], 8.0, 0.5, core)
+    believed = terrain_reach(x[small], y[small], np.ones(small.sum(), bool), wanted[small], core, 8.0, 0.5)
     assert believed >= reach or believed <= 2.0
 
 
@@ -447,7 +455,7 @@ def test_outputs_need_names(tmp_path, town_file):
 
 
 def test_only_seen_points_are_computed(tmp_path, town_file, model_file):
-    plan = make_plan(clouds.stages([town_file], tmp_path / "o.las", model_file), (), TilingOptions(30))
+    plan = make_plan(ps.Pipeline(clouds.stages([town_file], tmp_path / "o.las", model_file)))
     assert plan.head[1]["where"] == "PdalStagesMargin < 0"
     assert [s["type"] for s in plan.tail] == ["writers.las"]
     assert plan.halo == pytest.approx(4 * clouds.CELL + 16)
@@ -557,7 +565,7 @@ def test_reports(tmp_path, town_file, model_file):
 
 def test_a_failed_tile_is_crossed_out():
     from pdal_stages.reports.runpage import run_page
-    from pdal_stages.tiling.tiledrun import Job, TiledRun
+    from pdal_stages.tiling.outcome import Job, TiledRun
 
     report = {"points": 5, "read": 9, "buffer": 1.0, "seconds": 2.0}
     jobs = [Job((0, 0), "0_0", 5, [], state="done", report=report)]

@@ -42,13 +42,13 @@ class InputPlan:
         Inputs in order. X, Y and Z are taken from the batch's centre.
     halo : float
         Metres around a tile that its results depend on.
-    neighborhoods : tuple
-        None: a network computes no features.
+    most_neighbors : int
+        None: batches are cut by area.
     """
 
     dimensions: tuple[str, ...]
     halo: float
-    neighborhoods: ClassVar[tuple] = ()
+    most_neighbors: ClassVar[int] = 0
 
     @property
     def names(self) -> tuple[str, ...]:

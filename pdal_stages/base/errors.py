@@ -80,6 +80,10 @@ class InterruptedStage(StageError):
     """Ctrl-C came while a stage ran inside PDAL; the runners turn it back into KeyboardInterrupt."""
 
 
+class NoTerrainError(StageError):
+    """None of the points may form a terrain; with more points around them some may."""
+
+
 class DependencyError(StageError):
     """An optional program or package is missing."""
 

@@ -39,6 +39,8 @@ class LasHeader:
     scales, offsets : tuple of float
     texts : dict
         The texts of the header, as bytes.
+    box : tuple of float
+        (min x, min y, max x, max y).
     """
 
     minor: int
@@ -53,6 +55,7 @@ class LasHeader:
     scales: tuple[float, ...]
     offsets: tuple[float, ...]
     texts: dict[str, bytes]
+    box: tuple[float, float, float, float]
 
     @property
     def end_of_points(self) -> int:
@@ -71,12 +74,14 @@ def read_header(path: str | os.PathLike) -> LasHeader | None:
     if minor >= 4 and size >= 375 and len(head) >= 255:
         after, count = struct.unpack_from("<IQ", head, 243)
     numbers = struct.unpack_from("<6d", head, 131)
+    x1, x0, y1, y0 = struct.unpack_from("<4d", head, 179)
     texts = {
         "system identifier": head[26:58].split(b"\0")[0],
         "generating software": head[58:90].split(b"\0")[0],
     }
     return LasHeader(
-        minor, kind & 0x3F, length, bool(kind & 0xC0), size, offset, records, after, count, numbers[:3], numbers[3:], texts
+        minor, kind & 0x3F, length, bool(kind & 0xC0), size, offset, records, after, count,
+        numbers[:3], numbers[3:], texts, (x0, y0, x1, y1),
     )  # fmt: skip
 
 

@@ -37,6 +37,8 @@ class Inputs(Protocol):
         Which of them, at the end, are dimensions of the points.
     halo : float
         Metres around a tile whose points the tile's results depend on.
+    most_neighbors : int
+        The most neighbors a point is asked for, where their number decides how far away they are.
     """
 
     @property
@@ -45,6 +47,8 @@ class Inputs(Protocol):
     def dimensions(self) -> tuple[str, ...]: ...
     @property
     def halo(self) -> float: ...
+    @property
+    def most_neighbors(self) -> int: ...
     def to_dict(self) -> dict[str, Any]: ...
 
 

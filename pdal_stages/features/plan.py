@@ -180,6 +180,11 @@ class FeaturePlan:
         return reach + self.cell
 
     @property
+    def most_neighbors(self) -> int:
+        """The most neighbors a point is asked for, of neighborhoods whose size is a number of points; 0 where none is."""
+        return max((int(n.parameters[-1]) for n in self.neighborhoods if n.reach is None), default=0)
+
+    @property
     def unbounded(self) -> bool:
         """Whether a neighborhood's size is a number of points, so that no halo is sure to suffice."""
         return any(n.reach is None for n in self.neighborhoods)

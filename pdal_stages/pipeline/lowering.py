@@ -14,11 +14,12 @@ from typing import Any
 
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import DimensionError, OptionError, PipelineError, StageError, suggest
+from ..base.las import LasHeader, read_header
 from ..stages import registry
 from ..stages.base import Stage
 from .optionfile import settled
 from .read import PipelineSource
-from .runtime import TRAMPOLINE, known, place
+from .runtime import TRAMPOLINE, known, place, python_filter
 
 #: Options of every PDAL stage that a lowered stage hands on.
 PDAL_OWN = ("tag", "inputs", "user_data", "log")
@@ -40,8 +41,10 @@ class LoweredStage:
         Its type and tag, for messages.
     label : str
         The unique `module` label, under which the runtime knows it.
-    index : int
-        Place in the lowered list.
+    number, index : int
+        Place in the given and in the lowered list.
+    given : dict
+        The stage as it was written, with the options of its `option_file`.
     plain : dict
         The ``filters.python`` that PDAL runs.
     """
@@ -49,7 +52,9 @@ class LoweredStage:
     stage: Stage
     place: str
     label: str
+    number: int
     index: int
+    given: dict[str, Any]
     plain: dict[str, Any]
 
 
@@ -97,7 +102,7 @@ def lower(source: PipelineSource) -> Lowered:
                     stage["inputs"] = [merge["tag"]]
                 views.add(merge)
                 out.stages.append(merge)
-            lowered = lower_stage(stage, len(out.stages))
+            lowered = lower_stage(stage, index, len(out.stages))
         except StageError as error:
             raise error.within(where) from None
         views.add(stage)
@@ -134,7 +139,7 @@ def _distance_is_typo(type_name: str) -> bool:
     return bool(close)
 
 
-def lower_stage(given: dict[str, Any], index: int = 0) -> LoweredStage:
+def lower_stage(given: dict[str, Any], number: int = 0, index: int = 0) -> LoweredStage:
     """One stage of ours, checked, and the ``filters.python`` that stands for it."""
     kind = registry.get(given["type"])
     named = place(kind.type, given.get("tag"))
@@ -148,18 +153,10 @@ def lower_stage(given: dict[str, Any], index: int = 0) -> LoweredStage:
     arguments = {"stage": kind.type, "label": label, "options": options}
     if given.get("tag"):
         arguments["tag"] = given["tag"]
-    plain: dict[str, Any] = {
-        "type": "filters.python",
-        "module": label,
-        "function": "stage",
-        "source": TRAMPOLINE,
-        "pdalargs": arguments,
-    }
-    if creates := stage.creates():
-        plain["add_dimension"] = [f"{name}={kind}" for name, kind in creates.items()]
+    plain = python_filter(label, TRAMPOLINE, arguments, stage.creates())
     plain.update({key: given[key] for key in PDAL_OWN if key in given})
     known(label, stage)
-    return LoweredStage(stage, named, label, index, plain)
+    return LoweredStage(stage, named, label, number, index, given, plain)
 
 
 def _fresh_tag(tags: set[str]) -> str:
@@ -269,10 +266,10 @@ def _las_version(writer: dict[str, Any], before: list[dict[str, Any]]) -> tuple[
     forward = str(writer.get("forward", ""))
     headers = [h for h in (_las_header(s) for s in before) if h is not None]
     if headers and ("all" in forward or "header" in forward or "minor_version" in forward):
-        if len({h[0] for h in headers}) == 1:
-            minor = headers[0][0]
-        if len({h[1] for h in headers}) == 1:
-            format_id = headers[0][1]
+        if len({h.minor for h in headers}) == 1:
+            minor = headers[0].minor
+        if len({h.point_format for h in headers}) == 1:
+            format_id = headers[0].point_format
     return _whole(writer.get("minor_version"), minor), _whole(writer.get("dataformat_id"), format_id)
 
 
@@ -284,19 +281,12 @@ def _whole(value: Any, otherwise: int) -> int:
         return otherwise
 
 
-def _las_header(stage: dict[str, Any]) -> tuple[int, int] | None:
-    """Version and point format in a LAS file's first bytes; None where it cannot be read here."""
-    type_name = stage.get("type", "")
-    if type_name not in ("", "readers.las", "readers.copc"):
+def _las_header(stage: dict[str, Any]) -> LasHeader | None:
+    """The header of a LAS file that a stage reads; None where it cannot be read here."""
+    if stage.get("type", "") not in ("", "readers.las", "readers.copc"):
         return None
     path = Path(str(stage.get("filename", "")))
     try:
-        if not path.is_file():  # a pipe or device must not be read here
-            return None
-        with open(path, "rb") as file:
-            head = file.read(105)
+        return read_header(path) if path.is_file() else None  # a pipe or device must not be read here
     except (OSError, ValueError):
         return None
-    if len(head) < 105 or head[:4] != b"LASF":
-        return None
-    return head[25], head[104] & 0x3F

@@ -13,7 +13,8 @@ from __future__ import annotations
 import json
 import sys
 import threading
-from collections.abc import Mapping
+import uuid
+from collections.abc import Callable, Mapping
 from typing import Any
 from weakref import WeakValueDictionary
 
@@ -54,6 +55,22 @@ def place(type_name: str, tag: str | None) -> str:
     return f"{type_name} (tag '{tag}')" if tag else type_name
 
 
+def python_filter(
+    label: str, source: str, arguments: dict[str, Any], adds: Mapping[str, str]
+) -> dict[str, Any]:
+    """A ``filters.python`` that runs `source` and adds dimensions (name -> PDAL type)."""
+    out: dict[str, Any] = {
+        "type": "filters.python",
+        "module": label,
+        "function": "stage",
+        "source": source,
+        "pdalargs": arguments,
+    }
+    if adds:
+        out["add_dimension"] = [f"{name}={kind}" for name, kind in adds.items()]
+    return out
+
+
 def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
     """Run one lowered stage on one point view; True, also where it failed (see above).
 
@@ -75,13 +92,17 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
         failure = _as_stage_error(error, place(arguments["stage"], arguments.get("tag")))
         with _lock:
             _failures[label] = failure
-        outs.clear()
-        outs[f"{_OPENING}{_encodable(str(failure))}{_CLOSING}"] = None
-        restore_stdout()
+        _hand_over(failure, outs)
     else:
         with _lock:
             _reports.setdefault(label, []).append(report)
     return True
+
+
+def _hand_over(failure: StageError, outs: dict[str, Any]) -> None:
+    outs.clear()
+    outs[f"{_OPENING}{_encodable(str(failure))}{_CLOSING}"] = None
+    restore_stdout()
 
 
 def points_of(stage: Stage, module: Mapping[str, Any], ins: Mapping[str, Any]) -> Points:
@@ -177,6 +198,64 @@ def _metadata_node(name: str, report: Mapping[str, Any]) -> dict[str, Any]:
 
 def _leaf(name: str, value: str, kind: str) -> dict[str, Any]:
     return {"name": name, "value": _encodable(value), "type": kind, "description": "", "children": []}
+
+
+# ---- functions of this process as filters -----------------------------------------------------------
+
+_CALLBACK = """\
+def stage(ins, outs):
+    from pdal_stages.pipeline.runtime import call_back
+    return call_back(globals(), ins, outs)
+"""
+_functions: dict[str, Callable[[dict[str, Any], Mapping[str, Any], dict[str, Any]], None]] = {}
+
+
+class Callbacks:
+    """Filters that call functions of this process, which are forgotten when the ``with`` block ends."""
+
+    def __init__(self) -> None:
+        self._labels: list[str] = []
+
+    def __enter__(self) -> Callbacks:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        for label in self._labels:
+            _functions.pop(label, None)
+
+    def filter(
+        self,
+        function: Callable[[dict[str, Any], Mapping[str, Any], dict[str, Any]], None],
+        adds: Mapping[str, str] | None = None,
+        **own: Any,
+    ) -> dict[str, Any]:
+        """A ``filters.python`` that calls a function.
+
+        Parameters
+        ----------
+        function : callable
+            Gets the script's globals, the dimensions, and a dict for those to write back.
+        adds : mapping, optional
+            Dimensions to add: name -> PDAL type.
+        **own
+            `tag` and `inputs`.
+        """
+        label = f"pdal_stages_callback_{uuid.uuid4().hex}"
+        _functions[label] = function
+        self._labels.append(label)
+        return {**python_filter(label, _CALLBACK, {"label": label}, adds or {}), **own}
+
+
+@interrupts.catches
+def call_back(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
+    """Call the function of a filter that :class:`Callbacks` made."""
+    label = module["pdalargs"]["label"]
+    sys.modules.pop(label, None)
+    try:
+        _functions[label](module, ins, outs)
+    except BaseException as error:
+        _hand_over(_as_stage_error(error, "filters.python"), outs)
+    return True
 
 
 # ---- for the runners in the same process -----------------------------------------------------------

@@ -28,6 +28,9 @@ class AccuracyStage(Stage):
     type = "filters.accuracy"
     summary = "Compare a class dimension with a reference dimension; report as table, JSON and HTML"
     source = "[B16] section 4.3, [W18] section 4.3"
+    instead_of_tiles = (
+        "Write the files first, then compare them: pdal-stages accuracy FILE --reference-dimension Reference"
+    )
     where_help = "Only points inside are compared."
     dimension: str = option("string", "Classification", "The classes to judge")
     reference: str = option("string", "Reference", "The true classes, e.g. kept with filters.ferry")

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
+import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
@@ -54,6 +55,12 @@ class Stage(ABC):
     dimensions_help: ClassVar[str] = ""
     #: What `where` means here.
     where_help: ClassVar[str] = ""
+    #: Whether `where` only chooses what to compute, so that tiles may narrow it down to what is seen.
+    where_chooses: ClassVar[bool] = False
+    #: For a stage that needs all points at once: what to do instead of running it in tiles.
+    instead_of_tiles: ClassVar[str] = ""
+    #: Whether points beyond the halo may matter; tiles then ask :meth:`reach_of`, and are read wider.
+    open_ended: ClassVar[bool] = False
 
     where: str | None = option(
         "expression",
@@ -114,6 +121,31 @@ class Stage(ABC):
     def largest_class(self) -> int:
         """The largest class code the stage may write to `Classification` (0: none)."""
         return 0
+
+    def most_neighbors(self) -> int:
+        """The most neighbors a point is asked for, where their number decides how far away they are; 0: none."""
+        return 0
+
+    def check_tiled(self) -> None:
+        """Refuse options whose result depends on all points at once."""
+
+    def reach_of(self, points: Points, wanted: NDArray[np.bool_], box: Sequence[float]) -> float:
+        """How far around a box lie the points that decide the results of the wanted ones, for an open-ended stage.
+
+        Parameters
+        ----------
+        points : Points
+            What was read: the box and some surroundings.
+        wanted : (n,) bool
+        box : (min x, min y, max x, max y)
+            In metres.
+
+        Returns
+        -------
+        float
+            Metres; more than was read, where that was not enough.
+        """
+        return 0.0
 
     def points(self, arrays: Mapping[str, NDArray], *, wkt: str = "", legacy_flags: bool = False) -> Points:
         """PDAL's arrays as this stage sees them: with its `where` and its units."""

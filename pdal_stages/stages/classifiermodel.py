@@ -34,6 +34,7 @@ class ClassifierModel(Stage):
     type = "writers.classifiermodel"
     summary = "Train a classifier on the labelled points that reach it, and write one model file"
     source = "[B16] sections 3.3-4.2, [W18] section 4.3, [WM19] for alsnet"
+    instead_of_tiles = "Train without --tile: only samples are computed, so memory goes to the points alone"
     where_help = "Samples are drawn from the points inside; all points are neighbors."
     filename: str = option("filename", None, "The model file to write", required=True)
     label: str = option("string", "Classification", "Dimension that holds the labels")

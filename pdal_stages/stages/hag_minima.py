@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import NOISE
 from ..base.errors import OptionError
-from ..terrain.minima import MinimaTerrain
+from ..terrain.minima import MinimaTerrain, terrain_reach
 from .base import Stage
 from .options import option
 from .points import Points
@@ -17,6 +19,7 @@ class HagMinima(Stage):
     type = "filters.hag_minima"
     summary = "Height above a coarse terrain: the minima of a grid, interpolated"
     source = "[W18] section 3.2"
+    open_ended = True  # an empty cell is filled from the nearest ones, however far away
     where_help = "Points outside neither form the terrain nor receive a height."
     cell: float = option(
         "number",
@@ -73,6 +76,10 @@ the unit of Z.
         # The bilinear patch reaches one and a half cells, whole cells are needed, and an
         # empty cell is filled from the nearest ones with points.
         return 4.0 * self.cell
+
+    def reach_of(self, points: Points, wanted: NDArray[np.bool_], box: Sequence[float]) -> float:
+        x, y, _ = points.xyz.T
+        return terrain_reach(x, y, self.forms_terrain(points), wanted, box, self.cell, self.resolution)
 
     def forms_terrain(self, points: Points) -> NDArray[np.bool_]:
         """Which points form the terrain; those left out for their class are counted."""

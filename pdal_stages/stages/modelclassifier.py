@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +21,7 @@ class ModelClassifier(Stage):
     type = "filters.modelclassifier"
     summary = "Apply a model file: compute what the model needs block by block, and write classes"
     source = "[B16] section 3.4, [W18] section 3.3, [WM19] for networks"
+    where_chooses = True
     where_help = "Points outside keep their class but still serve as neighbors."
     model_file: str = option("filename", None, "The model file to apply", required=True, name="model")
     probabilities: bool = option(
@@ -88,10 +88,8 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         """The loaded model."""
         return loaded_model(self.model_file)
 
-    @property
-    def plan(self) -> Any:
-        """The model's features."""
-        return self.model.plan
+    def most_neighbors(self) -> int:
+        return self.model.plan.most_neighbors
 
     def reads(self) -> list[str]:
         return list(self.model.required_dimensions)

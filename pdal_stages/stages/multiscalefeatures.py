@@ -31,6 +31,7 @@ class MultiscaleFeatures(Stage):
     type = "filters.multiscalefeatures"
     summary = "Covariance, geometric and shape-distribution features of many neighborhoods"
     source = "[B16] sections 3.1-3.2, [W18] section 3.2, [H17] equations 1-3"
+    where_chooses = True
     where_help = "Features are computed for the points inside; all points are neighbors."
     neighborhoods: list = option(
         "list",
@@ -125,6 +126,21 @@ features inside and need no dimensions at all.
 
     def halo(self) -> float:
         return self.plan.halo
+
+    def most_neighbors(self) -> int:
+        return self.plan.most_neighbors
+
+    def check_tiled(self) -> None:
+        if self.bins and Path(self.bins).exists():
+            return
+        if self.plan.shapes or any(one.kind == "copt" for one in self.plan.neighborhoods):
+            what = "shape distributions" if self.plan.shapes else "copt"
+            raise OptionError(
+                f"the thresholds of {what} are fitted to the points, so every tile would have its own",
+                found=f"bins {self.bins!r}, which does not exist" if self.bins else "no option 'bins'",
+                cure='Give "bins": "thresholds.json", and run the pipeline once without --tile on one typical file, '
+                "which writes it; a model file has its thresholds within",
+            )
 
     def run(self, points: Points) -> dict[str, NDArray]:
         plan, names = self.plan, self.columns

@@ -40,7 +40,7 @@ def _round(a):
     return np.where(np.abs(a - whole) >= 0.5, whole + np.sign(a), whole)
 
 
-_OPERATIONS = {
+_OPERATIONS: dict[str, Callable] = {
     "||": np.logical_or,
     "&&": np.logical_and,
     "==": np.equal,
@@ -249,5 +249,6 @@ def _value(node: _Node, arrays: Mapping[str, NDArray]):
     if node.kind == "minus":
         return np.negative(parts[0])
     if node.kind == "call":
-        return {**_FUNCTIONS, **_CONDITIONS}[str(node.value)](parts[0])
+        name = str(node.value)
+        return (_FUNCTIONS[name] if name in _FUNCTIONS else _CONDITIONS[name])(parts[0])
     return _OPERATIONS[str(node.value)](*parts)

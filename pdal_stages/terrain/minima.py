@@ -13,12 +13,13 @@ classification of ALS point clouds.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..base.errors import OptionError, StageError
+from ..base.errors import NoTerrainError, OptionError, StageError
 
 #: Largest cell index either side of zero; beyond it coordinates cannot be terrain.
 _INDEX_LIMIT = 2**31 - 2
@@ -104,7 +105,7 @@ class MinimaTerrain:
         if not finite.any():
             return out
         if self._keys.size == 0:
-            raise StageError(
+            raise NoTerrainError(
                 "no terrain: none of the points may form one",
                 found=f"{x.size:,} points, all of them not finite, noise, or outside 'where'",
                 cure="Relax 'ignore_classes' or 'where'",
@@ -199,6 +200,52 @@ def hag_minima(
         return np.empty(0)
     terrain = MinimaTerrain.fit(x, y, z, cell=cell, resolution=resolution, mask=mask)
     return z - terrain.at(x, y)
+
+
+def terrain_reach(
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    forms: NDArray[np.bool_],
+    wanted: NDArray[np.bool_],
+    box: Sequence[float],
+    cell: float,
+    resolution: float,
+) -> float:
+    """How far around a box lies all that decides the terrain under the wanted points.
+
+    A height takes the four coarse cells around a point; an empty one is filled from all cells within its
+    nearest filled one's distance and 1.5 cells. All of these must be known whole. What is found with too few
+    points bounds the true reach from above.
+
+    Parameters
+    ----------
+    x, y : (n,) float64
+    forms, wanted : (n,) bool
+        Points that form the terrain, and those whose heights matter.
+    box : (min x, min y, max x, max y)
+    cell, resolution : float
+
+    Returns
+    -------
+    float
+        In the unit of x and y; 0 where the box suffices.
+    """
+    from scipy.spatial import cKDTree
+
+    if not wanted.any() or not forms.any():
+        return 0.0
+    filled = np.unique(np.column_stack([np.floor(x[forms] / cell), np.floor(y[forms] / cell)]), axis=0)
+    fine = np.unique(
+        np.column_stack([np.floor(x[wanted] / resolution), np.floor(y[wanted] / resolution)]), axis=0
+    )
+    low = np.floor((fine + 0.5) * (resolution / cell) - 0.5)
+    cells = np.unique(np.concatenate([low + np.array([a, b]) for a in (0, 1) for b in (0, 1)]), axis=0)
+    nearest = cKDTree(filled).query(cells)[0]
+    radius = np.where(nearest > 0, nearest + 1.5, 0.0)[:, None] + 0.5  # whole cells around it
+    centre = cells + 0.5
+    below = np.asarray(box[:2]) - (centre - radius) * cell
+    above = (centre + radius) * cell - np.asarray(box[2:])
+    return float(max(0.0, below.max(), above.max()))
 
 
 def _check_sizes(cell: float, resolution: float) -> None:

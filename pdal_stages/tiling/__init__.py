@@ -1,6 +1,7 @@
 """Pipelines over inputs of any number and size: tiles with a halo, run on Dask, written seamlessly."""
 
+from .outcome import TiledRun
 from .settings import TilingOptions
-from .tiledrun import TiledRun, run_tiled
+from .tiledrun import run_tiled
 
 __all__ = ["TiledRun", "TilingOptions", "run_tiled"]

@@ -2,68 +2,71 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from .extract import Piece
-from .inparts import write_in_parts
-from .tail import gather, run_tail
+from .inparts import HeadersDifferError, write_in_parts
+from .results import PieceResults, of_own_points, read_range
+from .sources import Source
+from .tail import run_tail
 
 #: A larger file is written in parts of so many points.
 MOST_AT_ONCE = 4_000_000
 
 
-def write_tile(task: dict[str, Any], results: Any, pieces: list[Piece], folder: str) -> dict[str, Any]:
-    """Write one tile's own points from the pieces already cut."""
-    readers, columns = [], []
-    for number, (piece, source) in enumerate(zip(pieces, _sources_of(task, pieces), strict=True)):
-        own = np.flatnonzero(piece.margin < 0)
-        if not own.size:
-            continue
-        rows = np.searchsorted(own, results.rows[number])
-        path = Path(piece.path)
-        core = str(path.with_name(path.name.replace("piece", "core")))
-        readers.append({**source["reader"], "type": "readers.las", "filename": core})
-        columns.append((len(own), rows, {n: c[number] for n, c in results.values.items()}))
-    if not readers:
-        return {"outputs": []}
-    return _write(readers, columns, task["tail"], task["outputs"])
+@dataclass(frozen=True)
+class FileTask:
+    """An input file's output, to be put together from tiles.
 
-
-def _sources_of(task: dict[str, Any], pieces: list[Piece]) -> list[dict[str, Any]]:
-    """The source of each piece, by the number in the piece's name."""
-    return [task["sources"][int(Path(p.path).stem.removeprefix("piece"))] for p in pieces]
-
-
-def write_file(task: dict[str, Any]) -> dict[str, Any]:
-    """Put one input file's results together and write its output.
-
-    Parameters
+    Attributes
     ----------
-    task : dict
-        ``source`` (path, reader, key), ``count``, ``results`` (files of tiles), ``tail``, ``outputs``.
+    source : Source
+    count : int
+        Points of the input.
+    results : list of str
+        Files of tiles.
+    tail : list of dict
+        Stages to run, with the writers.
+    outputs : list of str
+        What each of the writers writes.
+    scratch : str
+        Folder for temporary files.
     """
-    count = task["count"]
-    if count > MOST_AT_ONCE and all(_las(s) for s in task["tail"] if s["type"].startswith("writers.")):
-        written = write_in_parts(task, MOST_AT_ONCE)
-        if written is not None:
-            return written
-    kept, values = gather(task, 0, count)
-    reader = {**task["source"]["reader"], "type": "readers.las", "filename": task["source"]["path"]}
-    return run_tail([reader], [(kept, values)], task["tail"], task["outputs"])
+
+    source: Source
+    count: int
+    results: list[str]
+    tail: list[dict[str, Any]]
+    outputs: list[str]
+    scratch: str
+
+    def run(self) -> dict[str, Any]:
+        """Write the outputs; see :func:`~pdal_stages.tiling.tail.run_tail`."""
+
+        def new_values(start: int, end: int):
+            return read_range(self.results, self.source, self.count, start, end)
+
+        writers = [stage for stage in self.tail if stage["type"].startswith("writers.")]
+        if self.count > MOST_AT_ONCE and all(map(_writes_las, writers)):
+            try:
+                return write_in_parts(
+                    self.source, self.count, MOST_AT_ONCE, new_values, self.tail, self.outputs, self.scratch
+                )
+            except HeadersDifferError:  # such as automatic offsets: written at once
+                pass
+        reader = {**self.source.reader, "filename": self.source.path}
+        return run_tail([reader], [new_values(0, self.count)], self.tail, self.outputs)
 
 
-def _las(writer: dict[str, Any]) -> bool:
+def write_tile(results: list[PieceResults], tail: list[dict[str, Any]], outputs: list[str]) -> dict[str, Any]:
+    """Write one tile's own points, from the files that were cut for it."""
+    mine = [result for result in results if result.piece.own.size]
+    if not mine:
+        return {"outputs": []}
+    readers = [{**r.source.reader, "type": "readers.las", "filename": r.piece.core} for r in mine]
+    return run_tail(readers, [of_own_points(result) for result in mine], tail, outputs)
+
+
+def _writes_las(writer: dict[str, Any]) -> bool:
     return writer["type"] == "writers.las" and Path(writer["filename"]).suffix.lower() in (".las", ".laz")
-
-
-def _write(readers, columns, tail, outputs) -> dict[str, Any]:
-    made = []
-    for count, rows, values in columns:
-        kept = np.zeros(count, bool)
-        kept[rows] = True
-        every = len(rows) == count
-        made.append((kept, {n: (None if every else rows, v) for n, v in values.items()}))
-    return run_tail(readers, made, tail, outputs)

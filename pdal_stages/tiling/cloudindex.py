@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,24 @@ from .grid import Box, Grid, touch
 
 #: Points of a block: LAZ is compressed in pieces of so many.
 BLOCK = 50_000
+
+
+@dataclass(frozen=True)
+class CloudIndex:
+    """Where the points of a file lie.
+
+    Attributes
+    ----------
+    count : int
+    boxes : list of Box
+        The bounding box of each block of 50,000 points.
+    tiles : list of (int, int, int)
+        Column, row and number of points of each tile.
+    """
+
+    count: int
+    boxes: list[Box]
+    tiles: list[tuple[int, int, int]]
 
 
 def open_las(path: str):
@@ -45,27 +64,14 @@ def read_block(reader: Any, path: str, start: int, count: int):
     return points
 
 
-def index_las(path: str, size: float) -> dict[str, Any]:
-    """Read a file once and describe it.
-
-    Parameters
-    ----------
-    path : str
-    size : float
-        Side of the tiles.
-
-    Returns
-    -------
-    dict
-        ``count``; ``boxes``, the bounding box of each block of 50,000 points; ``tiles``, a list of
-        (i, j, points).
+def index_las(path: str, grid: Grid) -> CloudIndex:
+    """Read a file once and say where its points lie.
 
     Raises
     ------
     StageError
         If any of it cannot be read.
     """
-    grid = Grid(size)
     boxes: list[Box] = []
     tiles: dict[tuple[int, int], int] = {}
     with open_las(path) as reader:
@@ -79,20 +85,20 @@ def index_las(path: str, size: float) -> dict[str, Any]:
             )
             for (i, j), number in zip(pairs.tolist(), counts.tolist(), strict=True):
                 tiles[i, j] = tiles.get((i, j), 0) + number
-    return {
-        "count": total,
-        "boxes": boxes,
-        "tiles": [[i, j, n] for (i, j), n in sorted(tiles.items())],
-    }
+    return CloudIndex(total, boxes, [(i, j, n) for (i, j), n in sorted(tiles.items())])
 
 
-def runs(boxes: list[Box], box: Box) -> list[tuple[int, int]]:
-    """Blocks (first, one after the last) that may hold points of a box."""
-    out: list[tuple[int, int]] = []
-    for number, one in enumerate(boxes):
-        if touch(one, box):
-            if out and out[-1][1] == number:
-                out[-1] = (out[-1][0], number + 1)
-            else:
-                out.append((number, number + 1))
-    return out
+@dataclass(frozen=True)
+class IndexTask:
+    """An input to be read once, by a worker."""
+
+    path: str
+    grid: Grid
+
+    def run(self) -> CloudIndex:
+        return index_las(self.path, self.grid)
+
+
+def blocks_near(index: CloudIndex, box: Box) -> list[int]:
+    """Numbers of the blocks that may hold points of a box."""
+    return [number for number, one in enumerate(index.boxes) if touch(one, box)]

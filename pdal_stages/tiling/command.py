@@ -13,8 +13,11 @@ from typing import Any
 
 from ..base.errors import OptionError, StageError
 from ..base.files import check_writable, write_whole
+from ..pipeline.run import Pipeline
+from .outcome import TiledRun
 from .settings import PER, TilingOptions
-from .tiledrun import TiledRun, run_tiled
+from .tiledrun import run_tiled
+from .tileplan import make_plan
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -91,18 +94,14 @@ def run_command(options: argparse.Namespace, source: str | Path) -> int:
         resume=options.resume,
         retries=options.retries,
     )
+    pipeline = Pipeline(source, options.overrides)
     if options.validate:
-        from ..pipeline.run import Pipeline
-        from .tileplan import make_plan
-
-        make_plan(source, options.overrides, chosen)
-        Pipeline(source, options.overrides).validate()
+        make_plan(pipeline, chosen.buffer)
+        pipeline.validate()
         print(json.dumps({"valid": True, "error_detail": "", "streamable": False}, indent=2))
         return 0
     with _terminated_as_interrupted():
-        run = run_tiled(
-            source, chosen, options.overrides, dry_run=options.dry_run, progress=_progress(options.progress)
-        )
+        run = run_tiled(pipeline, chosen, dry_run=options.dry_run, progress=_progress(options.progress))
     _print_dry(run) if options.dry_run else _print(run)
     for name in [*options.report, *([options.metadata] if options.metadata else [])]:
         _write_report(name, run)

@@ -5,18 +5,18 @@ from __future__ import annotations
 from typing import Any
 
 from ..pipeline import pdal as pdal_env
-from .cloudindex import index_las
+from .cloudindex import CloudIndex, index_las
 from .grid import Grid
-from .sources import las_header, read_ept
+from .sources import Source, las_header, read_ept
 
 
-def fetch(source: dict[str, Any], grid: Grid, tile: tuple[int, int], margin: float, target: str):
-    """Read a tile and its surroundings into a LAS file; its path and index (None where it is empty).
+def fetch(source: Source, grid: Grid, tile: tuple[int, int], margin: float, target: str) -> CloudIndex | None:
+    """Read a tile and its surroundings into a LAS file; its index, None where it is empty.
 
     Scales and offsets are the source's, so coordinates stay what they are; other
     dimensions become extra dimensions.
     """
-    described = read_ept(source["path"])
+    described = read_ept(source.path)
     x0, y0, x1, y1 = grid.box(tile, margin)
     writer: dict[str, Any] = {
         "type": "writers.las",
@@ -30,13 +30,5 @@ def fetch(source: dict[str, Any], grid: Grid, tile: tuple[int, int], margin: flo
             axis = dimension["name"].lower()
             writer[f"scale_{axis}"] = dimension.get("scale", 0.001)
             writer[f"offset_{axis}"] = dimension.get("offset", 0.0)
-    reader = {
-        **source["reader"],
-        "type": "readers.ept",
-        "filename": source["path"],
-        "bounds": f"([{x0!r}, {x1!r}], [{y0!r}, {y1!r}])",
-    }
-    run = pdal_env.execute([reader, writer], arrays=False)
-    if not run.count or not las_header(target).count:
-        return target, None
-    return target, index_las(target, grid.size)
+    run = pdal_env.execute([source.within((x0, y0, x1, y1)), writer], arrays=False)
+    return index_las(target, grid) if run.count and las_header(target).count else None

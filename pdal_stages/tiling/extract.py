@@ -5,14 +5,15 @@ from __future__ import annotations
 import os
 import struct
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
-from .cloudindex import BLOCK, open_las, read_block, runs
-from .grid import Box, Grid
+from .cloudindex import BLOCK, CloudIndex, blocks_near, open_las, read_block
+from .grid import Grid
 
 _COMPRESSOR = b"laszip encoded"
 
@@ -25,6 +26,8 @@ class Piece:
     ----------
     path : str
         The LAS file.
+    core : str
+        Another one with the tile's own points alone; empty where none was asked for.
     index : (n,) int64
         Number of each point in the input file.
     margin : (n,) float64
@@ -32,8 +35,14 @@ class Piece:
     """
 
     path: str
+    core: str
     index: NDArray[np.int64]
     margin: NDArray[np.float64]
+
+    @cached_property
+    def own(self) -> NDArray[np.int64]:
+        """Rows of the tile's own points."""
+        return np.flatnonzero(self.margin < 0)
 
 
 def plain_header(path: str) -> tuple[bytearray, bytes]:
@@ -88,13 +97,12 @@ def finish(file: Any, head: bytearray, tail: bytes, count: int) -> None:
 
 def cut(
     path: str,
-    boxes: list[Box],
-    count: int,
+    index: CloudIndex,
     grid: Grid,
     tile: tuple[int, int],
     margin: float,
     target: str,
-    core_target: str | None = None,
+    core: str = "",
 ) -> Piece | None:
     """Cut a tile and its surroundings out of a file.
 
@@ -102,15 +110,15 @@ def cut(
     ----------
     path : str
         A LAS or LAZ file.
-    boxes, count
-        Its index, see :func:`pdal_stages.tiling.cloudindex.index_las`.
+    index : CloudIndex
+        Of that file.
     grid, tile
         Which tile.
     margin : float
         Surroundings, in the unit of the coordinates.
     target : str
         The LAS file to write.
-    core_target : str, optional
+    core : str, optional
         A second file, for the tile's own points alone.
 
     Returns
@@ -119,10 +127,10 @@ def cut(
         None where the file has no point there.
     """
     box = grid.box(tile, margin)
-    blocks = runs(boxes, box)
+    blocks = blocks_near(index, box)
     if not blocks:
         return None
-    index: list[NDArray[np.int64]] = []
+    rows_cut: list[NDArray[np.int64]] = []
     margins: list[NDArray[np.float64]] = []
     cores = 0
     head, tail = plain_header(path)
@@ -130,43 +138,42 @@ def cut(
         with (
             open_las(path) as reader,
             open(target, "wb") as out,
-            open(core_target or os.devnull, "wb") as core_out,
+            open(core or os.devnull, "wb") as core_out,
         ):
             out.write(head)
             core_out.write(head)
-            for first, last in blocks:
-                for block in range(first, last):
-                    start = block * BLOCK
-                    points = read_block(reader, path, start, min(BLOCK, count - start))
-                    x, y = np.asarray(points.x), np.asarray(points.y)
-                    rows = np.flatnonzero((x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3]))
-                    if not rows.size:
-                        continue
-                    away = outside(x[rows], y[rows], grid, tile)
-                    raw = points.array[rows]
-                    if raw.dtype.itemsize != struct.unpack_from("<H", head, 105)[0]:
-                        raise StageError("the points have another length than the header says", where=path)
-                    out.write(raw.tobytes())
-                    if core_target:
-                        mine = away < 0
-                        core_out.write(raw[mine].tobytes())
-                        cores += int(np.count_nonzero(mine))
-                    index.append(rows + start)
-                    margins.append(away)
-            found = sum(len(i) for i in index)
+            for block in blocks:
+                start = block * BLOCK
+                points = read_block(reader, path, start, min(BLOCK, index.count - start))
+                x, y = np.asarray(points.x), np.asarray(points.y)
+                rows = np.flatnonzero((x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3]))
+                if not rows.size:
+                    continue
+                away = outside(x[rows], y[rows], grid, tile)
+                raw = points.array[rows]
+                if raw.dtype.itemsize != struct.unpack_from("<H", head, 105)[0]:
+                    raise StageError("the points have another length than the header says", where=path)
+                out.write(raw.tobytes())
+                if core:
+                    mine = away < 0
+                    core_out.write(raw[mine].tobytes())
+                    cores += int(np.count_nonzero(mine))
+                rows_cut.append(rows + start)
+                margins.append(away)
+            found = sum(map(len, rows_cut))
             finish(out, bytearray(head), tail, found)
-            if core_target:
+            if core:
                 finish(core_out, bytearray(head), tail, cores)
     except OSError as error:
         raise StageError(
             "a tile could not be cut out", where=path, found=error.strerror or str(error)
         ) from error
-    if not index:
+    if not rows_cut:
         os.unlink(target)
-        if core_target:
-            os.unlink(core_target)
+        if core:
+            os.unlink(core)
         return None
-    return Piece(target, np.concatenate(index), np.concatenate(margins))
+    return Piece(target, core, np.concatenate(rows_cut), np.concatenate(margins))
 
 
 def outside(x: NDArray, y: NDArray, grid: Grid, tile: tuple[int, int]) -> NDArray[np.float64]:

@@ -4,52 +4,63 @@ from __future__ import annotations
 
 import contextlib
 import os
+from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from ..base.files import whole_files
 from .cloudindex import BLOCK, open_las, read_block
 from .extract import finish, plain_header
-from .scratch import scratch
-from .tail import check_whole, gather, run_tail, stamp
+from .results import NewValues
+from .sources import Source
+from .tail import check_whole, run_tail, stamp
 
 
-def write_in_parts(task: dict[str, Any], most: int) -> dict[str, Any] | None:
-    """Write the outputs of a file, `most` points at a time.
+class HeadersDifferError(Exception):
+    """Parts cannot be joined: the writer gives them different headers."""
+
+
+def write_in_parts(
+    source: Source,
+    count: int,
+    most: int,
+    new_values: Callable[[int, int], NewValues],
+    tail: list[dict[str, Any]],
+    outputs: list[str],
+    scratch: str,
+) -> dict[str, Any]:
+    """Write the outputs of a file with `count` points, `most` points at a time.
 
     Each part goes through the pipeline's own tail and writer into an uncompressed file; their points are then
-    joined under the first part's header.
+    joined under the first part's header. `new_values` gives the results of points from one number to another.
 
-    Returns
-    -------
-    dict or None
-        None where the writer gives parts different headers (such as automatic offsets), so that
-        they cannot be joined.
+    Raises
+    ------
+    HeadersDifferError
+        Nothing is written then.
     """
-    source, count = task["source"], task["count"]
-    writers = [s for s in task["tail"] if s["type"].startswith("writers.")]
-    finals = [Path(p) for p in task["outputs"]]
     joined: list[_Joined] = []
 
     def check(made: Path, final: Path) -> None:
         check_whole(made, final, joined[0].count)
 
-    try:
-        with whole_files(*finals, check=check) as partials, contextlib.ExitStack() as stack:
-            joined += [stack.enter_context(contextlib.closing(_Joined(p))) for p in partials]
-            folder = stack.enter_context(scratch(task["scratch"]))
-            for start in range(0, count, most):
-                end = min(count, start + most)
-                piece = os.path.join(folder, "part.las")
-                _copy(source["path"], start, end, piece)
-                outputs = [os.path.join(folder, f"out{n}.las") for n in range(len(writers))]
-                reader = {**source["reader"], "type": "readers.las", "filename": piece}
-                run_tail([reader], [gather(task, start, end)], _uncompressed(task["tail"]), outputs)
-                for one, output in zip(joined, outputs, strict=True):
-                    one.add(output)
-    except _HeadersDifferError:
-        return None
-    return {"outputs": [[str(p), *stamp(p)] for p in finals], "written": joined[0].count if joined else 0}
+    with whole_files(*outputs, check=check) as partials, contextlib.ExitStack() as stack:
+        joined += [stack.enter_context(contextlib.closing(_Joined(p))) for p in partials]
+        folder = stack.enter_context(TemporaryDirectory(dir=scratch, ignore_cleanup_errors=True))
+        for start in range(0, count, most):
+            end = min(count, start + most)
+            piece = os.path.join(folder, "part.las")
+            _copy(source.path, start, end, piece)
+            parts = [os.path.join(folder, f"out{n}.las") for n in range(len(outputs))]
+            reader = {**source.reader, "filename": piece}
+            run_tail([reader], [new_values(start, end)], _uncompressed(tail), parts)
+            for one, part in zip(joined, parts, strict=True):
+                one.add(part)
+    return {
+        "outputs": [[path, *stamp(path)] for path in outputs],
+        "written": joined[0].count if joined else 0,
+    }
 
 
 def _uncompressed(tail: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -66,10 +77,6 @@ def _copy(path: str, start: int, end: int, target: str) -> None:
         for first in range(start, end, BLOCK):
             out.write(read_block(reader, path, first, min(BLOCK, end - first)).array.tobytes())
         finish(out, head, tail, end - start)
-
-
-class _HeadersDifferError(Exception):
-    """Parts cannot be joined."""
 
 
 class _Joined:
@@ -99,7 +106,7 @@ class _Joined:
                     self.path, mode="w", header=header, do_compress=self.path.suffix.lower() == ".laz"
                 )
             elif head != self._head:
-                raise _HeadersDifferError
+                raise HeadersDifferError
             total = int(header.point_count)
             for first in range(0, total, BLOCK):
                 self._writer.write_points(read_block(reader, part, first, min(BLOCK, total - first)))

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import pickle
+from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any
 
 from ..base.errors import StageError, optional_import
 from ..pipeline.interrupts import gentle
 from .settings import TilingOptions
-from .work import perform
+from .work import Answer, Task, perform
 
 #: Seconds to wait for the first worker.
 _WAIT = 120
@@ -31,16 +33,14 @@ class Here:
 
     def __exit__(self, *exc: object) -> None: ...
 
-    def run(
-        self, tasks: Callable[[], tuple[Any, str] | None], busy: Callable[[], bool]
-    ) -> Iterator[tuple[Any, Any]]:
-        """Yield (key, answer) for every task; see :meth:`OnDask.run`."""
+    def run(self, waiting: deque, task_of: Callable[[Any], Task]) -> Iterator[tuple[Any, Answer]]:
+        """Yield (item, answer) for every item; see :meth:`OnDask.run`."""
         with gentle() as interrupts:
-            while (task := tasks()) is not None:
-                key, text = task
-                answer = perform(text)
+            while waiting:
+                item = waiting.popleft()
+                answer = perform(task_of(item))
                 interrupts.check()
-                yield key, answer
+                yield item, answer
 
 
 class OnDask:
@@ -121,63 +121,62 @@ class OnDask:
     def __exit__(self, *exc: object) -> None:
         self._stack.close()
 
-    def run(
-        self, tasks: Callable[[], tuple[Any, str] | None], busy: Callable[[], bool]
-    ) -> Iterator[tuple[Any, Any]]:
-        """Yield (key, answer) for every task, as they finish.
+    def run(self, waiting: deque, task_of: Callable[[Any], Task]) -> Iterator[tuple[Any, Answer]]:
+        """Yield (item, answer) for every item, as they finish.
 
         Parameters
         ----------
-        tasks : callable
-            Gives the next (key, JSON) or None when there is none now; asked again after every answer.
-        busy : callable
-            Whether there is a task.
+        waiting : deque
+            Items to do, from the left; more may be put in after every answer.
+        task_of : callable
+            Gives an item's task, just before it is sent.
 
         Notes
         -----
         As many tasks are out as there are workers. While a killed worker starts anew, two may sit on one; so a task
         whose worker was killed is tried once more with nothing beside it before it is blamed.
         """
-        if not busy():
+        if not waiting:
             return
         if self._distributed is None:
             self._start()
         finished = self._distributed.as_completed(loop=self._client.loop)
-        keys: dict[str, tuple[Any, str]] = {}
-        futures: dict[str, Any] = {}
-        suspects: list[tuple[Any, str]] = []
-        alone: tuple[Any, str] | None = None
+        out: dict[str, tuple[Any, Any]] = {}  # item and future, by the future's key
+        suspects: deque[Any] = deque()
+        alone = False
         try:
             while True:
-                waiting: list[tuple[Any, str]] = []
-                if alone is None:
-                    while len(keys) + len(waiting) < self._slots_now() and (task := tasks()) is not None:
-                        waiting.append(task)
-                    if not keys and not waiting:
+                sent: list[Any] = []
+                if not alone:
+                    while waiting and len(out) + len(sent) < self._slots_now():
+                        sent.append(waiting.popleft())
+                    if not out and not sent:
                         if not suspects:
                             return
-                        alone = suspects.pop(0)
-                        waiting.append(alone)
-                for task in waiting:
-                    future = self._client.submit(perform, task[1], pure=False, retries=0)
-                    keys[future.key], futures[future.key] = task, future
+                        alone = True
+                        sent.append(suspects.popleft())
+                for item in sent:
+                    # As bytes: Dask would look for its own keys in all that a task holds.
+                    task = pickle.dumps(task_of(item))
+                    future = self._client.submit(_perform_pickled, task, pure=False, retries=0)
+                    out[future.key] = item, future
                     finished.add(future)
                 future = next(finished)
-                task = keys.pop(future.key)
-                futures.pop(future.key)
+                item, _ = out.pop(future.key)
                 error = future.exception()
-                answer = error if error is not None else future.result()
+                killed = isinstance(error, self._distributed.KilledWorker)
+                answer = future.result() if error is None else _failed(error, killed)
                 future.release()
-                if alone is None and isinstance(error, self._distributed.KilledWorker):
+                if killed and not alone:
                     # It may only have waited on a worker that another tile killed: judge it by itself.
-                    suspects.append(task)
+                    suspects.append(item)
                     continue
-                alone = None
-                yield task[0], answer
+                alone = False
+                yield item, answer
         finally:
-            if futures:
+            if out:
                 with contextlib.suppress(Exception):
-                    self._client.cancel(list(futures.values()), force=True)
+                    self._client.cancel([future for _, future in out.values()], force=True)
 
     def _slots_now(self) -> int:
         if self._options.scheduler:  # workers may join and leave
@@ -186,6 +185,33 @@ class OnDask:
         return self.slots
 
 
-def open_pool(options: TilingOptions) -> Here | OnDask:
+def last_tries(
+    pool: Here | OnDask, waiting: deque, task_of: Callable[[Any], Task], retries: int
+) -> Iterator[tuple[Any, Answer]]:
+    """Items and the answers of their last tries; failed ones wait again behind the others, up to `retries` times."""
+    for item, answer in pool.run(waiting, task_of):
+        item.tries += 1
+        if answer.reason and answer.again and item.tries <= retries:
+            waiting.append(item)
+        else:
+            yield item, answer
+
+
+def _perform_pickled(task: bytes) -> Answer:
+    return perform(pickle.loads(task))
+
+
+def _failed(error: BaseException, killed: bool) -> Answer:
+    """The answer of a task that gave none."""
+    if killed:
+        reason = "it killed its worker each time it was tried: too little memory, or a crash in a library"
+        return Answer(reason=reason)
+    return Answer(reason=f"{type(error).__name__}: {error}", again=True)
+
+
+Pool = Here | OnDask
+
+
+def open_pool(options: TilingOptions) -> Pool:
     """Where the tasks of a run are done."""
     return OnDask(options) if options.scheduler or options.local_workers > 0 else Here(options)

@@ -6,13 +6,12 @@ import glob
 import hashlib
 import json
 import os
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..base import las
 from ..base.errors import PipelineError, StageError
-from ..base.las import check_readable
 from .grid import Box
 from .tindex import locations
 
@@ -64,8 +63,10 @@ class Source:
             return [-1, -1]
         return [stat.st_size, stat.st_mtime_ns]
 
-    def to_dict(self) -> dict[str, Any]:
-        return {"path": self.path, "reader": self.reader, "kind": self.kind}
+    def within(self, box: Box) -> dict[str, Any]:
+        """The reader of an EPT source for a box alone."""
+        x0, y0, x1, y1 = box
+        return {**self.reader, "filename": self.path, "bounds": f"([{x0!r}, {x1!r}], [{y0!r}, {y1!r}])"}
 
 
 def find_sources(readers: list[dict[str, Any]]) -> list[Source]:
@@ -155,29 +156,23 @@ def check_source(source: Source) -> None:
         If the file is damaged.
     """
     if source.kind == "las":
-        check_readable(source.path)
+        las.check_readable(source.path)
 
 
 def las_header(path: str) -> Header:
     """Number of points and bounding box in the header of a LAS or LAZ file."""
     try:
-        with open(path, "rb") as file:
-            head = file.read(375)
+        found = las.read_header(path)
     except OSError as error:
         raise StageError("the input cannot be read", where=path, found=error.strerror or str(error)) from None
-    if len(head) < 227 or head[:4] != b"LASF":
-        raise StageError(
-            "the input is not a LAS or LAZ file", where=path, found=f"{head[:4]!r} as first bytes"
-        )
-    (count,) = struct.unpack_from("<I", head, 107)
-    if head[25] >= 4 and len(head) >= 255:
-        (count,) = struct.unpack_from("<Q", head, 247)
-    x1, x0, y1, y0 = struct.unpack_from("<4d", head, 179)
-    if count and not (x0 <= x1 and y0 <= y1):
+    if found is None:
+        raise StageError("the input is not a LAS or LAZ file", where=path)
+    x0, y0, x1, y1 = found.box
+    if found.count and not (x0 <= x1 and y0 <= y1):
         raise StageError(
             "the header has no bounding box", where=path, found=f"x {x0} to {x1}, y {y0} to {y1}"
         )
-    return Header(int(count), (x0, y0, x1, y1))
+    return Header(found.count, found.box)
 
 
 def read_ept(path: str) -> dict[str, Any]:

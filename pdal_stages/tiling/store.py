@@ -9,11 +9,13 @@ import os
 import shutil
 import socket
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from ..base.errors import StageError
 from ..base.files import try_lock, write_whole
+from .cloudindex import CloudIndex
 
 #: The folder beside the outputs.
 FOLDER = ".pdal-stages"
@@ -150,12 +152,12 @@ class Store:
 
     # ---- indexes -------------------------------------------------------------------------------------
 
-    def index(self, mark: str) -> dict[str, Any] | None:
+    def index(self, mark: str) -> CloudIndex | None:
         """The index of an input that is still the same."""
-        with contextlib.suppress(OSError, ValueError):
-            return json.loads((self.indexes / f"{mark}.json").read_text())
+        with contextlib.suppress(OSError, ValueError, TypeError):
+            return CloudIndex(**json.loads((self.indexes / f"{mark}.json").read_text()))
         return None
 
-    def keep_index(self, mark: str, index: dict[str, Any]) -> None:
+    def keep_index(self, mark: str, index: CloudIndex) -> None:
         """Keep the index of an input."""
-        write_whole(self.indexes / f"{mark}.json", json.dumps(index).encode())
+        write_whole(self.indexes / f"{mark}.json", json.dumps(asdict(index)).encode())

@@ -1,110 +1,63 @@
-"""What puts results into points and writes them: gathering from tiles, the pipeline's tail, checks of outputs."""
+"""The pipeline's tail: points read again, results put into them, writers run, outputs checked before they get their name."""
 
 from __future__ import annotations
 
 import os
-import uuid
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.errors import StageError
 from ..base.files import whole_files
 from ..base.las import supersede_copc
 from ..pipeline import pdal as pdal_env
-from . import marks
+from ..pipeline.runtime import Callbacks
 from .cloudindex import open_las, read_block
+from .results import NewValues
 
 _PDAL_TYPES = {
     "f8": "double",
     "f4": "float",
-    "u1": "uint8_t",
-    "u2": "uint16_t",
-    "u4": "uint32_t",
-    "u8": "uint64_t",
-    "i1": "int8_t",
-    "i2": "int16_t",
-    "i4": "int32_t",
-    "i8": "int64_t",
+    **{f"u{size}": f"uint{8 * size}_t" for size in (1, 2, 4, 8)},
+    **{f"i{size}": f"int{8 * size}_t" for size in (1, 2, 4, 8)},
 }
 
 
-def gather(task: dict[str, Any], start: int, end: int) -> tuple[NDArray[np.bool_], dict[str, Any]]:
-    """Results of points `start` to `end` of a file: which of them came out, and their new values.
+def run_tail(
+    readers: list[dict[str, Any]], new: list[NewValues], tail: list[dict[str, Any]], outputs: Sequence[str]
+) -> dict[str, Any]:
+    """Run readers, results and tail; files appear under their names when all are whole.
 
-    Raises
-    ------
-    StageError
-        If the tiles do not hold each of the file's points once.
+    Parameters
+    ----------
+    readers : list of dict
+    new : list of NewValues
+        For each reader.
+    tail : list of dict
+        Stages of the pipeline, with its writers.
+    outputs : sequence of str
+        What each of the writers writes.
+
+    Returns
+    -------
+    dict
+        ``outputs`` with size and time of change, ``written`` points.
     """
-    source, count = task["source"], task["count"]
-    prefix = f"{source['key']}/"
-    kept = np.zeros(end - start, bool)
-    seen = 0
-    columns: dict[str, list[tuple[NDArray, NDArray]]] = {}
-    for name in task["results"]:
-        with np.load(name, allow_pickle=False) as tile:
-            if f"{prefix}index" not in tile:
-                continue
-            index = tile[f"{prefix}index"]  # ascending
-            seen += int(tile[f"{prefix}core"])
-            first, last = np.searchsorted(index, (start, end))
-            mine = index[first:last] - start
-            if (index.size and index[-1] >= count) or kept[mine].any():
-                raise StageError("internal: two tiles hold the same point", where=source["path"], found=name)
-            kept[mine] = True
-            for key in tile.files:
-                if key.startswith(f"{prefix}dim/"):
-                    part = tile[key][first:last].copy() if last - first < index.size else tile[key]
-                    columns.setdefault(key.removeprefix(f"{prefix}dim/"), []).append((mine, part))
-    if seen != count:
-        raise StageError(
-            "the tiles do not hold all points of the file: it changed while it was worked on",
-            where=source["path"],
-            found=f"{seen:,} of {count:,} points",
-            cure="Start the run again with --resume",
-        )
-    values: dict[str, Any] = {}
-    for name, parts in columns.items():
-        if sum(len(i) for i, _ in parts) == end - start:
-            full = np.empty(end - start, parts[0][1].dtype)
-            for index, part in parts:
-                full[index] = part
-            values[name] = (None, full)
-        else:
-            values[name] = (np.concatenate([i for i, _ in parts]), np.concatenate([v for _, v in parts]))
-        parts.clear()
-    return kept, values
-
-
-def run_tail(readers, injected, tail, outputs: list[str]) -> dict[str, Any]:
-    """Run readers, results and tail; files appear under their names when all are whole."""
-    token = uuid.uuid4().hex
-    stages: list[dict[str, Any]] = []
-    inputs = []
-    for number, (reader, (kept, values)) in enumerate(zip(readers, injected, strict=True)):
-        adds = {n: _PDAL_TYPES[v.dtype.str[1:]] for n, (_, v) in values.items()}
-        stage = marks.inject_stage(token, number, values, kept, adds)
-        stages += [
-            {**reader, "tag": f"in{number}"},
-            {**stage, "inputs": [f"in{number}"], "tag": f"put{number}"},
-        ]
-        if not kept.all():
-            drop = marks.drop_stage(token, number, kept)
-            stages[-1]["tag"] = f"all{number}"
-            stages.append({**drop, "inputs": [f"all{number}"], "tag": f"put{number}"})
-        inputs.append(f"put{number}")
-    stages.append({"type": "filters.merge", "inputs": inputs, "tag": "merged"})
-    finals = [Path(output) for output in outputs]
 
     def finish(made: Path, final: Path) -> None:
         check_whole(made, final, run.count)
         supersede_copc(made)
 
-    try:
-        with whole_files(*finals, check=finish) as partials:
+    with Callbacks() as callbacks:
+        stages: list[dict[str, Any]] = []
+        for number, (reader, values) in enumerate(zip(readers, new, strict=True)):
+            stages.append({**reader, "tag": f"in{number}"})
+            stages += _put(callbacks, values, f"in{number}", f"put{number}")
+        inputs = [f"put{number}" for number in range(len(readers))]
+        stages.append({"type": "filters.merge", "inputs": inputs, "tag": "merged"})
+        with whole_files(*outputs, check=finish) as partials:
             waiting = iter(partials)
             for stage in tail:
                 stage = {k: v for k, v in stage.items() if k != "inputs"}
@@ -112,13 +65,37 @@ def run_tail(readers, injected, tail, outputs: list[str]) -> dict[str, Any]:
                     stage["filename"] = str(next(waiting))
                 stages.append(stage)
             run = pdal_env.execute(stages, arrays=False)
-    finally:
-        marks.forget(token)
-    return {"outputs": [[str(final), *stamp(final)] for final in finals], "written": run.count}
+    return {"outputs": [[path, *stamp(path)] for path in outputs], "written": run.count}
 
 
-def stamp(path: Path) -> list[int]:
-    stat = path.stat()
+def _put(callbacks: Callbacks, new: NewValues, after: str, tag: str) -> list[dict[str, Any]]:
+    """Filters that give a reader's points their new values, and drop some; PDAL wants the two apart."""
+
+    def put(module, ins, outs) -> None:
+        if len(ins["X"]) != len(new.kept):
+            raise StageError(f"the reader gave {len(ins['X']):,} points of {len(new.kept):,}")
+        for name, (rows, values) in new.values.items():
+            if rows is None:
+                outs[name] = np.ascontiguousarray(values, ins[name].dtype)
+            else:
+                outs[name] = np.array(ins[name])
+                outs[name][rows] = values
+
+    def drop(module, ins, outs) -> None:
+        outs["Mask"] = np.ascontiguousarray(new.kept, bool)
+
+    adds = {name: _PDAL_TYPES[values.dtype.str[1:]] for name, (_, values) in new.values.items()}
+    if new.kept.all():
+        return [callbacks.filter(put, adds, inputs=[after], tag=tag)]
+    return [
+        callbacks.filter(put, adds, inputs=[after], tag=f"all_{tag}"),
+        callbacks.filter(drop, inputs=[f"all_{tag}"], tag=tag),
+    ]
+
+
+def stamp(path: str | Path) -> list[int]:
+    """Size and time of change of a file."""
+    stat = os.stat(path)
     return [stat.st_size, stat.st_mtime_ns]
 
 

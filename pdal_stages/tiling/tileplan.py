@@ -9,58 +9,33 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import OptionError, PipelineError, StageError
-from ..pipeline.lowering import PDAL_OWN
-from ..pipeline.optionfile import settled
-from ..pipeline.overrides import Override
+from ..base.errors import PipelineError, StageError
 from ..pipeline.run import Pipeline
-from ..stages import registry
 from ..stages.base import Stage
-from .settings import TilingOptions
 
 #: Dimensions that follow a point through a tile's pipeline.
 ROW, SOURCE, MARGIN = "PdalStagesRow", "PdalStagesSource", "PdalStagesMargin"
 
+
+def _filters(words: str) -> set[str]:
+    return {f"filters.{word}" for word in words.split()}
+
+
 #: PDAL's filters that look at one point at a time.
-PER_POINT = {
-    f"filters.{name}"
-    for name in (
-        *("assign", "colorization", "crop", "expression", "ferry", "hag_dem", "info", "merge", "mongo"),
-        *("mongoexpression", "overlay", "projpipeline", "range", "reprojection", "transformation"),
-    )
-}
+_PER_POINT = _filters(
+    "assign colorization crop expression ferry hag_dem info merge mongo mongoexpression overlay projpipeline range "
+    "reprojection transformation"
+)
 #: Of them, those that move points: tiles are cut before, so they may only come after all stages of ours.
-_MOVING = {"filters.reprojection", "filters.transformation", "filters.projpipeline"}
+_MOVING = _filters("reprojection transformation projpipeline")
 #: Filters whose result depends on all points at once.
-_GLOBAL = {
-    f"filters.{name}"
-    for name in (
-        *(
-            "chipper",
-            "colorinterp",
-            "cpd",
-            "divider",
-            "fps",
-            "georeference",
-            "gpstimeconvert",
-            "groupby",
-            "head",
-        ),
-        *("hexbin", "icp", "iqr", "locate", "mad", "mortonorder", "randomize", "relaxationdartthrowing"),
-        *("returns", "shell", "sort", "splitter", "stats", "tail", "teaser"),
-    )
-}
-#: Stages of ours whose result depends on all points at once, and what to do instead.
-_OUR_GLOBAL = {
-    "writers.classifiermodel": "Train without --tile: only samples are computed, so memory goes to the points alone",
-    "filters.accuracy": "Write the files first, then compare them: pdal-stages accuracy FILE --reference-dimension "
-    "Reference",
-}
-#: Stages of ours whose `where` only chooses the points to compute.
-_WHERE_CHOOSES = {"filters.multiscalefeatures", "filters.modelclassifier"}
+_GLOBAL = _filters(
+    "chipper colorinterp cpd divider fps georeference gpstimeconvert groupby head hexbin icp iqr locate mad mortonorder "
+    "randomize relaxationdartthrowing returns shell sort splitter stats tail teaser"
+)
 
 
-@dataclass
+@dataclass(frozen=True)
 class TilePlan:
     """What a tiled run does to each tile.
 
@@ -70,6 +45,8 @@ class TilePlan:
         The pipeline's readers, as given.
     head : list of dict
         Stages that see neighbors: run on a tile and its surroundings.
+    later : list of float
+        How far outside the tile, in metres, the results of each stage of the head are still used.
     tail : list of dict
         Stages that look at single points, and the writers: run on the points of one output.
     halo : float
@@ -86,6 +63,7 @@ class TilePlan:
 
     readers: list[dict[str, Any]]
     head: list[dict[str, Any]]
+    later: list[float]
     tail: list[dict[str, Any]]
     halo: float
     creates: list[str] | None
@@ -98,50 +76,91 @@ class TilePlan:
         return [s for s in self.tail if str(s["type"]).startswith("writers.")]
 
 
-def make_plan(source: Any, overrides: Iterable[Override], options: TilingOptions) -> TilePlan:
+@dataclass(frozen=True)
+class _Step:
+    """One stage of the pipeline: as an object with a type, its place for messages, and ours where it is."""
+
+    given: dict[str, Any]
+    where: str
+    ours: Stage | None
+
+    @property
+    def type(self) -> str:
+        return str(self.given["type"])
+
+    @property
+    def rank(self) -> int:
+        """0 for readers, 1 for filters and all of ours, 2 for writers."""
+        return {"readers": 0, "writers": 2}.get(self.type.partition(".")[0], 1) if self.ours is None else 1
+
+    @property
+    def sees_neighbors(self) -> bool:
+        return self.ours is not None or self.type not in _PER_POINT
+
+    def reach(self, buffer: float | None) -> float:
+        """Metres around a point in which others change its result."""
+        if self.ours is not None:
+            return self.ours.halo()
+        return float(buffer or 0.0) if self.sees_neighbors else 0.0
+
+
+def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
     """Check that a pipeline can be run in tiles, and cut it.
+
+    Parameters
+    ----------
+    pipeline : Pipeline
+    buffer : float, optional
+        How far PDAL's filters look, metres.
 
     Raises
     ------
     PipelineError, OptionError
         For pipelines whose result tiles cannot give, with the reason and the cure.
     """
-    pipeline = Pipeline(source, overrides)  # every error of ours, before any tile
-    stages = [_object(s, i, len(pipeline.source.stages)) for i, s in enumerate(pipeline.source.stages)]
-    where = [pipeline.source.where(i) for i in range(len(stages))]
-    readers, filters, writers = _sections(stages, where)
-    last = -1
-    for place, stage in enumerate(filters):
-        _refuse_global(stage, where[len(readers) + place], options)
-        if stage["type"] in registry.stages() or stage["type"] not in PER_POINT:
-            last = place
-    head, tail = filters[: last + 1], filters[last + 1 :]
-    for place, stage in enumerate(head):
-        if stage["type"] in _MOVING:
+    source = pipeline.source
+    ours = {lowered.number: lowered for lowered in pipeline.lowered.ours}
+    steps = []
+    for index, stage in enumerate(source.stages):
+        made = ours.get(index)
+        given = _object(stage, index, len(source.stages)) if made is None else dict(made.given)
+        steps.append(_Step(given, source.where(index), None if made is None else made.stage))
+    _check_row(steps)
+    readers, filters, writers = ([s for s in steps if s.rank == rank] for rank in (0, 1, 2))
+    _check_ends(readers, filters, writers)
+    for step in filters:
+        _check_local(step, buffer)
+    end = max((n for n, step in enumerate(filters, 1) if step.sees_neighbors), default=0)
+    head, tail = filters[:end], filters[end:]
+    for step in head:
+        if step.type in _MOVING:
             raise PipelineError(
-                f"{stage['type']} moves points before stages that see neighbors, and tiles are cut before it",
-                where=where[len(readers) + place],
+                f"{step.type} moves points before stages that see neighbors, and tiles are cut before it",
+                where=step.where,
                 cure="Reproject the files first, or put it after the last stage of pdal_stages",
             )
-    kinds = [registry.stages().get(s["type"]) for s in head]
-    ours = [None if k is None else k(given_options(s), s["type"]) for k, s in zip(kinds, head, strict=True)]
-    reaches = [_reach(stage, made, options) for stage, made in zip(head, ours, strict=True)]
-    unit = next((s.horizontal_unit for s in ours if s is not None and s.horizontal_unit), "")
-    ready = _prepare(head, ours, reaches)
-    foreign = [
-        s["type"] for s, k in zip(head, kinds, strict=True) if k is None and s["type"] != "filters.merge"
-    ]
-    creates: list[str] | None = None
-    if not foreign:
-        creates = list(dict.fromkeys(name for s in ours if s is not None for name in s.creates()))
+    reaches = [step.reach(buffer) for step in head]
+    later = [sum(reaches[n + 1 :]) for n in range(len(head))]
+    stages = [step.ours for step in head if step.ours is not None]
+    foreign = any(step.ours is None and step.type != "filters.merge" for step in head)
     notes = []
-    if any(k is None and t not in PER_POINT for k, t in zip(kinds, (s["type"] for s in head), strict=True)):
+    if any(step.ours is None and step.sees_neighbors for step in head):
         notes.append(
-            "filters of PDAL that look at neighbors were given --buffer; whether it suffices for a seamless result "
-            "only they know"
+            "PDAL filters that look at neighbors were given --buffer; the result is seamless only if it is wide enough "
+            "for them"
         )
     return TilePlan(
-        readers, ready, [*tail, *writers], sum(reaches), creates, unit, notes, pipeline.source.name
+        readers=[step.given for step in readers],
+        head=[_narrowed(step, reach) for step, reach in zip(head, later, strict=True)],
+        later=later,
+        tail=[step.given for step in [*tail, *writers]],
+        halo=sum(reaches),
+        creates=None
+        if foreign
+        else list(dict.fromkeys(name for stage in stages for name in stage.creates())),
+        unit=next((stage.horizontal_unit for stage in stages if stage.horizontal_unit), ""),
+        notes=notes,
+        name=source.name,
     )
 
 
@@ -155,7 +174,7 @@ def _object(stage: Any, index: int, count: int) -> dict[str, Any]:
             out["type"] = _driver(name, "writers")
         else:
             out["type"] = "readers.ept" if name.endswith("ept.json") else _driver(name, "readers")
-    return settled(out) if out["type"] in registry.stages() else out
+    return out
 
 
 def _driver(name: str, kind: str) -> str:
@@ -170,136 +189,85 @@ def _driver(name: str, kind: str) -> str:
     )
 
 
-def _sections(
-    stages: list[dict[str, Any]], where: list[str]
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]], list[dict[str, Any]]]:
-    kinds = [str(s["type"]).partition(".")[0] for s in stages]
-    order = {"readers": 0, "filters": 1, "writers": 2}
-    ranks = [
-        1 if s["type"] in registry.stages() else order.get(k, 1) for s, k in zip(stages, kinds, strict=True)
-    ]
-    tags: set[str] = set()
-    for place, (stage, rank) in enumerate(zip(stages, ranks, strict=True)):
-        if place and rank < ranks[place - 1]:
+def _check_row(steps: list[_Step]) -> None:
+    """Refuse pipelines that branch; in a row `inputs` say nothing new, so they are left out."""
+    for place, step in enumerate(steps):
+        before = steps[:place]
+        if before and step.rank < before[-1].rank:
             raise PipelineError(
                 "a pipeline in tiles is a row: readers, then filters, then writers",
-                where=where[place],
-                found=f"{stage['type']} after {stages[place - 1]['type']}",
+                where=step.where,
+                found=f"{step.type} after {before[-1].type}",
             )
-        wanted = stage.pop("inputs", None)
-        if wanted is not None and rank:
+        wanted = step.given.pop("inputs", None)
+        if wanted is not None and step.rank:
             names = {wanted} if isinstance(wanted, str) else set(map(str, wanted))
-            before = {str(s.get("tag")) for s, r in zip(stages[:place], ranks[:place], strict=True) if r == 0}
-            if names != before and names != {str(stages[place - 1].get("tag"))}:
+            of_readers = {str(s.given.get("tag")) for s in before if s.rank == 0}
+            if names != of_readers and names != {str(before[-1].given.get("tag"))}:
                 raise PipelineError(
                     "a pipeline in tiles is a row; this stage takes only some of the points before it",
-                    where=where[place],
+                    where=step.where,
                     found=f"inputs {sorted(names)}",
                     cure="Run one pipeline for each branch",
                 )
-        if "tag" in stage:
-            tags.add(str(stage["tag"]))
-    readers = [s for s, r in zip(stages, ranks, strict=True) if r == 0]
-    filters = [s for s, r in zip(stages, ranks, strict=True) if r == 1]
-    writers = [s for s, r in zip(stages, ranks, strict=True) if r == 2]
+
+
+def _check_ends(readers: list[_Step], filters: list[_Step], writers: list[_Step]) -> None:
     if not readers:
         raise PipelineError("the pipeline has no reader, so there is nothing to cut into tiles")
-    if not any(s["type"] in _OUR_GLOBAL for s in filters):
+    if not any(step.ours is not None and step.ours.instead_of_tiles for step in filters):
         if not writers:
             raise PipelineError(
                 "the pipeline has no writer", cure="End it with a file name, e.g. classified_#.laz"
             )
-        for stage in writers:
-            if not isinstance(stage.get("filename"), str) or "://" in stage["filename"]:
-                raise PipelineError("in tiles, a writer writes files", where=stage["type"])
-    for stage in readers:
+        for step in writers:
+            if not isinstance(step.given.get("filename"), str) or "://" in step.given["filename"]:
+                raise PipelineError("in tiles, a writer writes files", where=step.type)
+    for step in readers:
         for name in ("count", "start", "bounds", "polygon", "resolution"):
-            if name in stage:
+            if name in step.given:
                 raise PipelineError(
                     f"option '{name}' of a reader cannot be combined with --tile",
-                    where=stage["type"],
-                    found=stage[name],
+                    where=step.type,
+                    found=step.given[name],
                     cure="Cut the input first, with pdal translate",
                 )
-    return readers, filters, writers
 
 
-def _refuse_global(stage: dict[str, Any], where: str, options: TilingOptions) -> None:
-    kind = stage["type"]
-    if kind in _OUR_GLOBAL:
+def _check_local(step: _Step, buffer: float | None) -> None:
+    """Refuse stages that need all points at once, or that look at neighbors no one knows how far away."""
+    instead = step.ours.instead_of_tiles if step.ours is not None else ""
+    if instead or step.type in _GLOBAL:
         raise PipelineError(
-            f"{kind} needs all points at once, so it cannot be run in tiles",
-            where=where,
-            cure=_OUR_GLOBAL[kind],
+            f"{step.type} needs all points at once, so it cannot be run in tiles",
+            where=step.where,
+            cure=instead or None,
         )
-    if kind in _GLOBAL:
-        raise PipelineError(f"{kind} needs all points at once, so it cannot be run in tiles", where=where)
-    if kind not in registry.stages() and kind not in PER_POINT and options.buffer is None:
+    if step.ours is not None:
+        try:
+            step.ours.check_tiled()
+        except StageError as error:
+            raise error.at(step.type) from None
+    elif step.sees_neighbors and buffer is None:
         raise PipelineError(
-            f"{kind} may look at neighbors, and PDAL does not say how far",
-            where=where,
+            f"{step.type} may look at neighbors, and PDAL does not say how far",
+            where=step.where,
             cure="Give --buffer METRES, wide enough for it (0 if it looks at single points)",
         )
 
 
-def given_options(stage: dict[str, Any]) -> dict[str, Any]:
-    """A stage's options without those that every stage of PDAL has."""
-    return {k: v for k, v in stage.items() if k not in ("type", *PDAL_OWN)}
-
-
-def _reach(stage: dict[str, Any], made: Stage | None, options: TilingOptions) -> float:
-    if made is None:
-        return 0.0 if stage["type"] in PER_POINT else float(options.buffer or 0.0)
-    if made.type == "filters.multiscalefeatures":
-        _needs_thresholds(stage, made)
-    return made.halo()
-
-
-def _needs_thresholds(stage: dict[str, Any], made: Any) -> None:
-    plan = made.plan
-    copt = any(n.kind == "copt" for n in plan.neighborhoods)
-    if not (plan.shapes or copt):
-        return
-    path = made.bins
-    if path and Path(path).exists():
-        return
-    what = "shape distributions" if plan.shapes else "copt"
-    raise OptionError(
-        f"the thresholds of {what} are fitted to the points, so every tile would have its own",
-        where=stage["type"],
-        found=f"bins {path!r}, which does not exist" if path else "no option 'bins'",
-        cure='Give "bins": "thresholds.json", and run the pipeline once without --tile on one typical file, which '
-        "writes it; a model file has its thresholds within",
-    )
-
-
-def _prepare(head, ours, reaches) -> list[dict[str, Any]]:
-    """The head for a tile: absolute paths, and only points computed that someone will see."""
-    out = []
-    for place, (stage, made) in enumerate(zip(head, ours, strict=True)):
-        stage = dict(stage)
-        if made is not None:
-            for option in made.all_options():
-                if option.kind == "filename" and stage.get(option.name):
-                    stage[option.name] = str(Path(stage[option.name]).absolute())
-            later = sum(reaches[place + 1 :]) + made.inner_reach()
-            if made.type in _WHERE_CHOOSES:
-                seen = f"{MARGIN} <= {later!r}" if later > 0 else f"{MARGIN} < 0"
-                stage["where"] = f"({made.where}) && ({seen})" if made.where else seen
-        out.append(stage)
-    return out
-
-
-def later_reaches(head: list[dict[str, Any]], options_buffer: float) -> list[float]:
-    """For each stage of a head, how far outside the tile its results are still used, metres."""
-    reaches = []
-    for stage in head:
-        kind = registry.stages().get(stage["type"])
-        if kind is None:
-            reaches.append(0.0 if stage["type"] in PER_POINT else options_buffer)
-        else:
-            reaches.append(kind(given_options(stage)).halo())
-    return [sum(reaches[i + 1 :]) for i in range(len(reaches))]
+def _narrowed(step: _Step, later: float) -> dict[str, Any]:
+    """A stage of the head for a tile: absolute paths, and only points computed that someone will see."""
+    stage, ours = dict(step.given), step.ours
+    if ours is not None:
+        for option in ours.all_options():
+            if option.kind == "filename" and stage.get(option.name):
+                stage[option.name] = str(Path(stage[option.name]).absolute())
+        if ours.where_chooses:
+            seen_to = later + ours.inner_reach()
+            seen = f"{MARGIN} <= {seen_to!r}" if seen_to > 0 else f"{MARGIN} < 0"
+            stage["where"] = f"({ours.where}) && ({seen})" if ours.where else seen
+    return stage
 
 
 def outputs_for(plan: TilePlan, names: list[str]) -> list[list[Path]]:

@@ -4,296 +4,319 @@ from __future__ import annotations
 
 import json
 import os
-import uuid
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import dataclass
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import LEGACY_LIMIT
-from ..base.errors import PipelineError, StageError
-from ..base.files import whole_files, write_whole
+from ..base.errors import NoTerrainError, PipelineError, StageError
+from ..base.files import write_whole
+from ..base.las import read_header
 from ..pipeline.run import Pipeline
+from ..pipeline.runtime import Callbacks, points_of
 from ..stages import registry
-from . import marks
+from ..stages.base import Stage
 from .assemble import write_tile
+from .cloudindex import CloudIndex
+from .ept import fetch
 from .extract import Piece, cut
-from .grid import Grid, inside
-from .scratch import scratch
-from .tileplan import MARGIN, ROW, SOURCE, given_options, later_reaches
+from .grid import Box, Grid, inside
+from .results import PieceResults, class_counts, save
+from .sources import Source
+from .tileplan import MARGIN, ROW, SOURCE
 
 #: How often a tile is read again with wider surroundings.
 _WIDENINGS = 3
+_MARK_TYPES = {ROW: "uint32_t", SOURCE: "uint32_t", MARGIN: "double"}
 
 
-def run_tile(task: dict[str, Any]) -> dict[str, Any]:
-    """Run the head on a tile; write its results, or its output.
-
-    Parameters
-    ----------
-    task : dict
-        ``tile``, ``size``, ``unit`` (metres per unit of the coordinates), ``buffer`` (metres), ``bounds`` (of all
-        inputs), ``sources`` (path, reader, kind, key, index), ``head``, ``extra`` (metres that PDAL's filters look
-        at), ``creates``, ``threads``, ``scratch`` (folder), ``most_points``; ``result`` (file to write) or ``tail``
-        and ``outputs``.
-
-    Returns
-    -------
-    dict
-        ``points`` of the tile, ``read`` with surroundings, ``classes``, ``buffer`` used, ``short`` (True where
-        the surroundings did not suffice), ``dropped``.
-    """
-    with scratch(task["scratch"]) as folder:
-        head, keys, pieces, report = _settle(task, folder)
-        report["classes"] = _class_counts(head)
-        if task.get("result"):
-            _save(Path(task["result"]), head, keys, pieces)
-        else:
-            report.update(write_tile(task, head, pieces, folder))
-    if task.get("done"):
-        write_whole(task["done"], json.dumps({**report, "fingerprint": task["fingerprint"]}).encode())
-    return report
-
-
-class Results:
-    """Results of a tile's own points, by source.
+@dataclass(frozen=True)
+class Recipe:
+    """What all tiles of a run have in common.
 
     Attributes
     ----------
-    rows : list of ndarray
-        For each source, rows of its piece that came out, ascending.
-    values : dict of str to list of ndarray
-        For each dimension and source, values in the order of `rows`.
-    cores : list of int
-        For each source, how many own points went in.
-    legacy : bool
-        Whether the flag bits of LAS 1.0-1.3 sit inside `Classification`.
+    grid : Grid
+    unit : float
+        Metres per unit of the coordinates.
+    bounds : Box
+        Of all inputs.
+    head, later, tail, halo, creates
+        As in :class:`~pdal_stages.tiling.tileplan.TilePlan`.
+    threads : int
+    most_points : int
+        A tile is not read with wider surroundings that hold more.
+    scratch : str
+        Folder for temporary files.
     """
 
-    def __init__(
-        self, rows: list[NDArray], values: dict[str, list[NDArray]], cores: list[int], legacy: bool = False
-    ) -> None:
-        self.rows, self.values, self.cores, self.legacy = rows, values, cores, legacy
+    grid: Grid
+    unit: float
+    bounds: Box
+    head: list[dict[str, Any]]
+    later: list[float]
+    tail: list[dict[str, Any]]
+    halo: float
+    creates: list[str] | None
+    threads: int
+    most_points: int
+    scratch: str
 
 
-def _settle(task: dict[str, Any], folder: str) -> tuple[Results, list[str], list[Piece], dict[str, Any]]:
-    """Run the head with surroundings that suffice."""
-    grid, tile, unit = Grid(task["size"]), tuple(task["tile"]), task["unit"]
-    buffer = task["buffer"]
-    short = False
-    result: Results | None = None
+@dataclass(frozen=True)
+class TileTask:
+    """A tile to be worked on.
+
+    Attributes
+    ----------
+    recipe : Recipe
+    tile : (int, int)
+    sources : list of (Source, CloudIndex or None)
+        Inputs that may hold points of it or its surroundings; EPT sources have no index.
+    mark : str
+        Fingerprint of all that decides the result.
+    result, done : str
+        Files for the results and the report, where outputs are put together from tiles.
+    outputs : list of str
+        Otherwise: what each of the writers writes.
+    """
+
+    recipe: Recipe
+    tile: tuple[int, int]
+    sources: list[tuple[Source, CloudIndex | None]]
+    mark: str
+    result: str = ""
+    done: str = ""
+    outputs: list[str] | None = None
+
+    def run(self) -> dict[str, Any]:
+        """Run the head; write its results, or the outputs.
+
+        Returns
+        -------
+        dict
+            ``points`` of the tile, ``read`` with surroundings, ``classes``, ``buffer`` used, ``short`` (True where
+            the surroundings did not suffice), ``widened``, ``dropped``.
+        """
+        with TemporaryDirectory(
+            prefix="tile-", dir=self.recipe.scratch, ignore_cleanup_errors=True
+        ) as folder:
+            results, report = _settle(self, folder)
+            if self.outputs is not None:
+                return report | write_tile(results, self.recipe.tail, self.outputs)
+            save(self.result, results)
+        write_whole(self.done, json.dumps({**report, "fingerprint": self.mark}).encode())
+        return report
+
+
+@dataclass
+class _Head:
+    """What a run of the head gave; `need`: the metres of surroundings that it took."""
+
+    results: list[PieceResults]
+    legacy: bool
+    need: float
+
+
+def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, Any]]:
+    """Run the head with surroundings that suffice; results, and the report."""
+    recipe, tile = task.recipe, task.tile
+    side, buffer, short = recipe.grid.size * recipe.unit, recipe.halo, False
+    head: _Head | None = None
     for attempt in range(_WIDENINGS + 1):
-        keys, pieces, sources = _cut_all(task, grid, tile, buffer / unit, folder)
-        read = sum(len(p.index) for p in pieces)
-        own = sum(int(np.count_nonzero(p.margin < 0)) for p in pieces)
-        everything = inside(tuple(task["bounds"]), grid.box(tile, buffer / unit))
+        cuts = _cut_all(task, buffer / recipe.unit, folder)
+        read = sum(len(piece.index) for _, piece in cuts)
+        own = sum(len(piece.own) for _, piece in cuts)
         if not own:
             break
-        result, need = _head(task, grid, tile, pieces, sources, everything)
+        everything = inside(recipe.bounds, recipe.grid.box(tile, buffer / recipe.unit))
+        try:
+            head = _run_head(task, cuts, everything)
+            need = head.need
+        except NoTerrainError:
+            if everything:
+                raise
+            head, need = None, side + 2 * recipe.halo  # look farther away
         if everything or need <= buffer:
             break
         short = True
-        estimate = read * ((task["size"] * unit + 2 * need) / (task["size"] * unit + 2 * buffer)) ** 2
-        if attempt == _WIDENINGS or estimate > task["most_points"]:
-            if result is None:
-                raise StageError(
+        estimate = read * ((side + 2 * need) / (side + 2 * buffer)) ** 2
+        if attempt == _WIDENINGS or estimate > recipe.most_points:
+            if head is None:
+                raise NoTerrainError(
                     "no terrain: no point near the tile may form one", found=f"within {buffer:.0f} m"
                 )
             break
-        buffer, short = float(need) + 1e-6, False
-    report: dict[str, Any] = {
+        buffer, short = need + 1e-6, False
+    if head is None:
+        empty = np.empty(0, np.int64)
+        head = _Head([PieceResults(source, piece, empty, {}) for source, piece in cuts], False, 0.0)
+    report = {
         "points": own,
         "read": read,
         "buffer": buffer,
         "short": short,
-        "widened": buffer > task["buffer"],
+        "widened": buffer > recipe.halo,
+        "dropped": own - sum(len(result.rows) for result in head.results),
+        "classes": class_counts(head.results, head.legacy),
     }
-    if not own or result is None:
-        result = Results([np.empty(0, np.int64) for _ in pieces], {}, [0 for _ in pieces])
-    report["dropped"] = own - sum(len(r) for r in result.rows)
-    return result, keys, pieces, report
+    return head.results, report
 
 
-def _cut_all(task, grid: Grid, tile, margin: float, folder: str):
-    keys, pieces, sources = [], [], []
-    for number, source in enumerate(task["sources"]):
-        path, index = source["path"], source.get("index")
-        if source["kind"] == "ept":
-            from .ept import fetch
-
-            path, index = fetch(source, grid, tile, margin, os.path.join(folder, f"fetched{number}.las"))
-        if not index:
+def _cut_all(task: TileTask, margin: float, folder: str) -> list[tuple[Source, Piece]]:
+    """The tile's points and their surroundings, out of every input."""
+    grid, cuts = task.recipe.grid, []
+    for number, (source, index) in enumerate(task.sources):
+        path = source.path
+        if source.kind == "ept":
+            path = os.path.join(folder, f"fetched{number}.las")
+            index = fetch(source, grid, task.tile, margin, path)
+        if index is None:
             continue
         target = os.path.join(folder, f"piece{number}.las")
-        core = os.path.join(folder, f"core{number}.las") if not task.get("result") else None
-        piece = cut(path, index["boxes"], index["count"], grid, tile, margin, target, core)
-        if piece is None:
-            continue
-        keys.append(source["key"])
-        pieces.append(piece)
-        sources.append(source)
-    return keys, pieces, sources
+        core = "" if task.outputs is None else os.path.join(folder, f"core{number}.las")
+        piece = cut(path, index, grid, task.tile, margin, target, core)
+        if piece is not None:
+            cuts.append((source, piece))
+    return cuts
 
 
-def _head(task, grid, tile, pieces: list[Piece], sources, everything: bool) -> tuple[Results | None, float]:
-    """Run the head once; its results, and the metres of surroundings it needed."""
-    token = uuid.uuid4().hex
-    unit = task["unit"]
-    head = task["head"]
-    cores = [int(np.count_nonzero(p.margin < 0)) for p in pieces]
-    if not head:
-        rows = [np.flatnonzero(p.margin < 0) for p in pieces]
-        return Results(rows, {}, cores), 0.0
-    stages: list[dict[str, Any]] = []
-    inputs = []
-    try:
-        for number, (piece, source) in enumerate(zip(pieces, sources, strict=True)):
-            metres = np.where(piece.margin < 0, -1.0, piece.margin * unit)
-            reader = {**source["reader"], "type": "readers.las", "filename": piece.path, "tag": f"in{number}"}
-            mark = marks.mark_stage(token, number, metres, task["creates"] is None)
-            stages += [reader, {**mark, "inputs": [f"in{number}"], "tag": f"mark{number}"}]
-            inputs.append(f"mark{number}")
-        later = later_reaches(head, task["extra"])
-        for place, stage in enumerate(head):
-            stage = {k: v for k, v in stage.items() if k != "inputs"}
-            if place == 0:
-                stage["inputs"] = inputs
-            if stage["type"] in registry.stages():
-                given = int(stage.get("threads") or 0)
-                stage["threads"] = min(given, task["threads"]) if given else task["threads"]
+def _run_head(task: TileTask, cuts: list[tuple[Source, Piece]], everything: bool) -> _Head:
+    """Run the head once; `everything`: all inputs were read, so nothing can lie farther away."""
+    recipe = task.recipe
+    if not recipe.head:
+        return _Head([PieceResults(source, piece, piece.own, {}) for source, piece in cuts], False, 0.0)
+    originals: dict[int, Mapping[str, NDArray]] | None = {} if recipe.creates is None else None
+    reaches: dict[int, _Reach] = {}
+    with Callbacks() as callbacks:
+        stages: list[dict[str, Any]] = []
+        for number, (source, piece) in enumerate(cuts):
+            reader = {**source.reader, "type": "readers.las", "filename": piece.path, "tag": f"in{number}"}
+            mark = _marking(number, piece, recipe.unit, originals)
+            marked = callbacks.filter(mark, _MARK_TYPES, inputs=[f"in{number}"], tag=f"mark{number}")
+            stages += [reader, marked]
+        inputs = {"inputs": [f"mark{number}" for number in range(len(cuts))]}
+        for given, later in zip(recipe.head, recipe.later, strict=True):
+            stage = {**given, **inputs}
+            inputs = {}
+            kind = registry.stages().get(stage["type"])
+            if kind is not None:
+                asked = int(stage.get("threads") or 0)
+                stage["threads"] = min(asked, recipe.threads) if asked else recipe.threads
             stages.append(stage)
-            if stage["type"] == "filters.hag_minima" and not everything:
-                box = list(grid.box(tile))
-                stages.append(marks.terrain_stage(token, place, given_options(stage), later[place], box))
+            if kind is not None and kind.open_ended and not everything:
+                reach = reaches[len(stages) - 1] = _Reach(recipe.grid.box(task.tile), later)
+                stages.append(callbacks.filter(reach))
         pipeline = Pipeline(stages)
-        try:
-            pipeline.execute(arrays=True)
-        except StageError as error:
-            if error.what.startswith("no terrain") and not everything:
-                return None, task["size"] * unit + 2 * task["buffer"]  # look farther away
-            raise
-        result = _collect(pipeline.arrays, pieces, cores, task["creates"], marks.originals(token))
-        need = marks.need(token)
-        if not everything and any(
-            _looked_far(report) for _, reports in pipeline.reports for report in reports
-        ):
-            need = max(need, _far_neighbors(pipeline.arrays, head, grid.box(tile), unit, task["threads"]))
-        return result, need
-    finally:
-        marks.forget(token)
+        for ours in pipeline.lowered.ours:
+            if ours.number in reaches:
+                reaches[ours.number].stage = ours.stage
+        pipeline.execute(arrays=True)
+    results, legacy = _collect(pipeline.arrays, cuts, recipe.creates, originals)
+    need = max((reach.need for reach in reaches.values()), default=0.0)
+    if not everything and any(_looked_far(r) for _, reports in pipeline.reports for r in reports):
+        most = max(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
+        need = max(need, _far_neighbors(pipeline.arrays, most, task))
+    return _Head(results, legacy, need)
 
 
-def _collect(arrays, pieces, cores, creates, before) -> Results:
-    """Results of the tile's own points, sorted as their pieces are."""
-    names = [n for a in arrays[:1] for n in a.dtype.names]
+def _marking(number: int, piece: Piece, unit: float, originals: dict[int, Mapping[str, NDArray]] | None):
+    """A function that numbers a reader's points, and keeps what they were where changes are to be found later."""
+    margin = np.where(piece.margin < 0, -1.0, piece.margin * unit)
+
+    def mark(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        count = len(ins["X"])
+        if count != len(margin):
+            raise StageError(f"the reader gave {count:,} points of {len(margin):,}")
+        outs[ROW] = np.arange(count, dtype=np.uint32)
+        outs[SOURCE] = np.full(count, number, np.uint32)
+        outs[MARGIN] = margin
+        if originals is not None:
+            originals[number] = {name: v[piece.own] for name, v in ins.items() if name not in _MARK_TYPES}
+
+    return mark
+
+
+class _Reach:
+    """Finds how far an open-ended stage reached for what is used of its results: up to `later` metres outside the tile."""
+
+    def __init__(self, box: Box, later: float) -> None:
+        self.box, self.later, self.need = box, later, 0.0
+        self.stage: Stage | None = None
+
+    def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        assert self.stage is not None
+        points = points_of(self.stage, module, ins)
+        wanted = ins[MARGIN] <= self.later if self.later > 0 else ins[MARGIN] < 0
+        if points.mask is not None:
+            wanted &= points.mask
+        box = [side * points.units.horizontal for side in self.box]
+        self.need = max(self.need, self.stage.reach_of(points, wanted, box))
+
+
+def _collect(
+    arrays: list[NDArray],
+    cuts: list[tuple[Source, Piece]],
+    creates: list[str] | None,
+    originals: dict[int, Mapping[str, NDArray]] | None,
+) -> tuple[list[PieceResults], bool]:
+    """Results of the tile's own points, sorted as their pieces are; whether class codes hold flag bits."""
+    names = [n for a in arrays[:1] for n in a.dtype.names or ()]
+    headers = [read_header(piece.path) for _, piece in cuts]
     legacy = not {"Synthetic", "Withheld", "ClassFlags"} & set(names) and all(
-        _old_format(p.path) for p in pieces
+        header is not None and header.point_format <= 5 for header in headers
     )
-    if creates is not None:
-        names = [n for n in creates if n in names]
+    if creates is None:
+        names = [n for n in names if n not in _MARK_TYPES]
     else:
-        names = [n for n in names if n not in (ROW, SOURCE, MARGIN)]
-    found: dict[int, list[tuple[NDArray, dict[str, NDArray]]]] = {k: [] for k in range(len(pieces))}
-    for array in arrays:
-        mine = np.flatnonzero(array[MARGIN] < 0)
-        source = array[SOURCE][mine]
-        for number in np.unique(source).tolist():
-            at = mine[source == number]
-            found[number].append((array[ROW][at].astype(np.int64), {n: array[n][at] for n in names}))
-    rows: list[NDArray] = []
-    values: dict[str, list[NDArray]] = {n: [] for n in names}
-    for number in range(len(pieces)):
-        parts = found[number]
-        row = np.concatenate([p[0] for p in parts]) if parts else np.empty(0, np.int64)
-        order = np.argsort(row, kind="stable")
-        row = row[order]
-        if row.size and (np.diff(row) == 0).any():
+        names = [n for n in creates if n in names]
+    results = []
+    for number, (source, piece) in enumerate(cuts):
+        mine = [(a, np.flatnonzero((a[MARGIN] < 0) & (a[SOURCE] == number))) for a in arrays]
+        rows = np.concatenate([a[ROW][at].astype(np.int64) for a, at in mine] or [np.empty(0, np.int64)])
+        order = np.argsort(rows, kind="stable")
+        rows = rows[order]
+        if (np.diff(rows) == 0).any():
             raise PipelineError(
                 "a stage makes new points, which have no place in the input files",
                 cure="Run the pipeline without --tile",
             )
-        rows.append(row)
+        values = {name: np.concatenate([a[name][at] for a, at in mine])[order] for name in names}
+        results.append(PieceResults(source, piece, rows, values))
+    if originals is not None:
         for name in names:
-            column = np.concatenate([p[1][name] for p in parts]) if parts else np.empty(0)
-            values[name].append(column[order] if parts else column)
-    if creates is None:
-        values = _changed(values, rows, before)
-    return Results(rows, values, cores, legacy)
+            if not any(_changed(result, name, originals[n]) for n, result in enumerate(results)):
+                for result in results:
+                    del result.values[name]
+    return results, legacy
 
 
-def _old_format(path: str) -> bool:
-    with open(path, "rb") as file:
-        return file.read(105)[104] & 0x3F <= 5
-
-
-def _changed(values, rows, before) -> dict[str, list[NDArray]]:
-    """Only the dimensions that are new, or differ from what was read."""
-    old: dict[int, dict[str, NDArray]] = {}
-    for kept in before:
-        if len(kept[ROW]):
-            old[int(kept[SOURCE][0])] = kept
-    out = {}
-    for name, columns in values.items():
-        for number, column in enumerate(columns):
-            if not len(column):
-                continue
-            kept = old[number]
-            if name not in kept or not np.array_equal(
-                kept[name][np.searchsorted(kept[ROW], rows[number])], column
-            ):
-                out[name] = columns
-                break
-    return out
+def _changed(result: PieceResults, name: str, original: Mapping[str, NDArray]) -> bool:
+    """Whether a dimension is new, or differs from what was read."""
+    if not result.rows.size:
+        return False
+    before = np.searchsorted(result.piece.own, result.rows)
+    return name not in original or not np.array_equal(original[name][before], result.values[name])
 
 
 def _looked_far(report: dict[str, Any]) -> bool:
     return any((report.get("beyond_halo") or {}).values())
 
 
-def _far_neighbors(arrays, head, box, unit: float, threads: int) -> float:
-    """Metres around the tile within which the k nearest neighbors of all its points lie."""
+def _far_neighbors(arrays: list[NDArray], most: int, task: TileTask) -> float:
+    """Metres around the tile within which the `most` nearest neighbors of all its points lie."""
     from scipy.spatial import cKDTree
 
-    most = 0
-    for stage in head:
-        kind = registry.stages().get(stage["type"])
-        if kind is None:
-            continue
-        plan = getattr(kind(given_options(stage)), "plan", None)
-        for one in plan.neighborhoods if plan is not None else ():
-            if one.reach is None:
-                most = max(most, int(one.parameters[-1] if one.kind == "knn" else one.parameters[1]))
+    recipe = task.recipe
+    x0, y0, x1, y1 = (side * recipe.unit for side in recipe.grid.box(task.tile))
     array = np.concatenate([a[["X", "Y", "Z", MARGIN]] for a in arrays])
-    xyz = np.column_stack([array[c] for c in "XYZ"]) * unit
-    mine = np.flatnonzero(array[MARGIN] < 0)
-    inward = np.minimum(
-        np.minimum(xyz[mine, 0] - box[0] * unit, box[2] * unit - xyz[mine, 0]),
-        np.minimum(xyz[mine, 1] - box[1] * unit, box[3] * unit - xyz[mine, 1]),
-    )
+    xyz = np.column_stack([array[c] for c in "XYZ"]) * recipe.unit
+    mine = xyz[array[MARGIN] < 0]
     if len(xyz) <= most:
-        return float(2 * (box[2] - box[0]) * unit)
-    far = cKDTree(xyz).query(xyz[mine], k=[most + 1], workers=threads)[0][:, 0]
+        return 2 * (x1 - x0)
+    inward = np.min([mine[:, 0] - x0, x1 - mine[:, 0], mine[:, 1] - y0, y1 - mine[:, 1]], axis=0)
+    far = cKDTree(xyz).query(mine, k=[most + 1], workers=recipe.threads)[0][:, 0]
     return float(max(0.0, (far - inward).max()))
-
-
-def _save(path: Path, results: Results, keys: list[str], pieces: list[Piece]) -> None:
-    """Write the results of a tile for the files to be put together from."""
-    content: dict[str, NDArray] = {}
-    for number, key in enumerate(keys):
-        rows = results.rows[number]
-        content[f"{key}/index"] = pieces[number].index[rows]
-        content[f"{key}/core"] = np.array(results.cores[number])
-        for name, columns in results.values.items():
-            content[f"{key}/dim/{name}"] = columns[number]
-    with whole_files(path, what="result") as (partial,):
-        np.savez(partial, **content)  # type: ignore[arg-type]
-
-
-def _class_counts(results: Results) -> dict[str, int]:
-    counts = np.zeros(256, np.int64)
-    for column in results.values.get("Classification", ()):
-        if len(column):
-            codes = np.asarray(column, np.uint8)
-            counts += np.bincount(codes & LEGACY_LIMIT if results.legacy else codes, minlength=256)
-    return {str(c): int(counts[c]) for c in np.flatnonzero(counts)}

@@ -1,13 +1,13 @@
-"""The tasks of a tiled run, as workers do them: JSON in, JSON out."""
+"""The tasks of a tiled run, as workers do them."""
 
 from __future__ import annotations
 
-import json
+import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 from ..base.errors import (
     DependencyError,
@@ -15,7 +15,6 @@ from ..base.errors import (
     InterruptedStage,
     ModelError,
     OptionError,
-    PipelineError,
     StageError,
 )
 
@@ -23,59 +22,61 @@ from ..base.errors import (
 _one = threading.Lock()
 
 
-def perform(task: str) -> str:
-    """Do a task in a worker process.
+class Task(Protocol):
+    """Work that is sent to a worker process whole."""
 
-    Parameters
+    def run(self) -> Any:
+        """Do it."""
+
+
+@dataclass
+class Answer:
+    """What became of a task.
+
+    Attributes
     ----------
-    task : str
-        JSON: ``kind`` (``index``, ``tile`` or ``file``) and what that kind needs.
-
-    Returns
-    -------
-    str
-        JSON: the result, or ``error`` with ``reason`` and whether trying again can help (``again``).
+    result : object
+        What it gave.
+    reason : str
+        Why it failed; empty where it did not.
+    again : bool
+        Whether trying again can help.
+    cost : dict
+        ``seconds``, ``cpu_seconds``, ``peak_mb`` (the most memory the process has held so far).
     """
-    given = json.loads(task)
+
+    result: Any = None
+    reason: str = ""
+    again: bool = False
+    cost: dict[str, float] = field(default_factory=dict)
+
+
+def perform(task: Task) -> Answer:
+    """Do a task; what goes wrong is in the answer, except Ctrl-C."""
     with _one:
         started, cpu = time.perf_counter(), time.process_time()
         try:
-            result = _kinds()[given["kind"]](given)
-        except InterruptedStage:  # what a stage makes of Ctrl-C within PDAL
+            answer = Answer(task.run())
+        except InterruptedStage:
             raise KeyboardInterrupt from None
         except StageError as error:
-            result = {"error": {"reason": str(error), "again": _again(error)}}
+            answer = Answer(reason=str(error), again=_may_pass(error))
         except MemoryError:
-            result = {
-                "error": {"reason": "memory ran out. Take smaller tiles or fewer workers", "again": True}
-            }
+            answer = Answer(reason="memory ran out. Take smaller tiles or fewer workers", again=True)
         except Exception as error:
             last = traceback.extract_tb(error.__traceback__)[-1]
             reason = f"{type(error).__name__}: {error} ({last.name}, line {last.lineno})"
-            result = {"error": {"reason": reason, "again": True}}
-        result["seconds"] = time.perf_counter() - started
-        result["cpu_seconds"] = time.process_time() - cpu
-        result["peak_mb"] = _peak()
-        return json.dumps(result)
+            answer = Answer(reason=reason, again=True)
+        answer.cost = {
+            "seconds": time.perf_counter() - started,
+            "cpu_seconds": time.process_time() - cpu,
+            "peak_mb": _peak(),
+        }
+        return answer
 
 
-def _kinds() -> dict[str, Callable[[dict[str, Any]], dict[str, Any]]]:
-    from .assemble import write_file
-    from .tilework import run_tile
-
-    return {"index": _index, "tile": run_tile, "file": write_file}
-
-
-def _index(given: dict[str, Any]) -> dict[str, Any]:
-    from .cloudindex import index_las
-
-    return index_las(given["path"], given["size"])
-
-
-def _again(error: StageError) -> bool:
+def _may_pass(error: StageError) -> bool:
     """Whether an error may be gone when the task is tried again: not where the request itself is wrong."""
-    if isinstance(error, PipelineError):
-        return True  # PDAL's words: a full disk, a lost network folder, or anything else
     return not isinstance(error, OptionError | ModelError | DimensionError | DependencyError)
 
 
@@ -85,7 +86,5 @@ def _peak() -> float:
         import resource
     except ImportError:
         return 0.0
-    import sys
-
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return most / (2**20 if sys.platform == "darwin" else 2**10)

@@ -1,0 +1,84 @@
+"""Tasks handed out until all are done or given up: tiles, and outputs as soon as the last of their tiles is there."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+from ..base.errors import StageError
+from ..base.progress import Progress
+from .outcome import Job, Output
+from .pool import Pool, last_tries
+from .store import Store
+from .work import Task
+
+#: A run stops when so many tiles failed for one reason and none succeeded.
+_HOPELESS = 10
+
+
+def run_all(
+    jobs: list[Job],
+    outputs: list[Output],
+    task_of: Callable[[Job | Output], Task],
+    store: Store,
+    pool: Pool,
+    retries: int,
+    show: bool | None,
+) -> None:
+    """Do all waiting tiles and outputs; their states, reports and reasons are set.
+
+    Raises
+    ------
+    StageError
+        If the first tiles all fail for one reason.
+    """
+    waiting: deque[Job | Output] = deque(job for job in jobs if job.state == "waiting")
+    done = good = sum(job.state == "kept" for job in jobs)
+    failures: list[str] = []
+    users: dict[tuple[int, int], list[Output]] = {}
+    for out in outputs:
+        for job in out.jobs:
+            users.setdefault(job.tile, []).append(out)
+        _make_ready(out, waiting)
+    total = sum(item.points for item in waiting if isinstance(item, Job))
+    with Progress(total, f"{done} of {len(jobs)} tiles", enabled=show) as progress:
+        for item, answer in last_tries(pool, waiting, task_of, retries):
+            if answer.reason:
+                item.state, item.reason = "failed", answer.reason
+            else:
+                item.state, item.report = "done", answer.result | answer.cost
+            if isinstance(item, Output):
+                if not answer.reason:
+                    store.wrote(item.source.key, item.mark, item.report)
+                continue
+            done += 1
+            progress.label = f"{done} of {len(jobs)} tiles"
+            progress.update(item.report.get("points", item.points))
+            for out in users.get(item.tile, ()):
+                _make_ready(out, waiting)
+            if answer.reason:
+                failures.append(answer.reason)
+            else:
+                good += 1
+                if item.outputs is not None:
+                    store.wrote(item.name, item.mark, item.report)
+            if not good and len(failures) >= _HOPELESS and len(set(failures)) == 1:
+                raise StageError(
+                    f"the first {len(failures)} tiles all failed for one reason, so the run was stopped",
+                    found=answer.reason,
+                )
+
+
+def _make_ready(out: Output, waiting: deque) -> None:
+    """Put an output to work when the last of its tiles is there."""
+    if out.state != "waiting" or any(job.state == "waiting" for job in out.jobs):
+        return
+    failed = [job for job in out.jobs if job.state == "failed"]
+    if failed:
+        others = f", and {len(failed) - 1} more of its tiles" if len(failed) > 1 else ""
+        out.state, out.reason = "failed", f"tile {failed[0].name} failed{others}"
+        if all(job.blocked_by for job in failed):
+            out.blocked_by = failed[0].blocked_by
+    else:
+        out.state = "ready"
+        waiting.appendleft(out)

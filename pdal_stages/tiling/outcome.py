@@ -1,0 +1,154 @@
+"""Tiles and outputs of a run, and what became of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..base.version import __version__
+from .sources import Source
+
+
+@dataclass
+class Job:
+    """A tile to run.
+
+    Attributes
+    ----------
+    tile : (int, int)
+    name : str
+    points : int
+        The tile's own; 0 where not known before it is read.
+    sources : list of Source
+        Inputs that may hold points of it or its surroundings.
+    outputs : list of str, optional
+        What the writers write, where each tile is an output.
+    mark : str
+        Fingerprint of all that decides its result.
+    state : str
+        ``waiting``, ``done``, ``kept`` (from an earlier run) or ``failed``.
+    report : dict
+    reason : str
+        Why it failed.
+    blocked_by : str
+        The unreadable input that it failed for, where that is the reason.
+    tries : int
+    """
+
+    tile: tuple[int, int]
+    name: str
+    points: int
+    sources: list[Source]
+    outputs: list[str] | None = None
+    mark: str = ""
+    state: str = "waiting"
+    report: dict[str, Any] = field(default_factory=dict)
+    reason: str = ""
+    blocked_by: str = ""
+    tries: int = 0
+
+
+@dataclass
+class Output:
+    """An input file whose output is put together from tiles; `state` may be ``ready`` too, when all of these are done."""
+
+    source: Source
+    paths: list[str]
+    jobs: list[Job] = field(default_factory=list)
+    mark: str = ""
+    state: str = "waiting"
+    report: dict[str, Any] = field(default_factory=dict)
+    reason: str = ""
+    blocked_by: str = ""
+    tries: int = 0
+
+
+@dataclass
+class TiledRun:
+    """What a tiled run did.
+
+    Attributes
+    ----------
+    tiles : list of Job
+    outputs : list of Output
+        Empty where each tile is an output.
+    unreadable : dict of str to str
+        Inputs that could not be read, and why.
+    notes : list of str
+        What the user should know.
+    summary : dict
+        Figures for people; see :meth:`to_dict`.
+    """
+
+    tiles: list[Job]
+    outputs: list[Output]
+    unreadable: dict[str, str]
+    notes: list[str]
+    summary: dict[str, Any]
+
+    @property
+    def failures(self) -> list[tuple[str, str]]:
+        """What failed, and why: inputs with all that waits for them, then other tiles and outputs."""
+        found = [
+            (path, reason.removeprefix(f"{path}: ") + self._blocked_by(path))
+            for path, reason in self.unreadable.items()
+        ]
+        failed = [(f"tile {job.name}", job) for job in self.tiles] + [(o.paths[0], o) for o in self.outputs]
+        return found + [
+            (what, item.reason) for what, item in failed if item.state == "failed" and not item.blocked_by
+        ]
+
+    def _blocked_by(self, path: str) -> str:
+        """What was not made because an input cannot be read, in words."""
+        tiles = sum(job.blocked_by == path for job in self.tiles)
+        outputs = [Path(out.paths[0]).name for out in self.outputs if out.blocked_by == path]
+        parts = [f"{tiles} tile{'s' * (tiles != 1)} there"] if tiles else []
+        parts += [*outputs[:5], *([f"{len(outputs) - 5} more outputs"] if len(outputs) > 5 else [])]
+        return f" (not made because of it: {', '.join(parts)})" if parts else ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """A JSON-able report."""
+        return {
+            "pdal_stages": __version__,
+            **self.summary,
+            "notes": self.notes,
+            "failures": [{"what": what, "reason": reason} for what, reason in self.failures],
+            "tiles": [
+                {"name": j.name, "tile": list(j.tile), "state": j.state, "tries": j.tries, "points": j.points}
+                | {k: v for k, v in j.report.items() if k != "fingerprint"}
+                | ({"reason": j.reason} if j.reason else {})
+                for j in self.tiles
+            ],
+            "outputs": [
+                {"input": o.source.path, "output": o.paths, "state": o.state}
+                | ({"reason": o.reason} if o.reason else {})
+                | {k: o.report[k] for k in ("written", "seconds", "cpu_seconds", "peak_mb") if k in o.report}
+                for o in self.outputs
+            ],
+        }
+
+
+def summarize(tiles: list[Job], outputs: list[Output], seconds: float) -> dict[str, Any]:
+    """Figures of all tiles and outputs together, for :attr:`TiledRun.summary`."""
+    worked = [job for job in tiles if job.state == "done"]
+    classes: dict[str, int] = {}
+    for job in tiles:
+        for code, count in (job.report.get("classes") or {}).items():
+            classes[code] = classes.get(code, 0) + count
+
+    def total(key: str) -> int:
+        return sum(job.report.get(key, 0) for job in worked)
+
+    reports = [job.report for job in worked] + [out.report for out in outputs]
+    return {
+        "points": total("points"),
+        "points_read": total("read"),
+        "dropped": total("dropped"),
+        "seconds": seconds,
+        "points_per_second": total("points") / seconds if seconds else 0.0,
+        "cpu_seconds": sum(report.get("cpu_seconds", 0.0) for report in reports),
+        "peak_mb_of_a_worker": max((report.get("peak_mb", 0.0) for report in reports), default=0.0),
+        "states": {s: sum(job.state == s for job in tiles) for s in ("done", "kept", "failed")},
+        "classes": dict(sorted(classes.items(), key=lambda item: int(item[0]))),
+    }

@@ -1,0 +1,130 @@
+"""New values of points: what a tile's head gave, as files between tiles and outputs, and as a file's points take them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.asprs import LEGACY_LIMIT
+from ..base.errors import StageError
+from ..base.files import whole_files
+from .extract import Piece
+from .sources import Source
+
+
+@dataclass
+class PieceResults:
+    """Results of a tile's own points of one source.
+
+    Attributes
+    ----------
+    source : Source
+    piece : Piece
+    rows : (n,) int64
+        Rows of the piece that came out, ascending.
+    values : dict of str to (n,) ndarray
+        New values of dimensions.
+    """
+
+    source: Source
+    piece: Piece
+    rows: NDArray[np.int64]
+    values: dict[str, NDArray]
+
+
+@dataclass(frozen=True)
+class NewValues:
+    """What points get that are read again, in the order they are read in.
+
+    Attributes
+    ----------
+    kept : (n,) bool
+        Which of the points stay.
+    values : mapping of str to (rows or None, ndarray)
+        New values of dimensions and the rows they belong to; None for all.
+    """
+
+    kept: NDArray[np.bool_]
+    values: Mapping[str, tuple[NDArray[np.int64] | None, NDArray]]
+
+
+def of_own_points(result: PieceResults) -> NewValues:
+    """The results for a file of the tile's own points alone."""
+    own = result.piece.own
+    rows = np.searchsorted(own, result.rows)
+    kept = np.zeros(len(own), bool)
+    kept[rows] = True
+    at = None if kept.all() else rows
+    return NewValues(kept, {name: (at, values) for name, values in result.values.items()})
+
+
+def class_counts(results: Iterable[PieceResults], legacy: bool) -> dict[str, int]:
+    """Number of points of each class; without the flag bits of LAS 1.0-1.3 where these are inside."""
+    counts = np.zeros(256, np.int64)
+    for result in results:
+        codes = np.asarray(result.values.get("Classification", ()), np.uint8)
+        counts += np.bincount(codes & LEGACY_LIMIT if legacy else codes, minlength=256)
+    return {str(code): int(counts[code]) for code in np.flatnonzero(counts)}
+
+
+def save(path: str | Path, results: Iterable[PieceResults]) -> None:
+    """Write a tile's results, for the files that outputs are put together from."""
+    content: dict[str, NDArray] = {}
+    for result in results:
+        key = result.source.key
+        content[f"{key}/index"] = result.piece.index[result.rows]
+        content[f"{key}/core"] = np.array(len(result.piece.own))
+        content |= {f"{key}/dim/{name}": values for name, values in result.values.items()}
+    with whole_files(path, what="result") as (partial,):
+        np.savez(partial, **content)  # type: ignore[arg-type]
+
+
+def read_range(tiles: Iterable[str], source: Source, count: int, start: int, end: int) -> NewValues:
+    """Results of points `start` to `end` of a file with `count` points, out of the files of its tiles.
+
+    Raises
+    ------
+    StageError
+        If the tiles do not hold each of the file's points once.
+    """
+    prefix = f"{source.key}/"
+    kept = np.zeros(end - start, bool)
+    seen = 0
+    columns: dict[str, list[tuple[NDArray, NDArray]]] = {}
+    for name in tiles:
+        with np.load(name, allow_pickle=False) as tile:
+            if f"{prefix}index" not in tile:
+                continue
+            index = tile[f"{prefix}index"]  # ascending
+            seen += int(tile[f"{prefix}core"])
+            first, last = np.searchsorted(index, (start, end))
+            mine = index[first:last] - start
+            if (index.size and index[-1] >= count) or kept[mine].any():
+                raise StageError("internal: two tiles hold the same point", where=source.path, found=name)
+            kept[mine] = True
+            for key in tile.files:
+                if key.startswith(f"{prefix}dim/"):
+                    part = tile[key][first:last].copy() if last - first < index.size else tile[key]
+                    columns.setdefault(key.removeprefix(f"{prefix}dim/"), []).append((mine, part))
+    if seen != count:
+        raise StageError(
+            "the tiles do not hold all points of the file: it changed while it was worked on",
+            where=source.path,
+            found=f"{seen:,} of {count:,} points",
+            cure="Start the run again with --resume",
+        )
+    values: dict[str, tuple[NDArray[np.int64] | None, NDArray]] = {}
+    for name, parts in columns.items():
+        if sum(len(rows) for rows, _ in parts) == end - start:
+            full = np.empty(end - start, parts[0][1].dtype)
+            for rows, part in parts:
+                full[rows] = part
+            values[name] = (None, full)
+        else:
+            values[name] = (np.concatenate([r for r, _ in parts]), np.concatenate([v for _, v in parts]))
+        parts.clear()
+    return NewValues(kept, values)

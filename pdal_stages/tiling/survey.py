@@ -1,0 +1,199 @@
+"""What is known of a run's inputs before any tile: which can be read, where they lie, in what unit."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..base.errors import OptionError, PipelineError, StageError
+from ..base.progress import Progress
+from ..base.units import units_of_wkt
+from ..pipeline import pdal as pdal_env
+from .cloudindex import CloudIndex, IndexTask
+from .grid import Box, Grid, union
+from .pool import Pool, last_tries
+from .settings import TilingOptions
+from .sources import Header, Source, check_source, find_sources, read_header
+from .store import Store, fingerprint
+from .tileplan import TilePlan
+
+
+class Survey:
+    """The inputs of a run.
+
+    Attributes
+    ----------
+    sources : list of Source
+    headers : dict of str to Header
+        Of sources by path, where the header can be read.
+    unreadable : dict of str to str
+        Paths of inputs that cannot be read, and why.
+    indexes : dict of str to CloudIndex
+        Of LAS and LAZ files, once they were read.
+    notes : list of str
+    grid : Grid
+    per : str
+        ``file`` or ``tile``: what one output is made of.
+    unit : float
+        Metres per unit of the coordinates.
+    margin : float
+        Surroundings of a tile, in the unit of the coordinates.
+    """
+
+    def __init__(self, plan: TilePlan, options: TilingOptions) -> None:
+        self.started = time.strftime("%Y-%m-%d %H:%M")
+        self.grid = Grid(options.tile)
+        self.notes = list(plan.notes)
+        self.unreadable: dict[str, str] = {}
+        self.headers: dict[str, Header] = {}
+        self.indexes: dict[str, CloudIndex] = {}
+        self.sources = find_sources(plan.readers)
+        if any("t_srs" in reader for reader in plan.readers):
+            self.notes.append(
+                "readers.tindex: in tiles points keep the reference of their file, t_srs is left out"
+            )
+        self._read_headers()
+        files = all(source.kind == "las" for source in self.sources)
+        if options.per == "file" and not files:
+            raise OptionError("--per file needs LAS or LAZ inputs", cure="Use --per tile")
+        self.per = options.per if options.per != "auto" else "file" if files else "tile"
+        self.unit = self._unit(plan)
+        self.margin = plan.halo / self.unit
+        self._place()
+
+    def _read_headers(self) -> None:
+        for source in self.sources:
+            try:
+                self.headers[source.path] = read_header(source)
+                check_source(source)
+            except StageError as error:
+                self.unreadable[source.path] = str(error)
+        if len(self.unreadable) == len(self.sources):
+            raise self._none_readable()
+        lost = len(self.sources) - len(self.headers)
+        if lost:
+            which = "1 input has" if lost == 1 else f"{lost} inputs have"
+            self.notes.append(
+                f"{which} no readable header, so its place is not known: tiles beside it may lack neighbors. Once "
+                "it can be read, --resume runs those tiles again"
+            )
+
+    def _none_readable(self) -> StageError:
+        return StageError(
+            "none of the inputs can be read", found=next(iter(self.unreadable.values()), "no input")
+        )
+
+    def _unit(self, plan: TilePlan) -> float:
+        """Metres per unit of the coordinates, as the first input says that PDAL can read."""
+        for source in self.sources:
+            if source.path in self.unreadable:
+                continue
+            try:
+                metadata = self._metadata(source)
+                break
+            except PipelineError as error:
+                self.unreadable[source.path] = str(error)
+        else:
+            raise self._none_readable()
+        node = metadata.get(source.reader["type"], {})
+        srs = (node[0] if isinstance(node, list) else node).get("srs", {})
+        wkt = str(srs.get("compoundwkt") or srs.get("wkt") or "")
+        try:
+            return units_of_wkt(wkt, horizontal=plan.unit, vertical="").horizontal
+        except StageError:
+            if plan.head and plan.halo:
+                raise
+            return 1.0
+
+    def _metadata(self, source: Source) -> dict[str, Any]:
+        """What PDAL's reader says of an input, with as few points read as it can."""
+        if source.kind == "las":
+            reader = {**source.reader, "filename": source.path, "count": 1}
+        else:
+            x, y, _, _ = self.headers[source.path].box
+            reader = source.within((x, y, x + 1, y + 1))
+        return pdal_env.execute([reader], arrays=False).metadata.get("metadata", {})
+
+    def _place(self) -> None:
+        """Note where inputs lie, as headers or indexes say; thousands of them are compared at once."""
+        self._placed = [s for s in self.sources if s.path in self.headers and self.headers[s.path].count]
+        boxes = []
+        for source in self._placed:
+            index = self.indexes.get(source.path)
+            boxes.append(union(index.boxes) if index else self.headers[source.path].box)
+        self._boxes = np.array(boxes, np.float64).reshape(-1, 4)
+        self.bounds: Box = union(boxes)
+
+    @property
+    def points(self) -> int:
+        """Points of all inputs, as their headers say."""
+        return sum(header.count for header in self.headers.values())
+
+    def near(self, box: Box, margin: float) -> list[Source]:
+        """Inputs that may hold points of a box or its surroundings."""
+        b = self._boxes
+        hits = (b[:, 0] <= box[2] + margin) & (b[:, 2] >= box[0] - margin)
+        hits &= (b[:, 1] <= box[3] + margin) & (b[:, 3] >= box[1] - margin)
+        return [self._placed[n] for n in np.flatnonzero(hits)]
+
+    def tiles(self) -> dict[tuple[int, int], int]:
+        """Every tile that may have points of its own, row by row, and how many where that is known (else 0)."""
+        counts: dict[tuple[int, int], int] = {}
+        for path, header in self.headers.items():
+            if path in self.indexes:
+                for i, j, n in self.indexes[path].tiles:
+                    counts[i, j] = counts.get((i, j), 0) + n
+            elif header.count:
+                for tile in self.grid.covering(header.box):
+                    counts.setdefault(tile, 0)
+        return dict(sorted(counts.items(), key=lambda item: (item[0][1], item[0][0])))
+
+    def figures(self, plan: TilePlan) -> dict[str, Any]:
+        """What a report says of the pipeline, its models, the inputs and the tiles' size."""
+        return {
+            "pipeline": plan.name,
+            "models": [str(stage["model"]) for stage in plan.head if "model" in stage],
+            "started": self.started,
+            "tile": self.grid.size,
+            "buffer_metres": plan.halo,
+            "metres_per_unit": self.unit,
+            "per": self.per,
+            "inputs": len(self.sources),
+            "bounds": list(self.bounds) if math.isfinite(self.bounds[0]) else None,
+        }
+
+    def read_indexes(self, store: Store, pool: Pool, retries: int, show: bool | None) -> None:
+        """Read every LAS and LAZ file once, but those whose index an earlier run kept."""
+        waiting: deque[_Reading] = deque()
+        for source in self.sources:
+            if source.kind != "las" or source.path in self.unreadable:
+                continue
+            mark = fingerprint(source.path, source.stamp(), self.grid.size)
+            if (known := store.index(mark)) is not None:
+                self.indexes[source.path] = known
+            else:
+                waiting.append(_Reading(source.path, mark))
+        total = sum(self.headers[reading.path].count for reading in waiting)
+        with Progress(total, "reading the inputs", enabled=show) as progress:
+            for reading, answer in last_tries(
+                pool, waiting, lambda reading: IndexTask(reading.path, self.grid), retries
+            ):
+                if answer.reason:
+                    self.unreadable[reading.path] = answer.reason
+                    continue
+                self.indexes[reading.path] = answer.result
+                store.keep_index(reading.mark, answer.result)
+                progress.update(answer.result.count)
+        self._place()
+
+
+@dataclass
+class _Reading:
+    path: str
+    mark: str
+    tries: int = 0
