@@ -159,8 +159,14 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--count", type=int, help="Samples of each class")
 
     command = add("accuracy", _accuracy, "Compare two class dimensions, or two files", overrides=True)
-    command.add_argument("input", help="The classified file")
-    command.add_argument("--reference", metavar="FILE", help="The same points with true classes; same order")
+    command.add_argument("inputs", nargs="+", metavar="input", help="Classified files, folders or patterns")
+    command.add_argument(
+        "--reference",
+        action="append",
+        metavar="FILE",
+        help="The same points, in the same order, with true classes: a file, a folder or a pattern, paired by name; "
+        "may be repeated",
+    )
     command.add_argument("--dimension", default="Classification", help="Classes to judge")
     command.add_argument("--reference-dimension", help="Dimension with the true classes")
     command.add_argument("--json", help="Write figures to this file")
@@ -287,6 +293,7 @@ def _options(options: argparse.Namespace) -> None:
 def _classify(options: argparse.Namespace) -> None:
     from .pipeline.jobs import classify_pipeline
     from .pipeline.run import Pipeline
+    from .stages.modelclassifier import loaded_model
 
     stages = classify_pipeline(options.input, options.output, options.model, where=options.where)
     pipeline = Pipeline(stages, options.overrides)
@@ -296,14 +303,14 @@ def _classify(options: argparse.Namespace) -> None:
     _after(pipeline, options.metadata)
     report = pipeline.reports[-1][1][-1]
     print(f"{count:,} points written to {options.output}")
-    print(_class_counts(report))
+    print(_class_counts(report, dict(loaded_model(options.model).classes)))
 
 
-def _class_counts(report: dict) -> str:
+def _class_counts(report: dict, names: dict[int, str]) -> str:
     from .base.asprs import class_name
 
     lines = [
-        f"  {int(code):3d} {class_name(int(code)):28s} {n:>12,}"
+        f"  {int(code):3d} {names.get(int(code), class_name(int(code))):28s} {n:>12,}"
         for code, n in report.get("classes", {}).items()
     ]
     if report.get("rejected"):
@@ -330,7 +337,7 @@ def _train(options: argparse.Namespace) -> None:
 
 
 def _accuracy(options: argparse.Namespace) -> None:
-    from .pipeline.jobs import accuracy_pipeline, attach_reference
+    from .pipeline.jobs import accuracy_pipeline, compare_files
     from .pipeline.run import Pipeline
 
     reference_dimension = options.reference_dimension or (
@@ -338,8 +345,8 @@ def _accuracy(options: argparse.Namespace) -> None:
     )
     outputs = {k: v for k in ("json", "html") if (v := getattr(options, k))}
     if options.reference:
-        attach_reference(
-            options.input,
+        compare_files(
+            options.inputs,
             options.reference,
             options.dimension,
             reference_dimension,
@@ -347,7 +354,7 @@ def _accuracy(options: argparse.Namespace) -> None:
             **outputs,
         )
         return
-    stages = accuracy_pipeline(options.input, options.dimension, reference_dimension, **outputs)
+    stages = accuracy_pipeline(options.inputs, options.dimension, reference_dimension, **outputs)
     pipeline = Pipeline(stages, options.overrides)
     pipeline.execute(arrays=False)
     _after(pipeline, None)

@@ -52,7 +52,7 @@ def town(n=5000, seed=1):
 @given(label_pairs())
 def test_all_measures_equal_scikit_learn(pair):
     reference, predicted = pair
-    a = Accuracy.from_labels(reference, predicted)
+    a = Accuracy.from_labels(reference, predicted, ignore=())
     present = sorted(set(reference.tolist()))
     everything = present + sorted(set(predicted.tolist()) - set(present))
     assert list(a.classes) == present
@@ -153,8 +153,8 @@ def test_point_order_does_not_matter(pair, random):
     order = list(range(len(reference)))
     random.shuffle(order)
     reliability = np.linspace(0, 1, len(reference))
-    a = Accuracy.from_labels(reference, predicted, reliability=reliability)
-    b = Accuracy.from_labels(reference[order], predicted[order], reliability=reliability[order])
+    a = Accuracy.from_labels(reference, predicted, ignore=(), reliability=reliability)
+    b = Accuracy.from_labels(reference[order], predicted[order], ignore=(), reliability=reliability[order])
     assert a.table() == b.table()
     np.testing.assert_array_equal(a.matrix, b.matrix)
     np.testing.assert_array_equal(a.reliability.right, b.reliability.right)
@@ -185,10 +185,10 @@ def test_tiles_add_to_the_whole(pair, cut, ignore):
 @given(label_pairs())
 def test_perfect_and_worst(pair):
     reference, _ = pair
-    best = Accuracy.from_labels(reference, reference)
+    best = Accuracy.from_labels(reference, reference, ignore=())
     assert best.overall_accuracy == best.mean_f1 == best.mean_iou == best.mean_class_recall == 1
     assert best.kappa in (1.0, None)
-    worst = Accuracy.from_labels(reference, np.full(len(reference), 99))
+    worst = Accuracy.from_labels(reference, np.full(len(reference), 99), ignore=())
     assert worst.overall_accuracy == worst.mean_f1 == worst.mean_class_precision == 0
     assert worst.extra == (99,)
     assert worst.extra_points == len(reference)
@@ -212,11 +212,11 @@ def test_swapping_both_sides_transposes(pair):
 def test_merging_the_matrix_equals_merging_the_labels(pair):
     reference, predicted = pair
     merge = {5: [0, 2], 300: [64]}
-    a = Accuracy.from_labels(reference, predicted).merge(merge)
-    b = Accuracy.from_labels(reference, predicted, merge=merge)
+    a = Accuracy.from_labels(reference, predicted, ignore=()).merge(merge)
+    b = Accuracy.from_labels(reference, predicted, merge=merge, ignore=())
     assert (a.classes, a.extra, a.names, a.merged) == (b.classes, b.extra, b.names, b.merged)
     np.testing.assert_array_equal(a.matrix, b.matrix)
-    assert a.correct >= Accuracy.from_labels(reference, predicted).correct
+    assert a.correct >= Accuracy.from_labels(reference, predicted, ignore=()).correct
 
 
 @settings(max_examples=60, deadline=None)
@@ -265,6 +265,25 @@ def test_left_out_points_are_counted_by_class():
     assert a.left_out_points == 4
     assert a.points == 2
     assert "26 Reserved 26: 1" in a.table()
+
+
+def test_what_training_leaves_out_is_not_scored():
+    reference = [0, 1, 7, 12, 18, 2, 6]
+    a = Accuracy.from_labels(reference, [2] * 7)
+    assert a.left_out == {0: 1, 1: 1, 7: 1, 12: 1, 18: 1}
+    assert a.classes == (2, 6)
+    assert Accuracy.from_labels(reference, [2] * 7, ignore=[]).points == 7
+    assert Accuracy.from_labels(reference, [2] * 7, classes=[1, 6]).classes == (1, 6)
+
+
+def test_classes_merged_into_an_ignored_code_are_scored():
+    """The background of a binary model is 1, whose own points are unclassified: its precision came out as 100 %."""
+    reference, predicted = [1, 2, 5, 5, 6, 6], [6, 1, 1, 6, 6, 1]
+    a = Accuracy.from_labels(reference, predicted, merge={1: [2, 5]})
+    assert a.left_out == {1: 1}
+    assert a.precision == {1: 2 / 3, 6: 0.5}
+    assert a.recall == {1: 2 / 3, 6: 0.5}
+    assert sum([a, a]).to_dict()["left_out"] == {"points": 2, "by_class": {"1": 2}}
 
 
 def test_predictions_of_left_out_points_make_no_column():
@@ -380,13 +399,13 @@ def test_table_refuses_an_unknown_matrix():
         ({"reference": [2, 6], "predicted": [2]}, "another length.*1 and 2"),
         ({"reference": [2, 6], "predicted": [2, 6], "reliability": [1.0]}, "reliability has another length"),
         ({"reference": [[2, 6]], "predicted": [2, 6]}, "one label per point"),
-        ({"reference": [2.5], "predicted": [2]}, "no class codes.*2.5"),
-        ({"reference": [2.0, np.nan], "predicted": [2, 2]}, "no class codes.*nan"),
-        ({"reference": [2], "predicted": [-1]}, "prediction has values that are no class codes.*-1"),
-        ({"reference": [2], "predicted": [70000]}, "no class codes.*70000"),
+        ({"reference": [2.5], "predicted": [2]}, "not class codes.*2.5"),
+        ({"reference": [2.0, np.nan], "predicted": [2, 2]}, "not class codes.*nan"),
+        ({"reference": [2], "predicted": [-1]}, "prediction has values that are not class codes.*-1"),
+        ({"reference": [2], "predicted": [70000]}, "not class codes.*70000"),
         ({"reference": ["ground"], "predicted": [2]}, "not a list of class codes"),
-        ({"reference": [2], "predicted": [2], "classes": ["ground"]}, "'classes' has something.*'ground'"),
-        ({"reference": [2], "predicted": [2], "ignore": [2.5]}, "'ignore' has something"),
+        ({"reference": [2], "predicted": [2], "classes": ["ground"]}, "'classes' has an entry.*'ground'"),
+        ({"reference": [2], "predicted": [2], "ignore": [2.5]}, "'ignore' has an entry"),
         (
             {"reference": [2], "predicted": [2], "merge": {5: [3], 6: [3]}},
             "to two others.*class 3 to 5 and 6",
@@ -432,12 +451,12 @@ def test_a_wrong_matrix_is_told(arguments, message):
 
 
 def test_tiles_compared_differently_do_not_add():
-    a = Accuracy.from_labels([1, 2], [1, 2])
+    a = Accuracy.from_labels([1, 2], [1, 2], ignore=[])
     b = Accuracy.from_labels([1, 2], [1, 2], ignore=[1])
     with pytest.raises(StageError, match=r"do not add.*class 1"):
         _ = a + b
     with pytest.raises(StageError, match="merge different classes"):
-        _ = a + Accuracy.from_labels([1, 2], [1, 2], merge={2: 5})
+        _ = a + Accuracy.from_labels([1, 2], [1, 2], merge={2: 5}, ignore=[])
     with pytest.raises(StageError, match=r"left out.*class 2"):
         b.merge({1: 2})
 

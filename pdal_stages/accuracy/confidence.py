@@ -138,3 +138,12 @@ class Grading:
             return None
         below = np.concatenate([[0.0], np.cumsum(wrong)[:-1]])
         return float((right * (below + 0.5 * wrong)).sum() / (right.sum() * wrong.sum()))
+
+    def to_dict(self, kind: str) -> dict[str, Any] | None:
+        """As JSON types, with the "curve" or the "deciles"; None without points."""
+        if not self.points:
+            return None
+        out: dict[str, Any] = {"mean": self.mean, "separation": self.separation()}
+        if kind == "deciles":
+            return {**out, "deciles": self.quantiles()}
+        return {**out, "expected_calibration_error": self.expected_calibration_error(), "curve": self.curve()}

@@ -1,8 +1,9 @@
-"""Class labels: checked, listed, counted, merged and looked up, for comparing two of them."""
+"""Class labels: checked, counted in pairs, merged and named, for comparing two classifications."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,14 +14,14 @@ from ..base.errors import StageError
 
 #: Largest class code; LAS itself stops at 255, other label dimensions do not.
 MAX_CODE = 65535
-#: A dimension with more different values than this is no class dimension.
+#: A dimension with more different values than this is not a class dimension.
 MAX_CLASSES = 256
 #: Points looked at in one go, which bounds the memory.
 CHUNK = 1 << 20
 
 
 def as_codes(labels: npt.ArrayLike, what: str) -> npt.NDArray[Any]:
-    """The labels as an integer array, or an error that says what is wrong with them."""
+    """The labels as an (n,) integer array, or an error that says what is wrong with them."""
     a = np.asarray(labels)
     if a.ndim != 1:
         raise StageError(f"the {what} must be one label per point", found=f"shape {a.shape}")
@@ -28,7 +29,7 @@ def as_codes(labels: npt.ArrayLike, what: str) -> npt.NDArray[Any]:
         bad = ~(np.isfinite(a) & (a == np.floor(a)))
         if bad.any():
             raise StageError(
-                f"the {what} has values that are no class codes",
+                f"the {what} has values that are not class codes",
                 found=a[bad][0],
                 cure="Compare a class dimension",
             )
@@ -39,7 +40,7 @@ def as_codes(labels: npt.ArrayLike, what: str) -> npt.NDArray[Any]:
         a = a.astype(np.int64)
     if a.size and (a.min() < 0 or a.max() > MAX_CODE):
         raise StageError(
-            f"the {what} has values that are no class codes",
+            f"the {what} has values that are not class codes",
             found=f"{a.min()} to {a.max()}",
             cure=f"Class codes are whole numbers from 0 to {MAX_CODE}",
         )
@@ -47,6 +48,7 @@ def as_codes(labels: npt.ArrayLike, what: str) -> npt.NDArray[Any]:
 
 
 def same_length(reference: npt.NDArray[Any], others: Mapping[str, npt.NDArray[Any]]) -> None:
+    """Refuse arrays that are not as long as the reference; `others` says what each is."""
     for what, values in others.items():
         if len(values) != len(reference):
             raise StageError(
@@ -56,7 +58,7 @@ def same_length(reference: npt.NDArray[Any], others: Mapping[str, npt.NDArray[An
             )
 
 
-def code_list(codes: Iterable[Any], what: str) -> list[int]:
+def code_list(codes: Iterable[Any], option: str) -> list[int]:
     """Class codes as ints; strings of digits (JSON keys) are allowed."""
     out = []
     for code in codes:
@@ -66,99 +68,135 @@ def code_list(codes: Iterable[Any], what: str) -> list[int]:
         except (TypeError, ValueError):
             good = False
         if not good or isinstance(code, bool):
-            raise StageError(f"'{what}' has something that is no class code", found=repr(code))
+            raise StageError(f"'{option}' has an entry that is not a class code", found=repr(code))
         out.append(value)
     return out
 
 
-def int_keys(names: Mapping[Any, str] | None) -> dict[int, str]:
-    return dict(zip(code_list(names, "names"), map(str, names.values()), strict=True)) if names else {}
+def class_names(codes: Iterable[int], given: Mapping[Any, str] | None) -> dict[int, str]:
+    """The names of codes: those given, whose keys may be text, then ASPRS's own."""
+    own = dict(zip(code_list(given, "names"), map(str, given.values()), strict=True)) if given else {}
+    return {code: own.get(code) or class_name(code) for code in sorted(set(codes))}
 
 
-def merging(mapping: Mapping[Any, Any] | None) -> tuple[npt.NDArray[np.int64], dict[int, str]]:
-    """The class every code becomes, and names for the merged classes."""
-    to = np.arange(MAX_CODE + 1)
-    parts: dict[int, set[int]] = {}
-    for key, value in (mapping or {}).items():
-        if isinstance(value, (str, int, np.integer)):
-            (target,), sources = code_list([value], "merge"), code_list([key], "merge")
-        else:
-            (target,), sources = code_list([key], "merge"), code_list(value, "merge")
-        for source in sources:
-            if to[source] not in (source, target):
-                raise StageError(
-                    "'merge' sends one class to two others",
-                    found=f"class {source} to {to[source]} and {target}",
-                )
-            to[source] = target
-        parts.setdefault(target, set()).update(sources)
-    called = {}
-    for target, sources_of in parts.items():
-        # An ASPRS target keeps its own points (3, 4 -> 5); a user's own code is a new class.
-        members = sorted(sources_of | ({target} if target in NAMES and to[target] == target else set()))
-        if len(members) > 1:
-            words = {class_name(code).split()[-1] for code in members}
-            # Low, medium and high vegetation are vegetation; others have no word in common.
-            common = len(words) == 1 and all(code in NAMES for code in members)
-            called[target] = words.pop().capitalize() if common else f"Classes {', '.join(map(str, members))}"
-    return to, called
+@dataclass(frozen=True)
+class Merge:
+    """Classes taken as one, on both sides of a comparison.
+
+    Attributes
+    ----------
+    to : (65536,) int64
+        The class that every code becomes.
+    names : dict of int to str
+        Names of the classes made of several.
+    """
+
+    to: npt.NDArray[np.int64]
+    names: dict[int, str]
+
+    @classmethod
+    def parse(cls, mapping: Mapping[Any, Any] | None) -> Merge:
+        """Read ``{5: [3, 4]}`` or ``{3: 5, 4: 5}``; keys and codes may be text.
+
+        Raises
+        ------
+        StageError
+            For something that is not a class code, or a class sent to two others.
+        """
+        to = np.arange(MAX_CODE + 1)
+        members: dict[int, set[int]] = {}
+        for key, value in (mapping or {}).items():
+            if isinstance(value, (str, int, np.integer)):
+                (target,), sources = code_list([value], "merge"), code_list([key], "merge")
+            else:
+                (target,), sources = code_list([key], "merge"), code_list(value, "merge")
+            for source in sources:
+                if to[source] not in (source, target):
+                    raise StageError(
+                        "'merge' sends one class to two others",
+                        found=f"class {source} to {to[source]} and {target}",
+                    )
+                to[source] = target
+            members.setdefault(target, set()).update(sources)
+        names = {}
+        for target, codes in members.items():
+            # An ASPRS target keeps its own points (3, 4 -> 5); a user's own code is a new class.
+            if target in NAMES and to[target] == target:
+                codes.add(target)
+            if len(codes) > 1:
+                words = {class_name(code).split()[-1] for code in codes}
+                # Low, medium and high vegetation are vegetation; others have no word in common.
+                common = len(words) == 1 and all(code in NAMES for code in codes)
+                listed = ", ".join(map(str, sorted(codes)))
+                names[target] = words.pop().capitalize() if common else f"Classes {listed}"
+        return cls(to, names)
+
+    @property
+    def changed(self) -> dict[int, int]:
+        """The codes that become another class, and which."""
+        return {int(code): int(self.to[code]) for code in np.flatnonzero(self.to != np.arange(len(self.to)))}
 
 
-def moved(to: npt.NDArray[np.int64]) -> dict[int, int]:
-    """The codes a merge changes, and what they become."""
-    return {int(code): int(to[code]) for code in np.flatnonzero(to != np.arange(len(to)))}
+def pair_counts(
+    reference: npt.NDArray[Any], predicted: npt.NDArray[Any]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """How often each pair of codes occurs.
 
+    Parameters
+    ----------
+    reference, predicted : (n,) int
+        See :func:`as_codes`.
 
-def present(
-    codes: npt.NDArray[Any], to: npt.NDArray[np.int64], where: Callable | None = None
-) -> dict[int, int]:
-    """Merged code to count, over all points or those `where` says."""
-    counts = np.zeros(MAX_CODE + 1, np.int64)
-    for start in range(0, len(codes), CHUNK):
+    Returns
+    -------
+    rows, columns : (R,), (C,) int64
+        Codes of the reference and of the prediction, ascending.
+    counts : (R, C) int64
+    """
+    codes, positions = [], []
+    for what, labels in (("reference", reference), ("prediction", predicted)):
+        there = np.zeros(MAX_CODE + 1, bool)
+        there[labels] = True
+        codes.append(np.flatnonzero(there))
+        positions.append(np.cumsum(there) - 1)
+        if len(codes[-1]) > MAX_CLASSES:
+            raise StageError(
+                f"the {what} has more different values than a class dimension has",
+                found=f"{len(codes[-1]):,} values",
+                cure="Check which dimension is compared",
+            )
+    (rows, columns), (row_of, column_of) = codes, positions
+    counts = np.zeros(len(rows) * len(columns), np.int64)
+    for start in range(0, len(reference), CHUNK):
         part = slice(start, start + CHUNK)
-        chosen = codes[part] if where is None else codes[part][where(part)]
-        found = np.bincount(chosen)
-        counts[: len(found)] += found
-    merged = np.zeros(MAX_CODE + 1, np.int64)
-    np.add.at(merged, to, counts)
-    return {int(code): int(merged[code]) for code in np.flatnonzero(merged)}
+        pairs = row_of[reference[part]] * len(columns) + column_of[predicted[part]]
+        counts += np.bincount(pairs, minlength=len(counts))
+    return rows, columns, counts.reshape(len(rows), len(columns))
 
 
-def mask(reference: npt.NDArray[Any], to: npt.NDArray[np.int64], rows: Sequence[int]) -> Callable:
-    """A function: which points of a slice have a compared reference class."""
-    wanted = np.zeros(MAX_CODE + 1, bool)
-    wanted[list(rows)] = True
-    wanted = wanted[to]
-    return lambda part: wanted[reference[part]]
-
-
-def lookup(codes: Sequence[int], to: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Code to position in `codes` after merging, -1 for the others."""
-    place = np.full(MAX_CODE + 1, -1, np.int64)
-    place[list(codes)] = np.arange(len(codes))
-    return place[to]
-
-
-def placed(
-    matrix: npt.NDArray[np.int64],
-    row_codes: Sequence[int],
-    column_codes: Sequence[int],
+def regroup(
+    counts: npt.NDArray[np.int64],
+    row_classes: Iterable[int],
+    column_classes: Iterable[int],
     rows: Sequence[int],
     columns: Sequence[int],
 ) -> npt.NDArray[np.int64]:
-    """The matrix moved onto other (or merged) rows and columns."""
+    """Counts with the rows and columns of one class added up.
+
+    Parameters
+    ----------
+    counts : (R, C) int64
+    row_classes, column_classes : R and C codes
+        The class that each row and column of `counts` belongs to.
+    rows, columns : sequence of int
+        Classes of the new matrix; those of other rows and columns of `counts` are among them.
+
+    Returns
+    -------
+    (len(rows), len(columns)) int64
+    """
     out = np.zeros((len(rows), len(columns)), np.int64)
-    i = np.array([rows.index(int(c)) for c in row_codes], dtype=int)
-    j = np.array([columns.index(int(c)) for c in column_codes], dtype=int)
-    np.add.at(out, (i[:, None], j[None, :]), matrix)
+    i = np.array([rows.index(int(c)) for c in row_classes], dtype=int)
+    j = np.array([columns.index(int(c)) for c in column_classes], dtype=int)
+    np.add.at(out, (i[:, None], j[None, :]), counts)
     return out
-
-
-def named(codes: Iterable[int], given: Mapping[int, str]) -> dict[int, str]:
-    return {code: given.get(code) or class_name(code) for code in sorted(set(codes))}
-
-
-def listing(found: Mapping[int, int]) -> str:
-    return ", ".join(f"{code}: {n:,}" for code, n in sorted(found.items())[:12]) + (
-        ", ..." if len(found) > 12 else ""
-    )

@@ -25,25 +25,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..base.asprs import class_name
-from ..base.errors import StageError
+from ..base.asprs import UNINFORMATIVE, class_name
+from ..base.errors import OptionError, StageError, suggest
 from .confidence import Grading
-from .labels import (
-    CHUNK,
-    MAX_CLASSES,
-    as_codes,
-    code_list,
-    int_keys,
-    listing,
-    lookup,
-    mask,
-    merging,
-    moved,
-    named,
-    placed,
-    present,
-    same_length,
-)
+from .labels import CHUNK, Merge, as_codes, class_names, code_list, pair_counts, regroup, same_length
+from .text import CONFUSIONS, table
 
 FORMAT = "pdal-stages accuracy"
 VERSION = 1
@@ -97,7 +83,7 @@ class Accuracy:
         Points; rows are the reference, columns the prediction.
     names : mapping of code to name
     left_out : mapping of code to count
-        Reference points that were not compared, by their reference class.
+        Reference points that were not compared, by their reference class before any merge.
     merged : mapping of code to code
         Classes that were taken as another one on both sides.
     reliability, margin : Grading or None
@@ -122,7 +108,7 @@ class Accuracy:
         predicted: npt.ArrayLike,
         classes: Iterable[int] | None = None,
         names: Mapping[int, str] | None = None,
-        ignore: Iterable[int] = (),
+        ignore: Iterable[int] | None = None,
         reliability: npt.ArrayLike | None = None,
         margin: npt.ArrayLike | None = None,
         merge: Mapping[Any, Any] | None = None,
@@ -135,74 +121,72 @@ class Accuracy:
         reference, predicted : (n,) arrays
             Class codes, whole numbers from 0 to 65535.
         classes : iterable of int, optional
-            Classes of the reference to compare; reference points of any other class are left out and
-            counted. By default every class found in the reference.
+            Classes of the reference to compare, after merging; points of any other class are left out and counted.
+            By default every class found.
         names : mapping, optional
             Code to name, where it is not ASPRS's own.
-        ignore : iterable of int
-            Reference classes to leave out and count (0 and 1, say).
+        ignore : iterable of int, optional
+            Reference codes, before merging, whose points are left out and counted. By default those that training
+            leaves out as well: 0 and 1 (unclassified), 7 and 18 (noise) and 12 (overlap); none where `classes` is
+            given.
         reliability, margin : (n,) arrays, optional
             Winning probability, and winning minus second, both from 0 to 1.
         merge : mapping, optional
-            Classes to take as one, on both sides and before `classes` and `ignore` are looked at:
-            ``{5: [3, 4]}`` or ``{3: 5, 4: 5}``.
+            Classes to take as one, on both sides: ``{5: [3, 4]}`` or ``{3: 5, 4: 5}``.
         allow_empty : bool
             Whether no point to compare is allowed (a tile without reference points, to be added to others).
 
         Raises
         ------
         StageError
-            Arrays of different lengths, labels that are no class codes, or nothing left to compare.
+            Arrays of different lengths, labels that are not class codes, or nothing left to compare.
         """
         ref, pred = as_codes(reference, "reference"), as_codes(predicted, "prediction")
-        same_length(ref, {"prediction": pred})
-        confidences: dict[str, npt.NDArray[Any]] = {}
-        for key, values in (("reliability", reliability), ("margin", margin)):
-            if values is not None:
-                confidences[key] = np.asarray(values).reshape(-1)
-        same_length(ref, confidences)
+        given = {"reliability": reliability, "margin": margin}
+        confidences = {key: np.asarray(v).reshape(-1) for key, v in given.items() if v is not None}
+        same_length(ref, {"prediction": pred, **confidences})
 
-        to, called = merging(merge)
-        found = present(ref, to)
-        dropped = set(code_list(ignore, "ignore"))
-        wanted = set(code_list(classes, "classes")) if classes is not None else set(found)
-        rows = tuple(sorted(wanted - dropped))
-        left = {code: n for code, n in found.items() if code not in rows}
-        if not allow_empty and sum(found.values()) == sum(left.values()):
+        merged = Merge.parse(merge)
+        found, found_predicted, counts = pair_counts(ref, pred)
+        if ignore is None:
+            ignore = UNINFORMATIVE if classes is None else ()
+        kept = ~np.isin(found, code_list(ignore, "ignore"))
+        if classes is None:
+            rows = tuple(np.unique(merged.to[found[kept]]).tolist())
+        else:
+            rows = tuple(sorted(set(code_list(classes, "classes"))))
+            kept &= np.isin(merged.to[found], rows)
+        points = dict(zip(found.tolist(), counts.sum(axis=1).tolist(), strict=True))
+        left = {code: points[code] for code in found[~kept].tolist()}
+        if not allow_empty and not kept.any():
+            listed = ", ".join(f"{code}: {n:,}" for code, n in list(points.items())[:12])
             raise StageError(
                 "no point to compare: every reference point is left out" if left else "no point to compare",
-                found=f"reference classes {listing(found)}" if found else "0 points",
+                found=f"reference classes {listed}{', ...' * (len(points) > 12)}" if points else "0 points",
                 cure="Name classes the reference has, or ignore fewer" if left else None,
             )
-        columns = rows + tuple(sorted(set(present(pred, to, where=mask(ref, to, rows))) - set(rows)))
-        for what, listed in (("reference", rows), ("prediction", columns)):
-            if len(listed) > MAX_CLASSES:
-                raise StageError(
-                    f"the {what} has more different values than a class dimension has",
-                    found=f"{len(listed):,} values",
-                    cure="Check which dimension is compared",
-                )
+        counts = counts[kept]
+        given_classes = merged.to[found_predicted[counts.any(axis=0)]]
+        columns = rows + tuple(sorted(set(given_classes.tolist()) - set(rows)))
+        counts = counts[:, counts.any(axis=0)]
 
-        row_of, column_of = lookup(rows, to), lookup(columns, to)
-        matrix = np.zeros((len(rows), len(columns)), np.int64)
+        compared = np.isin(np.arange(len(merged.to)), found[kept])
         graded = {key: Grading.empty() for key in confidences}
-        for start in range(0, len(ref), CHUNK):
+        for start in range(0, len(ref) if graded else 0, CHUNK):
             part = slice(start, start + CHUNK)
-            i = row_of[ref[part]]
-            kept = i >= 0
-            i, j = i[kept], column_of[pred[part]][kept]
-            matrix += np.bincount(i * len(columns) + j, minlength=matrix.size).reshape(matrix.shape)
+            chosen = compared[ref[part]]
+            right = merged.to[ref[part][chosen]] == merged.to[pred[part][chosen]]
             for key, values in confidences.items():
-                graded[key] += Grading.from_values(values[part][kept], i == j, key)
+                graded[key] += Grading.from_values(values[part][chosen], right, key)
         return cls(
             rows,
             columns[len(rows) :],
-            matrix,
-            named(columns + tuple(left), {**called, **int_keys(names)}),
+            regroup(counts, merged.to[found[kept]], given_classes, rows, columns),
+            class_names((*columns, *left), {**merged.names, **(names or {})}),
             left,
             graded.get("reliability"),
             graded.get("margin"),
-            moved(to),
+            merged.changed,
         )
 
     @classmethod
@@ -240,9 +224,7 @@ class Accuracy:
         whole = whole[order][:, np.concatenate([order, tail]).astype(int)]
         left = {int(c): int(n) for c, n in (left_out or {}).items()}
         codes = tuple(sorted(rows)) + tuple(sorted(more))
-        return cls(
-            codes[: len(rows)], codes[len(rows) :], whole, named(codes + tuple(left), int_keys(names)), left
-        )
+        return cls(codes[: len(rows)], codes[len(rows) :], whole, class_names((*codes, *left), names), left)
 
     def merge(self, mapping: Mapping[Any, Any], names: Mapping[int, str] | None = None) -> Accuracy:
         """The accuracy with some classes taken as one: ``{5: [3, 4]}`` or ``{3: 5, 4: 5}``.
@@ -250,28 +232,36 @@ class Accuracy:
         Confusions inside a merged class become right, so the gradings of reliability and margin, which
         do not know them, are dropped; use `merge` of :meth:`from_labels` to keep them.
         """
-        to, called = merging(mapping)
-        rows = tuple(sorted({int(to[c]) for c in self.classes}))
-        columns = rows + tuple(sorted({int(to[c]) for c in self.columns} - set(rows)))
-        left: dict[int, int] = {}
-        for code, n in self.left_out.items():
-            left[int(to[code])] = left.get(int(to[code]), 0) + n
-        clash = sorted(set(left) & set(rows))
-        if clash:
-            raise StageError(
-                "merging joins a compared class with one that was left out",
-                found=f"class {clash[0]}",
-                cure="Compare the labels again with this merge",
-            )
-        known = {c: n for c, n in self.names.items() if int(to[c]) == c}
+        merged = Merge.parse(mapping)
+        rows = tuple(sorted({int(merged.to[c]) for c in self.classes}))
+        columns = rows + tuple(sorted({int(merged.to[c]) for c in self.columns} - set(rows)))
+        self._refuse_clash(
+            [int(merged.to[c]) for c in self.left_out],
+            rows,
+            "merging joins a compared class with one that was left out",
+            "Compare the labels again with this merge",
+        )
+        known = {c: n for c, n in self.names.items() if int(merged.to[c]) == c}
+        counts = regroup(
+            self.matrix, merged.to[list(self.classes)], merged.to[list(self.columns)], rows, columns
+        )
         return Accuracy(
             rows,
             columns[len(rows) :],
-            placed(self.matrix, [to[c] for c in self.classes], [to[c] for c in self.columns], rows, columns),
-            named(columns + tuple(left), {**known, **called, **int_keys(names)}),
-            left,
-            merged={**{c: int(to[t]) for c, t in self.merged.items()}, **moved(to)},
+            counts,
+            class_names((*columns, *self.left_out), {**known, **merged.names, **(names or {})}),
+            self.left_out,
+            merged={**{c: int(merged.to[t]) for c, t in self.merged.items()}, **merged.changed},
         )
+
+    def _refuse_clash(self, left: Iterable[int], rows: Iterable[int], what: str, cure: str) -> None:
+        """Refuse classes that are compared in one part and left out in another.
+
+        A code that others were merged into may be both: its own points left out, theirs compared.
+        """
+        clash = sorted(set(left) & set(rows) - set(self.merged.values()))
+        if clash:
+            raise StageError(what, found=f"class {clash[0]}", cure=cure)
 
     def __add__(self, other: Accuracy) -> Accuracy:
         if not isinstance(other, Accuracy):
@@ -282,13 +272,12 @@ class Accuracy:
             c: self.left_out.get(c, 0) + other.left_out.get(c, 0)
             for c in sorted(set(self.left_out) | set(other.left_out))
         }
-        clash = sorted(set(left) & set(rows))
-        if clash:
-            raise StageError(
-                "two accuracies do not add: one compares a class that the other leaves out",
-                found=f"class {clash[0]}",
-                cure="Compare both with the same 'classes' and 'ignore'",
-            )
+        self._refuse_clash(
+            left,
+            rows,
+            "two accuracies do not add: one compares a class that the other leaves out",
+            "Compare both with the same 'classes' and 'ignore'",
+        )
         if self.merged != other.merged and self.points and other.points:
             raise StageError(
                 "two accuracies do not add: they merge different classes",
@@ -309,8 +298,8 @@ class Accuracy:
         return Accuracy(
             rows,
             columns[len(rows) :],
-            placed(self.matrix, self.classes, self.columns, rows, columns)
-            + placed(other.matrix, other.classes, other.columns, rows, columns),
+            regroup(self.matrix, self.classes, self.columns, rows, columns)
+            + regroup(other.matrix, other.classes, other.columns, rows, columns),
             {**other.names, **self.names},
             left,
             graded["reliability"],
@@ -484,9 +473,45 @@ class Accuracy:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as JSON types; ``accuracy-1.json`` describes it."""
-        from .text import as_dict
 
-        return as_dict(self)
+        def described(codes: Iterable[int]) -> list[dict[str, Any]]:
+            return [{"code": c, "name": self.name(c)} for c in codes]
+
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "points": self.points,
+            "correct": self.correct,
+            "left_out": {
+                "points": self.left_out_points,
+                "by_class": {str(c): n for c, n in self.left_out.items()},
+            },
+            "merged": {str(c): t for c, t in sorted(self.merged.items())},
+            "predicted_outside_reference": {
+                "points": self.extra_points,
+                "classes": described(self.extra),
+            },
+            "overall_accuracy": self.overall_accuracy,
+            "overall_accuracy_interval": list(self.overall_accuracy_interval),
+            "kappa": self.kappa,
+            "mean_class_recall": self.mean_class_recall,
+            "mean_class_precision": self.mean_class_precision,
+            "mean_f1": self.mean_f1,
+            "mean_iou": self.mean_iou,
+            "classes": [
+                {key: list(value) if isinstance(value, tuple) else value for key, value in vars(f).items()}
+                for f in self.per_class
+            ],
+            "confusion": {
+                "rows": described(self.classes),
+                "columns": described(self.columns),
+                "counts": self.matrix.tolist(),
+                "by_reference": self.by_reference.tolist(),
+                "by_prediction": self.by_prediction.tolist(),
+            },
+            "reliability": self.reliability.to_dict("curve") if self.reliability else None,
+            "margin": self.margin.to_dict("deciles") if self.margin else None,
+        }
 
     def table(self, confusion: str = "by_reference") -> str:
         """The figures as aligned text, in percent.
@@ -496,6 +521,10 @@ class Accuracy:
         confusion : {"by_reference", "by_prediction", "counts", "none"}
             How the confusion matrix is given.
         """
-        from .text import as_table
-
-        return as_table(self, confusion)
+        if confusion not in CONFUSIONS:
+            raise OptionError(
+                "'confusion' is not a way to give the matrix",
+                found=confusion,
+                cure=suggest(confusion, CONFUSIONS) + f"Use one of {', '.join(CONFUSIONS)}",
+            )
+        return table(self.to_dict(), confusion, self.name)

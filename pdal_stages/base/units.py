@@ -163,3 +163,14 @@ def parse_wkt(text: str) -> WktNode | None:
                 stack.pop()
     top = stack[0].children
     return top[0] if top else None
+
+
+def name_of_wkt(wkt: str) -> str:
+    """The name of a spatial reference in well-known text, with its authority's code; empty where it has none."""
+    root = parse_wkt(wkt)
+    if root is None:
+        return ""
+    codes = [
+        ":".join(c.values[:2]) for c in root.children if c.keyword in ("AUTHORITY", "ID") and c.values[1:]
+    ]
+    return f"{root.name} ({codes[-1]})" if codes else root.name

@@ -11,12 +11,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..base.asprs import NAMES, NOISE, UNLABELLED, class_name
+from ..base.asprs import NAMES, UNINFORMATIVE, class_name
 from ..base.errors import OptionError, suggest
 
-#: Labels that are no class of their own unless `classes` names them: never classified, unclassified,
-#: noise, and 12, which before LAS 1.4 marked overlap of flight strips, not a kind of object.
-LEFT_OUT = (*UNLABELLED, *NOISE, 12)
 #: The largest code a point can carry.
 MAX_CODE = 255
 
@@ -71,7 +68,7 @@ class ClassMap:
         Parameters
         ----------
         spec : None, str, list of codes or mapping
-            None: every label found as it is, except those in :data:`LEFT_OUT`. A list: those labels
+            None: every label found as it is, except those in 0, 1, 7, 12 and 18. A list: those labels
             as they are. A mapping: labels (``"3,4,5"``, ``"3-5"``) to a code, an ASPRS name, a code with a
             name (``"5 Trees"``), ``{"code": 5, "name": "Trees"}``, or ``"drop"``. Labels not mentioned are
             dropped. Text is a comma-separated list, or JSON.
@@ -81,7 +78,7 @@ class ClassMap:
         if isinstance(spec, str):
             spec = _from_text(spec)
         if spec is None:
-            spec = [label for label in sorted(set(map(int, found))) if label not in LEFT_OUT]
+            spec = [label for label in sorted(set(map(int, found))) if label not in UNINFORMATIVE]
             if any(label > MAX_CODE for label in spec):
                 raise OptionError(
                     f"labels above {MAX_CODE} cannot be class codes",

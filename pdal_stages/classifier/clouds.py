@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from ..base.asprs import UNINFORMATIVE
 from ..base.errors import OptionError
-from .classes import LEFT_OUT, ClassMap, as_labels
+from .classes import ClassMap, as_labels
 from .trainoptions import TrainingOptions
 
 
@@ -81,7 +82,7 @@ def class_positions(
         raise OptionError(
             "a classifier needs at least two classes",
             found=f"labels {listing}",
-            cure=f"Labels {', '.join(map(str, LEFT_OUT))} are left out unless 'classes' names them",
+            cure=f"Labels {', '.join(map(str, UNINFORMATIVE))} are left out unless 'classes' names them",
         )
     positions = []
     for labels, mask in usable:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import glob
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,48 +45,130 @@ def train_pipeline(sources: Iterable[str], model: str, **options: Any) -> list[d
     return stages
 
 
-def accuracy_pipeline(source: str, dimension: str, reference: str, **outputs: str) -> list[dict[str, Any]]:
-    """Read, compare two dimensions."""
+def accuracy_pipeline(
+    sources: Sequence[str], dimension: str, reference: str, **outputs: str
+) -> list[dict[str, Any]]:
+    """Read files, folders or patterns, compare two dimensions."""
+    files = las_files(sources)
+    tags = ["input"] if len(files) == 1 else [f"input{i}" for i in range(1, len(files) + 1)]
     return [
-        _reader(source, "input"),
+        *map(_reader, files, tags),
         {"type": "filters.accuracy", "dimension": dimension, "reference": reference, **outputs},
     ]
 
 
-def attach_reference(
-    source: str,
-    reference: str,
+def compare_files(
+    sources: Sequence[str],
+    references: Sequence[str],
     dimension: str,
     reference_dimension: str,
     overrides: Iterable[Override] = (),
     **outputs: str,
 ) -> None:
-    """Compare two files that hold the same points in the same order.
+    """Compare files with others that hold the same points in the same order, in pairs of the same name.
+
+    Parameters
+    ----------
+    sources, references : sequence of str
+        Files, folders or patterns.
+    dimension, reference_dimension : str
+        The classes to judge in `sources`, and the true ones in `references`.
+    overrides : iterable of Override
+    **outputs
+        Options of ``filters.accuracy``.
 
     Raises
     ------
     StageError
-        If they do not hold the same points.
+        If a file has no partner, or two do not hold the same points.
     """
     from ..stages.accuracy import AccuracyStage
-    from . import pdal as pdal_env
     from .overrides import apply_overrides
-    from .run import Pipeline
 
-    (given,) = apply_overrides([{"type": AccuracyStage.type, **outputs}], overrides)
-    compared = {"dimension": "Classification", "reference": "Reference", "horizontal_unit": "m"}
-    stage = AccuracyStage({k: v for k, v in given.items() if k != "type"} | compared)
-    check_outputs(stage.outputs(), [source, reference, *stage_files(stage)])
-    both: list[Any] = []
-    for name in (source, reference):
-        pipeline = Pipeline([_reader(name, "input")])
-        pipeline.execute()
-        array: Any = np.concatenate(pipeline.arrays) if pipeline.arrays else np.empty(0)
-        both.append(array)
-        names = array.dtype.names or ()
-        if "Classification" in names and pdal_env.flags_inside_classification(names, pipeline.metadata):
-            array["Classification"] &= LEGACY_LIMIT
-    mine, true = both
+    pairs = paired(las_files(sources), las_files(references))
+    listed = {"files": [name for pair in pairs for name in pair]}
+    wanted: dict[str, Any] = {"type": AccuracyStage.type, **listed, **outputs}
+    (given,) = apply_overrides([wanted], overrides)
+    renamed = {"dimension": "Classification", "reference": "Reference"}
+    stage = AccuracyStage({k: v for k, v in {**given, **renamed}.items() if k != "type"})
+    check_outputs(stage.outputs(), [*listed["files"], *stage_files(stage)])
+    parts, wkt = [], ""
+    for source, reference in pairs:
+        (mine, wkt), (true, _) = _points_of(source, dimension), _points_of(reference, reference_dimension)
+        _refuse_other_points(mine, true, source, reference)
+        kept = [name for name in ("X", "Y", "Z", "Reliability", "Margin") if name in mine.dtype.fields]
+        part = {name: mine[name] for name in kept}
+        parts.append({**part, "Classification": mine[dimension], "Reference": true[reference_dimension]})
+    shared = [name for name in parts[0] if all(name in part for part in parts)]
+    arrays = {name: np.concatenate([part[name] for part in parts]) for name in shared}
+    stage.run(stage.points(arrays, wkt=wkt))
+
+
+def las_files(names: Sequence[str]) -> list[str]:
+    """The files that names, folders and patterns stand for, sorted within each."""
+    found: list[str] = []
+    for name in names:
+        if Path(name).is_dir():
+            inside = sorted(str(p) for p in Path(name).iterdir() if p.suffix.lower() in (".las", ".laz"))
+            if not inside:
+                raise StageError("the folder holds no LAS or LAZ files", found=name)
+            found += inside
+        elif not Path(name).exists() and (matches := sorted(glob.glob(name))):
+            found += matches
+        else:
+            found.append(name)
+    return found
+
+
+def paired(sources: Sequence[str], references: Sequence[str]) -> list[tuple[str, str]]:
+    """Files with their references: of the same name, or the longest name inside theirs (c_town: town).
+
+    Raises
+    ------
+    StageError
+        If a file has no reference, or shares it with another.
+    """
+    if len(sources) == len(references) == 1:
+        return [(sources[0], references[0])]
+    by_name = {Path(name).stem: name for name in references}
+    pairs: dict[str, str] = {}
+    for source in sources:
+        inside = [name for name in by_name if name in Path(source).stem]
+        if not inside:
+            raise StageError(
+                "a file has no reference of its name",
+                found=source,
+                cure=f"Name the references like the files they belong to, not {', '.join(list(by_name)[:5])}",
+            )
+        reference = by_name[max(inside, key=len)]
+        if reference in pairs:
+            raise StageError(
+                "two files have the same reference", found=f"{pairs[reference]} and {source}: {reference}"
+            )
+        pairs[reference] = source
+    return [(source, reference) for reference, source in pairs.items()]
+
+
+def _points_of(name: str, dimension: str) -> tuple[Any, str]:
+    """All points of a file with class codes freed of flag bits, and its spatial reference."""
+    from . import pdal as pdal_env
+    from .run import Pipeline
+    from .runtime import wkt_of
+
+    pipeline = Pipeline([_reader(name, "input")])
+    pipeline.execute()
+    array: Any = np.concatenate(pipeline.arrays) if pipeline.arrays else np.empty(0)
+    names = array.dtype.names or ()
+    if dimension not in names:
+        raise DimensionError(f"the dimension '{dimension}' is missing", where=name, found=", ".join(names))
+    if "Classification" in names and pdal_env.flags_inside_classification(names, pipeline.metadata):
+        array["Classification"] &= LEGACY_LIMIT
+    readers = [v for k, v in pipeline.metadata.get("metadata", {}).items() if k.startswith("readers.")]
+    node = readers[0] if readers else None
+    return array, wkt_of(node[0] if isinstance(node, list) else node)
+
+
+def _refuse_other_points(mine: np.ndarray, true: np.ndarray, source: str, reference: str) -> None:
     if len(mine) != len(true):
         raise StageError(
             "the two files do not hold the same points",
@@ -97,15 +180,9 @@ def attach_reference(
         if apart.size and apart.max() > 0.01:
             raise StageError(
                 "the two files do not hold the same points in the same order",
-                found=f"{int(np.count_nonzero(apart > 0.01)):,} points differ in {axis}",
+                found=f"{int(np.count_nonzero(apart > 0.01)):,} points of {source} and {reference} differ in {axis}",
                 cure="Keep the labels with filters.ferry while classifying instead",
             )
-    for array, name, file in ((mine, dimension, source), (true, reference_dimension, reference)):
-        if name not in (array.dtype.names or ()):
-            raise DimensionError(f"the dimension '{name}' is missing", where=file)
-    arrays = {name: np.ascontiguousarray(mine[name]) for name in mine.dtype.names}
-    arrays["Classification"], arrays["Reference"] = mine[dimension], true[reference_dimension]
-    stage.run(stage.points(arrays))
 
 
 def _reader(source: str, tag: str) -> dict[str, Any]:

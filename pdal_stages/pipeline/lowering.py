@@ -102,7 +102,8 @@ def lower(source: PipelineSource) -> Lowered:
                     stage["inputs"] = [merge["tag"]]
                 views.add(merge)
                 out.stages.append(merge)
-            lowered = lower_stage(stage, index, len(out.stages))
+            taken = registry.get(type_name).from_pipeline(stage, stages[:index])
+            lowered = lower_stage({**taken, **stage}, index, len(out.stages))
         except StageError as error:
             raise error.within(where) from None
         views.add(stage)

@@ -109,7 +109,7 @@ def points_of(stage: Stage, module: Mapping[str, Any], ins: Mapping[str, Any]) -
     """The points of a view, as a stage sees them, from what PDAL sets in a script's globals."""
     return stage.points(
         ins,
-        wkt=_wkt(module.get("spatialreference")),
+        wkt=wkt_of(module.get("spatialreference")),
         legacy_flags=pdal_env.flags_inside_classification(ins, module.get("metadata")),
     )
 
@@ -170,7 +170,7 @@ def _encodable(text: str) -> str:
     return text.encode("utf-8", "replace").decode().replace("\0", "?")
 
 
-def _wkt(reference: Any) -> str:
+def wkt_of(reference: Any) -> str:
     """The well-known text in PDAL's description of a spatial reference."""
     if isinstance(reference, dict):
         srs = reference.get("srs", reference)

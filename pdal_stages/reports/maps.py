@@ -18,7 +18,7 @@ from ..base.asprs import NOISE, class_color
 from ..base.errors import StageError
 from .pictures import png
 from .raster import Frame
-from .views import IGNORED, RIGHT, WRONG, error_view, nice_step, section_view, top_view
+from .views import IGNORED, RIGHT, WRONG, nice_step, section_view, top_view, verdict_view
 
 #: Most pixels across a map and in all of it, fewest along its longer side, and pixels across a section.
 MAP_WIDTH, MAP_PIXELS, MAP_LEAST = 820, 800_000, 240
@@ -137,8 +137,8 @@ class Scene:
             to[source] = target
         ref, pred = as_codes(reference, "reference"), as_codes(predicted, "prediction")
         same_length(ref, {"prediction": pred, "list of coordinates": points})
+        compared = np.isin(to[ref], a.classes) & ~np.isin(ref, list(a.left_out))
         ref, pred = to[ref], to[pred]
-        compared = np.isin(ref, a.classes)
         return cls(points, ref, pred, compared, compared & (ref != pred))
 
     @property
@@ -174,7 +174,6 @@ def draw_scene(a: Accuracy, scene: Scene, unit: str = "m", section: Line | None 
     width = _map_width(scene.xyz)
     frame = Frame.around(x, y, width)
     wide, tall = frame.pixel * frame.width, frame.pixel * frame.height
-    ignored = [int(c) for c in np.unique(scene.reference[~scene.compared])]
 
     def shown(codes: npt.NDArray[Any]) -> str:
         count = np.bincount(codes)
@@ -201,7 +200,7 @@ def draw_scene(a: Accuracy, scene: Scene, unit: str = "m", section: Line | None 
             **over,
         ),
         Picture.of(
-            error_view(x, y, z, scene.predicted, scene.reference, ignore=ignored, width=width),
+            verdict_view(x, y, z, scene.wrong, ~scene.compared, width=width),
             "Errors",
             f"Map of the errors from above: {wrong:,} of {n:,} compared points are wrong",
             **over,
@@ -219,7 +218,7 @@ def draw_scene(a: Accuracy, scene: Scene, unit: str = "m", section: Line | None 
         n,
         note,
         _keys(a, scene.codes()),
-        [(RIGHT, "right"), (WRONG, "wrong"), *([(IGNORED, "not compared")] if ignored else [])],
+        [(RIGHT, "right"), (WRONG, "wrong"), *([(IGNORED, "not compared")] if n < len(x) else [])],
         maps,
         wide < 1.7 * tall,
         None if line is None else draw_section(a, scene, unit, line, depth, chosen=section is None),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 
@@ -134,10 +133,11 @@ def triptych(
     if truth is not None:
         _, truth = checked_columns(x, truth, names=("x", "truth"))
         truth = class_codes(truth)
-        images.append(paint(s, verdict(s, x, y, z, predicted, truth, ignore), light))
-        scored = ~np.isin(truth, list(ignore))
-        wrong = float((predicted[scored] != truth[scored]).mean()) if scored.any() else math.nan
-        texts.append(f"Errors: {100 * wrong:.1f} % of {int(scored.sum()):,} points")
+        left_out = np.isin(truth, list(ignore))
+        wrong = (predicted != truth) & ~left_out
+        images.append(paint(s, verdict(s, x, y, z, wrong, left_out), light))
+        scored = len(x) - int(left_out.sum())
+        texts.append(f"Errors: {100 * wrong.sum() / max(scored, 1):.1f} % of {scored:,} points")
         extra = [("right", RIGHT), ("wrong", WRONG)]
     if captions is not None:
         if len(captions) != panels:

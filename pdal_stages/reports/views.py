@@ -169,17 +169,21 @@ def error_view(x, y, z, predicted, truth, *, ignore: Sequence[int] = (), width: 
     x, y, z, predicted, truth = checked_columns(
         x, y, z, predicted, truth, names=("x", "y", "z", "predicted", "truth")
     )
+    left_out = np.isin(truth, list(ignore))
+    wrong = class_codes(predicted) != class_codes(truth)
+    return verdict_view(x, y, z, wrong & ~left_out, left_out, width=width)
+
+
+def verdict_view(x, y, z, wrong, left_out, *, width: int = 900) -> np.ndarray:
+    """As :func:`error_view`, from (n,) bool masks of the wrong points and of those that are not compared."""
     s = window(x, y, z, width)
-    shown = verdict(s, x, y, z, class_codes(predicted), class_codes(truth), ignore)
-    return paint(s, shown, shading(s))
+    return paint(s, verdict(s, x, y, z, wrong, left_out), shading(s))
 
 
-def verdict(s: Surface, x, y, z, predicted, truth, ignore) -> np.ndarray:
-    skip = np.isin(truth, list(ignore))
-    wrong = (predicted != truth) & ~skip
-    shown = np.array([RIGHT, WRONG, IGNORED], dtype=np.uint8)[
-        s.spread(np.where(skip, 2, wrong).astype(np.int64), 0)
-    ]
+def verdict(s: Surface, x, y, z, wrong: np.ndarray, left_out: np.ndarray) -> np.ndarray:
+    """Colours of the pixels of a surface, (height, width, 3) uint8: right, wrong or left out."""
+    kinds = s.spread(np.where(left_out, 2, wrong).astype(np.int64), 0)
+    shown = np.array([RIGHT, WRONG, IGNORED], dtype=np.uint8)[kinds]
     if wrong.any():
         f = s.frame
         good = wrong & np.isfinite(x) & np.isfinite(y) & np.isfinite(z)

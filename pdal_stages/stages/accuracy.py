@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..accuracy.labels import code_list, merging
+from ..accuracy.labels import Merge
 from ..accuracy.measures import Accuracy
 from ..base import kinds
+from ..base.asprs import UNINFORMATIVE
 from ..base.errors import StageError
 from ..base.files import check_writable, write_whole
 from ..base.outputs import Output
+from ..base.units import name_of_wkt
 from .base import Stage
-from .modelclassifier import loaded_model
+from .modelclassifier import ModelClassifier, loaded_model
 from .options import option
 from .points import Points
-
-#: Options that the report lists.
-_SHOWN = ("dimension", "reference", "classes", "ignore", "merge", "where")
 
 
 class AccuracyStage(Stage):
@@ -34,26 +34,46 @@ class AccuracyStage(Stage):
     where_help = "Only points inside are compared."
     dimension: str = option("string", "Classification", "The classes to judge")
     reference: str = option("string", "Reference", "The true classes, e.g. kept with filters.ferry")
-    classes: list = option("list", (), "Reference codes to compare; default: every one found")
-    ignore: list = option(
-        "list",
-        (0, 1),
-        "Reference codes left out (and counted); where 'classes' is given, only those left out by it",
+    classes: list[int] = option(
+        "codes",
+        (),
+        "Reference classes to compare, after merging; default: those of the model, or else every one found",
+    )
+    ignore: list[int] | None = option(
+        "codes",
+        None,
+        "Reference codes, before merging, left out and counted; default: "
+        f"{', '.join(map(str, UNINFORMATIVE))}, or, where 'classes' or a model says what counts, none",
         may_be_empty=True,
     )
-    merge: dict | None = option("mapping", None, 'Classes taken as one on both sides: {"5": [3, 4]}')
+    merge: dict | None = option(
+        "mapping",
+        None,
+        'Classes taken as one on both sides, {"5": [3, 4]}; default: as the model was trained',
+    )
     json: str | None = option("filename", None, "Write the figures to this JSON file")
     html: str | None = option("filename", None, "Write a report with maps to this HTML file")
     title: str = option("string", "Classification accuracy", "Heading of the report")
     model_file: str | None = option(
-        "filename", None, "Model file whose importances the report shows", name="model"
+        "filename",
+        None,
+        "Model file whose classes are scored and whose importances the report shows; default: that of the "
+        "filters.modelclassifier before",
+        name="model",
     )
-    print_table: bool = option("boolean", True, "Print the table on standard error", name="print")
+    files: list[str] = option("list", (), "Files that the report names; default: those of the readers")
+    print_table: bool = option("boolean", True, "Print the table on standard output", name="print")
     details = """
 Prints the table of overall accuracy, kappa, mean class recall and precision, mean F1 and the figures of each class
-on standard error; `json` and `html` write them to files. Keep the labels before classifying with
+on standard output; `json` and `html` write them to files. Keep the labels before classifying with
 `{"type": "filters.ferry", "dimensions": "Classification=>Reference"}`. Dimensions `Reliability` and `Margin`, where
 present, add a reliability curve and the error by margin.
+
+What is scored follows one rule, the one that training follows. With a model, its classes are scored, each made of the
+labels that it was trained on: a model of vegetation from 3, 4 and 5 counts all three as vegetation, and a binary
+model everything else that it was trained on as background. Without one, every class of the reference is scored but 0
+and 1 (unclassified), 7 and 18 (noise) and 12 (overlap), which do not say what a point is. All other points are left
+out and counted. `classes`, `ignore` and `merge` overrule this.
 """
     before = (
         {"type": "filters.ferry", "dimensions": "Classification=>Reference"},
@@ -68,10 +88,17 @@ present, add a reliability curve and the error by margin.
         "html": "accuracy.html",
     }
 
+    @classmethod
+    def from_pipeline(cls, given: Mapping[str, Any], before: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        readers = [s for s in before if str(s.get("type") or "readers.").startswith("readers.")]
+        taken: dict[str, Any] = {"files": [str(s["filename"]) for s in readers if "filename" in s]}
+        models = [s["model"] for s in before if s.get("type") == ModelClassifier.type and "model" in s]
+        if models and given.get("dimension", "Classification") == "Classification":
+            taken["model"] = models[-1]
+        return taken
+
     def check(self) -> None:
-        for name in ("classes", "ignore"):
-            code_list(_codes(self.options[name]), name)
-        merging(self.merge)
+        Merge.parse(self.merge)
         for output in self.outputs():
             check_writable(output.path, output.what, output.kind)
         if self.model_file:
@@ -84,6 +111,30 @@ present, add a reliability curve and the error by margin.
     def reads(self) -> list[str]:
         return [self.dimension, self.reference]
 
+    def scored(self) -> dict[str, Any]:
+        """What is compared: `classes`, `ignore`, `merge` and `names` of :meth:`Accuracy.from_labels`."""
+        rule: dict[str, Any] = {
+            "classes": self.classes or None,
+            "ignore": self.ignore,
+            "merge": self.merge,
+            "names": None,
+        }
+        if not self.model_file:
+            return rule
+        trained = loaded_model(self.model_file).info["classes"]
+        rule["names"] = {c["code"]: c["name"] for c in trained}
+        if self.classes:
+            return rule
+        if self.merge is None:
+            rule["merge"] = {c["code"]: c["labels"] for c in trained}
+        merged = Merge.parse(rule["merge"])
+        rule["classes"] = sorted({int(merged.to[c["code"]]) for c in trained})
+        if self.ignore is None:
+            # A class's code need not be one of its labels: 1 is the background, or unclassified.
+            labels = {label for c in trained for label in c["labels"]}
+            rule["ignore"] = [c["code"] for c in trained if c["code"] not in labels]
+        return rule
+
     def run(self, points: Points) -> dict[str, NDArray]:
         if points.count == 0:
             raise StageError(
@@ -93,26 +144,19 @@ present, add a reliability curve and the error by margin.
         inside = slice(None) if points.mask is None else points.mask
         reference = points.codes_of(self.reference)[inside]
         predicted = points.codes_of(self.dimension)[inside]
-        graded = {
+        confidence: dict[str, Any] = {
             name.lower(): np.asarray(points.arrays[name])[inside]
             for name in ("Reliability", "Margin")
             if name in points.arrays
         }
-        accuracy = Accuracy.from_labels(
-            reference,
-            predicted,
-            classes=_codes(self.classes) or None,
-            ignore=[] if self.classes else _codes(self.ignore),
-            merge=self.merge,
-            reliability=graded.get("reliability"),
-            margin=graded.get("margin"),
-        )
+        rule = self.scored()
+        accuracy = Accuracy.from_labels(reference, predicted, **rule, **confidence)
         if self.print_table:
-            print(accuracy.table(), file=sys.__stderr__ or sys.stderr)
+            print(accuracy.table(), file=sys.__stdout__ or sys.stdout)
         if self.json:
             write_whole(self.json, (json.dumps(accuracy.to_dict(), indent=1) + "\n").encode())
         if self.html:
-            self._write_page(self.html, accuracy, points.xyz[inside], reference, predicted)
+            self._write_page(self.html, points, accuracy, rule, points.xyz[inside], reference, predicted)
         points.report.update(
             {
                 "compared": accuracy.points,
@@ -127,15 +171,28 @@ present, add a reliability curve and the error by margin.
         return {}
 
     def _write_page(
-        self, path: str, accuracy: Accuracy, xyz: NDArray, reference: NDArray, predicted: NDArray
+        self,
+        path: str,
+        points: Points,
+        accuracy: Accuracy,
+        rule: Mapping[str, Any],
+        xyz: NDArray,
+        reference: NDArray,
+        predicted: NDArray,
     ) -> None:
         from ..reports.accuracypage import write_accuracy_report
 
-        settings: dict[str, Any] = {k: v for k, v in self.options.items() if k in _SHOWN}
+        about = {
+            "files": self.files,
+            "reference system": name_of_wkt(points.wkt) or "none given",
+            "model": self.model_file,
+        }
+        how = {k: self.options[k] for k in ("dimension", "reference", "where") if self.options[k]}
+        how |= {k: v for k in ("classes", "ignore", "merge") if (v := rule[k]) is not None}
+        model = loaded_model(self.model_file) if self.model_file else None
         importances = None
-        if self.model_file:
-            importances = loaded_model(self.model_file).importances("column")
-            settings["model"] = self.model_file
+        if model is not None and model.info["passes"][-1]["importances"] is not None:  # networks have none
+            importances = model.importances("column")
         write_accuracy_report(
             path,
             accuracy,
@@ -143,11 +200,9 @@ present, add a reliability curve and the error by margin.
             reference=reference,
             predicted=predicted,
             title=self.title,
+            subtitle="; ".join(
+                str(v) for v in (*self.files[:3], about["reference system"], self.model_file) if v
+            ),
             importances=importances,
-            settings=settings,
+            settings={**about, **how},
         )
-
-
-def _codes(given: list) -> list:
-    """Numbers for text that holds whole numbers; what else there is, is refused where codes are checked."""
-    return [int(text) if (text := str(v).strip()).lstrip("-").isdigit() else v for v in given]

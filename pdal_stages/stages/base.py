@@ -147,6 +147,19 @@ class Stage(ABC):
         """
         return 0.0
 
+    @classmethod
+    def from_pipeline(cls, given: Mapping[str, Any], before: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """Options that the stage takes from the pipeline where they are not given.
+
+        Parameters
+        ----------
+        given : mapping
+            The stage's own options, as given.
+        before : sequence of mapping
+            The stages before it.
+        """
+        return {}
+
     def points(self, arrays: Mapping[str, NDArray], *, wkt: str = "", legacy_flags: bool = False) -> Points:
         """PDAL's arrays as this stage sees them: with its `where` and its units."""
         units = (self.horizontal_unit, self.vertical_unit)
