@@ -295,7 +295,7 @@ def test_where_no_torch_is_training_says_what_to_install(monkeypatch):
 @pytest.mark.parametrize(
     "values, text",
     [
-        ({"algorithm": "alsnett"}, "not known"),
+        ({"algorithm": "alsnett"}, "must be one of"),
         ({"alsnet": {"epochs": 3}}, "only with algorithm"),
         ({"algorithm": "alsnet", "alsnet": {"epoch": 3}}, "Did you mean 'epochs'"),
         ({"algorithm": "alsnet", "alsnet": {"epochs": 0}}, "epochs"),

@@ -104,7 +104,7 @@ def test_not_finite_coordinates_stay_apart():
 
 
 def test_sizes_and_shapes_are_checked():
-    with pytest.raises(OptionError, match="'cell' must be a positive length"):
+    with pytest.raises(OptionError, match="'cell' must be a number above 0"):
         hag_minima([0.0], [0.0], [0.0], cell=0)
     with pytest.raises(OptionError, match="'resolution' must not be larger"):
         hag_minima([0.0], [0.0], [0.0], cell=1, resolution=2)

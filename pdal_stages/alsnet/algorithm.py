@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from ..base import checks
 from ..base.errors import ModelError, OptionError, StageError
 from ..base.threads import map_blocks, resolve_threads
 from ..classifier.algorithms import Answer, Block, Column, Question
@@ -340,7 +341,7 @@ def _mapping(value: Any) -> Mapping[str, Any]:
 
 
 def _finite(value: Any, name: str, low: float, high: float) -> float:
-    good = isinstance(value, int | float) and not isinstance(value, bool)
-    if not good or not low <= value <= high:
-        raise ModelError(f"the network's '{name}' must be from {low:g} to {high:g}", found=repr(value)[:60])
-    return float(value)
+    try:
+        return checks.number(f"the network's '{name}'", value, low, high)
+    except OptionError as error:
+        raise ModelError(error.what, found=error.found) from None

@@ -7,11 +7,11 @@ perceptron that describes the ball, and the widths of the one that carries featu
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from ..base import checks
 from ..base.errors import OptionError, suggest
 
 #: A configuration's largest number of shared layers: a model file holds 63 arrays.
@@ -67,17 +67,17 @@ class Configuration:
 
     def __post_init__(self) -> None:
         _name(self.name)
-        _whole("points", self.points, 16, 10**7)
+        checks.whole("'points'", self.points, 16, 10**7)
         if not 1 <= len(self.levels) <= 8:
             raise OptionError("a network must have 1 to 8 levels", found=len(self.levels))
         for number, level in enumerate(self.levels, 1):
-            _whole(f"levels/{number}/centres", level.centres, 1, 10**7)
-            _whole(f"levels/{number}/samples", level.samples, 1, 1024)
-            _number(f"levels/{number}/radius", level.radius, 1e-3, 1e4)
+            checks.whole(f"'levels/{number}/centres'", level.centres, 1, 10**7)
+            checks.whole(f"'levels/{number}/samples'", level.samples, 1, 1024)
+            checks.number(f"'levels/{number}/radius'", level.radius, 1e-3, 1e4)
             _widths(f"levels/{number}/mlp", level.mlp)
             _widths(f"levels/{number}/up", level.up)
         _widths("head", self.head)
-        _number("dropout", self.dropout, 0.0, 0.95)
+        checks.number("'dropout'", self.dropout, 0.0, 0.95)
         if self.layers > MAX_LAYERS:
             raise OptionError(f"a network may have {MAX_LAYERS} layers", found=self.layers)
 
@@ -189,7 +189,7 @@ def parse_configuration(
         made = _from_mapping(given)
     else:
         raise OptionError("a network configuration must be a name or a mapping", found=repr(given)[:60])
-    return made if points is None else replace(made, points=_whole("points", points, 16, 10**7))
+    return made if points is None else replace(made, points=checks.whole("'points'", points, 16, 10**7))
 
 
 def _from_mapping(given: Mapping[str, Any]) -> Configuration:
@@ -209,19 +209,19 @@ def _from_mapping(given: Mapping[str, Any]) -> Configuration:
         _only(level, keys, keys, "a level")
         levels.append(
             Level(
-                _whole("centres", level["centres"], 1, 10**7),
-                _number("radius", level["radius"], 1e-3, 1e4),
-                _whole("samples", level["samples"], 1, 1024),
+                checks.whole("'centres'", level["centres"], 1, 10**7),
+                checks.number("'radius'", level["radius"], 1e-3, 1e4),
+                checks.whole("'samples'", level["samples"], 1, 1024),
                 _widths("mlp", level["mlp"]),
                 _widths("up", level["up"]),
             )
         )
     return Configuration(
         _name(given.get("name", "own")),
-        _whole("points", given["points"], 16, 10**7),
+        checks.whole("'points'", given["points"], 16, 10**7),
         tuple(levels),
         _widths("head", given.get("head", (128,))),
-        _number("dropout", given.get("dropout", 0.5), 0.0, 0.95),
+        checks.number("'dropout'", given.get("dropout", 0.5), 0.0, 0.95),
     )
 
 
@@ -240,24 +240,10 @@ def _name(value: Any) -> str:
     return value
 
 
-def _whole(name: str, value: Any, low: int, high: int) -> int:
-    good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    if not good or int(value) != value or not low <= value <= high:
-        raise OptionError(f"'{name}' must be a whole number from {low} to {high}", found=repr(value)[:60])
-    return int(value)
-
-
-def _number(name: str, value: Any, low: float, high: float) -> float:
-    good = isinstance(value, int | float) and not isinstance(value, bool)
-    if not good or not low <= value <= high:
-        raise OptionError(f"'{name}' must be a number from {low:g} to {high:g}", found=repr(value)[:60])
-    return float(value)
-
-
 def _widths(name: str, value: Any) -> tuple[int, ...]:
     if not isinstance(value, list | tuple) or not 1 <= len(value) <= 8:
         raise OptionError(f"'{name}' must be a list of 1 to 8 widths", found=repr(value)[:60])
-    return tuple(_whole(name, width, 1, 4096) for width in value)
+    return tuple(checks.whole(f"'{name}'", width, 1, 4096) for width in value)
 
 
 def _levels(*rows) -> tuple[Level, ...]:

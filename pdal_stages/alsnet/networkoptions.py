@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
+from ..base import checks
 from ..base.errors import OptionError, suggest
-from .configuration import _number, _whole, parse_configuration
+from .configuration import parse_configuration
 
 CLASS_WEIGHTS = ("none", "sqrt", "balanced")
 DEVICES = ("auto", "cpu", "cuda")
@@ -83,29 +84,21 @@ class NetworkOptions:
     def __post_init__(self) -> None:
         set_ = object.__setattr__
         set_(self, "configuration", parse_configuration(self.configuration, self.points))
-        set_(self, "epochs", _whole("epochs", self.epochs, 1, 100_000))
-        set_(self, "batches_per_step", _whole("batches_per_step", self.batches_per_step, 1, 1024))
-        set_(self, "patience", _whole("patience", self.patience, 0, 100_000))
+        set_(self, "epochs", checks.whole("'epochs'", self.epochs, 1, 100_000))
+        set_(self, "batches_per_step", checks.whole("'batches_per_step'", self.batches_per_step, 1, 1024))
+        set_(self, "patience", checks.whole("'patience'", self.patience, 0, 100_000))
         limits = {
             "learning_rate": (1e-8, 10.0), "histogram_threshold": (0.0, 100.0), "shift": (0.0, 0.5),
             "jitter": (0.0, 10.0), "thin": (0.0, 0.95), "validation": (0.0, 0.5), "block_size": (0.1, 1e6),
         }  # fmt: skip
         for name, (low, high) in limits.items():
-            set_(self, name, _number(name, getattr(self, name), low, high))
+            set_(self, name, checks.number(f"'{name}'", getattr(self, name), low, high))
         if self.spacing is not None:
-            set_(self, "spacing", _number("spacing", self.spacing, 0.01, 1e5))
-        if not isinstance(self.rotate, bool):
-            raise OptionError("'rotate' must be true or false", found=repr(self.rotate))
-        for name, choices in (
-            ("class_weights", CLASS_WEIGHTS),
-            ("device", DEVICES),
-            ("coordinates", ("", "Z", "XYZ")),
-        ):
-            if getattr(self, name) not in choices:
-                raise OptionError(
-                    f"'{name}' must be one of {', '.join(map(repr, choices))}",
-                    found=repr(getattr(self, name)),
-                )
+            set_(self, "spacing", checks.number("'spacing'", self.spacing, 0.01, 1e5))
+        checks.flag("'rotate'", self.rotate)
+        checks.one_of("'class_weights'", self.class_weights, CLASS_WEIGHTS)
+        checks.one_of("'device'", self.device, DEVICES)
+        checks.one_of("'coordinates'", self.coordinates, ("", "Z", "XYZ"))
         for name in ("checkpoint", "start_from"):
             if getattr(self, name) is not None and not isinstance(getattr(self, name), str):
                 raise OptionError(f"'{name}' must be a file name", found=repr(getattr(self, name)))

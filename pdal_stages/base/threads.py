@@ -13,7 +13,7 @@ from functools import cache
 from threading import Event
 from typing import Any
 
-from .errors import OptionError
+from . import checks
 
 
 @cache
@@ -26,11 +26,9 @@ def available_threads() -> int:
 
 def resolve_threads(threads: int | None) -> int:
     """``None`` or 0: every core on offer; a positive number: that many."""
-    if threads is None or threads == 0:
+    if threads is None or (threads == 0 and not isinstance(threads, bool)):
         return available_threads()
-    if isinstance(threads, bool) or int(threads) != threads or threads < 0:
-        raise OptionError("'threads' must be a whole number of 0 (all cores) or more", found=threads)
-    return int(threads)
+    return checks.whole("'threads'", threads, 0)
 
 
 def map_blocks(

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..base.errors import OptionError
+from ..base import checks
 from .smoothing import checked_radius
 
 #: The class of a rejected point where its old class is not known: ASPRS "Unclassified".
@@ -46,10 +46,10 @@ class PredictionOptions:
     def __post_init__(self) -> None:
         object.__setattr__(self, "smooth", checked_radius(self.smooth))
         low, code = self.reject_below, self.rejected_code
-        if low is not None and (isinstance(low, bool) or not 0.0 <= low <= 1.0):
-            raise OptionError("'reject_below' must be a probability from 0 to 1", found=low)
-        if code is not None and (isinstance(code, bool) or not 0 <= code <= 255):
-            raise OptionError("'rejected_code' must be a class code from 0 to 255", found=code)
+        if low is not None:
+            checks.number("'reject_below'", low, 0, 1)
+        if code is not None:
+            checks.whole("'rejected_code'", code, 0, 255)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..base.errors import OptionError
+from ..base import checks
 from ..base.jit import njit
 from ..base.threads import map_blocks
 from ..features.index import build_grid, check_xyz
@@ -36,10 +36,7 @@ def count_shares(probabilities: npt.NDArray[Any]) -> npt.NDArray[np.uint16]:
 
 def checked_radius(radius: float) -> float:
     """The radius in metres, or an OptionError."""
-    good = isinstance(radius, int | float) and not isinstance(radius, bool) and 0 <= radius <= FARTHEST
-    if not good:
-        raise OptionError(f"'smooth' must be a radius from 0 (off) to {FARTHEST:g} m", found=repr(radius))
-    return float(radius)
+    return checks.number("'smooth'", radius, 0, FARTHEST, unit="m")
 
 
 def smooth(

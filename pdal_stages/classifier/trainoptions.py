@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
+from ..base import checks
 from ..base.errors import OptionError, suggest
 from ..base.threads import resolve_threads
 from .algorithms import algorithm_names, trainer
@@ -123,18 +123,13 @@ class TrainingOptions:
             ("passes", 1, MOST_PASSES),
             ("pass_folds", 2, 100),
         ):
-            set_(self, name, _whole(name, getattr(self, name), low, high))
+            set_(self, name, checks.whole(f"'{name}'", getattr(self, name), low, high))
         for name, low, high in (("trees", 1, 10_000), ("min_samples_leaf", 1, 10**6)):
             _values(name, getattr(self, name), low, high)
         _values("max_depth", self.max_depth, 1, 10_000, none=True)
         if self.folds == 1:
             raise OptionError("'folds' must be 0 or at least 2", found=1)
-        if self.strategy not in STRATEGIES:
-            raise OptionError(
-                "'strategy' is not known",
-                found=repr(self.strategy),
-                cure=f"Choose one of {', '.join(STRATEGIES)}",
-            )
+        checks.one_of("'strategy'", self.strategy, STRATEGIES)
         self._check_algorithm()
         set_(self, "context", Context.parse(self.context).tokens)
         if self.passes > 1 and not self.context:
@@ -146,15 +141,14 @@ class TrainingOptions:
         if self.strategy == "multiclass" and self.target is not None:
             raise OptionError("'target' means something only with strategy 'binary'", found=self.target)
         if self.target is not None:
-            set_(self, "target", _whole("target", self.target, 0, 255))
-        set_(self, "background", _whole("background", self.background, 0, 255))
-        _number("max_samples", self.max_samples, 0.0, 1.0)
-        _number("block_size", self.block_size, 0.0, 1e6)
-        _number("memory_mb", self.memory_mb, 0.0, 1e9)
-        if self.prior_weight != 0:
-            _number("prior_weight", self.prior_weight, 0.0, 1.0)
-        if self.gap is not None and self.gap != 0:
-            _number("gap", self.gap, 0.0, 1e6)
+            set_(self, "target", checks.whole("'target'", self.target, 0, 255))
+        set_(self, "background", checks.whole("'background'", self.background, 0, 255))
+        checks.number("'max_samples'", self.max_samples, 0, 1, above=True)
+        checks.number("'block_size'", self.block_size, 0, 10**6, above=True, unit="m")
+        checks.number("'memory_mb'", self.memory_mb, 0, 10**9, above=True)
+        checks.number("'prior_weight'", self.prior_weight, 0, 1)
+        if self.gap is not None:
+            checks.number("'gap'", self.gap, 0, 10**6, unit="m")
         m = self.max_features
         if isinstance(m, str):
             good = m in ("auto", "sqrt", "log2")
@@ -167,28 +161,14 @@ class TrainingOptions:
                 "'max_features' must be auto, sqrt, log2, a number of features, or a share up to 1.0",
                 found=repr(m),
             )
-        names = self.dimensions
-        names = (
-            tuple(part.strip() for part in names.split(",") if part.strip())
-            if isinstance(names, str)
-            else names
-        )
-        if not all(isinstance(name, str) for name in names):
-            raise OptionError("'dimensions' must be a list of names", found=repr(self.dimensions))
-        set_(self, "dimensions", tuple(dict.fromkeys(names)))
-        if not isinstance(self.scale, bool):
-            raise OptionError("'scale' must be true or false", found=repr(self.scale))
+        set_(self, "dimensions", checks.names("'dimensions'", self.dimensions))
+        checks.flag("'scale'", self.scale)
         resolve_threads(self.threads)
 
     def _check_algorithm(self) -> None:
-        names = algorithm_names()
-        if self.algorithm not in names:
-            raise OptionError(
-                "'algorithm' is not known",
-                found=repr(self.algorithm),
-                cure=f"Choose one of {', '.join(names)}",
-            )
-        for name in names:  # an algorithm's own options stand under its name
+        known = algorithm_names()
+        checks.one_of("'algorithm'", self.algorithm, known)
+        for name in known:  # an algorithm's own options stand under its name
             if name != self.algorithm and getattr(self, name, None):
                 raise OptionError(
                     f"'{name}' means something only with algorithm '{name}'", found=self.algorithm
@@ -229,22 +209,9 @@ class TrainingOptions:
         return len(self.candidates()) * len(self.tree_counts()) > 1
 
 
-def _whole(name: str, value: Any, low: int, high: int) -> int:
-    good = isinstance(value, int | np.integer | float | np.floating) and not isinstance(value, bool)
-    if not good or not math.isfinite(value) or int(value) != value or not low <= value <= high:
-        raise OptionError(f"'{name}' must be a whole number from {low} to {high}", found=repr(value))
-    return int(value)
-
-
-def _number(name: str, value: Any, above: float, high: float) -> None:
-    good = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if not good or not above < value <= high:  # NaN fails too
-        raise OptionError(f"'{name}' must be more than {above:g} and at most {high:g}", found=repr(value))
-
-
 def _values(name: str, value: Any, low: int, high: int, none: bool = False) -> list[Any]:
     """One value or a list of them, each a whole number (or unlimited: None or 0)."""
     many = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]
     if not many:
         raise OptionError(f"'{name}' is an empty list", cure="Give a number")
-    return [None if none and (v is None or v == 0) else _whole(name, v, low, high) for v in many]
+    return [None if none and (v is None or v == 0) else checks.whole(f"'{name}'", v, low, high) for v in many]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from ..base import checks
 from ..base.errors import DimensionError, OptionError, StageError
 from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
@@ -44,8 +45,7 @@ class Run:
             from .index import build_grid
 
             self.grid = build_grid(coordinates, engine.plan.cell)
-        if not isinstance(memory_mb, int | float) or not memory_mb >= 16:
-            raise OptionError("'memory_mb' must be a number of 16 or more", found=memory_mb)
+        checks.number("'memory_mb'", memory_mb, 16)
         self.threads = resolve_threads(threads)
         self.starts = np.zeros(1, np.int64)
         if not count:

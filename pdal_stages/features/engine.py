@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from ..base import checks
 from ..base.errors import OptionError, StageError
 from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
@@ -86,10 +87,8 @@ class FeatureEngine:
             raise OptionError(
                 "'plan' must be a FeaturePlan", found=type(plan).__name__, cure="Use FeaturePlan.parse"
             )
-        if isinstance(seed, bool) or int(seed) != seed or not 0 <= seed < 2**63:
-            raise OptionError("'seed' must be a whole number of 0 or more", found=seed)
         resolve_threads(threads)
-        self.plan, self.seed, self.threads = plan, int(seed), threads
+        self.plan, self.seed, self.threads = plan, checks.whole("'seed'", seed, 0, 2**63 - 1), threads
         self.bins, self.copt_threshold = bins, copt_threshold
         self._cloud = check_xyz(xyz)
         compile_once("index")

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
+from ..base import checks
 from ..base.errors import OptionError
 from .names import ALL_FEATURES, GROUPS, WITH_DIMENSIONS, parse_feature_set
 from .neighborhoods import LEAST_MEMBERS, Neighborhood, parse_neighborhoods, preset_dimensions
@@ -213,9 +214,7 @@ class FeaturePlan:
             if not isinstance(value, list | tuple) or not all(isinstance(item, str) for item in value):
                 raise OptionError("a feature plan holds lists of text", found=repr(value)[:80])
         # A model that does not say was trained when three members were enough.
-        least = data.get("least_members", 3)
-        if not isinstance(least, int) or isinstance(least, bool) or not 3 <= least <= 100:
-            raise OptionError("'least_members' of a feature plan is from 3 to 100", found=repr(least)[:20])
+        least = checks.whole("'least_members' of a feature plan", data.get("least_members", 3), 3, 100)
         return cls(
             tuple(parse_neighborhoods(tokens)),
             parse_feature_set(words),

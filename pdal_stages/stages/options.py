@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from ..base import checks
 from ..base.errors import OptionError, suggest
 
 _JSON_TYPES = {
@@ -211,14 +212,9 @@ class Option:
         if (low is not None and (value < low or (self.exclusive and value == low))) or (
             high is not None and value > high
         ):
-            bounds = []
-            if low is not None:
-                bounds.append(f"more than {low:g}" if self.exclusive else f"at least {low:g}")
-            if high is not None:
-                bounds.append(f"at most {high:g}")
-            unit = f" {self.unit}" if self.unit else ""
+            limits = checks.bounds(low, high, self.exclusive, self.unit)
             raise OptionError(
-                f"option '{self.name}' must be {' and '.join(bounds)}{unit}", found=f"{value:g}"
+                f"option '{self.name}' must be {_READABLE[self.kind]}{limits}", found=f"{value:g}"
             )
 
 

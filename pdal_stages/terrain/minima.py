@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..base import checks
 from ..base.errors import NoTerrainError, OptionError, StageError
 
 #: Largest cell index either side of zero; beyond it coordinates cannot be terrain.
@@ -250,8 +251,7 @@ def terrain_reach(
 
 def _check_sizes(cell: float, resolution: float) -> None:
     for name, value in (("cell", cell), ("resolution", resolution)):
-        if not (np.isfinite(value) and value > 0):
-            raise OptionError(f"'{name}' must be a positive length", found=value)
+        checks.number(f"'{name}'", value, 0, above=True)
     if resolution > cell:
         raise OptionError(
             "'resolution' must not be larger than 'cell'",

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
+from ..base import checks
 from ..base.errors import OptionError
 from ..base.threads import available_threads
 
@@ -49,22 +49,19 @@ class TilingOptions:
     most_points: int = 5_000_000
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "tile", float(self.tile))  # 20 and 20.0 are one run
-        if not (math.isfinite(self.tile) and self.tile > 0):
-            raise OptionError("--tile must be a positive length", found=self.tile)
-        if self.workers is not None and self.workers < 0:
-            raise OptionError("--workers must be a whole number of 0 or more", found=self.workers)
+        # 20 and 20.0 are one run
+        object.__setattr__(self, "tile", checks.number("--tile", self.tile, 0, above=True))
+        if self.workers is not None:
+            checks.whole("--workers", self.workers, 0)
         if self.workers is not None and self.scheduler:
             raise OptionError(
                 "--workers starts processes on this machine, and --scheduler uses others",
                 cure="Give one of them",
             )
-        if self.per not in PER:
-            raise OptionError(f"--per must be one of {', '.join(PER)}", found=repr(self.per))
-        if self.buffer is not None and not (math.isfinite(self.buffer) and self.buffer >= 0):
-            raise OptionError("--buffer must be a length of 0 or more, in metres", found=self.buffer)
-        if self.retries < 0:
-            raise OptionError("--retries must be a whole number of 0 or more", found=self.retries)
+        checks.one_of("--per", self.per, PER)
+        if self.buffer is not None:
+            checks.number("--buffer", self.buffer, 0, unit="metres")
+        checks.whole("--retries", self.retries, 0)
         cores = available_threads()
         if self.workers is not None and self.workers > cores:
             raise OptionError(

@@ -1,0 +1,112 @@
+"""Checks of single values, with one wording: what must be what, and what was found."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from .errors import OptionError, suggest
+
+
+def whole(what: str, value: Any, low: int | None = None, high: int | None = None, *, unit: str = "") -> int:
+    """A whole number within bounds, both included; also where it is given as 2.0.
+
+    Parameters
+    ----------
+    what : str
+        What it is the value of, as the message says it, e.g. ``'count'`` with its quotes.
+
+    Raises
+    ------
+    OptionError
+        Naming the bounds and what was found.
+    """
+    found = _finite(value)
+    if found is None or found != int(found) or not _within(found, low, high):
+        raise OptionError(f"{what} must be a whole number{bounds(low, high, unit=unit)}", found=_shown(value))
+    return int(found)
+
+
+def number(
+    what: str,
+    value: Any,
+    low: float | None = None,
+    high: float | None = None,
+    *,
+    above: bool = False,
+    unit: str = "",
+) -> float:
+    """A finite number within bounds, both included; the lower one not with `above`. See :func:`whole`."""
+    found = _finite(value)
+    if found is None or not _within(found, low, high) or (above and found == low):
+        raise OptionError(f"{what} must be a number{bounds(low, high, above, unit)}", found=_shown(value))
+    return float(found)
+
+
+def flag(what: str, value: Any) -> bool:
+    """True or false. See :func:`whole`."""
+    if not isinstance(value, bool | np.bool_):
+        raise OptionError(f"{what} must be true or false", found=_shown(value))
+    return bool(value)
+
+
+def one_of(what: str, value: Any, choices: Iterable[Any]) -> Any:
+    """One of the values there are. See :func:`whole`."""
+    known = list(choices)
+    if not any(type(value) is type(choice) and value == choice for choice in known):
+        raise OptionError(
+            f"{what} must be one of {', '.join(map(repr, known))}",
+            found=_shown(value),
+            cure=suggest(str(value), map(str, known)) or None,
+        )
+    return value
+
+
+def names(what: str, value: Any) -> tuple[str, ...]:
+    """Names, each once, from a list or from text with commas. See :func:`whole`."""
+    if isinstance(value, str):
+        value = [part.strip() for part in value.split(",") if part.strip()]
+    found = list(value) if isinstance(value, Iterable) else [None]
+    if not all(isinstance(name, str) for name in found):
+        raise OptionError(f"{what} must be a list of names", found=_shown(value))
+    return tuple(dict.fromkeys(found))
+
+
+def bounds(low: float | None, high: float | None, above: bool = False, unit: str = "") -> str:
+    """Bounds as words that follow "a number"."""
+    unit = f" {unit}" if unit else ""
+    if low is None:
+        return "" if high is None else f" of at most {_plain(high)}{unit}"
+    if high is None:
+        return f" above {_plain(low)}{unit}" if above else f" of {_plain(low)}{unit} or more"
+    if above:
+        return f" above {_plain(low)} and at most {_plain(high)}{unit}"
+    return f" from {_plain(low)} to {_plain(high)}{unit}"
+
+
+def _finite(value: Any) -> int | float | None:
+    """A number that is finite as a double; None for anything else, true and false too."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        return None
+    try:
+        finite = math.isfinite(value)
+    except OverflowError:
+        return None
+    plain = value.item() if isinstance(value, np.generic) else value
+    return plain if finite else None
+
+
+def _within(value: float, low: float | None, high: float | None) -> bool:
+    return (low is None or value >= low) and (high is None or value <= high)
+
+
+def _plain(bound: float) -> str:
+    return str(bound) if isinstance(bound, int) else f"{bound:g}"
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
