@@ -19,7 +19,7 @@ from ..base.errors import ModelError, OptionError, StageError
 from ..base.threads import map_blocks, resolve_threads
 from ..classifier.algorithms import Answer, Block, Column, Question
 from ..classifier.arrays import ArrayRule
-from ..classifier.dimensions import gather
+from ..classifier.dimensions import gather, with_returns
 from ..features.index import check_xyz
 from . import circles as circles_
 from .circles import Circles
@@ -179,7 +179,9 @@ class AlsNet:
 
         Batches are computed side by side, as many as fit into the memory, at least one.
         """
-        values, notes = gather(self.inputs, question.dimensions, len(question.xyz))
+        values, notes = gather(
+            self.inputs, with_returns(self.inputs, question.xyz, question.dimensions), len(question.xyz)
+        )
         report: dict[str, Any] = {name: number for name, number in notes.items() if number}
         if not question.count:
             return Answer((), report)

@@ -13,7 +13,7 @@ import numpy as np
 from ..base.errors import OptionError
 from ..base.version import __version__
 from ..classifier.clouds import TrainingCloud, class_positions
-from ..classifier.dimensions import gather
+from ..classifier.dimensions import gather, with_returns
 from ..classifier.model import Model
 from ..classifier.trainoptions import TrainingOptions
 from ..features.index import check_xyz
@@ -55,7 +55,9 @@ def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: 
     labelled: list[LabelledCloud] = []
     notes: dict[str, int] = {}
     for cloud, xyz, position in zip(clouds, checked, positions, strict=True):
-        values, counted = gather(inputs, cloud.dimensions, len(xyz), where=cloud.name)
+        values, counted = gather(
+            inputs, with_returns(inputs, xyz, cloud.dimensions), len(xyz), where=cloud.name
+        )
         for name, number in counted.items():
             notes[name] = notes.get(name, 0) + number
         labelled.append(LabelledCloud(xyz, position, values))

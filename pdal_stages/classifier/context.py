@@ -19,8 +19,7 @@ import numpy.typing as npt
 from ..base.errors import OptionError
 from ..base.jit import njit
 from ..base.threads import map_blocks
-from ..features.index import cell_numbers
-from .smoothing import WHOLE
+from ..features.cells import SIDES, WHOLE, cell_keys, cell_means, take_means
 
 
 @dataclass(frozen=True)
@@ -42,9 +41,6 @@ KINDS = {
 
 #: The token of the point's own probabilities.
 OWN = "own"
-
-#: Sides of cells that can be asked for, metres: powers of two, so that corners are exact.
-SIDES = tuple(2.0**k for k in range(-3, 7))
 
 
 @dataclass(frozen=True)
@@ -129,7 +125,11 @@ class Context:
         shares : (n, classes) uint16
             Of each point; see ``smoothing.count_shares``.
         """
-        parts = map_blocks(lambda scale: cell_means(xyz, shares, scale), self.scales, threads)
+
+        def means(scale: Scale):
+            return cell_means(xyz[:, : scale.kind.axes], shares, scale.side, scale.kind.votes)
+
+        parts = map_blocks(means, self.scales, threads)
         return Tables(self.tokens, shares, dict(zip((s.token for s in self.scales), parts, strict=True)))
 
 
@@ -152,115 +152,7 @@ class Tables:
                 take_means(*self.cells[token], points, part)
 
 
-def cell_means(
-    xyz: npt.NDArray[np.float64], shares: npt.NDArray[np.uint16], scale: Scale
-) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
-    """(cell of each point, means (cells, classes) over each cell and those around it)."""
-    keys, offsets = cell_keys(xyz[:, : scale.kind.axes], scale.side)
-    order = np.argsort(keys)
-    ascending = keys[order]
-    new = np.ones(len(keys), np.bool_)
-    np.not_equal(ascending[1:], ascending[:-1], out=new[1:])
-    start = np.append(np.flatnonzero(new), len(keys))
-    occupied = ascending[start[:-1]]
-    cell = np.empty(len(keys), np.int32)
-    sums = np.zeros((len(occupied), shares.shape[1] + 1), np.int64)
-    add_cells(order, start, shares, scale.kind.votes, cell, sums)
-    means = np.empty((len(occupied), shares.shape[1]), np.float32)
-    average_around(occupied, sums, offsets, means)
-    return cell, means
-
-
-def cell_keys(
-    coordinates: npt.NDArray[np.float64], side: float
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """A number for each point's cell, such that cells beside each other along the last axis follow each other.
-
-    Returns
-    -------
-    keys : (n,) int64
-    offsets : (3 or 9,) int64
-        Added to a key, the middle cells of the rows of three around it.
-    """
-    numbers = [cell_numbers(coordinates[:, k], side) for k in _ORDER[coordinates.shape[1]]]
-    lengths = []
-    for attempt in (_from_zero, _without_gaps):
-        numbers = [attempt(number) for number in numbers]
-        # One empty cell beside the last, so that no cell has neighbors at the other end of the grid.
-        lengths = [int(number.max(initial=0)) + 2 for number in numbers]
-        if float(np.prod(np.array(lengths, float))) < 2.0**62:
-            break
-    keys = numbers[0]
-    steps = [1]
-    for number, length in zip(numbers[1:], lengths[1:], strict=True):
-        keys = keys * length + number
-        steps = [step * length for step in steps] + [1]
-    offsets = np.zeros(1, np.int64)
-    for step in steps[:-1]:
-        offsets = np.add.outer(offsets, np.array([-step, 0, step])).reshape(-1)
-    return keys, np.sort(offsets)
-
-
-#: Axes from the slowest to the fastest.
-_ORDER = {2: (1, 0), 3: (1, 0, 2)}
-
-
-def _from_zero(number: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    return number - number.min() if len(number) else number
-
-
-def _without_gaps(number: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Strays far apart: empty stretches become one empty cell."""
-    there, at = np.unique(number, return_inverse=True)
-    return np.concatenate(([0], np.cumsum(np.minimum(np.diff(there), 2))))[at]
-
-
 # ---- kernels -----------------------------------------------------------------------------------------------
-
-
-@njit
-def add_cells(order, start, shares, votes, cell, sums):
-    """Fill `cell` with each point's, and `sums` with each cell's shares (or votes) and, last, its points."""
-    classes = shares.shape[1]
-    for k in range(len(start) - 1):
-        for j in range(start[k], start[k + 1]):
-            i = order[j]
-            cell[i] = k
-            if votes:
-                best = 0
-                for c in range(1, classes):
-                    if shares[i, c] > shares[i, best]:
-                        best = c
-                sums[k, best] += WHOLE
-            else:
-                for c in range(classes):
-                    sums[k, c] += np.int64(shares[i, c])
-        sums[k, classes] = start[k + 1] - start[k]
-
-
-@njit
-def average_around(keys, sums, offsets, means):
-    """Fill `means`: over each cell and those around it, sums of shares / (WHOLE x points)."""
-    classes = sums.shape[1] - 1
-    rows = len(offsets)
-    cursor = np.zeros(rows, np.int64)
-    total = np.empty(classes + 1, np.int64)
-    n = len(keys)
-    for k in range(n):
-        total[:] = 0
-        for r in range(rows):
-            middle = keys[k] + offsets[r]
-            at = cursor[r]
-            while at < n and keys[at] < middle - 1:
-                at += 1
-            cursor[r] = at
-            while at < n and keys[at] <= middle + 1:
-                for c in range(classes + 1):
-                    total[c] += sums[at, c]
-                at += 1
-        whole = float(total[classes]) * WHOLE
-        for c in range(classes):
-            means[k, c] = float(total[c]) / whole
 
 
 @njit
@@ -269,15 +161,6 @@ def take_shares(shares, points, out):
     for i in range(len(points)):
         for c in range(shares.shape[1]):
             out[i, c] = float(shares[points[i], c]) / WHOLE
-
-
-@njit
-def take_means(cell, means, points, out):
-    """The means of the points' cells."""
-    for i in range(len(points)):
-        k = cell[points[i]]
-        for c in range(means.shape[1]):
-            out[i, c] = means[k, c]
 
 
 def around(

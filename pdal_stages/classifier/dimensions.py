@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import DimensionError
+from ..features import returns
 
 #: What every point has: the feature engine takes these from the coordinates.
 COORDINATES = ("X", "Y", "Z")
@@ -30,10 +31,22 @@ def required(names: Iterable[str]) -> tuple[str, ...]:
     """Dimensions the cloud must have for these dimension features."""
     out: dict[str, None] = {}
     for name in names:
-        if name not in COORDINATES:
-            both = ("ReturnNumber", "NumberOfReturns")
-            out.update(dict.fromkeys(both if name == RETURN_RATIO else (name,)))
+        if name not in COORDINATES and returns.parse(name) is None:
+            out.update(dict.fromkeys(returns.SOURCES if name == RETURN_RATIO else (name,)))
     return tuple(out)
+
+
+def welcome(names: Iterable[str]) -> tuple[str, ...]:
+    """Dimensions that these features can do without but use where the cloud has them."""
+    return returns.SOURCES if any(returns.parse(name) is not None for name in names) else ()
+
+
+def with_returns(
+    names: Iterable[str], xyz: npt.NDArray[np.float64], dimensions: Mapping[str, npt.ArrayLike]
+) -> Mapping[str, npt.ArrayLike]:
+    """The dimensions and those of `names` that are made of return numbers and the points around."""
+    made = returns.return_features(names, xyz, dimensions)
+    return {**dimensions, **made} if made else dimensions
 
 
 def gather(
@@ -50,7 +63,7 @@ def gather(
     names : iterable of str
         Dimension features, ``ReturnRatio`` among them or not.
     dimensions : mapping
-        Name to (n,) values of the whole cloud.
+        Name to (n,) values of the whole cloud; see :func:`with_returns`.
     n : int
         Points in the cloud.
     rows : array of int, optional
@@ -98,6 +111,9 @@ def gather(
     out = {}
     for name in names:
         if name in COORDINATES:
+            continue
+        if returns.parse(name) is not None:
+            out[name] = np.asarray(dimensions[name] if rows is None else np.asarray(dimensions[name])[rows])
             continue
         if name != RETURN_RATIO:
             out[name] = picked[name]

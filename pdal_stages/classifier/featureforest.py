@@ -15,7 +15,7 @@ from ..features.names import GROUPS, RELATIVE
 from .algorithms import Answer, Block, Column, Question
 from .arrays import ArrayRule
 from .context import Context
-from .dimensions import gather
+from .dimensions import gather, with_returns
 from .forest import Forest
 
 
@@ -181,7 +181,9 @@ class Computing:
         self.features, self._question = features, question
         self.report: dict[str, Any] = {}
         self._engine: FeatureEngine | None = None
-        _, notes = gather(features.plan.dimensions, question.dimensions, len(question.xyz), question.rows)
+        names = features.plan.dimensions
+        self._dimensions = with_returns(names, question.xyz, question.dimensions)
+        _, notes = gather(names, self._dimensions, len(question.xyz), question.rows)
         self.report.update({name: number for name, number in notes.items() if number})
 
     def blocks(
@@ -203,7 +205,7 @@ class Computing:
         if self._engine is None:
             self._engine = self.features.engine(asked.xyz, asked.threads)
         engine = self._engine
-        fed, _ = gather(self.features.plan.dimensions, asked.dimensions, len(asked.xyz), rows)
+        fed, _ = gather(self.features.plan.dimensions, self._dimensions, len(asked.xyz), rows)
         before = {key: dict(value) for key, value in engine.report.items() if isinstance(value, dict)}
         yield from engine.blocks(
             queries=rows,

@@ -15,7 +15,7 @@ from ..base.errors import ModelError, OptionError
 from . import modelfile, summary
 from .algorithms import Inputs, Question, algorithm
 from .deciding import Outcome, Prediction, PredictionOptions, decide
-from .dimensions import required
+from .dimensions import required, welcome
 from .passes import Passes
 from .smoothing import count_shares, smooth
 
@@ -75,6 +75,11 @@ class Model:
     def required_dimensions(self) -> tuple[str, ...]:
         """Dimensions a cloud must have beside its coordinates."""
         return required(self.plan.dimensions)
+
+    @property
+    def welcome_dimensions(self) -> tuple[str, ...]:
+        """Dimensions it uses where a cloud has them: return numbers."""
+        return welcome(self.plan.dimensions)
 
     @property
     def halo(self) -> float:

@@ -15,7 +15,7 @@ from ..base.progress import Progress
 from ..base.threads import map_blocks
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from .clouds import TrainingCloud
-from .dimensions import gather
+from .dimensions import gather, with_returns
 from .featureforest import Features
 from .sampling import Samples
 from .trainoptions import TrainingOptions
@@ -87,9 +87,9 @@ def sample_features(
             if not len(at):
                 continue
             engine = features.engine(cloud.xyz, options.threads)
-            fed, counted = gather(
-                features.plan.dimensions, cloud.dimensions, len(cloud.xyz), rows, cloud.name
-            )
+            own = features.plan.dimensions
+            there = with_returns(own, cloud.xyz, cloud.dimensions)
+            fed, counted = gather(own, there, len(cloud.xyz), rows, cloud.name)
             for name, n in counted.items():
                 notes[name] = notes.get(name, 0) + n
             for part, block in engine.blocks(

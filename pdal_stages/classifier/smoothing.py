@@ -17,10 +17,8 @@ import numpy.typing as npt
 from ..base import checks
 from ..base.jit import njit
 from ..base.threads import map_blocks
+from ..features.cells import WHOLE
 from ..features.index import build_grid, check_xyz
-
-#: Probability 1.
-WHOLE = 65535
 
 #: Farthest that can be asked for, metres: beyond it nothing is a neighbor any more.
 FARTHEST = 10.0

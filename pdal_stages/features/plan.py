@@ -10,6 +10,7 @@ from typing import Any
 
 from ..base import checks
 from ..base.errors import OptionError
+from . import returns
 from .names import ALL_FEATURES, GROUPS, WITH_DIMENSIONS, parse_feature_set
 from .neighborhoods import LEAST_MEMBERS, Neighborhood, parse_neighborhoods, preset_dimensions
 
@@ -92,7 +93,9 @@ class FeaturePlan:
         parsed = tuple(parse_neighborhoods(neighborhoods))
         given = dimensions.split(",") if isinstance(dimensions, str) else list(dimensions)
         own = preset_dimensions(neighborhoods) if any(word in WITH_DIMENSIONS for word in words) else ()
-        names = dict.fromkeys([*own, *(name.strip() for name in given if name.strip())])
+        names = dict.fromkeys(own)
+        for name in (name.strip() for name in given):
+            names.update(dict.fromkeys(returns.NAMES if name == returns.GROUP else [name] if name else []))
         return cls(parsed, words, tuple(names))
 
     @cached_property
@@ -176,6 +179,7 @@ class FeaturePlan:
         metre. How many queries had to look farther is counted in ``FeatureEngine.report["beyond_halo"]``.
         """
         reach = max((n.reach for n in self.neighborhoods if n.reach is not None), default=0.0)
+        reach = max(reach, returns.reach(self.dimensions))
         if self.unbounded:
             reach = max(reach, POINTS_HALO)
         return reach + self.cell

@@ -1,0 +1,152 @@
+"""Means over cells of an absolute grid and those around them: of probabilities, of return flags.
+
+Values are counted in 65535ths and added as whole numbers over a point's own cell and the cells around it, then divided
+by the number of points there. So a mean has the same bits for any order of points, number of threads, and in any
+tile that holds those cells; and a point costs as much in a dense cloud as in a sparse one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from ..base.jit import njit
+from .index import cell_numbers
+
+#: A share of 1.
+WHOLE = 65535
+
+#: Sides of cells that can be asked for, metres: powers of two, so that corners are exact.
+SIDES = tuple(2.0**k for k in range(-3, 7))
+
+
+def cell_means(
+    coordinates: npt.NDArray[np.float64], shares: npt.NDArray[np.uint16], side: float, votes: bool = False
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
+    """(cell of each point, means (cells, columns) over each cell and those around it).
+
+    Parameters
+    ----------
+    coordinates : (n, 2 or 3) float64
+        Metres; two for columns of any height.
+    shares : (n, columns) uint16
+        In 65535ths.
+    side : float
+        Of a cell, metres; one of :data:`SIDES`.
+    votes : bool
+        Count the largest column of each point alone, as a whole.
+    """
+    keys, offsets = cell_keys(coordinates, side)
+    order = np.argsort(keys)
+    ascending = keys[order]
+    new = np.ones(len(keys), np.bool_)
+    np.not_equal(ascending[1:], ascending[:-1], out=new[1:])
+    start = np.append(np.flatnonzero(new), len(keys))
+    occupied = ascending[start[:-1]]
+    cell = np.empty(len(keys), np.int32)
+    sums = np.zeros((len(occupied), shares.shape[1] + 1), np.int64)
+    add_cells(order, start, shares, votes, cell, sums)
+    means = np.empty((len(occupied), shares.shape[1]), np.float32)
+    average_around(occupied, sums, offsets, means)
+    return cell, means
+
+
+def cell_keys(
+    coordinates: npt.NDArray[np.float64], side: float
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """A number for each point's cell, such that cells beside each other along the last axis follow each other.
+
+    Returns
+    -------
+    keys : (n,) int64
+    offsets : (3 or 9,) int64
+        Added to a key, the middle cells of the rows of three around it.
+    """
+    numbers = [cell_numbers(coordinates[:, k], side) for k in _ORDER[coordinates.shape[1]]]
+    lengths = []
+    for attempt in (_from_zero, _without_gaps):
+        numbers = [attempt(number) for number in numbers]
+        # One empty cell beside the last, so that no cell has neighbors at the other end of the grid.
+        lengths = [int(number.max(initial=0)) + 2 for number in numbers]
+        if float(np.prod(np.array(lengths, float))) < 2.0**62:
+            break
+    keys = numbers[0]
+    steps = [1]
+    for number, length in zip(numbers[1:], lengths[1:], strict=True):
+        keys = keys * length + number
+        steps = [step * length for step in steps] + [1]
+    offsets = np.zeros(1, np.int64)
+    for step in steps[:-1]:
+        offsets = np.add.outer(offsets, np.array([-step, 0, step])).reshape(-1)
+    return keys, np.sort(offsets)
+
+
+#: Axes from the slowest to the fastest.
+_ORDER = {2: (1, 0), 3: (1, 0, 2)}
+
+
+def _from_zero(number: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    return number - number.min() if len(number) else number
+
+
+def _without_gaps(number: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Strays far apart: empty stretches become one empty cell."""
+    there, at = np.unique(number, return_inverse=True)
+    return np.concatenate(([0], np.cumsum(np.minimum(np.diff(there), 2))))[at]
+
+
+# ---- kernels --------------------------------------------------------------------------------------------
+
+
+@njit
+def add_cells(order, start, shares, votes, cell, sums):
+    """Fill `cell` with each point's, and `sums` with each cell's shares (or votes) and, last, its points."""
+    classes = shares.shape[1]
+    for k in range(len(start) - 1):
+        for j in range(start[k], start[k + 1]):
+            i = order[j]
+            cell[i] = k
+            if votes:
+                best = 0
+                for c in range(1, classes):
+                    if shares[i, c] > shares[i, best]:
+                        best = c
+                sums[k, best] += WHOLE
+            else:
+                for c in range(classes):
+                    sums[k, c] += np.int64(shares[i, c])
+        sums[k, classes] = start[k + 1] - start[k]
+
+
+@njit
+def average_around(keys, sums, offsets, means):
+    """Fill `means`: over each cell and those around it, sums of shares / (WHOLE x points)."""
+    classes = sums.shape[1] - 1
+    rows = len(offsets)
+    cursor = np.zeros(rows, np.int64)
+    total = np.empty(classes + 1, np.int64)
+    n = len(keys)
+    for k in range(n):
+        total[:] = 0
+        for r in range(rows):
+            middle = keys[k] + offsets[r]
+            at = cursor[r]
+            while at < n and keys[at] < middle - 1:
+                at += 1
+            cursor[r] = at
+            while at < n and keys[at] <= middle + 1:
+                for c in range(classes + 1):
+                    total[c] += sums[at, c]
+                at += 1
+        whole = float(total[classes]) * WHOLE
+        for c in range(classes):
+            means[k, c] = float(total[c]) / whole
+
+
+@njit
+def take_means(cell, means, points, out):
+    """The means of the points' cells."""
+    for i in range(len(points)):
+        k = cell[points[i]]
+        for c in range(means.shape[1]):
+            out[i, c] = means[k, c]

@@ -1,0 +1,123 @@
+"""What return numbers say of a point and of its surroundings: how often pulses go through.
+
+A pulse that meets a roof gives one return, one that meets a tree several. Two flags say so of a point: it is one of
+several returns (`MultipleReturn`), or not the last of its pulse (`EarlierReturn`). Their means over cells of an
+absolute grid and those around them say so of its surroundings: ``MultipleReturn_box2`` over 3 x 3 x 3 cells of 2 m,
+``MultipleReturn_column2`` over 3 x 3 columns of any height. All are 0 where a cloud has no return numbers.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ..base.errors import OptionError
+from .cells import SIDES, WHOLE, cell_means, take_means
+
+#: What they are made of.
+SOURCES = ("ReturnNumber", "NumberOfReturns")
+
+#: Flag -> what it says.
+FLAGS = {
+    "MultipleReturn": "the pulse gave several returns (NumberOfReturns > 1)",
+    "EarlierReturn": "a later return of the pulse exists (ReturnNumber < NumberOfReturns)",
+}
+
+#: The word for all flags, of the point and at three scales.
+GROUP = "returns"
+SCALES = ("", "_box1", "_box2", "_column2")
+NAMES = tuple(flag + scale for scale in SCALES for flag in FLAGS)
+
+_NAME = re.compile(rf"({'|'.join(FLAGS)})(?:_(box|column)(\d+(?:_\d+)?))?")
+
+
+@dataclass(frozen=True)
+class ReturnFeature:
+    """One of them; make it with :func:`parse`.
+
+    Attributes
+    ----------
+    flag : str
+    axes : int
+        3 for boxes, 2 for columns, 0 for the point itself.
+    side : float
+        Of a cell, metres.
+    """
+
+    flag: str
+    axes: int = 0
+    side: float = 0.0
+
+
+def parse(name: str) -> ReturnFeature | None:
+    """The feature of a name such as ``EarlierReturn_box0_5``; None for another name.
+
+    Raises
+    ------
+    OptionError
+        For a side that is not a power of two from 0.125 to 64 m.
+    """
+    match = _NAME.fullmatch(name)
+    if match is None:
+        return None
+    if match[2] is None:
+        return ReturnFeature(match[1])
+    side = float(match[3].replace("_", "."))
+    if side not in SIDES:
+        raise OptionError(
+            "the cells of a return feature have a side that is a power of two",
+            found=name,
+            cure=f"Write a side from {SIDES[0]:g} to {SIDES[-1]:g} m: {match[1]}_{match[2]}2",
+        )
+    return ReturnFeature(match[1], {"box": 3, "column": 2}[match[2]], side)
+
+
+def reach(names: Iterable[str]) -> float:
+    """Metres, along x or y, to the farthest point that can matter to any of these dimensions."""
+    return max((2.0 * one.side for one in map(parse, names) if one is not None), default=0.0)
+
+
+def return_features(
+    names: Iterable[str], xyz: npt.NDArray[np.float64], dimensions: Mapping[str, npt.ArrayLike]
+) -> dict[str, npt.NDArray[np.float32]]:
+    """Those of `names` that are return features, for every point of a cloud.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Others are passed over.
+    xyz : (n, 3) float64
+        Metres.
+    dimensions : mapping
+        ``ReturnNumber`` and ``NumberOfReturns``, (n,) each; without them all is 0.
+
+    Returns
+    -------
+    dict of name to (n,) float32
+        0 to 1.
+    """
+    wanted = {name: one for name in names if (one := parse(name)) is not None}
+    if not wanted:
+        return {}
+    number, total = (np.asarray(dimensions.get(source, np.zeros(len(xyz), np.uint8))) for source in SOURCES)
+    flags = np.empty((len(xyz), len(FLAGS)), np.uint16)
+    flags[:, 0] = np.where(total > 1, WHOLE, 0)
+    flags[:, 1] = np.where((number > 0) & (number < total), WHOLE, 0)
+    out: dict[str, npt.NDArray[np.float32]] = {}
+    tables: dict[tuple[int, float], npt.NDArray[np.float32]] = {}
+    every = np.arange(len(xyz))
+    for name, one in wanted.items():
+        column = list(FLAGS).index(one.flag)
+        if not one.axes:
+            out[name] = (flags[:, column] > 0).astype(np.float32)
+            continue
+        key = (one.axes, one.side)
+        if key not in tables:
+            tables[key] = np.empty((len(xyz), len(FLAGS)), np.float32)
+            take_means(*cell_means(xyz[:, : one.axes], flags, one.side), every, tables[key])
+        out[name] = np.ascontiguousarray(tables[key][:, column])
+    return out

@@ -1,0 +1,74 @@
+"""Return features against a slow reference, and what must hold of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pdal_stages.base.errors import OptionError
+from pdal_stages.classifier.dimensions import gather, required, welcome, with_returns
+from pdal_stages.features import FeaturePlan, returns
+
+
+def cloud(n=400, seed=0, spread=12.0):
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform(0, spread, (n, 3)) + np.array([500_000.0, -3.0, 0.0])
+    total = rng.integers(0, 4, n).astype(np.uint8)
+    number = np.minimum(rng.integers(0, 4, n), total).astype(np.uint8)
+    return xyz, {"ReturnNumber": number, "NumberOfReturns": total}
+
+
+def slow(name, xyz, dimensions):
+    """Point by point, over all others."""
+    number, total = dimensions["ReturnNumber"].astype(int), dimensions["NumberOfReturns"].astype(int)
+    flag = total > 1 if name.startswith("MultipleReturn") else (number > 0) & (number < total)
+    one = returns.parse(name)
+    if not one.axes:
+        return flag.astype(float)
+    cell = np.floor(xyz[:, : one.axes] / one.side).astype(int)
+    return np.array([flag[(abs(cell - mine) <= 1).all(axis=1)].mean() for mine in cell])
+
+
+@pytest.mark.parametrize("name", [*returns.NAMES, "EarlierReturn_box0_5", "MultipleReturn_column8"])
+@pytest.mark.parametrize("seed", range(3))
+def test_they_are_the_slow_reference_s(name, seed):
+    xyz, dimensions = cloud(seed=seed)
+    got = returns.return_features([name], xyz, dimensions)[name]
+    assert got.dtype == np.float32
+    assert got == pytest.approx(slow(name, xyz, dimensions), abs=1e-6)
+
+
+def test_any_order_of_points_and_a_tile_with_its_halo_give_the_same_bits():
+    xyz, dimensions = cloud(3000, seed=5, spread=60.0)
+    whole = returns.return_features(returns.NAMES, xyz, dimensions)
+    order = np.random.default_rng(1).permutation(len(xyz))
+    moved = returns.return_features(
+        returns.NAMES, xyz[order], {name: values[order] for name, values in dimensions.items()}
+    )
+    low, high = xyz[:, :2].min(axis=0) + 20, xyz[:, :2].min(axis=0) + 40
+    halo = FeaturePlan.parse("s1", "Linearity", returns.NAMES).halo
+    near = ((xyz[:, :2] >= low - halo) & (xyz[:, :2] < high + halo)).all(axis=1)
+    tile = returns.return_features(returns.NAMES, xyz[near], {k: v[near] for k, v in dimensions.items()})
+    inside = ((xyz[near, :2] >= low) & (xyz[near, :2] < high)).all(axis=1)
+    for name in returns.NAMES:
+        assert np.array_equal(moved[name], whole[name][order])
+        assert inside.any() and np.array_equal(tile[name][inside], whole[name][near][inside])
+
+
+def test_without_return_numbers_all_is_zero():
+    xyz, _ = cloud(50)
+    assert required(returns.NAMES) == () and welcome(returns.NAMES) == returns.SOURCES
+    for dimensions in ({}, {name: np.zeros(50, np.uint8) for name in returns.SOURCES}):
+        fed, _ = gather(returns.NAMES, with_returns(returns.NAMES, xyz, dimensions), 50, np.arange(0, 50, 7))
+        assert all(len(fed[name]) == 8 and not fed[name].any() for name in returns.NAMES)
+    assert not returns.return_features(returns.NAMES, xyz[:0], {})["MultipleReturn_box2"].size
+
+
+def test_names():
+    assert returns.parse("Linearity_c1") is None
+    assert FeaturePlan.parse("s1", "Linearity", "returns,Intensity").dimensions == (
+        *returns.NAMES,
+        "Intensity",
+    )
+    with pytest.raises(OptionError, match="power of two"):
+        returns.parse("MultipleReturn_box3")
