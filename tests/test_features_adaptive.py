@@ -265,6 +265,16 @@ def test_copies_have_a_finite_density_and_no_structure():
     assert table["Density_kopt"][0] == pytest.approx(101 / oracle.ball_volume(0.001))
 
 
+@pytest.mark.parametrize("cloud", CLOUDS)
+def test_several_numbers_of_neighbors_at_once_are_each_by_itself(cloud):
+    xyz = CLOUDS[cloud]
+    together = compute_features(xyz, None, "k3,k10,k20,k50", "covariance,geometric,HeightAboveLowest")
+    for k in (3, 10, 20, 50):
+        alone = compute_features(xyz, None, f"k{k}", "covariance,geometric,HeightAboveLowest")
+        columns = [together.names.index(name) for name in alone.names]
+        assert np.array_equal(together.values[:, columns], alone.values)
+
+
 # ---- ropt --------------------------------------------------------------------------------------------------
 
 

@@ -17,7 +17,7 @@ from .index import Grid
 from .kdtree import KdTree, build_tree
 from .moments import BATCH, FEATURES, MOMENTS, finish
 from .names import MOMENT_FEATURES, SHAPE_FEATURES
-from .optimal import kopt_block
+from .optimal import kopt_block, nearest_block
 from .plan import Columns, FeaturePlan
 from .ropt import COPT_RADII, copt_block, curvature_block, curvature_threshold, radii_of, ropt_block
 from .shapes import Shapes, count_shapes, list_shapes, no_shapes, point_seeds
@@ -76,6 +76,10 @@ class AdaptiveNeighborhoods:
         self.query_ns = sum(NS_QUERY[s.kind] * _load(s) + NS_SHAPES * s.shaped for s in self.specs)
         largest = max((s.parameters[-1] for s in self.specs if s.parameters), default=0.0)
         self.scratch_bytes = 2_000_000 + int(500 * largest)
+        nearest = [n for n, spec in enumerate(self.specs) if spec.kind == "knn" and not spec.shaped]
+        nearest.sort(key=lambda n: self.specs[n].parameters[0])
+        #: Places in `specs` of plain nearest neighbors, which one search of the largest k serves.
+        self._nearest = nearest if len(nearest) > 1 else []
         self._tree: KdTree | None = None
         if len(grid):
             with CompilationNote():
@@ -94,6 +98,8 @@ class AdaptiveNeighborhoods:
             few, copies = np.zeros(1, np.int64), np.ones(1, np.int64)
             nowhere = np.full(len(spec.columns), -1, np.int64)
             write_columns(table, radius, one[2], few, copies, nowhere, np.zeros((1, 1), np.float32))
+        if self._nearest:
+            self._compute_nearest(*one)
 
     def fit_copt(self, threads: int | None = None) -> float:
         """The curvature from which on a point is scattered, from all points of the cloud [H17]."""
@@ -148,19 +154,33 @@ class AdaptiveNeighborhoods:
             Raised by the number of queries whose result depends on points farther than the plan's halo.
         out : (m, F) float32 array
         """
+        together = self._compute_nearest(qx, qy, qz) if self._nearest else {}
         for number, spec in enumerate(self.specs):
             if spec.shaped:
                 assert bins is not None
                 shapes = count_shapes(bins.comparable([spec.token])[0], len(qx))
             else:
                 shapes = no_shapes()
-            table, radius, reach = self._compute(spec, qx, qy, qz, seed, copt_threshold, shapes)
+            if number in together:
+                table, radius, reach = together[number]
+            else:
+                table, radius, reach = self._compute(spec, qx, qy, qz, seed, copt_threshold, shapes)
             write_columns(table, radius, qz, few[number : number + 1], copies, spec.columns, out)
             if spec.shaped:
                 wanted = spec.shape_columns >= 0
                 out[:, spec.shape_columns[wanted]] = shapes.counts[:, wanted]
             if spec.unbounded:
                 far[number] += int(copies[reach > self.halo].sum())
+
+    def _compute_nearest(
+        self, qx: np.ndarray, qy: np.ndarray, qz: np.ndarray
+    ) -> dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """What :meth:`_compute` gives, for all of ``_nearest``."""
+        ks = np.array([int(self.specs[n].parameters[0]) for n in self._nearest], np.int64)
+        tables = np.empty((len(ks), MOMENTS, len(qx)))
+        radius, reach = np.empty((len(ks), len(qx))), np.empty((len(ks), len(qx)))
+        nearest_block(self._tree, qx, qy, qz, ks, tables, radius, reach)
+        return {n: (tables[j], radius[j], reach[j]) for j, n in enumerate(self._nearest)}
 
     def _compute(
         self,

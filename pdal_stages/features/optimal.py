@@ -329,6 +329,50 @@ def kopt_into(tree, qx, qy, qz, target, k_min, k_max, cap2, table, radius, reach
 
 
 @njit
+def nearest_block(tree, qx, qy, qz, ks, tables, radius, reach):
+    """Moments, radius and reach of several numbers of nearest neighbors at once, from one search.
+
+    The bits are those of :func:`kopt_block` for each k by itself.
+
+    Parameters
+    ----------
+    tree, qx, qy, qz
+        As for :func:`kopt_block`.
+    ks : ndarray of int64, shape (s,)
+        Neighbors besides the point itself, ascending.
+    tables : ndarray of float64, shape (s, 12, m)
+    radius, reach : ndarray of float64, shape (s, m)
+        Out, as for :func:`kopt_block`.
+    """
+    need = ks[len(ks) - 1] + 1
+    search = start_search(qx, qy, qz)
+    scratch = make_scratch(CROWD * need + ROOM)
+    rows = make_rows(need)
+    members = make_members(need)
+    s = make_sums(need)
+    while True:
+        lo, hi, count, scratch = next_rows(tree, search, need, math.inf, scratch, rows)
+        if lo < 0:
+            return
+        for row in range(count):
+            q = search.order[lo + row]
+            found = rows.found[row]
+            take_members(tree, rows.at[row], found, qx[q], qy[q], qz[q], members)
+            running_sums(members.x, members.y, members.z, found, s)
+            for j in range(len(ks)):
+                last = min(ks[j], found - 1)
+                write_moments(s, last, members, last + 1, tables[j], q)
+                radius[j, q] = math.sqrt(rows.d2[row, last])
+                reach[j, q] = radius[j, q] if last == ks[j] else math.inf
+        for i in range(lo + count, hi):  # queries that coincide with the first
+            source, target = search.order[lo], search.order[i]
+            for j in range(len(ks)):
+                tables[j, :, target] = tables[j, :, source]
+                radius[j, target] = radius[j, source]
+                reach[j, target] = reach[j, source]
+
+
+@njit
 def write_nothing(table, radius, shapes, column):
     """The result of a neighborhood without points."""
     table[:, column] = 0.0

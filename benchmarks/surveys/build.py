@@ -1,0 +1,33 @@
+"""Train a shipped model from the open clouds; the same bits every time.
+
+python benchmarks/surveys/build.py --data DIR --out pdal_stages/models/standard.model
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import time
+from pathlib import Path
+
+from clouds import SURVEYS
+from recipe import train_on
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    options.add_argument("--data", type=Path, required=True, help="folder of the clouds")
+    options.add_argument("--out", type=Path, required=True, help="the model file")
+    options.add_argument("--surveys", nargs="+", default=list(SURVEYS), choices=list(SURVEYS))
+    args = options.parse_args()
+    started = time.process_time()
+    model = train_on(args.data, args.surveys)
+    model.save(args.out)
+    print(model)
+    digest = hashlib.sha256(args.out.read_bytes()).hexdigest()
+    size = args.out.stat().st_size / 1e6
+    print(f"{args.out}: {size:.2f} MB, sha256 {digest[:16]}, {time.process_time() - started:.0f} CPU s")
+
+
+if __name__ == "__main__":
+    main()

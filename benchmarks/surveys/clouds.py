@@ -1,0 +1,226 @@
+"""The open, labelled surveys that the shipped models are trained on, and copies of them that are thinner, steeper, or
+without return numbers.
+
+Labels become 2 ground, 5 vegetation, 6 building and 0, which is left out of training and scoring. Low vegetation (3) is
+left out: in these surveys most of it lies on the ground, and where it begins is a matter of taste.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import laspy
+import numpy as np
+
+from pdal_stages.base.hashing import coordinate_hash
+from pdal_stages.terrain import filtered_ground
+
+GROUND, VEGETATION, BUILDING = 2, 5, 6
+
+
+@dataclass(frozen=True)
+class Survey:
+    """One flight.
+
+    Attributes
+    ----------
+    files : tuple of str
+        Under the data folder.
+    labels : mapping
+        The survey's codes -> ours; the others are neighbors only.
+    dropped : tuple of int
+        Codes that do not even serve as neighbors: noise, points added by computer.
+    tall : mapping
+        Codes of everything else: vegetation from a height in metres on.
+    tall_scored : bool
+        Whether that is true enough to score by, or to train on only.
+    returns : bool
+        Whether it records return numbers.
+    what, licence : str
+        For the card.
+    """
+
+    files: tuple[str, ...]
+    labels: Mapping[int, int]
+    what: str
+    licence: str
+    dropped: tuple[int, ...] = (7, 18)
+    tall: Mapping[int, float] = field(default_factory=dict)
+    tall_scored: bool = False
+    returns: bool = True
+
+
+_LIDARHD = "IGN, LiDAR HD, Licence Ouverte Etalab 2.0"
+_AHN = "AHN, open data of the Dutch government"
+CLASSES = {2: GROUND, 4: VEGETATION, 5: VEGETATION, 6: BUILDING}
+SURVEYS = {
+    "Montpellier": Survey(
+        (
+            "montpellier/train_77050_627755.laz",
+            "montpellier/train_77050_627760.laz",
+            "montpellier/train_77055_627755.laz",
+            "montpellier/train_77055_627760.laz",
+        ),
+        CLASSES,
+        "French city, campus with trees",
+        _LIDARHD,
+    ),
+    "Delft": Survey(
+        ("delft/train.laz",),
+        {2: GROUND, 6: BUILDING, 9: GROUND},
+        "Dutch old town with canals (AHN3)",
+        _AHN,
+        dropped=(7, 18, 26),
+        tall={1: 2.0},
+    ),
+    "Seville": Survey(
+        ("seville/plazanueva.laz",),
+        CLASSES,
+        "Spanish old town, closed blocks (PNOA)",
+        "Instituto Geografico Nacional de Espana, PNOA, CC BY 4.0",
+        returns=False,
+    ),
+    "hamlet": Survey(("rural/lidarhd_57ppm2.laz",), CLASSES, "French hamlet on a slope", _LIDARHD),
+    "farm": Survey(
+        ("rural/lidarhd_11ppm2.laz",),
+        {2: GROUND, 6: BUILDING},
+        "French farm",
+        _LIDARHD,
+        dropped=(7, 18, 208, 214),
+        tall={1: 0.5},
+        tall_scored=True,
+    ),
+    "power line": Survey(
+        ("rural/ahn4_powerline.laz",),
+        {2: GROUND, 5: VEGETATION, 9: GROUND},
+        "Dutch meadows and woods under a power line (AHN4)",
+        _AHN + ", arranged by github hankersyan/AHN_transmission_corridor",
+        dropped=(7, 18, 26, 1),
+        returns=False,
+    ),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """A survey, or a copy of it, with heights.
+
+    Attributes
+    ----------
+    survey, name : str
+    xyz : (n, 3) float64
+        Metres.
+    labels : (n,) uint8
+        2, 5, 6, or 0: what is trained on.
+    truth : (n,) uint8
+        The same: what is scored.
+    dimensions : dict
+        What the models read beside coordinates.
+    """
+
+    survey: str
+    name: str
+    xyz: np.ndarray
+    labels: np.ndarray
+    truth: np.ndarray
+    dimensions: dict[str, np.ndarray]
+
+    def part(self, rows: np.ndarray, name: str, xyz: np.ndarray | None = None) -> Cloud:
+        """Some of the points, with heights of their own; `xyz`: where they are now."""
+        return with_heights(
+            Cloud(
+                self.survey,
+                name,
+                self.xyz[rows] if xyz is None else xyz,
+                self.labels[rows],
+                self.truth[rows],
+                {key: self.dimensions[key][rows] for key in ("ReturnNumber", "NumberOfReturns")},
+            )
+        )
+
+    @property
+    def density(self) -> float:
+        """Points per square metre of the 4 m cells that hold more than one, the median."""
+        _, number = np.unique(np.floor(self.xyz[:, :2] / 4.0), axis=0, return_counts=True)
+        return float(np.median(number[number > 1]) / 16.0)
+
+
+def load(data: Path, survey: str) -> Cloud:
+    """A survey as it was published, with heights above filtered ground."""
+    known = SURVEYS[survey]
+    parts = [laspy.read(data / name) for name in known.files]
+    xyz = np.concatenate([np.column_stack([p.x, p.y, p.z]) for p in parts]).astype(float)
+    code = np.concatenate([np.asarray(p.classification) for p in parts]).astype(np.uint8)
+    dimensions = {
+        name: np.concatenate([np.asarray(p[word]) for p in parts]).astype(np.uint8)
+        for name, word in (("ReturnNumber", "return_number"), ("NumberOfReturns", "number_of_returns"))
+    }
+    kept = ~np.isin(code, known.dropped)
+    xyz, code = xyz[kept], code[kept]
+    labels = np.zeros(len(code), np.uint8)
+    for given, ours in known.labels.items():
+        labels[code == given] = ours
+    kept_dimensions = {name: values[kept] for name, values in dimensions.items()}
+    cloud = with_heights(Cloud(survey, survey, xyz, labels, labels.copy(), kept_dimensions))
+    for given, height in known.tall.items():
+        tall = (code == given) & (cloud.dimensions["HeightAboveGround"] >= height)
+        cloud.labels[tall] = VEGETATION
+        if known.tall_scored:
+            cloud.truth[tall] = VEGETATION
+    return cloud
+
+
+def with_heights(cloud: Cloud) -> Cloud:
+    """The cloud with what the ground filter makes of it."""
+    made = filtered_ground(*np.ascontiguousarray(cloud.xyz.T), openings=(5, 17))
+    return replace(cloud, dimensions={**cloud.dimensions, **made})
+
+
+def thinned(cloud: Cloud, density: float) -> Cloud | None:
+    """A copy of so many points per square metre, chosen by their coordinates; None if it is hardly denser itself."""
+    share = density / cloud.density
+    if share > 0.87:
+        return None
+    kept = np.flatnonzero(coordinate_hash(cloud.xyz, 0) < np.uint64(share * 2.0**64))
+    return cloud.part(kept, f"{cloud.name}, {density:g} points/m2")
+
+
+def without_returns(cloud: Cloud) -> Cloud:
+    """A copy that has no return numbers."""
+    none = np.zeros(len(cloud.xyz), np.uint8)
+    return replace(
+        cloud,
+        name=f"{cloud.name}, no returns",
+        dimensions={**cloud.dimensions, "ReturnNumber": none, "NumberOfReturns": none},
+    )
+
+
+def on_slopes(cloud: Cloud, slope: float, seed: int, most: int = 250_000) -> Cloud:
+    """A copy that stands on synthetic terrain: a tilted plane and waves, up to about that slope (rise over run).
+
+    Of a large cloud a strip of at most `most` points is taken.
+    """
+    random = np.random.default_rng(seed)
+    if len(cloud.xyz) > most:
+        order = np.argsort(cloud.xyz[:, 0], kind="stable")
+        first = int(random.integers(0, len(order) - most))
+        part = np.sort(order[first : first + most])
+    else:
+        part = np.arange(len(cloud.xyz))
+    xyz = cloud.xyz[part].copy()
+    u = xyz[:, :2] - xyz[:, :2].mean(axis=0)
+
+    def direction() -> np.ndarray:
+        angle = random.uniform(0, 2 * np.pi)
+        return np.array([np.cos(angle), np.sin(angle)])
+
+    rise = u @ direction() * random.uniform(0.3, 1.0) * slope
+    for length, share in ((150.0, 0.5), (60.0, 0.35), (25.0, 0.15)):
+        for _ in range(3):
+            number = 2 * np.pi / (length * random.uniform(0.7, 1.4))
+            wave = np.sin(number * (u @ direction()) + random.uniform(0, 2 * np.pi))
+            rise += share * slope / number / 3 * wave
+    xyz[:, 2] = np.round(xyz[:, 2] + rise, 3)
+    return cloud.part(part, f"{cloud.name}, slopes to {100 * slope:.0f} %", xyz)

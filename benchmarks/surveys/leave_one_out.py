@@ -1,0 +1,128 @@
+"""Leave one survey out: each survey classified by a model that was trained on all the others.
+
+    python benchmarks/surveys/leave_one_out.py --data DIR --json FILE
+
+Every survey at its own density and thinned to 2 and 0.5 points per square metre. OA and F1 over ground, vegetation and
+building; low vegetation and what is none of the three is not scored. With --ground the ISPRS filter samples are scored
+on ground alone, by a model of all surveys.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+from clouds import SURVEYS, Cloud, load, thinned, with_heights
+from recipe import train_on
+
+from pdal_stages.accuracy import Accuracy
+from pdal_stages.classifier import Model, load_model
+
+SAMPLES = (11, 12, 21, 31, 41, 51, 54, 61)
+NAMES = {2: "ground", 5: "vegetation", 6: "building"}
+
+
+def score(model: Model, cloud: Cloud) -> dict[str, Any]:
+    """How well the model does on a cloud."""
+    found = model.predict(cloud.xyz, cloud.dimensions).classification
+    known = cloud.truth > 0
+    codes = sorted(set(cloud.truth[known].tolist()) | {2, 5, 6})
+    result = Accuracy.from_labels(cloud.truth[known], found[known], classes=codes)
+    matrix = {
+        f"{NAMES[a]} as {NAMES[b]}": int(np.count_nonzero((cloud.truth == a) & (found == b)))
+        for a in codes
+        for b in codes
+        if a != b
+    }
+    worst = max(matrix, key=lambda key: matrix[key])
+    return {
+        "cloud": cloud.name,
+        "points": int(known.sum()),
+        "density": round(cloud.density, 2),
+        "oa": 100 * float(np.mean(found[known] == cloud.truth[known])),
+        "f1": {
+            NAMES[c]: 100 * float(f)
+            for c, f in zip(codes, result.f1, strict=True)
+            if (cloud.truth == c).any()
+        },
+        "worst": worst,
+        "share": 100 * matrix[worst] / int(known.sum()),
+    }
+
+
+def ground_only(model: Model, data: Path, sample: int) -> dict[str, Any]:
+    """Ground or not, on one of the ISPRS filter samples."""
+    las = laspy.read(data / "isprs_filter" / f"samp{sample}.laz")
+    xyz = np.column_stack([las.x, las.y, las.z]).astype(float)
+    truth = np.asarray(las.classification).astype(np.uint8)
+    cloud = with_heights(Cloud("ISPRS", f"samp{sample}", xyz, truth, truth, {}))
+    found = model.predict(cloud.xyz, cloud.dimensions).classification == 2
+    ground = truth == 2
+    return {
+        "cloud": cloud.name,
+        "points": len(xyz),
+        "density": round(cloud.density, 2),
+        "total": 100 * float(np.mean(found != ground)),
+        "type_1": 100 * float(np.mean(~found[ground])),
+        "type_2": 100 * float(np.mean(found[~ground])),
+    }
+
+
+def tables(runs: list[dict[str, Any]], samples: list[dict[str, Any]]) -> str:
+    """Both as Markdown."""
+    lines = [
+        "| survey left out | points/m2 | OA | F1 ground | vegetation | building | what costs most |",
+        "|---|---:|---:|---:|---:|---:|---|",
+    ]
+    for run in runs:
+        f1 = " | ".join(f"{run['f1'][name]:.1f}" if name in run["f1"] else "-" for name in NAMES.values())
+        lines.append(
+            f"| {run['cloud']} | {run['density']} | {run['oa']:.1f} | {f1} | {run['worst']} ({run['share']:.1f} %) |"
+        )
+    lines.append(f"| **mean** | | **{np.mean([run['oa'] for run in runs]):.1f}** | | | | |")
+    if samples:
+        lines += [
+            "",
+            "| ISPRS sample | points/m2 | total error | type I | type II |",
+            "|---|---:|---:|---:|---:|",
+        ]
+        for one in samples:
+            errors = f"{one['total']:.1f} | {one['type_1']:.1f} | {one['type_2']:.1f}"
+            lines.append(f"| {one['cloud']} | {one['density']} | {errors} |")
+        lines.append(f"| **mean** | | **{np.mean([one['total'] for one in samples]):.1f}** | | |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    options.add_argument("--data", type=Path, required=True, help="folder of the clouds")
+    options.add_argument("--json", type=Path, help="where the figures go")
+    options.add_argument("--surveys", nargs="+", default=list(SURVEYS), choices=list(SURVEYS))
+    options.add_argument("--ground", type=Path, help="model file to score on the ISPRS samples")
+    args = options.parse_args()
+    runs: list[dict[str, Any]] = []
+    for left_out in args.surveys:
+        started = time.process_time()
+        model = train_on(args.data, [name for name in SURVEYS if name != left_out])
+        cloud = load(args.data, left_out)
+        for one in (cloud, thinned(cloud, 2.0), thinned(cloud, 0.5)):
+            if one is not None:
+                runs.append(score(model, one))
+                print(json.dumps(runs[-1]), flush=True)
+        print(f"{left_out}: {time.process_time() - started:.0f} CPU s", flush=True)
+    samples = []
+    if args.ground:
+        model = load_model(args.ground)
+        samples = [ground_only(model, args.data, sample) for sample in SAMPLES]
+    print(tables(runs, samples))
+    if args.json:
+        args.json.write_text(json.dumps({"surveys": runs, "isprs": samples}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
