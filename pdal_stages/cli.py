@@ -145,11 +145,17 @@ def _parser() -> argparse.ArgumentParser:
     command = add("classify", _classify, "Classify a cloud with a model file", overrides=True)
     command.add_argument("input", help="A file PDAL can read")
     command.add_argument("output", help="A file PDAL can write; other dimensions and the header are kept")
-    command.add_argument("--model", required=True, help="The model file")
+    command.add_argument(
+        "--model",
+        default="standard",
+        help="A model file, or a shipped model's name (pdal-stages models); default standard",
+    )
     command.add_argument(
         "--where", help="Only classify points for which this holds; the others serve as neighbors"
     )
     command.add_argument("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
+
+    add("models", _models, "List the models that come with the package")
 
     command = add("train", _train, "Train a model on labelled clouds", overrides=True)
     command.add_argument("inputs", nargs="+", help="Labelled files PDAL can read")
@@ -306,6 +312,17 @@ def _classify(options: argparse.Namespace) -> None:
     print(_class_counts(report, dict(loaded_model(options.model).classes)))
 
 
+def _models(options: argparse.Namespace) -> None:
+    from .base.asprs import class_name
+    from .classifier import load_model
+    from .models import shipped
+
+    for name, path in shipped().items():
+        model = load_model(path)
+        classes = ", ".join(f"{code} {class_name(code)}" for code, _ in model.classes)
+        print(f"{name:12s} {classes}; {path}")
+
+
 def _class_counts(report: dict, names: dict[int, str]) -> str:
     from .base.asprs import class_name
 
@@ -362,8 +379,9 @@ def _accuracy(options: argparse.Namespace) -> None:
 
 def _model(options: argparse.Namespace) -> None:
     from .classifier import load_model
+    from .models import find
 
-    model = load_model(options.file)
+    model = load_model(find(options.file))
     if options.html:
         from .reports.modelpage import write_model_report
 

@@ -22,9 +22,9 @@ def classify_pipeline(
     """Read, give heights if the model wants them, classify, write with everything else kept."""
     from ..stages.modelclassifier import loaded_model
 
-    stages: list[dict[str, Any]] = [_reader(source, "input")]
-    if "HeightAboveGround" in loaded_model(model).required_dimensions:
-        stages.append({"type": "filters.hag_minima"})
+    loaded = loaded_model(model)
+    prepared = loaded.info.get("preparation") or heights_for(loaded.required_dimensions)
+    stages: list[dict[str, Any]] = [_reader(source, "input"), *prepared]
     classifier: dict[str, Any] = {"type": "filters.modelclassifier", "model": model}
     if where:
         classifier["where"] = where
@@ -39,10 +39,21 @@ def train_pipeline(sources: Iterable[str], model: str, **options: Any) -> list[d
 
     writer = {"filename": model, **options}
     stages: list[dict[str, Any]] = [_reader(name, f"input{i}") for i, name in enumerate(sources, 1)]
-    if "HeightAboveGround" in ClassifierModel(writer).reads():
-        stages.append({"type": "filters.hag_minima"})
+    stages += heights_for(ClassifierModel(writer).reads())
     stages.append({"type": ClassifierModel.type, **writer})
     return stages
+
+
+def heights_for(dimensions: Iterable[str]) -> list[dict[str, Any]]:
+    """The stage that makes these dimensions, as far as they are heights."""
+    names = list(dimensions)
+    openings = [int(name.rpartition("_")[2]) for name in names if name.startswith("HeightAboveOpening_")]
+    if openings or "Ground" in names:
+        stage: dict[str, Any] = {"type": "filters.hag_morphological"}
+        if "Ground" in names:
+            stage["ground"] = True
+        return [{**stage, "openings": sorted(openings)}] if openings else [stage]
+    return [{"type": "filters.hag_minima"}] if "HeightAboveGround" in names else []
 
 
 def accuracy_pipeline(

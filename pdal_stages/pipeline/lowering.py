@@ -15,7 +15,7 @@ from typing import Any
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import DimensionError, OptionError, PipelineError, StageError, suggest
 from ..base.las import LasHeader, read_header
-from ..stages import registry
+from ..stages import preparation, registry
 from ..stages.base import Stage
 from .optionfile import settled
 from .read import PipelineSource
@@ -60,10 +60,11 @@ class LoweredStage:
 
 @dataclass
 class Lowered:
-    """A plain PDAL pipeline, and which of its stages are ours."""
+    """A plain PDAL pipeline, which of its stages are ours, and what the user should know of it."""
 
     stages: list[dict[str, Any]]
     ours: list[LoweredStage] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
 
     @property
     def halo(self) -> float:
@@ -109,8 +110,26 @@ def lower(source: PipelineSource) -> Lowered:
         views.add(stage)
         out.ours.append(lowered)
         out.stages.append(lowered.plain)
+    _tell_preparations(out)
     _check_writers(out)
     return out
+
+
+def _tell_preparations(lowered: Lowered) -> None:
+    """Each stage of ours hears which stages before it made what it reads."""
+    for ours in lowered.ours:
+        wanted = set(ours.stage.reads())
+        makers = {one.index: one for one in lowered.ours if wanted & set(one.stage.creates())}
+        made = []
+        for index, stage in enumerate(lowered.stages[: ours.index]):
+            if index in makers:
+                made.append(preparation.entry({"type": makers[index].stage.type, **makers[index].given}))
+            elif "HeightAboveGround" in wanted and stage.get("type") in preparation.OF_PDAL:
+                made.append(preparation.entry(stage))
+        if made:
+            ours.plain["pdalargs"]["preparation"] = made
+        if (remark := ours.stage.follows(made)) is not None:
+            lowered.remarks.append(remark)
 
 
 def _as_object(given: Any) -> dict[str, Any]:

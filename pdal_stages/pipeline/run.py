@@ -139,7 +139,8 @@ class Pipeline:
                 raise PipelineError(
                     "the file cannot be read", where=path, found=error.strerror or str(error)
                 ) from None
-        self.remarks = [
+        self.remarks = list(self.lowered.remarks)
+        self.remarks += [
             r for path in readers_files(self.lowered.stages, las=True) if (r := check_readable(path))
         ]
 

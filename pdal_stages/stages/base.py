@@ -98,6 +98,10 @@ class Stage(ABC):
     def check(self) -> None:
         """Refuse options that contradict each other; read the files they name."""
 
+    def follows(self, preparation: list[dict[str, Any]]) -> str | None:
+        """Told, before it runs in a pipeline, which stages made what it reads; what the user should know of it."""
+        return None
+
     def outputs(self) -> list[Output]:
         """Files the stage will write."""
         return []

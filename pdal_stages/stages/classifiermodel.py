@@ -15,7 +15,7 @@ from ..base.files import check_writable
 from ..base.outputs import Output
 from ..classifier import TrainingCloud, TrainingOptions, train
 from ..classifier.classes import ClassMap
-from ..classifier.dimensions import required
+from ..classifier.dimensions import required, welcome
 from ..classifier.trainoptions import MOST_PASSES
 from .base import Stage
 from .options import option
@@ -169,7 +169,12 @@ holds the classes.
             given["classes"] = {str(c): _code(c) for c in codes}
         if isinstance(share, int | float) and not isinstance(share, bool):
             given["max_features"] = str(share)
+        self._preparation: list[dict[str, Any]] = []
         super().__init__(given, place)
+
+    def follows(self, preparation: list[dict[str, Any]]) -> str | None:
+        self._preparation = preparation
+        return None
 
     @cached_property
     def training(self) -> TrainingOptions:
@@ -206,11 +211,13 @@ holds the classes.
         cloud = TrainingCloud(
             xyz=points.xyz,
             labels=points.codes_of(self.label),
-            dimensions={name: points.dimension(name) for name in required(self.training.inputs)},
+            dimensions={name: points.dimension(name) for name in required(self.training.inputs)}
+            | {name: points.arrays[name] for name in welcome(self.training.inputs) if name in points.arrays},
             name="the points",
             mask=points.mask,
         )
         model = train([cloud], self.training)
+        model.info["preparation"] = self._preparation
         model.save(self.filename)
         points.report.update({"model": self.filename, **_brief(model.info), "seconds": model.seconds})
         if self.algorithm == "alsnet":  # with the curve

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import OptionError
+from ..base.errors import DimensionError, OptionError
 from ..base.progress import Progress
 from ..classifier import Model, load_model
 from ..classifier.smoothing import FARTHEST
+from ..models import find
 from .base import Stage
 from .options import option
 from .points import Points
+from .preparation import as_json, same
 
 
 class ModelClassifier(Stage):
@@ -23,7 +26,13 @@ class ModelClassifier(Stage):
     source = "[B16] section 3.4, [W18] section 3.3, [WM19] for networks"
     where_chooses = True
     where_help = "Points outside keep their class but still serve as neighbors."
-    model_file: str = option("filename", None, "The model file to apply", required=True, name="model")
+    model_file: str = option(
+        "filename",
+        None,
+        "The model file to apply, or the name of a shipped one (standard)",
+        required=True,
+        name="model",
+    )
     probabilities: bool = option(
         "boolean", False, "Also write the probability of each class, as Probability_<code>"
     )
@@ -88,6 +97,19 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         """The loaded model."""
         return loaded_model(self.model_file)
 
+    @property
+    def preparation(self) -> list[dict[str, Any]]:
+        """The stages that made what the model was trained on; empty where the model does not say."""
+        return self.model.info.get("preparation") or []
+
+    def follows(self, preparation: list[dict[str, Any]]) -> str | None:
+        if not self.preparation or not preparation or same(preparation, self.preparation):
+            return None
+        return (
+            f"{self.type}: the model was trained on other heights than this pipeline makes. Trained on: "
+            f"{as_json(self.preparation)}. Here: {as_json(preparation)}. Expect worse classes, or use the former"
+        )
+
     def most_neighbors(self) -> int:
         return self.model.plan.most_neighbors
 
@@ -113,6 +135,18 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
     def largest_class(self) -> int:
         return max([code for code, _ in self.model.classes] + [self.rejected_code or 0])
 
+    def _dimensions(self, points: Points) -> dict[str, NDArray]:
+        """What the model reads; an error for what is missing says which stages make it."""
+        found = {name: points.arrays[name] for name in self.model.welcome_dimensions if name in points.arrays}
+        for name in self.model.required_dimensions:
+            try:
+                found[name] = points.dimension(name)
+            except DimensionError as error:
+                if self.preparation:
+                    error.cure = f"Put before this stage: {as_json(self.preparation)}"
+                raise
+        return found
+
     def run(self, points: Points) -> dict[str, NDArray]:
         if points.count == 0:
             return {}
@@ -120,7 +154,7 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         with Progress(chosen, self.type) as progress:
             found = self.model.predict(
                 points.xyz,
-                {name: points.dimension(name) for name in self.model.required_dimensions},
+                self._dimensions(points),
                 points.mask,
                 current=points.class_codes,
                 threads=self.threads,
@@ -155,6 +189,7 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
 
 def loaded_model(path: str) -> Model:
     """A model file's model, read once per process as long as the file stays the same."""
+    path = find(path)
     try:
         stat = Path(path).stat()
         stamp = (stat.st_mtime_ns, stat.st_size)

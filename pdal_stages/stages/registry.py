@@ -9,7 +9,7 @@ from functools import cache
 from ..base.errors import PipelineError, suggest
 from .base import Stage
 
-_SUPPORT = {"base", "options", "points", "registry", "where"}
+_SUPPORT = {"base", "options", "points", "registry", "where", "preparation"}
 
 
 @cache
