@@ -17,7 +17,9 @@ def test_numbers_are_taken_where_they_are_within(value):
     try:
         number = checks.number("'x'", value, -5, 2**63 - 1)
     except OptionError as error:
-        assert not good and str(error).startswith("'x' must be a number from -5 to 9223372036854775807 (found ")
+        assert not good and str(error).startswith(
+            "'x' must be a number from -5 to 9223372036854775807 (found "
+        )
     else:
         assert good and number == float(value) and type(number) is float
     try:
@@ -60,7 +62,9 @@ def test_numbers_of_numpy():
 
 def test_words():
     assert checks.one_of("x", "a", ("a", "b")) == "a"
-    with pytest.raises(OptionError, match=r"x must be one of 'sqrt', 'log2' \(found 'sqr'\). Did you mean 'sqrt'"):
+    with pytest.raises(
+        OptionError, match=r"x must be one of 'sqrt', 'log2' \(found 'sqr'\). Did you mean 'sqrt'"
+    ):
         checks.one_of("x", "sqr", ("sqrt", "log2"))
     with pytest.raises(OptionError):
         checks.one_of("x", True, (0, 1))

@@ -32,7 +32,8 @@ def test_several_files_appear_together_or_not_at_all(tmp_path):
         raise ZeroDivisionError
     assert names(tmp_path) == ["b.txt"] and b.read_text() == "older"
 
-    def check(made, final):
+    def check(made, final, number):
+        assert number == [a, b].index(final)
         if final == b:
             raise StageError("not whole", found=str(made))
 

@@ -11,7 +11,6 @@ import sys
 import time
 from pathlib import Path
 
-import laspy
 import numpy as np
 import pytest
 import tiling_clouds as clouds
@@ -20,7 +19,6 @@ from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.base.threads import available_threads
 from pdal_stages.tiling import run_tiled
 from pdal_stages.tiling.store import Store
-from pdal_stages.tiling.tail import check_whole
 
 pytestmark = pytest.mark.pdal
 WORKERS = min(2, available_threads())
@@ -171,22 +169,6 @@ def test_full_file_system(tmp_path, folder, expected):
         check_same(small, expected)
     finally:
         subprocess.run(["umount", str(small)], check=True)
-
-
-def test_outputs_are_checked_before_they_get_their_name(tmp_path, folder):
-    source = folder / "east.laz"
-    whole = tmp_path / "whole.las"
-    laspy.read(source).write(whole)
-    count = len(laspy.read(whole))
-    check_whole(whole, whole, count)
-    with pytest.raises(StageError, match="not whole"):
-        check_whole(whole, whole, count + 1)
-    for path in (whole, tmp_path / "whole.laz"):
-        laspy.read(source).write(path)
-        content = path.read_bytes()
-        path.write_bytes(content[: len(content) - 2_000])
-        with pytest.raises(StageError, match="not whole"):
-            check_whole(path, path, count)
 
 
 # ---- inputs ----------------------------------------------------------------------------------------------

@@ -140,7 +140,7 @@ def write_whole(path: str | os.PathLike, content: bytes, what: str = "output") -
 
 @contextlib.contextmanager
 def whole_files(
-    *paths: str | os.PathLike, what: str = "output", check: Callable[[Path, Path], None] | None = None
+    *paths: str | os.PathLike, what: str = "output", check: Callable[[Path, Path, int], None] | None = None
 ) -> Iterator[list[Path]]:
     """Give files to write to; on leaving, all of them get their names, or after an exception none.
 
@@ -152,7 +152,8 @@ def whole_files(
     what : str
         What messages call them.
     check : callable, optional
-        Called with each file that was written and the name it is to get, before any of them gets its name.
+        Called with each file that was written, the name it is to get and the number of the path it belongs to,
+        before any of them gets its name.
 
     Yields
     ------
@@ -173,12 +174,12 @@ def whole_files(
         inside = True
         yield [place.partial for place in places]
         inside = False
-        moves = [move for place in places for move in place.made()]
-        for made, target in moves:
+        moves = [(*move, number) for number, place in enumerate(places) for move in place.made()]
+        for made, target, number in moves:
             check_writable(target, what, kind_of(made) or "a file of another kind")
             if check is not None:
-                check(made, target)
-        for made, target in moves:
+                check(made, target, number)
+        for made, target, _ in moves:
             _give_name(made, target)
     except StageError as error:
         for place in places:

@@ -155,20 +155,6 @@ def _what_is_wrong(header: LasHeader, size: int, table: int) -> tuple[str, str] 
     return None
 
 
-def is_short(path: str | os.PathLike, size: int) -> bool | None:
-    """Whether a file just written ends before its points do; None where it is no LAS file."""
-    header = read_header(path)
-    if header is None:
-        return True if size < 227 else None
-    if not header.compressed:
-        # The count is written last: none of it, but points and no records after them, is a header left behind.
-        unfinished = (
-            not header.count and not header.records_after and size >= header.offset + header.point_bytes
-        )
-        return unfinished or header.end_of_points > size
-    return bool(header.count) and not header.offset + 8 <= _chunk_table(path, size, header) <= size - 8
-
-
 def supersede_copc(path: str | os.PathLike) -> bool:
     """Mark COPC records that do not describe this file, which PDAL forwards from a COPC input with the others.
 

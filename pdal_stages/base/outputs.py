@@ -1,4 +1,4 @@
-"""What a command is about to write, held against what it reads and what is there already; and what it wrote."""
+"""What a command is about to write, held against what it reads and what is there already."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from .errors import StageError
-from .files import check_writable, disk_is_full, is_stream
-from .las import is_short
+from .files import check_writable, is_stream
 
 
 @dataclass(frozen=True)
@@ -82,33 +81,3 @@ def _numbered(output: Path, inputs: list[Path]) -> Path | None:
     before, _, after = output.name.partition("#")
     pattern = re.compile(rf"{re.escape(before)}\d+{re.escape(after)}")
     return next((p for p in inputs if p.parent == output.parent and pattern.fullmatch(p.name)), None)
-
-
-def check_complete(path: str | os.PathLike, name: str | os.PathLike) -> None:
-    """Refuse a file that a writer could not finish: PDAL's do not notice that a disk is full.
-
-    Parameters
-    ----------
-    path : path
-        The file as it was written.
-    name : path
-        The name it is to get, for the message.
-
-    Raises
-    ------
-    StageError
-        If a LAS or LAZ file is shorter than its header says, or no space is left beside the file.
-    """
-    path = Path(path)
-    try:
-        size = path.stat().st_size
-        short = is_short(path, size) if path.suffix.lower() in (".las", ".laz") else None
-        full = short is None and disk_is_full(path)
-    except OSError as error:
-        raise StageError("the output file cannot be read back", found=f"{name}: {error}") from error
-    if short or full:
-        raise StageError(
-            "the output file could not be written completely",
-            found=f"{name}: {size:,} bytes were written",
-            cure="Make room on the disk (or raise the limit on file sizes)",
-        )

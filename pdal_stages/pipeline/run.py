@@ -9,14 +9,15 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from ..base.complete import check_complete
 from ..base.errors import InterruptedStage, PipelineError, StageError
 from ..base.files import whole_files
 from ..base.las import check_readable, odd_text, supersede_copc
-from ..base.outputs import Output, check_complete, check_outputs
+from ..base.outputs import Output, check_outputs
 from ..stages import registry
 from . import pdal as pdal_env
 from . import runtime
-from .filenames import named_files, readers_files, stage_files, with_outputs, writers_outputs
+from .filenames import is_writer, named_files, readers_files, stage_files, with_outputs, writers_outputs
 from .interrupts import gentle
 from .lowering import Lowered, lower
 from .overrides import Override, apply_overrides
@@ -103,14 +104,23 @@ class Pipeline:
         """
         self._check_inputs()
         self.check_outputs()
-        outputs = [output.path for output in writers_outputs(self.lowered.stages)]
+        stages = self.lowered.stages
+        outputs = [output.path for output in writers_outputs(stages)]
+        writers = [stage for stage in stages if is_writer(stage, stages)]
+        alone = len(writers) == 1 and writers[0] is stages[-1] and "where" not in writers[0]
+
+        def finish(made: Path, final: Path, number: int) -> None:
+            count = result.count if alone and "#" not in outputs[0] else None
+            check_complete(made, final, writers[number], count)
+            supersede_copc(made)
+
         runtime.remember_stdout()
         failure: StageError | None = None
         try:
-            with whole_files(*outputs, check=_finish) as partials:
+            with whole_files(*outputs, check=finish) as partials:
                 try:
                     with gentle(signal.SIGINT) as interrupts:
-                        result = pdal_env.execute(with_outputs(self.lowered.stages, partials), arrays=arrays)
+                        result = pdal_env.execute(with_outputs(stages, partials), arrays=arrays)
                         interrupts.check()
                 finally:
                     self.reports = []
@@ -182,12 +192,6 @@ _STAGE_TYPE = re.compile(r"\b(?:readers|filters|writers)\.\w+")
 
 
 _NOT_UTF8 = re.compile(r"returned a result with an exception set|UnicodeDecodeError|codec can't decode")
-
-
-def _finish(made: Path, final: Path) -> None:
-    """What remains to be done to a file that PDAL wrote, before it gets its name."""
-    check_complete(made, final)
-    supersede_copc(made)
 
 
 def _named_metadata(

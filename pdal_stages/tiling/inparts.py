@@ -9,12 +9,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from ..base.complete import check_complete
 from ..base.files import whole_files
 from .cloudindex import BLOCK, open_las, read_block
 from .extract import finish, plain_header
 from .results import NewValues
 from .sources import Source
-from .tail import check_whole, run_tail, stamp
+from .tail import run_tail, stamp
 
 
 class HeadersDifferError(Exception):
@@ -42,8 +43,8 @@ def write_in_parts(
     """
     joined: list[_Joined] = []
 
-    def check(made: Path, final: Path) -> None:
-        check_whole(made, final, joined[0].count)
+    def check(made: Path, final: Path, number: int) -> None:
+        check_complete(made, final, {"type": "writers.las", "filename": final}, joined[number].count)
 
     with whole_files(*outputs, check=check) as partials, contextlib.ExitStack() as stack:
         joined += [stack.enter_context(contextlib.closing(_Joined(p))) for p in partials]

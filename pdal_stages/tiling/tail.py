@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from ..base.complete import check_complete
 from ..base.errors import StageError
 from ..base.files import whole_files
 from ..base.las import supersede_copc
 from ..pipeline import pdal as pdal_env
 from ..pipeline.runtime import Callbacks
-from .cloudindex import open_las, read_block
 from .results import NewValues
 
 _PDAL_TYPES = {
@@ -46,8 +46,10 @@ def run_tail(
         ``outputs`` with size and time of change, ``written`` points.
     """
 
-    def finish(made: Path, final: Path) -> None:
-        check_whole(made, final, run.count)
+    writers = [stage for stage in tail if stage["type"].startswith("writers.")]
+
+    def finish(made: Path, final: Path, number: int) -> None:
+        check_complete(made, final, writers[number], None if "where" in writers[number] else run.count)
         supersede_copc(made)
 
     with Callbacks() as callbacks:
@@ -97,34 +99,3 @@ def stamp(path: str | Path) -> list[int]:
     """Size and time of change of a file."""
     stat = os.stat(path)
     return [stat.st_size, stat.st_mtime_ns]
-
-
-def check_whole(partial: Path, final: Path, count: int) -> None:
-    """Refuse a file that is not whole: a writer may not notice that the disk is full.
-
-    Raises
-    ------
-    StageError
-        Naming the output.
-    """
-    with open(partial, "rb+") as file:
-        os.fsync(file.fileno())  # some file systems report a full disk only here
-    if final.suffix.lower() not in (".las", ".laz"):
-        return
-    full = "The disk may be full"
-    try:
-        with open_las(str(partial)) as reader:
-            header = reader.header
-            found = int(header.point_count)
-            if found == count and count:
-                read_block(reader, str(partial), count - 1, 1)
-                if final.suffix.lower() == ".las":
-                    needed = header.offset_to_point_data + count * header.point_format.size
-                    if partial.stat().st_size < needed:
-                        raise StageError("cut short")
-    except StageError:
-        raise StageError("the output is not whole", found=str(final), cure=full) from None
-    if found != count:
-        raise StageError(
-            "the output is not whole", found=f"{found:,} of {count:,} points in {final}", cure=full
-        )
