@@ -21,6 +21,7 @@ _WHERE = {
     "TrainingOptions": "classifier",
     "Writer": "pipeline.native",
     "compute_features": "features",
+    "filtered_ground": "terrain",
     "hag_minima": "terrain",
     "load_model": "classifier",
     "make_town": "synthetic",
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
     from .pipeline.native import Filter, Writer
     from .reports.accuracypage import write_accuracy_report
     from .synthetic import make_town
-    from .terrain.minima import hag_minima
+    from .terrain import filtered_ground, hag_minima
     from .tiling import run_tiled
 
 

@@ -18,12 +18,14 @@ from .where import Expression
 MAKERS = {
     "HeightAboveGround": 'Add {"type": "filters.hag_minima"} (or filters.hag_delaunay, filters.hag_nn) before this stage',
     "Reference": 'Keep the labels before classifying: {"type": "filters.ferry", "dimensions": "Classification=>Reference"}',
+    "Ground": 'Add {"type": "filters.hag_morphological", "ground": true} before this stage',
+    "Slope": 'Add {"type": "filters.hag_morphological", "terrain_slope": true} before this stage',
     "Intensity": "The reader does not give it; leave it out of the model's dimensions",
     "ReturnNumber": "The reader does not give it; leave it out of the model's dimensions",
     "NumberOfReturns": "The reader does not give it; leave it out of the model's dimensions",
 }
-#: Dimensions that are lengths upward, so they follow the vertical unit.
-VERTICAL_LENGTHS = ("HeightAboveGround", "Z")
+#: How the names of dimensions begin that are lengths upward, as Z is, so they follow the vertical unit.
+_HEIGHTS = "HeightAbove"
 
 
 class Points:
@@ -119,7 +121,7 @@ class Points:
         values = self.arrays[name]
         if name == "Classification":
             return self.class_codes
-        if metres and name in VERTICAL_LENGTHS and self.units.vertical != 1.0:
+        if metres and (name == "Z" or name.startswith(_HEIGHTS)) and self.units.vertical != 1.0:
             return values * self.units.vertical
         return values
 

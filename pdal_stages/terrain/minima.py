@@ -74,7 +74,7 @@ class MinimaTerrain:
         if mask is not None:
             usable &= np.asarray(mask, bool)
         terrain = cls(float(cell), float(resolution))
-        column, row = _cells(x[usable], cell), _cells(y[usable], cell)
+        column, row = cell_numbers(x[usable], cell), cell_numbers(y[usable], cell)
         key = _key(column, row)
         order = np.argsort(key, kind="stable")
         key = key[order]
@@ -271,7 +271,14 @@ def _bounded(index: NDArray[np.float64]) -> NDArray[np.int64]:
     return index.astype(np.int64)
 
 
-def _cells(coordinate: NDArray[np.float64], cell: float) -> NDArray[np.int64]:
+def cell_numbers(coordinate: NDArray[np.float64], cell: float) -> NDArray[np.int64]:
+    """Which cell coordinates fall in, counted from the origin.
+
+    Raises
+    ------
+    StageError
+        Where coordinates are beyond what any survey has.
+    """
     return _bounded(np.floor(coordinate / cell))
 
 

@@ -1,0 +1,150 @@
+"""``filters.hag_morphological``: height above ground that a progressive morphological filter finds [P13]."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.asprs import NOISE
+from ..base.errors import OptionError, StageError
+from ..terrain.morphological import check_sizes, filtered_ground, reach
+from ..terrain.profile import opening_names
+from .base import Stage
+from .options import option
+from .points import Points
+
+
+class HagMorphological(Stage):
+    type = "filters.hag_morphological"
+    summary = "Height above ground found by a progressive morphological filter"
+    source = "after Pingel, Clarke, McBride 2013 (SMRF), ISPRS Journal of Photogrammetry and Remote Sensing 77, 21-30"
+    where_help = "Points outside neither form the ground nor receive a height."
+    cell: float = option(
+        "number", 1.0, "Side of the grid's cells", minimum=0, exclusive=True, maximum=1000, unit="m"
+    )
+    slope: float = option(
+        "number",
+        0.15,
+        "Rise over run: a window removes what it lowers by more than this times its radius, or by 3.5 m; raise it for "
+        "rugged terrain without buildings",
+        minimum=0,
+        maximum=100,
+    )
+    window: float = option(
+        "number",
+        75.0,
+        "Radius of the largest window: half the width of the largest building",
+        minimum=0,
+        exclusive=True,
+        maximum=10_000,
+        unit="m",
+    )
+    threshold: float = option(
+        "number",
+        0.5,
+        "How far from the surface through the ground a point may lie and still be ground",
+        minimum=0,
+        maximum=1000,
+        unit="m",
+    )
+    scalar: float = option(
+        "number", 1.25, "Added to the threshold per unit of the terrain's slope", minimum=0, maximum=1000
+    )
+    ignore_classes: list = option(
+        "codes",
+        NOISE,
+        "Class codes that cannot be ground (they still receive heights), e.g. noise; a range such as "
+        "Classification[7:7] too, and by PDAL's name, ignore",
+        may_be_empty=True,
+        also="ignore",
+    )
+    ground: bool = option(
+        "boolean", False, "Also write Ground: 1 where the filter calls the point ground, else 0"
+    )
+    terrain_slope: bool = option("boolean", False, "Also write Slope: the terrain's, in degrees")
+    openings: list = option(
+        "list",
+        (),
+        "Also write heights above openings of the minimum grid with windows of these widths in metres, e.g. 5,9,17,33,65: "
+        "HeightAboveOpening_5, ...",
+        may_be_empty=True,
+    )
+    details = """
+The lowest point of every cell of a grid is taken, pits (low outliers) left out, and the grid opened with windows of
+growing radius: a cell that a window lowers by more than `slope` times its radius, or by 3.5 m, belongs to an object.
+A surface is led through what is left, ground that was taken from ridges and dams is regained where it continues the
+surface, and points within `threshold` plus `scalar` times the terrain's slope of it are ground. A point's height is its
+Z minus the surface through the ground points. `Classification` is read for `ignore_classes` alone and not changed;
+return numbers are not looked at.
+
+The options mean what they mean in PDAL's `filters.smrf`. Unlike it, every step reaches a bounded way and the grid is
+anchored to absolute coordinates: a tile with its halo (about 370 m, less with a smaller `window`) gets the heights of
+the whole cloud, bit for bit. Large buildings are removed up to twice `window`; what lies far from all ground, such as
+the middle of a large hall, is measured from the openings' level. A point with no usable point near has height 0;
+metadata counts these as `without_terrain`.
+
+`openings` are heights above what remains of the minimum grid when everything narrower than the window is removed. They
+need no threshold and tell a classifier what a point stands on: low above the narrow window and high above the wide one
+is a roof.
+
+Lengths are metres, whatever the unit of the points; `HeightAboveGround` and the heights above openings are in the unit
+of Z.
+"""
+    after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)
+    example = {"type": "filters.hag_morphological", "ground": True}
+
+    def check(self) -> None:
+        try:
+            self.windows = [float(size) for size in self.openings]
+        except ValueError:
+            raise OptionError(
+                "option 'openings' must list widths in metres", found=", ".join(map(str, self.openings))
+            ) from None
+        try:
+            check_sizes(self.cell, self.slope, self.window, self.threshold, self.scalar, self.windows)
+        except StageError as error:
+            raise OptionError(f"option {error.what}", found=error.found, cure=error.cure) from None
+
+    def creates(self) -> dict[str, str]:
+        return {
+            "HeightAboveGround": "double",
+            **({"Ground": "uint8_t"} if self.ground else {}),
+            **({"Slope": "double"} if self.terrain_slope else {}),
+            **dict.fromkeys(opening_names(self.windows), "float"),
+        }
+
+    def halo(self) -> float:
+        return reach(cell=self.cell, window=self.window, openings=self.windows)
+
+    def run(self, points: Points) -> dict[str, NDArray]:
+        x, y, z = points.xyz.T
+        usable = np.ones(points.count, bool)
+        if "Classification" in points.arrays and self.ignore_classes:
+            noise = np.isin(points.class_codes, np.array(self.ignore_classes, np.uint8))
+            wanted = slice(None) if points.mask is None else points.mask
+            points.report["ignored"] = int(np.count_nonzero(noise[wanted]))
+            usable = ~noise
+        inside = slice(None) if points.mask is None else points.mask
+        found = filtered_ground(
+            x[inside],
+            y[inside],
+            z[inside],
+            mask=usable[inside],
+            cell=self.cell,
+            slope=self.slope,
+            window=self.window,
+            threshold=self.threshold,
+            scalar=self.scalar,
+            openings=self.windows,
+            slope_too=self.terrain_slope,
+            threads=self.threads,
+            report=points.report,
+        )
+        out = {}
+        for name, kind in self.creates().items():
+            values = found[name]
+            if name.startswith("HeightAbove") and points.units.vertical != 1.0:
+                values = values / points.units.vertical
+            out[name] = np.array(points.arrays[name], {"double": "f8", "float": "f4", "uint8_t": "u1"}[kind])
+            out[name][inside] = values
+        return out

@@ -1,0 +1,136 @@
+"""The lowest point of every cell of a grid anchored to absolute coordinates, and which of them are pits.
+
+A pit is a low outlier: an echo from below the ground (multiple reflections, noise) that would pull the
+terrain down. Ground seen through a canopy lies as deep below its surroundings, but not alone, and what it
+lies below is rough.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..base.jit import njit
+from .openings import HOLE
+
+#: Cells within which a lone low cell looks for company, and within which smooth surroundings are judged.
+COMPANY, SURROUNDINGS = 20, 4
+
+#: A pit has fewer than `NEED` other cells within `LEVEL` + `GRADE` x distance of its height (metres).
+NEED, LEVEL, GRADE = 4, 1.0, 0.15
+#: Cells with points that must be in view before a cell may be called lonely.
+IN_VIEW = 12
+#: Or it lies `DROP` metres below all but a `SHARE` of the cells around, if these are smooth: from the lowest
+#: eighth to the middle no more than `SPREAD` metres, and `MANY`.
+DROP, SPREAD, SHARE, MANY = 3.0, 0.75, 0.15, 10
+
+
+def _by_distance(reach: int) -> tuple[np.ndarray, np.ndarray]:
+    """Offsets (row, column) within `reach` cells, nearest first, and their distances."""
+    j, i = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    squared = (j * j + i * i).ravel()
+    order = np.lexsort((i.ravel(), j.ravel(), squared))
+    order = order[(squared[order] > 0) & (squared[order] <= reach * reach)]
+    return np.column_stack([j.ravel(), i.ravel()])[order].astype(np.int64), np.sqrt(squared[order])
+
+
+@njit
+def lowest_points(z, x, y, use, column, row, left, bottom, grid):
+    """Put the index of the lowest usable point of each cell into `grid` (-1: none).
+
+    Of points of one height the first by x, then y, is taken, so that order does not matter.
+    """
+    grid[:] = -1
+    for p in range(len(z)):
+        if not use[p]:
+            continue
+        j, i = row[p] - bottom, column[p] - left
+        q = grid[j, i]
+        if q < 0 or z[p] < z[q] or (z[p] == z[q] and (x[p] < x[q] or (x[p] == x[q] and y[p] < y[q]))):
+            grid[j, i] = p
+
+
+@njit
+def cell_values(x, y, z, cell, grid):
+    """Place in the cell (from its centre, in cells) and height of each cell's lowest point."""
+    h, w = grid.shape
+    place = np.zeros((h, w, 3))
+    raster = np.full((h, w), HOLE, np.float32)
+    for j in range(h):
+        for i in range(w):
+            p = grid[j, i]
+            if p >= 0:
+                u, v = x[p] / cell, y[p] / cell
+                place[j, i, 0] = u - np.floor(u) - 0.5
+                place[j, i, 1] = v - np.floor(v) - 0.5
+                place[j, i, 2] = z[p]
+                raster[j, i] = z[p]
+    return place, raster
+
+
+@njit
+def _lonely(raster, offsets, distances, cell, out):
+    h, w = raster.shape
+    for j in range(h):
+        for i in range(w):
+            here = raster[j, i]
+            if here == HOLE:
+                continue
+            company, seen = 0, 0
+            for k in range(len(offsets)):
+                a, b = j + offsets[k, 0], i + offsets[k, 1]
+                if a < 0 or b < 0 or a >= h or b >= w or raster[a, b] == HOLE:
+                    continue
+                seen += 1
+                if abs(raster[a, b] - here) <= LEVEL + GRADE * cell * distances[k]:
+                    company += 1
+                    if company == NEED:
+                        break
+            out[j, i] = company < NEED and seen >= IN_VIEW
+
+
+@njit
+def _below_smooth(raster, out):
+    h, w = raster.shape
+    higher = np.empty((2 * SURROUNDINGS + 1) ** 2)
+    for j in range(h):
+        for i in range(w):
+            here = raster[j, i]
+            if here == HOLE or out[j, i]:
+                continue
+            low, n = 0, 0
+            for a in range(max(j - SURROUNDINGS, 0), min(j + SURROUNDINGS + 1, h)):
+                for b in range(max(i - SURROUNDINGS, 0), min(i + SURROUNDINGS + 1, w)):
+                    value = raster[a, b]
+                    if value == HOLE or out[a, b] == 1:
+                        continue
+                    if value < here + DROP:
+                        low += 1
+                    else:
+                        higher[n] = value
+                        n += 1
+            if n < MANY or low > SHARE * (low + n):
+                continue
+            near = np.sort(higher[:n])
+            if near[n // 2] - near[n // 8] <= SPREAD:
+                out[j, i] = 2
+
+
+def pits(raster: np.ndarray, cell: float) -> np.ndarray:
+    """Cells of a minimum grid (holes ``inf``) whose lowest point is a low outlier.
+
+    Parameters
+    ----------
+    raster : ndarray of float32, shape (h, w)
+        Lowest heights, metres.
+    cell : float
+        Side of a cell, metres.
+
+    Returns
+    -------
+    ndarray of bool, shape (h, w)
+    """
+    out = np.zeros(raster.shape, np.uint8)
+    offsets, distances = _by_distance(COMPANY)
+    _lonely(raster, offsets, distances, cell, out)
+    _below_smooth(raster, out)
+    return out > 0

@@ -1,0 +1,302 @@
+"""Height above filtered ground: a progressive morphological filter that tiles cannot tell from the whole.
+
+After SMRF [P13]: the grid of lowest points is opened with growing windows; a cell that an opening lowers by more
+than `slope` times the window's radius is an object; what is left is ground, a surface is led through it, and a
+point is ground if it lies within `threshold` plus `scalar` times the terrain's slope of the surface. Unlike there:
+
+* the grid is anchored to absolute coordinates and every step reaches a bounded way (:func:`reach`), so that a tile
+  with its halo gets the bits of the whole cloud, and so does any order of the points;
+* windows grow to the size of large halls, and a drop of a few metres is enough there (:mod:`.progressive`);
+* holes are left open, not painted over; a pyramid of planes carries the surface across them (:mod:`.planes`);
+* ground that openings took from ridges, dams and the upper side of walls is regained where it continues the surface;
+* low outliers are told from ground under a canopy (:mod:`.lowest`).
+
+[P13] Pingel, Clarke, McBride (2013): An improved simple morphological filter for the terrain classification of
+airborne LIDAR data. ISPRS Journal of Photogrammetry and Remote Sensing 77, 21-30.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..base.errors import OptionError, StageError
+from ..base.jit import njit
+from ..base.threads import map_blocks
+from .lowest import COMPANY, SURROUNDINGS, cell_values, lowest_points, pits
+from .minima import cell_numbers
+from .openings import HOLE
+from .patches import patches
+from .planes import blend, surface
+from .planes import reach as planes_reach
+from .profile import above_opening, opening_names, opening_radius
+from .progressive import objects_of
+
+#: Blocks, in metres, from which the surface is made: that for telling ground, and that of the heights.
+_NEAR, _FAR = 8.0, 32.0
+#: How often ground is regained.
+_ROUNDS = 3
+#: The most cells a window's radius may have.
+_MOST_CELLS = 300
+#: Points handed to a thread at a time.
+_SPAN = 1 << 17
+#: Heights beyond this, in metres, are no terrain, and too much for the sums.
+_HIGHEST = 1e6
+#: Sums of coordinates are whole numbers of this part of a metre, so that order does not matter.
+_PARTS = 2.0**20
+
+
+def filtered_ground(
+    x: ArrayLike,
+    y: ArrayLike,
+    z: ArrayLike,
+    *,
+    mask: ArrayLike | None = None,
+    cell: float = 1.0,
+    slope: float = 0.15,
+    window: float = 75.0,
+    threshold: float = 0.5,
+    scalar: float = 1.25,
+    openings: Sequence[float] = (),
+    slope_too: bool = False,
+    threads: int | None = None,
+    report: dict[str, Any] | None = None,
+) -> dict[str, NDArray]:
+    """Height of every point above the ground that a progressive morphological filter finds.
+
+    Parameters
+    ----------
+    x, y, z : array_like, shape (n,)
+        Coordinates in metres.
+    mask : array_like of bool, shape (n,), optional
+        Points that may be ground, e.g. all but noise; the others only receive heights.
+    cell : float, default 1
+        Side of the grid's cells, metres.
+    slope : float, default 0.15
+        Rise over run: a window of radius r removes what it lowers by more than `slope` times r, or by 3.5 m.
+    window : float, default 75
+        Radius of the largest window, metres: half the width of the largest building.
+    threshold, scalar : float, default 0.5 and 1.25
+        A point is ground within `threshold` + `scalar` times the terrain's slope of the surface, metres.
+    openings : sequence of float
+        Windows, in metres, of openings of the minimum grid above which heights are wanted too.
+    slope_too : bool
+        Whether the slope of the terrain is wanted.
+    threads : int, optional
+        None or 0: every available core.
+    report : dict, optional
+        Receives counts: ``ground_points``, ``pits`` (cells whose lowest point is a low outlier),
+        ``without_terrain`` (points with no usable point near; their height is 0), ``unused_points``.
+
+    Returns
+    -------
+    dict of str to ndarray, shape (n,)
+        ``HeightAboveGround`` (float64), ``Ground`` (uint8, 1 where the filter calls a point ground), ``Slope``
+        (float64, degrees) and ``HeightAboveOpening_<window>`` (float32) on request. NaN where a coordinate is not
+        finite.
+
+    Raises
+    ------
+    OptionError
+        For sizes that are not positive, or a window of too many cells.
+    StageError
+        If shapes differ or coordinates are too large.
+    """
+    check_sizes(cell, slope, window, threshold, scalar, openings)
+    x, y, z = (np.ascontiguousarray(a, np.float64) for a in (x, y, z))
+    if not (x.shape == y.shape == z.shape and x.ndim == 1):
+        raise StageError(
+            "x, y and z must be one-dimensional and of one length", found=(x.shape, y.shape, z.shape)
+        )
+    use = np.ones(len(x), bool) if mask is None else np.array(mask, bool)
+    if use.shape != x.shape:
+        raise StageError("'mask' must have one value per point", found=f"{use.shape}, {len(x):,} points")
+    finite = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
+    all_finite = bool(finite.all())
+    if not all_finite:
+        x, y, z, use = x[finite], y[finite], z[finite], use[finite]
+    use &= np.abs(z) < _HIGHEST
+    counts = {"pits": 0, "without_terrain": 0}
+    out: dict[str, NDArray] = {
+        "HeightAboveGround": np.zeros(len(x)),
+        "Ground": np.zeros(len(x), np.uint8),
+        "Slope": np.zeros(len(x)),
+        **{name: np.zeros(len(x), np.float32) for name in opening_names(openings)},
+    }
+    if not slope_too:
+        del out["Slope"]
+    if len(x):
+        column, row = cell_numbers(x, cell), cell_numbers(y, cell)
+        around = math.ceil(reach(cell=cell, window=window, openings=openings) / cell)
+
+        def work(piece):
+            points, own = piece
+            found = _filter(
+                x[points], y[points], z[points], use[points], column[points], row[points], own,
+                cell=cell, slope=slope, window=window, threshold=threshold, scalar=scalar, openings=openings,
+                wanted=set(out), threads=threads, counts=counts,
+            )  # fmt: skip
+            for name, values in found.items():
+                if isinstance(points, slice):
+                    out[name][:] = values
+                else:
+                    out[name][points[own]] = values[own]
+
+        for piece in patches(column, row, around):
+            work(piece)
+    if report is not None:
+        report["ground_points"] = int(np.count_nonzero(out["Ground"]))
+        report.update(counts, unused_points=int(len(finite) - np.count_nonzero(use)))
+    if not all_finite:
+        for name, values in out.items():
+            whole = np.zeros(len(finite), values.dtype)
+            if name != "Ground":
+                whole[:] = np.nan
+            whole[finite] = values
+            out[name] = whole
+    return out
+
+
+def reach(*, cell: float = 1.0, window: float = 75.0, openings: Sequence[float] = ()) -> float:
+    """How far away, in metres, points can change a point's results: the halo a tile needs.
+
+    An opening looks twice its radius away; low outliers are judged before, and surfaces led through ground after it.
+    """
+    radius = max([_radius(window, cell), *(opening_radius(size, cell) for size in openings)])
+    near, far = (planes_reach(_levels(block, cell)) for block in (_NEAR, _FAR))
+    return (COMPANY + SURROUNDINGS + 2 * radius + (_ROUNDS + 1) * near + far + 2) * cell
+
+
+def check_sizes(
+    cell: float,
+    slope: float,
+    window: float,
+    threshold: float,
+    scalar: float,
+    openings: Sequence[float] = (),
+) -> None:
+    """Refuse sizes that make no filter; raises :class:`OptionError`."""
+    for name, value in (("cell", cell), ("window", window), *(("openings", size) for size in openings)):
+        if not (np.isfinite(value) and value > 0):
+            raise OptionError(f"'{name}' must be a positive length", found=value)
+        if name != "cell" and value > _MOST_CELLS * cell:
+            raise OptionError(
+                f"'{name}' must not be more than {_MOST_CELLS} cells",
+                found=f"{value:g} m in cells of {cell:g} m",
+                cure="Use larger cells or a smaller window",
+            )
+    for name, value in (("slope", slope), ("threshold", threshold), ("scalar", scalar)):
+        if not (np.isfinite(value) and value >= 0):
+            raise OptionError(f"'{name}' must not be negative", found=value)
+
+
+def _radius(window: float, cell: float) -> int:
+    return max(1, round(window / cell))
+
+
+def _levels(block: float, cell: float) -> int:
+    return max(1, round(math.log2(block / cell)))
+
+
+def _filter(
+    x, y, z, use, column, row, own, *,
+    cell, slope, window, threshold, scalar, openings, wanted, threads, counts,
+):  # fmt: skip
+    """All of it on one raster round the points."""
+    # One empty cell on every side: points blend the four cells round them.
+    left, bottom = int(column.min()) - 1, int(row.min()) - 1
+    shape = int(row.max()) + 2 - bottom, int(column.max()) + 2 - left
+    lowest = np.empty(shape, np.int64)
+    lowest_points(z, x, y, use, column, row, left, bottom, lowest)
+    place, raster = cell_values(x, y, z, cell, lowest)
+    bad = pits(raster, cell)
+    counts["pits"] += int(np.count_nonzero(bad) if isinstance(own, slice) else own[lowest[bad]].sum())
+    raster[bad] = HOLE
+    del lowest, bad
+    radii = [opening_radius(size, cell) for size in openings]
+    objects, floor, opened = objects_of(raster, cell, slope, _radius(window, cell), radii)
+    ground = np.isfinite(raster) & ~objects
+    for _ in range(_ROUNDS):
+        planes = surface(ground, place, floor, raster, left, bottom, _levels(_NEAR, cell))
+        _regain(ground, raster, place, planes, cell, threshold, scalar)
+    planes = surface(ground, place, floor, raster, left, bottom, _levels(_NEAR, cell))
+    height, gradient = np.empty((2, len(x)))
+
+    spans = [slice(start, start + _SPAN) for start in range(0, len(x), _SPAN)]
+
+    def each(function):
+        for _ in map_blocks(function, spans, threads):
+            pass
+
+    def above(span):
+        _heights(x[span], y[span], z[span], cell, left, bottom, planes, height[span], gradient[span])
+
+    each(above)
+    is_ground = use & (np.abs(height) <= threshold + scalar * gradient)  # NaN is not
+    _means(x, y, z, is_ground, column, row, cell, left, bottom, ground, place)
+    planes = surface(ground, place, floor, raster, left, bottom, _levels(_FAR, cell))
+    each(above)
+    nowhere = np.isnan(height)
+    counts["without_terrain"] += int(np.count_nonzero(nowhere[own]))
+    height[nowhere] = gradient[nowhere] = 0.0
+    found = {"HeightAboveGround": height, "Ground": is_ground.view(np.uint8)}
+    if "Slope" in wanted:
+        found["Slope"] = np.degrees(np.arctan(gradient))
+    for name, radius in zip(opening_names(openings), radii, strict=True):
+        values = found[name] = np.empty(len(x), np.float32)
+        opening = opened[radius]
+
+        def over(span, opening=opening, values=values):
+            above_opening(x[span], y[span], z[span], cell, left, bottom, opening, height[span], values[span])
+
+        each(over)
+    return found
+
+
+@njit
+def _regain(ground, raster, place, planes, cell, threshold, scalar):
+    """Make ground what lies near the surface of the ground found so far."""
+    for j in range(ground.shape[0]):
+        for i in range(ground.shape[1]):
+            if not ground[j, i] and raster[j, i] != HOLE:
+                height, across, along = planes[j, i]
+                x, y, z = place[j, i]
+                gradient = np.sqrt(across * across + along * along) / cell
+                if abs(z - height - x * across - y * along) <= threshold + scalar * gradient:
+                    ground[j, i] = True
+
+
+@njit
+def _heights(x, y, z, cell, left, bottom, planes, height, gradient):
+    """Height above the surface, and its slope, at points."""
+    for p in range(len(x)):
+        u, v = x[p] / cell - 0.5, y[p] / cell - 0.5
+        i, j = np.floor(u), np.floor(v)
+        level, across, along = blend(planes, int(i) - left, int(j) - bottom, u - i, v - j, 1.0)
+        height[p] = z[p] - level
+        gradient[p] = np.sqrt(across * across + along * along) / cell
+
+
+@njit
+def _means(x, y, z, is_ground, column, row, cell, left, bottom, ground, place):
+    """Put the mean of each cell's ground points in its place; the sums are whole numbers, so order is free."""
+    h, w = ground.shape
+    sums = np.zeros((h, w, 4), np.int64)
+    for p in range(len(x)):
+        if is_ground[p]:
+            total = sums[row[p] - bottom, column[p] - left]
+            total[0] += 1
+            total[1] += int(np.rint((x[p] / cell - column[p] - 0.5) * _PARTS))
+            total[2] += int(np.rint((y[p] / cell - row[p] - 0.5) * _PARTS))
+            total[3] += int(np.rint(z[p] * _PARTS))
+    for j in range(h):
+        for i in range(w):
+            n = sums[j, i, 0]
+            ground[j, i] = n > 0
+            if n > 0:
+                for k in range(3):
+                    place[j, i, k] = sums[j, i, k + 1] / _PARTS / n

@@ -1,0 +1,240 @@
+"""A surface through scattered ground heights: planes on a pyramid of blocks, coarse to fine.
+
+Every block of the pyramid (a cell, 2 x 2 cells, 4 x 4, ...; anchored to absolute coordinates) has a plane at
+its centre: a least squares fit to the ground of the 3 x 3 blocks round it, held by what the planes of the
+four nearest blocks of the next coarser level say there. Where ground is dense the finest level decides;
+across a hole the finest level that sees its rim does. The reach is bounded (:func:`reach`), sums are taken
+in a fixed tree, so the same ground gives the same bits whatever lies further away.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..base.jit import njit
+
+#: Weight of the coarser gradient per ground cell, for a lever of one block: it decides where all
+#: ground of a fit lies to one side or on a line.
+_STIFFNESS = 0.02
+#: Weight of the coarser height, in ground cells.
+_HOLD = 0.1
+
+
+def reach(levels: int) -> int:
+    """How far ground changes the surface, in cells."""
+    # A block's parents lie up to 1.5 blocks away, level by level; the coarsest sees 3 x 3 of its blocks.
+    return 3 * 2**levels
+
+
+@njit
+def _add(total, m, dx, dy, weight):
+    """Add moments whose origin lies at (dx, dy)."""
+    n = m[0]
+    if n > 0:
+        total[0] += weight * n
+        total[1] += weight * (m[1] + n * dx)
+        total[2] += weight * (m[2] + n * dy)
+        total[3] += weight * (m[3] + 2 * dx * m[1] + n * dx * dx)
+        total[4] += weight * (m[4] + dx * m[2] + dy * m[1] + n * dx * dy)
+        total[5] += weight * (m[5] + 2 * dy * m[2] + n * dy * dy)
+        total[6] += weight * m[6]
+        total[7] += weight * (m[7] + dx * m[6])
+        total[8] += weight * (m[8] + dy * m[6])
+
+
+@njit
+def _moments_of_cells(ground, place, left, bottom, out, out_left, out_bottom):
+    """n, x, y, xx, xy, yy, z, xz, yz of the ground of each block of 2 x 2 cells, about its centre."""
+    one = np.empty(9)
+    for j in range(ground.shape[0]):
+        for i in range(ground.shape[1]):
+            if ground[j, i]:
+                x, y, z = place[j, i]
+                one[:] = (1.0, x, y, x * x, x * y, y * y, z, x * z, y * z)
+                column, row = i + left, j + bottom
+                target = out[(row >> 1) - out_bottom, (column >> 1) - out_left]
+                _add(target, one, (column & 1) - 0.5, (row & 1) - 0.5, 1.0)
+
+
+@njit
+def _moments_of_blocks(fine, left, bottom, size, out, out_left, out_bottom):
+    """The same of blocks of twice the `size`, from their four parts."""
+    for j in range(fine.shape[0]):
+        for i in range(fine.shape[1]):
+            column, row = i + left, j + bottom
+            target = out[(row >> 1) - out_bottom, (column >> 1) - out_left]
+            _add(target, fine[j, i], ((column & 1) - 0.5) * size, ((row & 1) - 0.5) * size, 1.0)
+
+
+@njit
+def blend(planes, i, j, s, t, size):
+    """Height and gradient of the four planes round a place, weighted by nearness; NaN where none is known.
+
+    The place lies `s` and `t` (0 to 1) blocks of `size` cells beyond the centre of block (j, i): given apart, so that
+    rounding does not depend on where the array begins.
+    """
+    height, across, along, total = 0.0, 0.0, 0.0, 0.0
+    for b in range(2):
+        wv = t if b else 1.0 - t
+        if j + b < 0 or j + b >= planes.shape[0] or wv == 0.0:
+            continue
+        for a in range(2):
+            wu = s if a else 1.0 - s
+            if i + a < 0 or i + a >= planes.shape[1] or wu == 0.0:
+                continue
+            plane = planes[j + b, i + a]
+            if np.isnan(plane[0]):
+                continue
+            weight = wu * wv
+            height += weight * (plane[0] + size * (plane[1] * (s - a) + plane[2] * (t - b)))
+            across += weight * plane[1]
+            along += weight * plane[2]
+            total += weight
+    if total == 0.0:
+        return np.nan, np.nan, np.nan
+    return height / total, across / total, along / total
+
+
+@njit
+def _coarsest(floor, raster, left, bottom, level, out, out_left, out_bottom):
+    """Level planes at the mean of `floor` over the measured cells of 3 x 3 blocks."""
+    h, w = out.shape[:2]
+    sums = np.zeros((h, w, 2))
+    for j in range(raster.shape[0]):
+        for i in range(raster.shape[1]):
+            if np.isfinite(raster[j, i]):
+                block = sums[((j + bottom) >> level) - out_bottom, ((i + left) >> level) - out_left]
+                block[0] += floor[j, i]
+                block[1] += 1.0
+    for j in range(h):
+        for i in range(w):
+            total, n = 0.0, 0.0
+            for b in range(max(j - 1, 0), min(j + 2, h)):
+                for a in range(max(i - 1, 0), min(i + 2, w)):
+                    weight = (1.0 - 0.5 * abs(b - j)) * (1.0 - 0.5 * abs(a - i))
+                    total += weight * sums[b, a, 0]
+                    n += weight * sums[b, a, 1]
+            out[j, i] = (total / n if n > 0 else np.nan, 0.0, 0.0)
+
+
+@njit
+def _fit(moments, size, planes):
+    """Correct the planes (given: what the coarser level says) by the ground of 3 x 3 blocks."""
+    h, w = planes.shape[:2]
+    m = np.empty(9)
+    for j in range(h):
+        for i in range(w):
+            height, across, along = planes[j, i]
+            if np.isnan(height):
+                continue
+            m[:] = 0.0
+            for b in range(max(j - 1, 0), min(j + 2, h)):
+                for a in range(max(i - 1, 0), min(i + 2, w)):
+                    weight = (1.0 - 0.5 * abs(b - j)) * (1.0 - 0.5 * abs(a - i))
+                    _add(m, moments[b, a], (a - i) * size, (b - j) * size, weight)
+            n = m[0]
+            if n == 0.0:
+                continue
+            # Residuals of the coarser plane; the offset is eliminated, two unknowns are left.
+            r = m[6] - n * height - across * m[1] - along * m[2]
+            rx = m[7] - height * m[1] - across * m[3] - along * m[4]
+            ry = m[8] - height * m[2] - across * m[4] - along * m[5]
+            n_held = n + _HOLD
+            stiff = _STIFFNESS * n * size * size
+            xx = m[3] + stiff - m[1] * m[1] / n_held
+            xy = m[4] - m[1] * m[2] / n_held
+            yy = m[5] + stiff - m[2] * m[2] / n_held
+            rx -= m[1] * r / n_held
+            ry -= m[2] * r / n_held
+            determinant = xx * yy - xy * xy
+            gx = (rx * yy - ry * xy) / determinant
+            gy = (ry * xx - rx * xy) / determinant
+            planes[j, i] = (
+                height + (r - m[1] * gx - m[2] * gy) / n_held,
+                across + gx,
+                along + gy,
+            )
+
+
+@njit
+def _from_parents(parents, parents_left, parents_bottom, size, left, bottom, planes):
+    """What the planes of blocks of twice the `size` say at the centres of blocks of `size`."""
+    for j in range(planes.shape[0]):
+        for i in range(planes.shape[1]):
+            # A left child lies 3/4 of the way from the block before its parent's, a right one 1/4 beyond its parent.
+            column, row = i + left, j + bottom
+            s, t = 0.25 + 0.5 * (1 - (column & 1)), 0.25 + 0.5 * (1 - (row & 1))
+            before = ((column + 1) >> 1) - 1 - parents_left
+            below = ((row + 1) >> 1) - 1 - parents_bottom
+            planes[j, i] = blend(parents, before, below, s, t, 2.0 * size)
+
+
+@njit
+def _through_ground(ground, place, planes):
+    """Shift the planes of ground cells so that they hold their cell's ground."""
+    for j in range(ground.shape[0]):
+        for i in range(ground.shape[1]):
+            if ground[j, i]:
+                x, y, z = place[j, i]
+                planes[j, i, 0] = z - x * planes[j, i, 1] - y * planes[j, i, 2]
+
+
+def surface(
+    ground: np.ndarray,
+    place: np.ndarray,
+    floor: np.ndarray,
+    raster: np.ndarray,
+    left: int,
+    bottom: int,
+    levels: int,
+) -> np.ndarray:
+    """Planes at the centres of all cells.
+
+    Parameters
+    ----------
+    ground : ndarray of bool, shape (h, w)
+        Cells that hold ground.
+    place : ndarray, shape (h, w, 3)
+        Where it is: from the cell's centre, in cells, and height.
+    floor : ndarray, shape (h, w)
+        Level to take where no ground is near, at measured cells.
+    raster : ndarray, shape (h, w)
+        Not finite where nothing was measured.
+    left, bottom : int
+        Number of the first column and row, counted from the origin of the coordinates.
+    levels : int
+        Number of coarser levels, at least 1.
+
+    Returns
+    -------
+    ndarray, shape (h, w, 3)
+        Height at the centre and gradient per cell; NaN beyond the reach of all measured cells.
+    """
+    h, w = ground.shape
+    spans = [(left, bottom, w, h)]
+    for _ in range(levels):
+        a, b, w, h = spans[-1]
+        low_a, low_b = (a >> 1) - 1, (b >> 1) - 1
+        spans.append((low_a, low_b, ((a + w - 1) >> 1) + 2 - low_a, ((b + h - 1) >> 1) + 2 - low_b))
+    moments = []
+    for level in range(1, levels + 1):
+        a, b, w, h = spans[level]
+        moments.append(np.zeros((h, w, 9)))
+        before = spans[level - 1][:2]
+        if level == 1:
+            _moments_of_cells(ground, place, *before, moments[-1], a, b)
+        else:
+            _moments_of_blocks(moments[-2], *before, 2.0 ** (level - 1), moments[-1], a, b)
+    planes = np.empty((0, 0, 3))
+    for level in range(levels, -1, -1):
+        a, b, w, h = spans[level]
+        coarser, planes = planes, np.empty((h, w, 3))
+        if level == levels:
+            _coarsest(floor, raster, left, bottom, level, planes, a, b)
+        else:
+            _from_parents(coarser, *spans[level + 1][:2], 2.0**level, a, b, planes)
+        if level == 0:
+            _through_ground(ground, place, planes)
+        else:
+            _fit(moments[level - 1], 2.0**level, planes)
+    return planes

@@ -1,0 +1,71 @@
+"""Which cells of a minimum grid are objects: openings with growing windows, and what each lowers [P13]."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+import numpy as np
+
+from ..base.jit import njit
+from .openings import HOLE, dilate, erode_step, opening_radii, square_steps
+
+#: Drops beyond this are objects however large the window: halls are not higher for being wider.
+LARGEST_DROP = 3.5
+
+
+@njit
+def _mark(before, after, raster, drop, objects, floor):
+    h, w = raster.shape
+    for j in range(h):
+        for i in range(w):
+            if raster[j, i] != HOLE and not objects[j, i] and before[j, i] - after[j, i] > drop:
+                objects[j, i] = True
+                floor[j, i] = after[j, i]
+
+
+def objects_of(
+    raster: np.ndarray, cell: float, slope: float, window: int, keep: Collection[int] = ()
+) -> tuple[np.ndarray, np.ndarray, Mapping[int, np.ndarray]]:
+    """Cells that an opening lowers by more than `slope` times its radius, or than `LARGEST_DROP`.
+
+    Parameters
+    ----------
+    raster : ndarray of float32, shape (h, w)
+        Minimum grid in metres, with holes.
+    cell : float
+        Side of a cell, metres.
+    slope : float
+    window : int
+        Largest radius, in cells.
+    keep : collection of int
+        Radii, in cells, whose openings are wanted.
+
+    Returns
+    -------
+    objects : ndarray of bool, shape (h, w)
+    floor : ndarray of float32, shape (h, w)
+        What the opening that showed an object left there; the cell's own height elsewhere.
+    openings : mapping of int to ndarray of float32
+        The openings of `keep`.
+    """
+    h, w = raster.shape
+    radii = set(opening_radii(window))
+    largest = max(radii.union(keep))
+    eroded, other = raster.copy(), np.empty_like(raster)
+    before, after = raster.copy(), np.empty_like(raster)
+    objects, floor = np.zeros((h, w), bool), raster.copy()
+    pad = 2 * (largest + 1)
+    one, two = np.empty((2, (h + pad) * (w + pad)), np.float32)
+    openings = {}
+    for radius in range(1, largest + 1):
+        squares = square_steps(radius)
+        erode_step(eroded, other, squares > square_steps(radius - 1))
+        eroded, other = other, eroded
+        if radius in radii or radius in keep:
+            dilate(eroded, raster, radius, squares, one, two, after)
+        if radius in keep:
+            openings[radius] = after.copy()
+        if radius in radii:
+            _mark(before, after, raster, np.float32(min(slope * radius * cell, LARGEST_DROP)), objects, floor)
+            before, after = after, before
+    return objects, floor, openings

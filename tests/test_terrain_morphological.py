@@ -1,0 +1,435 @@
+"""Heights above filtered ground: against slow references, and what must hold whatever the points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+
+import pdal_stages as ps
+from pdal_stages.base.errors import OptionError, StageError
+from pdal_stages.stages.hag_morphological import HagMorphological
+from pdal_stages.terrain import filtered_ground, patches
+from pdal_stages.terrain.lowest import pits
+from pdal_stages.terrain.morphological import reach
+from pdal_stages.terrain.openings import opening_radii, square_steps
+from pdal_stages.terrain.planes import surface
+from pdal_stages.terrain.progressive import LARGEST_DROP, objects_of
+
+SMALL = {"window": 12.0, "openings": (5, 9), "slope_too": True}
+
+
+def town(seed=0, side=120, density=3.0, origin=(0.0, 0.0)):
+    """A hillside with houses, trees, pits and a pond: x, y, z, true height."""
+    rng = np.random.default_rng(seed)
+    n = int(side * side * density)
+    x, y = rng.uniform(0, side, (2, n))
+    terrain = 0.2 * x + 3 * np.sin(y / 17)
+    height = np.where((x % 40 < 14) & (y % 30 < 12), 7.0, 0.0)
+    tree = (np.hypot(x % 25 - 20, y % 27 - 20) < 4) & (rng.random(n) < 0.7)
+    height = np.where(tree, rng.uniform(1, 12, n), height)
+    height[rng.random(n) < 0.0005] = -15.0
+    keep = np.hypot(x - 80, y - 80) > 15
+    x, y, height, terrain = x[keep], y[keep], height[keep], terrain[keep]
+    z = terrain + height + rng.normal(0, 0.03, len(x))
+    return np.round(x + origin[0], 3), np.round(y + origin[1], 3), np.round(z + 100, 3), height
+
+
+def same(one, two):
+    assert one.keys() == two.keys()
+    for name in one:
+        assert np.array_equal(one[name], two[name]), name
+
+
+# ---- the steps, each against a slow reference -------------------------------------------------------------
+
+
+def octagon(radius):
+    """Squares (+) diamonds, by the definition of their sum."""
+    squares = square_steps(radius)
+    j, i = np.abs(np.mgrid[-radius : radius + 1, -radius : radius + 1])
+    return np.maximum(i - squares, 0) + np.maximum(j - squares, 0) <= radius - squares
+
+
+def slow_opening(raster, radius):
+    eroded = ndimage.grey_erosion(raster, footprint=octagon(radius), mode="constant", cval=np.inf)
+    centres = np.where(np.isinf(raster), -np.inf, eroded).astype(np.float32)
+    return ndimage.grey_dilation(centres, footprint=octagon(radius), mode="constant", cval=-np.inf)
+
+
+def raster_with_holes(seed, shape, holes=0.3):
+    rng = np.random.default_rng(seed)
+    raster = rng.normal(0, 3, shape).astype(np.float32)
+    raster[rng.random(shape) < holes] = np.inf
+    return raster
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (33, 2), (45, 38)])
+def test_openings_and_objects_equal_the_slow_reference(shape):
+    raster = raster_with_holes(1, shape)
+    window = 21
+    objects, floor, openings = objects_of(raster, 1.0, 0.15, window, keep=range(1, 25))
+    for radius in range(1, 25):
+        assert np.array_equal(openings[radius], slow_opening(raster, radius)), radius
+    want, want_floor, before = np.zeros(shape, bool), raster.copy(), raster
+    for radius in opening_radii(window):
+        after = slow_opening(raster, radius)
+        with np.errstate(invalid="ignore"):
+            drop = before - after > np.float32(min(0.15 * radius, LARGEST_DROP))
+        new = drop & ~want & np.isfinite(raster)
+        want_floor[new] = after[new]
+        want |= new
+        before = after
+    assert np.array_equal(objects, want)
+    assert np.array_equal(floor[np.isfinite(raster)], want_floor[np.isfinite(raster)])
+
+
+def slow_pits(raster, cell):
+    h, w = raster.shape
+    cells = [(j, i) for j in range(h) for i in range(w) if np.isfinite(raster[j, i])]
+    lonely = np.zeros((h, w), bool)
+    for j, i in cells:
+        near = [(raster[b, a], np.hypot(b - j, a - i)) for b, a in cells if 0 < np.hypot(b - j, a - i) <= 20]
+        company = sum(abs(value - raster[j, i]) <= 1.0 + 0.15 * cell * far for value, far in near)
+        lonely[j, i] = company < 4 and len(near) >= 12
+    out = lonely.copy()
+    for j, i in cells:
+        if lonely[j, i]:
+            continue
+        near = [raster[b, a] for b, a in cells if max(abs(b - j), abs(a - i)) <= 4 and not lonely[b, a]]
+        higher = sorted(value for value in near if value >= raster[j, i] + 3.0)
+        n = len(higher)
+        if n >= 10 and len(near) - n <= 0.15 * len(near) and higher[n // 2] - higher[n // 8] <= 0.75:
+            out[j, i] = True
+    return out
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_pits_equal_the_slow_reference(seed):
+    rng = np.random.default_rng(seed)
+    raster = raster_with_holes(seed, (30, 34), 0.2) * np.float32(0.05 + seed)
+    raster[rng.random(raster.shape) < 0.02] -= np.float32(12)
+    found = pits(raster, 1.0)
+    assert np.array_equal(found, slow_pits(raster, 1.0))
+    assert found.any()
+
+
+def test_a_ditch_and_ground_between_trees_are_no_pits():
+    rng = np.random.default_rng(0)
+    ditch = rng.normal(0, 0.05, (40, 40)).astype(np.float32)
+    ditch[:, 18:21] -= 4
+    assert not pits(ditch, 1.0).any()
+    wood = rng.uniform(8, 20, (60, 60)).astype(np.float32)
+    seen = rng.random(wood.shape) < 0.03
+    wood[seen] = 0
+    assert pits(wood, 1.0)[seen].mean() < 0.05
+
+
+def test_a_plane_is_carried_across_a_hole():
+    left, bottom, h, w = 123_450, -77, 60, 70
+    j, i = np.mgrid[:h, :w]
+    level = 5 + 0.3 * (i + left) - 0.2 * (j + bottom)
+    ground = (np.hypot(i - 35, j - 30) > 18) & ((i * 7 + j * 3) % 4 == 0)
+    place = np.zeros((h, w, 3))
+    place[..., 2] = level
+    floor = level.astype(np.float32)
+    planes = surface(ground, place, floor, floor, left, bottom, 5)
+    # Held a little by the level planes the coarsest blocks start from.
+    assert np.abs(planes[..., 0] - level).max() < 0.25
+    assert np.array_equal(planes[ground, 0], level[ground])
+
+
+def slow_planes(cells, left, bottom, level, floor, at):
+    """Plane (height, gradient) of one block of the pyramid, by least squares over its cells, and recursion."""
+    size = 2**level
+    centre = (np.array(at) + 0.5) * size
+
+    def weight(cell):
+        far = np.abs(cell // size - np.array(at))
+        return 0.0 if far.max() > 1 else float(np.prod(1 - 0.5 * far))
+
+    ground = [(np.array(c), p, z) for c, (p, z) in cells.items() if weight(np.array(c)) > 0]
+    if level == 5:
+        known = [(weight(np.array(c)), f) for c, f in floor.items() if weight(np.array(c)) > 0]
+        if not known:
+            return None
+        prior = np.array([np.average([f for _, f in known], weights=[k for k, _ in known]), 0, 0])
+    else:
+        uv = centre / (2 * size) - 0.5
+        base = np.floor(uv).astype(int)
+        total, prior = 0.0, np.zeros(3)
+        for a in (0, 1):
+            for b in (0, 1):
+                parent = base + np.array([a, b])
+                plane = slow_planes(cells, left, bottom, level + 1, floor, tuple(parent))
+                share = (1 - abs(uv[0] - parent[0])) * (1 - abs(uv[1] - parent[1]))
+                if plane is not None and share > 0:
+                    d = centre - (parent + 0.5) * 2 * size
+                    prior += share * np.array([plane[0] + plane[1] * d[0] + plane[2] * d[1], *plane[1:]])
+                    total += share
+        if total == 0:
+            return None
+        prior /= total
+    if not ground:
+        return prior
+    rows, right = [], []
+    n = sum(weight(c) for c, _, _ in ground)
+    for c, p, z in ground:
+        d = c + 0.5 + p - centre
+        k = np.sqrt(weight(c))
+        rows.append(k * np.array([1, *d]))
+        right.append(k * (z - prior[0] - prior[1:] @ d))
+    rows += [np.sqrt([0.1, 0, 0]), np.sqrt([0, 0.02 * n * size**2, 0]), np.sqrt([0, 0, 0.02 * n * size**2])]
+    right += [0, 0, 0]
+    return prior + np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0]
+
+
+def test_planes_equal_the_slow_reference():
+    rng = np.random.default_rng(4)
+    left, bottom, h, w = -13, 40, 30, 26
+    ground = rng.random((h, w)) < 0.05
+    place = rng.uniform(-0.5, 0.5, (h, w, 3)) * [1, 1, 40]
+    floor = rng.normal(0, 5, (h, w)).astype(np.float32)
+    raster = np.where(rng.random((h, w)) < 0.5, floor, np.float32(np.inf))
+    raster[ground] = floor[ground]
+    planes = surface(ground, place, floor, raster, left, bottom, 5)
+    cells = {
+        (i + left, j + bottom): (place[j, i, :2], place[j, i, 2])
+        for j, i in zip(*np.nonzero(ground), strict=True)
+    }
+    known = {
+        (i + left, j + bottom): floor[j, i] for j, i in zip(*np.nonzero(np.isfinite(raster)), strict=True)
+    }
+    empty = [(j, i) for j, i in zip(*np.nonzero(~ground), strict=True)]
+    for j, i in [empty[k] for k in rng.choice(len(empty), 3, replace=False)]:
+        # A cell without ground has what the blocks of 2 x 2 cells say.
+        uv = (np.array([i + left, j + bottom]) + 0.5) / 2 - 0.5
+        base = np.floor(uv).astype(int)
+        want = 0.0
+        for a in (0, 1):
+            for b in (0, 1):
+                parent = base + np.array([a, b])
+                plane = slow_planes(cells, left, bottom, 1, known, tuple(parent))
+                d = np.array([i + left, j + bottom]) + 0.5 - (parent + 0.5) * 2
+                share = (1 - abs(uv[0] - parent[0])) * (1 - abs(uv[1] - parent[1]))
+                want += share * (plane[0] + plane[1:] @ d)
+        assert planes[j, i, 0] == pytest.approx(want, abs=1e-6)
+
+
+# ---- what must hold --------------------------------------------------------------------------------------
+
+
+def test_ground_is_found_in_a_town_on_a_slope():
+    x, y, z, height = town()
+    report = {}
+    found = filtered_ground(x, y, z, openings=(5, 17), slope_too=True, report=report)
+    error = np.abs(found["HeightAboveGround"] - height)
+    assert np.percentile(error[height == 0], 99) < 0.5
+    assert np.median(error[height > 2]) < 0.5
+    assert found["Ground"][height == 0].mean() > 0.97
+    assert found["Ground"][height > 2].mean() < 0.02
+    assert not found["Ground"][height < 0].any()
+    assert np.median(found["Slope"]) == pytest.approx(np.degrees(np.arctan(0.2)), abs=3)
+    assert report["pits"] > 0 and report["without_terrain"] == 0
+    assert report["ground_points"] == found["Ground"].sum()
+    roofs = height == 7
+    assert (
+        np.median(found["HeightAboveOpening_5"][roofs]) < 1 < np.median(found["HeightAboveOpening_17"][roofs])
+    )
+
+
+def test_a_hall_of_150_metres_and_a_ridge():
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, 300, (2, 90_000))
+    hall = np.maximum(np.abs(x - 150), np.abs(y - 150)) < 75
+    height = filtered_ground(x, y, np.where(hall, 6.0, 0.0) + rng.normal(0, 0.02, len(x)))[
+        "HeightAboveGround"
+    ]
+    assert (np.abs(height - np.where(hall, 6.0, 0.0)) < 1).mean() > 0.99
+    ridge = -np.abs(x - y) * 0.6
+    assert (np.abs(filtered_ground(x, y, ridge)["HeightAboveGround"]) < 1).mean() > 0.98
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 400), st.integers(-40, 40))
+def test_order_and_shifts_by_whole_cells_change_nothing(seed, n, cells):
+    rng = np.random.default_rng(seed)
+    # Quarter metres are exact in binary, so a shift by whole blocks of the pyramid is exact too.
+    x, y, z = rng.integers(0, 160, (3, n)) / 4.0
+    found = filtered_ground(x, y, z, **SMALL)
+    order = rng.permutation(n)
+    same(filtered_ground(x[order], y[order], z[order], **SMALL), {k: v[order] for k, v in found.items()})
+    same(filtered_ground(x + 32 * cells, y - 32 * cells, z, **SMALL), found)
+
+
+@pytest.mark.parametrize("origin", [(0.0, 0.0), (-47.0, -200.0), (770_500.0, 6_277_550.0)])
+def test_a_tile_with_its_halo_gives_the_same_bits(origin):
+    x, y, z, _ = town(2, side=700, density=0.3, origin=origin)
+    options = {**SMALL, "window": 6.0}
+    halo = reach(window=6.0, openings=(5, 9))
+    whole = filtered_ground(x, y, z, **options)
+    u, v = x - origin[0], y - origin[1]
+    core = (u >= 330) & (u < 380) & (v >= 340) & (v < 400)
+    near = (u >= 330 - halo) & (u < 380 + halo) & (v >= 340 - halo) & (v < 400 + halo)
+    assert near.sum() < 0.9 * len(x)
+    tile = filtered_ground(x[near], y[near], z[near], **options)
+    same({k: a[core[near]] for k, a in tile.items()}, {k: a[core] for k, a in whole.items()})
+
+
+def test_pieces_and_threads_change_nothing(monkeypatch):
+    x, y, z, _ = town(3, side=260, density=0.5)
+    noise = np.random.default_rng(0).random(len(x)) < 0.05
+    whole, report = {}, {}
+    whole = filtered_ground(x, y, z, mask=~noise, threads=1, report=report, **SMALL)
+    monkeypatch.setattr(patches, "LARGEST", 1000)
+    monkeypatch.setattr(patches, "SIDE", 64)
+    again = {}
+    same(filtered_ground(x, y, z, mask=~noise, threads=2, report=again, **SMALL), whole)
+    assert again == report
+
+
+def test_one_stray_point_costs_little_memory():
+    x, y, z, _ = town(1, side=60)
+    whole = filtered_ground(x, y, z, **SMALL)
+    for far in (1e5, -1e7, 1e9):
+        found = filtered_ground(np.append(x, far), np.append(y, -far), np.append(z, 5.0), **SMALL)
+        same({k: v[:-1] for k, v in found.items()}, whole)
+        assert found["HeightAboveGround"][-1] == pytest.approx(0, abs=1e-9)
+
+
+def test_ignored_points_change_nothing_but_get_heights():
+    x, y, z, _ = town(5, side=60)
+    rng = np.random.default_rng(1)
+    extra = rng.uniform(0, 60, (2, 50))
+    report = {}
+    found = filtered_ground(
+        np.append(x, extra[0]), np.append(y, extra[1]), np.append(z, np.full(50, -300.0)),
+        mask=np.arange(len(x) + 50) < len(x), report=report, **SMALL,
+    )  # fmt: skip
+    same({k: v[: len(x)] for k, v in found.items()}, filtered_ground(x, y, z, **SMALL))
+    assert (found["HeightAboveGround"][len(x) :] < -350).all()
+    assert report["unused_points"] == 50
+
+
+@pytest.mark.parametrize(
+    "x, y, z",
+    [
+        ([5.0], [5.0], [9.0]),
+        (np.full(50, 3.25), np.full(50, -7.5), np.full(50, 2.0)),
+        (np.linspace(0, 90, 100), np.zeros(100), np.zeros(100)),
+        ([0.0, 1e8], [0.0, 1e8], [0.0, 1.0]),
+    ],
+)
+def test_degenerate_clouds(x, y, z):
+    found = filtered_ground(x, y, z, **SMALL)
+    assert np.allclose(found["HeightAboveGround"], 0, atol=1e-6)
+    assert found["Ground"].all()
+
+
+def test_nothing_not_finite_and_nothing_usable():
+    empty = filtered_ground([], [], [], **SMALL)
+    assert {k: (v.dtype.char, v.size) for k, v in empty.items()} == {
+        "HeightAboveGround": ("d", 0), "Ground": ("B", 0), "Slope": ("d", 0),
+        "HeightAboveOpening_5": ("f", 0), "HeightAboveOpening_9": ("f", 0),
+    }  # fmt: skip
+    found = filtered_ground([1.0, np.nan, 2.0], [1.0, 1.0, np.inf], [3.0, 4.0, 5.0])
+    assert found["HeightAboveGround"][0] == 0 and np.isnan(found["HeightAboveGround"][1:]).all()
+    assert found["Ground"].tolist() == [1, 0, 0]
+    report = {}
+    none = filtered_ground([1.0, 2.0], [1.0, 2.0], [3.0, 9.0], mask=[False, False], report=report)
+    assert none["HeightAboveGround"].tolist() == [0, 0] and report["without_terrain"] == 2
+    high = filtered_ground([1.0, 2.0], [1.0, 2.0], [3.0, 1e300], report=report)
+    assert high["HeightAboveGround"].tolist() == [0, 1e300] and report["unused_points"] == 1
+
+
+def test_sizes_and_shapes_are_checked():
+    with pytest.raises(OptionError, match="'cell' must be a positive length"):
+        filtered_ground([0.0], [0.0], [0.0], cell=0)
+    with pytest.raises(OptionError, match="'window' must not be more than 300 cells"):
+        filtered_ground([0.0], [0.0], [0.0], cell=0.1)
+    with pytest.raises(OptionError, match="'slope' must not be negative"):
+        filtered_ground([0.0], [0.0], [0.0], slope=-1)
+    with pytest.raises(StageError, match="one length"):
+        filtered_ground([0.0, 1.0], [0.0], [0.0])
+    with pytest.raises(StageError, match="one value per point"):
+        filtered_ground([0.0], [0.0], [0.0], mask=[True, False])
+    with pytest.raises(StageError, match="too large for the grid"):
+        filtered_ground([1e300], [0.0], [0.0])
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["samp12", "samp21", "samp31", "samp54"])
+def test_ground_of_real_clouds(data_dir, name):
+    import laspy
+
+    las = laspy.read(data_dir / "isprs_filter" / f"{name}.laz")
+    true = np.asarray(las.classification) == 2
+    found = filtered_ground(las.x, las.y, las.z)
+    wrong = (found["Ground"] == 1) != true
+    assert wrong.mean() < 0.04
+    assert np.abs(found["HeightAboveGround"][true]).mean() < 0.1
+
+
+# ---- the stage -------------------------------------------------------------------------------------------
+
+
+def test_the_stage_declares_what_it_makes_and_how_far_it_looks():
+    stage = HagMorphological({"ground": True, "terrain_slope": "true", "openings": "5, 16.5"})
+    assert stage.creates() == {
+        "HeightAboveGround": "double",
+        "Ground": "uint8_t",
+        "Slope": "double",
+        "HeightAboveOpening_5": "float",
+        "HeightAboveOpening_16_5": "float",
+    }
+    assert HagMorphological({}).creates() == {"HeightAboveGround": "double"}
+    assert 300 < HagMorphological({}).halo() < 400
+    assert HagMorphological({"window": 20}).halo() < 300
+    with pytest.raises(
+        StageError, match=r"filters\.hag_morphological.*'window' must not be more than 300 cells"
+    ):
+        HagMorphological({"cell": 0.2})
+    with pytest.raises(StageError, match="'openings' must list widths in metres"):
+        HagMorphological({"openings": "five"})
+
+
+@pytest.mark.pdal
+def test_through_pdal_with_noise_where_and_classes_kept(tmp_path, write_las):
+    x, y, z, height = town(7, side=80)
+    codes = np.where(height < 0, 7, 1).astype(np.uint8)
+    source = write_las(tmp_path / "in.las", {"X": x, "Y": y, "Z": z, "Classification": codes})
+    options = {"ground": True, "terrain_slope": True, "openings": [5, 17], "tag": "h"}
+    pipeline = ps.run_pipeline([str(source), {"type": "filters.hag_morphological", **options}])
+    array = pipeline.arrays[0]
+    want = filtered_ground(
+        array["X"], array["Y"], array["Z"], mask=codes != 7, openings=(5, 17), slope_too=True
+    )
+    for name, values in want.items():
+        assert np.array_equal(array[name], values), name
+    assert np.array_equal(array["Classification"], codes)
+    assert (array["Ground"].dtype, array["HeightAboveOpening_5"].dtype) == (np.uint8, np.float32)
+    metadata = pipeline.metadata["metadata"]["filters.hag_morphological"]
+    assert metadata["ignored"] == (codes == 7).sum() and metadata["ground_points"] == want["Ground"].sum()
+
+    half = {"type": "filters.hag_morphological", "where": "X < 40"}
+    array = ps.run_pipeline([str(source), half]).arrays[0]
+    inside = array["X"] < 40
+    alone = filtered_ground(*(array[k][inside] for k in "XYZ"), mask=codes[inside] != 7)
+    assert np.array_equal(array["HeightAboveGround"][inside], alone["HeightAboveGround"])
+    assert not array["HeightAboveGround"][~inside].any()
+
+
+@pytest.mark.pdal
+@pytest.mark.data
+def test_feet_in_feet_out(data_dir):
+    stage = {"type": "filters.hag_morphological", "openings": [9], "ground": True}
+    array = ps.run_pipeline([str(data_dir / "units" / "autzen_feet.las"), stage]).arrays[0]
+    foot = 0.3048
+    want = filtered_ground(*(array[k] * foot for k in "XYZ"), openings=(9,))
+    assert np.allclose(array["HeightAboveGround"], want["HeightAboveGround"] / foot, atol=1e-9)
+    assert np.allclose(array["HeightAboveOpening_9"], want["HeightAboveOpening_9"] / foot, atol=1e-4)
+    ground = array["Classification"] == 2
+    assert array["Ground"][ground].mean() > 0.99
+    assert np.abs(array["HeightAboveGround"][ground]).mean() < 0.25  # feet
