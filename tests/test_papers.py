@@ -14,6 +14,7 @@ if str(FOLDER) not in sys.path:
     sys.path.insert(0, str(FOLDER))
 
 import b16_experiments  # noqa: E402
+import clouds  # noqa: E402
 import h17_oakland  # noqa: E402
 import kit  # noqa: E402
 import pts_input  # noqa: E402
@@ -41,7 +42,7 @@ def town():
         "ReturnNumber": made.return_number.astype(float),
         "NumberOfReturns": made.number_of_returns.astype(float),
     }
-    return kit.Cloud("town", made.xyz, labels, dimensions)
+    return clouds.Cloud("town", made.xyz, labels, dimensions)
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +99,7 @@ def test_cached_features_are_those_computed_and_depend_on_the_cloud(town, tmp_pa
     first = kit.features(town, plan, cache)
     expected = compute_features(town.xyz, neighborhoods="c2", feature_set="covariance").values
     np.testing.assert_array_equal(first, expected)
-    moved = kit.Cloud("town", town.xyz * [1, 1, 2], town.labels)
+    moved = clouds.Cloud("town", town.xyz * [1, 1, 2], town.labels)
     assert not np.array_equal(kit.features(moved, plan, cache), expected)
     assert len(list(tmp_path.glob("*.npy"))) == 2
 
@@ -255,7 +256,7 @@ def test_w18_groups():
 
 def test_h17_thresholds_are_a_choice_between_two_tables(town):
     """What the command takes together from two tables is what the engine computes at that threshold."""
-    cloud = kit.with_height(kit.Cloud("town", town.xyz, town.labels))
+    cloud = clouds.with_height(clouds.Cloud("town", town.xyz, town.labels))
     part = h17_oakland.compute([cloud], kit.Cache(None), 1)
     words = (*h17_oakland.SIX, "Radius")
     direct = compute_features(town.xyz, neighborhoods="copt", feature_set=words, copt_threshold=0.05)
@@ -271,7 +272,7 @@ def test_h17_score_and_report(town, monkeypatch):
     monkeypatch.setattr(h17_oakland, "CURVE", (0.03,))
     codes = np.array(list(h17_oakland.CLASSES))
     labels = codes[np.searchsorted([1, 2, 5, 7, 8], town.labels) % 5]
-    cloud = kit.with_height(kit.Cloud("town", town.xyz, labels))
+    cloud = clouds.with_height(clouds.Cloud("town", town.xyz, labels))
     part = h17_oakland.compute([cloud], kit.Cache(None), 1)
     runs = []
     for name in h17_oakland.TOKENS:

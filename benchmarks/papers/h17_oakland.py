@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from clouds import Cloud, read_cloud, with_height
 from kit import (
     Cache,
-    Cloud,
     draw,
     features,
     figures,
@@ -33,8 +33,6 @@ from kit import (
     opened,
     parser,
     predict,
-    read_cloud,
-    with_height,
 )
 from tables import choose, spread, table, values
 

@@ -1,4 +1,4 @@
-"""What the commands of this folder share: clouds, cached features, forests, results that resume."""
+"""What the commands of this folder share: cached features, forests, results that resume."""
 
 from __future__ import annotations
 
@@ -9,79 +9,21 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from clouds import Cloud
 
 import pdal_stages
 from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.base.progress import Progress
 from pdal_stages.classifier.forest import Forest
 from pdal_stages.features import FeatureEngine, FeaturePlan, ShapeBins
-from pdal_stages.terrain.minima import hag_minima
-
-#: Scene -> classes trained and scored; points of other classes are neighbors only.
-SCENES = {"montpellier": (2, 3, 4, 5, 6), "delft": (1, 2, 6)}
 
 #: Parts of a result that --json leaves out.
 BULKY = ("clouds", "importance")
-
-
-# ---- clouds ------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Cloud:
-    """A labelled cloud: (n, 3) coordinates in metres, (n,) class codes, and the points' own dimensions."""
-
-    name: str
-    xyz: np.ndarray
-    labels: np.ndarray
-    dimensions: dict[str, np.ndarray] = field(default_factory=dict)
-
-    def __len__(self) -> int:
-        return len(self.labels)
-
-    def only(self, mask: np.ndarray) -> Cloud:
-        """The points of a mask, as a cloud of their own."""
-        return Cloud(
-            self.name,
-            np.ascontiguousarray(self.xyz[mask]),
-            self.labels[mask],
-            {k: v[mask] for k, v in self.dimensions.items()},
-        )
-
-
-def read_cloud(paths: Iterable[Path], name: str) -> Cloud:
-    """LAS or LAZ files as one cloud."""
-    import laspy
-
-    tiles = [laspy.read(path) for path in paths]
-    if not tiles:
-        sys.exit(f"no clouds for {name}: name their folder with --data")
-    xyz = np.concatenate([np.column_stack([t.x, t.y, t.z]) for t in tiles])
-    return Cloud(name, xyz, np.concatenate([np.asarray(t.classification) for t in tiles]))
-
-
-def with_height(cloud: Cloud) -> Cloud:
-    """The cloud with HeightAboveGround [W18 3.2]."""
-    made = hag_minima(*cloud.xyz.T)
-    height = made[0] if isinstance(made, tuple) else made
-    return Cloud(cloud.name, cloud.xyz, cloud.labels, {**cloud.dimensions, "HeightAboveGround": height})
-
-
-def read_scene(data: Path, scene: str, part: str, columns: str | None = None) -> Cloud:
-    """A part (train, test) of one of the airborne scenes: a folder of LAZ, or ``.pts`` text (see pts_input)."""
-    folder = data / scene
-    text = sorted(folder.glob(f"{part}*.pts"))
-    if text:
-        from pts_input import COLUMNS, read_pts
-
-        return read_pts(text, f"{scene} {part}", columns or COLUMNS)
-    return read_cloud(sorted(folder.glob(f"{part}*.la[sz]")), f"{scene} {part}")
 
 
 # ---- the cache ---------------------------------------------------------------------------------------------

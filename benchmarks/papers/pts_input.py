@@ -20,7 +20,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from kit import Cloud
+from clouds import Cloud
 
 from pdal_stages.base.errors import StageError
 
@@ -33,7 +33,7 @@ def read_pts(paths: Iterable[Path], name: str, columns: str = COLUMNS) -> Cloud:
     Raises
     ------
     StageError
-        Where a line has not the columns, or a value is no number; it names the file.
+        Where a line does not have the columns, or a value is not a number; it names the file.
     """
     words = columns.split()
     if words.count("Classification") != 1 or not {"X", "Y", "Z"} <= set(words):

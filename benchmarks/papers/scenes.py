@@ -7,10 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from kit import SCENES, Cache, Cloud, features, fingerprint, fitted_bins, note, read_scene, with_height
+from clouds import Cloud, read_cloud, with_height
+from kit import Cache, features, fingerprint, fitted_bins, note
+from pts_input import COLUMNS, read_pts
 
 from pdal_stages.features import FeaturePlan
 
+#: Scene -> classes trained and scored; points of other classes are neighbors only.
+SCENES = {"montpellier": (2, 3, 4, 5, 6), "delft": (1, 2, 6)}
 NEIGHBORHOODS = "weinmann2018"  # [B16]'s are among them
 
 
@@ -30,6 +34,15 @@ class Scene:
         """Where features stand in the tables."""
         at = {name: number for number, name in enumerate(self.plan.names)}
         return np.array([at[name] for name in names])
+
+
+def read_scene(data: Path, scene: str, part: str, columns: str | None = None) -> Cloud:
+    """A part (train, test) of one of the airborne scenes: a folder of LAZ, or ``.pts`` text (see pts_input)."""
+    folder = data / scene
+    text = sorted(folder.glob(f"{part}*.pts"))
+    if text:
+        return read_pts(text, f"{scene} {part}", columns or COLUMNS)
+    return read_cloud(sorted(folder.glob(f"{part}*.la[sz]")), f"{scene} {part}")
 
 
 def load(

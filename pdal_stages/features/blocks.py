@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +17,10 @@ from ..base.threads import map_blocks, resolve_threads
 from .plan import FeaturePlan
 
 if TYPE_CHECKING:
-    from .engine import FeatureEngine
+    from .adaptive import AdaptiveNeighborhoods
+    from .bins import ShapeBins
+    from .fixed import FixedRadius
+    from .index import Grid
 
 #: Estimated nanoseconds a block may take on one core: Ctrl-C waits for the blocks in work.
 BLOCK_NS = 1.5e8
@@ -31,47 +35,83 @@ MAKERS = {
 }
 
 
-class Run:
-    """One pass over queries: sorted like the cloud, cut into blocks."""
+#: What a block counted: by kind, then by neighborhood.
+Tally = dict[str, dict[str, int]]
 
-    def __init__(self, engine: FeatureEngine, queries, dimensions, threads, memory_mb) -> None:
-        self.engine = engine
-        self.indices, coordinates = _queries(queries, engine._cloud)
-        count = len(engine) if coordinates is None else len(coordinates)
-        self.dimensions = _dimensions(engine.plan, dimensions, count)
-        if coordinates is None:
-            self.grid = engine._grid
-        else:
+
+@dataclass(frozen=True)
+class Fitted:
+    """What features are computed with: the neighborhoods of a cloud, and what was fitted or given."""
+
+    fixed: FixedRadius
+    adaptive: AdaptiveNeighborhoods | None
+    bins: ShapeBins | None
+    copt_threshold: float | None
+    seed: int
+
+
+class Run:
+    """One pass over queries: sorted like the cloud, cut into blocks.
+
+    Parameters
+    ----------
+    plan : FeaturePlan
+    cloud : (n, 3) float64
+    grid : Grid
+        The index of the cloud.
+    fit : callable
+        Gives what was fitted; called once the queries are found to be right.
+    queries, dimensions, threads, memory_mb
+        As for ``FeatureEngine.blocks``.
+    """
+
+    def __init__(
+        self,
+        plan: FeaturePlan,
+        cloud: np.ndarray,
+        grid: Grid,
+        fit: Callable[[], Fitted],
+        queries: npt.ArrayLike | None,
+        dimensions: Mapping[str, npt.ArrayLike] | None,
+        threads: int | None,
+        memory_mb: float,
+    ) -> None:
+        self.plan = plan
+        self.indices, coordinates = _queries(queries, cloud)
+        count = len(grid) if coordinates is None else len(coordinates)
+        self.dimensions = _dimensions(plan, dimensions, count)
+        self.grid = grid
+        if coordinates is not None:
             from .index import build_grid
 
-            self.grid = build_grid(coordinates, engine.plan.cell)
+            self.grid = build_grid(coordinates, plan.cell)
         checks.number("'memory_mb'", memory_mb, 16)
         self.threads = resolve_threads(threads)
         self.starts = np.zeros(1, np.int64)
         if not count:
             return
-        if not len(engine):
+        if not len(grid):
             raise StageError("the cloud has no points", found=f"{count} queries")
-        engine.fit()
-        self.fixed, self.adaptive = engine._prepared()
-        if len(self.fixed):
+        self.fitted = fit()
+        if len(self.fitted.fixed):
             compile_once("fixed")
-        self.candidates = self.fixed.candidates(self.grid.rows_of_cells(), self.grid.cell_ix)
+        self.candidates = self.fitted.fixed.candidates(self.grid.rows_of_cells(), self.grid.cell_ix)
         self._cut(float(memory_mb) * 2**20)
 
     def _cut(self, budget: float) -> None:
         """Cut the queries into blocks of bounded rows and time; use fewer threads where scratch is large."""
         from .index import cut_blocks
 
-        cost = self.fixed.cost(self.candidates) if len(self.fixed) else np.zeros(len(self.candidates))
-        scratch = float(self.fixed.scratch_bytes(int(self.candidates.max())))
-        if self.adaptive is not None:
-            cost = cost + self.adaptive.query_ns
-            scratch += self.adaptive.scratch_bytes
+        fixed, adaptive = self.fitted.fixed, self.fitted.adaptive
+        cost = fixed.cost(self.candidates) if len(fixed) else np.zeros(len(self.candidates))
+        scratch = float(fixed.scratch_bytes(int(self.candidates.max())))
+        if adaptive is not None:
+            cost = cost + adaptive.query_ns
+            scratch += adaptive.scratch_bytes
         cost = cost * self._distinct_share()
         self.threads = int(max(1, min(self.threads, 0.5 * budget // scratch)))
         # Two results per thread may wait (map_blocks) and one is being made; copies of points double a block.
-        row = 8 * len(self.engine.plan.names) + ROW_BYTES
+        row = 8 * len(self.plan.names) + ROW_BYTES
         rows = (budget - self.threads * scratch) / ((2 * self.threads + 1) * row)
         total = float(cost @ np.diff(self.grid.cell_start))
         most = min(BLOCK_NS, max(total / (4 * self.threads), 5e6))
@@ -89,9 +129,10 @@ class Run:
         copies = np.add.reduceat(copy, grid.cell_start[:-1], dtype=np.int64)
         return 1.0 - copies / np.diff(grid.cell_start)
 
-    def compute(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, dict[str, dict[str, int]]]:
+    def compute(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, Tally]:
         """Positions (in the user's order) and values of the sorted queries first..last, and what to report."""
-        engine, grid = self.engine, self.grid
+        plan, grid, fitted = self.plan, self.grid, self.fitted
+        fixed, adaptive = fitted.fixed, fitted.adaptive
         qx, qy, qz = grid.x[first:last], grid.y[first:last], grid.z[first:last]
         new = np.empty(last - first, np.bool_)
         new[:1] = True
@@ -100,34 +141,30 @@ class Run:
         copies = np.diff(at, append=last - first)
         if len(at) < last - first:
             qx, qy, qz = qx[at], qy[at], qz[at]
-        width = len(engine.plan.names)
+        width = len(plan.names)
         values = np.empty((len(at), width), np.float32)
-        tally: dict[str, dict[str, int]] = {}
-        if len(self.fixed):
+        tally: Tally = {}
+        if len(fixed):
             a = np.searchsorted(grid.cell_start, first, "right") - 1
             b = np.searchsorted(grid.cell_start, last, "left")
-            few = np.zeros(len(self.fixed), np.int64)
-            self.fixed.fill(
-                qx, qy, qz, copies, engine.bins, engine.seed, int(self.candidates[a:b].max()), few, values
+            few = np.zeros(len(fixed), np.int64)
+            fixed.fill(
+                qx, qy, qz, copies, fitted.bins, fitted.seed, int(self.candidates[a:b].max()), few, values
             )
-            tally["fewer_than_three"] = dict(zip(self.fixed.tokens, few.tolist(), strict=True))
-        if self.adaptive is not None:
-            few = np.zeros(len(self.adaptive.tokens), np.int64)
-            far = np.zeros(len(self.adaptive.tokens), np.int64)
-            self.adaptive.fill(
-                qx, qy, qz, copies, engine.bins, engine.seed, engine.copt_threshold, few, far, values
+            tally["fewer_than_three"] = dict(zip(fixed.tokens, few.tolist(), strict=True))
+        if adaptive is not None:
+            few = np.zeros(len(adaptive.tokens), np.int64)
+            far = np.zeros(len(adaptive.tokens), np.int64)
+            adaptive.fill(
+                qx, qy, qz, copies, fitted.bins, fitted.seed, fitted.copt_threshold, few, far, values
             )
-            tally.setdefault("fewer_than_three", {}).update(
-                zip(self.adaptive.tokens, few.tolist(), strict=True)
-            )
-            if engine.plan.unbounded:
-                tally["beyond_halo"] = {
-                    t: n for t, n in zip(self.adaptive.tokens, far.tolist(), strict=True) if n
-                }
+            tally.setdefault("fewer_than_three", {}).update(zip(adaptive.tokens, few.tolist(), strict=True))
+            if plan.unbounded:
+                tally["beyond_halo"] = {t: n for t, n in zip(adaptive.tokens, far.tolist(), strict=True) if n}
         if len(at) < last - first:
             values = np.repeat(values, copies, axis=0)
         positions = grid.order[first:last].astype(np.int64)
-        for column, name in enumerate(engine.plan.dimensions, width - len(engine.plan.dimensions)):
+        for column, name in enumerate(plan.dimensions, width - len(plan.dimensions)):
             given = self.dimensions.get(name)
             if given is None:
                 values[:, column] = {"X": grid.x, "Y": grid.y, "Z": grid.z}[name][first:last]
@@ -135,18 +172,19 @@ class Run:
                 values[:, column] = given[positions]
         return positions, values, tally
 
-    def iterate(self, compute, progress) -> Iterator[tuple[np.ndarray, Any]]:
+    def iterate(
+        self,
+        compute: Callable[[tuple[int, int]], tuple[np.ndarray, Any, int, Tally]],
+        progress: Any,
+        tell: Callable[[int, Tally], None],
+    ) -> Iterator[tuple[np.ndarray, Any]]:
+        """Rows and results of the blocks as threads finish them; `tell` hears how many queries each had, and its tally."""
         blocks = list(zip(self.starts[:-1].tolist(), self.starts[1:].tolist(), strict=True))
         own = Progress(len(self.grid), "features") if progress is True else None
         bar = own if own is not None else progress or None
-        report = self.engine.report
         try:
             for rows, result, count, tally in map_blocks(compute, blocks, self.threads):
-                with self.engine._lock:
-                    report["queries"] += count
-                    for key, counts in tally.items():
-                        for token, n in counts.items():
-                            report[key][token] = report[key].get(token, 0) + n
+                tell(count, tally)
                 if bar is not None:
                     bar.update(count)
                 yield rows, result

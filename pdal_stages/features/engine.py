@@ -14,7 +14,7 @@ from ..base import checks
 from ..base.errors import OptionError, StageError
 from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
-from .blocks import Run, compile_once
+from .blocks import Fitted, Run, Tally, compile_once
 from .plan import FeaturePlan
 
 if TYPE_CHECKING:
@@ -174,6 +174,10 @@ class FeatureEngine:
                 self._parts = FixedRadius(self._grid, self.plan), adaptive
             return self._parts
 
+    def _fitted(self) -> Fitted:
+        self.fit()
+        return Fitted(*self._prepared(), self.bins, self.copt_threshold, self.seed)
+
     # ---- computing -----------------------------------------------------------------------------------------
 
     def blocks(
@@ -217,14 +221,14 @@ class FeatureEngine:
         DimensionError
             Where a dimension of the plan is not given, or has not one value per query.
         """
-        run = Run(self, queries, dimensions, self.threads if threads is None else threads, memory_mb)
+        run = self._run(queries, dimensions, threads, memory_mb)
 
         def compute(block: tuple[int, int]):
             positions, values, tally = run.compute(*block)
             rows = positions if run.indices is None else run.indices[positions]
             return rows, values if apply is None else apply(values, rows), len(rows), tally
 
-        yield from run.iterate(compute, progress)
+        yield from run.iterate(compute, progress, self._tell)
 
     def table(
         self,
@@ -236,7 +240,7 @@ class FeatureEngine:
         progress: Progress | bool | None = None,
     ) -> FeatureTable:
         """The features of all queries as one table, row i for query i; parameters as for :meth:`blocks`."""
-        run = Run(self, queries, dimensions, self.threads if threads is None else threads, memory_mb)
+        run = self._run(queries, dimensions, threads, memory_mb)
         values = np.empty((len(run.grid), len(self.plan.names)), np.float32)
 
         def compute(block: tuple[int, int]):
@@ -244,9 +248,20 @@ class FeatureEngine:
             values[positions] = part  # blocks are disjoint
             return positions, None, len(positions), tally
 
-        for _ in run.iterate(compute, progress):
+        for _ in run.iterate(compute, progress, self._tell):
             pass
         return FeatureTable(values, self.plan.names, self.bins, self.copt_threshold, self.report)
+
+    def _run(self, queries, dimensions, threads: int | None, memory_mb: float) -> Run:
+        threads = self.threads if threads is None else threads
+        return Run(self.plan, self._cloud, self._grid, self._fitted, queries, dimensions, threads, memory_mb)
+
+    def _tell(self, count: int, tally: Tally) -> None:
+        with self._lock:
+            self.report["queries"] += count
+            for key, counts in tally.items():
+                for token, n in counts.items():
+                    self.report[key][token] = self.report[key].get(token, 0) + n
 
 
 @dataclass
