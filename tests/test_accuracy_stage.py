@@ -48,6 +48,7 @@ def models(tmp_path_factory):
     for name, options in (
         ("classes", {"classes": {"2": 2, "3,5": "5 Anything green", "6": 6}}),
         ("binary", {"strategy": "binary", "target": 6}),
+        ("translated", {"classes": {"2": 5, "3,5": 4, "6": 2}}),
     ):
         train([cloud], TrainingOptions(**common, **options), progress=False).save(folder / f"{name}.model")
     return folder
@@ -96,6 +97,15 @@ def test_the_background_of_a_binary_model_is_scored(models, tmp_path, write_las)
     assert figures["left_out"]["by_class"] == {"1": 90}
     matrix = np.array(figures["confusion"]["counts"])
     assert building["precision"] == matrix[1, 1] / matrix[:, 1].sum()
+
+
+def test_a_reference_in_the_codes_of_a_model_that_translates_labels(models, tmp_path, write_las):
+    arrays = scene(seed=2)
+    arrays["Classification"] = np.array([0, 1, 5, 4, 4, 4, 2], np.uint8)[arrays["Classification"]]
+    source = write_las(tmp_path / "town.laz", arrays)
+    figures, _ = judged(source, models / "translated.model", tmp_path, print=False)
+    assert [c["code"] for c in figures["classes"]] == [2, 4, 5] and figures["merged"] == {}
+    assert figures["left_out"]["by_class"] == {"1": 90} and figures["overall_accuracy"] > 0.5
 
 
 def test_the_user_overrules_the_model(models, tmp_path, write_las):

@@ -71,7 +71,8 @@ present, add a reliability curve and the error by margin.
 
 What is scored follows one rule, the one that training follows. With a model, its classes are scored, each made of the
 labels that it was trained on: a model of vegetation from 3, 4 and 5 counts all three as vegetation, and a binary
-model everything else that it was trained on as background. Without one, every class of the reference is scored but 0
+model everything else that it was trained on as background. (A model of labels that are not ASPRS codes expects a
+reference in the codes that it writes.) Without one, every class of the reference is scored but 0
 and 1 (unclassified), 7 and 18 (noise) and 12 (overlap), which do not say what a point is. All other points are left
 out and counted. `classes`, `ignore` and `merge` overrule this.
 """
@@ -125,11 +126,11 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
         rule["names"] = {c["code"]: c["name"] for c in trained}
         if self.classes:
             return rule
-        if self.merge is None:
+        if self.merge is None and _one_code_system(trained):
             rule["merge"] = {c["code"]: c["labels"] for c in trained}
         merged = Merge.parse(rule["merge"])
         rule["classes"] = sorted({int(merged.to[c["code"]]) for c in trained})
-        if self.ignore is None:
+        if self.ignore is None and rule["merge"] is not None:
             # A class's code need not be one of its labels: 1 is the background, or unclassified.
             labels = {label for c in trained for label in c["labels"]}
             rule["ignore"] = [c["code"] for c in trained if c["code"] not in labels]
@@ -206,3 +207,9 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
             importances=importances,
             settings={**about, **how},
         )
+
+
+def _one_code_system(trained: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether a model's labels and codes mean the same; not where label 5 became 6, and 8 became 5."""
+    class_of = {label: c["code"] for c in trained for label in c["labels"]}
+    return all(class_of.get(c["code"], c["code"]) == c["code"] for c in trained)
