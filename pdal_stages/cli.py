@@ -233,23 +233,20 @@ def _pipeline(options: argparse.Namespace) -> int | None:
         return run_command(options, _source(options))
     pipeline = _build(options)
     if options.validate:
-        pipeline.validate()
-        print(json.dumps({"valid": True, "error_detail": "", "streamable": False}, indent=2))
+        print(pipeline.validate())
         return None
-    pipeline.check_outputs(*_metadata(options))
-    _end_at_once(options)
-    pipeline.execute(arrays=False)
-    _after(pipeline, options.metadata, verbose=bool(options.verbose))
+    _run(options, pipeline)
     return None
 
 
-def _metadata(options: argparse.Namespace) -> list[Output]:
-    return [Output(options.metadata, "metadata", kinds.JSON)] if options.metadata else []
-
-
-def _after(pipeline, metadata: str | None, verbose: bool = False) -> None:
+def _run(options: argparse.Namespace, pipeline) -> int:
+    """Run a pipeline and tell what it has to say; the number of points."""
     from .base.files import write_whole
 
+    metadata, verbose = getattr(options, "metadata", None), bool(getattr(options, "verbose", 0))
+    pipeline.check_outputs(*([Output(metadata, "metadata", kinds.JSON)] if metadata else []))
+    _end_at_once(options)
+    count = pipeline.execute(arrays=False)
     # What PDAL calls an error although it goes on: a reader that sets what it cannot read to 0, say.
     said = pipeline.log.strip().splitlines()
     for line in said if verbose else said[:_SAID]:
@@ -265,6 +262,7 @@ def _after(pipeline, metadata: str | None, verbose: bool = False) -> None:
                     print(f"pdal-stages: {place}: {report[key]}", file=sys.stderr)
     if metadata:
         write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
+    return count
 
 
 def _expand(options: argparse.Namespace) -> None:
@@ -280,8 +278,7 @@ def _expand(options: argparse.Namespace) -> None:
 
 
 def _validate(options: argparse.Namespace) -> None:
-    _build(options).validate()
-    print(json.dumps({"valid": True, "error_detail": "", "streamable": False}, indent=2))
+    print(_build(options).validate())
 
 
 def _drivers(options: argparse.Namespace) -> None:
@@ -297,19 +294,23 @@ def _options(options: argparse.Namespace) -> None:
 
 
 def _classify(options: argparse.Namespace) -> None:
+    from .base.asprs import class_name
     from .pipeline.jobs import classify_pipeline
     from .pipeline.run import Pipeline
     from .stages.modelclassifier import loaded_model
 
-    stages = classify_pipeline(options.input, options.output, options.model, where=options.where)
+    stages = classify_pipeline(
+        options.input, options.output, options.model, options.overrides, where=options.where
+    )
     pipeline = Pipeline(stages, options.overrides)
-    pipeline.check_outputs(*_metadata(options))
-    _end_at_once(options)
-    count = pipeline.execute(arrays=False)
-    _after(pipeline, options.metadata)
-    report = pipeline.reports[-1][1][-1]
+    count = _run(options, pipeline)
     print(f"{count:,} points written to {options.output}")
-    print(_class_counts(report, dict(loaded_model(options.model).classes)))
+    names = dict(loaded_model(options.model).classes)
+    report = pipeline.reports[-1][1][-1]
+    for code, points in report.get("classes", {}).items():
+        print(f"  {int(code):3d} {names.get(int(code), class_name(int(code))):28s} {points:>12,}")
+    if report.get("rejected"):
+        print(f"  rejected: {report['rejected']:,}")
 
 
 def _models(options: argparse.Namespace) -> None:
@@ -323,32 +324,14 @@ def _models(options: argparse.Namespace) -> None:
         print(f"{name:12s} {classes}; {path}")
 
 
-def _class_counts(report: dict, names: dict[int, str]) -> str:
-    from .base.asprs import class_name
-
-    lines = [
-        f"  {int(code):3d} {names.get(int(code), class_name(int(code))):28s} {n:>12,}"
-        for code, n in report.get("classes", {}).items()
-    ]
-    if report.get("rejected"):
-        lines.append(f"  rejected: {report['rejected']:,}")
-    return "\n".join(lines)
-
-
 def _train(options: argparse.Namespace) -> None:
     from .classifier import load_model
     from .pipeline.jobs import train_pipeline
     from .pipeline.run import Pipeline
 
     extra = {k: v for k in ("classes", "neighborhoods", "count") if (v := getattr(options, k)) is not None}
-    # Overrides for the model writer reach the job before it decides whether heights are needed.
-    for override in options.overrides:
-        if not override.by_tag and override.selector == "writers.classifiermodel":
-            extra[override.option] = override.value
-    pipeline = Pipeline(train_pipeline(options.inputs, options.model, **extra), options.overrides)
-    _end_at_once(options)
-    pipeline.execute(arrays=False)
-    _after(pipeline, None)
+    stages = train_pipeline(options.inputs, options.model, options.overrides, **extra)
+    _run(options, Pipeline(stages, options.overrides))
     if Path(options.model).is_file():  # not written into a pipe or device
         print(load_model(options.model))
 
@@ -372,9 +355,7 @@ def _accuracy(options: argparse.Namespace) -> None:
         )
         return
     stages = accuracy_pipeline(options.inputs, options.dimension, reference_dimension, **outputs)
-    pipeline = Pipeline(stages, options.overrides)
-    pipeline.execute(arrays=False)
-    _after(pipeline, None)
+    _run(options, Pipeline(stages, options.overrides))
 
 
 def _model(options: argparse.Namespace) -> None:

@@ -13,35 +13,38 @@ from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import DimensionError, StageError
 from ..base.outputs import check_outputs
 from .filenames import stage_files
-from .overrides import Override
+from .lowering import lower_stage
+from .overrides import Override, apply_overrides
 
 
 def classify_pipeline(
-    source: str, target: str, model: str, *, where: str | None = None
+    source: str, target: str, model: str, overrides: Iterable[Override] = (), *, where: str | None = None
 ) -> list[dict[str, Any]]:
-    """Read, give heights if the model wants them, classify, write with everything else kept."""
+    """Read, give heights if the model wants them, classify, write with everything else kept.
+
+    The overrides are those of the run: they may name another model.
+    """
     from ..stages.modelclassifier import loaded_model
 
-    loaded = loaded_model(model)
+    classifier = {"type": "filters.modelclassifier", "model": model, **({"where": where} if where else {})}
+    loaded = loaded_model(_overridden(classifier, overrides)["model"])
     prepared = loaded.info.get("preparation") or heights_for(loaded.required_dimensions)
-    stages: list[dict[str, Any]] = [_reader(source, "input"), *prepared]
-    classifier: dict[str, Any] = {"type": "filters.modelclassifier", "model": model}
-    if where:
-        classifier["where"] = where
-    stages.append(classifier)
-    stages.append(_writer(target))
-    return stages
+    return [_reader(source, "input"), *prepared, classifier, _writer(target)]
 
 
-def train_pipeline(sources: Iterable[str], model: str, **options: Any) -> list[dict[str, Any]]:
+def train_pipeline(
+    sources: Iterable[str], model: str, overrides: Iterable[Override] = (), **options: Any
+) -> list[dict[str, Any]]:
     """Read labelled files, give heights if wanted, train, write the model."""
-    from ..stages.classifiermodel import ClassifierModel
+    writer = {"type": "writers.classifiermodel", "filename": model, **options}
+    heights = heights_for(lower_stage(_overridden(writer, overrides)).stage.reads())
+    return [*(_reader(name, f"input{i}") for i, name in enumerate(sources, 1)), *heights, writer]
 
-    writer = {"filename": model, **options}
-    stages: list[dict[str, Any]] = [_reader(name, f"input{i}") for i, name in enumerate(sources, 1)]
-    stages += heights_for(ClassifierModel(writer).reads())
-    stages.append({"type": ClassifierModel.type, **writer})
-    return stages
+
+def _overridden(stage: dict[str, Any], overrides: Iterable[Override]) -> dict[str, Any]:
+    """A stage with the overrides of its type."""
+    of_type = [o for o in overrides if not o.by_tag and o.selector == stage["type"]]
+    return apply_overrides([stage], of_type)[0]
 
 
 def heights_for(dimensions: Iterable[str]) -> list[dict[str, Any]]:
@@ -93,15 +96,12 @@ def compare_files(
     StageError
         If a file has no partner, or two do not hold the same points.
     """
-    from ..stages.accuracy import AccuracyStage
-    from .overrides import apply_overrides
-
     pairs = paired(las_files(sources), las_files(references))
     listed = {"files": [name for pair in pairs for name in pair]}
-    wanted: dict[str, Any] = {"type": AccuracyStage.type, **listed, **outputs}
+    wanted: dict[str, Any] = {"type": "filters.accuracy", **listed, **outputs}
     (given,) = apply_overrides([wanted], overrides)
     renamed = {"dimension": "Classification", "reference": "Reference"}
-    stage = AccuracyStage({k: v for k, v in {**given, **renamed}.items() if k != "type"})
+    stage = lower_stage({**given, **renamed}).stage
     check_outputs(stage.outputs(), [*listed["files"], *stage_files(stage)])
     parts, wkt = [], ""
     for source, reference in pairs:

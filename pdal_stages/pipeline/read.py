@@ -57,7 +57,7 @@ def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
     Raises
     ------
     PipelineError
-        If the file cannot be read, is not JSON, or is no pipeline.
+        If the file cannot be read, is not JSON, or is not a pipeline.
     """
     if isinstance(source, Path) or (isinstance(source, str) and not _looks_like_json(source)):
         path = Path(source)
@@ -105,9 +105,8 @@ def parse_pipeline(text: str, name: str = "") -> PipelineSource:
     clean = _without_comments(text.removeprefix("\ufeff"), name)
     if not clean.strip():
         raise PipelineError("the pipeline is empty", where=name or None)
-    _check_depth(clean, name)
     try:
-        # parse_constant: NaN and Infinity are no JSON, and PDAL refuses them too.
+        # parse_constant: NaN and Infinity are not JSON, and PDAL refuses them too.
         value = json.loads(clean, parse_constant=_no_constant)
     except json.JSONDecodeError as error:
         raise PipelineError(
@@ -116,7 +115,9 @@ def parse_pipeline(text: str, name: str = "") -> PipelineSource:
             found=_excerpt(clean, error.pos),
             cure=_cure(clean, error),
         ) from None
-    except (ValueError, RecursionError) as error:
+    except RecursionError:
+        raise _too_deep(name or None) from None
+    except ValueError as error:
         raise PipelineError(
             "the pipeline is not valid JSON", where=name or None, found=str(error)[:200]
         ) from None
@@ -181,7 +182,7 @@ def _check_values(value: Any, where: str, depth: int = 0) -> None:
     takes numbers that a double holds.
     """
     if depth > _DEEPEST:
-        raise PipelineError(f"the pipeline is nested more than {_DEEPEST} levels deep", where=where)
+        raise _too_deep(where)
     if isinstance(value, str):
         try:
             good = "\0" not in value and bool(value.encode() or True)
@@ -205,6 +206,10 @@ def _check_values(value: Any, where: str, depth: int = 0) -> None:
             _check_values(inner, where, depth + 1)
 
 
+def _too_deep(where: str | None) -> PipelineError:
+    return PipelineError(f"the pipeline is nested more than {_DEEPEST} levels deep", where=where)
+
+
 def _looks_like_json(text: str) -> bool:
     start = text.lstrip("\ufeff \t\r\n")[:2]
     return start[:1] in ("[", "{") or start in ("//", "/*")
@@ -213,7 +218,6 @@ def _looks_like_json(text: str) -> bool:
 # The closing quote is optional, so that a match never fails: searching stays linear whatever the text.
 _STRING = r'"[^"\\\n]*(?:\\.[^"\\\n]*)*"?'
 _STRING_OR_COMMENT = re.compile(rf"{_STRING}|//|/\*")
-_STRING_OR_BRACKET = re.compile(rf"{_STRING}|[\[{{]|[\]}}]")
 
 
 def _without_comments(text: str, name: str = "") -> str:
@@ -241,21 +245,6 @@ def _without_comments(text: str, name: str = "") -> str:
         parts += [text[at:start], re.sub(r"[^\n]", " ", text[start:end])]
         at = end
     return "".join([*parts, text[at:]])
-
-
-def _check_depth(text: str, name: str) -> None:
-    depth = 0
-    for match in _STRING_OR_BRACKET.finditer(text):
-        mark = match.group()
-        if mark in "[{":
-            depth += 1
-            if depth > _DEEPEST:
-                raise PipelineError(
-                    f"the pipeline is nested more than {_DEEPEST} levels deep",
-                    where=f"{name or 'pipeline'}, line {text.count(chr(10), 0, match.start()) + 1}",
-                )
-        elif mark in "]}":
-            depth -= 1
 
 
 def _no_constant(word: str):

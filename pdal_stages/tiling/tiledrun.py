@@ -18,8 +18,8 @@ from .pool import open_pool
 from .settings import TilingOptions
 from .store import Store
 from .survey import Survey
-from .tileplan import TilePlan, make_plan
-from .worklist import Worklist, output_names
+from .tileplan import TilePlan, make_plan, outputs_for
+from .worklist import Worklist
 
 
 def run_tiled(
@@ -76,7 +76,7 @@ def run_tiled(
         if not chosen.resume:
             store.clear()
         if survey.per == "file":  # refused now, not after reading all inputs
-            output_names(plan, survey, [source.stem for source in survey.sources])
+            outputs_for(plan, [source.stem for source in survey.sources], survey.paths)
         try:
             with open_pool(chosen) as pool:
                 survey.read_indexes(store, pool, chosen.retries, progress)

@@ -9,7 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ..base import kinds
 from ..base.errors import PipelineError, StageError
+from ..base.outputs import Output, check_outputs
 from ..pipeline.run import Pipeline
 from ..stages.base import Stage
 
@@ -270,45 +272,41 @@ def _narrowed(step: _Step, later: float) -> dict[str, Any]:
     return stage
 
 
-def outputs_for(plan: TilePlan, names: list[str]) -> list[list[Path]]:
-    """Paths of each writer for every name put in place of '#'.
+def outputs_for(plan: TilePlan, names: list[str], inputs: Iterable[str]) -> list[list[str]]:
+    """For every name put in place of '#', what each of the writers writes.
 
     Raises
     ------
     PipelineError
         Where several outputs would have one name.
+    StageError
+        Where one is an input, or cannot be written.
     """
-    found: list[list[Path]] = []
+    found: list[list[Output]] = []
     for writer in plan.writers:
-        text = str(writer["filename"])
-        if "#" not in Path(text).name and len(names) > 1:
+        path = Path(writer["filename"])
+        if "#" not in path.name and len(names) > 1:
             raise PipelineError(
                 f"{len(names)} files will be written, and the writer has one name",
                 where=writer["type"],
-                found=text,
-                cure="Put '#' where the name of the tile or input file shall stand, e.g. "
-                f"{Path(text).stem}_#{Path(text).suffix}",
+                found=str(path),
+                cure="Put '#' where the name of the tile or input file should be, e.g. "
+                f"{path.stem}_#{path.suffix}",
             )
-        if "#" in str(Path(text).parent):
+        if "#" in str(path.parent):
             raise PipelineError(
-                "'#' stands in the file's name, not in its folder", where=writer["type"], found=text
+                "'#' goes into the file's name, not its folder", where=writer["type"], found=str(path)
             )
-        path = Path(text).absolute()
-        found.append([path.with_name(path.name.replace("#", n)) for n in names])
-    flat = [p for paths in found for p in paths]
-    twice = sorted(str(p) for p, n in Counter(flat).items() if n > 1)
+        kind = kinds.LAS if writer["type"] in ("writers.las", "writers.copc") else ""
+        path = path.absolute()
+        found.append([Output(str(path.with_name(path.name.replace("#", n))), "output", kind) for n in names])
+    flat = [output for outputs in found for output in outputs]
+    twice = sorted(path for path, n in Counter(output.path for output in flat).items() if n > 1)
     if twice:
         raise PipelineError(
             "two inputs would be written to the same file",
             found=twice[0],
             cure="Give input files different names, or use --per tile",
         )
-    return found
-
-
-def check_not_inputs(outputs: Iterable[Path], inputs: Iterable[str]) -> None:
-    """Refuse to write over what is being read."""
-    real = {str(Path(p).resolve()) for p in inputs}
-    for path in outputs:
-        if str(path.resolve()) in real:
-            raise StageError("the output is one of the inputs", found=str(path), cure="Give it another name")
+    check_outputs(flat, inputs)
+    return [[outputs[n].path for outputs in found] for n in range(len(names))]

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from ..base.errors import NoTerrainError, PipelineError, StageError
 from ..base.files import write_whole
 from ..base.las import read_header
+from ..pipeline.callbacks import Callbacks
 from ..pipeline.run import Pipeline
-from ..pipeline.runtime import Callbacks, points_of
+from ..pipeline.runtime import points_of
 from ..stages import registry
 from ..stages.base import Stage
 from .assemble import write_tile

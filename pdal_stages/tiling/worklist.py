@@ -14,7 +14,7 @@ from .settings import TilingOptions
 from .sources import Source
 from .store import Store, fingerprint
 from .survey import Survey
-from .tileplan import TilePlan, check_not_inputs, outputs_for
+from .tileplan import TilePlan, outputs_for
 from .tilework import Recipe, TileTask
 
 
@@ -47,7 +47,8 @@ class Worklist:
             jobs.append(job)
         tail: list[Any] = []
         if survey.per == "tile":
-            for job, paths in zip(jobs, output_names(plan, survey, [job.name for job in jobs]), strict=True):
+            named = outputs_for(plan, [job.name for job in jobs], survey.paths)
+            for job, paths in zip(jobs, named, strict=True):
                 job.outputs = paths
             tail = [plan.tail, _files_of(plan.tail)]
         common = fingerprint(
@@ -60,7 +61,7 @@ class Worklist:
     def _outputs(self) -> list[Output]:
         survey = self.survey
         by_tile = {job.tile: job for job in self.jobs}
-        named = output_names(self.plan, survey, [source.stem for source in survey.sources])
+        named = outputs_for(self.plan, [source.stem for source in survey.sources], survey.paths)
         tail = [self.plan.tail, _files_of(self.plan.tail)]
         outputs = []
         for source, paths in zip(survey.sources, named, strict=True):
@@ -144,13 +145,6 @@ class Worklist:
         return source, None if index is None else replace(
             index, tiles=[]
         )  # blocks are all that a worker needs
-
-
-def output_names(plan: TilePlan, survey: Survey, names: list[str]) -> list[list[str]]:
-    """For each name, what the writers write; none of it may be an input."""
-    columns = outputs_for(plan, names)
-    check_not_inputs([path for column in columns for path in column], [s.path for s in survey.sources])
-    return [[str(column[n]) for column in columns] for n in range(len(names))]
 
 
 def _files_of(stages: list[dict[str, Any]]) -> list[Any]:

@@ -47,7 +47,7 @@ REFUSED = [
     ("Latin-1 text", '["Gr\u00fcn.las"]'.encode("latin-1"), ["not UTF-8", "byte 4 is 0xfc", "Save it as UTF-8"]),
     ("UTF-16", '["a.las"]'.encode("utf-16"), ["not UTF-8", "UTF-16", "Save it as UTF-8"]),
     ("a LAS file as the pipeline", b"LASF\x00\x00\xff\xfe" + b"\x00" * 300, ["not"]),
-    ("nested 100,000 deep", b"[" * 100_000, ["nested more than 200 levels deep", "line 1"]),
+    ("nested 100,000 deep", b"[" * 100_000, ["nested more than 200 levels deep"]),
     ("options nested 300 deep", b'[{"type": "filters.range", "x": ' + b'{"a":' * 300 + b"1" + b"}" * 300 + b"}]", ["nested more than 200"]),
     ("10 MB without an end", b'["' + b"x" * 10_000_000, ["job.json, line 1"]),
     ("a million opened comments", b"[" + b"/*" * 1_000_001, ["does not end"]),
