@@ -68,7 +68,7 @@ def _print_anything() -> None:
 
 
 def _unforeseen(error: Exception) -> StageError:
-    """What nobody thought of, as a message of one paragraph."""
+    """An unforeseen error, as a message of one paragraph."""
     if isinstance(error, MemoryError):
         return StageError("memory ran out", cure="Work in tiles (--tile), or lower 'memory'")
     if isinstance(error, OSError):
@@ -108,7 +108,7 @@ def _parser() -> argparse.ArgumentParser:
         command.set_defaults(run=run, takes_overrides=overrides)
         return command
 
-    command = add("pipeline", _pipeline, "Run a pipeline that may hold stages of ours", overrides=True)
+    command = add("pipeline", _pipeline, "Run a pipeline that may contain our stages", overrides=True)
     _pipeline_input(command)
     command.add_argument("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
     command.add_argument(
@@ -118,7 +118,9 @@ def _parser() -> argparse.ArgumentParser:
         "--progress", action=argparse.BooleanOptionalAction, default=None, help="Show progress"
     )
     command.add_argument(
-        "--nostream", action="store_true", help="Accepted for PDAL's sake: our stages never stream"
+        "--nostream",
+        action="store_true",
+        help="Accepted for compatibility with PDAL; our stages never stream",
     )
     command.add_argument("-v", "--verbose", action="count", default=0, help="Print PDAL's log")
     from .tiling.command import add_arguments
@@ -139,7 +141,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--showjson", action="store_true", help="As JSON, like pdal --drivers --showjson")
 
     command = add("options", _options, "List the options of a stage")
-    command.add_argument("stage", help="e.g. filters.hag_minima; PDAL's stages are handed to pdal --options")
+    command.add_argument("stage", help="e.g. filters.hag_minima; for PDAL's stages pdal --options is asked")
     command.add_argument("--showjson", action="store_true", help="As JSON Schema")
 
     command = add("classify", _classify, "Classify a cloud with a model file", overrides=True)
@@ -151,7 +153,7 @@ def _parser() -> argparse.ArgumentParser:
         help="A model file, or a shipped model's name (pdal-stages models); default standard",
     )
     command.add_argument(
-        "--where", help="Only classify points for which this holds; the others serve as neighbors"
+        "--where", help="Classify only the points for which this holds; the others serve as neighbors"
     )
     command.add_argument("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
 
@@ -178,7 +180,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--json", help="Write figures to this file")
     command.add_argument("--html", help="Write a report to this file")
 
-    command = add("model", _model, "Print what a model file is")
+    command = add("model", _model, "Describe a model file")
     command.add_argument("file")
     command.add_argument("--showjson", action="store_true", help="Everything, as JSON")
     command.add_argument(
@@ -191,7 +193,9 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--density", type=float, default=7.0, help="Points per square metre")
     command.add_argument("--seed", type=int, default=1)
 
-    add("warmup", _warmup, "Compile the kernels for this machine once, so that later runs start at once")
+    add(
+        "warmup", _warmup, "Compile the kernels for this machine once, so that later runs start without delay"
+    )
     return parser
 
 

@@ -28,7 +28,7 @@ class Override:
 
 
 def parse_overrides(arguments: Iterable[str]) -> tuple[list[Override], list[str]]:
-    """Overrides among command-line arguments, and the arguments that are none.
+    """Overrides among command-line arguments, and the other arguments.
 
     The value follows after ``=`` or as the next argument.
     """

@@ -62,7 +62,7 @@ class ClassifierModel(Stage):
     dimensions: list = option(
         "list",
         ("HeightAboveGround",),
-        "Dimensions of the points used as features too (Intensity, ReturnNumber, NumberOfReturns, ReturnRatio)",
+        "Dimensions of the points that are used as features too (Intensity, ReturnNumber, NumberOfReturns, ReturnRatio)",
         may_be_empty=True,
     )
     classes: dict | None = option(
@@ -74,30 +74,41 @@ class ClassifierModel(Stage):
     strategy: str = option(
         "string",
         "multiclass",
-        "All classes at once, or 'target' against all others",
+        "All classes at once, or 'target' against all the others",
         choices=("multiclass", "binary"),
     )
     target: int | None = option(
         "integer", None, "Class to find with the binary strategy", minimum=0, maximum=255
     )
-    background: int = option("integer", 1, "Code of all other classes with it", minimum=0, maximum=255)
+    background: int = option(
+        "integer", 1, "Code given to all other classes with the binary strategy", minimum=0, maximum=255
+    )
     count: int = option(
-        "integer", _default("count"), "Samples of each class; smaller classes are duplicated", minimum=1
+        "integer",
+        _default("count"),
+        "Samples per class; smaller classes are filled up with duplicates",
+        minimum=1,
     )
     seed: int = option(
-        "integer", 0, "Seed of sampling, trees and shape distributions", minimum=0, maximum=2**31 - 1
+        "integer", 0, "Seed for sampling, trees and shape distributions", minimum=0, maximum=2**31 - 1
     )
     trees: list = option(
-        "list", (_default("trees"),), "Number of trees; several values are searched by cross-validation"
+        "list",
+        (_default("trees"),),
+        "Number of trees; of several values the best is found by cross-validation",
     )
-    max_depth: list = option("list", (0,), "Depth of trees, 0 for no limit; several values are searched")
+    max_depth: list = option(
+        "list", (0,), "Maximum depth of the trees, 0 for no limit; of several values the best is found"
+    )
     min_samples_leaf: list = option(
-        "list", (_default("min_samples_leaf"),), "Samples a leaf must have; several values are searched"
+        "list",
+        (_default("min_samples_leaf"),),
+        "Minimum number of samples in a leaf; of several values the best is found",
     )
     max_samples: float = option(
         "number",
         _default("max_samples"),
-        "Share of the samples each tree draws",
+        "Share of the samples that each tree draws",
         minimum=0,
         exclusive=True,
         maximum=1,
@@ -105,17 +116,17 @@ class ClassifierModel(Stage):
     max_features: str = option(
         "string",
         _default("max_features"),
-        "Features tried at a split: auto (a tenth, at least the square root), sqrt, log2, a number or a share",
+        "Features tried at each split: auto (a tenth, at least the square root), sqrt, log2, a number or a share",
     )
     prior_weight: float = option(
         "number",
         _default("prior_weight"),
-        "0: all classes count as equally frequent, as they are sampled; 1: as frequent as in the training points",
+        "0: all classes count as equally frequent, as they are sampled; 1: each as frequent as in the training points",
         minimum=0,
         maximum=1,
     )
     folds: int = option("integer", 0, "Folds of cross-validation over spatial blocks; 0 for none", minimum=0)
-    block_size: float = option("number", 25.0, "Side of those blocks", minimum=0, exclusive=True, unit="m")
+    block_size: float = option("number", 25.0, "Side of these blocks", minimum=0, exclusive=True, unit="m")
     passes: int = option(
         "integer",
         _default("passes"),
@@ -136,7 +147,7 @@ class ClassifierModel(Stage):
         maximum=100,
     )
     memory: int = option(
-        "integer", 512, "Memory for blocks of points, over the samples", minimum=16, unit="MB"
+        "integer", 512, "Memory for blocks of points, in addition to the samples", minimum=16, unit="MB"
     )
     details = """
 Samples `count` points of each class, spread over space; computes features for the samples only; fits the

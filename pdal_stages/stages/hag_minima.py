@@ -24,7 +24,7 @@ class HagMinima(Stage):
     cell: float = option(
         "number",
         20.0,
-        "Side of the coarse cells whose lowest points form the terrain; larger than the largest building's half width",
+        "Side of the coarse cells whose lowest points form the terrain; more than half the width of the largest building",
         minimum=0,
         exclusive=True,
         maximum=10_000,
@@ -42,8 +42,8 @@ class HagMinima(Stage):
     ignore_classes: list = option(
         "codes",
         NOISE,
-        "Class codes that do not form the terrain (they still receive heights), e.g. noise below ground; a range such "
-        "as Classification[7:7] too, and by PDAL's name, ignore",
+        "Class codes that do not form the terrain but still receive heights, e.g. noise below ground; ranges such as "
+        "Classification[7:7] are accepted, and so is PDAL's name for the option, ignore",
         may_be_empty=True,
         also="ignore",
     )

@@ -36,23 +36,25 @@ class ModelClassifier(Stage):
     probabilities: bool = option(
         "boolean", False, "Also write the probability of each class, as Probability_<code>"
     )
-    margin: bool = option("boolean", False, "Also write Margin, the winning probability minus the second")
+    margin: bool = option(
+        "boolean", False, "Also write Margin: the winning probability minus the second highest"
+    )
     variance: bool = option(
         "boolean",
         False,
-        "Also write Variance, that of the probabilities over a network's batches (alsnet only)",
+        "Also write Variance: how much the probabilities vary over a network's batches (alsnet only)",
     )
     reject_below: float | None = option(
         "number",
         None,
-        "Points less reliable than this are not given the winning class, and are counted",
+        "Points less reliable than this do not get the winning class; they are counted",
         minimum=0,
         maximum=1,
     )
     rejected_code: int | None = option(
         "integer",
         None,
-        "Class code of rejected points; default: they keep the class they had",
+        "Class code for rejected points; by default they keep the class they had",
         minimum=0,
         maximum=255,
     )
@@ -65,7 +67,7 @@ class ModelClassifier(Stage):
         unit="m",
     )
     memory: int = option(
-        "integer", 512, "Memory for blocks of points, over the cloud itself", minimum=16, unit="MB"
+        "integer", 512, "Memory for blocks of points, in addition to the cloud itself", minimum=16, unit="MB"
     )
     details = """
 Computes the features the model needs block by block and classifies them at once, so memory does not grow with their

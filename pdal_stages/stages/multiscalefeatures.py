@@ -45,13 +45,13 @@ class MultiscaleFeatures(Stage):
         "Groups (covariance, geometric, shapes, all) or single features (Linearity, A3, ...)",
     )
     seed: int = option(
-        "integer", 0, "Seed of the random pulls of shape distributions", minimum=0, maximum=2**31 - 1
+        "integer", 0, "Seed for the random draws of the shape distributions", minimum=0, maximum=2**31 - 1
     )
     bins: str | None = option(
         "filename",
         None,
-        "JSON file of shape-histogram thresholds and the curvature threshold: read where it exists, "
-        "otherwise fitted to these points and written, so that other tiles see the same ones",
+        "JSON file with the thresholds of shape histograms and curvature: read if it exists, otherwise fitted to "
+        "these points and written, so that other tiles use the same ones",
     )
     optimal: bool = option(
         "boolean",
@@ -59,7 +59,7 @@ class MultiscaleFeatures(Stage):
         "Also write the neighborhood that kopt chose as PDAL does: OptimalKNN (the point itself counted) and OptimalRadius",
     )
     memory: int = option(
-        "integer", 512, "Memory for blocks of points, over the cloud itself", minimum=16, unit="MB"
+        "integer", 512, "Memory for blocks of points, in addition to the cloud itself", minimum=16, unit="MB"
     )
     details = """
 Each neighborhood is a token, which ends the dimension's name: `Linearity_c2` is the linearity in the vertical cylinder

@@ -30,7 +30,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--workers",
         type=int,
         metavar="N",
-        help="Processes; 0: this one alone, without Dask (default: half the cores)",
+        help="Worker processes; 0 runs everything in this process, without Dask (default: half the cores)",
     )
     group.add_argument(
         "--scheduler", default="", metavar="ADDRESS", help="A running Dask scheduler, tcp://HOST:8786"
@@ -39,16 +39,18 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--per",
         choices=PER,
         default="auto",
-        help="One output for each input file, or for each tile (auto: file)",
+        help="One output per input file or per tile (auto: per file)",
     )
     group.add_argument(
         "--buffer", type=float, metavar="METRES", help="Surroundings for PDAL filters that look at neighbors"
     )
     group.add_argument(
-        "--resume", action="store_true", help="Keep what an earlier run into this folder finished"
+        "--resume", action="store_true", help="Keep what an earlier run in this folder finished"
     )
-    group.add_argument("--retries", type=int, default=2, metavar="N", help="Tries again of a failed tile (2)")
-    group.add_argument("--dry-run", action="store_true", help="Show tiles and an estimate, and stop")
+    group.add_argument(
+        "--retries", type=int, default=2, metavar="N", help="How often a failed tile is tried again (2)"
+    )
+    group.add_argument("--dry-run", action="store_true", help="Show the tiles and an estimate, then stop")
     group.add_argument(
         "--report",
         action="append",

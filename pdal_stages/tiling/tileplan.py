@@ -145,7 +145,7 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
     later = [sum(reaches[n + 1 :]) for n in range(len(head))]
     stages = [step.ours for step in head if step.ours is not None]
     foreign = any(step.ours is None and step.type != "filters.merge" for step in head)
-    notes = []
+    notes = list(pipeline.lowered.remarks)
     if any(step.ours is None and step.sees_neighbors for step in head):
         notes.append(
             "PDAL filters that look at neighbors were given --buffer; the result is seamless only if it is wide enough "

@@ -73,7 +73,7 @@ class Cell:
         """Run the command line in this process."""
         from pdal_stages.cli import main
 
-        self.before = self._files()
+        self.before = self.files()
         self.capture.readouterr()
         try:
             code = main([str(word) for word in words])
@@ -84,7 +84,7 @@ class Cell:
 
     def process(self, *words: object, **options) -> Done:
         """Run it in a process of its own."""
-        self.before = self._files()
+        self.before = self.files()
         environment = {**os.environ, **options.pop("env", {})}
         command = options.pop("command", [sys.executable, "-m", "pdal_stages.cli"])
         done = subprocess.run(
@@ -99,7 +99,7 @@ class Cell:
             done.returncode, done.stdout.decode(errors="replace"), done.stderr.decode(errors="replace")
         )
 
-    def _files(self) -> set[Path]:
+    def files(self) -> set[Path]:
         return {path for path in self.folder.rglob("*") if path.is_file()}
 
     # ---- outcomes ------------------------------------------------------------------------------------------
@@ -114,7 +114,7 @@ class Cell:
         message = done.err[done.err.rindex("pdal-stages: ") :].strip()  # PDAL may have begun the line
         for text in says:
             assert text in message, (text, message)
-        left = self._files() - self.before
+        left = self.files() - self.before
         assert not left, f"left behind: {left}"
         self.note("error", message.removeprefix("pdal-stages: "))
         return message

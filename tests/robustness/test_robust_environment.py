@@ -285,7 +285,7 @@ def test_standard_output_is_full(cell, tmp_path, cloud):
     if not os.path.exists("/dev/full"):
         pytest.skip("no /dev/full here")
     it = cell("Environment", "standard output on a full disk")
-    it.before = it._files() | {simple(tmp_path, cloud)}
+    it.before = it.files() | {simple(tmp_path, cloud)}
     with open("/dev/full", "w") as full:
         done = subprocess.run(
             [sys.executable, "-m", "pdal_stages.cli", "drivers", "--ours"],

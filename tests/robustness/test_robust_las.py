@@ -249,6 +249,6 @@ def test_damaged_in_tiles(cell, tmp_path, good, case, edit, says):
     path = job(tmp_path, str(good), STAGES[0], str(tmp_path / "out.las"))
     it = cell("LAS files", f"LAS in tiles: {case}")
     done = it.command("pipeline", path, "--tile", "20")
-    it.before = it._files()  # the marks of the run stay, for --resume
+    it.before = it.files()  # the marks of the run stay, for --resume
     it.refused(done, "in.las", says)
     assert not (tmp_path / "out.las").exists()
