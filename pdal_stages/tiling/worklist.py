@@ -9,13 +9,14 @@ from typing import Any
 from ..base.version import __version__
 from ..stages import registry
 from .assemble import FileTask
+from .headrun import Recipe
 from .outcome import Job, Output
 from .settings import TilingOptions
 from .sources import Source
 from .store import Store, fingerprint
 from .survey import Survey
 from .tileplan import TilePlan, outputs_for
-from .tilework import Recipe, TileTask
+from .tilework import TileTask
 
 
 class Worklist:

@@ -1,0 +1,205 @@
+"""The head of a pipeline on a tile and its surroundings: points numbered, stages run, the tile's own results taken out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import PipelineError, StageError
+from ..base.las import read_header
+from ..pipeline.callbacks import Callbacks
+from ..pipeline.run import Pipeline
+from ..pipeline.runtime import points_of
+from ..stages import registry
+from ..stages.base import Stage
+from .extract import Piece
+from .grid import Box, Grid
+from .results import PieceResults
+from .sources import Source
+from .tileplan import MARGIN, ROW, SOURCE
+
+_MARK_TYPES = {ROW: "uint32_t", SOURCE: "uint32_t", MARGIN: "double"}
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What all tiles of a run have in common.
+
+    Attributes
+    ----------
+    grid : Grid
+    unit : float
+        Metres per unit of the coordinates.
+    bounds : Box
+        Of all inputs.
+    head, later, tail, halo, creates
+        As in :class:`~pdal_stages.tiling.tileplan.TilePlan`.
+    threads : int
+    most_points : int
+        A tile is not read with wider surroundings that hold more.
+    scratch : str
+        Folder for temporary files.
+    """
+
+    grid: Grid
+    unit: float
+    bounds: Box
+    head: list[dict[str, Any]]
+    later: list[float]
+    tail: list[dict[str, Any]]
+    halo: float
+    creates: list[str] | None
+    threads: int
+    most_points: int
+    scratch: str
+
+
+@dataclass
+class HeadRun:
+    """What a run of the head gave; `need`: the metres of surroundings that it took."""
+
+    results: list[PieceResults]
+    legacy: bool
+    need: float
+
+
+def run_head(
+    recipe: Recipe, tile: tuple[int, int], cuts: list[tuple[Source, Piece]], everything: bool
+) -> HeadRun:
+    """Run the head once; `everything`: all inputs were read, so nothing can lie farther away."""
+    if not recipe.head:
+        return HeadRun([PieceResults(source, piece, piece.own, {}) for source, piece in cuts], False, 0.0)
+    originals: dict[int, Mapping[str, NDArray]] | None = {} if recipe.creates is None else None
+    reaches: dict[int, _Reach] = {}
+    with Callbacks() as callbacks:
+        stages: list[dict[str, Any]] = []
+        for number, (source, piece) in enumerate(cuts):
+            reader = {**source.reader, "type": "readers.las", "filename": piece.path, "tag": f"in{number}"}
+            mark = _marking(number, piece, recipe.unit, originals)
+            marked = callbacks.filter(mark, _MARK_TYPES, inputs=[f"in{number}"], tag=f"mark{number}")
+            stages += [reader, marked]
+        inputs = {"inputs": [f"mark{number}" for number in range(len(cuts))]}
+        for given, later in zip(recipe.head, recipe.later, strict=True):
+            stage = {**given, **inputs}
+            inputs = {}
+            kind = registry.stages().get(stage["type"])
+            if kind is not None:
+                asked = int(stage.get("threads") or 0)
+                stage["threads"] = min(asked, recipe.threads) if asked else recipe.threads
+            stages.append(stage)
+            if kind is not None and kind.open_ended and not everything:
+                reach = reaches[len(stages) - 1] = _Reach(recipe.grid.box(tile), later)
+                stages.append(callbacks.filter(reach))
+        pipeline = Pipeline(stages)
+        for ours in pipeline.lowered.ours:
+            if ours.number in reaches:
+                reaches[ours.number].stage = ours.stage
+        pipeline.execute(arrays=True)
+    results, legacy = _collect(pipeline.arrays, cuts, recipe.creates, originals)
+    need = max((reach.need for reach in reaches.values()), default=0.0)
+    if not everything and any(_looked_far(r) for _, reports in pipeline.reports for r in reports):
+        most = max(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
+        need = max(need, _far_neighbors(pipeline.arrays, most, recipe, tile))
+    return HeadRun(results, legacy, need)
+
+
+def _marking(number: int, piece: Piece, unit: float, originals: dict[int, Mapping[str, NDArray]] | None):
+    """A function that numbers a reader's points, and keeps what they were where changes are to be found later."""
+    margin = np.where(piece.margin < 0, -1.0, piece.margin * unit)
+
+    def mark(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        count = len(ins["X"])
+        if count != len(margin):
+            raise StageError(f"the reader gave {count:,} points of {len(margin):,}")
+        outs[ROW] = np.arange(count, dtype=np.uint32)
+        outs[SOURCE] = np.full(count, number, np.uint32)
+        outs[MARGIN] = margin
+        if originals is not None:
+            originals[number] = {name: v[piece.own] for name, v in ins.items() if name not in _MARK_TYPES}
+
+    return mark
+
+
+class _Reach:
+    """Finds how far an open-ended stage reached for what is used of its results: up to `later` metres outside the tile."""
+
+    def __init__(self, box: Box, later: float) -> None:
+        self.box, self.later, self.need = box, later, 0.0
+        self.stage: Stage | None = None
+
+    def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        assert self.stage is not None
+        points = points_of(self.stage, module, ins)
+        wanted = ins[MARGIN] <= self.later if self.later > 0 else ins[MARGIN] < 0
+        if points.mask is not None:
+            wanted &= points.mask
+        box = [side * points.units.horizontal for side in self.box]
+        self.need = max(self.need, self.stage.reach_of(points, wanted, box))
+
+
+def _collect(
+    arrays: list[NDArray],
+    cuts: list[tuple[Source, Piece]],
+    creates: list[str] | None,
+    originals: dict[int, Mapping[str, NDArray]] | None,
+) -> tuple[list[PieceResults], bool]:
+    """Results of the tile's own points, sorted as their pieces are; whether class codes hold flag bits."""
+    names = [n for a in arrays[:1] for n in a.dtype.names or ()]
+    headers = [read_header(piece.path) for _, piece in cuts]
+    legacy = not {"Synthetic", "Withheld", "ClassFlags"} & set(names) and all(
+        header is not None and header.point_format <= 5 for header in headers
+    )
+    if creates is None:
+        names = [n for n in names if n not in _MARK_TYPES]
+    else:
+        names = [n for n in creates if n in names]
+    results = []
+    for number, (source, piece) in enumerate(cuts):
+        mine = [(a, np.flatnonzero((a[MARGIN] < 0) & (a[SOURCE] == number))) for a in arrays]
+        rows = np.concatenate([a[ROW][at].astype(np.int64) for a, at in mine] or [np.empty(0, np.int64)])
+        order = np.argsort(rows, kind="stable")
+        rows = rows[order]
+        if (np.diff(rows) == 0).any():
+            raise PipelineError(
+                "a stage makes new points, which have no place in the input files",
+                cure="Run the pipeline without --tile",
+            )
+        values = {name: np.concatenate([a[name][at] for a, at in mine])[order] for name in names}
+        results.append(PieceResults(source, piece, rows, values))
+    if originals is not None:
+        for name in names:
+            if not any(_changed(result, name, originals[n]) for n, result in enumerate(results)):
+                for result in results:
+                    del result.values[name]
+    return results, legacy
+
+
+def _changed(result: PieceResults, name: str, original: Mapping[str, NDArray]) -> bool:
+    """Whether a dimension is new, or differs from what was read."""
+    if not result.rows.size:
+        return False
+    before = np.searchsorted(result.piece.own, result.rows)
+    return name not in original or not np.array_equal(original[name][before], result.values[name])
+
+
+def _looked_far(report: dict[str, Any]) -> bool:
+    return any((report.get("beyond_halo") or {}).values())
+
+
+def _far_neighbors(arrays: list[NDArray], most: int, recipe: Recipe, tile: tuple[int, int]) -> float:
+    """Metres around the tile within which the `most` nearest neighbors of all its points lie."""
+    from scipy.spatial import cKDTree
+
+    x0, y0, x1, y1 = (side * recipe.unit for side in recipe.grid.box(tile))
+    array = np.concatenate([a[["X", "Y", "Z", MARGIN]] for a in arrays])
+    xyz = np.column_stack([array[c] for c in "XYZ"]) * recipe.unit
+    mine = xyz[array[MARGIN] < 0]
+    if len(xyz) <= most:
+        return 2 * (x1 - x0)
+    inward = np.min([mine[:, 0] - x0, x1 - mine[:, 0], mine[:, 1] - y0, y1 - mine[:, 1]], axis=0)
+    far = cKDTree(xyz).query(mine, k=[most + 1], workers=recipe.threads)[0][:, 0]
+    return float(max(0.0, (far - inward).max()))
