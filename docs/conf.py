@@ -5,9 +5,15 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-import stage_pages
+try:
+    import stage_pages
 
-from pdal_stages import __version__
+    from pdal_stages import __version__
+except ModuleNotFoundError as error:
+    sys.exit(
+        f"The pages of the stages and of the API are made from the package itself, and {error.name} is missing: "
+        "pip install '.[docs]' in the environment that runs sphinx-build"
+    )
 
 stage_pages.write()
 

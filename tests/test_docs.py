@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import re
@@ -139,3 +140,20 @@ def test_gallery_scripts_run(script, tmp_path):
     assert f"pictures/{script.stem}.png" in (ROOT / "docs" / "gallery" / "index.md").read_text(
         encoding="utf-8"
     )
+
+
+def test_the_picture_of_the_architecture_is_of_this_code():
+    spec = importlib.util.spec_from_file_location(
+        "architecture_picture", ROOT / "docs" / "architecture_picture.py"
+    )
+    drawn = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(drawn)
+    for _, steps in drawn.COLUMNS:
+        for *_, room in steps:
+            assert room == "PDAL" or (ROOT / "pdal_stages" / room).is_file(), room
+    assert drawn.TARGET.read_text(encoding="utf-8") == drawn.picture(), "run docs/architecture_picture.py"
+    rooms = set(
+        re.findall(r"^\| `(\w+(?:/|\.py))` \|", (ROOT / "docs" / "architecture.md").read_text(), re.MULTILINE)
+    )
+    there = {f"{p.name}/" for p in (ROOT / "pdal_stages").iterdir() if (p / "__init__.py").exists()}
+    assert rooms == there | {"cli.py"}

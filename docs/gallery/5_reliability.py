@@ -1,4 +1,4 @@
-"""Where the classifier doubts: reliability from above, and the share of errors among doubtful points."""
+"""Where the classifier is in doubt: reliability from above, and the share of errors among doubtful points."""
 
 import numpy as np
 from _common import halves, save, town
