@@ -386,8 +386,10 @@ def _demo(options: argparse.Namespace) -> None:
 
 def _warmup(options: argparse.Namespace) -> None:
     from .features import warmup
+    from .terrain import filtered_ground
 
     warmup()
+    filtered_ground([0.0], [0.0], [0.0], openings=(5,))
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ anchored to absolute coordinates (`floor(x / cell)`), so every tile of a survey 
 are filled from the nearest ones with points, by inverse distance, and counted in the metadata.
 
 The terrain is coarse on purpose: it needs no ground classification and never fails, and the classifier copes with its
-errors. Where heights themselves matter use `filters.smrf` with `filters.hag_nn` or `filters.hag_delaunay`;
+errors. Where heights themselves matter use `filters.hag_morphological`, or `filters.smrf` with `filters.hag_nn`;
 [the comparison](../benchmarks.md) says how far apart they are. Lengths are metres; `HeightAboveGround` is in
 the unit of Z.
 """
