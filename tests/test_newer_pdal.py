@@ -209,7 +209,7 @@ def test_data_frames(cloud, pdal_module):
     pipeline = pdal_module.Reader.las(str(cloud)) | ps.Filter.hag_minima()
     pipeline.execute()
     frame = pipeline.get_dataframe(0)
-    assert isinstance(frame, pandas.DataFrame) and frame["HeightAboveGround"].max() > 5
+    assert isinstance(frame, pandas.DataFrame) and frame["HeightAboveGround"].max() > 3
     again = pdal_module.Pipeline(ps.Filter.hag_minima(cell=10).stages, dataframes=[frame[["X", "Y", "Z"]]])
     assert again.execute() == 2000
     assert np.allclose(
