@@ -473,11 +473,14 @@ def test_tile_indexes_are_read(tmp_path, town_file, pdal_program, model_file, wh
         ("c.sqlite", "SQLite"),
         ("d.geojson", "GeoJSON"),
     ):
-        subprocess.run(
+        done = subprocess.run(
             [pdal_program, "tindex", "create", tmp_path / name, town_file, "-f", driver, "--fast_boundary"],
-            check=True,
             capture_output=True,
+            text=True,
         )
+        if "supports a maximum of 254" in done.stderr:
+            continue  # newer PDAL puts no long spatial reference into a Shapefile
+        assert done.returncode == 0, done.stderr
         assert locations(str(tmp_path / name)) == [str(town_file)]
         with pytest.raises(StageError, match="cannot be read"):
             locations(str(tmp_path / name), "nothing")
