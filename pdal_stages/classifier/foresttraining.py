@@ -87,7 +87,7 @@ def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: 
 
     chosen, validation = _validate(values, samples, xy, classes, plan, options, progress)
     started = time.perf_counter()
-    passes = _Passes(clouds, positions, samples, xy, classes.codes, features, context, chosen, options)
+    passes = _Passes(clouds, positions, samples, classes.codes, features, context, chosen, options)
     passes.grow(values, limits, progress)
     timed["trees"] = time.perf_counter() - started
     info = {
@@ -192,14 +192,13 @@ class _Passes:
         clouds: Sequence[TrainingCloud],
         positions: Sequence[npt.NDArray[np.int16]],
         samples: Samples,
-        xy: npt.NDArray[np.float64],
         codes: Sequence[int],
         features: Features,
         context: Context,
         chosen: Mapping[str, Any],
         options: TrainingOptions,
     ) -> None:
-        self.clouds, self.samples, self.xy, self.codes = clouds, samples, xy, codes
+        self.clouds, self.samples, self.codes = clouds, samples, codes
         self.features, self.context, self.chosen, self.options = features, context, chosen, options
         self.setting = _tree_options(options, chosen["max_depth"], chosen["min_samples_leaf"])
         self.made: list[FeatureForest] = []
@@ -253,12 +252,10 @@ class _Passes:
                 columns,
                 self.samples.label,
                 self.samples.weight,
-                self.xy,
                 fold,
                 self.folds,
                 trees,
                 self.setting,
-                gap=_gap(self.features.plan, self.options),
                 seed=self.options.seed,
                 threads=self.options.threads,
                 progress=bar,

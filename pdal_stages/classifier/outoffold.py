@@ -16,7 +16,6 @@ import numpy.typing as npt
 from ..base.errors import OptionError
 from .algorithms import Question
 from .context import Context
-from .crossval import split
 from .featureforest import Features
 from .forest import Forest
 from .growing import TreeOptions, grow
@@ -66,21 +65,23 @@ def grow_folds(
     values: npt.NDArray[np.float32],
     label: npt.NDArray[Any],
     weight: npt.NDArray[np.int64],
-    xy: npt.NDArray[np.float64],
     fold: npt.NDArray[np.int16],
     folds: int,
     trees: int,
     setting: TreeOptions,
     *,
-    gap: float,
     seed: int,
     threads: int | None = None,
     progress: Any = None,
 ) -> list[Forest]:
-    """A forest for each fold, grown on the samples outside it that are not within `gap` metres of it."""
+    """A forest for each fold, grown on the samples outside it.
+
+    Ground beside a fold is not left out as in cross-validation: the forests miss the fold's samples already, and the
+    next pass should see probabilities as good as those it will see when the model is used.
+    """
     forests = []
     for number in range(folds):
-        train, _ = split(xy, fold, number, gap)
+        train = fold != number
         if len(np.unique(label[train])) < 2:
             raise OptionError(
                 "without one of its folds the training ground has fewer than two classes left",
