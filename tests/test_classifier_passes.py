@@ -8,11 +8,11 @@ from test_classifier_training import SMALL, scene
 
 from pdal_stages.base.errors import ModelError, OptionError
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, modelfile, train
-from pdal_stages.classifier.folds import point_folds
+from pdal_stages.classifier.folds import Folds
 from pdal_stages.features import FeatureEngine
 
 FEW = {
-    **SMALL,
+    **{key: value for key, value in SMALL.items() if key != "passes"},
     "feature_set": "covariance",
     "neighborhoods": "s1",
     "trees": 8,
@@ -216,19 +216,29 @@ def test_a_pass_may_come_from_elsewhere(two, other):
 
 def test_folds_are_strips_or_whole_surveys():
     random = np.random.default_rng(0)
-    a, b, c = (random.random((n, 3)) * (50, 20, 3) + shift for n, shift in ((900, 0), (500, 100), (700, 300)))
-    label = [np.where(random.random(len(x)) < 0.8, 1, -1) for x in (a, b, c)]
-    parts, folds = point_folds(list(zip((a, b), label, strict=False)), ("x", "y"), 4)
-    assert folds == 4
-    for xyz, mine, position in zip((a, b), parts, label, strict=False):
-        assert (np.diff(mine[np.argsort(xyz[:, 0])]) >= 0).all()
+    clouds = [
+        (xyz, np.where(random.random(len(xyz)) < 0.8, 1, -1))
+        for xyz in (
+            random.random((n, 3)) * (90, 70, 3) + shift for n, shift in ((900, 0), (500, 100), (700, 300))
+        )
+    ]
+    folds = Folds.of(clouds[:2], ("x", "y"), 4)
+    for xyz, position in clouds[:2]:
+        mine = folds.points(xyz, "x")
         share = np.bincount(mine[position >= 0], minlength=4) / (position >= 0).sum()
-        assert np.allclose(share, 0.25, atol=0.01)
-    parts, folds = point_folds(list(zip((a, b, c), label, strict=True)), ("x", "y", "z"), 5)
-    assert folds == 3 and sorted(part[0] for part in parts) == [0, 1, 2]
-    assert all((part == part[0]).all() for part in parts)
-    parts, folds = point_folds(list(zip((a, b, c), label, strict=True)), ("x", "y", "x"), 5)
-    assert folds == 5 and set(parts[0]) == set(range(5))
+        assert (share > 0.1).all()
+        strip = np.floor((xyz[:, 0] + xyz[:, 1]) / (10 * np.sqrt(2))).astype(int)
+        assert np.array_equal(mine, strip % 4)
+        some = random.permutation(len(xyz))[:50]  # a thinned copy: the same ground in the same fold
+        assert np.array_equal(folds.points(xyz[some], "x"), mine[some])
+    folds = Folds.of(clouds, ("x", "y", "z"), 5)
+    assert folds.count == 3 and sorted(folds.surveys.values()) == [0, 1, 2]
+    assert (folds.points(clouds[1][0], "y") == folds.surveys["y"]).all()
+    assert Folds.of(clouds, ("x", "y", "x"), 5).surveys is None
+    small = [(clouds[0][0] / 20, clouds[0][1])]
+    assert 0.01 < Folds.of(small, ("x",), 5).width < 10
+    with pytest.raises(OptionError, match="too small"):
+        Folds.of([(np.ones((9, 3)), np.ones(9, int))], ("x",), 5)
 
 
 def test_options():

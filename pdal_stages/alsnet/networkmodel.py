@@ -12,9 +12,10 @@ import numpy as np
 
 from ..base.errors import OptionError
 from ..base.version import __version__
-from ..classifier.clouds import TrainingCloud, class_positions
+from ..classifier.clouds import TrainingCloud, label_classes
 from ..classifier.dimensions import gather, with_returns
 from ..classifier.model import Model
+from ..classifier.thinning import density_range
 from ..classifier.trainoptions import TrainingOptions
 from ..features.index import check_xyz
 from .epochs import LabelledCloud, train_network
@@ -51,7 +52,8 @@ def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: 
     network = options.alsnet
     inputs = input_names(network.coordinates, options.dimensions)
     checked = [check_xyz(np.asarray(cloud.xyz), cloud.name) for cloud in clouds]
-    classes, positions = class_positions(clouds, options)
+    known = label_classes(clouds, options)
+    classes, positions = known.classes, [position for _, position in known]
     labelled: list[LabelledCloud] = []
     notes: dict[str, int] = {}
     for cloud, xyz, position in zip(clouds, checked, positions, strict=True):
@@ -90,6 +92,7 @@ def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: 
             **trained.notes,
             **{name: number for name, number in notes.items() if number},
         },
+        "densities": density_range(checked),
         "accuracy": {"cross_validation": None},
         "passes": [
             {

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +12,7 @@ import numpy.typing as npt
 from ..base.asprs import UNINFORMATIVE
 from ..base.errors import OptionError
 from .classes import ClassMap, as_labels
+from .thinning import thinned
 from .trainoptions import TrainingOptions
 
 
@@ -27,10 +29,12 @@ class TrainingCloud:
         Name to (n,) values, as the options' `dimensions` need.
     name : str
         For messages and the model file; a path is cut to its last part.
-    survey : str, optional
-        The flight it belongs to; by default it is one of its own.
     mask : (n,) bool, optional
         Points samples may be drawn from; all points serve as neighbors.
+    survey : str, optional
+        The flight it belongs to; by default it is one of its own.
+    copy : str
+        Which of the survey's copies it is, where there are several.
     """
 
     xyz: npt.NDArray[np.float64]
@@ -39,34 +43,80 @@ class TrainingCloud:
     name: str = "cloud"
     mask: npt.ArrayLike | None = None
     survey: str | None = None
+    copy: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "xyz", np.asarray(self.xyz, dtype=np.float64))
 
+    @property
+    def flight(self) -> str:
+        """The survey, or the cloud's own name."""
+        return self.survey or self.name
 
-def class_positions(
-    clouds: Sequence[TrainingCloud], options: TrainingOptions
-) -> tuple[ClassMap, list[npt.NDArray[np.int16]]]:
-    """The classes, and for each cloud the place of each point's class in them, -1 where it is not used."""
-    usable = []
+    def part(self, rows: npt.NDArray[np.int64], copy: str = "") -> TrainingCloud:
+        """Some of its points, as a cloud of the same survey."""
+        return TrainingCloud(
+            self.xyz[rows],
+            np.asarray(self.labels)[rows],
+            {name: np.asarray(values)[rows] for name, values in self.dimensions.items()},
+            f"{self.name} {copy}".strip(),
+            None if self.mask is None else np.asarray(self.mask)[rows],
+            self.flight,
+            copy or self.copy,
+        )
+
+
+#: A training cloud, or a function that makes it when it is its turn.
+Source = TrainingCloud | Callable[[], TrainingCloud]
+
+
+def prepared(sources: Iterable[Source], options: TrainingOptions) -> Iterator[TrainingCloud]:
+    """The clouds without ignored points, each followed by its thinned copies."""
+    named: set[int] = set()
+    if options.classes is not None:
+        named.update(label for part in ClassMap.parse(options.classes).labels for label in part)
+    ignored = [label for label in options.ignore if label not in named]
+    for source in sources:
+        cloud = source() if callable(source) else source
+        labels = _checked_labels(cloud)
+        if ignored and (gone := np.isin(labels, ignored)).any():
+            cloud = cloud.part(np.flatnonzero(~gone))
+        yield cloud
+        for wanted in options.thin:
+            rows = thinned(cloud.xyz, wanted, options.seed)
+            if rows is not None and len(rows):
+                yield cloud.part(rows, f"thinned to {wanted:g} per m2")
+
+
+@dataclass(frozen=True, eq=False)
+class Labelled:
+    """For each cloud its coordinates and the place of each point's class, -1 where it is not used."""
+
+    clouds: Sequence[TrainingCloud]
+    classes: ClassMap
+
+    def __len__(self) -> int:
+        return len(self.clouds)
+
+    def __getitem__(self, number: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int16]]:
+        cloud = self.clouds[number]
+        position = self.classes.index(as_labels(cloud.labels, cloud.name))
+        if cloud.mask is not None:
+            position[~np.asarray(cloud.mask)] = -1
+        return cloud.xyz, position
+
+    def __iter__(self) -> Iterator[tuple[npt.NDArray[np.float64], npt.NDArray[np.int16]]]:
+        return (self[number] for number in range(len(self)))
+
+
+def label_classes(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> Labelled:
+    """The classes that the clouds' labels make."""
     found: dict[int, int] = {}
     for cloud in clouds:
-        labels = as_labels(cloud.labels, cloud.name)
-        if len(labels) != len(cloud.xyz):
-            raise OptionError(
-                "labels and points differ in number",
-                where=cloud.name,
-                found=f"{len(labels)} and {len(cloud.xyz)}",
-            )
-        mask = None
-        if cloud.mask is not None:
-            mask = np.asarray(cloud.mask)
-            if mask.shape != labels.shape or mask.dtype != np.bool_:
-                raise OptionError("the mask must be one true or false per point", where=cloud.name)
-        number = np.bincount(labels if mask is None else labels[mask])
+        labels = _checked_labels(cloud)
+        number = np.bincount(labels if cloud.mask is None else labels[np.asarray(cloud.mask)])
         for label in np.flatnonzero(number).tolist():
             found[label] = found.get(label, 0) + int(number[label])
-        usable.append((labels, mask))
     listing = ", ".join(f"{label}: {n:,}" for label, n in sorted(found.items())[:20]) or "no points"
     classes = ClassMap.parse(options.classes, found)
     if options.strategy == "binary" and options.target is not None:
@@ -84,10 +134,19 @@ def class_positions(
             found=f"labels {listing}",
             cure=f"Labels {', '.join(map(str, UNINFORMATIVE))} are left out unless 'classes' names them",
         )
-    positions = []
-    for labels, mask in usable:
-        position = classes.index(labels)
-        if mask is not None:
-            position[~mask] = -1
-        positions.append(position)
-    return classes, positions
+    return Labelled(clouds, classes)
+
+
+def _checked_labels(cloud: TrainingCloud) -> npt.NDArray[Any]:
+    labels = as_labels(cloud.labels, cloud.name)
+    if len(labels) != len(cloud.xyz):
+        raise OptionError(
+            "labels and points differ in number",
+            where=cloud.name,
+            found=f"{len(labels)} and {len(cloud.xyz)}",
+        )
+    if cloud.mask is not None:
+        mask = np.asarray(cloud.mask)
+        if mask.shape != labels.shape or mask.dtype != np.bool_:
+            raise OptionError("the mask must be one true or false per point", where=cloud.name)
+    return labels

@@ -6,28 +6,30 @@ import math
 import os
 import platform
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from ..base.errors import OptionError
 from ..base.progress import Progress
 from ..base.version import __version__
 from ..features import FeaturePlan
 from . import crossval
 from .classes import ClassMap
-from .clouds import TrainingCloud, class_positions
+from .clouds import Labelled, TrainingCloud, label_classes
 from .context import Context
 from .dimensions import gather, required
 from .featureforest import FeatureForest, Features
-from .folds import point_folds
+from .folds import Folds
 from .forest import Forest
 from .growing import TreeOptions, grow
 from .model import Model
 from .outoffold import FoldForests, grow_folds, sample_context
 from .samplefeatures import fit, must_fit, percentiles, sample_features
 from .sampling import Samples, draw_samples
+from .thinning import density_range
 from .trainoptions import TrainingOptions
 
 #: Trees of a forest that judges a fold, as a share of the final one's.
@@ -66,13 +68,10 @@ def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: 
         for name in required(plan.dimensions):
             if name not in cloud.dimensions:
                 gather((name,), cloud.dimensions, len(cloud.xyz), where=cloud.name)
-    classes, positions = class_positions(clouds, options)
-    samples = draw_samples(
-        [(cloud.xyz, position) for cloud, position in zip(clouds, positions, strict=True)],
-        len(classes.codes),
-        options.count,
-        options.seed,
-    )
+    labelled = label_classes(clouds, options)
+    classes = labelled.classes
+    groups = [f"{cloud.flight} {cloud.copy}" for cloud in clouds] if options.balance else None
+    samples = draw_samples(labelled, len(classes.codes), options.count, options.seed, groups)
     context = Context.parse(options.context)
     must_fit(len(plan.names) + (options.passes > 1) * len(context.tokens) * len(classes.codes), len(samples))
     share = np.bincount(samples.cloud, minlength=len(clouds)).tolist()
@@ -87,8 +86,9 @@ def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: 
 
     chosen, validation = _validate(values, samples, xy, classes, plan, options, progress)
     started = time.perf_counter()
-    passes = _Passes(clouds, positions, samples, classes.codes, features, context, chosen, options)
+    passes = _Passes(labelled, samples, features, context, chosen, options)
     passes.grow(values, limits, progress)
+    left_out = passes.without_each_survey(values, progress) if options.leave_one_survey_out else None
     timed["trees"] = time.perf_counter() - started
     info = {
         "strategy": options.strategy,
@@ -113,7 +113,8 @@ def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: 
             **notes,
         },
         "priors": _priors(samples, len(classes.codes), float(options.prior_weight)),
-        "accuracy": {"cross_validation": validation},
+        "densities": density_range(cloud.xyz for cloud in clouds),
+        "accuracy": {"cross_validation": validation, "leave_one_survey_out": left_out},
         "passes": passes.scores,
         "created_by": _versions(),
     }
@@ -189,38 +190,29 @@ class _Passes:
 
     def __init__(
         self,
-        clouds: Sequence[TrainingCloud],
-        positions: Sequence[npt.NDArray[np.int16]],
+        labelled: Labelled,
         samples: Samples,
-        codes: Sequence[int],
         features: Features,
         context: Context,
         chosen: Mapping[str, Any],
         options: TrainingOptions,
     ) -> None:
-        self.clouds, self.samples, self.codes = clouds, samples, codes
+        self.clouds, self.codes, self.samples = labelled.clouds, labelled.classes.codes, samples
         self.features, self.context, self.chosen, self.options = features, context, chosen, options
         self.setting = _tree_options(options, chosen["max_depth"], chosen["min_samples_leaf"])
         self.made: list[FeatureForest] = []
         self.scores: list[dict[str, Any]] = []
         self.notes: dict[str, Any] = {}
+        self.flights = [cloud.flight for cloud in self.clouds]
         if options.passes > 1:
-            self.fold, self.folds = point_folds(
-                [(cloud.xyz, position) for cloud, position in zip(clouds, positions, strict=True)],
-                [cloud.survey or cloud.name for cloud in clouds],
-                options.pass_folds,
-            )
-            self.notes["pass_folds"] = self.folds
+            self.folds = Folds.of(labelled, self.flights, options.pass_folds)
+            self.notes["pass_folds"] = self.folds.count
 
     def grow(
         self, values: npt.NDArray[np.float32], limits: tuple[list[float], list[float]], progress: bool
     ) -> None:
         """Fill `made` and `scores`."""
-        columns, held_out = values, []
-        for number in range(self.options.passes):
-            if number:
-                held_out.append(self._hold_out(columns, number, progress))
-                columns = np.concatenate([values, self._context(held_out, progress)], axis=1)
+        for number, columns in enumerate(self._columns(values, self.samples.weight, progress)):
             forest, importances, bag = self._forest(columns, number, progress)
             self.made.append(FeatureForest(self.features, forest, self.context if number else None))
             low, high = (
@@ -235,15 +227,55 @@ class _Passes:
                 }
             )
 
-    def _hold_out(self, columns: npt.NDArray[np.float32], number: int, progress: bool) -> list[Forest]:
-        """The pass before `number` once more, a forest without each fold."""
+    def without_each_survey(self, values: npt.NDArray[np.float32], progress: bool) -> dict[str, Any]:
+        """Scores of each survey's samples by passes grown without that survey.
+
+        Raises
+        ------
+        OptionError
+            There is only one survey.
+        """
+        names = sorted(set(self.flights))
+        if len(names) < 2:
+            raise OptionError(
+                "'leave_one_survey_out' needs clouds of at least two surveys", found=", ".join(names)
+            )
+        flight = np.array(self.flights)[self.samples.cloud]
+        label, weight, rows = self.samples.label, self.samples.weight, []
+        for name in names:
+            mine = flight == name
+            *_, columns = self._columns(values, weight * ~mine, progress)
+            forest = self._plain_forest(columns, weight * ~mine, f"growing without {name}", progress)
+            best = forest.predict_proba(np.ascontiguousarray(columns[mine])).argmax(axis=1)
+            matrix = np.zeros((len(self.codes), len(self.codes)), np.int64)
+            np.add.at(matrix, (label[mine], best), weight[mine])
+            rows.append({"name": os.path.basename(name), **crossval.figures(matrix, self.codes)})
+        means = {key: float(np.mean([row[key] for row in rows])) for key in ("overall_accuracy", "mean_f1")}
+        return {"surveys": rows, **means}
+
+    def _columns(
+        self, values: npt.NDArray[np.float32], weight: npt.NDArray[np.int64], progress: bool
+    ) -> Iterator[npt.NDArray[np.float32]]:
+        """What each pass reads of the samples; those of weight 0 teach none of them anything."""
+        held_out: list[list[Forest]] = []
+        columns = values
+        yield columns
+        for number in range(1, self.options.passes):
+            held_out.append(self._hold_out(columns, weight, number, progress))
+            columns = np.concatenate([values, self._context(held_out, progress)], axis=1)
+            yield columns
+
+    def _hold_out(
+        self, columns: npt.NDArray[np.float32], weight: npt.NDArray[np.int64], number: int, progress: bool
+    ) -> list[Forest]:
+        """The pass `number` once more, a forest without each fold."""
         trees = max(1, math.ceil(self.chosen["trees"] * FOLD_TREES))
         fold = np.empty(len(self.samples), np.int16)
-        for k in range(len(self.clouds)):
+        for k, cloud in enumerate(self.clouds):
             mine = self.samples.cloud == k
-            fold[mine] = self.fold[k][self.samples.row[mine]]
+            fold[mine] = self.folds.points(cloud.xyz[self.samples.row[mine]], self.flights[k])
         with Progress(
-            trees * self.folds,
+            trees * self.folds.count,
             f"pass {number} without each fold",
             "trees",
             enabled=None if progress else False,
@@ -251,9 +283,9 @@ class _Passes:
             return grow_folds(
                 columns,
                 self.samples.label,
-                self.samples.weight,
+                weight,
                 fold,
-                self.folds,
+                self.folds.count,
                 trees,
                 self.setting,
                 seed=self.options.seed,
@@ -272,8 +304,9 @@ class _Passes:
                 at, rows = self.samples.of_cloud(number)
                 if not len(at):
                     continue
+                fold = self.folds.points(cloud.xyz, self.flights[number])
                 passes = [
-                    FoldForests(self.features, self.context if k else None, forests, self.fold[number])
+                    FoldForests(self.features, self.context if k else None, forests, fold)
                     for k, forests in enumerate(held_out)
                 ]
                 out[at] = sample_context(
@@ -288,6 +321,23 @@ class _Passes:
                     progress=bar,
                 )
         return out
+
+    def _plain_forest(
+        self, columns: npt.NDArray[np.float32], weight: npt.NDArray[np.int64], what: str, progress: bool
+    ) -> Forest:
+        options = self.options
+        with Progress(self.chosen["trees"], what, "trees", enabled=None if progress else False) as bar:
+            grown = grow(
+                columns,
+                self.samples.label,
+                weight,
+                self.chosen["trees"],
+                self.setting,
+                options.seed,
+                threads=options.threads,
+                progress=bar,
+            )
+            return Forest.from_sklearn([tree.tree_ for tree, _, _ in grown], columns.shape[1])
 
     def _forest(
         self, values: npt.NDArray[np.float32], number: int, progress: bool

@@ -18,6 +18,7 @@ from .deciding import Outcome, Prediction, PredictionOptions, decide
 from .dimensions import required, welcome
 from .passes import Passes
 from .smoothing import count_shares, smooth
+from .thinning import density, out_of_range
 
 #: What a file says of a pass that its classifier does not need.
 _SCORES = ("percentiles", "importances", "out_of_bag")
@@ -146,6 +147,7 @@ class Model:
         where: npt.ArrayLike | None = None,
         *,
         current: npt.ArrayLike | None = None,
+        ignore: npt.ArrayLike | None = None,
         progress: Any = None,
         **options: Any,
     ) -> Prediction:
@@ -164,6 +166,8 @@ class Model:
         current : (n,) int, optional
             Classes the points have now: what points outside `where`, and rejected ones, keep. Without it
             the former get 0 (never classified) and the latter 1 (unclassified).
+        ignore : (n,) bool, optional
+            Points that are not there for the model: not classified, and not even neighbors. For noise.
         progress : object, optional
             Its ``update`` is called with the points done.
         **options
@@ -179,13 +183,70 @@ class Model:
             )
         rows = _rows(where, len(xyz))
         old = None if current is None else _codes_now(current, len(xyz))
+        gone = np.zeros(0, np.int64) if ignore is None else mask_of("ignore", ignore, len(xyz)).nonzero()[0]
+        if len(gone):
+            return self._without(xyz, dimensions or {}, rows, old, gone, how, progress)
+        return self._predict(xyz, dimensions or {}, rows, old, how, progress)
+
+    def _without(
+        self,
+        xyz: npt.NDArray[np.float64],
+        dimensions: Mapping[str, npt.ArrayLike],
+        rows: npt.NDArray[np.int64] | None,
+        old: npt.NDArray[np.uint8] | None,
+        gone: npt.NDArray[np.int64],
+        how: PredictionOptions,
+        progress: Any,
+    ) -> Prediction:
+        """Classify as if the points of the rows `gone` were not there."""
+        n = len(xyz)
+        keep = np.delete(np.arange(n), gone)
+        wanted = None
+        if rows is not None:
+            wanted = np.searchsorted(keep, rows[np.isin(rows, keep, assume_unique=True)])
+        part = self._predict(
+            xyz[keep],
+            {name: np.asarray(dimensions[name])[keep] for name in dimensions},
+            wanted,
+            None if old is None else old[keep],
+            how,
+            progress,
+        )
+
+        def spread(values: Any, first: Any = None) -> Any:
+            if values is None:
+                return None
+            out = np.zeros((n, *values.shape[1:]), values.dtype) if first is None else first.copy()
+            out[keep] = values
+            return out
+
+        return Prediction(
+            spread(part.classification, old),
+            spread(part.reliability),
+            spread(part.margin),
+            spread(part.probabilities),
+            spread(part.variance),
+            part.classified,
+            part.rejected,
+            {**part.report, "points": n, "ignored": len(gone)},
+        )
+
+    def _predict(
+        self,
+        xyz: npt.NDArray[np.float64],
+        dimensions: Mapping[str, npt.ArrayLike],
+        rows: npt.NDArray[np.int64] | None,
+        old: npt.NDArray[np.uint8] | None,
+        how: PredictionOptions,
+        progress: Any,
+    ) -> Prediction:
         codes = self.codes
 
         def finish(p):
             p = self._weigh(p)
             return count_shares(p) if how.smooth else decide(p, codes, how)
 
-        question = Question(xyz, dimensions or {}, rows, how.threads, how.memory_mb, progress)
+        question = Question(xyz, dimensions, rows, how.threads, how.memory_mb, progress)
         answer = self.algorithm.predict(question, finish)
         outcome = Outcome(len(xyz), len(codes), old, how)
         shares = np.zeros((len(xyz), len(codes)), np.uint16) if how.smooth else None
@@ -200,7 +261,32 @@ class Model:
             for part, p in _smoothed(xyz, rows, shares, how):
                 outcome.write(part, decide(p, codes, how))
             answer.report["smooth"] = how.smooth
+        answer.report.update(self._density_report(xyz, question.count, answer.report))
         return outcome.prediction(rows, answer.report)
+
+    def _density_report(
+        self, xyz: npt.NDArray[np.float64], count: int, report: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """How dense the cloud is; a warning where that is not what the model was trained for."""
+        trained = self.info.get("densities")
+        if trained is None or not count:
+            return {}
+        found = density(xyz)
+        out: dict[str, Any] = {"density": round(found, 3)}
+        if out_of_range(found, trained):
+            low, high = f"{trained['low']:.3g}", f"{trained['high']:.3g}"
+            few = report.get("fewer_than_three", {})
+            token = max(few, key=lambda one: few[one], default="")
+            lonely = (
+                f"; {100 * few[token] / count:.2g} % have fewer than three neighbors in {token}"
+                if few
+                else ""
+            )
+            out["warning"] = (
+                f"the cloud has {found:.3g} points/m2, the model was trained on "
+                f"{low if low == high else f'{low} to {high}'}{lonely}. Expect worse classes, or train with 'thin'"
+            )
+        return out
 
     def _weigh(self, p: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         factors = self.factors
@@ -271,14 +357,20 @@ def _smoothed(
         yield part if rows is None else rows[part], means[part]
 
 
+def mask_of(name: str, mask: npt.ArrayLike, n: int) -> npt.NDArray[np.bool_]:
+    """A mask of n points, or an OptionError."""
+    array = np.asarray(mask)
+    if array.shape != (n,) or array.dtype != np.bool_:
+        raise OptionError(
+            f"'{name}' must be one true or false per point", found=f"{array.dtype} of shape {array.shape}"
+        )
+    return array
+
+
 def _rows(where: npt.ArrayLike | None, n: int) -> npt.NDArray[np.int64] | None:
     if where is None:
         return None
-    mask = np.asarray(where)
-    if mask.shape != (n,) or mask.dtype != np.bool_:
-        raise OptionError(
-            "'where' must be one true or false per point", found=f"{mask.dtype} of shape {mask.shape}"
-        )
+    mask = mask_of("where", where, n)
     return None if mask.all() else np.flatnonzero(mask)
 
 

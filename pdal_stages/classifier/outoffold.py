@@ -81,7 +81,7 @@ def grow_folds(
     """
     forests = []
     for number in range(folds):
-        train = fold != number
+        train = (fold != number) & (weight > 0)
         if len(np.unique(label[train])) < 2:
             raise OptionError(
                 "without one of its folds the training ground has fewer than two classes left",

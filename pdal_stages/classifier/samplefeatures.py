@@ -14,11 +14,16 @@ from ..base.errors import DimensionError, OptionError
 from ..base.progress import Progress
 from ..base.threads import map_blocks
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
+from ..features.names import SHAPES
 from .clouds import TrainingCloud
 from .dimensions import gather, with_returns
 from .featureforest import Features
 from .sampling import Samples
 from .trainoptions import TrainingOptions
+
+#: Dimensions that the papers count among the geometric features.
+CUT = ("HeightAboveGround", "Z")
+_HISTOGRAMS = tuple(f"{metric}_" for metric in SHAPES)
 
 
 def must_fit(columns: int, n: int) -> None:
@@ -113,16 +118,16 @@ def percentiles(
 
     [B16 3.3] scales features to [0, 1] between the two and cuts off what is beyond. Splits of a tree do not
     change under scaling, so only the cut is done, on the training values: no threshold can then lie beyond
-    the percentiles, and a value beyond goes the way its limit would. Inference needs neither.
+    the percentiles, and a value beyond goes the way its limit would. Inference needs neither. Histograms of shape
+    distributions and the points' other dimensions are not cut; for them it is the smallest and largest value.
     """
-    computed = len(plan.names) - len(plan.dimensions)
-    low = [0.0] * len(plan.names)
-    high = [1.0] * len(plan.names)
-    columns = range(len(plan.names))
+    names, computed = plan.names, len(plan.names) - len(plan.dimensions)
+    low = [0.0] * len(names)
+    high = [1.0] * len(names)
 
     def one(j: int) -> None:
         column = values[:, j]
-        if j >= computed:  # dimensions keep their own scale
+        if names[j] not in CUT if j >= computed else names[j].startswith(_HISTOGRAMS):
             low[j], high[j] = float(column.min()), float(column.max())
             return
         first, last = np.percentile(column, [1.0, 99.0]).astype(np.float32)
@@ -132,6 +137,6 @@ def percentiles(
         if options.scale:
             np.clip(column, first, last, out=column)
 
-    for _ in map_blocks(one, columns, options.threads):
+    for _ in map_blocks(one, range(len(names)), options.threads):
         pass
     return low, high

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +21,11 @@ from ..base.hashing import coordinate_hash
 
 #: Side of a cell of the curve in metres.
 CELL = 0.5
+#: Points of a class that are put in order at a time; of more, those with the smallest hashes.
+MOST = 5_000_000
+
+#: ((n, 3) float64 coordinates in metres, (n,) class positions) of each cloud; may be made when asked for.
+Clouds = Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +70,9 @@ class Samples:
 
 
 def draw_samples(
-    clouds: Sequence[tuple[npt.NDArray[np.float64], npt.NDArray[Any]]], n_classes: int, count: int, seed: int
+    clouds: Clouds, n_classes: int, count: int, seed: int, groups: Sequence[str] | None = None
 ) -> Samples:
-    """Draw `count` samples of each class from several clouds together.
+    """Draw `count` samples of each class from several clouds.
 
     Parameters
     ----------
@@ -76,29 +82,82 @@ def draw_samples(
     count : int
         Samples per class. A class with fewer points gives each of them count/n times, rounded down or up.
     seed : int
+    groups : sequence of str, optional
+        The group of each cloud: each gives as many samples of a class as the others, as far as it has them. Without,
+        all clouds are one.
 
     Raises
     ------
     OptionError
         If a class has no points at all. (The caller knows the labels and says which were found.)
     """
-    parts, available = [], []
+    of_cloud = np.zeros(len(clouds), np.int64)
+    names: Any = [""]
+    if groups is not None:
+        names, of_cloud = np.unique(np.asarray(groups, dtype=str), return_inverse=True)
+    there = np.zeros((len(names), n_classes), np.int64)
+    for number, (_, position) in enumerate(clouds):
+        there[of_cloud[number]] += np.bincount(position[position >= 0], minlength=n_classes)
+    available = there.sum(axis=0)
+    if not available.all():
+        raise OptionError("a class has no samples", found=f"class position {int(np.argmin(available))}")
+    parts = []
     for position in range(n_classes):
-        rows = [np.flatnonzero(labels == position) for _, labels in clouds]
-        n = sum(len(r) for r in rows)
-        available.append(n)
-        if n == 0:
-            raise OptionError("a class has no samples", found=f"class position {position}")
-        keys = np.concatenate([curve_keys(xyz[r], seed) for (xyz, _), r in zip(clouds, rows, strict=True)])
-        where = np.concatenate([np.full(len(r), c, np.int64) for c, r in enumerate(rows)])
-        order = np.lexsort((keys["hash"], keys["cell"]))
-        place, weight = spread(n, count, np.random.default_rng([seed, position]))
-        chosen = order[place]
-        parts.append(
-            (where[chosen], np.concatenate(rows)[chosen], np.full(len(chosen), position, np.int16), weight)
-        )
+        quota = share_out(there[:, position], count)
+        for group in np.flatnonzero(quota):
+            random = (
+                [seed, position] if len(names) == 1 else [seed, position, crc32(str(names[group]).encode())]
+            )
+            members = np.flatnonzero(of_cloud == group)
+            cloud, row, weight = _draw(
+                clouds, members, position, int(there[group, position]), int(quota[group]), seed, random
+            )
+            parts.append((cloud, row, np.full(len(row), position, np.int16), weight))
     cloud, row, label, weight = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Samples(cloud, row, label, weight, tuple(available))
+    return Samples(cloud, row, label, weight, tuple(available.tolist()))
+
+
+def share_out(available: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.int64]:
+    """How many of `count` samples each group gives: alike, as far as there are so many; else in proportion."""
+    total = int(available.sum())
+    if count >= total:  # all of them, the rest as copies
+        exact = available * (count / total)
+    else:
+        exact = np.zeros(len(available))
+        open_ = available > 0
+        while open_.any():
+            level = (count - exact[~open_].sum()) / np.count_nonzero(open_)
+            full = open_ & (available <= level)
+            if not full.any():
+                exact[open_] = level
+                break
+            exact[full] = available[full]
+            open_ &= ~full
+    quota = np.floor(exact + 1e-9).astype(np.int64)
+    for place in np.argsort(quota - exact, kind="stable")[: count - int(quota.sum())]:
+        quota[place] += 1
+    return quota
+
+
+def _draw(
+    clouds: Clouds, members: Any, position: int, n: int, count: int, seed: int, random: list[int]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """(cloud, row, weight) of `count` samples from the n points of a class in some clouds."""
+    limit = np.uint64(2**64 - 1) if n <= MOST else np.uint64(MOST / n * 2.0**64)
+    keys, rows, where = [], [], []
+    for number in members.tolist():
+        xyz, label = clouds[number]
+        mine = np.flatnonzero(label == position)
+        key = curve_keys(xyz[mine], seed)
+        keep = key["hash"] <= limit
+        keys.append(key[keep])
+        rows.append(mine[keep])
+        where.append(np.full(len(rows[-1]), number, np.int64))
+    key, row, cloud = np.concatenate(keys), np.concatenate(rows), np.concatenate(where)
+    order = np.lexsort((key["hash"], key["cell"]))
+    place, weight = spread(len(order), count, np.random.default_rng(random))
+    chosen = order[place]
+    return cloud[chosen], row[chosen], weight
 
 
 def spread(

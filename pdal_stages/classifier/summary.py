@@ -70,6 +70,10 @@ def text(info: Mapping[str, Any]) -> str:
         lines.append(
             f"strategy       binary, target {info.get('target')}, background {info.get('background')}"
         )
+    if info.get("densities"):
+        lines.append(
+            f"densities      {info['densities']['low']:.3g} to {info['densities']['high']:.3g} points/m2"
+        )
     for cloud in training.get("clouds", []):
         lines.append(f"trained on     {cloud['name']}, {cloud['points']:,} points")
     lines += ["", f"{'class':<34}{'available':>12}{'samples':>10}{'duplicates':>12}{'F1 out of bag':>15}"]
@@ -101,6 +105,14 @@ def _scores(info: Mapping[str, Any], held_out: dict[str, Any] | None = None) -> 
             "",
         ]
     lines = []
+    left_out = info["accuracy"].get("leave_one_survey_out")
+    if left_out:
+        worst = min(left_out["surveys"], key=lambda row: row["overall_accuracy"])
+        lines.append(
+            f"{'survey left out':<17}overall accuracy {_percent(left_out['overall_accuracy'])} on average, "
+            f"{_percent(worst['overall_accuracy'])} at worst ({worst['name']}), "
+            f"mean F1 {_percent(left_out['mean_f1'])}"
+        )
     crossed = info["accuracy"]["cross_validation"]
     rows = [("blocks held out", crossed and crossed["chosen"])]
     for number, one in enumerate(info["passes"], 1):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -22,7 +23,7 @@ from .options import option
 from .points import Points
 
 #: Options of this stage that are not the trainer's.
-_OWN = {"filename", "label", "where", "threads", "memory", "horizontal_unit", "vertical_unit"}
+_OWN = {"filename", "label", "survey", "where", "threads", "memory", "horizontal_unit", "vertical_unit"}
 
 
 def _default(name: str) -> Any:
@@ -51,7 +52,7 @@ class ClassifierModel(Stage):
     )
     neighborhoods: list = option(
         "list",
-        ("weinmann2018",),
+        _default("neighborhoods"),
         "Neighborhoods: tokens (c2, s1, k50, kopt, ropt, copt) or a preset (blomley2016, weinmann2018, he2017)",
     )
     feature_set: list = option(
@@ -127,6 +128,31 @@ class ClassifierModel(Stage):
     )
     folds: int = option("integer", 0, "Folds of cross-validation over spatial blocks; 0 for none", minimum=0)
     block_size: float = option("number", 25.0, "Side of these blocks", minimum=0, exclusive=True, unit="m")
+    survey: str = option(
+        "string",
+        "",
+        "Dimension that tells surveys apart: points of another value are not neighbors, and surveys weigh alike",
+    )
+    balance: bool = option(
+        "boolean",
+        _default("balance"),
+        "Take as many samples of a class from each survey and each thinned copy; false: as many as their share",
+    )
+    thin: list = option(
+        "list",
+        _default("thin"),
+        "Points per square metre of sparser copies to train on as well, so that the model bears sparse clouds",
+        may_be_empty=True,
+    )
+    ignore: list = option(
+        "codes",
+        _default("ignore"),
+        "Labels whose points are not even neighbors, unless 'classes' names them",
+        may_be_empty=True,
+    )
+    leave_one_survey_out: bool = option(
+        "boolean", False, "Score each survey with forests grown without it; takes a training per survey"
+    )
     passes: int = option(
         "integer",
         _default("passes"),
@@ -195,6 +221,7 @@ holds the classes.
             numbers = [int(v) if str(v).strip().lstrip("-").isdigit() else v for v in values[name]]
             values[name] = numbers[0] if len(numbers) == 1 else numbers
         values["max_features"] = _number(values["max_features"])
+        values["thin"] = [_number(v) if isinstance(v, str) else v for v in values["thin"]]
         return TrainingOptions(**values, threads=self.threads, memory_mb=self.memory)
 
     def check(self) -> None:
@@ -211,7 +238,8 @@ holds the classes.
         return found
 
     def reads(self) -> list[str]:
-        return [self.label, *required(self.training.inputs)]
+        own = [self.survey] if self.survey else []
+        return [self.label, *own, *required(self.training.inputs)]
 
     def run(self, points: Points) -> dict[str, NDArray]:
         if points.count == 0:
@@ -227,13 +255,21 @@ holds the classes.
             name="the points",
             mask=points.mask,
         )
-        model = train([cloud], self.training)
+        model = train(self._surveys(cloud, points), self.training)
         model.info["preparation"] = self._preparation
         model.save(self.filename)
         points.report.update({"model": self.filename, **_brief(model.info), "seconds": model.seconds})
         if self.algorithm == "alsnet":  # with the curve
             points.report["training"] = _plain(model.info["training"])
         return {}
+
+    def _surveys(self, cloud: TrainingCloud, points: Points) -> list[TrainingCloud]:
+        """The points as one cloud, or one for each value of the dimension `survey`."""
+        if not self.survey:
+            return [cloud]
+        value = points.dimension(self.survey)
+        parts = [(one, cloud.part(np.flatnonzero(value == one))) for one in np.unique(value)]
+        return [replace(part, name=f"{self.survey} {one:g}", survey=None) for one, part in parts]
 
 
 def _code(label: Any) -> Any:

@@ -1,0 +1,275 @@
+"""Training that generalises: copies, surveys that weigh alike, surveys left out, noise, clouds one at a time, densities."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_classifier_training import SMALL, scene
+
+from pdal_stages.base.errors import OptionError
+from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, train
+from pdal_stages.classifier.sampling import draw_samples, share_out
+from pdal_stages.classifier.thinning import density, thinned
+
+FEW = {**SMALL, "feature_set": "covariance", "neighborhoods": "s1", "trees": 6}
+
+
+def clouds(n=3, **more):
+    return [
+        TrainingCloud(
+            *scene(seed, 3000, (2000.0 * seed, 0.0, 0.0)), name=f"{seed}.laz", survey=f"flight {seed}", **more
+        )
+        for seed in range(n)
+    ]
+
+
+def learnt(these, **more):
+    return train(these, TrainingOptions(**{**FEW, **more}), progress=False)
+
+
+def written(model, folder, name="m"):
+    model.save(folder / name)
+    return (folder / name).read_bytes()
+
+
+# ---- density and copies --------------------------------------------------------------------------------
+
+
+def test_density_is_robust_and_knows_no_order():
+    random = np.random.default_rng(0)
+    xyz = random.random((20_000, 3)) * (50, 40, 9)
+    assert density(xyz) == pytest.approx(10.0, rel=0.05)
+    strays = np.vstack([xyz, [[1e9, -1e9, 0.0]] * 5, random.normal(20, 0.01, (900, 3))])
+    assert (
+        density(strays[random.permutation(len(strays))]) == density(strays) == pytest.approx(10.0, rel=0.05)
+    )
+    assert density(np.zeros((0, 3))) == 0.0 and density(np.zeros((7, 3))) == 7 / 4
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from([0.5, 2.0, 7.0]))
+def test_a_copy_has_its_density_in_any_order_and_tile(seed, wanted):
+    random = np.random.default_rng(seed)
+    xyz = random.random((30_000, 3)) * (50, 40, 9) + (6e5, 6e6, 0)
+    rows = thinned(xyz, wanted, seed)
+    assert len(rows) / 2000 == pytest.approx(wanted, rel=0.15)
+    p = random.permutation(len(xyz))
+    assert np.array_equal(np.sort(p[thinned(xyz[p], wanted, seed)]), rows)
+    assert thinned(xyz, 14.0) is None and thinned(xyz, 1e5) is None and thinned(xyz[:0], 1.0) is None
+    assert not np.array_equal(rows, thinned(xyz, wanted, seed + 1))
+
+
+def test_copies_are_trained_on_as_clouds_of_the_same_survey():
+    one = clouds(1)
+    model = learnt(one, thin=[0.3, 0.1, 50.0], passes=2, context=["own"])
+    names = [(c["name"], c["points"]) for c in model.info["training"]["clouds"]]
+    assert [name for name, _ in names] == [
+        "0.laz",
+        "0.laz thinned to 0.3 per m2",
+        "0.laz thinned to 0.1 per m2",
+    ]
+    assert names[0][1] > names[1][1] > names[2][1] > 0
+    assert model.info["densities"]["low"] < 0.5 < model.info["densities"]["high"]
+    assert "0.25 to " in str(model) and "points/m2" in str(model)
+    by_hand = [one[0], *(one[0].part(thinned(one[0].xyz, d), f"thinned to {d:g} per m2") for d in (0.3, 0.1))]
+    again = learnt(by_hand, passes=2, context=["own"])
+    assert np.array_equal(again.passes[1].forest.threshold, model.passes[1].forest.threshold)
+
+
+def test_a_cloud_of_another_density_is_told(tmp_path):
+    model = learnt(clouds(1))
+    xyz, _, dimensions = scene(5, 3000)
+    report = model.predict(xyz, dimensions).report
+    assert "warning" not in report and report["density"] == pytest.approx(3000 / 3600, rel=0.3)
+    some = thinned(np.repeat(xyz, 1, axis=0), 0.1, 1)
+    report = model.predict(xyz[some], {k: v[some] for k, v in dimensions.items()}).report
+    assert "points/m2, the model was trained on" in report["warning"]
+    assert "fewer than three neighbors in s1" in report["warning"]
+    many = np.vstack([xyz + shift for shift in np.linspace(0, 0.1, 4)])
+    assert "warning" in model.predict(many, {"HeightAboveGround": many[:, 2]}).report
+    model.info.pop("densities")  # an older model does not say
+    assert "density" not in model.predict(xyz, dimensions).report
+    model.save(tmp_path / "m")
+    assert load_model(tmp_path / "m").info.get("densities") is None
+
+
+# ---- surveys -------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.integers(0, 500), min_size=1, max_size=6).filter(any), st.integers(1, 900))
+def test_shares_are_exact_and_as_even_as_can_be(available, count):
+    available = np.array(available)
+    quota = share_out(available, count)
+    assert quota.sum() == count and (quota[available == 0] == 0).all()
+    if count < available.sum():
+        assert (quota <= available).all()
+        short = quota < available
+        if short.any():
+            assert (
+                quota[short].max() - quota[short].min() <= 1
+                and (quota[~short] <= quota[short].min() + 1).all()
+            )
+    else:
+        there = available[available > 0]
+        assert np.ptp(quota[available > 0] / there) <= 1 / there.min() + 1e-9
+
+
+def test_surveys_weigh_alike():
+    big, small = scene(0, 9000), scene(1, 900, (3000.0, 0.0, 0.0))
+    pair = [TrainingCloud(*big, name="big"), TrainingCloud(*small, name="small")]
+    position = [np.searchsorted((2, 5, 6), cloud.labels).astype(np.int16) for cloud in pair]
+    inputs = [(cloud.xyz, where) for cloud, where in zip(pair, position, strict=True)]
+    even = draw_samples(inputs, 3, 60, 0, ["a", "b"])
+    assert np.array_equal(np.bincount(even.cloud, even.weight), [90, 90])
+    assert np.array_equal(np.bincount(even.label, even.weight), [60, 60, 60])
+    alike = draw_samples(inputs, 3, 60, 0)
+    assert np.bincount(alike.cloud, alike.weight)[0] > 150
+    one = draw_samples(inputs, 3, 60, 0, ["a", "a"])  # tiles of one survey are one
+    for name in ("cloud", "row", "label", "weight"):
+        assert np.array_equal(getattr(one, name), getattr(alike, name))
+    proportional = learnt(pair, balance=False)
+    assert not np.array_equal(
+        proportional.passes[0].forest.threshold, learnt(pair).passes[0].forest.threshold
+    )
+    swapped = learnt(pair[::-1])
+    assert np.array_equal(swapped.passes[0].forest.threshold, learnt(pair).passes[0].forest.threshold)
+
+
+def test_more_points_than_are_put_in_order_at_a_time(monkeypatch):
+    from pdal_stages.classifier import sampling
+
+    xyz, label, _ = scene(0, 6000)
+    position = np.searchsorted((2, 5, 6), label).astype(np.int16)
+    monkeypatch.setattr(sampling, "MOST", 300)
+    first = draw_samples([(xyz, position)], 3, 100, 0)
+    assert [first.counts(k)["samples"] for k in range(3)] == [100] * 3
+    p = np.random.default_rng(0).permutation(len(xyz))
+    other = draw_samples(
+        [(xyz[p][:2000], position[p][:2000]), (xyz[p][2000:], position[p][2000:])], 3, 100, 0
+    )
+    chosen = [np.vstack([part[r] for part, r in ((xyz, first.row),)]), None]
+    parts = (xyz[p][:2000], xyz[p][2000:])
+    rows = np.array([parts[c][r] for c, r in zip(other.cloud, other.row, strict=True)])
+    assert np.array_equal(rows, chosen[0])
+
+
+@pytest.mark.parametrize("passes", [1, 2])
+def test_each_survey_left_out(passes, tmp_path):
+    three = clouds(3)
+    odd = three[2]
+    wrong = {2: 5, 5: 6, 6: 2}
+    three[2] = TrainingCloud(
+        odd.xyz, np.vectorize(wrong.get)(odd.labels), odd.dimensions, name="odd.laz", survey="the odd one"
+    )
+    model = learnt(three, leave_one_survey_out=True, passes=passes, context=["own", "box1"])
+    found = model.info["accuracy"]["leave_one_survey_out"]
+    by_name = {row["name"]: row["overall_accuracy"] for row in found["surveys"]}
+    assert set(by_name) == {"flight 0", "flight 1", "the odd one"}
+    assert by_name["the odd one"] < 0.1  # nobody else calls things as it does
+    assert found["overall_accuracy"] == pytest.approx(np.mean(list(by_name.values())))
+    lines = str(model).splitlines()
+    scores = [line for line in lines if line.startswith(("survey left out", "out of bag"))]
+    assert scores[0].startswith("survey left out") and "the odd one" in scores[0]
+    model.save(tmp_path / "m")
+    assert load_model(tmp_path / "m").info["accuracy"]["leave_one_survey_out"] == json.loads(
+        json.dumps(found)
+    )
+    plain = learnt(three, passes=passes, context=["own", "box1"])
+    assert np.array_equal(plain.passes[-1].forest.threshold, model.passes[-1].forest.threshold)
+
+
+def test_a_survey_left_out_equals_a_model_without_it():
+    """One pass: the forest grown with the others' samples alone."""
+    three = clouds(3)
+    model = learnt(three, leave_one_survey_out=True, scale=False)
+    row = model.info["accuracy"]["leave_one_survey_out"]["surveys"][0]
+    assert 0.7 < row["overall_accuracy"] < 1.0 and set(row["f1"]) == {"2", "5", "6"}
+    with pytest.raises(OptionError, match="at least two surveys"):
+        learnt(three[:1], leave_one_survey_out=True)
+
+
+# ---- noise, one at a time ------------------------------------------------------------------------------
+
+
+def test_noise_is_not_even_a_neighbor(tmp_path):
+    xyz, label, dimensions = scene()
+    random = np.random.default_rng(0)
+    extra = np.column_stack([random.random((500, 2)) * 60, random.random(500) * 20])
+    noisy = np.vstack([xyz, extra])
+    labels = np.concatenate([label, np.full(500, 7)])
+    more = {"HeightAboveGround": noisy[:, 2]}
+    clean = learnt([TrainingCloud(xyz, label, {"HeightAboveGround": xyz[:, 2]}, "a")])
+    with_noise = learnt([TrainingCloud(noisy, labels, more, "a")])
+    assert written(clean, tmp_path, "a") == written(with_noise, tmp_path, "b")
+    kept = learnt([TrainingCloud(noisy, labels, more, "a")], ignore=())
+    assert kept.info["training"]["clouds"][0]["points"] == len(noisy)
+    named = learnt([TrainingCloud(noisy, labels, more, "a")], classes=[2, 5, 6, 7])
+    assert [code for code, _ in named.classes] == [2, 5, 6, 7]
+    overlap = learnt([TrainingCloud(noisy, np.where(labels == 7, 12, labels), more, "a")])
+    assert overlap.info["classes"] == clean.info["classes"]  # 12 gives no samples ...
+    assert not np.array_equal(
+        overlap.passes[0].forest.threshold, clean.passes[0].forest.threshold
+    )  # ... but neighbors
+
+    gone = labels == 7
+    whole = clean.predict(xyz, dimensions, probabilities=True, margin=True)
+    current = np.full(len(noisy), 9)
+    p = random.permutation(len(noisy))
+    found = clean.predict(
+        noisy[p],
+        {"HeightAboveGround": noisy[p, 2]},
+        current=current,
+        ignore=gone[p],
+        probabilities=True,
+        margin=True,
+    )
+    at = np.argsort(p)[: len(xyz)]
+    for name in ("classification", "reliability", "margin", "probabilities"):
+        assert np.array_equal(getattr(found, name)[at], getattr(whole, name)), name
+    assert (found.classification[gone[p]] == 9).all() and not found.reliability[gone[p]].any()
+    assert found.report["ignored"] == 500 and found.report["points"] == len(noisy)
+    where = noisy[:, 0] < 30
+    part = clean.predict(noisy, more, where, ignore=gone, current=current)
+    assert np.array_equal(
+        part.classification[: len(xyz)][where[: len(xyz)]], whole.classification[where[: len(xyz)]]
+    )
+    assert (part.classification[~where | gone] == 9).all()
+    with pytest.raises(OptionError, match="ignore"):
+        clean.predict(xyz, dimensions, ignore=np.zeros(3, bool))
+
+
+def test_clouds_made_one_at_a_time(tmp_path):
+    at_hand = learnt(clouds(3), passes=2, context=["own", "box1"], thin=[0.3])
+    alive = []
+
+    def maker(number):
+        def make():
+            alive.append(number)
+            return clouds(3)[number]
+
+        return make
+
+    later = learnt([maker(k) for k in range(3)], passes=2, context=["own", "box1"], thin=[0.3])
+    assert alive == [0, 1, 2]  # each made once
+    streamed = learnt((cloud for cloud in clouds(3)), passes=2, context=["own", "box1"], thin=[0.3])
+    assert (
+        written(at_hand, tmp_path, "a") == written(later, tmp_path, "b") == written(streamed, tmp_path, "c")
+    )
+    with pytest.raises(OptionError, match="no training cloud"):
+        learnt(iter(()))
+
+
+def test_options():
+    for bad in (
+        {"thin": [0]},
+        {"thin": "x"},
+        {"ignore": [-1]},
+        {"balance": 1},
+        {"leave_one_survey_out": "yes"},
+    ):
+        with pytest.raises(OptionError):
+            TrainingOptions(**bad)
+    assert TrainingOptions(thin=2, ignore=7).thin == (2.0,)
