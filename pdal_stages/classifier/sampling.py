@@ -101,13 +101,12 @@ def draw_samples(
     available = there.sum(axis=0)
     if not available.all():
         raise OptionError("a class has no samples", found=f"class position {int(np.argmin(available))}")
+    alone = np.count_nonzero(there.any(axis=1)) == 1
     parts = []
     for position in range(n_classes):
         quota = share_out(there[:, position], count)
         for group in np.flatnonzero(quota):
-            random = (
-                [seed, position] if len(names) == 1 else [seed, position, crc32(str(names[group]).encode())]
-            )
+            random = [seed, position] if alone else [seed, position, crc32(str(names[group]).encode())]
             members = np.flatnonzero(of_cloud == group)
             cloud, row, weight = _draw(
                 clouds, members, position, int(there[group, position]), int(quota[group]), seed, random
