@@ -184,7 +184,7 @@ def thinned(cloud: Cloud, density: float) -> Cloud | None:
     if share > 0.87:
         return None
     kept = np.flatnonzero(coordinate_hash(cloud.xyz, 0) < np.uint64(share * 2.0**64))
-    return cloud.part(kept, f"{cloud.name}, {density:g} points/m2")
+    return cloud.part(kept, f"{cloud.name}, {density:g} points per m2")
 
 
 def without_returns(cloud: Cloud) -> Cloud:

@@ -18,6 +18,9 @@ SLOPES = ((0.3, 8.0), (0.6, 3.0), (0.9, 1.0), (0.5, 0.3))
 #: Samples of each class from each copy.
 SAMPLES = 1500
 
+#: The stage that makes in a pipeline what ``clouds.with_heights`` makes here.
+PREPARATION = {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]}
+
 OPTIONS = TrainingOptions(
     neighborhoods="s5,k10,k20,k50",
     feature_set="covariance,Verticality,HeightRange,HeightStd,HeightAboveLowest",
@@ -62,4 +65,6 @@ def training_cloud(cloud: Cloud) -> TrainingCloud:
 def train_on(data: Path, surveys: Iterable[str], progress: bool = True) -> Model:
     """The model of these surveys."""
     made = [training_cloud(copy) for name in surveys for copy in copies(load(data, name))]
-    return train(made, OPTIONS, progress)
+    model = train(made, OPTIONS, progress)
+    model.info["preparation"] = [PREPARATION]
+    return model

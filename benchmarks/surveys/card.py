@@ -1,0 +1,58 @@
+"""The card of a shipped model: what it was trained on, how it does survey by survey, where it fails.
+
+    python benchmarks/surveys/card.py --model pdal_stages/models/standard.model --scores FILE > docs/models.md
+
+FILE is what leave_one_out.py wrote.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+from clouds import SURVEYS
+from leave_one_out import tables
+from recipe import DENSITIES, OPTIONS, PREPARATION, SAMPLES, SLOPES
+
+from pdal_stages.classifier import load_model
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    options.add_argument("--model", type=Path, required=True)
+    options.add_argument("--scores", type=Path, required=True)
+    args = options.parse_args()
+    model, scores = load_model(args.model), json.loads(args.scores.read_text())
+    surveys = ["| survey | what | points | licence |", "|---|---|---:|---|"]
+    points = {cloud["name"]: cloud["points"] for cloud in model.info["training"]["clouds"]}
+    for name, survey in SURVEYS.items():
+        surveys.append(f"| {name} | {survey.what} | {points[name]:,} | (c) {survey.licence} |")
+    worst = min(scores["surveys"], key=lambda run: run["oa"])
+    own = [run["oa"] for run in scores["surveys"] if run["cloud"] in SURVEYS]
+    print(
+        Path(__file__)
+        .with_suffix(".md")
+        .read_text()
+        .format(
+            stage=json.dumps(PREPARATION),
+            passes=len(model.passes),
+            trees=OPTIONS.trees,
+            size=args.model.stat().st_size / 1e6,
+            digest=hashlib.sha256(args.model.read_bytes()).hexdigest()[:16],
+            scores=tables(scores["surveys"], scores["isprs"]),
+            read=f"At their own densities the mean is {np.mean(own):.1f}; the worst of all is {worst['cloud']}, "
+            f"{worst['oa']:.1f}.",
+            surveys="\n".join(surveys),
+            densities=", ".join(f"{density:g}" for density in DENSITIES),
+            slopes=f"{100 * max(slope for slope, _ in SLOPES):.0f}",
+            samples=SAMPLES,
+        ),
+        end="",
+    )
+
+
+if __name__ == "__main__":
+    main()
