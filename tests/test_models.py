@@ -1,0 +1,111 @@
+"""Models that come with the package, and what a model says of the stages before it."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from pdal_stages.base.errors import StageError
+from pdal_stages.classifier import load_model
+from pdal_stages.cli import main
+from pdal_stages.models import STANDARD, find, shipped
+from pdal_stages.pipeline import Pipeline
+from pdal_stages.pipeline.jobs import heights_for
+from pdal_stages.synthetic import TownOptions, write_town
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory):
+    path = tmp_path_factory.mktemp("models") / "town.laz"
+    write_town(TownOptions(size=120, density=8, seed=3), path)
+    return path
+
+
+def test_every_shipped_model_loads_says_its_preparation_and_is_small():
+    assert STANDARD in shipped()
+    for path in shipped().values():
+        model = load_model(path)
+        assert path.stat().st_size < 5e6
+        made = {name for stage in model.info["preparation"] for name in _creates(stage)}
+        assert set(model.required_dimensions) <= made
+        assert not {"Intensity", "Red", "Green", "Blue"} & set(model.required_dimensions)
+
+
+def _creates(stage):
+    from pdal_stages.stages import registry
+
+    return registry.get(stage["type"])({k: v for k, v in stage.items() if k != "type"}).creates()
+
+
+def test_a_file_of_that_name_comes_first(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert find(STANDARD) == str(shipped()[STANDARD]) and find("other.model") == "other.model"
+    (tmp_path / STANDARD).write_text("mine")
+    assert find(STANDARD) == STANDARD
+
+
+@pytest.mark.pdal
+def test_a_raw_tile_is_classified_without_a_model_named(town, tmp_path, capsys):
+    out = tmp_path / "classified.laz"
+    assert main(["classify", str(town), str(out)]) == 0
+    assert "points written" in capsys.readouterr().out
+    points, truth = (Pipeline([str(path)]) for path in (out, town))
+    points.execute()
+    truth.execute()
+    found, known = points.arrays[0], truth.arrays[0]
+    groups = {2: 2, 3: 0, 4: 5, 5: 5, 6: 6}
+    wanted = np.array([groups.get(code, 0) for code in range(256)])[known["Classification"]]
+    given = found["Classification"]
+    assert set(np.unique(given).tolist()) <= {2, 5, 6}
+    assert np.mean(given[wanted > 0] == wanted[wanted > 0]) > 0.8  # it has never seen a generated town
+
+
+@pytest.mark.pdal
+def test_models_are_listed(capsys):
+    assert main(["models"]) == 0
+    assert "standard" in capsys.readouterr().out
+
+
+@pytest.mark.pdal
+def test_a_pipeline_with_other_heights_is_told(town):
+    same = [str(town), *load_model(shipped()[STANDARD]).info["preparation"]]
+    classify = {"type": "filters.modelclassifier", "model": STANDARD}
+    assert Pipeline([*same, classify]).lowered.remarks == []
+    other = [
+        str(town),
+        {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17], "window": 20},
+    ]
+    (remark,) = Pipeline([*other, classify]).lowered.remarks
+    assert "trained on other heights" in remark and '"window": 20' in remark
+
+
+@pytest.mark.pdal
+def test_missing_heights_come_with_the_stage_to_paste(town):
+    pipeline = Pipeline([str(town), {"type": "filters.modelclassifier", "model": STANDARD}])
+    with pytest.raises(StageError) as caught:
+        pipeline.execute()
+    assert '{"type": "filters.hag_morphological", "ground": true, "openings": [5, 17]}' in str(caught.value)
+
+
+@pytest.mark.pdal
+def test_training_keeps_the_stages_before_it(town, tmp_path):
+    path = tmp_path / "own.model"
+    writer = {"type": "writers.classifiermodel", "filename": str(path), "classes": {"2": 2, "5": 5, "6": 6}}
+    few = {"neighborhoods": "k10", "feature_set": "covariance", "count": 50, "trees": 3, "passes": 1}
+    heights = {"type": "filters.hag_minima", "cell": 10, "tag": "h"}
+    few["dimensions"] = "HeightAboveGround"
+    Pipeline([str(town), heights, {**writer, **few}]).execute()
+    assert load_model(path).info["preparation"] == [{"type": "filters.hag_minima", "cell": 10}]
+    expanded = json.loads(Pipeline([str(town), heights, {**writer, **few}]).json)
+    arguments = expanded["pipeline"][-1]["pdalargs"]
+    assert arguments["preparation"] == [{"type": "filters.hag_minima", "cell": 10}]
+
+
+def test_heights_follow_from_what_is_read():
+    assert heights_for(["X", "Intensity"]) == []
+    assert heights_for(["HeightAboveGround"]) == [{"type": "filters.hag_minima"}]
+    assert heights_for(["Ground", "HeightAboveOpening_17", "HeightAboveOpening_5"]) == [
+        {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]}
+    ]
