@@ -45,11 +45,7 @@ def score(model: Model, cloud: Cloud) -> dict[str, Any]:
         "points": int(known.sum()),
         "density": round(cloud.density, 2),
         "oa": 100 * float(np.mean(found[known] == cloud.truth[known])),
-        "f1": {
-            NAMES[c]: 100 * float(f)
-            for c, f in zip(codes, result.f1, strict=True)
-            if (cloud.truth == c).any()
-        },
+        "f1": {NAMES[c]: 100 * f for c, f in result.f1.items() if f is not None and (cloud.truth == c).any()},
         "worst": worst,
         "share": 100 * matrix[worst] / int(known.sum()),
     }
