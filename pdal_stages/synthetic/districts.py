@@ -1,0 +1,158 @@
+"""What stands in each block of the town, and along its streets."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+
+from . import townplan as t
+from .objects import cable, car, hedge, house, mast, shrub, thing, tree
+from .solids import BRIDGE, MARGIN, MARGINS, POLE, Site
+
+ACROSS = math.pi / 2
+
+
+def fill(plan: t.Plan, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
+    """The things (n, 12) of block (i, j) and of the streets on its low sides, and their planes (m, 4)."""
+    site = Site(plan, i, j)
+    kind = t.block_at(t.FIRST_U + t.PITCH_U * (i + 0.5), t.FIRST_V + t.PITCH_V * (j + 0.5), plan)[2]
+    (_row, _court, _villa, _hall, _park)[kind](site)
+    _street(site)
+    {t.BANK: _bank, t.CANAL: _canal}.get(j % 4, _cross_street)(site)
+    return np.array(site.things), np.array(site.planes)
+
+
+def _greenery(s: Site, trees: int, shrubs: int, low=0.0, high=0.0, land=None) -> None:
+    """Trees and shrubs strewn over the block, or over a part (a, b, width, depth) of it."""
+    a, b, w, d = land or (0, 0, s.w, s.d)
+    for _ in range(trees):
+        tree(s, a + w * s.draw(0.02, 0.98), b + d * s.draw(0.02, 0.98), low, high)
+    for _ in range(shrubs):
+        shrub(s, a + w * s.draw(0, 1), b + d * s.draw(0, 1))
+
+
+def _cars(s: Site, along, across, turn: float, share=0.45) -> None:
+    for a, b in itertools.product(along, across):
+        if s.chance() < share:
+            car(s, a + s.draw(-0.3, 0.3), b + s.draw(-0.3, 0.3), turn + s.draw(-0.04, 0.04))
+
+
+def _row(s: Site) -> None:
+    """Two rows of terraced houses, gardens with hedges, walls, sheds and trees between them."""
+    for front in (0.4, s.d - 0.4):  # a row shares eaves and roof; gaps let the gardens be seen
+        a, deep, eave, pitch = s.draw(0.5, 2.0), s.draw(4.2, 5.0), s.draw(4.8, 7.5), s.draw(0.65, 1.1)
+        roof, b = s.rng.choice(["gable", "gable", "halfhip"]), deep + 2.2
+        while a + 14 < s.w:
+            half = min(s.draw(14, 24), s.w - a - 0.5) / 2
+            house(s, a + half, b if front < 1 else s.d - b, 0.0, half, deep, eave, roof, pitch)
+            hedge(s, a, front, 0, half, s.draw(0.45, 1.3), 0.3)
+            a += 2 * half + s.draw(2.5, 4.5)
+    low, long = 12.5, s.d - 25.0
+    for a in np.arange(1.0, s.w - 1, 7.0):
+        hedge(s, a, low, ACROSS, long, s.draw(1.0, 1.9), wall=s.chance() < 0.5)
+        if s.chance() < 0.3:
+            house(s, a + 3.5, low + s.draw(0.2, 0.8) * long, 0, 1.5, 1.2, 2.1, "shed", 0.25, plain=True)
+        _greenery(s, int(s.chance() < 0.4), 2, 4, 9, (a + 1, low, 5, long))
+
+
+def _court(s: Site) -> None:
+    """A closed block round a courtyard with green and cars."""
+    half, eave, pitch = s.draw(4.6, 5.6), s.draw(9, 15), s.draw(0.55, 0.9)
+    roof, inner = s.rng.choice(["gable", "hip", "flat"]), s.d / 2 - 2 * half
+    sides = [(0.0, s.w / 2, b, s.w / 2) for b in (half, s.d - half)]
+    sides += [(ACROSS, a, s.d / 2, inner) for a in (half, s.w - half) if s.chance() < 0.8]
+    for turn, a, b, length in sides:
+        house(s, a, b, turn, length, half, eave + s.draw(-1.5, 1.5), roof, pitch)
+    _greenery(s, 4, 4, 5, 11, (13, 13, s.w - 26, s.d - 26))
+    _cars(s, s.w / 2 + np.arange(-4, 5, 2.7), [s.d / 2], ACROSS)
+
+
+def _villa(s: Site) -> None:
+    """Six detached houses of all roof shapes with garages, in green gardens."""
+    w, d = s.w / 3, s.d / 2
+    for a, b in itertools.product((0, w, 2 * w), (0, d)):
+        turn = s.rng.choice([0, ACROSS]) + s.draw(-0.06, 0.06)
+        roof = s.rng.choice(["hip", "gable", "halfhip", "pyramid", "flat"])
+        half_l, half_w, eave, pitch = s.draw(4.4, 5.6), s.draw(3.4, 4.2), s.draw(2.8, 6.2), s.draw(0.45, 1.1)
+        house(s, a + w / 2, b + d / 2, turn, half_l, half_w, eave, roof, pitch)
+        house(s, a + 2.6, b + 3.0, 0, 1.5, 2.7, 2.5, "flat", plain=True)
+        car(s, a + 2.6, b + 8.0, ACROSS)
+        _greenery(s, 1, 3, 4, 13, (a + 1, b + d - 4, w - 2, 3))
+        _greenery(s, 1, 3, 4, 9, (a + 5, b, w - 5, 3))
+        hedge(s, a + 5, b + 0.3, 0, w - 5.5, s.draw(0.9, 1.9))
+        hedge(s, a, b + 1, ACROSS, d - 2, 1.5, wall=s.chance() < 0.5)
+
+
+def _hall(s: Site) -> None:
+    """A hall, half flat and half saw-toothed, a parking place with trees, containers."""
+    deep, b, eave = 0.22 * s.d, 0.76 * s.d - 1, s.draw(5.5, 9)
+    for a, half, roof in ((0.27, 0.23, "flat"), (0.62, 0.12, "shed"), (0.86, 0.12, "shed")):
+        house(s, a * s.w, b, ACROSS, deep, half * s.w, eave, roof, 0.22, plain=roof == "shed")
+    _cars(s, np.arange(2.0, 0.6 * s.w, 2.7), (0.12 * s.d, 0.32 * s.d), ACROSS, 0.65)
+    for n in range(3):
+        thing(s, 0.75 * s.w + 4 * n, 0.3 * s.d, ACROSS, s.draw(3, 5), 1.25, s.draw(2.6, 3.6))
+        tree(s, 4 + 9 * n, 0.22 * s.d, 5, 8, 0)
+
+
+def _park(s: Site) -> None:
+    """A church in a park: tall trees, hedgerows, allotments with huts, lamps."""
+    a, b = s.w / 2, s.d * 0.6
+    house(s, a, b, 0, 9, 5, 9, "gable", 1.1, plain=True)
+    house(s, a + 11.5, b, 0, 3.5, 3.5, 7, "pyramid", 1.0, plain=True)
+    house(s, a - 11.5, b, 0, 3, 3, s.draw(17, 22), "pyramid", s.draw(2.2, 3.0), plain=True)
+    for b in (0.8, s.d - 0.8):
+        hedge(s, 1, b, 0, s.w - 2, s.draw(0.8, 2.4), s.draw(0.5, 1.2))
+    for a in np.arange(5, s.w - 3, 11):
+        roof = s.rng.choice(["gable", "shed", "flat"])
+        house(s, a, 5, s.draw(-0.1, 0.1), 2, 1.6, 2.2, roof, 0.5, plain=True)
+        mast(s, a + 5, s.d / 3, 0, 4.5, 0.5)
+    _greenery(s, 6, 25, 5, 14, (2, 8, s.w - 4, 8))
+    _greenery(s, 12, 5, 8, 20, (2, s.d - 10, s.w - 4, 8))
+
+
+def _street(s: Site) -> None:
+    """Along the street on the block's low-u side: cars, poles and wires or lamps and trees, boxes."""
+    _cars(s, (-2.3 - MARGIN, 2.3 - MARGIN), np.arange(2, s.d - 2, 6.0), ACROSS)
+    if s.i % 2:
+        ends = [2, s.d / 2]
+        if (s.j + 1) % 4 != t.BANK:  # no wire crosses the railway
+            ends.append(s.d + s.high + MARGINS.get((s.j + 1) % 4, MARGIN) + 2)
+        _poles(s, [(-1.3, b) for b in ends], (1, 0))
+    else:
+        for b in np.arange(3, s.d, 14.0):
+            mast(s, -4.4 - MARGIN, b, 0, 7.5, 1.4)
+            tree(s, -1.6, b - 2, 5, 9, 0)
+            thing(s, -4.6 - MARGIN, b + s.draw(1, 9), 0, 0.4, 0.35, s.draw(0.8, 1.4))
+
+
+def _cross_street(s: Site) -> None:
+    """Along the street on the low-v side: cars, poles and wires."""
+    _cars(s, np.arange(2, s.w - 2, 6.0), (s.axis - 2.3, s.axis + 2.3), 0.0)
+    _poles(s, [(a, s.axis - 4.9) for a in (1, s.w / 2, t.PITCH_U + 1)], (0, 1))
+
+
+def _poles(s: Site, stations: list[tuple[float, float]], across: tuple[float, float]) -> None:
+    """Wooden poles with three conductors; the last station is the next block's pole."""
+    for p, q in itertools.pairwise((a, b, s.z(a, b) + 8.4) for a, b in stations):
+        s.bar((*p[:2], p[2] - 8.4), (*p[:2], p[2] + 0.2), 0.13, POLE, "bark")
+        for off in (-0.6, 0.0, 0.6):
+            ends = [(a + off * across[0], b + off * across[1], z) for a, b, z in (p, q)]
+            cable(s, *ends, 0.02 * math.dist(p, q))
+
+
+def _canal(s: Site) -> None:
+    """Quays with trees, lamps and cars, and the bridge of the street."""
+    for side, a in itertools.product((-1, 1), np.arange(3, s.w - 3, 8.0)):
+        tree(s, a, s.axis + side * 8.8, 6, 10, 0)
+        mast(s, a + 4, s.axis + side * 8.8, side * ACROSS, 6.0, 1.4)
+        _cars(s, [a], [s.axis + side * 10.3], 0.0)
+    for a, half_w, z1 in ((0, 5.0, -t.KERB), (-4.85, 0.15, 0.9), (4.85, 0.15, 0.9)):  # deck and parapets
+        s.box(a - MARGIN, s.axis, ACROSS, t.CANAL_HALF + 0.1, half_w, -0.8, z1, BRIDGE, "asphalt", "stone")
+
+
+def _bank(s: Site) -> None:
+    """Masts on the crest of the railway bank, shrubs on its slopes."""
+    mast(s, s.w / 2, s.axis + 3.0, -ACROSS, 7.2, 3.0)
+    _greenery(s, 0, 12, land=(0, s.axis - t.BANK_FOOT, t.PITCH_U, 2 * t.BANK_FOOT))

@@ -1,0 +1,77 @@
+"""A town as a LAS 1.4 or LAZ file, written chunk by chunk, whole or not at all."""
+
+from __future__ import annotations
+
+import datetime
+import os
+from pathlib import Path
+
+import numpy as np
+
+from ..base.errors import OptionError, StageError
+from ..base.files import check_complete, check_writable, partial_name
+from ..base.version import __version__
+from .town import Town, TownOptions, town_chunks
+
+_UTM = (
+    'PROJCS["ETRS89 / UTM zone {zone}N",GEOGCS["ETRS89",DATUM["European_Terrestrial_Reference_System_1989",'
+    'SPHEROID["GRS 1980",6378137,298.257222101,AUTHORITY["EPSG","7019"]],AUTHORITY["EPSG","6258"]],'
+    'PRIMEM["Greenwich",0,AUTHORITY["EPSG","8901"]],UNIT["degree",0.0174532925199433,AUTHORITY["EPSG","9122"]],'
+    'AUTHORITY["EPSG","4258"]],PROJECTION["Transverse_Mercator"],PARAMETER["latitude_of_origin",0],'
+    'PARAMETER["central_meridian",{meridian}],PARAMETER["scale_factor",0.9996],PARAMETER["false_easting",500000],'
+    'PARAMETER["false_northing",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]],AXIS["Easting",EAST],'
+    'AXIS["Northing",NORTH],AUTHORITY["EPSG","258{zone}"]]'
+)
+
+
+def wkt(srs: str) -> str:
+    """OGC WKT 1 of a UTM zone on ETRS89, EPSG:25828 to EPSG:25838."""
+    zones = {f"EPSG:258{zone}": zone for zone in range(28, 39)}
+    if srs not in zones:
+        cure = "For another one, write none and give PDAL's readers 'override_srs'"
+        what = "'srs' must be EPSG:25828 to EPSG:25838, or none"
+        raise OptionError(what, where="synthetic", found=srs, cure=cure)
+    return _UTM.format(zone=zones[srs], meridian=6 * zones[srs] - 183)
+
+
+def write_town(town: Town | TownOptions, path: str | os.PathLike, *, threads=None) -> dict[int, int]:
+    """Write a town to a LAS or LAZ file (by its suffix), whole or not at all; the points written by class code.
+
+    Options instead of points are generated and written in memory that does not grow with the town.
+    """
+    import laspy
+
+    target = Path(path)
+    if target.suffix.lower() not in (".las", ".laz"):
+        raise OptionError("the output's name must end in .las or .laz", where="write_town", found=str(path))
+    check_writable(target)
+    made = isinstance(town, Town)
+    options, pieces = (town.options, [town]) if made else (town, town_chunks(town, threads=threads))
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales, header.offsets = np.full(3, 0.001), np.floor(np.array(options.origin))
+    header.creation_date = datetime.date(2020, 7, 1)  # fixed, so that the same town gives the same bytes
+    header.system_identifier, header.generating_software = "generated town", f"pdal-stages {__version__}"
+    header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
+    header.global_encoding.wkt = True
+    if options.srs != "none":
+        header.vlrs.append(laspy.VLR("LASF_Projection", 2112, "OGC WKT", wkt(options.srs).encode() + b"\0"))
+    counts, part = np.zeros(256, dtype=np.int64), partial_name(target)
+    try:
+        with laspy.open(part, mode="w", header=header, do_compress=target.suffix.lower() == ".laz") as writer:
+            for piece in pieces:
+                record = laspy.ScaleAwarePointRecord.zeros(len(piece), header=writer.header)
+                whole = np.round((piece.xyz - header.offsets) * 1000.0).astype(np.int32)
+                record["X"], record["Y"], record["Z"] = whole.T
+                for name in ("classification", "intensity", "return_number", "number_of_returns"):
+                    record[name] = getattr(piece, name)
+                record["gps_time"], record["point_source_id"] = piece.gps_time, piece.point_source_id
+                record["scan_angle"] = np.round(piece.scan_angle / 0.006).astype(np.int16)
+                writer.write_points(record)
+                counts += np.bincount(piece.classification, minlength=256)
+        check_complete(part, target)
+        os.replace(part, target)
+    except OSError as error:
+        raise StageError("the file cannot be written", where=str(path), found=error) from error
+    finally:
+        part.unlink(missing_ok=True)
+    return {int(code): int(counts[code]) for code in np.flatnonzero(counts)}
