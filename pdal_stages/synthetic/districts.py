@@ -138,8 +138,8 @@ def _poles(s: Site, stations: list[tuple[float, float]], across: tuple[float, fl
     for p, q in itertools.pairwise((a, b, s.z(a, b) + 8.4) for a, b in stations):
         s.bar((*p[:2], p[2] - 8.4), (*p[:2], p[2] + 0.2), 0.13, POLE, "bark")
         for off in (-0.6, 0.0, 0.6):
-            ends = [(a + off * across[0], b + off * across[1], z) for a, b, z in (p, q)]
-            cable(s, *ends, 0.02 * math.dist(p, q))
+            start, end = ((a + off * across[0], b + off * across[1], z) for a, b, z in (p, q))
+            cable(s, start, end, 0.02 * math.dist(p, q))
 
 
 def _canal(s: Site) -> None:

@@ -114,12 +114,12 @@ class Survey:
         pulse = hits[:, 6].astype(np.int64)
         # One error per pulse, mostly in height, so that its returns stay in order.
         xyz = hits[:, 1:4] + o.noise * (rng.standard_normal(origin.shape) * (0.5, 0.5, 1.0))[pulse]
-        xyz[:, :2] = xyz[:, :2] @ turn.T + o.size / 2
+        xyz[:, :2] = xyz[:, :2] @ turn.T + flight.size / 2
         mm = np.round(xyz * 1000.0)  # whole numbers, so that a file's coordinates are exactly these
-        outside = (mm[:, :2] < 0).any(axis=1) | (mm[:, :2] >= 1000.0 * o.size).any(axis=1)
+        outside = (mm[:, :2] < 0).any(axis=1) | (mm[:, :2] >= 1000.0 * flight.size).any(axis=1)
         keep = ~np.isin(pulse, pulse[outside])  # a pulse has all its returns or none
         mm, pulse, distance, (code, echo) = mm[keep], pulse[keep], hits[keep, 0], hits[keep, 4:6].T
-        above = mm[:, 2] / 1000.0 - heights((mm[:, :2] / 1000.0 - o.size / 2) @ turn, plan)
+        above = mm[:, 2] / 1000.0 - heights((mm[:, :2] / 1000.0 - flight.size / 2) @ turn, plan)
         code = np.where(code == VEGETATION, np.select([above < 0.5, above < 2.0], [3, 4], 5), code)
         echo = 4000.0 * echo * (o.altitude / distance) ** 2 * np.exp(0.12 * rng.standard_normal(len(echo)))
         _, start, nth, count = np.unique(pulse, return_index=True, return_inverse=True, return_counts=True)
@@ -164,5 +164,6 @@ def make_town(size=200.0, density=7.0, seed=1, *, threads=None, progress=True, *
         raise OptionError(f"unknown option '{name}'", where="synthetic", cure=cure)
     options = TownOptions(size, density, seed, **changes)
     pieces = list(town_chunks(options, threads=threads, progress=progress))
-    columns = [f.name for f in dataclasses.fields(Town)][:-1]
-    return Town(*(np.concatenate([getattr(p, name) for p in pieces]) for name in columns), options=options)
+    names = [f.name for f in dataclasses.fields(Town)][:-1]
+    columns: dict = {name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in names}
+    return Town(**columns, options=options)

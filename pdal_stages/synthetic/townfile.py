@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..base.errors import OptionError, StageError
-from ..base.files import check_complete, check_writable, partial_name
+from ..base.files import check_complete, whole_files
 from ..base.version import __version__
 from .town import Town, TownOptions, town_chunks
 
@@ -44,9 +44,8 @@ def write_town(town: Town | TownOptions, path: str | os.PathLike, *, threads=Non
     target = Path(path)
     if target.suffix.lower() not in (".las", ".laz"):
         raise OptionError("the output's name must end in .las or .laz", where="write_town", found=str(path))
-    check_writable(target)
-    made = isinstance(town, Town)
-    options, pieces = (town.options, [town]) if made else (town, town_chunks(town, threads=threads))
+    options = town.options if isinstance(town, Town) else town
+    pieces = [town] if isinstance(town, Town) else town_chunks(town, threads=threads)
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.scales, header.offsets = np.full(3, 0.001), np.floor(np.array(options.origin))
     header.creation_date = datetime.date(2020, 7, 1)  # fixed, so that the same town gives the same bytes
@@ -55,23 +54,23 @@ def write_town(town: Town | TownOptions, path: str | os.PathLike, *, threads=Non
     header.global_encoding.wkt = True
     if options.srs != "none":
         header.vlrs.append(laspy.VLR("LASF_Projection", 2112, "OGC WKT", wkt(options.srs).encode() + b"\0"))
-    counts, part = np.zeros(256, dtype=np.int64), partial_name(target)
-    try:
-        with laspy.open(part, mode="w", header=header, do_compress=target.suffix.lower() == ".laz") as writer:
-            for piece in pieces:
-                record = laspy.ScaleAwarePointRecord.zeros(len(piece), header=writer.header)
-                whole = np.round((piece.xyz - header.offsets) * 1000.0).astype(np.int32)
-                record["X"], record["Y"], record["Z"] = whole.T
-                for name in ("classification", "intensity", "return_number", "number_of_returns"):
-                    record[name] = getattr(piece, name)
-                record["gps_time"], record["point_source_id"] = piece.gps_time, piece.point_source_id
-                record["scan_angle"] = np.round(piece.scan_angle / 0.006).astype(np.int16)
-                writer.write_points(record)
-                counts += np.bincount(piece.classification, minlength=256)
-        check_complete(part, target)
-        os.replace(part, target)
-    except OSError as error:
-        raise StageError("the file cannot be written", where=str(path), found=error) from error
-    finally:
-        part.unlink(missing_ok=True)
+    counts = np.zeros(256, dtype=np.int64)
+    compress = target.suffix.lower() == ".laz"
+    with (
+        whole_files(target, check=check_complete) as (part,),
+        laspy.open(part, mode="w", header=header, do_compress=compress) as writer,
+    ):
+        for piece in pieces:
+            record = laspy.ScaleAwarePointRecord.zeros(len(piece), header=writer.header)
+            whole = np.round((piece.xyz - header.offsets) * 1000.0).astype(np.int32)
+            record["X"], record["Y"], record["Z"] = whole[:, 0], whole[:, 1], whole[:, 2]
+            for name in ("classification", "intensity", "return_number", "number_of_returns"):
+                record[name] = getattr(piece, name)
+            record["gps_time"], record["point_source_id"] = piece.gps_time, piece.point_source_id
+            record["scan_angle"] = np.round(piece.scan_angle / 0.006).astype(np.int16)
+            writer.write_points(record)
+            counts += np.bincount(piece.classification, minlength=256)
+        if not counts.any():
+            cure = "Give a larger 'size' or 'density'"
+            raise StageError("no pulse hit this town", where="synthetic", cure=cure)
     return {int(code): int(counts[code]) for code in np.flatnonzero(counts)}
