@@ -86,10 +86,10 @@ def _villa(s: Site) -> None:
 
 
 def _hall(s: Site) -> None:
-    """A hall, half flat and half saw-toothed, a parking place with trees, containers."""
-    deep, b, eave = 0.22 * s.d, 0.76 * s.d - 1, s.draw(5.5, 9)
-    for a, half, roof in ((0.27, 0.23, "flat"), (0.62, 0.12, "shed"), (0.86, 0.12, "shed")):
-        house(s, a * s.w, b, ACROSS, deep, half * s.w, eave, roof, 0.22, plain=roof == "shed")
+    """A hall of three parts, flat and pitched, a parking place with trees, containers."""
+    for n, roof in enumerate(("flat", "shed", "flat")):
+        at, eave = ((0.2 + 0.3 * n) * s.w, 0.78 * s.d), s.draw(4.5, 9)
+        house(s, *at, ACROSS, 0.19 * s.d, 0.15 * s.w, eave, roof, 0.22, plain=roof == "shed")
     _cars(s, np.arange(2.0, 0.6 * s.w, 2.7), (0.12 * s.d, 0.32 * s.d), ACROSS, 0.65)
     for n in range(3):
         thing(s, 0.75 * s.w + 4 * n, 0.3 * s.d, ACROSS, s.draw(3, 5), 1.25, s.draw(2.6, 3.6))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..base.errors import OptionError, StageError
-from ..base.files import check_complete, whole_files
+from ..base.files import whole_files
 from ..base.version import __version__
 from .town import Town, TownOptions, town_chunks
 
@@ -57,7 +57,7 @@ def write_town(town: Town | TownOptions, path: str | os.PathLike, *, threads=Non
     counts = np.zeros(256, dtype=np.int64)
     compress = target.suffix.lower() == ".laz"
     with (
-        whole_files(target, check=check_complete) as (part,),
+        whole_files(target) as (part,),
         laspy.open(part, mode="w", header=header, do_compress=compress) as writer,
     ):
         for piece in pieces:
