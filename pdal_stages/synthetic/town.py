@@ -9,6 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from ..base import checks
 from ..base.errors import OptionError, suggest
 from ..base.jit import CompilationNote
 from ..base.progress import Progress
@@ -45,15 +46,17 @@ class TownOptions:
 
     def __post_init__(self) -> None:
         for option in dataclasses.fields(self)[:-2]:
-            value, limits = getattr(self, option.name), option.metadata
-            kinds = (int, np.integer) if option.name == "seed" else (int, float, np.integer, np.floating)
-            number = isinstance(value, kinds) and not isinstance(value, bool)
-            if not (number and limits["low"] <= value <= limits["high"]):
-                kind = "whole number" if option.name == "seed" else "number"
-                what = f"'{option.name}' must be a {kind} from {limits['low']} to {limits['high']} ({limits['what']})"
-                raise OptionError(what, where="synthetic", found=value)
-        if np.shape(self.origin) != (3,) or not np.isfinite(np.array(self.origin, dtype=float)).all():
-            raise OptionError("'origin' must be three numbers: x, y, z", where="synthetic", found=self.origin)
+            check = checks.whole if option.name == "seed" else checks.number
+            check(
+                f"'{option.name}'",
+                getattr(self, option.name),
+                option.metadata["low"],
+                option.metadata["high"],
+            )
+        if np.shape(self.origin) != (3,):
+            raise OptionError("'origin' must be three numbers: x, y, z", found=self.origin)
+        for value in self.origin:
+            checks.number("each of the three numbers of 'origin'", value)
 
 
 @dataclasses.dataclass
