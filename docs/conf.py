@@ -3,6 +3,8 @@
 import sys
 from pathlib import Path
 
+from sphinx.errors import ConfigError
+
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 try:
@@ -10,10 +12,10 @@ try:
 
     from pdal_stages import __version__
 except ModuleNotFoundError as error:
-    sys.exit(
+    raise ConfigError(
         f"The pages of the stages and of the API are made from the package itself, and {error.name} is missing: "
         "pip install '.[docs]' in the environment that runs sphinx-build"
-    )
+    ) from None
 
 stage_pages.write()
 
