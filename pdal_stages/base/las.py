@@ -35,6 +35,8 @@ class LasHeader:
         Size of the header, and where points (or LAZ chunks) begin.
     records, records_after : int
         Variable-length records before and after the points.
+    after : int
+        Where the records after the points begin.
     count : int
     scales, offsets : tuple of float
     texts : dict
@@ -51,6 +53,7 @@ class LasHeader:
     offset: int
     records: int
     records_after: int
+    after: int
     count: int
     scales: tuple[float, ...]
     offsets: tuple[float, ...]
@@ -70,9 +73,9 @@ def read_header(path: str | os.PathLike) -> LasHeader | None:
     if len(head) < 227 or head[:4] != b"LASF":
         return None
     size, offset, records, kind, length, count = struct.unpack_from("<HIIBHI", head, 94)
-    minor, after = head[25], 0
+    minor, after, place = head[25], 0, 0
     if minor >= 4 and size >= 375 and len(head) >= 255:
-        after, count = struct.unpack_from("<IQ", head, 243)
+        place, after, count = struct.unpack_from("<QIQ", head, 235)
     numbers = struct.unpack_from("<6d", head, 131)
     x1, x0, y1, y0 = struct.unpack_from("<4d", head, 179)
     texts = {
@@ -80,7 +83,7 @@ def read_header(path: str | os.PathLike) -> LasHeader | None:
         "generating software": head[58:90].split(b"\0")[0],
     }
     return LasHeader(
-        minor, kind & 0x3F, length, bool(kind & 0xC0), size, offset, records, after, count,
+        minor, kind & 0x3F, length, bool(kind & 0xC0), size, offset, records, after, place, count,
         numbers[:3], numbers[3:], texts, (x0, y0, x1, y1),
     )  # fmt: skip
 
@@ -98,6 +101,8 @@ def check_readable(path: str | os.PathLike) -> str | None:
         header = read_header(path)
         table = _chunk_table(path, size, header) if header is not None and header.compressed else 0
         wrong = None if header is None else _what_is_wrong(header, size, table)
+        if header is not None and header.records_after and not wrong:
+            wrong = _wrong_records(path, header, size)
         if header is not None and header.compressed and header.count and not wrong:
             wrong = _wrong_chunks(path, header, table)
     except OSError as error:
@@ -152,6 +157,33 @@ def _what_is_wrong(header: LasHeader, size: int, table: int) -> tuple[str, str] 
     elif header.end_of_points > size:
         held = max(0, size - header.offset) // header.point_bytes
         return "it is cut short", f"{held:,} whole points, its header counts {header.count:,}"
+    if not header.count:
+        end = header.after if header.records_after else size
+        if header.compressed and header.offset + 8 <= table <= size - 8:
+            end = min(end, table - 8)  # which is where an empty file has it
+        if end >= header.offset + (8 + 1 if header.compressed else header.point_bytes):
+            return (
+                "its header counts no points, but holds some, as programs leave it that end before they are done",
+                f"{end - header.offset:,} bytes where points are",
+            )
+    return None
+
+
+def _wrong_records(path: str | os.PathLike, header: LasHeader, size: int) -> tuple[str, str] | None:
+    """What is wrong with the records after the points."""
+    begin = header.offset if header.compressed else header.end_of_points
+    if not begin <= header.after <= size - 60 * header.records_after:
+        return (
+            "the records after its points are not where it says",
+            f"{header.records_after:,} records at {header.after:,}, a file of {size:,} bytes",
+        )
+    with open(path, "rb") as file:
+        held = [r for r in _records(file, header) if r.after and r.data + r.length <= size]
+    if len(held) < header.records_after:
+        return (
+            "the records after its points do not end within the file",
+            f"{len(held):,} of {header.records_after:,} do",
+        )
     return None
 
 
@@ -208,9 +240,10 @@ def _records(file: BinaryIO, header: LasHeader) -> Iterator[_Record]:
     for index in range(header.records + header.records_after):
         after = index >= header.records
         if index == header.records:
-            file.seek(235)
-            (place,) = struct.unpack("<Q", file.read(8))
+            place = header.after
         size = 60 if after else 54
+        if place >= 2**62:
+            return
         file.seek(place)
         head = file.read(size)
         if len(head) < size:

@@ -108,8 +108,8 @@ class Expression:
     def __init__(self, text: str) -> None:
         self.text = text
         self._tokens: list[tuple[str, str, int]] = []
-        position = 0
-        while position < len(text) and text[position:].strip():
+        position, end = 0, len(text.rstrip())
+        while position < end:
             match = _TOKEN.match(text, position)
             if match is None:
                 while text[position].isspace():
@@ -233,12 +233,27 @@ def _find(name: str, arrays: Mapping[str, NDArray]) -> str:
 
 
 def _names(node: _Node) -> set[str]:
-    if node.kind == "name":
-        return {str(node.value)}
-    return set().union(*(_names(part) for part in node.parts)) if node.parts else set()
+    found, waiting = set(), [node]
+    while waiting:
+        node = waiting.pop()
+        waiting += node.parts
+        if node.kind == "name":
+            found.add(str(node.value))
+    return found
 
 
 def _value(node: _Node, arrays: Mapping[str, NDArray]):
+    chain = []  # a row of terms, as long as it may be, is nested to the left
+    while node.kind == "op":
+        chain.append(node)
+        node = node.parts[0]
+    value = _operand(node, arrays)
+    for operation in reversed(chain):
+        value = _OPERATIONS[str(operation.value)](value, _value(operation.parts[1], arrays))
+    return value
+
+
+def _operand(node: _Node, arrays: Mapping[str, NDArray]):
     if node.kind == "number":
         return node.value
     if node.kind == "name":
@@ -251,4 +266,4 @@ def _value(node: _Node, arrays: Mapping[str, NDArray]):
     if node.kind == "call":
         name = str(node.value)
         return (_FUNCTIONS[name] if name in _FUNCTIONS else _CONDITIONS[name])(parts[0])
-    return _OPERATIONS[str(node.value)](*parts)
+    raise AssertionError(node.kind)

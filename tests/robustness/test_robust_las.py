@@ -223,6 +223,63 @@ def test_damaged_laz(cell, tmp_path, write_las, model, case, edit):
     it.refused(["pipeline", pipeline(tmp_path, source, model)], "in.laz", "LAS file")
 
 
+def after(number=None, place=None, length=None):
+    """Give the records after the points another number, place or length; with one good record at the end."""
+
+    def edit(data):
+        end = len(data)
+        data += struct.pack("<H16sHQ32s", 0, b"test", 1, 10 if length is None else length, b"") + bytes(10)
+        struct.pack_into("<QI", data, 235, end if place is None else place, 1 if number is None else number)
+
+    return edit
+
+
+def zero(data):
+    """The header that a program leaves that ends before it is done."""
+    struct.pack_into("<I", data, 107, 0)
+    if data[25] >= 4:
+        struct.pack_into("<Q", data, 247, 0)
+    if data[104] & 0xC0:
+        struct.pack_into("<q", data, struct.unpack_from("<I", data, 96)[0], -1)
+
+
+NEWER = [
+    ("LAS 1.4: four billion records after the points", ".las", after(2**32 - 1), "not where it says"),
+    ("LAS 1.4: records after the points at byte 0", ".las", after(place=0), "not where it says"),
+    ("LAS 1.4: records after the points at 2^62", ".las", after(place=2**62), "not where it says"),
+    ("LAS 1.4: records after the points at 2^64 - 1", ".las", after(place=2**64 - 1), "not where it says"),
+    ("LAS 1.4: a record of 2^62 bytes after the points", ".las", after(length=2**62), "do not end within"),
+    ("LAZ 1.4: records after the points at 2^62", ".laz", after(place=2**62), "not where it says"),
+    ("LAS 1.4: no points in the header, many in the file", ".las", zero, "counts no points, but holds some"),
+    ("LAZ 1.4: no points in the header, many in the file", ".laz", zero, "counts no points, but holds some"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("case", "suffix", "edit", "says"), NEWER, ids=[row[0] for row in NEWER])
+def test_damaged_headers_of_las_1_4(cell, tmp_path, write_las, model, case, suffix, edit, says):
+    source = damaged(write_las(tmp_path / f"in{suffix}", scene(), point_format=6), edit)
+    it = cell("LAS files", case)
+    it.refused(["pipeline", pipeline(tmp_path, source, model)], f"in{suffix}", "damaged", says)
+    tiled = job(tmp_path, str(source), {"type": "filters.hag_minima"}, {"type": "writers.las", "filename": str(tmp_path / "o_#.las")})
+    done = it.command("pipeline", tiled, "--tile", 20, "--workers", 0)
+    assert done.code == 1 and says in done.err
+
+
+def test_a_record_after_the_points(cell, tmp_path, write_las, model):
+    source = damaged(write_las(tmp_path / "in.las", scene(), point_format=6), after())
+    cell("LAS files", "LAS 1.4: a record after the points").runs(["pipeline", pipeline(tmp_path, source, model)], "classes")
+    check(tmp_path)
+
+
+def test_a_file_without_points(cell, tmp_path, write_las):
+    none = {name: values[:0] for name, values in scene().items()}
+    for suffix in (".las", ".laz"):
+        source = write_las(tmp_path / f"in{suffix}", dict(none), point_format=6)
+        it = cell("LAS files", f"{suffix[1:].upper()}: a file without points")
+        it.runs(["pipeline", pipeline(tmp_path, source, None, {"type": "filters.hag_minima"})], "a file without points")
+        assert len(laspy.read(tmp_path / "out.las")) == 0
+
+
 def test_header_texts_in_latin_1(cell, tmp_path, good, model, pdal_program):
     damaged(good, lambda d: d.__setitem__(slice(26, 58), "Vermessungsb\u00fcro".encode("latin-1").ljust(32, b"\0")))
     it = cell("LAS files", "header texts in Latin-1")

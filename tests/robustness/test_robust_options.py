@@ -84,6 +84,7 @@ WRONG = [
     ("where in Python's words", HAG, {"where": "Z > 3 and X > 2"}, ["'and' is not expected"]),
     ("where that is no condition", HAG, {"where": "Z + 3"}, ["gives a number, not true or false"]),
     ("where left empty", HAG, {"where": " "}, ["option 'where' is empty"]),
+    ("where that compares comparisons", HAG, {"where": "20 < Z < 22"}, ["'<' does not fit its two sides"]),
     ("where nested 1,000 deep", HAG, {"where": "(" * 1000 + "Z>1" + ")" * 1000}, ["nested too deeply"]),
     ("unknown unit", HAG, {"horizontal_unit": "foots"}, ["no unit of length", "Did you mean"]),
     ("unit of an angle", HAG, {"vertical_unit": "degree"}, ["no unit of length", "Known units"]),
@@ -169,6 +170,12 @@ def test_wrong_stages(cell, tmp_path, monkeypatch, cloud, case, stages, says):
         assert "'where' holds for none of the 600 points: Z > 1e6" in done.err
     else:
         cell("Options", case).refused(["pipeline", path], *says)
+
+
+def test_a_where_of_many_terms(cell, tmp_path, cloud):
+    where = " || ".join(f"Classification == {k % 256}" for k in range(20_000))
+    path = job(tmp_path, str(cloud), {"type": HAG, "where": where})
+    cell("Options", "where of 20,000 terms").runs(["pipeline", path], "heights")
 
 
 OVERRIDES = [
