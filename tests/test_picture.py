@@ -22,7 +22,6 @@ from pdal_stages.reports.views import (
     RIGHT,
     WRONG,
     error_view,
-    height_view,
     nice_step,
     ramp,
     section_view,
@@ -133,7 +132,7 @@ def test_any_extent_and_density(extent, points, origin):
 
 def test_one_stray_point_cannot_exhaust_memory():
     x, y, z = block()
-    image = height_view(np.r_[x, 1e9], np.r_[y, -4e9], np.r_[z, 0.0], width=400)
+    image = top_view(np.r_[x, 1e9], np.r_[y, -4e9], np.r_[z, 0.0], width=400)
     assert image.shape[0] <= 1001 and image.shape[1] <= 401
 
 
@@ -161,8 +160,8 @@ def test_values_take_the_ramp_and_nan_is_grey():
 def test_shading_lights_slopes_that_face_the_sun():
     x, y, _ = block(60)
     ridge = 8.0 - np.abs(x - 15.0)  # runs south to north; its west side faces the sun
-    image = height_view(x, y, ridge, width=300, colors="grey").astype(int)
-    flat = height_view(x, y, ridge, width=300, colors="grey", shade=False).astype(int)
+    image = top_view(x, y, ridge, width=300, colors="grey").astype(int)
+    flat = top_view(x, y, ridge, width=300, colors="grey", shade=False).astype(int)
     gain = (image - flat).sum(axis=2)
     assert gain[100:200, 60:100].mean() > gain[100:200, 200:240].mean() + 30
 
@@ -173,13 +172,13 @@ def test_errors_are_red_even_under_a_roof():
     roof = np.full(x.size, 6)
     below = truth.copy()
     below[x < 5] = 5
-    image = error_view(
-        np.r_[x, x], np.r_[y, y], np.r_[z, z + 8], np.r_[below, roof], np.r_[truth, roof], width=200
-    )
+    wrong = np.r_[below, roof] != np.r_[truth, roof]
+    xyz = np.r_[x, x], np.r_[y, y], np.r_[z, z + 8]
+    image = error_view(*xyz, wrong, np.zeros_like(wrong), width=200)
     red = (image[..., 0] > 1.8 * image[..., 1].astype(int)).mean(axis=0)
     assert red[5:45].mean() > 0.2 and red[55:].max() == 0.0
-    ignored = error_view(x, y, z, below, truth, ignore=[2], width=100)
-    assert not (ignored[..., 0] > 1.5 * ignored[..., 1].astype(int)).any()
+    left_out = error_view(x, y, z, np.zeros(x.size, bool), np.ones(x.size, bool), width=100)
+    assert not (left_out[..., 0] > 1.5 * left_out[..., 1].astype(int)).any()
 
 
 # ---- section -----------------------------------------------------------------------------------------------
@@ -279,7 +278,7 @@ def test_nice_step(step):
 # ---- errors ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("view", [top_view, height_view, section_view])
+@pytest.mark.parametrize("view", [top_view, section_view])
 def test_an_empty_cloud_is_a_clear_error(view):
     with pytest.raises(StageError, match="empty"):
         view(np.zeros(0), np.zeros(0), np.zeros(0))

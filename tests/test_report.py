@@ -7,6 +7,8 @@ import io
 import re
 from html.parser import HTMLParser
 from importlib.resources import files
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from PIL import Image
 from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.accuracy.text import percent
 from pdal_stages.base.errors import StageError
-from pdal_stages.reports.accuracypage import accuracy_page, write_accuracy_report
+from pdal_stages.reports import write_accuracy_report
 from pdal_stages.reports.charts import percent_axis
 from pdal_stages.reports.maps import Scene, densest_line, heights_to_draw
 from pdal_stages.reports.runpage import run_page
@@ -56,6 +58,12 @@ class Page(HTMLParser):
 
     def all(self, tag):
         return [attrs for name, attrs in self.tags if name == tag]
+
+
+def accuracy_page(a, **content):
+    """The report as text."""
+    with TemporaryDirectory() as folder:
+        return write_accuracy_report(Path(folder) / "a.html", a, **content).read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")

@@ -85,13 +85,13 @@ class Merge:
 
     Attributes
     ----------
-    to : (65536,) int64
+    target_of : (65536,) int64
         The class that every code becomes.
     names : dict of int to str
         Names of the classes made of several.
     """
 
-    to: npt.NDArray[np.int64]
+    target_of: npt.NDArray[np.int64]
     names: dict[int, str]
 
     @classmethod
@@ -134,7 +134,8 @@ class Merge:
     @property
     def changed(self) -> dict[int, int]:
         """The codes that become another class, and which."""
-        return {int(code): int(self.to[code]) for code in np.flatnonzero(self.to != np.arange(len(self.to)))}
+        codes = np.flatnonzero(self.target_of != np.arange(len(self.target_of)))
+        return {int(code): int(self.target_of[code]) for code in codes}
 
 
 def pair_counts(

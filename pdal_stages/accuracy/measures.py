@@ -10,7 +10,7 @@ Rules for what is not defined, so that no figure is ever NaN:
 - A class with no reference points (named in `classes`, or predicted only) has recall None; its
   precision, where it was predicted, is 0.
 - Kappa is None where chance alone would agree on everything (one class, predicted throughout).
-- A predicted class that is no class of the reference (1 where points were rejected, say) gets a column
+- A predicted class that is not a class of the reference (1 where points were rejected, say) gets a column
   of its own, and its points count as errors.
 """
 
@@ -152,10 +152,10 @@ class Accuracy:
             ignore = UNINFORMATIVE if classes is None else ()
         kept = ~np.isin(found, code_list(ignore, "ignore"))
         if classes is None:
-            rows = tuple(np.unique(merged.to[found[kept]]).tolist())
+            rows = tuple(np.unique(merged.target_of[found[kept]]).tolist())
         else:
             rows = tuple(sorted(set(code_list(classes, "classes"))))
-            kept &= np.isin(merged.to[found], rows)
+            kept &= np.isin(merged.target_of[found], rows)
         points = dict(zip(found.tolist(), counts.sum(axis=1).tolist(), strict=True))
         left = {code: points[code] for code in found[~kept].tolist()}
         if not allow_empty and not kept.any():
@@ -166,22 +166,22 @@ class Accuracy:
                 cure="Name classes the reference has, or ignore fewer" if left else None,
             )
         counts = counts[kept]
-        given_classes = merged.to[found_predicted[counts.any(axis=0)]]
+        given_classes = merged.target_of[found_predicted[counts.any(axis=0)]]
         columns = rows + tuple(sorted(set(given_classes.tolist()) - set(rows)))
         counts = counts[:, counts.any(axis=0)]
 
-        compared = np.isin(np.arange(len(merged.to)), found[kept])
+        compared = np.isin(np.arange(len(merged.target_of)), found[kept])
         graded = {key: Grading.empty() for key in confidences}
         for start in range(0, len(ref) if graded else 0, CHUNK):
             part = slice(start, start + CHUNK)
             chosen = compared[ref[part]]
-            right = merged.to[ref[part][chosen]] == merged.to[pred[part][chosen]]
+            right = merged.target_of[ref[part][chosen]] == merged.target_of[pred[part][chosen]]
             for key, values in confidences.items():
                 graded[key] += Grading.from_values(values[part][chosen], right, key)
         return cls(
             rows,
             columns[len(rows) :],
-            regroup(counts, merged.to[found[kept]], given_classes, rows, columns),
+            regroup(counts, merged.target_of[found[kept]], given_classes, rows, columns),
             class_names((*columns, *left), {**merged.names, **(names or {})}),
             left,
             graded.get("reliability"),
@@ -233,17 +233,21 @@ class Accuracy:
         do not know them, are dropped; use `merge` of :meth:`from_labels` to keep them.
         """
         merged = Merge.parse(mapping)
-        rows = tuple(sorted({int(merged.to[c]) for c in self.classes}))
-        columns = rows + tuple(sorted({int(merged.to[c]) for c in self.columns} - set(rows)))
+        rows = tuple(sorted({int(merged.target_of[c]) for c in self.classes}))
+        columns = rows + tuple(sorted({int(merged.target_of[c]) for c in self.columns} - set(rows)))
         self._refuse_clash(
-            [int(merged.to[c]) for c in self.left_out],
+            [int(merged.target_of[c]) for c in self.left_out],
             rows,
             "merging joins a compared class with one that was left out",
             "Compare the labels again with this merge",
         )
-        known = {c: n for c, n in self.names.items() if int(merged.to[c]) == c}
+        known = {c: n for c, n in self.names.items() if int(merged.target_of[c]) == c}
         counts = regroup(
-            self.matrix, merged.to[list(self.classes)], merged.to[list(self.columns)], rows, columns
+            self.matrix,
+            merged.target_of[list(self.classes)],
+            merged.target_of[list(self.columns)],
+            rows,
+            columns,
         )
         return Accuracy(
             rows,
@@ -251,7 +255,7 @@ class Accuracy:
             counts,
             class_names((*columns, *self.left_out), {**known, **merged.names, **(names or {})}),
             self.left_out,
-            merged={**{c: int(merged.to[t]) for c, t in self.merged.items()}, **merged.changed},
+            merged={**{c: int(merged.target_of[t]) for c, t in self.merged.items()}, **merged.changed},
         )
 
     def _refuse_clash(self, left: Iterable[int], rows: Iterable[int], what: str, cure: str) -> None:

@@ -72,42 +72,11 @@ def write_accuracy_report(
     StageError
         Arrays of different lengths, coordinates that are not numbers, or a file that cannot be written.
     """
-    text = accuracy_page(
-        accuracy,
-        xyz=xyz,
-        reference=reference,
-        predicted=predicted,
-        title=title,
-        subtitle=subtitle,
-        importances=importances,
-        settings=settings,
-        unit=unit,
-        section=section,
-        date=date,
-    )
-    return write_whole(path, text.encode())
-
-
-def accuracy_page(
-    accuracy: Accuracy,
-    *,
-    xyz: npt.ArrayLike | None = None,
-    reference: npt.ArrayLike | None = None,
-    predicted: npt.ArrayLike | None = None,
-    title: str = "Classification accuracy",
-    subtitle: str = "",
-    importances: Mapping[str, float] | None = None,
-    settings: Mapping[str, Any] | None = None,
-    unit: str = "m",
-    section: Line | None = None,
-    date: str | None = None,
-) -> str:
-    """The page of :func:`write_accuracy_report` as text."""
     scene = None
     if xyz is not None or reference is not None or predicted is not None:
         scene = draw_scene(accuracy, Scene.of(accuracy, xyz, reference, predicted), unit, section)
     ordered = sorted((importances or {}).items(), key=lambda item: (-item[1], item[0]))
-    return render(
+    page = render(
         "accuracy.html",
         date=date,
         title=title,
@@ -119,6 +88,7 @@ def accuracy_page(
         importances=[(name, float(share)) for name, share in ordered],
         settings=settings,
     )
+    return write_whole(path, page.encode())
 
 
 def _matrix_width(a: Accuracy) -> int:

@@ -18,7 +18,7 @@ from ..base.asprs import NOISE, class_color
 from ..base.errors import StageError
 from .pictures import png
 from .raster import Frame
-from .views import IGNORED, RIGHT, WRONG, nice_step, section_view, top_view, verdict_view
+from .views import IGNORED, RIGHT, WRONG, error_view, nice_step, section_view, top_view
 
 #: Most pixels across a map and in all of it, fewest along its longer side, and pixels across a section.
 MAP_WIDTH, MAP_PIXELS, MAP_LEAST = 820, 800_000, 240
@@ -200,7 +200,7 @@ def draw_scene(a: Accuracy, scene: Scene, unit: str = "m", section: Line | None 
             **over,
         ),
         Picture.of(
-            verdict_view(x, y, z, scene.wrong, ~scene.compared, width=width),
+            error_view(x, y, z, scene.wrong, ~scene.compared, width=width),
             "Errors",
             f"Map of the errors from above: {wrong:,} of {n:,} compared points are wrong",
             **over,

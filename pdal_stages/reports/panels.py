@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import numpy.typing as npt
 from PIL import Image, ImageDraw
 
 from ..base.asprs import class_name
@@ -78,11 +79,11 @@ def legend(
 
 
 def triptych(
-    x,
-    y,
-    z,
-    predicted,
-    truth=None,
+    x: npt.ArrayLike,
+    y: npt.ArrayLike,
+    z: npt.ArrayLike,
+    predicted: npt.ArrayLike,
+    truth: npt.ArrayLike | None = None,
     *,
     width: int = 1500,
     captions: Sequence[str] | None = None,
@@ -118,7 +119,7 @@ def triptych(
     -------
     (height, width, 3) uint8
     """
-    x, y, z, predicted = checked_columns(x, y, z, predicted, names=("x", "y", "z", "predicted"))
+    x, y, z, predicted = checked_columns(x=x, y=y, z=z, predicted=predicted)
     predicted = class_codes(predicted)
     panels = 2 if truth is None else 3
     each = (int(width) - _GAP * (panels + 1)) // panels
@@ -131,7 +132,7 @@ def triptych(
     texts = ["Heights (shaded)", "Predicted classes"]
     extra: list[Entry] = []
     if truth is not None:
-        _, truth = checked_columns(x, truth, names=("x", "truth"))
+        _, truth = checked_columns(x=x, truth=truth)
         truth = class_codes(truth)
         left_out = np.isin(truth, list(ignore))
         wrong = (predicted != truth) & ~left_out

@@ -18,7 +18,7 @@ MOST_PIXELS = 25_000_000
 
 @dataclass(frozen=True)
 class Frame:
-    """A map window: lower left corner, metres a pixel, and size in pixels."""
+    """A map window: lower left corner, units per pixel, and size in pixels."""
 
     x0: float
     y0: float
@@ -28,7 +28,7 @@ class Frame:
 
     @staticmethod
     def around(x: np.ndarray, y: np.ndarray, width: int) -> Frame:
-        """The window of all finite points, `width` pixels wide (a very tall one gets narrower)."""
+        """The window of all finite points, `width` pixels wide (narrower where it would be more than 2.5 times as tall)."""
         good = np.isfinite(x) & np.isfinite(y)
         if not good.any():
             raise StageError(
@@ -45,7 +45,8 @@ class Frame:
 
 
 @njit
-def _highest(x, y, z, x0, y0, pixel, width, height, top, which, base):
+def _highest(x, y, z, x0, y0, pixel, top, which, base):
+    height, width = top.shape
     for n in range(x.size):
         if not (math.isfinite(x[n]) and math.isfinite(y[n]) and math.isfinite(z[n])):
             continue
@@ -96,20 +97,8 @@ def surface(x: np.ndarray, y: np.ndarray, z: np.ndarray, frame: Frame, gap: floa
     which = np.full((frame.height, frame.width), -1, dtype=np.int64)
     for base in range(0, len(x), 4_000_000):  # bounded copies of columns that are not contiguous float64
         part = slice(base, base + 4_000_000)
-        px, py, pz = (np.ascontiguousarray(a[part], dtype=np.float64) for a in (x, y, z))
-        _highest(
-            px,
-            py,
-            pz,
-            frame.x0,
-            frame.y0,
-            frame.pixel,
-            frame.width,
-            frame.height,
-            top,
-            which,
-            base,
-        )
+        xyz = [np.ascontiguousarray(a[part], dtype=np.float64) for a in (x, y, z)]
+        _highest(*xyz, frame.x0, frame.y0, frame.pixel, top, which, base)
     seen = which >= 0
     if not seen.any():
         raise StageError(

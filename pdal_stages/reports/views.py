@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 from PIL import Image, ImageDraw
 from scipy import ndimage
 
@@ -48,22 +48,21 @@ def ramp(values: np.ndarray, low: float, high: float, name: str = "value") -> np
     return np.round(out).astype(np.uint8)
 
 
+#: The colour of each class code, (256, 3) uint8.
 CLASS_COLORS = np.array([class_color(code) for code in range(256)], dtype=np.uint8)
 #: Discs of 5 and 21 pixels that a point of a section is drawn as.
 _SMALL_DOT = ndimage.generate_binary_structure(2, 1)
 _DOT = np.hypot(*np.mgrid[-2:3, -2:3]) <= 2.3
 
 
-def checked_columns(*arrays, names: Sequence[str]) -> list[np.ndarray]:
-    out = [np.asarray(a) for a in arrays]
+def checked_columns(**arrays: npt.ArrayLike) -> list[np.ndarray]:
+    """Arrays of one value per point, all as long as the first and not empty; their names are for messages."""
+    out = [np.asarray(a) for a in arrays.values()]
     size = out[0].shape
-    for a, name in zip(out, names, strict=True):
+    for a, name in zip(out, arrays, strict=True):
         if a.ndim != 1 or a.shape != size:
-            raise StageError(
-                f"'{name}' must be one value per point",
-                where="picture",
-                found=f"shape {a.shape}, '{names[0]}' has {size}",
-            )
+            found = f"shape {a.shape}, '{next(iter(arrays))}' has {size}"
+            raise StageError(f"'{name}' must be one value per point", where="picture", found=found)
     if not size[0]:
         raise StageError(
             "there is nothing to draw: the cloud is empty",
@@ -75,6 +74,7 @@ def checked_columns(*arrays, names: Sequence[str]) -> list[np.ndarray]:
 
 
 def class_codes(classes: np.ndarray) -> np.ndarray:
+    """Codes from 0 to 255 as (n,) uint8, or an error."""
     if classes.dtype.kind not in "iub" or (classes.size and (classes.min() < 0 or classes.max() > 255)):
         raise StageError(
             "classes must be whole numbers from 0 to 255",
@@ -84,25 +84,26 @@ def class_codes(classes: np.ndarray) -> np.ndarray:
     return classes.astype(np.uint8)
 
 
-def window(x, y, z, width: int) -> Surface:
+def window(x: np.ndarray, y: np.ndarray, z: np.ndarray, width: int) -> Surface:
+    """The surface of all points, `width` pixels wide."""
     if not 16 <= int(width) <= 20_000:
         raise StageError("'width' must be from 16 to 20000 pixels", where="picture", found=width)
     return surface(x, y, z, Frame.around(x, y, int(width)))
 
 
 def top_view(
-    x,
-    y,
-    z,
-    classes=None,
+    x: npt.ArrayLike,
+    y: npt.ArrayLike,
+    z: npt.ArrayLike,
+    classes: npt.ArrayLike | None = None,
     *,
-    values=None,
+    values: npt.ArrayLike | None = None,
     width: int = 900,
     limits: tuple[float, float] | None = None,
-    colors: str = "value",
+    colors: str | None = None,
     shade: bool = True,
 ) -> np.ndarray:
-    """The cloud from above, coloured by ASPRS class or by a value; the highest point of a pixel wins.
+    """The cloud from above, coloured by ASPRS class, by a value or by height; the highest point of a pixel wins.
 
     Parameters
     ----------
@@ -110,13 +111,13 @@ def top_view(
         Coordinates; points that are not finite are left out.
     classes : (n,) integer, optional
     values : (n,) float, optional
-        Instead of classes: a feature, ``Reliability``, intensity. Heights where neither is given.
+        Instead of classes: a feature, ``Reliability``, intensity. Without either, heights are shown.
     width : int
         Pixels across; the height follows from the extent.
     limits : (low, high), optional
-        Values at the ends of the ramp; the 1st and 99th percentile where not given.
-    colors : str
-        Ramp: 'value', 'height' or 'grey'.
+        Values at the ends of the ramp; by default the 1st and 99th percentile.
+    colors : str, optional
+        Ramp: 'value', 'height' or 'grey'; by default 'height' for heights and 'value' for other values.
     shade : bool
         Whether to shade the relief.
 
@@ -127,26 +128,25 @@ def top_view(
     Raises
     ------
     StageError
-        Where the cloud is empty, or arrays do not fit together.
+        If the cloud is empty, or arrays do not fit together.
     """
     if classes is not None and values is not None:
         raise StageError("give 'classes' or 'values', not both", where="picture")
-    if classes is None and values is None:
-        return height_view(x, y, z, width=width, shade=shade)
-    x, y, z, by = checked_columns(
-        x, y, z, classes if classes is not None else values, names=("x", "y", "z", "classes")
-    )
+    given = {"x": x, "y": y, "z": z, "classes": classes, "values": values}
+    x, y, z, *by = checked_columns(**{name: array for name, array in given.items() if array is not None})
     s = window(x, y, z, width)
     if classes is not None:
-        shown = CLASS_COLORS[s.spread(class_codes(by), 0)]
+        shown = CLASS_COLORS[s.spread(class_codes(by[0]), 0)]
+    elif values is not None:
+        numbers = by[0].astype(np.float64)
+        shown = ramp(s.spread(numbers, np.nan), *(limits or span(numbers)), colors or "value")
     else:
-        by = by.astype(np.float64)
-        low, high = limits if limits is not None else span(by)
-        shown = ramp(s.spread(by, np.nan), low, high, colors)
+        shown = ramp(s.z, *(limits or span(s.z)), colors or "height")
     return paint(s, shown, shading(s) if shade else None)
 
 
 def span(values: np.ndarray) -> tuple[float, float]:
+    """The 1st and 99th percentile of the finite values: what a ramp shows."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return 0.0, 1.0
@@ -154,33 +154,38 @@ def span(values: np.ndarray) -> tuple[float, float]:
     return float(low), float(high if high > low else low + 1.0)
 
 
-def height_view(x, y, z, *, width: int = 900, shade: bool = True, colors: str = "height") -> np.ndarray:
-    """The cloud from above as a tinted, shaded relief of its heights; see :func:`top_view`."""
-    x, y, z = checked_columns(x, y, z, names=("x", "y", "z"))
-    s = window(x, y, z, width)
-    return paint(s, ramp(s.z, *span(s.z), colors), shading(s) if shade else None)
-
-
-def error_view(x, y, z, predicted, truth, *, ignore: Sequence[int] = (), width: int = 900) -> np.ndarray:
-    """Grey where the predicted class is right, red where it is wrong, pale where `ignore` leaves it out.
+def error_view(
+    x: npt.ArrayLike,
+    y: npt.ArrayLike,
+    z: npt.ArrayLike,
+    wrong: npt.ArrayLike,
+    left_out: npt.ArrayLike,
+    *,
+    width: int = 900,
+) -> np.ndarray:
+    """The cloud from above: grey where points are right, red where they are `wrong`, pale where they are `left_out`.
 
     A wrong point is drawn over right ones of the same pixel, so that no error hides under a roof or a crown.
+
+    Parameters
+    ----------
+    x, y, z : (n,) float
+    wrong, left_out : (n,) bool
+    width : int
+        Pixels across.
+
+    Returns
+    -------
+    (height, width, 3) uint8
     """
-    x, y, z, predicted, truth = checked_columns(
-        x, y, z, predicted, truth, names=("x", "y", "z", "predicted", "truth")
-    )
-    left_out = np.isin(truth, list(ignore))
-    wrong = class_codes(predicted) != class_codes(truth)
-    return verdict_view(x, y, z, wrong & ~left_out, left_out, width=width)
-
-
-def verdict_view(x, y, z, wrong, left_out, *, width: int = 900) -> np.ndarray:
-    """As :func:`error_view`, from (n,) bool masks of the wrong points and of those that are not compared."""
+    x, y, z, wrong, left_out = checked_columns(x=x, y=y, z=z, wrong=wrong, left_out=left_out)
     s = window(x, y, z, width)
     return paint(s, verdict(s, x, y, z, wrong, left_out), shading(s))
 
 
-def verdict(s: Surface, x, y, z, wrong: np.ndarray, left_out: np.ndarray) -> np.ndarray:
+def verdict(
+    s: Surface, x: np.ndarray, y: np.ndarray, z: np.ndarray, wrong: np.ndarray, left_out: np.ndarray
+) -> np.ndarray:
     """Colours of the pixels of a surface, (height, width, 3) uint8: right, wrong or left out."""
     kinds = s.spread(np.where(left_out, 2, wrong).astype(np.int64), 0)
     shown = np.array([RIGHT, WRONG, IGNORED], dtype=np.uint8)[kinds]
@@ -197,10 +202,10 @@ def verdict(s: Surface, x, y, z, wrong: np.ndarray, left_out: np.ndarray) -> np.
 
 
 def section_view(
-    x,
-    y,
-    z,
-    classes=None,
+    x: npt.ArrayLike,
+    y: npt.ArrayLike,
+    z: npt.ArrayLike,
+    classes: npt.ArrayLike | None = None,
     *,
     start: tuple[float, float] | None = None,
     end: tuple[float, float] | None = None,
@@ -225,7 +230,7 @@ def section_view(
     exaggeration : float
         Vertical scale over horizontal scale.
     """
-    x, y, z = checked_columns(x, y, z, names=("x", "y", "z"))
+    x, y, z = checked_columns(x=x, y=y, z=z)
     frame = Frame.around(x, y, 1000)
     middle = frame.y0 + 0.5 * frame.pixel * frame.height
     start = (frame.x0, middle) if start is None else start

@@ -129,7 +129,7 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
         if self.merge is None and _one_code_system(trained):
             rule["merge"] = {c["code"]: c["labels"] for c in trained}
         merged = Merge.parse(rule["merge"])
-        rule["classes"] = sorted({int(merged.to[c["code"]]) for c in trained})
+        rule["classes"] = sorted({int(merged.target_of[c["code"]]) for c in trained})
         if self.ignore is None and rule["merge"] is not None:
             # A class's code need not be one of its labels: 1 is the background, or unclassified.
             labels = {label for c in trained for label in c["labels"]}
