@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import json
 import os
-import re
 import signal
 import sys
 import threading
@@ -16,6 +15,7 @@ from pathlib import Path
 from .base import kinds
 from .base.errors import StageError
 from .base.outputs import Output, check_outputs
+from .base.plain import PlainStream
 from .base.version import __version__
 from .pipeline.overrides import parse_overrides
 
@@ -24,7 +24,6 @@ _OVERRIDES = (
     "--filters.name.option=VALUE for all stages of a type."
 )
 
-_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 #: Lines of PDAL's log that are shown without -v.
 _SAID = 10
 
@@ -35,6 +34,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug = "--debug" in arguments or os.environ.get("PDAL_STAGES_DEBUG", "") not in ("", "0")
     arguments = [a for a in arguments if a != "--debug"]
     _print_anything()
+    streams = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = map(PlainStream, streams)  # type: ignore[assignment]
     try:
         overrides, rest = parse_overrides(arguments)
         options = _parser().parse_args(rest)
@@ -54,10 +55,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Exception as error:
         if debug:
             raise
-        message = str(error if isinstance(error, StageError) else _unforeseen(error))
-        # Names and texts from files may hold characters that command a terminal.
-        print(f"pdal-stages: {_CONTROL.sub(lambda m: ascii(m.group())[1:-1], message)}", file=sys.stderr)
+        message = error if isinstance(error, StageError) else _unforeseen(error)
+        print(f"pdal-stages: {message}", file=sys.stderr)
         return 1
+    finally:
+        sys.stdout, sys.stderr = streams
 
 
 def _print_anything() -> None:

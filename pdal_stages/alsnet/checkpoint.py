@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..base import strictjson
 from ..base.errors import ModelError
 from ..base.files import write_whole
 from ..classifier.arrays import ArrayRule, from_bytes, to_bytes
@@ -72,7 +73,7 @@ def load(
             expected = {STATE, *(f"{name}.npy" for name in shapes)}
             if STATE not in infos or infos[STATE].file_size > _STATE_LIMIT:
                 raise ModelError("this is not a checkpoint", cure=_CURE)
-            state = json.loads(_read(archive, infos[STATE]), parse_constant=_constant)
+            state = strictjson.loads(_read(archive, infos[STATE]))
             if not isinstance(state, dict) or state.get("format") != FORMAT:
                 raise ModelError("this is not a checkpoint of this release", cure=_CURE)
             _same(state.get("identity"), identity)
@@ -122,7 +123,3 @@ def _same(found: Any, wanted: dict[str, Any]) -> None:
             found=f"a different {', '.join(map(str, differs[:4]))}",
             cure=_CURE,
         )
-
-
-def _constant(word: str) -> None:
-    raise ValueError(f"{word} is no number")

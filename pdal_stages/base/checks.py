@@ -24,7 +24,7 @@ def whole(what: str, value: Any, low: int | None = None, high: int | None = None
     OptionError
         Naming the bounds and what was found.
     """
-    found = _finite(value)
+    found = finite(value)
     if found is None or found != int(found) or not _within(found, low, high):
         raise OptionError(f"{what} must be a whole number{bounds(low, high, unit=unit)}", found=_shown(value))
     return int(found)
@@ -40,7 +40,7 @@ def number(
     unit: str = "",
 ) -> float:
     """A finite number within bounds, both included; the lower one not with `above`. See :func:`whole`."""
-    found = _finite(value)
+    found = finite(value)
     if found is None or not _within(found, low, high) or (above and found == low):
         raise OptionError(f"{what} must be a number{bounds(low, high, above, unit)}", found=_shown(value))
     return float(found)
@@ -87,8 +87,8 @@ def bounds(low: float | None, high: float | None, above: bool = False, unit: str
     return f" from {_plain(low)} to {_plain(high)}{unit}"
 
 
-def _finite(value: Any) -> int | float | None:
-    """A number that is finite as a double; None for anything else, true and false too."""
+def finite(value: Any) -> int | float | None:
+    """A number that is finite as a double, as it is; None for anything else, true and false too."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         return None
     try:

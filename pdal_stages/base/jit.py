@@ -28,9 +28,18 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numba
-from numba.core import config
-from numba.core.compiler_lock import global_compiler_lock
+from .errors import DependencyError
+
+try:
+    import numba
+    from numba.core import config
+    from numba.core.compiler_lock import global_compiler_lock
+except ValueError as error:  # of an environment variable of its own
+    raise DependencyError(
+        "numba cannot be started",
+        found=str(error),
+        cure="Look for environment variables that begin with NUMBA_",
+    ) from None
 
 #: Flags that allow sums to be reordered and contracted, but keep NaN and infinity meaningful.
 FAST = frozenset({"reassoc", "contract", "nsz", "arcp"})

@@ -103,12 +103,12 @@ class WktNode:
 
     def find(self, *keywords: str) -> WktNode | None:
         """The first element, this one included, with one of the keywords."""
-        if self.keyword in keywords:
-            return self
-        for child in self.children:
-            found = child.find(*keywords)
-            if found is not None:
-                return found
+        waiting = [self]
+        while waiting:
+            node = waiting.pop()
+            if node.keyword in keywords:
+                return node
+            waiting += reversed(node.children)
         return None
 
     def unit(self) -> float | None:
@@ -132,6 +132,8 @@ class WktNode:
         return value if value > 0 else None
 
 
+#: Deeper text is not well-known text.
+_DEEPEST = 100
 _TOKEN = re.compile(r'\s*(?:"((?:[^"]|"")*)"|([A-Za-z_0-9.+\-]+)|([\[\](),]))')
 
 
@@ -151,6 +153,8 @@ def parse_wkt(text: str) -> WktNode | None:
                 stack[-1].values.append(word)
             word = quoted if quoted is not None else bare
         elif mark in "[(":
+            if len(stack) > _DEEPEST:
+                break
             node = WktNode((word or "").upper(), [], [])
             stack[-1].children.append(node)
             stack.append(node)

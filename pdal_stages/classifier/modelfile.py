@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy.typing as npt
 
+from ..base import strictjson
 from ..base.errors import ModelError, StageError
 from ..base.files import whole_files
 from .arrays import ArrayRule, from_bytes, to_bytes
@@ -246,21 +247,22 @@ def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
 def parse(data: bytes) -> dict[str, Any]:
     """The manifest in `data`, valid by its version's schema, as the newest version has it."""
     try:
-        manifest = json.loads(data.decode("utf-8"), object_pairs_hook=_unique, parse_constant=_constant)
+        manifest = strictjson.loads(data.decode("utf-8"))
     except RecursionError:
         raise ModelError("the manifest is nested too deeply", cure=CURE) from None
     except (UnicodeDecodeError, ValueError) as error:
         raise ModelError("the manifest is not valid JSON", found=str(error)[:200], cure=CURE) from None
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ModelError("this is not a model file", found="a manifest of something else")
-    if isinstance(manifest.get("version"), bool) or manifest.get("version") not in range(1, VERSION + 1):
+    version = manifest.get("version")
+    if type(version) is not int or not 1 <= version <= VERSION:
         raise ModelError(
             f"the model file has a version this release does not know (it knows 1 to {VERSION})",
-            found=f"version {str(manifest.get('version'))[:20]}",
+            found=f"version {str(version)[:20]}",
             cure="Update pdal-stages",
         )
     validate(manifest)
-    return _from_version_1(manifest) if manifest["version"] == 1 else manifest
+    return _from_version_1(manifest) if version == 1 else manifest
 
 
 def _from_version_1(old: Mapping[str, Any]) -> dict[str, Any]:
@@ -301,14 +303,3 @@ def _validator(version: int):
 
     text = resources.files(__package__).joinpath(f"model-{version}.json").read_text("utf-8")
     return jsonschema.Draft202012Validator(json.loads(text))
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    out = dict(pairs)
-    if len(out) != len(pairs):
-        raise ValueError("a key stands twice in one object")
-    return out
-
-
-def _constant(word: str) -> None:
-    raise ValueError(f"{word} is not a number")

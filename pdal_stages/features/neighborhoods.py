@@ -33,6 +33,8 @@ LEAST_MEMBERS = 10
 COPT_REACH = 3.0  # metres: the cap of the scattered branch, the largest radius copt looks at [H17]
 MAX_K = 10_000
 MIN_RADIUS, MAX_RADIUS = 0.001, 100_000.0  # metres
+#: Neighborhoods of one plan: a model file of a few kB must not ask for hours of work.
+MOST = 64
 
 _KNOWN = ("c2", "s1", "k50", "kopt", "ropt", "copt", *PRESETS)
 _TOKEN = re.compile(
@@ -122,6 +124,8 @@ def parse_neighborhoods(spec: str | Neighborhood | Iterable[str | Neighborhood])
             found.setdefault(one.token, one)
     if not found:
         raise OptionError("no neighborhood was given", found=repr(spec), cure=_CURE)
+    if len(found) > MOST:
+        raise OptionError(f"at most {MOST} neighborhoods can be used together", found=len(found))
     suffixes: dict[str, str] = {}
     for token, one in found.items():  # ropt(1,2.5,1) and ropt(1.2,5,1) would share dimension names
         if suffixes.setdefault(one.suffix, token) != token:

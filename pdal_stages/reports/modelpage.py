@@ -9,9 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..accuracy.text import percent
+from ..base import checks
 from ..base.files import write_whole
 from .charts import Chart
 from .page import render
+
+#: A curve with more is nonsense: the manifest's free parts may hold anything.
+_MOST_EPOCHS = 10**6
 
 if TYPE_CHECKING:
     from ..classifier import Model
@@ -69,7 +73,7 @@ def _scores(d: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
         return []
     titles = {"overall_accuracy": "Overall accuracy", "kappa": "Kappa", "mean_f1": "Mean F1"}
     return [
-        (title, percent(_finite_number(row.get(key)), 1), "%", remark if key == "overall_accuracy" else "")
+        (title, percent(checks.finite(row.get(key)), 1), "%", remark if key == "overall_accuracy" else "")
         for key, title in titles.items()
     ]
 
@@ -79,8 +83,8 @@ def _curves(rows: Any) -> list[Chart]:
     rows = [r for r in rows if isinstance(r, dict)] if isinstance(rows, list) else []
     charts = []
     for key, title in (("loss", "Loss"), ("mean_f1", "Mean F1 on the ground held out")):
-        pairs = [(_finite_number(r.get("epoch")), _finite_number(r.get(key))) for r in rows]
-        points = [(a, b) for a, b in pairs if a is not None and b is not None]
+        pairs = [(checks.finite(r.get("epoch")), checks.finite(r.get(key))) for r in rows]
+        points = sorted((a, b) for a, b in pairs if a is not None and b is not None and 0 < a <= _MOST_EPOCHS)
         if len(points) > 1:
             charts.append(_curve(points, title, is_share=key == "mean_f1"))
     return charts
@@ -88,7 +92,8 @@ def _curves(rows: Any) -> list[Chart]:
 
 def _curve(points: list[tuple[float, float]], title: str, is_share: bool) -> Chart:
     last = points[-1][0]
-    most = 1.0 if is_share else max(b for _, b in points) or 1.0
+    most = max(b for _, b in points)
+    most = most if most > 0 and not is_share else 1.0
     best = (max if is_share else min)(points, key=lambda p: p[1])
     step = max(1, math.ceil(last / 6))
     said = f"{100 * best[1]:.1f} %" if is_share else f"{best[1]:.4g}"
@@ -120,9 +125,3 @@ def _settings(d: Mapping[str, Any]) -> dict[str, Any]:
     if len(clouds) > 20:
         clouds = [*clouds[:20], f"and {len(clouds) - 20} more"]
     return {**out, "training": {"clouds": clouds, **training}}
-
-
-def _finite_number(value: Any) -> float | None:
-    """A finite number, or None: the manifest's free parts may hold anything."""
-    good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    return float(value) if good else None

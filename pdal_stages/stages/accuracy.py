@@ -17,6 +17,7 @@ from ..base.asprs import UNINFORMATIVE
 from ..base.errors import StageError
 from ..base.files import check_writable, write_whole
 from ..base.outputs import Output
+from ..base.plain import plain
 from ..base.units import name_of_wkt
 from .base import Stage
 from .modelclassifier import ModelClassifier, loaded_model
@@ -153,7 +154,7 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
         rule = self.scored()
         accuracy = Accuracy.from_labels(reference, predicted, **rule, **confidence)
         if self.print_table:
-            print(accuracy.table(), file=sys.__stdout__ or sys.stdout)
+            print(plain(accuracy.table()), file=sys.__stdout__ or sys.stdout)
         if self.json:
             write_whole(self.json, (json.dumps(accuracy.to_dict(), indent=1) + "\n").encode())
         if self.html:

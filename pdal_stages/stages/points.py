@@ -16,6 +16,7 @@ from .where import Expression
 
 #: Which stage makes a dimension that a user may lack.
 MAKERS = {
+    "Z": "The reader does not give it: check its file and options",
     "HeightAboveGround": 'Add {"type": "filters.hag_minima"} (or filters.hag_delaunay, filters.hag_nn) before this stage',
     "Reference": 'Keep the labels before classifying: {"type": "filters.ferry", "dimensions": "Classification=>Reference"}',
     "Ground": 'Add {"type": "filters.hag_morphological", "ground": true} before this stage',
@@ -93,7 +94,7 @@ class Points:
         for column, (name, unit) in enumerate(
             (("X", self.units.horizontal), ("Y", self.units.horizontal), ("Z", self.units.vertical))
         ):
-            np.multiply(self.arrays[name], unit, out=out[:, column])
+            np.multiply(self.dimension(name, metres=False), unit, out=out[:, column])
         bad = int(np.count_nonzero(~np.isfinite(out).all(axis=1)))
         if bad:
             raise StageError(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import StageError
-from .grid import Box, Grid, touch
+from .grid import Box, Grid, check_number, touch
 
 #: Points of a block: LAZ is compressed in pieces of so many.
 BLOCK = 50_000
@@ -85,6 +85,7 @@ def index_las(path: str, grid: Grid) -> CloudIndex:
             )
             for (i, j), number in zip(pairs.tolist(), counts.tolist(), strict=True):
                 tiles[i, j] = tiles.get((i, j), 0) + number
+            check_number(len(tiles), f"{path}, tiles of {grid.size:g}")
     return CloudIndex(total, boxes, [(i, j, n) for (i, j), n in sorted(tiles.items())])
 
 

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from ..base.errors import OptionError, StageError
 
 #: Most tiles of a run.
-_MOST = 10_000_000
+MOST_TILES = 1_000_000
+#: Beyond it the number of a column or row is not exact.
+_FARTHEST = 2.0**52
 
 Box = tuple[float, float, float, float]
 
@@ -38,7 +40,14 @@ class Grid:
         The edges decide, not the quotient: a point on an edge belongs to the tile it begins,
         whatever the division rounds to, so each point has exactly one tile.
         """
-        where = np.floor(coordinate / self.size)
+        with np.errstate(over="ignore", invalid="ignore"):
+            where = np.floor(coordinate / self.size)
+        if where.size and not np.abs(where).max() < _FARTHEST:  # not finite too
+            raise StageError(
+                "coordinates are too far away to be counted in tiles",
+                found=f"{coordinate[np.abs(where).argmax()]:g}, tiles of {self.size:g}",
+                cure="Take larger tiles, or repair the coordinates",
+            )
         where -= coordinate < where * self.size
         where += coordinate >= (where + 1.0) * self.size
         return where.astype(np.int64)
@@ -63,16 +72,21 @@ class Grid:
         Raises
         ------
         StageError
-            For more than ten million.
+            For more than :data:`MOST_TILES`.
         """
         x0, y0, x1, y1 = (int(self.index(np.array([v]))[0]) for v in box)
-        if (x1 - x0 + 1) * (y1 - y0 + 1) > _MOST:
-            raise StageError(
-                f"more than {_MOST:,} tiles",
-                found=f"bounds {box}, tiles of {self.size:g}",
-                cure="Take larger tiles, or repair the bounding box in the header",
-            )
+        check_number((x1 - x0 + 1) * (y1 - y0 + 1), f"bounds {box}, tiles of {self.size:g}")
         return [(i, j) for j in range(y0, y1 + 1) for i in range(x0, x1 + 1)]
+
+
+def check_number(tiles: int, found: str) -> None:
+    """Refuse more tiles than a run may have."""
+    if tiles > MOST_TILES:
+        raise StageError(
+            f"more than {MOST_TILES:,} tiles",
+            found=found,
+            cure="Take larger tiles, or repair the bounding box in the header",
+        )
 
 
 def touch(a: Box, b: Box) -> bool:

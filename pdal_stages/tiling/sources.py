@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import glob
 import hashlib
-import json
+import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..base import las
+from ..base import las, strictjson
 from ..base.errors import PipelineError, StageError
 from .grid import Box
 from .tindex import locations
 
 #: Readers of files whose points can be fetched by number.
 _LAS = ("readers.las", "readers.copc")
+#: Bytes of an EPT source's description at most.
+_LARGEST = 16 << 20
 #: Options of readers.tindex that choose files or points, or change them.
 _TINDEX_QUERIES = ("bounds", "polygon", "where", "sql", "count", "srs_column")
 
@@ -168,7 +170,7 @@ def las_header(path: str) -> Header:
     if found is None:
         raise StageError("the input is not a LAS or LAZ file", where=path)
     x0, y0, x1, y1 = found.box
-    if found.count and not (x0 <= x1 and y0 <= y1):
+    if found.count and not (math.isfinite(x1 - x0 + y1 - y0) and x0 <= x1 and y0 <= y1):
         raise StageError(
             "the header has no bounding box", where=path, found=f"x {x0} to {x1}, y {y0} to {y1}"
         )
@@ -182,13 +184,21 @@ def read_ept(path: str) -> dict[str, Any]:
             import urllib.request
 
             with urllib.request.urlopen(path, timeout=60) as answer:
-                text = answer.read()
+                text = answer.read(_LARGEST)
         else:
-            text = Path(path).read_bytes()
-        found = json.loads(text)
-        found["points"], found["boundsConforming"], found["schema"]
+            with open(path, "rb") as file:
+                text = file.read(_LARGEST)
+        found = strictjson.loads(text)
+        x0, y0, _, x1, y1, _ = map(float, found["boundsConforming"])
+        names = [dimension["name"] for dimension in found["schema"]]
+        if (
+            int(found["points"]) < 0
+            or not (x0 <= x1 and y0 <= y1)
+            or not all(isinstance(n, str) for n in names)
+        ):
+            raise ValueError("a description of nothing")
         return found
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise StageError("the EPT source cannot be read", where=path, found=str(error)) from None
 
 

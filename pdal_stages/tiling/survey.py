@@ -15,7 +15,7 @@ from ..base.progress import Progress
 from ..base.units import units_of_wkt
 from ..pipeline import pdal as pdal_env
 from .cloudindex import CloudIndex, IndexTask
-from .grid import Box, Grid, union
+from .grid import Box, Grid, check_number, union
 from .pool import Pool, last_tries
 from .settings import TilingOptions
 from .sources import Header, Source, check_source, find_sources, read_header
@@ -156,6 +156,7 @@ class Survey:
             elif header.count:
                 for tile in self.grid.covering(header.box):
                     counts.setdefault(tile, 0)
+        check_number(len(counts), f"tiles of {self.grid.size:g}")
         return dict(sorted(counts.items(), key=lambda item: (item[0][1], item[0][0])))
 
     def figures(self, plan: TilePlan) -> dict[str, Any]:

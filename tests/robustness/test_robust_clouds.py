@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 
 import laspy
 import numpy as np
@@ -377,3 +378,48 @@ def test_labels_that_are_none(cell, tmp_path, write_las):
 def test_stage_error_in_a_thread_is_the_same(cloud):
     with pytest.raises(StageError, match="none"):
         ps.run_pipeline([str(cloud), {**HAG, "where": "Z > 3", "ignore_classes": list(range(256))}])
+
+
+def test_no_heights(cell, tmp_path):
+    (tmp_path / "flat.txt").write_text("X,Y\n1,2\n3,4\n")
+    for stage in (HAG, {"type": "filters.multiscalefeatures", "neighborhoods": "c1"}):
+        path = job(tmp_path, {"type": "readers.text", "filename": str(tmp_path / "flat.txt")}, stage)
+        cell("Clouds", "cloud without Z").refused(["pipeline", path], "the dimension 'Z' is missing")
+
+
+def test_deep_well_known_text(cell):
+    from pdal_stages.base.units import units_of_wkt
+
+    it = cell("Clouds", "spatial reference nested 5,000 deep")
+    for text in ("PROJCS[" * 5000, 'PROJCS["a",' + 'UNIT["m",' * 5000 + "1" + "]" * 5001):
+        assert units_of_wkt(text).horizontal == 1.0
+    it.note("result", "metres are assumed, as where there is none")
+
+
+BOXES = [
+    ("infinite bounding box", float("inf"), 20, "the header has no bounding box"),
+    ("bounding box of 1e300", 1e300, 20, None),
+    ("tiles of 1e-300", None, 1e-300, "too far away to be counted in tiles"),
+    ("tiles of 1e-9", None, 1e-9, "too far away to be counted in tiles"),
+    ("tiles of a millimetre", None, 0.001, None),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("case", "side", "tile", "says"), BOXES, ids=[row[0] for row in BOXES])
+def test_boxes_and_tiles_of_odd_sizes(cell, tmp_path, cloud, case, side, tile, says):
+    data = bytearray(cloud.read_bytes())
+    if side is not None:
+        struct.pack_into("<4d", data, 179, side, -side, side, -side)
+    (tmp_path / "in.las").write_bytes(data)
+    path = job(tmp_path, str(tmp_path / "in.las"), {"type": "writers.las", "filename": str(tmp_path / "o_#.las")})
+    it = cell("Clouds", f"in tiles: {case}")
+    done = it.command("pipeline", path, "--tile", tile, "--workers", 0)
+    if says is not None:
+        assert done.code == 1 and "Traceback" not in done.err and says in done.err, done.err
+        assert not list(tmp_path.glob("o_*"))
+        it.note("error", says)
+    else:
+        it.runs(done, "every point comes out")
+        assert len(laspy.read(tmp_path / "o_in.las")) == 600
+    done = it.command("pipeline", path, "--tile", tile, "--workers", 0, "--dry-run")
+    assert done.code == 1 and "Traceback" not in done.err  # headers alone cannot say

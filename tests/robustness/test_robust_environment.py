@@ -352,6 +352,13 @@ def test_one_core(cell, tmp_path, cloud):
     )
 
 
+def test_settings_of_numba(cell, tmp_path, cloud):
+    it = cell("Environment", "NUMBA_NUM_THREADS=0")
+    done = it.process("pipeline", job(tmp_path, str(cloud), {"type": "filters.multiscalefeatures", "neighborhoods": "c1"}),
+                      env={"NUMBA_NUM_THREADS": "0"})  # fmt: skip
+    it.refused(done, "numba cannot be started", "must be > 0", "begin with NUMBA_")
+
+
 def test_no_threads_to_be_had(cell, tmp_path, cloud):
     import resource
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import pickle
+import re
 import zipfile
 
 import laspy
@@ -61,6 +63,24 @@ def bomb(head, members):
     head["arrays"]["1.threshold"]["shape"] = [30_000_000]
 
 
+def with_text(pattern, replacement):
+    """Replace a text in the manifest, where JSON allows what Python would not write."""
+
+    def edit(data):
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = {name: archive.read(name) for name in archive.namelist()}
+        found = re.subn(pattern, replacement, members["manifest.json"])
+        assert found[1]
+        members["manifest.json"] = found[0]
+        out = io.BytesIO()
+        with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, content in members.items():
+                archive.writestr(name, content)
+        return out.getvalue()
+
+    return edit
+
+
 class Evil:
     def __reduce__(self):
         return (open, ("/tmp/should-not-exist-pdal-stages", "w"))
@@ -70,6 +90,12 @@ class Evil:
 BROKEN = [
     ("model of version 3", lambda h, m: h.update(version=3), ["version", "Update pdal-stages"]),
     ("model of an algorithm that is not known", lambda h, m: h["passes"][0].update(algorithm="xgboost"), ["algorithm", "xgboost"]),
+    ("model of version 2.0", lambda h, m: h.update(version=2.0), ["version 2.0"]),
+    ("model with a number of 1e999", with_text(rb'"max_samples": [\d.]+', b'"max_samples": 1e999'), ["1e999 is too large"]),
+    ("model with NaN in its manifest", with_text(rb'"max_samples": [\d.]+', b'"max_samples": NaN'), ["NaN is not a number"]),
+    ("model with a key twice", with_text(rb'"max_samples"', b'"max_samples": 1, "max_samples"'), ["twice"]),
+    ("model with 997 neighborhoods", lambda h, m: h["passes"][0]["features"].update(neighborhoods=[f"ropt(0.25,{k / 100},0.05)" for k in range(30, 1027)]),
+     ["at most 64 neighborhoods"]),
     ("model with features in another order", swap_names, ["features"]),
     ("model with a feature this release lacks", lambda h, m: h["passes"][0]["feature_names"].__setitem__(0, "Magic_c1"), ["features"]),
     ("model with a neighborhood that is none", lambda h, m: h["passes"][0]["features"].update(neighborhoods=["q5"]), [""]),
@@ -186,3 +212,51 @@ def test_a_model_that_changes_between_runs(cell, tmp_path, cloud, model):
     (tmp_path / "out.las").unlink()
     copy.write_bytes(model.read_bytes()[:-50])
     it.refused(words, "m.model")
+
+
+# ---- names and figures that are not meant for people ----------------------------------------------------------
+
+
+def rewritten(model, target, **changes):
+    def edit(head, members):
+        for place, value in changes.items():
+            node = head
+            *way, last = place.split("__")
+            for word in way:
+                node = node[int(word)] if word.isdigit() else node[word]
+            node[last] = value
+
+    return repack(model, target, edit)
+
+
+def test_names_that_command_a_terminal(cell, tmp_path, cloud, model):
+    name = "\x1b]0;title\x07\x1b[31mred\u202eder"
+    evil = rewritten(model, tmp_path / "evil.model", classes__0__name=name)
+    it = cell("Models", "class name with escape sequences")
+    for words in (["model", evil], ["classify", cloud, tmp_path / "o.las", "--model", evil]):
+        done = it.runs(words, "printed as codes, such as \\x1b")
+        assert "\\x1b]0;title\\x07\\x1b[31mred\\u202eder" in done.out
+        assert not re.search("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202e]", done.out + done.err)
+    odd = tmp_path / "a\x1b[31m\x07.las"
+    odd.write_bytes(cloud.read_bytes())
+    it = cell("Clouds", "file name with escape sequences")
+    done = it.runs(["classify", odd, tmp_path / "o\x1b[0m.las", "--model", model], "printed as codes")
+    assert "o\\x1b[0m.las" in done.out and "\x1b" not in done.out + done.err
+    it.refused(["classify", odd, odd, "--model", model], "a\\x1b[31m\\x07.las")
+
+
+def test_figures_of_any_size(cell, tmp_path, model):
+    curve = [{"epoch": e, "loss": v, "mean_f1": v} for e, v in ((0, 1), (10**400, 10**400), (1, 0.5), (2, 0.25), (-3, -1))]
+    for case, changes in (
+        ("model with integers of 400 digits", {"training__huge": 10**400, "passes__0__parameters__trees": 10**400}),
+        ("model with a curve of epochs 0, -3 and 10^400", {"training__curve": curve}),
+        ("model whose curve is of epoch 0 alone", {"training__curve": [{"epoch": 0, "loss": 0, "mean_f1": 0}] * 2}),
+    ):
+        odd = rewritten(model, tmp_path / "odd.model", **changes)
+        it = cell("Models", case)
+        done = it.command("model", odd, "--html", tmp_path / "page.html")
+        if done.code:
+            it.refused(done, "odd.model")
+        else:
+            it.runs(done, "printed, and drawn as far as it can be")
+            assert (tmp_path / "page.html").read_text().rstrip().endswith("</html>")
