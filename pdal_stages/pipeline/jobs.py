@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -36,8 +36,11 @@ def train_pipeline(
     sources: Iterable[str], model: str, overrides: Iterable[Override] = (), **options: Any
 ) -> list[dict[str, Any]]:
     """Read labelled files, give heights if wanted, train, write the model."""
+    from ..stages.classifiermodel import ClassifierModel
+
     writer = {"type": "writers.classifiermodel", "filename": model, **options}
-    heights = heights_for(lower_stage(_overridden(writer, overrides)).stage.reads())
+    stage = cast(ClassifierModel, lower_stage(_overridden(writer, overrides)).stage)
+    heights = heights_for(stage.wished)
     return [*(_reader(name, f"input{i}") for i, name in enumerate(sources, 1)), *heights, writer]
 
 

@@ -18,6 +18,7 @@ from ..classifier import TrainingCloud, TrainingOptions, train
 from ..classifier.classes import ClassMap
 from ..classifier.dimensions import required, welcome
 from ..classifier.trainoptions import MOST_PASSES
+from ..features.returns import SOURCES
 from .base import Stage
 from .options import option
 from .points import Points
@@ -29,6 +30,12 @@ _OWN = {"filename", "label", "survey", "where", "threads", "memory", "horizontal
 def _default(name: str) -> Any:
     """The trainer's own default."""
     return TrainingOptions.__dataclass_fields__[name].default
+
+
+#: The word for the dimensions that follow from what the points have: always these, and those where they are there.
+AUTO = "auto"
+ALWAYS = ("HeightAboveGround",)
+WHERE_THERE = ("Ground", "HeightAboveOpening_5", "HeightAboveOpening_17")
 
 
 class ClassifierModel(Stage):
@@ -62,8 +69,10 @@ class ClassifierModel(Stage):
     )
     dimensions: list = option(
         "list",
-        ("HeightAboveGround",),
-        "Dimensions of the points that are used as features too (Intensity, ReturnNumber, NumberOfReturns, ReturnRatio)",
+        (AUTO,),
+        "Dimensions of the points that are used as features too, e.g. HeightAboveGround, Intensity, ReturnRatio, or returns "
+        "for all return features; auto: HeightAboveGround and, where the points have them, Ground, HeightAboveOpening_5, "
+        "HeightAboveOpening_17 and returns",
         may_be_empty=True,
     )
     classes: dict | None = option(
@@ -221,8 +230,29 @@ holds the classes.
             numbers = [int(v) if str(v).strip().lstrip("-").isdigit() else v for v in values[name]]
             values[name] = numbers[0] if len(numbers) == 1 else numbers
         values["max_features"] = _number(values["max_features"])
+        if self.automatic:
+            values["dimensions"] = ALWAYS
         values["thin"] = [_number(v) if isinstance(v, str) else v for v in values["thin"]]
         return TrainingOptions(**values, threads=self.threads, memory_mb=self.memory)
+
+    @property
+    def automatic(self) -> bool:
+        """Whether the dimensions follow from what the points have."""
+        return list(self.dimensions) == [AUTO]
+
+    @property
+    def wished(self) -> tuple[str, ...]:
+        """Dimensions worth making for the training, whether asked for or not."""
+        forest = self.algorithm == "random_forest"
+        return (*ALWAYS, *WHERE_THERE) if self.automatic and forest else tuple(required(self.training.inputs))
+
+    def _training_on(self, points: Points) -> TrainingOptions:
+        """The trainer's options, with the dimensions that the points have."""
+        if not self.automatic or self.algorithm != "random_forest":
+            return self.training
+        there = [name for name in WHERE_THERE if name in points.arrays]
+        there += ["returns"] if all(name in points.arrays for name in SOURCES) else []
+        return replace(self.training, dimensions=(*ALWAYS, *there))
 
     def check(self) -> None:
         self.training.inputs  # noqa: B018  words that mean nothing are refused
@@ -247,15 +277,16 @@ holds the classes.
                 "there are no points to train on",
                 cure="Check the reader's file and the filters before this stage",
             )
+        training = self._training_on(points)
         cloud = TrainingCloud(
             xyz=points.xyz,
             labels=points.codes_of(self.label),
-            dimensions={name: points.dimension(name) for name in required(self.training.inputs)}
-            | {name: points.arrays[name] for name in welcome(self.training.inputs) if name in points.arrays},
+            dimensions={name: points.dimension(name) for name in required(training.inputs)}
+            | {name: points.arrays[name] for name in welcome(training.inputs) if name in points.arrays},
             name="the points",
             mask=points.mask,
         )
-        model = train(self._surveys(cloud, points), self.training)
+        model = train(self._surveys(cloud, points), training)
         model.info["preparation"] = self._preparation
         model.save(self.filename)
         points.report.update({"model": self.filename, **_brief(model.info), "seconds": model.seconds})
