@@ -194,17 +194,13 @@ class FeaturePlan:
         """Whether a neighborhood's size is a number of points, so that no halo is sure to suffice."""
         return any(n.reach is None for n in self.neighborhoods)
 
-    @property
-    def _by_radius(self) -> bool:
-        return any(n.kind in ("ropt", "copt") for n in self.neighborhoods)
-
     def to_dict(self) -> dict[str, Any]:
         """A JSON-able description; :meth:`from_dict` reads it."""
         return {
             "neighborhoods": [n.token for n in self.neighborhoods],
             "features": list(self.features),
             "dimensions": list(self.dimensions),
-            **({"least_members": self.least_members} if self._by_radius else {}),
+            **({"least_members": self.least_members} if _by_radius(self.neighborhoods) else {}),
         }
 
     @classmethod
@@ -217,11 +213,18 @@ class FeaturePlan:
         for value in (tokens, words, dimensions):
             if not isinstance(value, list | tuple) or not all(isinstance(item, str) for item in value):
                 raise OptionError("a feature plan holds lists of text", found=repr(value)[:80])
+        parsed = tuple(parse_neighborhoods(tokens))
         # A model that does not say was trained when three members were enough.
-        least = checks.whole("'least_members' of a feature plan", data.get("least_members", 3), 3, 100)
+        given = data.get("least_members", 3 if _by_radius(parsed) else LEAST_MEMBERS)
+        least = checks.whole("'least_members' of a feature plan", given, 3, 100)
         return cls(
-            tuple(parse_neighborhoods(tokens)),
+            parsed,
             parse_feature_set(words),
             tuple(dict.fromkeys(dimensions)),
             least,
         )
+
+
+def _by_radius(neighborhoods: Iterable[Neighborhood]) -> bool:
+    """Whether any of them chooses among radii, so that `least_members` matters."""
+    return any(one.kind in ("ropt", "copt") for one in neighborhoods)
