@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -64,14 +66,9 @@ class Features:
 
     @classmethod
     def from_dict(cls, entry: Mapping[str, Any]) -> Features:
-        """From what a manifest says of a pass."""
-        bins = entry["shape_bins"]
-        return cls(
-            FeaturePlan.from_dict(entry["features"]),
-            None if bins is None else ShapeBins.from_dict(bins),
-            entry["copt_threshold"],
-            entry["feature_seed"],
-        )
+        """From what a manifest says of a pass; passes that read the same share one object."""
+        keys = ("features", "shape_bins", "copt_threshold", "feature_seed")
+        return _features(json.dumps({key: entry[key] for key in keys}, sort_keys=True))
 
     def engine(self, xyz: npt.NDArray[np.float64], threads: int | None = None) -> FeatureEngine:
         """What computes them over a cloud."""
@@ -83,6 +80,18 @@ class Features:
             seed=self.seed,
             threads=threads,
         )
+
+
+@lru_cache(maxsize=4)
+def _features(text: str) -> Features:
+    entry = json.loads(text)
+    bins = entry["shape_bins"]
+    return Features(
+        FeaturePlan.from_dict(entry["features"]),
+        None if bins is None else ShapeBins.from_dict(bins),
+        entry["copt_threshold"],
+        entry["feature_seed"],
+    )
 
 
 @dataclass(frozen=True, eq=False)
