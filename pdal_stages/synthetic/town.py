@@ -47,12 +47,8 @@ class TownOptions:
     def __post_init__(self) -> None:
         for option in dataclasses.fields(self)[:-2]:
             check = checks.whole if option.name == "seed" else checks.number
-            check(
-                f"'{option.name}'",
-                getattr(self, option.name),
-                option.metadata["low"],
-                option.metadata["high"],
-            )
+            limits = option.metadata["low"], option.metadata["high"]
+            check(f"'{option.name}'", getattr(self, option.name), *limits)
         if np.shape(self.origin) != (3,):
             raise OptionError("'origin' must be three numbers: x, y, z", found=self.origin)
         for value in self.origin:

@@ -76,12 +76,11 @@ def ground(u, v, plan):
     for n in range(plan.waves.shape[0]):
         z += plan.waves[n, 0] * math.sin(plan.waves[n, 1] * u + plan.waves[n, 2] * v + plan.waves[n, 3])
     canal = _from_line(v, FIRST_V + CANAL * PITCH_V, 4 * PITCH_V)
-    if canal < 54.0:  # in a valley, level near the quays
-        t = max((canal - 15.0) / 39.0, 0.0)
-        z *= t * t * (3.0 - 2.0 * t)
-        if canal < CANAL_HALF:  # sloping stone, and water
-            z = -CANAL_DEPTH * min((CANAL_HALF - canal) / (CANAL_HALF - WATER_HALF), 1.0)
-            return z, (WATER if canal < WATER_HALF else STONE)
+    t = min(max((canal - 15.0) / 95.0, 0.0), 1.0)
+    z *= t * t * (3.0 - 2.0 * t)  # wide valleys, level near the quays
+    if canal < CANAL_HALF:  # sloping stone, and water
+        z = -CANAL_DEPTH * min((CANAL_HALF - canal) / (CANAL_HALF - WATER_HALF), 1.0)
+        return z, (WATER if canal < WATER_HALF else STONE)
     bank = _from_line(v, FIRST_V + BANK * PITCH_V, 4 * PITCH_V)
     if bank < BANK_FOOT:
         z += BANK_HEIGHT * min((BANK_FOOT - bank) / (BANK_FOOT - BANK_CREST), 1.0)
