@@ -20,7 +20,7 @@ def town(size: float = 90.0, density: float = 4.0, seed: int = 5):
     xyz = made.xyz.copy()
     x, y = xyz[:, 0] - 500_000.0, xyz[:, 1] - 5_400_000.0
     for value, axis in ((10.0, 0), (40.0, 0), (70.0, 0), (30.0, 1), (60.0, 1)):
-        near = np.abs((x, y)[axis] - value) < 0.05
+        near = np.abs((x, y)[axis] - value) < 0.1
         xyz[near, axis] = value + (500_000.0, 5_400_000.0)[axis]
     hole = (x > 39.0) & (x < 71.0) & (y > 59.0)  # a whole tile and a little more
     return made, xyz, ~hole
