@@ -9,18 +9,13 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError
 from .arrays import ArrayRule
-
-if TYPE_CHECKING:
-    from .clouds import TrainingCloud
-    from .model import Model
-    from .trainoptions import TrainingOptions
 
 #: Packages that register kinds when they are imported.
 PACKAGES = ("pdal_stages.classifier", "pdal_stages.alsnet")
@@ -161,18 +156,22 @@ class Algorithm(Protocol):
 
 
 class Trainer(Protocol):
-    """How a kind is trained."""
+    """How a kind is trained.
+
+    `options` are ``TrainingOptions``, `clouds` ``TrainingCloud``s, and what comes out is a ``Model``: all of them rooms
+    that stand on this one.
+    """
 
     @staticmethod
     def own_options(given: Any) -> Any:
         """The kind's own options, checked; None where it has none."""
 
     @staticmethod
-    def inputs(options: TrainingOptions) -> tuple[str, ...]:
+    def inputs(options: Any) -> tuple[str, ...]:
         """Dimensions it uses as inputs, X, Y and Z among them."""
 
     @staticmethod
-    def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model: ...
+    def train(clouds: Sequence[Any], options: Any, progress: bool) -> Any: ...
 
 
 _KINDS: dict[str, tuple[str, str]] = {}
