@@ -62,7 +62,11 @@ def main() -> None:
         test = rng.choice(np.flatnonzero((tile == held) & known), 12_000, replace=False)
         queries = np.concatenate([train, test])
         table = ps.compute_features(
-            xyz, queries, "weinmann2018", "all,HeightAboveLowest", dimensions={"HeightAboveGround": height[queries]}
+            xyz,
+            queries,
+            "weinmann2018",
+            "all,HeightAboveLowest",
+            dimensions={"HeightAboveGround": height[queries]},
         )
         shape = np.array([name[:2] in ("A3", "D1", "D2", "D3", "D4") for name in table.names])
         lowest = np.array([name.startswith("HeightAboveLowest") for name in table.names])

@@ -57,7 +57,9 @@ def table(lines: list[dict]) -> str:
         cells = [line["date"], line["commit"], line["note"]]
         for case in CASES:
             row = line.get("town", {}).get(case)
-            cells.append("" if row is None else f"{row['cpu']}" + (f" ({row['pgeof']})" if "pgeof" in row else ""))
+            cells.append(
+                "" if row is None else f"{row['cpu']}" + (f" ({row['pgeof']})" if "pgeof" in row else "")
+            )
         for scene in ("montpellier", "delft"):
             row = line.get("real", {}).get(scene)
             cells.append("" if row is None else f"{row['overall_accuracy']:.1f} / {row['mean_f1']:.1f}")

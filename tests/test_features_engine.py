@@ -440,7 +440,7 @@ def test_without_a_writable_folder(tmp_path):
             locator = getattr(c, name, None) or getattr(c, "_" + name)
             locator.from_function = classmethod(lambda cls, f, path: None)
         import tempfile
-        from pdal_stages.features import jit
+        from pdal_stages.base import jit
         if {broken!r}:
             jit.private_cache_folder = lambda: None
         @jit.njit

@@ -19,7 +19,8 @@ import numpy.typing as npt
 from ..base.errors import OptionError
 from ..base.jit import njit
 from ..base.threads import map_blocks
-from ..features.cells import SIDES, WHOLE, cell_keys, cell_means, take_means
+from ..features.cells import WHOLE, cell_keys, cell_means, take_means
+from ..features.neighborhoods import SIDES
 
 
 @dataclass(frozen=True)

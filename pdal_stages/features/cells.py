@@ -16,9 +16,6 @@ from .index import cell_numbers
 #: A share of 1.
 WHOLE = 65535
 
-#: Sides of cells that can be asked for, metres: powers of two, so that corners are exact.
-SIDES = tuple(2.0**k for k in range(-3, 7))
-
 
 def cell_means(
     coordinates: npt.NDArray[np.float64], shares: npt.NDArray[np.uint16], side: float, votes: bool = False

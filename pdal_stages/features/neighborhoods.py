@@ -36,6 +36,9 @@ MIN_RADIUS, MAX_RADIUS = 0.001, 100_000.0  # metres
 #: Neighborhoods of one plan: a model file of a few kB must not ask for hours of work.
 MOST = 64
 
+#: Sides of cells of an absolute grid that can be asked for, metres: powers of two, so that corners are exact.
+SIDES = tuple(2.0**k for k in range(-3, 7))
+
 _KNOWN = ("c2", "s1", "k50", "kopt", "ropt", "copt", *PRESETS)
 _TOKEN = re.compile(
     r"(?P<head>kopt|ropt|copt|c|s|k)(?P<value>\d+(?:\.\d*)?|\.\d+)?(?:\((?P<inner>[^()]*)\))?"

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OptionError
-from .cells import SIDES, WHOLE, cell_means, take_means
+from .neighborhoods import SIDES
 
 #: What they are made of.
 SOURCES = ("ReturnNumber", "NumberOfReturns")
@@ -100,6 +100,8 @@ def return_features(
     dict of name to (n,) float32
         0 to 1.
     """
+    from .cells import WHOLE, cell_means, take_means  # numba, which a plan does without
+
     wanted = {name: one for name in names if (one := parse(name)) is not None}
     if not wanted:
         return {}

@@ -138,16 +138,17 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         return max([code for code, _ in self.model.classes] + [self.rejected_code or 0])
 
     def _dimensions(self, points: Points) -> dict[str, NDArray]:
-        """What the model reads; an error for what is missing says which stages make it."""
+        """What the model reads."""
         found = {name: points.arrays[name] for name in self.model.welcome_dimensions if name in points.arrays}
-        for name in self.model.required_dimensions:
-            try:
-                found[name] = points.dimension(name)
-            except DimensionError as error:
-                if self.preparation:
-                    error.cure = f"Put before this stage: {as_json(self.preparation)}"
-                raise
-        return found
+        return found | {name: self.dimension(points, name) for name in self.model.required_dimensions}
+
+    def dimension(self, points: Points, name: str) -> NDArray:
+        try:
+            return points.dimension(name)
+        except DimensionError as error:
+            if self.preparation:
+                error.cure = f"Put before this stage: {as_json(self.preparation)}"
+            raise
 
     def run(self, points: Points) -> dict[str, NDArray]:
         if points.count == 0:
