@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from pdal_stages.classifier import modelfile
+from pdal_stages.classifier.featureforest import shared_features
 from pdal_stages.cli import main
 from pdal_stages.features import FeaturePlan
 from pdal_stages.pipeline import Pipeline
@@ -189,6 +190,7 @@ def test_classifying_does_each_thing_once(cloud, tmp_path, capsys, monkeypatch):
     words = ["--neighborhoods", "c1", "--count", 50, "--writers.classifiermodel.trees=2"]
     assert run(capsys, "train", cloud, "--model", model, *words)[0] == 0
     counts: Counter[str] = Counter()
+    shared_features.cache_clear()
 
     def count(owner, name):
         original = getattr(owner, name)

@@ -68,7 +68,7 @@ class Features:
     def from_dict(cls, entry: Mapping[str, Any]) -> Features:
         """From what a manifest says of a pass; passes that read the same share one object."""
         keys = ("features", "shape_bins", "copt_threshold", "feature_seed")
-        return _features(json.dumps({key: entry[key] for key in keys}, sort_keys=True))
+        return shared_features(json.dumps({key: entry[key] for key in keys}, sort_keys=True))
 
     def engine(self, xyz: npt.NDArray[np.float64], threads: int | None = None) -> FeatureEngine:
         """What computes them over a cloud."""
@@ -83,7 +83,8 @@ class Features:
 
 
 @lru_cache(maxsize=4)
-def _features(text: str) -> Features:
+def shared_features(text: str) -> Features:
+    """What a manifest says of features, as JSON."""
     entry = json.loads(text)
     bins = entry["shape_bins"]
     return Features(

@@ -146,14 +146,13 @@ def model(data: bytes) -> str:
         made = assemble(manifest, arrays)
         assert str(made) and made.describe() and made.halo >= 0
         made.importances()
-        values = np.random.default_rng(1).normal(size=(50, len(made.plan.names))).astype(np.float32)
-        shares = made.algorithm.probabilities(values)
-        assert shares.shape == (50, len(made.classes))
-        assert (
-            np.isfinite(shares).all()
-            and (shares >= 0).all()
-            and np.allclose(shares.sum(axis=1), 1, atol=1e-5)
-        )
+        codes = [code for code, _ in made.classes]
+        for one in made.passes:
+            values = np.random.default_rng(1).normal(size=(50, len(one.columns(codes)))).astype(np.float32)
+            shares = one.probabilities(values)
+            assert shares.shape == (50, len(codes))
+            assert np.isfinite(shares).all() and (shares >= 0).all()
+            assert np.allclose(shares.sum(axis=1), 1, atol=1e-5)
         outcome = "loaded"
     except StageError as error:
         assert str(error).strip().endswith((".", "?", "!")) and "Traceback" not in str(error)

@@ -143,10 +143,10 @@ def test_no_points(cell, tmp_path, write_las, model):
 
 
 def test_training_on_odd_clouds(cell, tmp_path, write_las):
-    def train(case, xyz, *says, **more):
+    def train(case, xyz, *says, passes=1, **more):
         source = las(tmp_path / "in.las", xyz, write_las, **more)
         stage = {"type": "writers.classifiermodel", "filename": str(tmp_path / "m"), "count": 50, "trees": 3,
-                 "neighborhoods": "c1,k5", "feature_set": "covariance"}  # fmt: skip
+                 "neighborhoods": "c1,k5", "feature_set": "covariance", "passes": passes}  # fmt: skip
         path = job(tmp_path, str(source), HAG, stage)
         it = cell("Clouds", case)
         if says:
@@ -168,6 +168,7 @@ def test_training_on_odd_clouds(cell, tmp_path, write_las):
         Classification=np.zeros(100, np.uint8),
     )
     train("training on 2 points", ODD["2 points"])
+    train("two passes on 2 points", ODD["2 points"], "too small to be cut", "set passes to 1", passes=2)
     train("training where all points are equal", ODD["all points equal"])
 
 

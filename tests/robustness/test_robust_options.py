@@ -206,7 +206,7 @@ USAGE = [
     ("no pipeline file", ["pipeline"], 1, "no pipeline file was given"),
     ("stage options where none are taken", ["drivers", "--stage.a.b=1"], 1, "takes no stage options"),
     ("options of a stage that is not there", ["options", "filters.hag_minimum"], 1, "Did you mean 'filters.hag_minima'?"),
-    ("classify without a model", ["classify", "a.las", "b.las"], 2, "--model"),
+    ("classify with a model that is not there", ["classify", "a.las", "b.las", "--model", "standart"], 1, "standart"),
     ("count that is no number", ["train", "a.las", "--model", "m", "--count", "many"], 2, "invalid int value"),
     ("metadata in a folder that is not there", ["pipeline", "JOB", "--metadata", "no/m.json"], 1, "metadata file does not exist"),
 ]  # fmt: skip
