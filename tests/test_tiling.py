@@ -423,7 +423,7 @@ def test_moving_points_before_our_stages_is_refused(tmp_path, town_file):
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"tile": 0}, "positive"),
+        ({"tile": 0}, "above 0"),
         ({"workers": -1}, "0 or more"),
         ({"workers": 10_000}, "more workers than cores"),
         ({"workers": 1, "scheduler": "tcp://x:1"}, "one of them"),
@@ -458,7 +458,7 @@ def test_only_seen_points_are_computed(tmp_path, town_file, model_file):
     plan = make_plan(ps.Pipeline(clouds.stages([town_file], tmp_path / "o.las", model_file)))
     assert plan.head[1]["where"] == "PdalStagesMargin < 0"
     assert [s["type"] for s in plan.tail] == ["writers.las"]
-    assert plan.halo == pytest.approx(4 * clouds.CELL + 16)
+    assert plan.halo == pytest.approx(4 * clouds.CELL + ps.load_model(model_file).halo)
 
 
 # ---- tile indexes and EPT --------------------------------------------------------------------------------

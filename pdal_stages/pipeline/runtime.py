@@ -126,7 +126,7 @@ def run_on_view(module, arguments, ins, outs) -> dict[str, Any]:
     points = points_of(stage, module, ins)
     for name in stage.reads():
         if name not in ins:
-            stage.dimension(points, name)  # raises, naming the stage that makes it
+            stage.take(points, name)  # raises, naming the stage that makes it
     for name, values in stage.run(points).items():
         target = ins[name].dtype
         # PDAL copies raw memory: exactly this type, contiguous, one value per point.

@@ -169,7 +169,7 @@ class Stage(ABC):
         units = (self.horizontal_unit, self.vertical_unit)
         return Points(arrays, wkt=wkt, where=self._condition, units=units, legacy_flags=legacy_flags)
 
-    def dimension(self, points: Points, name: str) -> NDArray:
+    def take(self, points: Points, name: str) -> NDArray:
         """A dimension the stage reads; an error for a missing one names the stage that makes it."""
         return points.dimension(name)
 

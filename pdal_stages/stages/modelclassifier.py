@@ -140,9 +140,9 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
     def _dimensions(self, points: Points) -> dict[str, NDArray]:
         """What the model reads."""
         found = {name: points.arrays[name] for name in self.model.welcome_dimensions if name in points.arrays}
-        return found | {name: self.dimension(points, name) for name in self.model.required_dimensions}
+        return found | {name: self.take(points, name) for name in self.model.required_dimensions}
 
-    def dimension(self, points: Points, name: str) -> NDArray:
+    def take(self, points: Points, name: str) -> NDArray:
         try:
             return points.dimension(name)
         except DimensionError as error:
