@@ -68,7 +68,7 @@ class Features:
     def from_dict(cls, entry: Mapping[str, Any]) -> Features:
         """From what a manifest says of a pass; passes that read the same share one object."""
         keys = ("features", "shape_bins", "copt_threshold", "feature_seed")
-        return shared_features(json.dumps({key: entry[key] for key in keys}, sort_keys=True))
+        return shared_features(json.dumps({key: entry[key] for key in keys}))
 
     def engine(self, xyz: npt.NDArray[np.float64], threads: int | None = None) -> FeatureEngine:
         """What computes them over a cloud."""
