@@ -14,8 +14,9 @@ Markers
 
 Environment
     PDAL_STAGES_DATA     folder of the real clouds; default ``../shared/data`` beside the checkout
-    PDAL_STAGES_REQUIRE  comma-separated: ``pdal`` makes a skip for want of PDAL a failure, ``data`` one
-                         for want of the real clouds (continuous integration sets ``pdal``)
+    PDAL_STAGES_REQUIRE  comma-separated: ``pdal`` makes a skip for want of PDAL a failure, ``data`` one for want of
+                         the real clouds, ``torch`` one for want of PyTorch (continuous integration sets ``pdal``,
+                         and ``torch`` where it can be installed)
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ for _ignored, _usual in (("SIGINT", signal.default_int_handler), ("SIGHUP", sign
 ROOT = Path(__file__).resolve().parent.parent
 REQUIRED = {word.strip() for word in os.environ.get("PDAL_STAGES_REQUIRE", "").split(",") if word.strip()}
 NO_DATA = "real clouds not found"
+NO_TORCH = "PyTorch is not installed"
 
 # A skip reason that names PDAL itself. "PDAL 2.5" or "PDAL >= 2.5" asks for a version, which is another
 # matter, and PDAL_STAGES_DATA is another word.
@@ -98,6 +100,8 @@ def _forbidden(report) -> str | None:
     reason = str(report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr)
     if reason.startswith(f"Skipped: {NO_DATA}"):
         return reason if "data" in REQUIRED else None
+    if NO_TORCH in reason:
+        return reason if "torch" in REQUIRED else None
     return reason if "pdal" in REQUIRED and WANT_OF_PDAL.search(reason) else None
 
 

@@ -46,6 +46,13 @@ def test_ci_runs_the_readme_command_strictly():
     text = (ROOT / ".ci/run").read_text()
     assert "PDAL_STAGES_REQUIRE=pdal" in text
     assert re.search(r"^exec \./scripts/test$", text, re.MULTILINE)
+    assert re.search(r"^  exec \./scripts/test --deep$", text, re.MULTILINE)
+
+
+def test_pytorch_of_the_tests_is_one_version_without_cuda():
+    said = subprocess.run([ROOT / "scripts/setup", "--torch"], capture_output=True, text=True, check=True).stdout
+    assert re.fullmatch(r"torch==\d+\.\d+\.\d+(\+cpu)?\n", said)
+    assert ("+cpu" in said) == (sys.platform != "darwin")
 
 
 @pytest.mark.parametrize(
@@ -201,11 +208,15 @@ def test_version():
 
 def test_data(data_dir):
     pass
+
+@pytest.mark.skipif(True, reason="PyTorch is not installed (extra 'deep'): training is not tested")
+def test_torch():
+    pass
 """
 
 
 @pytest.mark.parametrize(
-    ("required", "failed", "skipped"), [("", 0, 4), ("pdal", 2, 2), ("data", 1, 3), ("pdal,data", 3, 1)]
+    ("required", "failed", "skipped"), [("", 0, 5), ("pdal", 2, 3), ("data", 1, 4), ("torch", 1, 4), ("pdal,data", 3, 2)]
 )
 def test_skips_that_must_not_happen_fail(tmp_path, required, failed, skipped):
     shutil.copy(ROOT / "tests/conftest.py", tmp_path)
