@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +12,8 @@ import numpy.typing as npt
 from ..base.errors import DimensionError, OptionError
 from ..base.progress import Progress
 from ..base.threads import map_blocks
-from ..features import FeatureEngine, FeaturePlan, ShapeBins
+from ..features import FeaturePlan
+from ..features.fitting import fit_clouds
 from ..features.names import SHAPES
 from .clouds import TrainingCloud
 from .dimensions import gather, with_returns
@@ -44,35 +44,9 @@ def must_fit(columns: int, n: int) -> None:
 def fit(
     clouds: Sequence[TrainingCloud], share: Sequence[int], plan: FeaturePlan, options: TrainingOptions
 ) -> Features:
-    """Histogram and curvature thresholds: the mean of each cloud's own, weighted by its `share` of the samples."""
-    each = []
-    for cloud, n in zip(clouds, share, strict=True):
-        if n:  # one index at a time
-            engine = FeatureEngine(cloud.xyz, plan, seed=options.seed, threads=options.threads).fit()
-            each.append((engine.bins, engine.copt_threshold))
-            del engine
-    weight = [n / sum(share) for n in share if n]
-
-    def mean(values) -> float:  # exactly rounded, so the order of the clouds does not matter
-        return math.fsum(w * v for w, v in zip(weight, values, strict=True)) if len(weight) > 1 else values[0]
-
-    bins, threshold = each[0]
-    if threshold is not None:
-        threshold = mean([value for _, value in each])
-    if bins is not None:
-        tables = [one.to_dict() for one, _ in each if one is not None]
-        bins = ShapeBins.from_dict(
-            {
-                token: {
-                    metric: [
-                        mean(values) for values in zip(*(one[token][metric] for one in tables), strict=True)
-                    ]
-                    for metric in rows
-                }
-                for token, rows in tables[0].items()
-            }
-        )
-    return Features(plan, bins, threshold, options.seed)
+    """Histogram and curvature thresholds, fitted to all clouds that have a `share` of the samples together."""
+    used = [cloud.xyz for cloud, n in zip(clouds, share, strict=True) if n]
+    return Features(plan, *fit_clouds(used, plan, seed=options.seed, threads=options.threads), options.seed)
 
 
 def sample_features(

@@ -19,7 +19,7 @@ from .moments import BATCH, FEATURES, MOMENTS, finish
 from .names import MOMENT_FEATURES, SHAPE_FEATURES
 from .optimal import kopt_block, nearest_block
 from .plan import Columns, FeaturePlan
-from .ropt import COPT_RADII, copt_block, curvature_block, curvature_threshold, radii_of, ropt_block
+from .ropt import COPT_RADII, copt_block, curvature_block, radii_of, ropt_block
 from .shapes import Shapes, count_shapes, list_shapes, no_shapes, point_seeds
 
 #: Density takes smaller radii as this, metres: copies of one point lie at a distance of 0.
@@ -61,8 +61,6 @@ class AdaptiveNeighborhoods:
     ----------
     tokens : list of str
         The neighborhoods, in the plan's order: what `few` and `far` of :meth:`fill` count for.
-    needs_copt : bool
-        Whether a copt threshold is needed.
     query_ns, scratch_bytes : float, int
         Estimated cost of one query; memory of one call of :meth:`fill` besides its rows.
     """
@@ -72,7 +70,6 @@ class AdaptiveNeighborhoods:
         fixed = ("cylinder", "sphere")
         self.specs = [_spec(c) for c in plan.layout if c.at and c.neighborhood.kind not in fixed]
         self.tokens = [spec.token for spec in self.specs]
-        self.needs_copt = any(spec.kind == "copt" for spec in self.specs)
         self.query_ns = sum(NS_QUERY[s.kind] * _load(s) + NS_SHAPES * s.shaped for s in self.specs)
         largest = max((s.parameters[-1] for s in self.specs if s.parameters), default=0.0)
         self.scratch_bytes = 2_000_000 + int(500 * largest)
@@ -101,8 +98,8 @@ class AdaptiveNeighborhoods:
         if self._nearest:
             self._compute_nearest(*one)
 
-    def fit_copt(self, threads: int | None = None) -> float:
-        """The curvature from which on a point is scattered, from all points of the cloud [H17]."""
+    def curvatures(self, threads: int | None = None) -> np.ndarray:
+        """The curvature of every point of the cloud, in the order of the grid, (n,) float64 [H17]."""
         grid = self.grid
         curvatures = np.empty(len(grid))
 
@@ -113,7 +110,7 @@ class AdaptiveNeighborhoods:
 
         for _ in map_blocks(compute, range(0, len(grid), CHUNK), threads):
             pass
-        return curvature_threshold(curvatures)
+        return curvatures
 
     def shape_values(self, token: str, points: Point, seed: int, copt_threshold: float | None) -> np.ndarray:
         """Metrics of all pulls of a neighborhood for a few points, (m, 5, 255) float32, comparable."""

@@ -16,18 +16,13 @@ from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
 from .blocks import Fitted, Run, Tally, compile_once
 from .plan import FeaturePlan
+from .samples import smallest_hashes
 
 if TYPE_CHECKING:
     from .adaptive import AdaptiveNeighborhoods
     from .bins import ShapeBins
     from .fixed import FixedRadius
     from .index import Grid
-
-#: Sample neighborhoods that the shape thresholds are fitted to [B16 3.2.2].
-SAMPLES = 500
-
-#: Points hashed at a time when samples are drawn.
-SAMPLE_CHUNK = 1_000_000
 
 
 class FeatureEngine:
@@ -108,58 +103,51 @@ class FeatureEngine:
         """Fit what the plan needs and was not given: shape thresholds and the threshold of copt.
 
         Samples are the 500 points with the smallest hash of (seed, coordinates), so they do not depend on the
-        order of the points. Called by :meth:`blocks` when needed; a second call does nothing.
+        order of the points. Called by :meth:`blocks` when needed; a second call does nothing. For several clouds see
+        :func:`fitting.fit_clouds`.
 
         Raises
         ------
         StageError
             Where the cloud is empty, so that there is nothing to fit to.
         """
-        fixed, adaptive = self._prepared()
-        needs_copt = self.copt_threshold is None and adaptive is not None and adaptive.needs_copt
+        needs_copt = self.copt_threshold is None and self.plan.copt
         needs_bins = self.bins is None and self.plan.shapes
         if not (needs_copt or needs_bins):
             return self
         if not len(self):
             raise StageError("the cloud has no points to fit shape thresholds or copt to")
+        self._prepared()
         with self._lock:
             if needs_copt and self.copt_threshold is None:
-                assert adaptive is not None
-                self.copt_threshold = adaptive.fit_copt(self.threads)
+                from .ropt import curvature_threshold
+
+                self.copt_threshold = curvature_threshold(self.curvatures())
             if needs_bins and self.bins is None:
-                self.bins = self._fit_bins(fixed, adaptive)
+                from .bins import ShapeBins
+
+                self.bins = ShapeBins.fit(self.shape_values(smallest_hashes(self._cloud, self.seed)[1]))
         return self
 
-    def _fit_bins(self, fixed: FixedRadius, adaptive: AdaptiveNeighborhoods | None) -> ShapeBins:
-        from .bins import ShapeBins
+    def curvatures(self) -> np.ndarray:
+        """The curvature of every point, in the order of the index, (n,) float64 [H17 eq. 1]; for plans with copt."""
+        _, adaptive = self._parts or self._prepared()
+        assert adaptive is not None
+        return adaptive.curvatures(self.threads)
 
-        grid = self._grid
-        sample = self._sample()
-        points = (grid.x[sample], grid.y[sample], grid.z[sample])
+    def shape_values(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+        """Neighborhood token -> metrics of all pulls round some points of the cloud, (m, 5, 255) float32, comparable."""
+        fixed, adaptive = self._parts or self._prepared()
+        x, y, z = np.ascontiguousarray(self._cloud[rows].T)
         tokens = [c.neighborhood.token for c in self.plan.layout if c.shapes]
 
         def values(token: str) -> np.ndarray:
             if token in fixed.tokens:
-                return fixed.shape_values(token, points, self.seed)
+                return fixed.shape_values(token, (x, y, z), self.seed)
             assert adaptive is not None
-            return adaptive.shape_values(token, points, self.seed, self.copt_threshold)
+            return adaptive.shape_values(token, (x, y, z), self.seed, self.copt_threshold)
 
-        return ShapeBins.fit(dict(zip(tokens, map_blocks(values, tokens, self.threads), strict=True)))
-
-    def _sample(self) -> np.ndarray:
-        """Sorted positions of the SAMPLES points with the smallest hash; copies of a point count once."""
-        from .shapes import point_seeds
-
-        grid = self._grid
-        hashes, at = np.zeros(0, np.uint64), np.zeros(0, np.int64)
-        for start in range(0, len(grid), SAMPLE_CHUNK):
-            part = slice(start, start + SAMPLE_CHUNK)
-            more = point_seeds(grid.x[part], grid.y[part], grid.z[part], self.seed, "samples")
-            hashes = np.concatenate((hashes, more))
-            at = np.concatenate((at, np.arange(start, start + len(more))))
-            hashes, first = np.unique(hashes, return_index=True)
-            hashes, at = hashes[:SAMPLES], at[first[:SAMPLES]]
-        return np.sort(at)
+        return dict(zip(tokens, map_blocks(values, tokens, self.threads), strict=True))
 
     def _prepared(self) -> tuple[FixedRadius, AdaptiveNeighborhoods | None]:
         with self._lock:

@@ -190,6 +190,11 @@ class FeaturePlan:
         return max((int(n.parameters[-1]) for n in self.neighborhoods if n.reach is None), default=0)
 
     @property
+    def copt(self) -> bool:
+        """Whether a neighborhood is curvature-adaptive, so that its threshold is needed."""
+        return any(c.at and c.neighborhood.kind == "copt" for c in self.layout)
+
+    @property
     def unbounded(self) -> bool:
         """Whether a neighborhood's size is a number of points, so that no halo is sure to suffice."""
         return any(n.reach is None for n in self.neighborhoods)

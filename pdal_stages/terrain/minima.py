@@ -128,7 +128,11 @@ class MinimaTerrain:
         return out
 
     def _filled(self, keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Values of the cells `keys`; empty ones by inverse squared distance to the nearest filled ones."""
+        """Values of the cells `keys`; empty ones from the filled ones about as near as the nearest.
+
+        Weights are one over the fourth power of the distance between cell centres. [W18] does not say what becomes
+        of empty cells.
+        """
         place = np.minimum(np.searchsorted(self._keys, keys), self._keys.size - 1)
         values = self._minima[place].copy()
         empty = np.flatnonzero(self._keys[place] != keys)
@@ -145,7 +149,7 @@ class MinimaTerrain:
             for at, (centre, radius) in enumerate(zip(wanted_at, reach, strict=True)):
                 near = np.sort(tree.query_ball_point(centre, radius))
                 squared = ((filled_at[near] - centre) ** 2).sum(axis=1)
-                weight = 1.0 / squared**2
+                weight = 1.0 / squared**2  # distance to the fourth power
                 values[empty[at]] = np.dot(weight, self._minima[near]) / weight.sum()
             self.report["interpolated_cells"] = int(empty.size)
             self.report["farthest_fill"] = float(nearest.max() * self.cell)

@@ -1,0 +1,38 @@
+"""The points whose neighborhoods the shape thresholds are fitted to [B16 3.2.2]."""
+
+from __future__ import annotations
+
+import numpy as np
+
+#: Sample neighborhoods [B16 3.2.2].
+SAMPLES = 500
+
+#: Points hashed at a time.
+CHUNK = 1_000_000
+
+
+def smallest_hashes(xyz: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """The SAMPLES points with the smallest hash of (seed, coordinates); copies of a point count once.
+
+    Parameters
+    ----------
+    xyz : (n, 3) float64
+    seed : int
+
+    Returns
+    -------
+    hashes : (m,) uint64
+        Ascending.
+    rows : (m,) int64
+        Of the points.
+    """
+    from .shapes import point_seeds  # numba is loaded here, not when the package is
+
+    hashes, rows = np.zeros(0, np.uint64), np.zeros(0, np.int64)
+    for start in range(0, len(xyz), CHUNK):
+        part = np.asarray(xyz[start : start + CHUNK])
+        hashes = np.concatenate((hashes, point_seeds(*part.T, seed, "samples")))
+        rows = np.concatenate((rows, np.arange(start, start + len(part))))
+        hashes, first = np.unique(hashes, return_index=True)
+        hashes, rows = hashes[:SAMPLES], rows[first[:SAMPLES]]
+    return hashes, rows
