@@ -574,6 +574,6 @@ def test_a_failed_tile_is_crossed_out():
     jobs = [Job((0, 0), "0_0", 5, [], state="done", report=report)]
     jobs.append(Job((1, 0), "10_0", 5, [], state="failed", reason="<odd> & broken"))
     summary = {"tile": 10.0, "points": 5, "states": {"done": 1, "kept": 0, "failed": 1}, "classes": {}}
-    text = run_page(TiledRun(jobs, [], {}, [], summary).to_dict())
+    text = run_page(TiledRun(jobs, [], {}, [], [], summary).to_dict())
     assert text.count("<rect") == 2 and text.count('d="M1.2') == 1
     assert "&lt;odd&gt; &amp; broken" in text and "<odd>" not in text

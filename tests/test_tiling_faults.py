@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import resource
@@ -9,8 +10,10 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 import tiling_clouds as clouds
@@ -87,7 +90,6 @@ def check_same(folder: Path, expected: dict[str, bytes]) -> None:
 
 def test_killed_workers(tmp_path, folder):
     """One tile kills its worker once and is done again; one always does, is given up and listed."""
-    pytest.importorskip("distributed")
     flag = tmp_path / "killed"
     kill = f"""first = ins['X'].max() < 20 and not os.path.exists({str(flag)!r})
 if first:
@@ -221,9 +223,9 @@ def test_resume_does_only_what_changed(tmp_path, folder, expected):
 # ---- people ----------------------------------------------------------------------------------------------
 
 
-def stop_in_the_middle(tmp_path: Path, stages: list, workers: int, number: int, *flags: str) -> str:
+def stop_in_the_middle(tmp_path: Path, stages: list, workers_: int, number: int, *flags: str) -> str:
     """Start a run, send a signal when some tiles are done; what it wrote on standard error."""
-    flags = ("--workers", str(workers), *flags)
+    flags = ("--workers", str(workers_), *flags)
     done = tmp_path / ".pdal-stages" / "tiles"
     before = len(list(done.glob("*.json")))
     run = command(tmp_path / "job.json", stages, *flags, start_new_session=True)
@@ -231,20 +233,22 @@ def stop_in_the_middle(tmp_path: Path, stages: list, workers: int, number: int, 
     while len(list(done.glob("*.json"))) < before + 2:
         assert run.poll() is None and time.monotonic() < until, run.communicate()
         time.sleep(0.02)
+    workers = _children(run.pid)
     os.killpg(run.pid, number) if number == signal.SIGINT else run.send_signal(number)  # as a terminal does
     _, err = run.communicate(timeout=60)
     assert run.returncode == (-9 if number == signal.SIGKILL else 130), err
     assert not list(tmp_path.glob("o_*"))
     if number != signal.SIGKILL:
         assert "interrupted" in err and not clouds.hidden(tmp_path)
-        assert not _alive(run.pid)
+        assert "Traceback" not in err
+    assert not _alive(run.pid) and not any(map(_lives, workers))
     return err
 
 
-def test_ctrl_c_stops_the_workers_too(tmp_path, folder, expected):
-    pytest.importorskip("distributed")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_the_workers_stop_too(tmp_path, folder, expected, number):
     stages = pipeline(folder, tmp_path / "o_#.laz", python_filter("time.sleep(0.5)"))
-    stop_in_the_middle(tmp_path, stages, WORKERS, signal.SIGINT)
+    stop_in_the_middle(tmp_path, stages, WORKERS, number)
     run = run_tiled(stages, 20, workers=0, resume=True, buffer=0.0)
     assert not run.failures and run.summary["states"]["kept"] >= 2
     check_same(tmp_path, expected)
@@ -257,6 +261,27 @@ def test_killed_then_terminated_then_finished(tmp_path, folder, expected):
     run = run_tiled(stages, 20, workers=0, resume=True, buffer=0.0)
     assert not run.failures and run.summary["states"]["kept"] >= 4
     check_same(tmp_path, expected)
+
+
+def _children(parent: int) -> list[int]:
+    found = []
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            if int(status.read_text().rpartition(")")[2].split()[1]) == parent:
+                found.append(int(status.parent.name))
+    return found
+
+
+def _lives(process: int) -> bool:
+    """Whether a process still lives, after a moment's grace."""
+    for _ in range(100):
+        try:
+            if Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z":
+                return False
+        except OSError:
+            return False
+        time.sleep(0.1)
+    return True
 
 
 def _alive(group: int) -> bool:
@@ -309,3 +334,261 @@ def test_a_scheduler_that_runs_already(tmp_path, folder, expected):
         run = run_tiled(pipeline(folder, tmp_path / "o_#.laz"), 20, scheduler=cluster.scheduler_address)
     assert not run.failures and run.summary["workers"] == WORKERS
     check_same(tmp_path, expected)
+
+
+# ---- workers and what they listen to ----------------------------------------------------------------------
+
+
+def test_nothing_listens_and_nothing_is_imported_from_the_current_folder(tmp_path, folder):
+    """Neither the run nor its workers open a port, and modules that lie about are not taken for Python's own."""
+    here = tmp_path / "here"
+    here.mkdir()
+    for name in ("signal", "struct", "numpy", "laspy", "pickle", "pdal_stages"):
+        (here / f"{name}.py").write_text(f"open({str(tmp_path / 'taken')!r}, 'a').write('{name} ')\n")
+    look = f"""
+inodes = set()
+for process in (os.getpid(), os.getppid()):
+    for link in os.listdir(f'/proc/{{process}}/fd'):
+        try:
+            inodes.add(os.readlink(f'/proc/{{process}}/fd/{{link}}'))
+        except OSError:
+            pass
+for table in ('tcp', 'tcp6', 'udp', 'udp6'):
+    for line in open(f'/proc/self/net/{{table}}').readlines()[1:]:
+        if f'socket:[{{line.split()[9]}}]' in inodes:
+            open({str(tmp_path / "sockets")!r}, 'a').write(line)
+open({str(tmp_path / "looked")!r}, 'a').write('x')"""
+    stages = pipeline(folder, tmp_path / "o_#.laz", python_filter(look))
+    (here / "job.json").write_text(json.dumps(stages))
+    root = str(Path(__file__).resolve().parents[1])
+    program = f"import sys; sys.path[0] = {root!r}; from pdal_stages.cli import main; sys.exit(main())"
+    words = ["pipeline", "job.json", "--tile", "20", "--buffer", "0", "--workers", str(WORKERS)]
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(
+        [sys.executable, "-c", program, *words], cwd=here, capture_output=True, text=True, env=environment
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "looked").read_text() == "x" * 8
+    assert not (tmp_path / "sockets").exists() and not (tmp_path / "taken").exists()
+
+
+def test_workers_that_cannot_start(tmp_path, folder):
+    prepare = (
+        "import sys, pdal_stages.tiling.processes as p; before = p._command()\n"
+        "p._command = lambda: [*before[:-1], 'raise SystemExit(\"no room here\")']\n"
+        "from pdal_stages.cli import main; sys.exit(main())"
+    )
+    (tmp_path / "job.json").write_text(json.dumps(pipeline(folder, tmp_path / "o_#.laz")))
+    words = ["pipeline", str(tmp_path / "job.json"), "--tile", "20", "--workers", "1"]
+    done = subprocess.run([sys.executable, "-c", prepare, *words], capture_output=True, text=True)
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert "no room here" in done.stderr and "a worker process could not be started" in done.stderr
+    assert "--workers 0" in done.stderr
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("after", [0.5, 1.0, 2.0])
+def test_stopped_while_workers_start(tmp_path, folder, number, after):
+    run = command(
+        tmp_path / "job.json",
+        pipeline(folder, tmp_path / "o_#.laz", python_filter("time.sleep(5)")),
+        *("--workers", str(WORKERS)),
+        start_new_session=True,
+    )
+    until = time.monotonic() + 100
+    while not _children(run.pid):
+        assert run.poll() is None and time.monotonic() < until
+        time.sleep(0.01)
+    time.sleep(after / 4)
+    workers = _children(run.pid)
+    os.killpg(run.pid, number)
+    _, err = run.communicate(timeout=60)
+    assert run.returncode == 130 and "Traceback" not in err and len(err.splitlines()) < 5, err
+    assert not any(map(_lives, workers)) and not clouds.hidden(tmp_path)
+
+
+# ---- what a run keeps -------------------------------------------------------------------------------------
+
+
+def test_damaged_notes_are_not_believed(tmp_path, folder, expected):
+    """Whatever is cut or changed of what a run keeps, --resume gives the same files."""
+    stages = pipeline(folder, tmp_path / "o_#.laz")
+    run_tiled(stages, 20, workers=0)
+    store = tmp_path / ".pdal-stages"
+    kept = [p for p in sorted(store.rglob("*")) if p.is_file() and p.name != "lock"]
+    assert {p.suffix for p in kept} == {".json", ".jsonl"}
+    rng = np.random.default_rng(0)
+    for change in ("cut", "flip", "empty", "other", "folder"):
+        for path in kept:
+            if not path.is_file():
+                continue
+            data = bytearray(path.read_bytes())
+            if change == "cut":
+                path.write_bytes(data[: len(data) // 2])
+            elif change == "flip":
+                data[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))
+                path.write_bytes(data)
+            elif change == "empty":
+                path.write_bytes(b"")
+            elif change == "other":
+                path.write_bytes(b'[{"fingerprint": 3}, null, 1e999]')
+            else:
+                path.unlink()
+                path.mkdir()
+        for name in expected:
+            (tmp_path / f"o_{name}.laz").unlink(missing_ok=True)
+        run = run_tiled(stages, 20, workers=0, resume=True)
+        assert not run.failures
+        check_same(tmp_path, expected)
+
+
+@pytest.mark.parametrize("change", ["cut", "flip", "gone"])
+def test_damaged_results_are_made_anew(tmp_path, folder, expected, change):
+    stages = pipeline(folder, tmp_path / "o_#.laz", python_filter("time.sleep(0.3)"))
+    stop_in_the_middle(tmp_path, stages, 0, signal.SIGKILL)
+    results = sorted((tmp_path / ".pdal-stages" / "tiles").glob("*.npz"))
+    assert len(results) >= 2
+    data = bytearray(results[0].read_bytes())
+    if change == "gone":
+        results[0].unlink()
+    elif change == "cut":
+        results[0].write_bytes(data[: len(data) // 2])
+    else:
+        with zipfile.ZipFile(results[0]) as archive:
+            largest = max(archive.infolist(), key=lambda member: member.file_size)
+        data[largest.header_offset + largest.file_size] ^= 1
+        results[0].write_bytes(data)
+    run = run_tiled(stages, 20, workers=0, resume=True, buffer=0.0)
+    if change == "flip":  # found when it is read, not before
+        assert run.failures and "cannot be read back" in run.failures[0][1]
+        run = run_tiled(stages, 20, workers=0, resume=True, buffer=0.0)
+    assert not run.failures
+    check_same(tmp_path, expected)
+
+
+def test_links_in_place_of_the_runs_own_folders(tmp_path, folder):
+    """Nothing is removed, locked or written where a link leads to."""
+    precious = tmp_path / "precious"
+    for name in ("tiles", "index", "scratch"):
+        (precious / name).mkdir(parents=True)
+        (precious / name / "file").write_text("mine")
+    (precious / "lock").write_text("mine")
+    (precious / "files.jsonl").write_text("mine")
+    before = {p: p.read_text() for p in precious.rglob("*") if p.is_file()}
+    stages = pipeline(folder, tmp_path / "o_#.laz")
+    store = tmp_path / ".pdal-stages"
+    store.symlink_to(precious)
+    with pytest.raises(StageError, match="is a link or a file"):
+        run_tiled(stages, 20, workers=0)
+    store.unlink()
+    for name in ("tiles", "index"):
+        store.mkdir(exist_ok=True)
+        (store / name).symlink_to(precious / name)
+        with pytest.raises(StageError, match="is a link or a file"):
+            run_tiled(stages, 20, workers=0)
+        (store / name).unlink()
+    for name in ("lock", "files.jsonl"):
+        (store / name).symlink_to(precious / name)
+        with contextlib.suppress(StageError):
+            run_tiled(stages, 20, workers=0, resume=True)
+        (store / name).unlink(missing_ok=True)
+    (store / "scratch").symlink_to(precious / "scratch")
+    assert not run_tiled(stages, 20, workers=0).failures
+    assert {p: p.read_text() for p in precious.rglob("*") if p.is_file()} == before
+
+
+# ---- what changes meanwhile, or between two runs ----------------------------------------------------------
+
+
+def test_an_input_replaced_by_one_of_the_same_size_and_time(tmp_path, folder):
+    inputs = tmp_path / "in"
+    inputs.mkdir()
+    for path in folder.glob("*.laz"):
+        las = laspy.read(path)
+        las.write(inputs / f"{path.stem}.las")
+    stages = pipeline(inputs, tmp_path / "o_#.las")
+    stages[0]["filename"] = str(inputs / "*.las")
+    run_tiled(stages, 20, workers=0)
+    path = inputs / "west.las"
+    status, las = path.stat(), laspy.read(path)
+    las.z = np.asarray(las.z) + 1
+    las.write(path)
+    assert path.stat().st_size == status.st_size
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+    again = run_tiled(stages, 20, workers=0, resume=True)
+    assert again.summary["states"]["done"] >= 4
+    (tmp_path / "link").hardlink_to(path)  # as programs that make backups do
+    path.chmod(0o600)
+    again = run_tiled(stages, 20, workers=0, resume=True)
+    assert again.summary["states"] == {"done": 0, "kept": 8, "failed": 0}
+
+
+def test_a_far_input_that_a_widened_tile_read(tmp_path, write_las):
+    """A tile is done again when anything changed that was read for it, farther away than its usual surroundings too."""
+    rng = np.random.default_rng(2)
+    for name, x0 in (("a", 0.0), ("b", 60.0), ("c", 120.0)):
+        xyz = rng.uniform(0, 1, (60, 3)) * (59.9, 60, 5) + (x0, 0, 0)
+        write_las(tmp_path / f"{name}.las", dict(zip("XYZ", xyz.T, strict=True)))
+    features = {
+        "type": "filters.multiscalefeatures",
+        "neighborhoods": "kopt(10,80)",
+        "feature_set": "Linearity",
+    }
+    writer = {"type": "writers.las", "filename": str(tmp_path / "o_#.las"), "extra_dims": "all"}
+    stages = [{"type": "readers.las", "filename": str(tmp_path / "?.las")}, features, writer]
+    first = run_tiled(stages, 60, workers=0)
+    wide = {job.name: job.report["buffer"] for job in first.tiles}
+    assert wide["0_0"] > 60, wide  # which reaches c
+    xyz = rng.uniform(0, 1, (60, 3)) * (59.9, 60, 5) + (120, 0, 0)
+    write_las(tmp_path / "c.las", dict(zip("XYZ", xyz.T, strict=True)))
+    again = run_tiled(stages, 60, workers=0, resume=True)
+    got = {path.name: path.read_bytes() for path in tmp_path.glob("o_*.las")}
+    assert {job.name: job.state for job in again.tiles}["0_0"] == "done"
+    run_tiled(stages, 60, workers=0)
+    assert got == {path.name: path.read_bytes() for path in tmp_path.glob("o_*.las")}
+
+
+def test_a_file_that_pdals_own_stages_read(tmp_path, folder):
+    polygons = tmp_path / "p.geojson"
+
+    def write(code):
+        square = [[[-1, -1], [99, -1], [99, 99], [-1, 99], [-1, -1]]]
+        feature = {
+            "type": "Feature",
+            "properties": {"c": code},
+            "geometry": {"type": "Polygon", "coordinates": square},
+        }
+        polygons.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+
+    overlay = {
+        "type": "filters.overlay",
+        "dimension": "Classification",
+        "datasource": str(polygons),
+        "column": "c",
+    }
+    stages = pipeline(folder, tmp_path / "o_#.laz", overlay)
+    for code, done in ((5, 2), (None, 0), (6, 2)):
+        if code is not None:
+            write(code)
+        run = run_tiled(stages, 20, workers=0, resume=True)
+        assert not run.failures and sum(o.state == "done" for o in run.outputs) == done
+        assert (np.asarray(laspy.read(tmp_path / "o_west.laz").classification) == (code or 5)).all()
+
+
+def test_a_file_that_changes_during_the_run_is_told(tmp_path, folder):
+    """Outputs may then be made of both; a later run makes them anew."""
+    inputs = tmp_path / "in"
+    inputs.mkdir()
+    for path in folder.glob("*.laz"):
+        (inputs / path.name).write_bytes(path.read_bytes())
+    flag, east = tmp_path / "flag", inputs / "east.laz"
+    change = f"""if not os.path.exists({str(flag)!r}):
+    open({str(flag)!r}, 'w').close()
+    os.utime({str(east)!r}, (1, 1))"""
+    run = run_tiled(pipeline(inputs, tmp_path / "o_#.laz", python_filter(change)), 20, workers=0, buffer=0.0)
+    assert [what for what, _ in run.failures] == [str(east)]
+    assert "changed while it was worked on" in run.failures[0][1] and "--resume" in run.failures[0][1]
+    run = run_tiled(
+        pipeline(inputs, tmp_path / "o_#.laz", python_filter(change)), 20, workers=0, buffer=0.0, resume=True
+    )
+    assert not run.failures and run.summary["states"]["done"] >= 4

@@ -69,8 +69,8 @@ def names(what: str, value: Any) -> tuple[str, ...]:
     """Names, each once, from a list or from text with commas. See :func:`whole`."""
     if isinstance(value, str):
         value = [part.strip() for part in value.split(",") if part.strip()]
-    found = list(value) if isinstance(value, Iterable) else [None]
-    if not all(isinstance(name, str) for name in found):
+    found = list(value) if isinstance(value, Iterable) else None
+    if found is None or not all(isinstance(name, str) for name in found):
         raise OptionError(f"{what} must be a list of names", found=_shown(value))
     return tuple(dict.fromkeys(found))
 

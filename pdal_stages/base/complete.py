@@ -166,7 +166,13 @@ def _sbet(file: BinaryIO, size: int, count: int | None, writer: Mapping[str, Any
 
 def _gltf(file: BinaryIO, size: int, count: int | None, writer: Mapping[str, Any]) -> bool:
     magic, length = struct.unpack("<4s4xI", file.read(12))
-    return magic == b"glTF" and length == size
+    at, kinds = 12, []
+    while at < size:
+        file.seek(at)
+        long, kind = struct.unpack("<I4s", file.read(8))
+        at += 8 + long
+        kinds.append(kind)
+    return magic == b"glTF" and length == size == at and kinds == [b"JSON", b"BIN\0"]
 
 
 def _header(file: BinaryIO, end: bytes) -> list[list[bytes]]:

@@ -6,6 +6,7 @@ end the process. What a header says is therefore held against the size of the fi
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 import struct
@@ -309,3 +310,28 @@ def odd_text(path: str | os.PathLike) -> tuple[str, bytes] | None:
         except UnicodeDecodeError:
             return what, text
     return None
+
+
+def projection(path: str | os.PathLike) -> str:
+    """A digest of the records that hold a file's spatial reference; empty where it has none.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be read.
+    """
+    header = read_header(path)
+    if header is None:
+        return ""
+    digest, found = hashlib.sha256(), False
+    with open(path, "rb") as file:
+        for record in islice(_records(file, header), _MOST_RECORDS):
+            if record.user == b"LASF_Projection" and record.length <= _LARGEST_RECORD:
+                file.seek(record.data)
+                digest.update(struct.pack("<HQ", record.number, record.length) + file.read(record.length))
+                found = True
+    return digest.hexdigest()[:16] if found else ""
+
+
+#: Records that are looked through for a spatial reference, and bytes of one.
+_MOST_RECORDS, _LARGEST_RECORD = 10_000, 1 << 20

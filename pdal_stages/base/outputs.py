@@ -41,20 +41,21 @@ def check_outputs(outputs: Iterable[Output], inputs: Iterable[str | os.PathLike]
     StageError
         Naming the output.
     """
-    read = {identity: os.fspath(path) for path in inputs if (identity := _identity(path)) is not None}
+    read = {identity: os.fspath(path) for path in inputs if (identity := _identity(path))}
     names = [Path(os.path.realpath(path)) for path in read.values()]
-    seen: dict[object, Output] = {}
+    seen: dict[tuple[int, int] | Path, Output] = {}
     for output in outputs:
         check_writable(output.path, output.what, output.kind)
         if is_stream(output.path):
             continue
         real = Path(os.path.realpath(output.path))
-        one = _identity(output.path) or real
-        hit = read.get(one) or _numbered(real, names)
+        identity = _identity(output.path)
+        hit = (identity and read.get(identity)) or _numbered(real, names)
         if hit is not None:
             raise StageError(
                 f"the {output.what} file is one of the inputs", found=str(hit), cure="Give it another name"
             )
+        one = identity or real
         if one in seen:
             raise StageError(
                 f"the {output.what} file is the {seen[one].what} file too"

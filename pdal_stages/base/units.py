@@ -124,6 +124,11 @@ class WktNode:
                     return found
         return None
 
+    def code(self) -> str:
+        """The authority's code of this element, as ``EPSG:25832``; empty where it has none."""
+        codes = [c.values[:2] for c in self.children if c.keyword in ("AUTHORITY", "ID") and c.values[1:]]
+        return ":".join(codes[-1]) if codes else ""
+
     def factor(self) -> float | None:
         try:
             value = float(self.values[1])
@@ -174,7 +179,4 @@ def name_of_wkt(wkt: str) -> str:
     root = parse_wkt(wkt)
     if root is None:
         return ""
-    codes = [
-        ":".join(c.values[:2]) for c in root.children if c.keyword in ("AUTHORITY", "ID") and c.values[1:]
-    ]
-    return f"{root.name} ({codes[-1]})" if codes else root.name
+    return f"{root.name} ({code})" if (code := root.code()) else root.name

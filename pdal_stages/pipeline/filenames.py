@@ -38,8 +38,15 @@ def named_files(stages: list[dict[str, Any]]) -> list[str]:
         own = ("filename",) if is_writer(stage, stages) else ()
         for name, value in stage.items():
             if name not in (*_NO_FILES, *own):
-                found += [text for text in _texts(value) if _is_file(text)]
+                found += [file for text in _texts(value) if _is_file(text) for file in _parts(text)]
     return found
+
+
+def _parts(name: str) -> list[str]:
+    """A file and those beside it that belong to it: a Shapefile is several."""
+    stem, suffix = os.path.splitext(name)
+    others = (".dbf", ".shx", ".prj", ".cpg") if suffix.lower() == ".shp" else ()
+    return [name, *(stem + other for other in others if os.path.isfile(stem + other))]
 
 
 def _texts(value: Any) -> Iterator[str]:

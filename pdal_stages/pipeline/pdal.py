@@ -107,12 +107,18 @@ def execute(stages: list[dict[str, Any]], *, arrays: bool = True) -> Execution:
     finally:
         # A stage that raises leaves sys.stdout pointing into PDAL's log.
         sys.stdout = stdout
+    log = str(pipeline.log or "")
+    if failed := _FAILED_WRITER.search(log):  # after which PDAL goes on
+        raise PipelineError("an output file could not be written", found=": ".join(failed.groups()))
     return Execution(
         count=int(count),
         metadata=_metadata(pipeline),
         arrays=list(pipeline.arrays) if arrays else [],
-        log=str(pipeline.log or ""),
+        log=log,
     )
+
+
+_FAILED_WRITER = re.compile(r"(writers\.\w+) Error\) (GDAL failure.*)")
 
 
 def python_object(stage: dict[str, Any], shown: str = ""):
@@ -177,17 +183,20 @@ def _metadata(pipeline) -> dict[str, Any]:
 def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Stages that this PDAL knows: before 2.4 a COPC file is read as the LAZ file that it is too.
 
+    Where nothing says otherwise, writers are told the file source identifier, 0: old PDAL writes what its memory held.
+
     Raises
     ------
     PipelineError
         If only a reader of COPC could do what its options ask for.
     """
-    copc = any(isinstance(stage, dict) and stage.get("type") == "readers.copc" for stage in stages)
-    if not copc or version() >= (2, 4, 0):
+    if version() >= (2, 4, 0):
         return stages
     out = []
     for stage in stages:
-        if isinstance(stage, dict) and stage.get("type") == "readers.copc":
+        if isinstance(stage, dict) and stage.get("type") == "writers.las" and "forward" not in stage:
+            stage = {"filesource_id": 0, **stage}
+        elif isinstance(stage, dict) and stage.get("type") == "readers.copc":
             beyond = [name for name in stage if name in _COPC_OPTIONS]
             if beyond:
                 raise PipelineError(

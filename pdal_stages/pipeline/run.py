@@ -22,6 +22,7 @@ from .interrupts import gentle
 from .lowering import Lowered, lower
 from .overrides import Override, apply_overrides
 from .read import PipelineSource, read_pipeline
+from .references import check_readers
 
 
 class Pipeline:
@@ -154,6 +155,11 @@ class Pipeline:
         self.remarks += [
             r for path in readers_files(self.lowered.stages, las=True) if (r := check_readable(path))
         ]
+        ours = [lowered.stage for lowered in self.lowered.ours]
+        if ours:
+            check_readers(
+                self.lowered.stages, next((s.horizontal_unit for s in ours if s.horizontal_unit), "")
+            )
 
     def _located(self, error: StageError) -> StageError:
         """PDAL's words, with the line of the stage that they name and the nearest stage there is."""

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base import kinds
+from ..base import kinds, strictjson
 from ..base.errors import OptionError, StageError
 from ..base.outputs import Output
 from ..base.progress import Progress
@@ -183,14 +183,15 @@ def _read_bins(path: str | None) -> tuple[ShapeBins | None, float | None]:
     if path is None or not Path(path).exists():
         return None, None
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-        threshold = content.get("copt_threshold")
-        bins = content.get("bins")
+        content = strictjson.loads(Path(path).read_bytes())
+        if missing := {"bins", "copt_threshold"} - set(content):
+            raise ValueError(f"without {' and '.join(sorted(missing))}")
+        bins, threshold = content["bins"], content["copt_threshold"]
         return (
             ShapeBins.from_dict(bins) if bins is not None else None,
             None if threshold is None else float(threshold),
         )
-    except (OSError, ValueError, AttributeError, TypeError, KeyError) as error:
+    except (OSError, ValueError, AttributeError, TypeError, KeyError, RecursionError) as error:
         raise OptionError(
             f"option 'bins': '{path}' is not a file of thresholds written by this stage",
             found=str(error),

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
+import errno
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +61,7 @@ def write_town(town: Town | TownOptions, path: str | os.PathLike, *, threads=Non
     compress = target.suffix.lower() == ".laz"
     with (
         whole_files(target) as (part,),
+        _plain_errors(),
         laspy.open(part, mode="w", header=header, do_compress=compress) as writer,
     ):
         for piece in pieces:
@@ -74,3 +78,14 @@ def write_town(town: Town | TownOptions, path: str | os.PathLike, *, threads=Non
             cure = "Give a larger 'size' or 'density'"
             raise StageError("no pulse hit this town", where="synthetic", cure=cure)
     return {int(code): int(counts[code]) for code in np.flatnonzero(counts)}
+
+
+@contextlib.contextmanager
+def _plain_errors() -> Iterator[None]:
+    """The compressor says with an error of its own that it could not write."""
+    import lazrs
+
+    try:
+        yield
+    except lazrs.LazrsError as error:
+        raise OSError(errno.EIO, str(error)) from None

@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
-from collections.abc import Callable
 
 from ..base.errors import StageError
 from ..base.progress import Progress
 from .outcome import Job, Output
 from .pool import Pool, last_tries
 from .store import Store
-from .work import Task
+from .worklist import Worklist
 
 #: A run stops when so many tiles failed for one reason and none succeeded.
 _HOPELESS = 10
 
 
-def run_all(
-    jobs: list[Job],
-    outputs: list[Output],
-    task_of: Callable[[Job | Output], Task],
-    store: Store,
-    pool: Pool,
-    retries: int,
-    show: bool | None,
-) -> None:
+def run_all(work: Worklist, store: Store, pool: Pool, retries: int, show: bool | None) -> None:
     """Do all waiting tiles and outputs; their states, reports and reasons are set.
 
     Raises
@@ -32,24 +24,25 @@ def run_all(
     StageError
         If the first tiles all fail for one reason.
     """
+    jobs = work.jobs
     waiting: deque[Job | Output] = deque(job for job in jobs if job.state == "waiting")
     done = good = sum(job.state == "kept" for job in jobs)
     failures: list[str] = []
     users: dict[tuple[int, int], list[Output]] = {}
-    for out in outputs:
+    for out in work.outputs:
         for job in out.jobs:
             users.setdefault(job.tile, []).append(out)
         _make_ready(out, waiting)
     total = sum(item.points for item in waiting if isinstance(item, Job))
     with Progress(total, f"{done} of {len(jobs)} tiles", enabled=show) as progress:
-        for item, answer in last_tries(pool, waiting, task_of, retries):
+        for item, answer in last_tries(pool, waiting, work.tasks(store, pool.threads), retries):
             if answer.reason:
                 item.state, item.reason = "failed", answer.reason
             else:
                 item.state, item.report = "done", answer.result | answer.cost
+                with contextlib.suppress(StageError, OSError):  # no room: a later run does it again
+                    work.keep(store, item)
             if isinstance(item, Output):
-                if not answer.reason:
-                    store.wrote(item.source.key, item.mark, item.report)
                 continue
             done += 1
             progress.label = f"{done} of {len(jobs)} tiles"
@@ -60,8 +53,6 @@ def run_all(
                 failures.append(answer.reason)
             else:
                 good += 1
-                if item.outputs is not None:
-                    store.wrote(item.name, item.mark, item.report)
             if not good and len(failures) >= _HOPELESS and len(set(failures)) == 1:
                 raise StageError(
                     f"the first {len(failures)} tiles all failed for one reason, so the run was stopped",

@@ -50,7 +50,7 @@ def estimate(plan: TilePlan, survey: Survey, options: TilingOptions) -> TiledRun
         "core_hours": count / _RATE / 3600,
         "states": {"waiting": len(listed)},
     }
-    return TiledRun(listed, [], survey.unreadable, survey.notes, summary)
+    return TiledRun(listed, [], survey.unreadable, [], survey.notes, summary)
 
 
 def estimate_memory(read: int, count: int, files: int) -> float:

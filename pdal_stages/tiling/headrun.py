@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import PipelineError, StageError
 from ..base.las import read_header
 from ..pipeline.callbacks import Callbacks
@@ -63,7 +64,6 @@ class HeadRun:
     """What a run of the head gave; `need`: the metres of surroundings that it took."""
 
     results: list[PieceResults]
-    legacy: bool
     need: float
 
 
@@ -72,15 +72,17 @@ def run_head(
 ) -> HeadRun:
     """Run the head once; `everything`: all inputs were read, so nothing can lie farther away."""
     if not recipe.head:
-        return HeadRun([PieceResults(source, piece, piece.own, {}) for source, piece in cuts], False, 0.0)
-    originals: dict[int, Mapping[str, NDArray]] | None = {} if recipe.creates is None else None
+        return HeadRun([PieceResults(source, piece, piece.own, {}) for source, piece in cuts], 0.0)
+    marks = [_Mark(number, piece, recipe) for number, (_, piece) in enumerate(cuts)]
+    old = [mark.old_format for mark in marks]
+    for mark in marks:
+        mark.mixed = any(old) and not all(old)
     reaches: dict[int, _Reach] = {}
     with Callbacks() as callbacks:
         stages: list[dict[str, Any]] = []
         for number, (source, piece) in enumerate(cuts):
             reader = {**source.reader, "type": "readers.las", "filename": piece.path, "tag": f"in{number}"}
-            mark = _marking(number, piece, recipe.unit, originals)
-            marked = callbacks.filter(mark, _MARK_TYPES, inputs=[f"in{number}"], tag=f"mark{number}")
+            marked = callbacks.filter(marks[number], _MARK_TYPES, inputs=[f"in{number}"], tag=f"mark{number}")
             stages += [reader, marked]
         inputs = {"inputs": [f"mark{number}" for number in range(len(cuts))]}
         for given, later in zip(recipe.head, recipe.later, strict=True):
@@ -99,29 +101,60 @@ def run_head(
             if ours.number in reaches:
                 reaches[ours.number].stage = ours.stage
         pipeline.execute(arrays=True)
-    results, legacy = _collect(pipeline.arrays, cuts, recipe.creates, originals)
+    results = _collect(pipeline.arrays, cuts, recipe.creates, marks)
     need = max((reach.need for reach in reaches.values()), default=0.0)
     if not everything and any(_looked_far(r) for _, reports in pipeline.reports for r in reports):
         most = max(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
         need = max(need, _far_neighbors(pipeline.arrays, most, recipe, tile))
-    return HeadRun(results, legacy, need)
+    return HeadRun(results, need)
 
 
-def _marking(number: int, piece: Piece, unit: float, originals: dict[int, Mapping[str, NDArray]] | None):
-    """A function that numbers a reader's points, and keeps what they were where changes are to be found later."""
-    margin = np.where(piece.margin < 0, -1.0, piece.margin * unit)
+class _Mark:
+    """Numbers a reader's points, and keeps what they were where changes are to be found later.
 
-    def mark(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+    Old PDAL reads the flags of LAS 1.0 to 1.3 as bits of the class. Beside a file of LAS 1.4, whose flags it reads apart,
+    stages could not tell: the bits are then taken off, and put back into the results.
+
+    Attributes
+    ----------
+    old_format : bool
+        Whether the file's point format is one of LAS 1.0 to 1.3.
+    mixed : bool
+        Whether there are others beside it.
+    holds_flags : bool
+        Whether class codes of the results hold flags.
+    original : dict of str to ndarray
+        Dimensions of the tile's own points.
+    """
+
+    def __init__(self, number: int, piece: Piece, recipe: Recipe) -> None:
+        self.number, self.piece, self.keep = number, piece, recipe.creates is None
+        self.margin = np.where(piece.margin < 0, -1.0, piece.margin * recipe.unit)
+        header = read_header(piece.path)
+        self.old_format = header is not None and header.point_format <= 5
+        self.mixed = self.holds_flags = False
+        self.original: dict[str, NDArray] = {}
+        self._flags: NDArray[np.uint8] | None = None
+
+    def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
         count = len(ins["X"])
-        if count != len(margin):
-            raise StageError(f"the reader gave {count:,} points of {len(margin):,}")
+        if count != len(self.margin):
+            raise StageError(f"the reader gave {count:,} points of {len(self.margin):,}")
         outs[ROW] = np.arange(count, dtype=np.uint32)
-        outs[SOURCE] = np.full(count, number, np.uint32)
-        outs[MARGIN] = margin
-        if originals is not None:
-            originals[number] = {name: v[piece.own] for name, v in ins.items() if name not in _MARK_TYPES}
+        outs[SOURCE] = np.full(count, self.number, np.uint32)
+        outs[MARGIN] = self.margin
+        if self.keep:
+            self.original = {name: v[self.piece.own] for name, v in ins.items() if name not in _MARK_TYPES}
+        self.holds_flags = self.old_format and not {"Synthetic", "Withheld"} & set(ins)
+        if self.holds_flags and self.mixed:
+            codes = ins["Classification"]
+            self._flags = codes[self.piece.own] & ~np.uint8(LEGACY_LIMIT)
+            outs["Classification"] = codes & np.uint8(LEGACY_LIMIT)
 
-    return mark
+    def put_flags_back(self, rows: NDArray[np.int64], values: dict[str, NDArray]) -> None:
+        """Give new class codes of some rows the flags that were taken off."""
+        if self._flags is not None and "Classification" in values:
+            values["Classification"] |= self._flags[np.searchsorted(self.piece.own, rows)]
 
 
 class _Reach:
@@ -145,14 +178,10 @@ def _collect(
     arrays: list[NDArray],
     cuts: list[tuple[Source, Piece]],
     creates: list[str] | None,
-    originals: dict[int, Mapping[str, NDArray]] | None,
-) -> tuple[list[PieceResults], bool]:
-    """Results of the tile's own points, sorted as their pieces are; whether class codes hold flag bits."""
+    marks: list[_Mark],
+) -> list[PieceResults]:
+    """Results of the tile's own points, sorted as their pieces are."""
     names = [n for a in arrays[:1] for n in a.dtype.names or ()]
-    headers = [read_header(piece.path) for _, piece in cuts]
-    legacy = not {"Synthetic", "Withheld", "ClassFlags"} & set(names) and all(
-        header is not None and header.point_format <= 5 for header in headers
-    )
     if creates is None:
         names = [n for n in names if n not in _MARK_TYPES]
     else:
@@ -169,13 +198,16 @@ def _collect(
                 cure="Run the pipeline without --tile",
             )
         values = {name: np.concatenate([a[name][at] for a, at in mine])[order] for name in names}
-        results.append(PieceResults(source, piece, rows, values))
-    if originals is not None:
+        marks[number].put_flags_back(rows, values)
+        results.append(PieceResults(source, piece, rows, values, marks[number].holds_flags))
+    if creates is None:
         for name in names:
-            if not any(_changed(result, name, originals[n]) for n, result in enumerate(results)):
+            if not any(
+                _changed(result, name, mark.original) for result, mark in zip(results, marks, strict=True)
+            ):
                 for result in results:
                     del result.values[name]
-    return results, legacy
+    return results
 
 
 def _changed(result: PieceResults, name: str, original: Mapping[str, NDArray]) -> bool:

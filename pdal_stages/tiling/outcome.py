@@ -24,8 +24,6 @@ class Job:
         Inputs that may hold points of it or its surroundings.
     outputs : list of str, optional
         What the writers write, where each tile is an output.
-    mark : str
-        Fingerprint of all that decides its result.
     state : str
         ``waiting``, ``done``, ``kept`` (from an earlier run) or ``failed``.
     report : dict
@@ -41,7 +39,6 @@ class Job:
     points: int
     sources: list[Source]
     outputs: list[str] | None = None
-    mark: str = ""
     state: str = "waiting"
     report: dict[str, Any] = field(default_factory=dict)
     reason: str = ""
@@ -56,12 +53,17 @@ class Output:
     source: Source
     paths: list[str]
     jobs: list[Job] = field(default_factory=list)
-    mark: str = ""
     state: str = "waiting"
     report: dict[str, Any] = field(default_factory=dict)
     reason: str = ""
     blocked_by: str = ""
     tries: int = 0
+
+
+_CHANGED = (
+    "it changed while it was worked on, so outputs may hold results from before and after. Once it stays as it is, "
+    "run it again with --resume"
+)
 
 
 @dataclass
@@ -75,6 +77,8 @@ class TiledRun:
         Empty where each tile is an output.
     unreadable : dict of str to str
         Inputs that could not be read, and why.
+    changed : list of str
+        Files that changed while they were worked on.
     notes : list of str
         What the user should know.
     summary : dict
@@ -84,6 +88,7 @@ class TiledRun:
     tiles: list[Job]
     outputs: list[Output]
     unreadable: dict[str, str]
+    changed: list[str]
     notes: list[str]
     summary: dict[str, Any]
 
@@ -95,6 +100,7 @@ class TiledRun:
             for path, reason in self.unreadable.items()
         ]
         failed = [(f"tile {job.name}", job) for job in self.tiles] + [(o.paths[0], o) for o in self.outputs]
+        found += [(path, _CHANGED) for path in self.changed]
         return found + [
             (what, item.reason) for what, item in failed if item.state == "failed" and not item.blocked_by
         ]

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import contextlib
+import zipfile
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +32,15 @@ class PieceResults:
         Rows of the piece that came out, ascending.
     values : dict of str to (n,) ndarray
         New values of dimensions.
+    holds_flags : bool
+        Whether class codes hold the flag bits of LAS 1.0-1.3.
     """
 
     source: Source
     piece: Piece
     rows: NDArray[np.int64]
     values: dict[str, NDArray]
+    holds_flags: bool = False
 
 
 @dataclass(frozen=True)
@@ -62,12 +69,12 @@ def of_own_points(result: PieceResults) -> NewValues:
     return NewValues(kept, {name: (at, values) for name, values in result.values.items()})
 
 
-def class_counts(results: Iterable[PieceResults], legacy: bool) -> dict[str, int]:
+def class_counts(results: Iterable[PieceResults]) -> dict[str, int]:
     """Number of points of each class; without the flag bits of LAS 1.0-1.3 where these are inside."""
     counts = np.zeros(256, np.int64)
     for result in results:
         codes = np.asarray(result.values.get("Classification", ()), np.uint8)
-        counts += np.bincount(codes & LEGACY_LIMIT if legacy else codes, minlength=256)
+        counts += np.bincount(codes & LEGACY_LIMIT if result.holds_flags else codes, minlength=256)
     return {str(code): int(counts[code]) for code in np.flatnonzero(counts)}
 
 
@@ -83,6 +90,21 @@ def save(path: str | Path, results: Iterable[PieceResults]) -> None:
         np.savez(partial, **content)  # type: ignore[arg-type]
 
 
+@contextlib.contextmanager
+def _opened(name: str) -> Iterator[Any]:
+    """The results in a file; one that cannot be read is removed, so that a later run makes it anew."""
+    try:
+        with np.load(name, allow_pickle=False) as tile:
+            yield tile
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        Path(name).unlink(missing_ok=True)
+        raise StageError(
+            "the results of a tile cannot be read back, and were removed",
+            found=f"{Path(name).name}: {error}",
+            cure="Run it again with --resume",
+        ) from error
+
+
 def read_range(tiles: Iterable[str], source: Source, count: int, start: int, end: int) -> NewValues:
     """Results of points `start` to `end` of a file with `count` points, out of the files of its tiles.
 
@@ -96,7 +118,7 @@ def read_range(tiles: Iterable[str], source: Source, count: int, start: int, end
     seen = 0
     columns: dict[str, list[tuple[NDArray, NDArray]]] = {}
     for name in tiles:
-        with np.load(name, allow_pickle=False) as tile:
+        with _opened(name) as tile:
             if f"{prefix}index" not in tile:
                 continue
             index = tile[f"{prefix}index"]  # ascending

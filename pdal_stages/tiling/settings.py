@@ -21,7 +21,7 @@ class TilingOptions:
     tile : float
         Side of a tile, in the unit of the coordinates.
     workers : int, optional
-        Worker processes; 0 works in this process, without Dask. Default: one for every two cores.
+        Worker processes; 0 works in this process. Default: one for every two cores.
     scheduler : str
         Address of a running Dask scheduler (``tcp://host:8786``) instead of processes on this machine.
     per : str

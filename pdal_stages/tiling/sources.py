@@ -12,6 +12,7 @@ from typing import Any
 
 from ..base import las, strictjson
 from ..base.errors import PipelineError, StageError
+from ..base.stamps import NONE, stamp
 from .grid import Box
 from .tindex import locations
 
@@ -55,15 +56,9 @@ class Source:
                 return name[: -len(suffix)]
         return Path(name).stem
 
-    def stamp(self) -> list[int]:
-        """Size and time of change, which tell whether an input is still the same."""
-        if "://" in self.path:
-            return [0, 0]
-        try:
-            stat = os.stat(self.path)
-        except OSError:
-            return [-1, -1]
-        return [stat.st_size, stat.st_mtime_ns]
+    def stamp(self) -> list[Any]:
+        """What tells whether an input is still the same; see :func:`pdal_stages.base.stamps.stamp`."""
+        return NONE if "://" in self.path else stamp(self.path)
 
     def within(self, box: Box) -> dict[str, Any]:
         """The reader of an EPT source for a box alone."""

@@ -8,11 +8,13 @@ import json
 import os
 import shutil
 import socket
+import stat
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
+from ..base import strictjson
 from ..base.errors import StageError
 from ..base.files import try_lock, write_whole
 from .cloudindex import CloudIndex
@@ -52,14 +54,19 @@ class Store:
     def __enter__(self) -> Store:
         try:
             for folder in (self.folder, self.tiles, self.indexes):
-                folder.mkdir(parents=True, exist_ok=True)
+                _make_own(folder)
+            self._take()
+            _remove(self.scratch)
+            self.scratch.mkdir()
         except OSError as error:
+            self._release()
             raise StageError(
-                "the output folder cannot be written to", found=f"{self.folder}: {error.strerror}"
+                "the output folder cannot be written to",
+                found=f"{error.filename or self.folder}: {error.strerror}",
             ) from None
-        self._take()
-        shutil.rmtree(self.scratch, ignore_errors=True)
-        self.scratch.mkdir()
+        except BaseException:
+            self._release()
+            raise
         self._written = self._load()
         return self
 
@@ -70,8 +77,7 @@ class Store:
     # ---- the lock ------------------------------------------------------------------------------------
 
     def _take(self) -> None:
-        path = self.folder / "lock"
-        file = open(path, "a+", encoding="utf-8")  # noqa: SIM115  open as long as the lock is held
+        file = _open_own(self.folder / "lock")
         if not try_lock(file):
             file.seek(0)
             who = file.read().strip() or str(self.folder)
@@ -99,7 +105,7 @@ class Store:
     def clear(self) -> None:
         """Forget all that earlier runs finished."""
         for folder in (self.tiles, self.indexes):
-            shutil.rmtree(folder, ignore_errors=True)
+            _remove(folder)
             folder.mkdir()
         self.files.unlink(missing_ok=True)
         self._written = {}
@@ -108,56 +114,117 @@ class Store:
         """The file of a tile's results."""
         return self.tiles / f"{name}.npz"
 
-    def done(self, name: str) -> Path:
-        """The file that says a tile is done."""
-        return self.tiles / f"{name}.json"
-
-    def finished(self, name: str, mark: str) -> dict[str, Any] | None:
-        """The report of a tile that is done and was the same then; otherwise None."""
+    def has_result(self, name: str, report: dict[str, Any]) -> bool:
+        """Whether the file of a tile's results is there, as long as the tile's report says."""
         try:
-            report = json.loads(self.done(name).read_text())
-        except (OSError, ValueError):
-            return None
-        return report if report.get("fingerprint") == mark else None
+            return self.result(name).stat().st_size == report.get("result_bytes")
+        except OSError:
+            return False
+
+    def finish(self, name: str, mark: str, report: dict[str, Any]) -> None:
+        """Remember that a tile is done."""
+        write_whole(self._done(name), _sealed({**report, "fingerprint": mark}).encode(), "result")
+
+    def finished(self, name: str) -> dict[str, Any] | None:
+        """The report of a tile that is done, with its fingerprint; otherwise None."""
+        return _read(self._done(name))
+
+    def _done(self, name: str) -> Path:
+        return self.tiles / f"{name}.json"
 
     # ---- outputs -------------------------------------------------------------------------------------
 
     def _load(self) -> dict[str, Any]:
         found: dict[str, Any] = {}
         with contextlib.suppress(OSError):
-            for line in self.files.read_text().splitlines():
-                with contextlib.suppress(ValueError):  # the last line of a run that was killed
-                    found.update(json.loads(line))
+            for line in self.files.read_bytes().splitlines():
+                found |= _opened(line) or {}
         return found
 
-    def written(self, name: str, mark: str) -> dict[str, Any] | None:
-        """The report of outputs that exist unchanged and were made of the same things; otherwise None."""
+    def written(self, name: str) -> dict[str, Any] | None:
+        """The report of outputs that exist unchanged, with its fingerprint; otherwise None."""
         report = self._written.get(name)
-        if not report or report.get("fingerprint") != mark:
-            return None
-        for path, size, changed in report.get("outputs", []):
+        for path, size, changed in report["outputs"] if report else ():
             try:
-                stat = os.stat(path)
+                status = os.stat(path)
             except OSError:
                 return None
-            if [stat.st_size, stat.st_mtime_ns] != [size, changed]:
+            if [status.st_size, status.st_mtime_ns] != [size, changed]:
                 return None
         return report
 
     def wrote(self, name: str, mark: str, report: dict[str, Any]) -> None:
         """Remember outputs."""
         self._written[name] = {**report, "fingerprint": mark}
-        with open(self.files, "a", encoding="utf-8") as file:
-            file.write("\n" + json.dumps({name: self._written[name]}))
+        with _open_own(self.files) as file:
+            file.write("\n" + _sealed({name: self._written[name]}))
 
     # ---- indexes -------------------------------------------------------------------------------------
 
     def index(self, mark: str) -> CloudIndex | None:
         """The index of an input that is still the same."""
-        with contextlib.suppress(OSError, ValueError, TypeError):
-            return CloudIndex(**json.loads((self.indexes / f"{mark}.json").read_text()))
-        return None
+        known = _read(self.indexes / f"{mark}.json")
+        return CloudIndex(**known) if known else None
 
     def keep_index(self, mark: str, index: CloudIndex) -> None:
-        """Keep the index of an input."""
-        write_whole(self.indexes / f"{mark}.json", json.dumps(asdict(index)).encode())
+        """Keep the index of an input, where there is room."""
+        with contextlib.suppress(StageError, OSError):
+            write_whole(self.indexes / f"{mark}.json", _sealed(asdict(index)).encode(), "index")
+
+
+# ---- files that nobody else put there ----------------------------------------------------------------------
+
+
+def _make_own(folder: Path) -> None:
+    """Make a folder, or take one that is there: no link, and not another user's in a folder that all may write to."""
+    with contextlib.suppress(FileExistsError):
+        folder.mkdir()
+    status, parent = os.lstat(folder), os.stat(folder.parent)
+    if not stat.S_ISDIR(status.st_mode):
+        raise StageError(
+            "the run's own folder beside the outputs is a link or a file",
+            found=str(folder),
+            cure="Remove it, or write to another folder",
+        )
+    if hasattr(os, "geteuid") and status.st_uid not in (os.geteuid(), parent.st_uid):
+        raise StageError(
+            "the run's own folder beside the outputs belongs to another user",
+            found=str(folder),
+            cure="Remove it, or write to another folder",
+        )
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder, but nothing that a link leads to."""
+    if folder.is_symlink():
+        folder.unlink()
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _open_own(path: Path) -> TextIO:
+    """Open a file to append to, unless it is a link."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0)
+    return os.fdopen(os.open(path, flags, 0o666), "a+", encoding="utf-8")
+
+
+def _sealed(value: dict[str, Any]) -> str:
+    """An object as a line of JSON, with a digest that tells later whether it is still what was written."""
+    return json.dumps({"digest": fingerprint(value), "content": value})
+
+
+def _opened(text: bytes) -> dict[str, Any] | None:
+    """The object in a line of JSON; None where it is cut or changed."""
+    try:
+        found = strictjson.loads(text)
+        content = found["content"]
+        return content if isinstance(content, dict) and found["digest"] == fingerprint(content) else None
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return None
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    """The object in a file; None where it cannot be read."""
+    try:
+        return _opened(path.read_bytes())
+    except OSError:
+        return None

@@ -10,15 +10,18 @@ from typing import Any
 
 import numpy as np
 
+from ..base import las
 from ..base.errors import OptionError, PipelineError, StageError
 from ..base.progress import Progress
-from ..base.units import units_of_wkt
-from ..pipeline import pdal as pdal_env
+from ..base.stamps import stamp
+from ..base.units import Units
+from ..pipeline.filenames import named_files
+from ..pipeline.references import Reference, check_one_reference, reference_of
 from .cloudindex import CloudIndex, IndexTask
 from .grid import Box, Grid, check_number, union
 from .pool import Pool, last_tries
 from .settings import TilingOptions
-from .sources import Header, Source, check_source, find_sources, read_header
+from .sources import Header, Source, check_source, find_sources, read_ept, read_header
 from .store import Store, fingerprint
 from .tileplan import TilePlan
 
@@ -35,6 +38,8 @@ class Survey:
         Paths of inputs that cannot be read, and why.
     indexes : dict of str to CloudIndex
         Of LAS and LAZ files, once they were read.
+    stamps : dict of str to list
+        What inputs, and other files that stages read, were like when the run began.
     notes : list of str
     grid : Grid
     per : str
@@ -53,6 +58,8 @@ class Survey:
         self.headers: dict[str, Header] = {}
         self.indexes: dict[str, CloudIndex] = {}
         self.sources = find_sources(plan.readers)
+        self.stamps = {source.path: source.stamp() for source in self.sources}
+        self.stamps |= {path: stamp(path) for path in named_files([*plan.head, *plan.tail])}
         if any("t_srs" in reader for reader in plan.readers):
             self.notes.append(
                 "readers.tindex: in tiles points keep the reference of their file, t_srs is left out"
@@ -89,35 +96,42 @@ class Survey:
         )
 
     def _unit(self, plan: TilePlan) -> float:
-        """Metres per unit of the coordinates, as the first input says that PDAL can read."""
+        """Metres per unit of the coordinates, whose reference must be one for all inputs that stages see together."""
+        needed = bool(plan.head and plan.halo)
+        groups: dict[str, list[Source]] = {}
         for source in self.sources:
-            if source.path in self.unreadable:
-                continue
-            try:
-                metadata = self._metadata(source)
-                break
-            except PipelineError as error:
-                self.unreadable[source.path] = str(error)
-        else:
+            if source.path not in self.unreadable:
+                groups.setdefault(self._tells(source), []).append(source)
+        found: dict[str, Reference] = {}
+        for group in groups.values():
+            for source in group:
+                try:
+                    found[source.path] = self._reference_of(source, plan.unit)
+                    break
+                except PipelineError as error:
+                    self.unreadable[source.path] = str(error)
+                except StageError:
+                    if needed:
+                        raise
+                    found[source.path] = Reference(Units())  # nobody asks
+                    break
+        if not found:
             raise self._none_readable()
-        node = metadata.get(source.reader["type"], {})
-        srs = (node[0] if isinstance(node, list) else node).get("srs", {})
-        wkt = str(srs.get("compoundwkt") or srs.get("wkt") or "")
-        try:
-            return units_of_wkt(wkt, horizontal=plan.unit, vertical="").horizontal
-        except StageError:
-            if plan.head and plan.halo:
-                raise
-            return 1.0
+        if needed:
+            check_one_reference(found)
+        return next(iter(found.values())).units.horizontal
 
-    def _metadata(self, source: Source) -> dict[str, Any]:
+    def _tells(self, source: Source) -> str:
+        """What tells apart inputs of different spatial references."""
+        own = read_ept(source.path).get("srs") if source.kind == "ept" else las.projection(source.path)
+        return fingerprint(source.reader, own)
+
+    def _reference_of(self, source: Source, horizontal: str) -> Reference:
         """What PDAL's reader says of an input, with as few points read as it can."""
         if source.kind == "las":
-            reader = {**source.reader, "filename": source.path, "count": 1}
-        else:
-            x, y, _, _ = self.headers[source.path].box
-            reader = source.within((x, y, x + 1, y + 1))
-        return pdal_env.execute([reader], arrays=False).metadata.get("metadata", {})
+            return reference_of({**source.reader, "filename": source.path, "count": 1}, horizontal)
+        x, y, _, _ = self.headers[source.path].box
+        return reference_of(source.within((x, y, x + 1, y + 1)), horizontal)
 
     def _place(self) -> None:
         """Note where inputs lie, as headers or indexes say; thousands of them are compared at once."""
@@ -133,6 +147,22 @@ class Survey:
     def paths(self) -> list[str]:
         """Of all inputs."""
         return [source.path for source in self.sources]
+
+    @property
+    def placed(self) -> int:
+        """How many inputs have a place."""
+        return len(self._placed)
+
+    def stamps_of(self, stages: list[dict[str, Any]]) -> list[Any]:
+        """Names and stamps of the files that stages read."""
+        return [[path, self.stamps.get(path)] for path in named_files(stages)]
+
+    def changed(self) -> list[str]:
+        """Inputs and other files that are not what they were when the run began."""
+        now = {source.path: source.stamp for source in self.sources}
+        return [
+            path for path, then in self.stamps.items() if now.get(path, lambda p=path: stamp(p))() != then
+        ]
 
     @property
     def points(self) -> int:
@@ -179,7 +209,7 @@ class Survey:
         for source in self.sources:
             if source.kind != "las" or source.path in self.unreadable:
                 continue
-            mark = fingerprint(source.path, source.stamp(), self.grid.size)
+            mark = fingerprint(source.path, self.stamps[source.path], self.grid.size)
             if (known := store.index(mark)) is not None:
                 self.indexes[source.path] = known
             else:

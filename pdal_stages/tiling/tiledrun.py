@@ -80,11 +80,10 @@ def run_tiled(
         try:
             with open_pool(chosen) as pool:
                 survey.read_indexes(store, pool, chosen.retries, progress)
-                work = Worklist(plan, survey)
+                work = Worklist(plan, survey, chosen)
                 if chosen.resume:
                     work.take_over(store)
-                tasks = work.tasks(store, pool.threads, chosen)
-                run_all(work.jobs, work.outputs, tasks, store, pool, chosen.retries, progress)
+                run_all(work, store, pool, chosen.retries, progress)
                 work.forget_results(store)
         finally:
             sweep(folder)  # what workers left that were killed
@@ -96,7 +95,7 @@ def run_tiled(
             f"{len(short)} tiles have points whose neighborhoods or terrain reach farther than could be read within "
             f"{chosen.most_points:,} points; they may differ from an untiled run: " + ", ".join(short[:5])
         )
-    return TiledRun(work.jobs, work.outputs, survey.unreadable, survey.notes, summary)
+    return TiledRun(work.jobs, work.outputs, survey.unreadable, survey.changed(), survey.notes, summary)
 
 
 def _folder(plan: TilePlan) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import dataclass
 from tempfile import TemporaryDirectory
@@ -11,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import NoTerrainError
-from ..base.files import write_whole
 from .assemble import write_tile
 from .cloudindex import CloudIndex
 from .ept import fetch
@@ -35,10 +33,10 @@ class TileTask:
     tile : (int, int)
     sources : list of (Source, CloudIndex or None)
         Inputs that may hold points of it or its surroundings; EPT sources have no index.
-    mark : str
-        Fingerprint of all that decides the result.
-    result, done : str
-        Files for the results and the report, where outputs are put together from tiles.
+    complete : float
+        Metres around the tile up to which these are all the inputs there are.
+    result : str
+        File for the results, where outputs are put together from tiles.
     outputs : list of str
         Otherwise: what each of the writers writes.
     """
@@ -46,9 +44,8 @@ class TileTask:
     recipe: Recipe
     tile: tuple[int, int]
     sources: list[tuple[Source, CloudIndex | None]]
-    mark: str
+    complete: float
     result: str = ""
-    done: str = ""
     outputs: list[str] | None = None
 
     def run(self) -> dict[str, Any]:
@@ -67,8 +64,7 @@ class TileTask:
             if self.outputs is not None:
                 return report | write_tile(results, self.recipe.tail, self.outputs)
             save(self.result, results)
-        write_whole(self.done, json.dumps({**report, "fingerprint": self.mark}).encode())
-        return report
+        return report | {"result_bytes": os.path.getsize(self.result)}
 
 
 def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, Any]]:
@@ -94,7 +90,7 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
             break
         short = True
         estimate = read * ((side + 2 * need) / (side + 2 * buffer)) ** 2
-        if attempt == _WIDENINGS or estimate > recipe.most_points:
+        if attempt == _WIDENINGS or estimate > recipe.most_points or need > task.complete:
             if head is None:
                 raise NoTerrainError(
                     "no terrain: no point near the tile may form one", found=f"within {buffer:.0f} m"
@@ -103,7 +99,7 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
         buffer, short = need + 1e-6, False
     if head is None:
         empty = np.empty(0, np.int64)
-        head = HeadRun([PieceResults(source, piece, empty, {}) for source, piece in cuts], False, 0.0)
+        head = HeadRun([PieceResults(source, piece, empty, {}) for source, piece in cuts], 0.0)
     report = {
         "points": own,
         "read": read,
@@ -111,7 +107,7 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
         "short": short,
         "widened": buffer > recipe.halo,
         "dropped": own - sum(len(result.rows) for result in head.results),
-        "classes": class_counts(head.results, head.legacy),
+        "classes": class_counts(head.results),
     }
     return head.results, report
 

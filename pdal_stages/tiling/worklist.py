@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from ..base.version import __version__
-from ..stages import registry
 from .assemble import FileTask
 from .headrun import Recipe
 from .outcome import Job, Output
@@ -30,8 +30,19 @@ class Worklist:
         One for each input file; empty where each tile is an output.
     """
 
-    def __init__(self, plan: TilePlan, survey: Survey) -> None:
-        self.plan, self.survey = plan, survey
+    def __init__(self, plan: TilePlan, survey: Survey, options: TilingOptions) -> None:
+        self.plan, self.survey, self.options = plan, survey, options
+        self._tail = [plan.tail, survey.stamps_of(plan.tail)]
+        self._common = fingerprint(
+            __version__,
+            plan.head,
+            survey.stamps_of(plan.head),
+            plan.creates,
+            plan.halo,
+            survey.grid.size,
+            options.most_points,
+            self._tail if survey.per == "tile" else [],
+        )
         self.jobs = self._jobs()
         self.outputs = self._outputs() if survey.per == "file" else []
 
@@ -46,24 +57,32 @@ class Worklist:
                 job.state, job.blocked_by = "failed", bad[0]
                 job.reason = f"an input here cannot be read: {bad[0]}"
             jobs.append(job)
-        tail: list[Any] = []
         if survey.per == "tile":
             named = outputs_for(plan, [job.name for job in jobs], survey.paths)
             for job, paths in zip(jobs, named, strict=True):
                 job.outputs = paths
-            tail = [plan.tail, _files_of(plan.tail)]
-        common = fingerprint(
-            __version__, plan.head, _files_of(plan.head), plan.creates, plan.halo, survey.grid.size, tail
-        )
-        for job in jobs:
-            job.mark = fingerprint(common, job.tile, [[s.path, s.stamp(), s.reader] for s in job.sources])
         return jobs
+
+    def mark_of(self, job: Job, report: dict[str, Any]) -> str:
+        """Fingerprint of all that decides a tile's result: of every input that was read for it too.
+
+        That is known from the report alone, as a tile may be read with wider surroundings.
+        """
+        survey = self.survey
+        margin = max(float(report.get("buffer", 0.0)) / survey.unit, survey.margin)
+        read = survey.near(survey.grid.box(job.tile), margin)
+        return fingerprint(self._common, job.tile, [[s.path, survey.stamps[s.path], s.reader] for s in read])
+
+    def output_mark(self, out: Output, marks: Mapping[tuple[int, int], str]) -> str:
+        """Fingerprint of all that decides an output, given those of its tiles."""
+        source = out.source
+        mine = [marks[job.tile] for job in out.jobs]
+        return fingerprint(source.path, self.survey.stamps[source.path], source.reader, self._tail, mine)
 
     def _outputs(self) -> list[Output]:
         survey = self.survey
         by_tile = {job.tile: job for job in self.jobs}
         named = outputs_for(self.plan, [source.stem for source in survey.sources], survey.paths)
-        tail = [self.plan.tail, _files_of(self.plan.tail)]
         outputs = []
         for source, paths in zip(survey.sources, named, strict=True):
             out = Output(source, paths)
@@ -72,8 +91,6 @@ class Worklist:
             if source.path in survey.unreadable:
                 out.state, out.blocked_by = "failed", source.path
                 out.reason = f"its input cannot be read: {source.path}"
-            marks = [job.mark for job in out.jobs]
-            out.mark = fingerprint(source.path, source.stamp(), source.reader, tail, marks)
             outputs.append(out)
         return outputs
 
@@ -81,18 +98,23 @@ class Worklist:
         """Keep what an earlier run finished; tiles that no output waits for need not be done again."""
         if self.survey.per == "tile":
             for job in self.jobs:
-                if job.state == "waiting" and (known := store.written(job.name, job.mark)) is not None:
+                known = store.written(job.name)
+                if job.state == "waiting" and known and known["fingerprint"] == self.mark_of(job, known):
                     job.state, job.report = "kept", known
             return
+        reports = {job.tile: store.finished(job.name) for job in self.jobs}
+        marks = {job.tile: self.mark_of(job, reports[job.tile] or {}) for job in self.jobs}
         for out in self.outputs:
-            if out.state == "waiting" and (known := store.written(out.source.key, out.mark)) is not None:
+            known = store.written(out.source.key)
+            if out.state == "waiting" and known and known["fingerprint"] == self.output_mark(out, marks):
                 out.state, out.report = "kept", known
         needed = {job.tile for out in self.outputs if out.state == "waiting" for job in out.jobs}
         for job in self.jobs:
             if job.state != "waiting":
                 continue
-            known = store.finished(job.name, job.mark)
-            if known is not None and (job.tile not in needed or store.result(job.name).exists()):
+            known = reports[job.tile]
+            same = known is not None and known["fingerprint"] == marks[job.tile]
+            if known is not None and same and (job.tile not in needed or store.has_result(job.name, known)):
                 job.state, job.report = "kept", known
             elif job.tile not in needed:
                 job.state = "kept"
@@ -104,7 +126,17 @@ class Worklist:
             if job.tile not in needed:
                 store.result(job.name).unlink(missing_ok=True)
 
-    def tasks(self, store: Store, threads: int, options: TilingOptions):
+    def keep(self, store: Store, item: Job | Output) -> None:
+        """Remember what was finished, for runs to come."""
+        if isinstance(item, Output):
+            marks = {job.tile: self.mark_of(job, job.report) for job in item.jobs}
+            store.wrote(item.source.key, self.output_mark(item, marks), item.report)
+        elif item.outputs is not None:
+            store.wrote(item.name, self.mark_of(item, item.report), item.report)
+        else:
+            store.finish(item.name, self.mark_of(item, item.report), item.report)
+
+    def tasks(self, store: Store, threads: int):
         """A function that gives the task of a tile or an output."""
         plan, survey = self.plan, self.survey
         recipe = Recipe(
@@ -117,7 +149,7 @@ class Worklist:
             halo=plan.halo,
             creates=plan.creates,
             threads=threads,
-            most_points=options.most_points,
+            most_points=self.options.most_points,
             scratch=str(store.scratch),
         )
         # Farther inputs too: a tile may have to be read with wider surroundings.
@@ -133,9 +165,8 @@ class Worklist:
                 recipe,
                 item.tile,
                 [self._with_index(s) for s in sources if s.path not in survey.unreadable],
-                item.mark,
+                math.inf if len(sources) == survey.placed else far * survey.unit,
                 str(store.result(item.name)),
-                str(store.done(item.name)),
                 item.outputs,
             )
 
@@ -146,16 +177,3 @@ class Worklist:
         return source, None if index is None else replace(
             index, tiles=[]
         )  # blocks are all that a worker needs
-
-
-def _files_of(stages: list[dict[str, Any]]) -> list[Any]:
-    """Size and time of change of files that stages of ours read, e.g. models."""
-    found = []
-    for stage in stages:
-        if stage["type"] not in registry.stages():
-            continue
-        for name, value in stage.items():
-            if isinstance(value, str) and Path(value).is_file():
-                stat = Path(value).stat()
-                found.append([name, stat.st_size, stat.st_mtime_ns])
-    return found

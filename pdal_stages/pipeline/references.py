@@ -1,0 +1,135 @@
+"""The reference systems of several inputs, which must be one: PDAL merges points of metres and of feet as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ..base.errors import StageError
+from ..base.las import projection
+from ..base.units import Units, name_of_wkt, parse_wkt, units_of_wkt
+from . import pdal as pdal_env
+from .filenames import is_writer, readers_files
+
+#: Stages that may give points of several references one.
+_MOVING = ("filters.reprojection", "filters.projpipeline", "filters.transformation", "filters.georeference")
+#: What differs between references whose coordinates lie within a metre: units are compared apart.
+_ALIKE = ("+datum=WGS84", "+datum=NAD83", "+ellps=WGS84", "+ellps=GRS80")
+_ASIDE = (
+    "+units",
+    "+vunits",
+    "+to_meter",
+    "+vto_meter",
+    "+towgs84",
+    "+geoidgrids",
+    "+no_defs",
+    "+type",
+    "+wktext",
+)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What an input's coordinates mean.
+
+    Attributes
+    ----------
+    units : Units
+    plane : frozenset of str
+        The projection's parameters; empty where they are not known.
+    height : str
+        The authority's code of the heights' system, where it is known.
+    name : str
+    """
+
+    units: Units
+    plane: frozenset[str] = frozenset()
+    height: str = ""
+    name: str = ""
+
+
+def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
+    """The reference of what a reader reads, as PDAL says.
+
+    Parameters
+    ----------
+    reader : mapping
+        A stage with a type, restricted to as few points as it can be.
+    horizontal : str
+        Name of the unit of x and y, where it is known better.
+
+    Raises
+    ------
+    PipelineError
+        If PDAL cannot read it.
+    StageError
+        If its coordinates are degrees.
+    """
+    metadata = pdal_env.execute([dict(reader)], arrays=False).metadata.get("metadata", {})
+    node = metadata.get(reader["type"], {})
+    srs = (node[0] if isinstance(node, list) else node).get("srs", {})
+    wkt = str(srs.get("compoundwkt") or srs.get("wkt") or "")
+    try:
+        units = units_of_wkt(wkt, horizontal=horizontal)
+    except StageError as error:
+        raise error.at(str(reader["filename"])) from None
+    words = str(srs.get("proj4") or "").split()
+    plane = frozenset(w for w in words if w not in _ALIKE and not w.startswith(_ASIDE))
+    root = parse_wkt(wkt)
+    height = root.find("VERT_CS", "VERTCRS", "VERTICALCRS") if root else None
+    return Reference(units, plane, height.code() if height else "", name_of_wkt(wkt))
+
+
+def check_one_reference(found: Mapping[str, Reference]) -> None:
+    """Refuse inputs of different units or reference systems; where one names none, only units are compared.
+
+    Parameters
+    ----------
+    found : mapping of str to Reference
+        Of one input of each kind.
+
+    Raises
+    ------
+    StageError
+    """
+    units: dict[object, str] = {}
+    planes: dict[object, str] = {}
+    heights: dict[object, str] = {}
+    for path, one in found.items():
+        across, upward = one.units.horizontal, one.units.vertical
+        assumed = ", as no reference says otherwise" if one.units.assumed else ""
+        units.setdefault((across, upward), f"{across:g} m across and {upward:g} m upward in {path}{assumed}")
+        if one.plane:
+            planes.setdefault(one.plane, f"{one.name} in {path}")
+        if one.height:
+            heights.setdefault(one.height, f"{one.name} in {path}")
+    for what, kinds in (
+        ("units of length", units),
+        ("reference systems", planes),
+        ("reference systems of heights", heights),
+    ):
+        if len(kinds) > 1:
+            raise StageError(
+                f"the inputs have different {what}",
+                found="; ".join(kinds.values()),
+                cure="Give them one spatial reference first: pdal translate IN OUT reprojection "
+                "--filters.reprojection.out_srs=EPSG:CODE",
+            )
+
+
+def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> None:
+    """Refuse a pipeline whose LAS readers read different references, unless a stage moves points."""
+    if any(stage.get("type") in _MOVING for stage in stages):
+        return
+    first: dict[str, dict[str, Any]] = {}
+    for stage in stages:
+        if is_writer(stage, stages):
+            continue
+        options = {k: v for k, v in stage.items() if k not in ("tag", "inputs", "filename")}
+        options.setdefault("type", "readers.las")
+        for path in readers_files([stage], las=True):
+            reader = {**options, "filename": path, "count": 1}
+            first.setdefault(f"{projection(path)} {options}", reader)
+    if len(first) > 1:
+        check_one_reference({r["filename"]: reference_of(r, horizontal) for r in first.values()})

@@ -1,0 +1,154 @@
+"""Worker processes on this machine, reached through pipes alone: nothing listens that another user could talk to."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import queue
+import subprocess
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from ..base.errors import StageError
+from .settings import TilingOptions
+from .work import Answer, Task
+
+_KILLED = "it killed its worker each time it was tried: too little memory, or a crash in a library"
+
+
+class Processes:
+    """Tasks in processes of their own, one at a time in each, started as they are needed.
+
+    A worker looks for modules where this Python is installed, never in the current folder. When this process ends,
+    however it does, its workers see their pipe end and end too.
+    """
+
+    address = "processes of this machine"
+
+    def __init__(self, options: TilingOptions) -> None:
+        self.slots, self.threads = options.local_workers, options.threads
+        self._workers: list[_Worker] = []
+        self._answers: queue.SimpleQueue[tuple[_Worker, Answer | None]] = queue.SimpleQueue()
+
+    def __enter__(self) -> Processes:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        for worker in self._workers:
+            worker.stop()
+        self._workers.clear()
+
+    def run(self, waiting: deque, task_of: Callable[[Any], Task]) -> Iterator[tuple[Any, Answer]]:
+        """Yield (item, answer) for every item, as they finish.
+
+        Parameters
+        ----------
+        waiting : deque
+            Items to do, from the left; more may be put in after every answer.
+        task_of : callable
+            Gives an item's task, just before it is sent.
+        """
+        busy: dict[_Worker, Any] = {}
+        while waiting or busy:
+            while waiting and len(busy) < self.slots:
+                item = waiting.popleft()
+                worker = next((w for w in self._workers if w not in busy), None) or self._start()
+                busy[worker] = item
+                worker.give(task_of(item))
+            worker, answer = self._answers.get()
+            if answer is None:
+                self._workers.remove(worker)
+                if not worker.began:
+                    raise StageError(
+                        "a worker process could not be started",
+                        found=f"it ended with status {worker.status()}",
+                        cure="What it said stands above. --workers 0 works in this process",
+                    )
+                if worker not in busy:
+                    continue
+                answer = Answer(reason=_KILLED, again=True)
+            yield busy.pop(worker), answer
+
+    def _start(self) -> _Worker:
+        worker = _Worker(self.threads, self._answers)
+        self._workers.append(worker)
+        return worker
+
+
+class _Worker:
+    """A process, and a thread here that waits for its answers.
+
+    Attributes
+    ----------
+    began : bool
+        Whether it got so far as to take tasks.
+    """
+
+    def __init__(self, threads: int, answers: queue.SimpleQueue) -> None:
+        self.began = False
+        self._answers = answers
+        self._process = subprocess.Popen(
+            _command(),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=_environment(threads),
+            start_new_session=True,  # Ctrl-C is for this process, which ends the others
+        )
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def give(self, task: Task) -> None:
+        """Send a task; where the process has ended, :meth:`_listen` tells."""
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):
+            pickle.dump(task, self._process.stdin)
+            self._process.stdin.flush()
+
+    def _listen(self) -> None:
+        """Hand on answers, and None at the end."""
+        assert self._process.stdout is not None
+        with contextlib.suppress(EOFError, OSError, ValueError, pickle.UnpicklingError):
+            self.began = pickle.load(self._process.stdout) == READY
+            while self.began:
+                self._answers.put((self, pickle.load(self._process.stdout)))
+        self._answers.put((self, None))
+
+    def status(self) -> int:
+        """How it ended."""
+        return self._process.wait()
+
+    def stop(self) -> None:
+        """End the process, whatever it does."""
+        self._process.kill()
+        self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            with contextlib.suppress(OSError):
+                pipe.close()  # type: ignore[union-attr]
+
+
+#: What a worker says when it can take tasks.
+READY = "ready"
+
+
+def _command() -> list[str]:
+    """A Python that finds modules where they are installed, and this package where it is here."""
+    root = str(Path(__file__).resolve().parents[2])
+    paths = [path for path in sys.path[1:] if path] if sys.version_info < (3, 11) else []
+    program = (
+        f"import sys; sys.path += {paths!r}; sys.path.insert(0, {root!r}); import pdal_stages; "
+        f"sys.path.remove({root!r}); from pdal_stages.tiling.worker import serve; serve()"
+    )
+    safe = "-P" if sys.version_info >= (3, 11) else "-I"
+    return [sys.executable, safe, "-X", f"utf8={sys.flags.utf8_mode}", "-c", program]
+
+
+def _environment(threads: int) -> dict[str, str]:
+    out = {**os.environ, "PDAL_STAGES_PROGRESS": "0"}
+    out |= {f"{name}_NUM_THREADS": str(threads) for name in ("OMP", "OPENBLAS", "MKL")}
+    if "PYTHONPATH" in out:  # where an empty entry means the current folder
+        out["PYTHONPATH"] = os.pathsep.join(filter(None, out["PYTHONPATH"].split(os.pathsep)))
+    return out

@@ -1,0 +1,178 @@
+"""Tasks on a Dask scheduler that runs already, with workers on this or other hosts."""
+
+from __future__ import annotations
+
+import contextlib
+import pickle
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError
+from typing import Any
+
+from ..base.errors import StageError, optional_import
+from ..base.version import build
+from ..pipeline import pdal as pdal_env
+from .settings import TilingOptions
+from .work import Answer, Task, perform
+
+#: Seconds to wait for a worker: at the beginning, and when all are gone.
+_WAIT = 120.0
+#: Seconds after which it is asked whether scheduler and workers are still there.
+_ASK = 10.0
+
+
+class OnDask:
+    """Tasks on the workers of a scheduler; they may join and leave."""
+
+    def __init__(self, options: TilingOptions) -> None:
+        self.address = options.scheduler
+        self.threads, self.slots = options.threads, 1
+        self._stack = contextlib.ExitStack()
+
+    def __enter__(self) -> OnDask:
+        self._dask: Any = optional_import("distributed", "dask", "a Dask scheduler (--scheduler)")
+        with contextlib.ExitStack() as stack:
+            try:
+                self._client = stack.enter_context(
+                    self._dask.Client(self.address, timeout=10, set_as_default=False)
+                )
+                with contextlib.suppress(TimeoutError, AttributeError):
+                    self._client.wait_for_workers(1, timeout=_WAIT)
+                threads = self._client.nthreads()
+            except OSError as error:
+                raise StageError(
+                    "the Dask scheduler cannot be reached", found=f"{self.address}: {error}"
+                ) from None
+            if not threads:
+                raise StageError(
+                    "the scheduler has no workers", found=self.address, cure="Start dask worker on some hosts"
+                )
+            self._check_versions()
+            self._stack = stack.pop_all()
+        self.slots = len(threads)
+        # One tile at a time in a process; what Dask calls its threads are the cores it may use.
+        self.threads = max(1, min(threads.values()))
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._stack.close()
+
+    def _check_versions(self) -> None:
+        """Refuse workers whose results would not be those of this program."""
+        try:
+            found = self._client.run(versions)
+        except Exception as error:
+            raise StageError(
+                "a worker of the scheduler cannot say which pdal-stages it has",
+                found=f"{type(error).__name__}: {error}",
+                cure=_SAME,
+            ) from None
+        for worker, theirs in found.items():
+            if theirs != versions():
+                raise StageError(_OTHER, found=_difference(worker, theirs, versions()), cure=_SAME)
+
+    def run(self, waiting: deque, task_of: Callable[[Any], Task]) -> Iterator[tuple[Any, Answer]]:
+        """Yield (item, answer) for every item; see :meth:`pdal_stages.tiling.processes.Processes.run`.
+
+        Notes
+        -----
+        As many tasks are out as there are workers. While a killed worker starts anew, two may sit on one; so a task
+        whose worker was killed is tried once more with nothing beside it before it is blamed.
+        """
+        out: dict[Any, Any] = {}  # items by their future
+        suspects: deque[Any] = deque()
+        try:
+            while waiting or out or suspects:
+                alone = not waiting and not out
+                source, room = (suspects, 1) if alone else (waiting, self._slots_now() - len(out))
+                sent = deque(source.popleft() for _ in range(min(room, len(source))))
+                try:
+                    while sent:
+                        future = self._submit(task_of(sent[0]))
+                        out[future] = sent.popleft()
+                    done = self._wait(list(out))
+                except _LostError as lost:
+                    waiting.extendleft([*out.values(), *sent, *suspects])
+                    out.clear()
+                    suspects.clear()
+                    while waiting:  # more may come while these are looked at
+                        yield waiting.popleft(), Answer(reason=str(lost))
+                    return
+                for future in done:
+                    item, error = out.pop(future), future.exception()
+                    killed = isinstance(error, self._dask.KilledWorker)
+                    answer = future.result() if error is None else _failed(error, killed)
+                    future.release()
+                    if killed and not alone:
+                        # It may only have waited on a worker that another tile killed: judge it by itself.
+                        suspects.append(item)
+                    else:
+                        yield item, answer
+        finally:
+            with contextlib.suppress(Exception):
+                self._client.cancel(list(out), force=True)
+
+    def _submit(self, task: Task) -> Any:
+        # As bytes: Dask would look for its own keys in all that a task holds.
+        content = pickle.dumps(task)
+        try:
+            return self._client.submit(perform_for, versions(), content, pure=False, retries=0)
+        except (OSError, RuntimeError):
+            raise _LostError(_LOST) from None
+
+    def _wait(self, futures: list[Any]) -> list[Any]:
+        """Futures that are done."""
+        gone: float | None = None
+        while True:
+            try:
+                with self._client.as_current():
+                    return list(self._dask.wait(futures, timeout=_ASK, return_when="FIRST_COMPLETED").done)
+            except (TimeoutError, self._dask.TimeoutError):
+                pass
+            except (OSError, RuntimeError, CancelledError):
+                raise _LostError(_LOST) from None
+            if self._client.status != "running":
+                raise _LostError(_LOST)
+            now = time.monotonic()
+            gone = None if self._slots_now(0) else gone or now
+            if gone is not None and now - gone > _WAIT:
+                raise _LostError("all workers of the Dask scheduler are gone")
+
+    def _slots_now(self, least: int = 1) -> int:
+        with contextlib.suppress(Exception):
+            self.slots = len(self._client.nthreads())
+        return max(least, self.slots)
+
+
+class _LostError(Exception):
+    """Nothing more will come from the scheduler."""
+
+
+_LOST = "the Dask scheduler cannot be reached any more"
+_OTHER = "a worker of the scheduler has other versions than this program"
+_SAME = "Install the same versions of pdal-stages and PDAL on all hosts"
+
+
+def versions() -> tuple[str, str]:
+    """Of this package and of PDAL, where it is called."""
+    return build(), ".".join(map(str, pdal_env.version()))
+
+
+def perform_for(wanted: tuple[str, str], task: bytes) -> Answer:
+    """Do a task on a worker, if it has the versions of the program that sent it."""
+    if versions() != wanted:
+        return Answer(reason=f"{_OTHER} ({_difference('it', versions(), wanted)}). {_SAME}", again=True)
+    return perform(pickle.loads(task))
+
+
+def _difference(worker: str, theirs: tuple[str, str], ours: tuple[str, str]) -> str:
+    return f"{worker} has pdal-stages {theirs[0]} and PDAL {theirs[1]}, this program {ours[0]} and {ours[1]}"
+
+
+def _failed(error: BaseException, killed: bool) -> Answer:
+    """The answer of a task that gave none."""
+    if killed:
+        reason = "it killed its worker each time it was tried: too little memory, or a crash in a library"
+        return Answer(reason=reason)
+    return Answer(reason=f"{type(error).__name__}: {error}", again=True)

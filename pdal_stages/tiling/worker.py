@@ -1,0 +1,41 @@
+"""What a worker process does: tasks in through the pipe it was started with, answers out through the other."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import queue
+import threading
+from typing import Any, BinaryIO
+
+from .processes import READY
+from .work import perform
+
+
+def serve() -> None:
+    """Do tasks until the parent closes the pipe, or ends."""
+    tasks, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    os.dup2(2, 1)  # what libraries print is not an answer
+    waiting: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    threading.Thread(target=_listen, args=(tasks, waiting), daemon=True).start()
+    _say(answers, READY)
+    while True:
+        _say(answers, perform(waiting.get()))
+
+
+def _listen(tasks: BinaryIO, waiting: queue.SimpleQueue) -> None:
+    """Take tasks; at the end of the pipe nobody waits any more for what is being done."""
+    try:
+        while True:
+            waiting.put(pickle.load(tasks))
+    finally:
+        os._exit(0)
+
+
+def _say(answers: BinaryIO, what: Any) -> None:
+    try:
+        pickle.dump(what, answers)
+        answers.flush()
+    except OSError:
+        os._exit(0)

@@ -1,0 +1,95 @@
+"""Inputs of metres, feet and degrees beside each other are refused, in tiles and without."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import pdal_stages as ps
+from pdal_stages.base.errors import StageError
+from pdal_stages.base.las import projection
+from pdal_stages.tiling import run_tiled
+
+pytestmark = pytest.mark.pdal
+
+_SPHERE = 'SPHEROID["WGS 84",6378137,298.257223563]'
+_EARTH = f'DATUM["WGS_1984",{_SPHERE}],PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433]'
+DEGREES = f'GEOGCS["WGS 84",{_EARTH}]'
+_PLACE = '"latitude_of_origin",0 "scale_factor",0.9996 "false_easting",500000 "false_northing",0'
+_PLACE = ",".join(f"PARAMETER[{value}]" for value in _PLACE.split())
+
+
+def mercator(meridian: int, unit: str) -> str:
+    parameters = f'PARAMETER["central_meridian",{meridian}],{_PLACE}'
+    return f'PROJCS["p",{DEGREES},PROJECTION["Transverse_Mercator"],{parameters},UNIT[{unit}]]'
+
+
+METRES, OTHER = mercator(9, '"metre",1'), mercator(15, '"metre",1')
+ALIKE = METRES.replace("WGS 84", "GRS 1980").replace("WGS_1984", "ETRS_1989").replace("298.257223563", "298.257222101")
+FEET = mercator(9, '"US survey foot",0.3048006096012192')
+
+
+@pytest.fixture()
+def inputs(tmp_path, write_las):
+    """A function that writes files with these references, side by side; the readers' pattern."""
+
+    def write(*references):
+        rng = np.random.default_rng(0)
+        for number, wkt in enumerate(references):
+            xyz = rng.uniform(0, 1, (500, 3)) * (40, 40, 3) + (500_000 + 40 * number, 5_400_000, 0)
+            write_las(
+                tmp_path / f"in{number}.las", dict(zip("XYZ", xyz.T, strict=True)), point_format=6, wkt=wkt
+            )
+        return str(tmp_path / "in*.las")
+
+    return write
+
+
+def ways(tmp_path, pattern, *more):
+    """The same pipeline whole and in tiles."""
+    stages = [{"type": "readers.las", "filename": pattern}, *more, {"type": "filters.hag_minima"}]
+    writer = {"type": "writers.las", "extra_dims": "all"}
+    yield lambda: ps.run_pipeline([*stages, {**writer, "filename": str(tmp_path / "whole.las")}])
+    yield lambda: run_tiled([*stages, {**writer, "filename": str(tmp_path / "o_#.las")}], 40, workers=0)
+
+
+@pytest.mark.parametrize(("one", "two"), [(METRES, FEET), (FEET, METRES), (FEET, None)])
+def test_units_of_two_kinds(tmp_path, inputs, one, two):
+    for way in ways(tmp_path, inputs(one, two)):
+        with pytest.raises(StageError, match="the inputs have different units of length") as caught:
+            way()
+        said = str(caught.value)
+        assert "0.304801 m" in said and "1 m" in said and "in0.las" in said and "in1.las" in said
+        assert ("as no reference says otherwise" in said) == (two is None)
+    assert not list(tmp_path.glob("o_*")) and not (tmp_path / "whole.las").exists()
+
+
+@pytest.mark.parametrize("references", [(METRES, DEGREES), (DEGREES, METRES)])
+def test_degrees_beside_metres(tmp_path, inputs, references):
+    for way in ways(tmp_path, inputs(*references)):
+        with pytest.raises(StageError, match=r"degrees") as caught:
+            way()
+        assert f"in{references.index(DEGREES)}.las" in str(caught.value)
+
+
+@pytest.mark.parametrize("references", [(METRES, OTHER), (OTHER, METRES)])
+def test_references_of_two_kinds(tmp_path, inputs, references):
+    for way in ways(tmp_path, inputs(*references)):
+        with pytest.raises(StageError, match="the inputs have different reference systems") as caught:
+            way()
+        assert "in0.las" in str(caught.value) and "in1.las" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "references", [(METRES, METRES), (METRES, ALIKE), (METRES, None), (None, None), (FEET, FEET)]
+)
+def test_units_of_one_kind(tmp_path, inputs, references):
+    for way in ways(tmp_path, inputs(*references)):
+        way()
+    assert (tmp_path / "whole.las").exists() and len(list(tmp_path.glob("o_*"))) == 2
+
+
+def test_references_in_files(tmp_path, inputs):
+    inputs(METRES, FEET, METRES, None)
+    found = [projection(tmp_path / f"in{number}.las") for number in range(4)]
+    assert found[0] == found[2] and len(set(found)) == 3 and found[3] == ""
