@@ -18,6 +18,7 @@ import clouds  # noqa: E402
 import h17_oakland  # noqa: E402
 import kit  # noqa: E402
 import pts_input  # noqa: E402
+import published  # noqa: E402
 import scenes  # noqa: E402
 import tables  # noqa: E402
 import w18  # noqa: E402
@@ -195,6 +196,28 @@ def scene(folder, tmp_path_factory):
     return scenes.load(folder, "town", cache, classes=(1, 2, 5, 8), neighborhoods="c1,c2,c3,c5,kopt")
 
 
+def test_published_tables_agree_with_each_other():
+    for first in (0, 3):
+        table3 = np.array(published.B16["Overall accuracy"])[:, first : first + 3]
+        np.testing.assert_allclose(published.b16_overall(first), table3, atol=0.03)  # sizes are thousands
+        for word in ("recall", "precision"):
+            low = published.b16_class(word, "low vegetation", first)
+            assert ((low > 0) & (low < 100)).all()
+    assert published.page() == (FOLDER.parents[1] / "docs" / "papers" / "published.md").read_text()
+
+
+def test_published_matrix_beside_ours(tmp_path):
+    order = [8, 0, 1, 2, 3, 4, 5, 6, 7]  # the file has its own order of classes
+    report = {
+        "classes": [{"code": published.VAIHINGEN_CODES[k]} for k in order],
+        "confusion": {"counts": np.array(published.WM19)[np.ix_(order, order)].tolist()},
+    }
+    (tmp_path / "a.json").write_text(json.dumps(report))
+    text = published.beside(tmp_path / "a.json")
+    assert "| Ours | 80.56 | 75.31 | 60.38 |" in text
+    assert text.count("| tree | 5 | 974 | 25 | 2 | 0 | 1,762 |") == 2
+
+
 def test_b16_names():
     count = {
         (hood, one): len(b16_experiments.names_of(tokens, one))
@@ -209,7 +232,7 @@ def test_b16_names():
 
 def test_b16_experiment(scene, monkeypatch):
     monkeypatch.setattr(b16_experiments, "COUNT", 100)
-    monkeypatch.setattr(b16_experiments, "TREES", 10)
+    monkeypatch.setattr(b16_experiments, "TREES", (5, 10))
     results = kit.Results(None, {})
     runs = []
     for feature_set in b16_experiments.SETS:
@@ -262,8 +285,50 @@ def test_h17_thresholds_are_a_choice_between_two_tables(town):
     direct = compute_features(town.xyz, neighborhoods="copt", feature_set=words, copt_threshold=0.05)
     np.testing.assert_array_equal(part.adaptive(0.05), np.column_stack([direct[f"{w}_copt"] for w in words]))
     assert 0.05 < (part.curvature >= 0.05).mean() < 0.95
-    shares = h17_oakland.shares(part, 0.0)
+    shares = h17_oakland.shares(part.labels, part.curvature, 0.0)
     assert all(one["points"] == one["scattered"] for one in shares.values())
+
+
+def test_h17_radii_by_dimensionality(town):
+    """Against the definition, point by point; members, radius and features."""
+    cloud = clouds.Cloud("town", town.xyz, town.labels)
+    made = h17_oakland.by_dimensionality(cloud, kit.Cache(None), 1)
+    radii = np.round(np.arange(0.25, 2.001, 0.05), 9)
+    fewest = []
+    for i in np.random.default_rng(0).choice(len(town), 60, replace=False):
+        away = np.linalg.norm(town.xyz - town.xyz[i], axis=1)
+        entropies = {}
+        for radius in radii:
+            members = town.xyz[away <= radius]
+            if len(members) < 10:
+                continue
+            s3, s2, s1 = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(members.T, bias=True)), 0))
+            shares = np.array([s1 - s2, s2 - s3, s3]) / s1
+            entropies[radius] = -(shares * np.log(np.maximum(shares, 1e-300))).sum()
+        chosen = round(float(made[i, 6]), 2)
+        if entropies:
+            assert entropies[chosen] == pytest.approx(min(entropies.values()), abs=1e-3)
+        else:
+            assert chosen == 2.0
+        fewest.append((away <= chosen).sum())
+        members = town.xyz[away <= chosen]
+        assert made[i, 1] == pytest.approx(np.ptp(members[:, 2]), abs=1e-5)
+    assert min(n for n in fewest if n >= 10) < 30
+
+
+def test_b16_searches_the_number_of_trees():
+    """Of equals the fewest; the forest is the first trees of the largest."""
+    random = np.random.default_rng(0)
+    values = random.normal(size=(300, 4)).astype(np.float32)
+    labels = (values[:, 0] > 0).astype(int)
+    forest = kit.search_trees(values, labels, (5, 30), seed=1, threads=1)
+    small = kit.search_trees(values, labels, (len(forest.estimators_),), seed=1, threads=1)
+    assert len(forest.estimators_) in (5, 30)
+    assert np.array_equal(forest.predict_proba(values), small.predict_proba(values))
+    whole = kit.grow_forest(values, labels, trees=5, seed=1, threads=1)
+    assert np.array_equal(
+        whole.predict_proba(values), kit.search_trees(values, labels, (5,), seed=1).predict_proba(values)
+    )
 
 
 def test_h17_score_and_report(town, monkeypatch):
@@ -280,15 +345,23 @@ def test_h17_score_and_report(town, monkeypatch):
             run = {"name": name, "seed": 0, "depth": None, "height": height, "threshold": 0.03}
             runs.append({**run, **h17_oakland.score(part, part, threads=1, **run)})
     assert np.sum(runs[0]["clouds"], axis=0).tolist() == runs[0]["matrix"]
-    shares = {at: h17_oakland.shares(part, 0.03) for at in ("train", "0.03")}
-    text = h17_oakland.report(runs, {"train": 0.03, "test": 0.03, "shares": shares})
+    name = h17_oakland.BY_DIMENSIONALITY
+    run = {"name": name, "seed": 0, "depth": None, "height": "range", "threshold": 0.03}
+    runs.append({**run, **h17_oakland.score(part, part, threads=1, **run)})
+    shares = {
+        "pooled": h17_oakland.shares(*h17_oakland.pooled(part, part), 0.03),
+        "test": h17_oakland.shares(part.labels, part.curvature, 0.03),
+    }
+    text = h17_oakland.report(runs, {"train": 0.03, "test": 0.03, "pooled": 0.03, "shares": shares})
+    lost, wire = h17_oakland.ground_lost(runs[0])
+    assert lost >= wire >= 0 and lost == (1 - runs[0]["recall"]["2"] / 100) * (labels == 2).sum()
     assert f"{runs[0]['mcp']:.2f}" in text
 
 
 def test_b16_command_on_pts_resumes(folder, tmp_path, monkeypatch, capsys):
     """The command for clouds that cannot be had, on the stand-in; a second run does nothing again."""
     monkeypatch.setattr(b16_experiments, "COUNT", 50)
-    monkeypatch.setattr(b16_experiments, "TREES", 3)
+    monkeypatch.setattr(b16_experiments, "TREES", (3,))
     monkeypatch.setattr(scenes, "NEIGHBORHOODS", "c1,c2,c3,c5,kopt")
     words = ["--data", str(folder), "--scene", "town", "--cache", str(tmp_path / "cache"), "--seeds", "1"]
     words += ["--threads", "1", "--json", str(tmp_path / "r.json"), "--tables", str(tmp_path / "t.md")]

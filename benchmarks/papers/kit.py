@@ -167,24 +167,31 @@ def grow_forest(
     labels: np.ndarray,
     *,
     trees: int,
-    depth: int | None,
     seed: int,
+    depth: int | None = None,
     threads: int | None = None,
-    leaf: int = 1,
-    bag: float | None = None,
 ):
     """A Random Forest as the papers describe it: Breiman's, sqrt(features) tried at a node."""
     from sklearn.ensemble import RandomForestClassifier
 
-    forest = RandomForestClassifier(
-        trees,
-        max_depth=depth,
-        min_samples_leaf=leaf,
-        max_samples=bag,
-        random_state=seed,
-        n_jobs=threads or -1,
-    )
+    forest = RandomForestClassifier(trees, max_depth=depth, random_state=seed, n_jobs=threads or -1)
     return forest.fit(values, labels)
+
+
+def search_trees(
+    values: np.ndarray, labels: np.ndarray, counts: Sequence[int], *, seed: int, threads: int | None = None
+):
+    """The forest of as many trees as are right about the most out-of-bag samples; of equals the smallest."""
+    from sklearn.ensemble import RandomForestClassifier
+
+    forest = RandomForestClassifier(warm_start=True, oob_score=True, random_state=seed, n_jobs=threads or -1)
+    scores = {}
+    for count in sorted(counts):
+        forest.n_estimators = count
+        scores[count] = forest.fit(values, labels).oob_score_
+    best = max(scores, key=lambda count: (scores[count], -count))
+    forest.estimators_ = forest.estimators_[:best]
+    return forest
 
 
 def predict(forest, values: np.ndarray, classes: Sequence[int], low=None, high=None, chunk: int = 65_536):

@@ -36,6 +36,20 @@ class Scene:
         return np.array([at[name] for name in names])
 
 
+class Columns:
+    """Some columns of a table, row by row: the whole is never copied."""
+
+    def __init__(self, table: np.ndarray, columns: np.ndarray) -> None:
+        self.table, self.columns = table, columns
+        self.shape = len(table), len(columns)
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def __getitem__(self, rows: slice) -> np.ndarray:
+        return self.table[rows][:, self.columns]
+
+
 def read_scene(data: Path, scene: str, part: str, columns: str | None = None) -> Cloud:
     """A part (train, test) of one of the airborne scenes: a folder of LAZ, or ``.pts`` text (see pts_input)."""
     folder = data / scene
