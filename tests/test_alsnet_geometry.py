@@ -292,3 +292,15 @@ def test_published_configuration():
 def test_bad_configurations(given, text):
     with pytest.raises(OptionError, match=text):
         parse_configuration(given)
+
+
+def test_published_configurations_have_the_published_widths():
+    """Of the authors' program: (centres, radius, samples, widths, widths back up) level by level."""
+    four, three = CONFIGURATIONS["alsnet4"], CONFIGURATIONS["alsnet3"]
+    assert [level.mlp for level in three.levels] == [(128, 128, 128), (128, 128, 256), (128, 128, 256)]
+    assert [level.up for level in three.levels] == [(128, 128), (256, 256), (256, 256)]
+    assert [level.mlp for level in four.levels] == [
+        (64, 128, 128), (128, 256, 256), (128, 256, 256), (128, 512, 256)
+    ]  # fmt: skip
+    assert [level.up for level in four.levels] == [(128, 64), (256, 256), (256, 256), (256, 256)]
+    assert (three.points, three.head, four.points, four.head) == (200_000, (128,), 200_000, (128,))

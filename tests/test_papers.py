@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import sys
 from pathlib import Path
@@ -185,6 +186,36 @@ def test_pts_through_pdal(folder, tmp_path, monkeypatch):
     matrix = np.array(report["confusion"]["counts"])
     assert matrix.sum() == len(test)
     assert np.trace(matrix) / matrix.sum() > 0.7
+
+
+@pytest.mark.pdal
+@pytest.mark.skipif(
+    importlib.util.find_spec("torch") is None,
+    reason="PyTorch is not installed (extra 'deep'): training is not tested",
+)
+def test_alsnet_with_the_papers_inputs_through_pdal(folder, tmp_path, monkeypatch):
+    from pdal_stages.classifier import load_model
+    from pdal_stages.pipeline.overrides import parse_overrides
+    from pdal_stages.pipeline.run import Pipeline
+
+    monkeypatch.chdir(tmp_path)
+    writer = json.loads((FOLDER / "vaihingen-train-alsnet.json").read_text())[-1]
+    there = {str(label): writer["classes"][str(label)] for label in (1, 2, 5, 7, 8)}
+    quick = {**writer["alsnet"], "configuration": "tiny", "epochs": 1, "device": "cpu"}
+    words = [
+        f"--stage.input.filename={folder / 'town' / 'train.pts'}",
+        f"--stage.model.classes={json.dumps(there)}",
+        f"--stage.model.alsnet={json.dumps(quick)}",
+    ]
+    Pipeline(FOLDER / "vaihingen-train-alsnet.json", parse_overrides(words)[0]).execute()
+    model = load_model(tmp_path / "vaihingen-alsnet.model")
+    assert model.required_dimensions == ("Intensity", "ReturnNumber", "NumberOfReturns")
+    evaluate = [
+        f"--stage.input.filename={folder / 'town' / 'test.pts'}",
+        "--stage.classifier.model=vaihingen-alsnet.model",
+    ]
+    Pipeline(FOLDER / "vaihingen-evaluate.json", parse_overrides(evaluate)[0]).execute()
+    assert (tmp_path / "vaihingen-accuracy.json").exists()
 
 
 # ---- experiments -----------------------------------------------------------------------------------------

@@ -250,7 +250,7 @@ def _levels(*rows) -> tuple[Level, ...]:
     return tuple(Level(*row) for row in rows)
 
 
-#: The named configurations. ``alsnet4`` and ``alsnet3`` are published [WM19]; the others are ours, for CPUs.
+#: The named ones. ``alsnet4`` and ``alsnet3`` are those of [WM19]'s program; the others are ours, for CPUs.
 CONFIGURATIONS = {
     one.name: one
     for one in (
@@ -268,9 +268,9 @@ CONFIGURATIONS = {
             "alsnet3",
             200_000,
             _levels(
-                (16384, 1.0, 32, (64, 128, 128), (128, 64)),
-                (8192, 5.0, 64, (128, 256, 256), (256, 256)),
-                (4096, 15.0, 64, (128, 256, 256), (256, 256)),
+                (16384, 1.0, 32, (128, 128, 128), (128, 128)),
+                (8192, 5.0, 64, (128, 128, 256), (256, 256)),
+                (4096, 15.0, 64, (128, 128, 256), (256, 256)),
             ),
         ),
         Configuration(

@@ -169,6 +169,9 @@ def three_nearest(
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
     """The three nearest coarse points of each point, and weights by inverse squared distance.
 
+    [WM19] says inverse distance, but its authors' program, which gave the published figures, takes the squared distances
+    of its search as they are, as PointNet++ does; so do we.
+
     Parameters
     ----------
     xyz : (n, 3) float64

@@ -36,7 +36,7 @@ class NetworkOptions:
     learning_rate : float
         At the start; it falls to 1 % of that along a cosine.
     class_weights : {"sqrt", "none", "balanced"}
-        Weight of a class in the loss: 1 / sqrt(share) [WM19's code], 1, or 1 / share.
+        Weight of a class in the loss: 1 / sqrt(share), 1 [WM19], or 1 / share.
     histogram_threshold : float
         Batches whose class shares have a standard deviation of this or more (per cent) are not trained on:
         they hold next to nothing but one class [WM19: 20 %]. 100: all are used.
