@@ -34,6 +34,7 @@ OPTIONS = TrainingOptions(
     pass_folds=len(SURVEYS),
     context=("own", "box1", "columnvotes2", "columnvotes8"),
     scale=False,
+    max_density=16.0,
 )
 
 

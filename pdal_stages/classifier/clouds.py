@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from ..base.asprs import UNINFORMATIVE
 from ..base.errors import OptionError
+from ..features.voxels import represent
 from .classes import ClassMap, as_labels
 from .thinning import thinned
 from .trainoptions import TrainingOptions
@@ -71,7 +72,7 @@ Source = TrainingCloud | Callable[[], TrainingCloud]
 
 
 def prepared(sources: Iterable[Source], options: TrainingOptions) -> Iterator[TrainingCloud]:
-    """The clouds without ignored points, each followed by its thinned copies."""
+    """The clouds without ignored points and no denser than `max_density`, each followed by its thinned copies."""
     named: set[int] = set()
     if options.classes is not None:
         named.update(label for part in ClassMap.parse(options.classes).labels for label in part)
@@ -81,6 +82,13 @@ def prepared(sources: Iterable[Source], options: TrainingOptions) -> Iterator[Tr
         labels = _checked_labels(cloud)
         if ignored and (gone := np.isin(labels, ignored)).any():
             cloud = cloud.part(np.flatnonzero(~gone))
+        few = (
+            represent(cloud.xyz, options.max_density, cloud.dimensions.values())
+            if options.max_density
+            else None
+        )
+        if few is not None:
+            cloud = cloud.part(few.rows)
         yield cloud
         for wanted in options.thin:
             rows = thinned(cloud.xyz, wanted, options.seed)

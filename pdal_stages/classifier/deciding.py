@@ -92,6 +92,10 @@ class Decided(NamedTuple):
     margin: npt.NDArray[np.floating]
     probabilities: npt.NDArray[np.floating] | None
 
+    def taken(self, place: npt.NDArray[np.int64]) -> Decided:
+        """The rows of these places."""
+        return Decided(*(None if part is None else part[place] for part in self))
+
 
 def decide(p: npt.NDArray[np.floating], codes: npt.NDArray[np.uint8], options: PredictionOptions) -> Decided:
     """The winner of each row of probabilities (n, classes); of equal ones the class that comes first."""
@@ -127,8 +131,14 @@ class Outcome:
         self.variance = np.zeros(n, np.float32) if options.variance else None
         self.probabilities = np.zeros((n, classes), np.float32) if options.probabilities else None
 
-    def write(self, rows: Any, decided: Decided) -> None:
-        """Write a block: `rows` index the cloud."""
+    def write(
+        self, rows: Any, decided: Decided | None, variance: npt.NDArray[np.floating] | None = None
+    ) -> None:
+        """Write what is known of a block: `rows` index the cloud."""
+        if self.variance is not None and variance is not None:
+            self.variance[rows] = variance
+        if decided is None:
+            return
         self.reliability[rows] = decided.reliability
         if self.margin is not None:
             self.margin[rows] = decided.margin

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError, OptionError
+from ..features.voxels import Representatives, reach, represent
 from . import modelfile, summary
 from .algorithms import Inputs, Question, algorithm
 from .deciding import Outcome, Prediction, PredictionOptions, decide
@@ -83,9 +84,14 @@ class Model:
         return welcome(self.plan.dimensions)
 
     @property
+    def max_density(self) -> float:
+        """Points per square metre above which one point represents a voxel; 0: none does."""
+        return float(self.info.get("max_density") or 0.0)
+
+    @property
     def halo(self) -> float:
         """Metres around a tile whose points a tile's results depend on."""
-        return self.plan.halo
+        return self.plan.halo + reach(self.max_density)
 
     @property
     def gives_variance(self) -> bool:
@@ -246,23 +252,52 @@ class Model:
             p = self._weigh(p)
             return count_shares(p) if how.smooth else decide(p, codes, how)
 
-        question = Question(xyz, dimensions, rows, how.threads, how.memory_mb, progress)
-        answer = self.algorithm.predict(question, finish)
         outcome = Outcome(len(xyz), len(codes), old, how)
+        few = self._representatives(xyz, dimensions, rows)
+        asked = rows
+        if few is not None:
+            xyz, asked = xyz[few.rows], few.wanted
+            dimensions = {name: np.asarray(dimensions[name])[few.rows] for name in dimensions}
+
+        def write(at, decided, variance=None):
+            if few is not None:
+                at, place = few.members(at)
+                decided = None if decided is None else decided.taken(place)
+                variance = None if variance is None else variance[place]
+                if progress is not None:
+                    progress.update(len(at))
+            outcome.write(at, decided, variance)
+
+        question = Question(
+            xyz, dimensions, asked, how.threads, how.memory_mb, progress if few is None else None
+        )
+        answer = self.algorithm.predict(question, finish)
         shares = np.zeros((len(xyz), len(codes)), np.uint16) if how.smooth else None
         for block in answer.blocks:
             if shares is not None:
                 shares[block.rows] = block.result
-            else:
-                outcome.write(block.rows, block.result)
-            if outcome.variance is not None:
-                outcome.variance[block.rows] = block.variance
+            write(block.rows, None if how.smooth else block.result, block.variance)
         if shares is not None and question.count:
-            for part, p in _smoothed(xyz, rows, shares, how):
-                outcome.write(part, decide(p, codes, how))
+            for part, p in _smoothed(xyz, asked, shares, how):
+                write(part, decide(p, codes, how))
             answer.report["smooth"] = how.smooth
+        if few is not None:
+            answer.report["representatives"] = len(few.rows)
         answer.report.update(self._density_report(xyz, question.count, answer.report))
         return outcome.prediction(rows, answer.report)
+
+    def _representatives(
+        self,
+        xyz: npt.NDArray[np.float64],
+        dimensions: Mapping[str, npt.ArrayLike],
+        rows: npt.NDArray[np.int64] | None,
+    ) -> Representatives | None:
+        """Who stands for whom where the cloud is denser than the model wants it."""
+        if not self.max_density:
+            return None
+        read = (*self.required_dimensions, *self.welcome_dimensions)
+        used = [dimensions[name] for name in read if name in dimensions]
+        return represent(xyz, self.max_density, used, rows)
 
     def _density_report(
         self, xyz: npt.NDArray[np.float64], count: int, report: Mapping[str, Any]

@@ -153,6 +153,13 @@ class ClassifierModel(Stage):
         "Points per square metre of sparser copies to train on as well, so that the model bears sparse clouds",
         may_be_empty=True,
     )
+    max_density: float = option(
+        "number",
+        _default("max_density"),
+        "Where the cloud is denser, one point represents each voxel, in training and in classifying; 0 for no limit",
+        minimum=0,
+        unit="points/m2",
+    )
     ignore: list = option(
         "codes",
         _default("ignore"),

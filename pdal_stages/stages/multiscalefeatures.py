@@ -16,6 +16,8 @@ from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.adaptive import LEAST_RADIUS
 from ..features.neighborhoods import Neighborhood, parse_neighborhoods
+from ..features.voxels import represent
+from ..features.voxels import reach as reach_of_voxels
 from .base import Stage
 from .options import option
 from .points import Points
@@ -58,6 +60,14 @@ class MultiscaleFeatures(Stage):
         False,
         "Also write the neighborhood that kopt chose as PDAL does: OptimalKNN (the point itself counted) and OptimalRadius",
     )
+    max_density: float = option(
+        "number",
+        0.0,
+        "Where the cloud is denser, features are those of a cloud with one point per voxel, each point taking its voxel's; "
+        "0 for no limit",
+        minimum=0,
+        unit="points/m2",
+    )
     memory: int = option(
         "integer", 512, "Memory for blocks of points, in addition to the cloud itself", minimum=16, unit="MB"
     )
@@ -67,7 +77,8 @@ of radius 2 m. See [neighborhoods and features](../features.md) for all tokens, 
 Shape distributions (`shapes`) need histogram thresholds, which are fitted to the points unless `bins` names a file;
 name one when several files must have comparable features. Features are 32-bit floats. LAS writers need
 `"extra_dims": "all"`, and one file describes at most 341 extra dimensions: training and classification compute
-features inside and need no dimensions at all.
+features inside and need no dimensions at all. In clouds of hundreds of points per square metre `max_density` keeps the
+time per point bounded, whatever the radius: see [dense clouds](../features.md#dense-clouds).
 """
     after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)
     example = {
@@ -125,7 +136,7 @@ features inside and need no dimensions at all.
         return {**dict.fromkeys(self.columns, "float"), **(_OPTIMAL if self.optimal else {})}
 
     def halo(self) -> float:
-        return self.plan.halo
+        return self.plan.halo + reach_of_voxels(self.max_density)
 
     def most_neighbors(self) -> int:
         return self.plan.most_neighbors
@@ -147,11 +158,16 @@ features inside and need no dimensions at all.
         if points.count == 0:
             return {name: np.empty(0, np.float32) for name in self.creates()}
         bins, threshold = _read_bins(self.bins)
-        engine = FeatureEngine(
-            points.xyz, plan, bins=bins, copt_threshold=threshold, seed=self.seed, threads=self.threads
-        )
-        queries = None if points.mask is None else np.flatnonzero(points.mask)
+        xyz, queries = points.xyz, None if points.mask is None else np.flatnonzero(points.mask)
+        total = points.count if queries is None else len(queries)
         own = {name: points.dimension(name) for name in plan.dimensions}
+        few = represent(xyz, self.max_density, own.values(), queries) if self.max_density else None
+        if few is not None:
+            xyz, queries = xyz[few.rows], few.wanted
+            own = {name: values[few.rows] for name, values in own.items()}
+        engine = FeatureEngine(
+            xyz, plan, bins=bins, copt_threshold=threshold, seed=self.seed, threads=self.threads
+        )
         if queries is not None:
             own = {name: values[queries] for name, values in own.items()}
         columns = [plan.names.index(name) for name in names]
@@ -159,11 +175,18 @@ features inside and need no dimensions at all.
         of_chosen = (
             [plan.names.index(f"{name}_{self.chosen.suffix}") for name in _OF_CHOSEN] if self.chosen else []
         )
-        total = points.count if queries is None else len(queries)
         with Progress(total, self.type) as progress:
             for rows, values in engine.blocks(
-                queries, dimensions=own, threads=self.threads, memory_mb=self.memory, progress=progress
+                queries,
+                dimensions=own,
+                threads=self.threads,
+                memory_mb=self.memory,
+                progress=progress if few is None else None,
             ):  # rows are indices into the cloud, with queries too
+                if few is not None:
+                    rows, place = few.members(rows)
+                    values = values[place]
+                    progress.update(len(rows))
                 for name, column in zip(names, columns, strict=True):
                     out[name][rows] = values[:, column]
                 if of_chosen:
@@ -174,7 +197,12 @@ features inside and need no dimensions at all.
         if self.bins and not Path(self.bins).exists():
             _write_bins(self.bins, engine)
         points.report.update(
-            {"neighborhoods": len(plan.neighborhoods), "features": len(names), **engine.report}
+            {
+                "neighborhoods": len(plan.neighborhoods),
+                "features": len(names),
+                **({} if few is None else {"representatives": len(few.rows)}),
+                **engine.report,
+            }
         )
         return out
 

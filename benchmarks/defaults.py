@@ -1,0 +1,194 @@
+"""How the defaults of training were chosen: parts of training clouds that a model has not seen.
+
+    python benchmarks/defaults.py --data DIR                       # every table
+    python benchmarks/defaults.py --data DIR --table trees --json FILE
+
+Each training tile of Montpellier, and each third of Delft's training part, is classified by a model of the rest, with
+one thing of the defaults changed. Cross-validation over small blocks amid the training points is flattered by what
+neighbors share; a tile never seen is what a user's next tile is. Test parts are not touched. CPU seconds are those of
+training, and microseconds a point those of classifying, both with one thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+
+from pdal_stages.accuracy import Accuracy
+from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
+from pdal_stages.terrain import filtered_ground
+
+MOMENTS = "covariance,Verticality,HeightRange,HeightStd,HeightAboveLowest"
+DIMENSIONS = ("HeightAboveGround", "Ground", "HeightAboveOpening_5", "HeightAboveOpening_17", "returns")
+PAPERS = "c1,c2,c3,c5,s1,s2,s3,s5,kopt"
+ONE = {"passes": 1}
+#: Table -> row -> what differs from today's defaults.
+TABLES: dict[str, dict[str, dict[str, Any]]] = {
+    "features": {
+        "today's": ONE,
+        "neighborhoods of weinmann2018": {**ONE, "neighborhoods": PAPERS},
+        "the same, with density and shape distributions": {
+            **ONE,
+            "neighborhoods": PAPERS,
+            "feature_set": "all,HeightAboveLowest",
+        },
+        "without s5": {**ONE, "neighborhoods": "k10,k20,k50"},
+        "without k10": {**ONE, "neighborhoods": "s5,k20,k50"},
+        "with c2": {**ONE, "neighborhoods": "c2,s5,k10,k20,k50"},
+        "without return numbers": {**ONE, "dimensions": DIMENSIONS[:4]},
+        "without heights above openings": {**ONE, "dimensions": (*DIMENSIONS[:2], "returns")},
+        "heights above ground alone": {**ONE, "dimensions": DIMENSIONS[:1]},
+    },
+    "passes": {
+        "1": ONE,
+        "2": {},
+        "3": {"passes": 3},
+    },
+    "context": {
+        "own,box1,columnvotes2,columnvotes8": {},
+        "own,box1,columnvotes2": {"context": ("own", "box1", "columnvotes2")},
+        "own,box0.5,box1,columnvotes2,columnvotes8": {
+            "context": ("own", "box0.5", "box1", "columnvotes2", "columnvotes8")
+        },
+        "own,box0.5,boxvotes1,columnvotes1,columnvotes4": {
+            "context": ("own", "box0.5", "boxvotes1", "columnvotes1", "columnvotes4")
+        },
+    },
+    "trees": {
+        "100, leaves of 3": {},
+        "60, leaves of 3": {"trees": 60},
+        "40, leaves of 3": {"trees": 40},
+        "60, leaves of 5": {"trees": 60, "min_samples_leaf": 5},
+        "60, leaves of 10": {"trees": 60, "min_samples_leaf": 10},
+        "30, leaves of 5": {"trees": 30, "min_samples_leaf": 5},
+    },
+}
+CODES = {"Montpellier": (2, 3, 4, 5, 6), "Delft": (1, 2, 6)}
+
+
+def cloud(files: list[Path], codes: tuple[int, ...], name: str) -> TrainingCloud:
+    """A labelled cloud with heights and return numbers."""
+    parts = [laspy.read(file) for file in files]
+    xyz = np.concatenate([np.column_stack([p.x, p.y, p.z]) for p in parts]).astype(float)
+    labels = np.concatenate([np.asarray(p.classification) for p in parts]).astype(np.uint8)
+    dimensions = filtered_ground(*np.ascontiguousarray(xyz.T), openings=(5, 17))
+    for ours, word in (("ReturnNumber", "return_number"), ("NumberOfReturns", "number_of_returns")):
+        dimensions[ours] = np.concatenate([np.asarray(p[word]) for p in parts]).astype(np.uint8)
+    return TrainingCloud(xyz, np.where(np.isin(labels, codes), labels, 0), dimensions, name=name)
+
+
+def part(whole: TrainingCloud, rows: np.ndarray, name: str) -> TrainingCloud:
+    """Some of a cloud's points."""
+    given = {key: np.asarray(values)[rows] for key, values in whole.dimensions.items()}
+    return TrainingCloud(whole.xyz[rows], whole.labels[rows], given, name=name)
+
+
+def held_out(data: Path) -> Iterator[tuple[str, TrainingCloud, TrainingCloud]]:
+    """(scene, what is trained on, what is classified)."""
+    whole = cloud(sorted((data / "montpellier").glob("train_*.laz")), CODES["Montpellier"], "Montpellier")
+    tile = np.unique(np.floor((whole.xyz[:, :2] - 1e-6) / 50.0), axis=0, return_inverse=True)[1].ravel()
+    for number in range(4):
+        yield "Montpellier", part(whole, tile != number, "rest"), part(whole, tile == number, "tile")
+    whole = cloud([data / "delft" / "train.laz"], CODES["Delft"], "Delft")
+    third = np.searchsorted(np.quantile(whole.xyz[:, 1], [1 / 3, 2 / 3]), whole.xyz[:, 1])
+    for number in range(3):
+        yield "Delft", part(whole, third != number, "rest"), part(whole, third == number, "third")
+
+
+def options(changes: dict[str, Any], codes: tuple[int, ...], count: int) -> TrainingOptions:
+    """Today's defaults with changes."""
+    given = {"neighborhoods": "s5,k10,k20,k50", "feature_set": MOMENTS, "dimensions": DIMENSIONS}
+    return TrainingOptions(
+        **{**given, "classes": {str(code): code for code in codes}, "count": count, "threads": 1, **changes}
+    )
+
+
+def run(data: Path, rows: dict[str, dict[str, Any]], count: int) -> list[dict[str, Any]]:
+    """A line for each row."""
+    found = {
+        name: {scene: np.zeros((len(codes), len(codes)), np.int64) for scene, codes in CODES.items()}
+        for name in rows
+    }
+    seconds = {name: [0.0, 0.0, 0] for name in rows}
+    columns = {}
+    for scene, rest, held in held_out(data):
+        codes = CODES[scene]
+        for name, changes in rows.items():
+            began = time.process_time()
+            model = train([rest], options(changes, codes, count), progress=False)
+            trained = time.process_time()
+            given = model.predict(held.xyz, held.dimensions, threads=1).classification
+            seconds[name][0] += trained - began
+            seconds[name][1] += time.process_time() - trained
+            seconds[name][2] += len(held.xyz)
+            columns[name] = len(model.passes[0].plan.names)
+            known = np.isin(held.labels, codes)
+            pair = np.searchsorted(codes, held.labels[known]), np.searchsorted(codes, given[known])
+            np.add.at(found[name][scene], pair, 1)
+        print(f"{scene}: a part held out", flush=True)
+    lines = []
+    for name in rows:
+        line: dict[str, Any] = {"name": name, "features": columns[name]}
+        for scene, codes in CODES.items():
+            accuracy = Accuracy.from_confusion(found[name][scene], codes)
+            line[scene] = {
+                "oa": 100 * accuracy.overall_accuracy,
+                "f1": 100 * accuracy.mean_f1,
+                "classes": {str(code): 100 * value for code, value in accuracy.f1.items()},
+            }
+        merged = Accuracy.from_confusion(found[name]["Montpellier"], CODES["Montpellier"]).merge({5: [3, 4]})
+        line["Montpellier"]["merged"] = 100 * merged.overall_accuracy
+        line["training"], line["classifying"] = (
+            seconds[name][0],
+            1e6 * seconds[name][1] / seconds[name][2],
+        )
+        lines.append(line)
+    return lines
+
+
+def text(tables: dict[str, list[dict[str, Any]]]) -> str:
+    """As Markdown."""
+    out = []
+    for title, lines in tables.items():
+        out += [
+            f"| {title} | features | Montpellier OA | mean F1 | merged | F1 of 3 | Delft OA | mean F1 | "
+            "training, CPU s | microseconds a point |",
+            "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
+        ]
+        for line in lines:
+            city, town = line["Montpellier"], line["Delft"]
+            out.append(
+                f"| {line['name']} | {line['features']} | {city['oa']:.1f} | {city['f1']:.1f} | {city['merged']:.1f} | "
+                f"{city['classes']['3']:.1f} | {town['oa']:.1f} | {town['f1']:.1f} | {line['training']:.0f} | "
+                f"{line['classifying']:.1f} |"
+            )
+        out.append("")
+    return "\n".join(out)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, required=True, help="folder of the clouds")
+    parser.add_argument("--table", nargs="+", choices=list(TABLES), default=list(TABLES))
+    parser.add_argument("--count", type=int, default=2500, help="samples of each class")
+    parser.add_argument("--json", type=Path, help="where the figures go")
+    given = parser.parse_args()
+    tables = {}
+    for title in given.table:
+        tables[title] = run(given.data, TABLES[title], given.count)
+        print(text({title: tables[title]}), flush=True)
+    if given.json:
+        given.json.write_text(json.dumps(tables, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

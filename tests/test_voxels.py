@@ -1,0 +1,154 @@
+"""One point for each voxel of dense clouds: an obvious reference, any order, any tile, and models that use it."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pdal_stages as ps
+from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, train
+from pdal_stages.features import compute_features, voxels
+from pdal_stages.features.voxels import COLUMN, represent
+
+
+def crowd(seed=0, n=6000, side=12.0, dense=4.0):
+    """A cloud that is ten times as dense in a corner, some points twice."""
+    rng = np.random.default_rng(seed)
+    xyz = np.column_stack([rng.uniform(0, side, (n, 2)), rng.normal(0, 0.3, n)])
+    xyz[: n // 2, :2] *= dense / side
+    xyz[:50] = xyz[50:100]
+    return np.round(xyz, 3) + np.array([600_000.0, 5_000_000.0, 100.0])
+
+
+def plainly(xyz, density):
+    """Voxel of each point of a crowded column, None for the others."""
+    along = max(round(COLUMN * density**0.5), 1)
+    column = [tuple(np.floor(p[:2] / COLUMN)) for p in xyz]
+    many = {c: column.count(c) for c in set(column)}
+    out = []
+    for p, c in zip(xyz, column, strict=True):
+        base = np.floor(p / COLUMN) * COLUMN
+        inside = np.minimum(((p - base) * (along / COLUMN)).astype(int), along - 1)
+        out.append((*base, *inside) if many[c] > density * COLUMN**2 else None)
+    return out
+
+
+@pytest.mark.parametrize("density", [0.5, 9.0, 16.0, 30.0])
+def test_one_of_each_voxel(density):
+    xyz = crowd(n=2500)
+    found = represent(xyz, density)
+    voxel = plainly(xyz, density)
+    assert found is not None
+    points, place = found.members(np.arange(len(found.rows)))
+    assert sorted(points) == list(range(len(xyz)))
+    for point, stands in zip(points, found.rows[place], strict=True):
+        assert voxel[point] == voxel[stands]
+        assert voxel[point] is not None or point == stands
+    assert len(found.rows) == len(set(filter(None, voxel))) + voxel.count(None)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 2**31), st.sampled_from([3.0, 16.0, 50.0]))
+def test_any_order_and_any_tile(seed, density):
+    xyz = crowd(seed % 7)
+    value = np.random.default_rng(seed).integers(0, 3, len(xyz))
+    whole = represent(xyz, density, [value])
+    order = np.random.default_rng(seed).permutation(len(xyz))
+    other = represent(xyz[order], density, [value[order]])
+    if whole is None:
+        assert other is None
+        return
+    rows = lambda points, v, kept: sorted(map(tuple, np.column_stack([points[kept], v[kept]])))  # noqa: E731
+    assert rows(xyz, value, whole.rows) == rows(xyz[order], value[order], other.rows)
+    core = (xyz[:, 0] < 600_003.1) & (xyz[:, 1] < 5_000_003.7)
+    halo = voxels.reach(density)
+    near = np.flatnonzero((xyz[:, 0] < 600_003.1 + halo) & (xyz[:, 1] < 5_000_003.7 + halo))
+    tile = represent(xyz[near], density, [value[near]])
+    kept = np.arange(len(near)) if tile is None else tile.rows
+    inside = lambda chosen: {r for r in chosen if core[r]}  # noqa: E731
+    assert {tuple(xyz[r]) for r in inside(near[kept])} == {tuple(xyz[r]) for r in inside(whole.rows)}
+
+
+def test_points_asked_for():
+    xyz = crowd()
+    rows = np.flatnonzero(np.arange(len(xyz)) % 5 == 0)
+    found = represent(xyz, 16.0, (), rows)
+    points, _ = found.members(found.wanted)
+    assert np.array_equal(np.sort(points), rows)
+
+
+def test_sparse_clouds_stay():
+    assert represent(crowd(), 1e4) is None
+
+
+@pytest.fixture(scope="module")
+def model():
+    xyz = crowd(n=9000)
+    labels = np.where(xyz[:, 2] > 100.1, 5, 2)
+    options = TrainingOptions(
+        neighborhoods="s1,k10", dimensions=(), trees=8, count=200, max_density=16.0, threads=2
+    )
+    return train(TrainingCloud(xyz, labels), options, progress=False)
+
+
+@pytest.mark.parametrize(
+    "how", [{}, {"smooth": 0.5}, {"reject_below": 0.7}, {"margin": True, "probabilities": True}]
+)
+def test_members_get_the_same(model, how, tmp_path):
+    xyz = crowd(3)
+    where = xyz[:, 0] < 600_006.0
+    old = np.full(len(xyz), 9)
+    found = model.predict(xyz, {}, where, current=old, **how)
+    few = represent(xyz, 16.0)
+    thin = model.predict(xyz[few.rows], {}, where[few.rows], current=old[few.rows], **how)
+    assert (found.classification[~where] == 9).all()
+    stands = few.rows
+    both = where[stands]
+    for name in ("classification", "reliability", "margin", "probabilities"):
+        a, b = getattr(found, name), getattr(thin, name)
+        if a is not None and not how.get("smooth"):
+            assert np.array_equal(a[stands][both], b[both])
+    points, place = few.members(np.arange(len(few.rows)))
+    inside = where[points] & where[stands[place]]
+    assert np.array_equal(found.reliability[points][inside], found.reliability[stands[place]][inside])
+    assert found.report["representatives"] == len(few.rows)
+    assert found.classified == where.sum()
+    model.save(tmp_path / "m.model")
+    again = load_model(tmp_path / "m.model")
+    assert again.max_density == 16.0
+    assert np.array_equal(
+        again.predict(xyz, {}, where, current=old, **how).classification, found.classification
+    )
+    order = np.random.default_rng(0).permutation(len(xyz))
+    shuffled = model.predict(xyz[order], {}, where[order], current=old, **how)
+    assert np.array_equal(shuffled.classification, found.classification[order])
+
+
+def test_tile_is_the_whole(model):
+    xyz = crowd(5, n=20_000, side=60.0, dense=25.0)
+    whole = model.predict(xyz, {})
+    near = (xyz[:, 0] < 600_010.0 + model.halo) & (xyz[:, 1] < 5_000_010.0 + model.halo)
+    core = (xyz[:, 0] < 600_010.0) & (xyz[:, 1] < 5_000_010.0)
+    assert not near.all()
+    tile = model.predict(xyz[near], {})
+    assert np.array_equal(tile.reliability[core[near]], whole.reliability[core])
+
+
+@pytest.mark.pdal
+def test_features_of_dense_clouds(pdal_module):
+    """``filters.multiscalefeatures`` with ``max_density``: those of the cloud of representatives."""
+    xyz = crowd(2)
+    few = represent(xyz, 16.0)
+    array = np.zeros(len(xyz), [("X", "f8"), ("Y", "f8"), ("Z", "f8")])
+    for axis, name in enumerate("XYZ"):
+        array[name] = xyz[:, axis]
+    options = {"neighborhoods": "s1,k10", "feature_set": "Linearity", "max_density": 16.0}
+    stage = ps.Filter.multiscalefeatures(**options, where="X < 600006")
+    job = pdal_module.Pipeline(stage.stages, arrays=[array])
+    job.execute()
+    found = job.arrays[0]
+    points, place = few.members(np.arange(len(few.rows)))
+    plain = compute_features(xyz[few.rows], neighborhoods="s1,k10", feature_set="Linearity")
+    inside = xyz[points, 0] < 600_006
+    assert np.array_equal(found["Linearity_k10"][points[inside]], plain["Linearity_k10"][place[inside]])
+    assert (found["Linearity_k10"][points[~inside]] == 0).all()
