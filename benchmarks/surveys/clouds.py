@@ -140,6 +140,16 @@ class Cloud:
             )
         )
 
+    def taken(self, rows: np.ndarray) -> Cloud:
+        """Some of the points, with the heights they have."""
+        return replace(
+            self,
+            xyz=self.xyz[rows],
+            labels=self.labels[rows],
+            truth=self.truth[rows],
+            dimensions={name: values[rows] for name, values in self.dimensions.items()},
+        )
+
     @property
     def density(self) -> float:
         """Points per square metre of the 4 m cells that hold more than one, the median."""

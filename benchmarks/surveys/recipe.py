@@ -10,6 +10,7 @@ from clouds import SURVEYS, Cloud, load, on_slopes, thinned, without_returns
 
 from pdal_stages.base.hashing import coordinate_hash
 from pdal_stages.classifier import Model, TrainingCloud, TrainingOptions, train
+from pdal_stages.features.voxels import represent
 
 #: Points per square metre of thinned copies.
 DENSITIES = (8.0, 2.0, 0.6)
@@ -53,7 +54,10 @@ def copies(cloud: Cloud) -> Iterator[Cloud]:
 
 
 def training_cloud(cloud: Cloud) -> TrainingCloud:
-    """With a mask of :data:`SAMPLES` points of each class, chosen by their coordinates."""
+    """As dense as it is trained on, with a mask of :data:`SAMPLES` points of each class, chosen by their coordinates."""
+    few = represent(cloud.xyz, OPTIONS.max_density, cloud.dimensions.values())
+    if few is not None:
+        cloud = cloud.taken(few.rows)
     order = np.argsort(coordinate_hash(cloud.xyz, 1), kind="stable")
     mask = np.zeros(len(order), np.bool_)
     for code in (2, 5, 6):
