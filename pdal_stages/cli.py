@@ -24,6 +24,13 @@ _OVERRIDES = (
     "--filters.name.option=VALUE for all stages of a type."
 )
 
+#: Points that a classifier did not give a class, by their name in its report.
+_LEFT_ALONE = {
+    "rejected": "rejected as unreliable",
+    "ignored": "left out: noise, withheld (ignore)",
+    "kept": "class kept (keep)",
+    "outside_where": "outside where",
+}
 #: Lines of PDAL's log that are shown without -v.
 _SAID = 10
 
@@ -315,8 +322,9 @@ def _classify(options: argparse.Namespace) -> None:
     report = pipeline.reports[-1][1][-1]
     for code, points in report.get("classes", {}).items():
         print(f"  {int(code):3d} {names.get(int(code), class_name(int(code))):28s} {points:>12,}")
-    if report.get("rejected"):
-        print(f"  rejected: {report['rejected']:,}")
+    for key, what in _LEFT_ALONE.items():
+        if report.get(key):
+            print(f"  {what:32s} {report[key]:>12,}")
 
 
 def _models(options: argparse.Namespace) -> None:

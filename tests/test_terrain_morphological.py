@@ -378,13 +378,13 @@ def test_ground_of_real_clouds(data_dir, name):
 def test_the_stage_declares_what_it_makes_and_how_far_it_looks():
     stage = HagMorphological({"ground": True, "terrain_slope": "true", "openings": "5, 16.5"})
     assert stage.creates() == {
-        "HeightAboveGround": "double",
+        "HeightAboveGround": "float",
         "Ground": "uint8_t",
-        "Slope": "double",
+        "Slope": "float",
         "HeightAboveOpening_5": "float",
         "HeightAboveOpening_16_5": "float",
     }
-    assert HagMorphological({}).creates() == {"HeightAboveGround": "double"}
+    assert HagMorphological({}).creates() == {"HeightAboveGround": "float"}
     assert 300 < HagMorphological({}).halo() < 400
     assert HagMorphological({"window": 20}).halo() < 300
     with pytest.raises(

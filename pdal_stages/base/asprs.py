@@ -61,9 +61,10 @@ _COLORS: dict[int, tuple[int, int, int]] = {
 NOISE = (7, 18)
 #: Codes that say nothing about the object: never classified, unclassified.
 UNLABELLED = (0, 1)
-#: Codes that do not say what kind of thing a point is, 12 (overlap of strips before LAS 1.4) among them. They are
-#: neither trained on nor scored unless they are named.
-UNINFORMATIVE = (*UNLABELLED, *NOISE, 12)
+#: Overlap of strips, before LAS 1.4 had a flag for it.
+OVERLAP = 12
+#: Codes that do not say what kind of thing a point is. They are neither trained on nor scored unless they are named.
+UNINFORMATIVE = (*UNLABELLED, *NOISE, OVERLAP)
 #: Largest code LAS 1.0-1.3 point formats (0-5) hold: five bits.
 LEGACY_LIMIT = 31
 #: Largest code point formats 6-10 hold: one byte.

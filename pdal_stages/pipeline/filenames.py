@@ -17,18 +17,21 @@ _NO_FILES = ("type", "tag", "inputs", "user_data", "pdalargs")
 
 def readers_files(stages: list[dict[str, Any]], *, las: bool = False) -> list[str]:
     """Local files that PDAL's readers read, patterns filled in; only LAS and LAZ files with `las`."""
-    found: list[str] = []
-    for index, stage in enumerate(stages):
-        name, kind = stage.get("filename"), stage.get("type", "")
-        if not isinstance(name, str) or "://" in name or (not kind and 0 < index == len(stages) - 1):
-            continue
-        is_las = kind in ("readers.las", "readers.copc") or (
-            not kind and name.lower().endswith((".las", ".laz"))
-        )
-        if is_las or (not las and (not kind or kind.startswith("readers."))):
-            names = sorted(glob.glob(name)) if not os.path.exists(name) else [name]
-            found += [n for n in names if os.path.isfile(n)]
-    return found
+    last = len(stages) - 1
+    reading = [s for n, s in enumerate(stages) if s.get("type") or not 0 < n == last]
+    return [name for stage in reading for name in reader_files(stage, las=las)]
+
+
+def reader_files(stage: dict[str, Any], *, las: bool = False) -> list[str]:
+    """Those of one stage, which is a reader where it has no type."""
+    name, kind = stage.get("filename"), stage.get("type", "")
+    if not isinstance(name, str) or "://" in name:
+        return []
+    is_las = kind in ("readers.las", "readers.copc") or (not kind and name.lower().endswith((".las", ".laz")))
+    if not is_las and (las or (kind and not kind.startswith("readers."))):
+        return []
+    names = sorted(glob.glob(name)) if not os.path.exists(name) else [name]
+    return [n for n in names if os.path.isfile(n)]
 
 
 def named_files(stages: list[dict[str, Any]]) -> list[str]:

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import DimensionError, StageError
 from ..base.outputs import check_outputs
+from ..stages.points import Points
 from .filenames import stage_files
 from .lowering import lower_stage
 from .overrides import Override, apply_overrides
@@ -108,11 +109,14 @@ def compare_files(
     check_outputs(stage.outputs(), [*listed["files"], *stage_files(stage)])
     parts, wkt = [], ""
     for source, reference in pairs:
-        (mine, wkt), (true, _) = _points_of(source, dimension), _points_of(reference, reference_dimension)
+        mine, wkt, withheld = _points_of(source, dimension)
+        true, _, _ = _points_of(reference, reference_dimension)
         _refuse_other_points(mine, true, source, reference)
-        kept = [name for name in ("X", "Y", "Z", "Reliability", "Margin") if name in mine.dtype.fields]
+        named = [span.dimension for span in stage.ignore.spans] if stage.ignore else []
+        kept = [n for n in ("X", "Y", "Z", "Reliability", "Margin", *named) if n in mine.dtype.names]
         part = {name: mine[name] for name in kept}
-        parts.append({**part, "Classification": mine[dimension], "Reference": true[reference_dimension]})
+        codes = {"Classification": mine[dimension], "Reference": true[reference_dimension]}
+        parts.append({"Withheld": withheld, **part, **codes})
     shared = [name for name in parts[0] if all(name in part for part in parts)]
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in shared}
     stage.run(stage.points(arrays, wkt=wkt))
@@ -163,8 +167,8 @@ def paired(sources: Sequence[str], references: Sequence[str]) -> list[tuple[str,
     return [(source, reference) for reference, source in pairs.items()]
 
 
-def _points_of(name: str, dimension: str) -> tuple[Any, str]:
-    """All points of a file with class codes freed of flag bits, and its spatial reference."""
+def _points_of(name: str, dimension: str) -> tuple[Any, str, NDArray]:
+    """All points of a file with class codes freed of flag bits, its spatial reference, and the withheld flags."""
     from . import pdal as pdal_env
     from .run import Pipeline
     from .runtime import wkt_of
@@ -175,11 +179,16 @@ def _points_of(name: str, dimension: str) -> tuple[Any, str]:
     names = array.dtype.names or ()
     if dimension not in names:
         raise DimensionError(f"the dimension '{dimension}' is missing", where=name, found=", ".join(names))
-    if "Classification" in names and pdal_env.flags_inside_classification(names, pipeline.metadata):
-        array["Classification"] &= LEGACY_LIMIT
+    points = Points(
+        {n: array[n] for n in names},
+        legacy_flags=pdal_env.flags_inside_classification(names, pipeline.metadata),
+    )
+    withheld = np.array(points.flag("Withheld"), np.uint8)
+    if "Classification" in names:
+        array["Classification"] = points.class_codes
     readers = [v for k, v in pipeline.metadata.get("metadata", {}).items() if k.startswith("readers.")]
     node = readers[0] if readers else None
-    return array, wkt_of(node[0] if isinstance(node, list) else node)
+    return array, wkt_of(node[0] if isinstance(node, list) else node), withheld
 
 
 def _refuse_other_points(mine: np.ndarray, true: np.ndarray, source: str, reference: str) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 from ..base.errors import PipelineError, StageError, suggest
 from ..stages import preparation, registry
 from ..stages.base import Stage
+from . import classflags
 from .optionfile import settled
 from .read import PipelineSource
 from .runtime import TRAMPOLINE, known, place, python_filter
@@ -76,6 +77,7 @@ def lower(source: PipelineSource) -> Lowered:
         _refuse_near_miss(stages[-1], source.where(index))
     views = _Views()
     out = Lowered([])
+    parted = classflags.splitter(stages)
     tags = {str(s["tag"]) for s in stages if "tag" in s}
     for index, stage in enumerate(stages):
         type_name = stage.get("type", "")
@@ -83,6 +85,8 @@ def lower(source: PipelineSource) -> Lowered:
         if type_name not in registry.stages():
             views.add(stage, last=0 < index == len(stages) - 1)
             out.stages.append(stage)
+            if parted is not None and index == parted[1]:
+                out.stages.append(parted[0])
             continue
         try:
             if views.unmerged(stage):
@@ -116,6 +120,11 @@ def _tell_preparations(lowered: Lowered) -> None:
                 made.append(preparation.entry({"type": makers[index].stage.type, **makers[index].given}))
             elif "HeightAboveGround" in wanted and stage.get("type") in preparation.OF_PDAL:
                 made.append(preparation.entry(stage))
+        before = {name for one in lowered.ours if one.index < ours.index for name in one.stage.creates()}
+        if any(s.get("type") in preparation.OF_PDAL for s in lowered.stages[: ours.index]):
+            before.add("HeightAboveGround")
+        if before & set(ours.stage.creates()):
+            ours.stage.makes_again = ours.plain["pdalargs"]["makes_again"] = True
         if made:
             ours.plain["pdalargs"]["preparation"] = made
         if (remark := ours.stage.follows(made)) is not None:

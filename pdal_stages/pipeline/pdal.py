@@ -229,12 +229,22 @@ def writes_extended_classes_to_laz() -> bool:
     return version() >= (2, 3, 0)
 
 
+#: Dimensions of newer PDAL for the flags of a point.
+FLAGS = ("Synthetic", "KeyPoint", "Withheld", "Overlap")
+
+
+@cache
+def splits_class_flags() -> bool:
+    """Whether readers give the flags of LAS 1.0-1.3 apart from the class (PDAL 2.2 does not)."""
+    return "Withheld" in {one["name"] for one in bindings().dimensions}
+
+
 def flags_inside_classification(dimensions, metadata: Any) -> bool:
     """Whether the flag bits of LAS 1.0-1.3 sit inside `Classification`, as PDAL 2.2 reads them.
 
     Newer versions have a dimension for each flag; LAS 1.4 formats have `ClassFlags`.
     """
-    if any(name in dimensions for name in ("Synthetic", "Withheld", "ClassFlags")):
+    if any(name in dimensions for name in (*FLAGS, "ClassFlags")):
         return False
     formats = [int(v) for v in _values(metadata, "dataformat_id") if str(v).isdigit()]
     return bool(formats) and all(f <= 5 for f in formats)

@@ -122,6 +122,7 @@ def run_on_view(module, arguments, ins, outs) -> dict[str, Any]:
     if stage is None:
         kind = registry.get(arguments["stage"])
         stage = kind(arguments.get("options", {}), place(kind.type, arguments.get("tag")))
+        stage.makes_again = arguments.get("makes_again", False)
         stage.follows(arguments.get("preparation", []))
     points = points_of(stage, module, ins)
     for name in stage.reads():

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import DimensionError, OptionError
 from ..base.las import LasHeader, read_header
-from ..stages.base import Stage
+from ..stages.base import CodeLimit, Stage
 from . import pdal as pdal_env
+from .filenames import reader_files
 
 _LAS_WRITERS = ("writers.las", "writers.copc")
 #: A variable-length record of LAS holds 65,535 bytes; an extra dimension's description takes 192.
@@ -34,10 +37,13 @@ def check_writers(stages: list[dict[str, Any]], ours: list[tuple[Stage, str, int
     for stage, place, index in ours:
         largest, extra = stage.largest_class(), len(stage.creates())
         for writer in stages[index + 1 :]:
-            if not _writes_las(writer):
+            if not writes_las(writer):
                 continue
-            if largest > LEGACY_LIMIT:
-                _check_codes(place, largest, writer, stages[:index])
+            limit = _code_limit(writer, stages[:index])
+            if limit is not None:
+                stage.code_limit = limit
+                if largest > limit.largest:
+                    raise OptionError(limit.what, where=place, found=f"code {largest}", cure=limit.cure)
             if extra > _MOST_EXTRA and str(writer.get("extra_dims", "")).strip() == "all":
                 raise DimensionError(
                     f"LAS cannot hold so many extra dimensions: one record describes {_MOST_EXTRA} of them",
@@ -49,41 +55,43 @@ def check_writers(stages: list[dict[str, Any]], ours: list[tuple[Stage, str, int
                 )
 
 
-def _writes_las(stage: dict[str, Any]) -> bool:
+def writes_las(stage: dict[str, Any]) -> bool:
+    """Whether a stage writes LAS."""
     type_name = stage.get("type", "")
     suffix = Path(str(stage.get("filename", ""))).suffix.lower()
     return type_name in _LAS_WRITERS or (not type_name and suffix in (".las", ".laz"))
 
 
-def _check_codes(place: str, largest: int, writer: dict[str, Any], before: list[dict[str, Any]]) -> None:
+def _code_limit(writer: dict[str, Any], before: list[dict[str, Any]]) -> CodeLimit | None:
+    """The largest class code that a LAS writer can hold; None where that is any."""
     if writer.get("type") == "writers.copc":
-        return
-    minor, format_id = _las_version(writer, before)
+        return None
+    minor, format_id = las_version(writer, before)
     if format_id <= 5:
-        raise OptionError(
+        return CodeLimit(
+            LEGACY_LIMIT,
             f"class codes above {LEGACY_LIMIT} do not fit the LAS file that writers.las would write "
             f"(LAS 1.{minor}, dataformat_id {format_id})",
-            where=place,
-            found=f"code {largest}",
-            cure='Give writers.las "minor_version": 4 and "dataformat_id": 6 (7 with colours, 8 with near infrared)',
+            'Give writers.las "minor_version": 4 and "dataformat_id": 6 (7 with colours, 8 with near infrared)',
         )
     compressed = str(writer.get("compression", "")).lower() not in ("", "none", "false") or str(
         writer.get("filename", "")
     ).lower().endswith(".laz")
     if compressed and not pdal_env.writes_extended_classes_to_laz():
-        raise OptionError(
-            f"this PDAL cannot write class codes above {LEGACY_LIMIT} to LAZ 1.4: they would come out wrong",
-            where=place,
-            found=f"code {largest}, PDAL {'.'.join(map(str, pdal_env.version()))}",
-            cure="Write .las and compress it afterwards, or use PDAL 2.3 or later",
+        return CodeLimit(
+            LEGACY_LIMIT,
+            f"PDAL {'.'.join(map(str, pdal_env.version()))} cannot write class codes above {LEGACY_LIMIT} to LAZ 1.4: they "
+            "would come out wrong",
+            "Write .las and compress it afterwards, or use PDAL 2.3 or later",
         )
+    return None
 
 
-def _las_version(writer: dict[str, Any], before: list[dict[str, Any]]) -> tuple[int, int]:
+def las_version(writer: dict[str, Any], before: Iterable[dict[str, Any]]) -> tuple[int, int]:
     """(minor_version, dataformat_id) the writer will use: its options, the forwarded header, PDAL's defaults."""
     minor, format_id = pdal_env.las_writer_defaults()
     forward = str(writer.get("forward", ""))
-    headers = [h for h in (_las_header(s) for s in before) if h is not None]
+    headers = las_headers(before)
     if headers and ("all" in forward or "header" in forward or "minor_version" in forward):
         if len({h.minor for h in headers}) == 1:
             minor = headers[0].minor
@@ -100,12 +108,10 @@ def _whole(value: Any, otherwise: int) -> int:
         return otherwise
 
 
-def _las_header(stage: dict[str, Any]) -> LasHeader | None:
-    """The header of a LAS file that a stage reads; None where it cannot be read here."""
-    if stage.get("type", "") not in ("", "readers.las", "readers.copc"):
-        return None
-    path = Path(str(stage.get("filename", "")))
-    try:
-        return read_header(path) if path.is_file() else None  # a pipe or device must not be read here
-    except (OSError, ValueError):
-        return None
+def las_headers(readers: Iterable[dict[str, Any]]) -> list[LasHeader]:
+    """Headers of the LAS files that stages read, as far as they can be read here."""
+    found = []
+    for path in [name for stage in readers for name in reader_files(stage, las=True)]:
+        with contextlib.suppress(OSError, ValueError):
+            found.append(read_header(path))
+    return [header for header in found if header is not None]

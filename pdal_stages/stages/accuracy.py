@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from .base import Stage
 from .modelclassifier import ModelClassifier, loaded_model
 from .options import option
 from .points import Points
+from .selection import Selection
 
 
 class AccuracyStage(Stage):
@@ -40,11 +42,11 @@ class AccuracyStage(Stage):
         (),
         "Reference classes to compare, after merging; default: those of the model, or else every one found",
     )
-    ignore: list[int] | None = option(
-        "codes",
+    ignore: Selection | None = option(
+        "selection",
         None,
-        "Reference codes, before merging, left out and counted; default: "
-        f"{', '.join(map(str, UNINFORMATIVE))}, or, where 'classes' or a model says what counts, none",
+        "Points left out and counted: reference codes (before merging), ranges of other dimensions, or the word withheld; "
+        f"default: withheld, and {', '.join(map(str, UNINFORMATIVE))} where neither 'classes' nor a model says what counts",
         may_be_empty=True,
     )
     merge: dict | None = option(
@@ -117,7 +119,7 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
         """What is compared: `classes`, `ignore`, `merge` and `names` of :meth:`Accuracy.from_labels`."""
         rule: dict[str, Any] = {
             "classes": self.classes or None,
-            "ignore": self.ignore,
+            "ignore": None if self.ignore is None else list(self.ignore.codes),
             "merge": self.merge,
             "names": None,
         }
@@ -143,7 +145,10 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
                 "there are no points to compare",
                 cure="Check the reader's file and the filters before this stage",
             )
-        inside = slice(None) if points.mask is None else points.mask
+        chosen = Selection.parse(["withheld"], "ignore") if self.ignore is None else self.ignore
+        inside = ~points.ignored(replace(chosen, codes=()))  # codes are of the reference
+        if points.mask is not None:
+            inside &= points.mask
         reference = points.codes_of(self.reference)[inside]
         predicted = points.codes_of(self.dimension)[inside]
         confidence: dict[str, Any] = {

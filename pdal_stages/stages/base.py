@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,20 @@ from ..base.units import named_unit
 from .options import Option, option, parse_options
 from .points import Points
 from .where import Expression
+
+#: What `where` means to stages of heights.
+HEIGHTS_OUTSIDE = (
+    "Points outside do not form the ground; they receive a height above it, unless they have one already or a stage "
+    "before made it."
+)
+
+
+class CodeLimit(NamedTuple):
+    """The largest class code that a later writer can hold, and what to say of larger ones."""
+
+    largest: int
+    what: str
+    cure: str
 
 
 class Stage(ABC):
@@ -76,6 +90,11 @@ class Stage(ABC):
     vertical_unit: str = option(
         "string", "", "Unit of z, where the spatial reference does not say; otherwise that of x and y"
     )
+
+    #: Whether stages before it in the pipeline make what it makes too.
+    makes_again: bool = False
+    #: Set where a pipeline's writer cannot hold every class code.
+    code_limit: CodeLimit | None = None
 
     def __init__(self, given: Mapping[str, Any], place: str | None = None) -> None:
         try:

@@ -22,6 +22,7 @@ from ..features.returns import SOURCES
 from .base import Stage
 from .options import option
 from .points import Points
+from .selection import UNWANTED, Selection
 
 #: Options of this stage that are not the trainer's.
 _OWN = {"filename", "label", "survey", "where", "threads", "memory", "horizontal_unit", "vertical_unit"}
@@ -160,10 +161,11 @@ class ClassifierModel(Stage):
         minimum=0,
         unit="points/m2",
     )
-    ignore: list = option(
-        "codes",
-        _default("ignore"),
-        "Labels whose points are not even neighbors, unless 'classes' names them",
+    ignore: Selection = option(
+        "selection",
+        UNWANTED,
+        "Points that are not even neighbors: labels (unless 'classes' names them), ranges of other dimensions such as "
+        "ReturnNumber[0:0], or the word withheld",
         may_be_empty=True,
     )
     leave_one_survey_out: bool = option(
@@ -239,6 +241,7 @@ holds the classes.
         values["max_features"] = _number(values["max_features"])
         if self.automatic:
             values["dimensions"] = ALWAYS
+        values["ignore"] = self.ignore.codes
         values["thin"] = [_number(v) if isinstance(v, str) else v for v in values["thin"]]
         return TrainingOptions(**values, threads=self.threads, memory_mb=self.memory)
 
@@ -293,6 +296,9 @@ holds the classes.
             name="the points",
             mask=points.mask,
         )
+        gone = points.ignored(replace(self.ignore, codes=()))  # the labels among them are left to the trainer
+        if gone.any():
+            cloud = cloud.part(np.flatnonzero(~gone))
         model = train(self._surveys(cloud, points), training)
         model.info["preparation"] = self._preparation
         model.save(self.filename)

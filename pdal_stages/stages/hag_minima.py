@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import NOISE
 from ..base.errors import OptionError
 from ..terrain.minima import MinimaTerrain, terrain_reach
-from .base import Stage
+from .base import HEIGHTS_OUTSIDE, Stage
 from .options import option
 from .points import Points
+from .selection import UNWANTED, Selection
 
 
 class HagMinima(Stage):
@@ -20,7 +20,7 @@ class HagMinima(Stage):
     summary = "Height above a coarse terrain: the minima of a grid, interpolated"
     source = "[W18] section 3.2"
     open_ended = True  # an empty cell is filled from the nearest ones, however far away
-    where_help = "Points outside neither form the terrain nor receive a height."
+    where_help = HEIGHTS_OUTSIDE
     cell: float = option(
         "number",
         20.0,
@@ -39,13 +39,13 @@ class HagMinima(Stage):
         maximum=10_000,
         unit="m",
     )
-    ignore_classes: list = option(
-        "codes",
-        NOISE,
-        "Class codes that do not form the terrain but still receive heights, e.g. noise below ground; ranges such as "
-        "Classification[7:7] are accepted, and so is PDAL's name for the option, ignore",
+    ignore: Selection = option(
+        "selection",
+        UNWANTED,
+        "Points that do not form the terrain but still receive heights: class codes, ranges such as "
+        "Classification[7:7], or the word withheld",
         may_be_empty=True,
-        also="ignore",
+        also="ignore_classes",
     )
     details = """
 The terrain is the lowest point of each cell of a coarse grid, interpolated bilinearly between cell centres and
@@ -71,7 +71,7 @@ the unit of Z.
             )
 
     def creates(self) -> dict[str, str]:
-        return {"HeightAboveGround": "double"}
+        return {"HeightAboveGround": "float"}
 
     def halo(self) -> float:
         # The bilinear patch reaches one and a half cells, whole cells are needed, and an
@@ -83,13 +83,9 @@ the unit of Z.
         return terrain_reach(x, y, self.forms_terrain(points), wanted, box, self.cell, self.resolution)
 
     def forms_terrain(self, points: Points) -> NDArray[np.bool_]:
-        """Which points form the terrain; those left out for their class are counted."""
-        forms = np.ones(points.count, bool) if points.mask is None else points.mask.copy()
-        if "Classification" in points.arrays and self.ignore_classes:
-            noise = np.isin(points.class_codes, np.array(self.ignore_classes, np.uint8))
-            points.report["ignored"] = int(np.count_nonzero(noise & forms))
-            forms &= ~noise
-        return forms
+        """Which points form the terrain; those left out are counted."""
+        forms = ~points.ignored(self.ignore)
+        return forms if points.mask is None else forms & points.mask
 
     def run(self, points: Points) -> dict[str, NDArray]:
         if points.count == 0:
@@ -97,7 +93,7 @@ the unit of Z.
         x, y, z = points.xyz.T
         forms = self.forms_terrain(points)
         terrain = MinimaTerrain.fit(x, y, z, cell=self.cell, resolution=self.resolution, mask=forms)
-        wanted = slice(None) if points.mask is None else points.mask
+        wanted = points.wanting("HeightAboveGround", self.makes_again)
         height = np.array(points.arrays["HeightAboveGround"], np.float64)
         height[wanted] = (z[wanted] - terrain.at(x[wanted], y[wanted])) / points.units.vertical
         points.report.update(terrain.report)

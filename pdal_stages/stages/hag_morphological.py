@@ -5,20 +5,20 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import NOISE
 from ..base.errors import OptionError, StageError
 from ..terrain.morphological import check_sizes, filtered_ground, reach
 from ..terrain.profile import opening_names
-from .base import Stage
+from .base import HEIGHTS_OUTSIDE, Stage
 from .options import option
 from .points import Points
+from .selection import UNWANTED, Selection
 
 
 class HagMorphological(Stage):
     type = "filters.hag_morphological"
     summary = "Height above ground found by a progressive morphological filter"
     source = "after Pingel, Clarke, McBride 2013 (SMRF), ISPRS Journal of Photogrammetry and Remote Sensing 77, 21-30"
-    where_help = "Points outside neither form the ground nor receive a height."
+    where_help = HEIGHTS_OUTSIDE
     cell: float = option(
         "number", 1.0, "Side of the grid's cells", minimum=0, exclusive=True, maximum=1000, unit="m"
     )
@@ -50,13 +50,13 @@ class HagMorphological(Stage):
     scalar: float = option(
         "number", 1.25, "Added to the threshold per unit of the terrain's slope", minimum=0, maximum=1000
     )
-    ignore_classes: list = option(
-        "codes",
-        NOISE,
-        "Class codes that cannot be ground (they still receive heights), e.g. noise; a range such as "
-        "Classification[7:7] too, and by PDAL's name, ignore",
+    ignore: Selection = option(
+        "selection",
+        UNWANTED,
+        "Points that cannot be ground but still receive heights: class codes, ranges such as Classification[7:7], or the "
+        "word withheld",
         may_be_empty=True,
-        also="ignore",
+        also="ignore_classes",
     )
     ground: bool = option(
         "boolean", False, "Also write Ground: 1 where the filter calls the point ground, else 0"
@@ -74,7 +74,7 @@ The lowest point of every cell of a grid is taken, pits (low outliers) left out,
 growing radius: a cell that a window lowers by more than `slope` times its radius, or by 3.5 m, belongs to an object.
 A surface is led through what is left, ground that was taken from ridges and dams is regained where it continues the
 surface, and points within `threshold` plus `scalar` times the terrain's slope of it are ground. A point's height is its
-Z minus the surface through the ground points. `Classification` is read for `ignore_classes` alone and not changed;
+Z minus the surface through the ground points. `Classification` is read for `ignore` alone and not changed;
 return numbers are not looked at.
 
 The options mean what they mean in PDAL's `filters.smrf`. Unlike it, every step reaches a bounded way and the grid is
@@ -107,9 +107,9 @@ of Z.
 
     def creates(self) -> dict[str, str]:
         return {
-            "HeightAboveGround": "double",
+            "HeightAboveGround": "float",
             **({"Ground": "uint8_t"} if self.ground else {}),
-            **({"Slope": "double"} if self.terrain_slope else {}),
+            **({"Slope": "float"} if self.terrain_slope else {}),
             **dict.fromkeys(opening_names(self.windows), "float"),
         }
 
@@ -118,18 +118,15 @@ of Z.
 
     def run(self, points: Points) -> dict[str, NDArray]:
         x, y, z = points.xyz.T
-        usable = np.ones(points.count, bool)
-        if "Classification" in points.arrays and self.ignore_classes:
-            noise = np.isin(points.class_codes, np.array(self.ignore_classes, np.uint8))
-            wanted = slice(None) if points.mask is None else points.mask
-            points.report["ignored"] = int(np.count_nonzero(noise[wanted]))
-            usable = ~noise
-        inside = slice(None) if points.mask is None else points.mask
+        usable = ~points.ignored(self.ignore)
+        if points.mask is not None:
+            usable &= points.mask
+        wanted = points.wanting("HeightAboveGround", self.makes_again)
         found = filtered_ground(
-            x[inside],
-            y[inside],
-            z[inside],
-            mask=usable[inside],
+            x[wanted],
+            y[wanted],
+            z[wanted],
+            mask=usable[wanted],
             cell=self.cell,
             slope=self.slope,
             window=self.window,
@@ -141,10 +138,10 @@ of Z.
             report=points.report,
         )
         out = {}
-        for name, kind in self.creates().items():
+        for name in self.creates():
             values = found[name]
             if name.startswith("HeightAbove") and points.units.vertical != 1.0:
                 values = values / points.units.vertical
-            out[name] = np.array(points.arrays[name], {"double": "f8", "float": "f4", "uint8_t": "u1"}[kind])
-            out[name][inside] = values
+            out[name] = np.array(points.arrays[name], values.dtype)
+            out[name][wanted] = values
         return out

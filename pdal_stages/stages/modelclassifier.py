@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.asprs import OVERLAP
 from ..base.errors import DimensionError, OptionError
 from ..base.progress import Progress
 from ..classifier import Model, load_model
@@ -18,6 +19,7 @@ from .base import Stage
 from .options import option
 from .points import Points
 from .preparation import as_json, same
+from .selection import UNWANTED, Selection
 
 
 class ModelClassifier(Stage):
@@ -58,6 +60,20 @@ class ModelClassifier(Stage):
         minimum=0,
         maximum=255,
     )
+    ignore: Selection = option(
+        "selection",
+        UNWANTED,
+        "Points that are neither neighbors nor classified, and keep their class: class codes, ranges such as "
+        "Classification[7:7], or the word withheld",
+        may_be_empty=True,
+    )
+    keep: Selection = option(
+        "selection",
+        (OVERLAP,),
+        "Points that are neighbors but keep the class they have, written as for ignore; 12 (overlap of strips) says of a "
+        "point what a class would overwrite",
+        may_be_empty=True,
+    )
     smooth: float = option(
         "number",
         0.0,
@@ -75,6 +91,9 @@ number. A model asked for a dimension that the points lack names the dimension a
 `Reliability` is the probability of the winning class. `smooth` (1 m, say)
 makes classes calmer: a point's probabilities become half its own and half the mean over its neighbors, as far as
 these are classified too; class, reliability and margin follow.
+Noise and withheld points would spoil the features of all around them, so by default these are as good as not there
+(`ignore`), and keep their class. `keep` names what is a neighbor but is not overwritten. Both are counted in the
+metadata; `"ignore": "", "keep": ""` classifies everything.
 With LAS 1.0-1.3 the synthetic, key-point and withheld flags of each point stay. Codes above 31
 need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before any work is done.
 """
@@ -153,13 +172,19 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
     def run(self, points: Points) -> dict[str, NDArray]:
         if points.count == 0:
             return {}
-        chosen = points.count if points.mask is None else int(np.count_nonzero(points.mask))
-        with Progress(chosen, self.type) as progress:
+        ignored, kept = points.ignored(self.ignore), points.chosen(self.keep)
+        inside = np.ones(points.count, bool) if points.mask is None else points.mask
+        stay = ignored | kept
+        points.report["kept"] = int(np.count_nonzero(inside & kept & ~ignored))
+        wanted = inside & ~stay
+        self._refuse_codes_that_stay(points, wanted)
+        with Progress(int(np.count_nonzero(wanted)), self.type) as progress:
             found = self.model.predict(
                 points.xyz,
                 self._dimensions(points),
-                points.mask,
+                None if wanted.all() else wanted,
                 current=points.class_codes,
+                ignore=ignored if ignored.any() else None,
                 threads=self.threads,
                 memory_mb=self.memory,
                 probabilities=self.probabilities,
@@ -186,8 +211,24 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
                 if name != "Classification":
                     values[name] = np.where(points.mask, values[name], points.arrays[name])
         values["Classification"] = points.with_codes(values["Classification"])
-        points.report.update(found.report)
+        points.report.update({k: v for k, v in found.report.items() if k not in points.report})
+        points.report["outside_where"] = int(np.count_nonzero(~inside))
         return values
+
+    def _refuse_codes_that_stay(self, points: Points, wanted: NDArray[np.bool_]) -> None:
+        """Before any work: codes that points keep must fit the file, as those do that the model gives."""
+        if self.code_limit is None:
+            return
+        may_keep = self.reject_below is not None and self.rejected_code is None
+        codes = points.class_codes if may_keep else points.class_codes[~wanted]
+        beyond, number = np.unique(codes[codes > self.code_limit.largest], return_counts=True)
+        if beyond.size:
+            listed = ", ".join(
+                f"{code}: {n:,} points" for code, n in zip(beyond[:5], number[:5], strict=True)
+            )
+            raise OptionError(
+                self.code_limit.what, found=f"codes that points keep, {listed}", cure=self.code_limit.cure
+            )
 
 
 def loaded_model(path: str) -> Model:

@@ -21,6 +21,7 @@ from ..features.voxels import reach as reach_of_voxels
 from .base import Stage
 from .options import option
 from .points import Points
+from .selection import UNWANTED, Selection
 
 #: Bytes a LAS extra-dimension name may have.
 _NAME_BYTES = 32
@@ -54,6 +55,13 @@ class MultiscaleFeatures(Stage):
         None,
         "JSON file with the thresholds of shape histograms and curvature: read if it exists, otherwise fitted to "
         "these points and written, so that other tiles use the same ones",
+    )
+    ignore: Selection = option(
+        "selection",
+        UNWANTED,
+        "Points that are not neighbors and get no features: class codes, ranges such as Classification[7:7], or the word "
+        "withheld",
+        may_be_empty=True,
     )
     optimal: bool = option(
         "boolean",
@@ -158,9 +166,12 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
         if points.count == 0:
             return {name: np.empty(0, np.float32) for name in self.creates()}
         bins, threshold = _read_bins(self.bins)
-        xyz, queries = points.xyz, None if points.mask is None else np.flatnonzero(points.mask)
-        total = points.count if queries is None else len(queries)
-        own = {name: points.dimension(name) for name in plan.dimensions}
+        ignored = points.ignored(self.ignore)
+        there = np.flatnonzero(~ignored)  # rows of the points that are seen
+        xyz = points.xyz[there] if ignored.any() else points.xyz
+        queries = None if points.mask is None else np.flatnonzero(points.mask[there])
+        total = len(there) if queries is None else len(queries)
+        own = {name: points.dimension(name)[there] for name in plan.dimensions}
         few = represent(xyz, self.max_density, own.values(), queries) if self.max_density else None
         if few is not None:
             xyz, queries = xyz[few.rows], few.wanted
@@ -182,11 +193,12 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
                 threads=self.threads,
                 memory_mb=self.memory,
                 progress=progress if few is None else None,
-            ):  # rows are indices into the cloud, with queries too
+            ):  # rows are indices into the engine's cloud, with queries too
                 if few is not None:
                     rows, place = few.members(rows)
                     values = values[place]
                     progress.update(len(rows))
+                rows = there[rows]
                 for name, column in zip(names, columns, strict=True):
                     out[name][rows] = values[:, column]
                 if of_chosen:

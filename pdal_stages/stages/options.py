@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from ..base import checks
 from ..base.errors import OptionError, suggest
+from .selection import Selection
 
 _JSON_TYPES = {
     "number": "number",
@@ -21,6 +21,7 @@ _JSON_TYPES = {
     "expression": "string",
     "list": "array",
     "codes": "array",
+    "selection": "array",
     "mapping": "object",
 }
 _READABLE = {
@@ -32,6 +33,7 @@ _READABLE = {
     "expression": 'a condition such as "Classification == 2"',
     "list": "a list, or text separated by commas",
     "codes": "a list, or text separated by commas",
+    "selection": "a list, or text separated by commas",
     "mapping": 'a mapping such as {"2": "Ground"}',
 }
 
@@ -45,7 +47,8 @@ class Option:
     kind : str
         ``number``, ``integer``, ``string``, ``boolean``, ``filename``, ``expression``,
         ``list`` (a JSON list or comma-separated text), ``codes`` (a list of class codes, or of ranges as PDAL
-        writes them, ``Classification[7:7]``) or ``mapping`` (a JSON object).
+        writes them, ``Classification[7:7]``), ``selection`` (the same, of other dimensions too) or ``mapping``
+        (a JSON object).
     default : object
         The value where the option is absent; None means "decided by the stage".
     help : str
@@ -87,7 +90,7 @@ class Option:
     def schema(self) -> dict:
         """The option's JSON Schema."""
         out: dict[str, Any] = {"description": self.help, "type": _JSON_TYPES[self.kind]}
-        if self.kind in ("list", "codes"):
+        if self.kind in ("list", "codes", "selection"):
             out["type"] = ["array", "string"]
         if self.kind in ("number", "integer", "boolean", "mapping"):
             out["type"] = [out["type"], "string"]  # PDAL takes numbers as text too
@@ -176,26 +179,17 @@ class Option:
         return list(value)
 
     def _parse_codes(self, value: Any) -> list[int]:
-        codes: list[int] = []
-        for item in self._parse_list(value.split(",") if isinstance(value, str) else value):
-            if not str(item).strip():
-                continue
-            span = _RANGE.fullmatch(str(item).strip())
-            if str(item).strip() in map(str, range(256)):
-                codes.append(int(item))
-            elif span is None:
-                raise OptionError(
-                    f"option '{self.name}' must list class codes of 0 to 255", found=repr(item),
-                    cure="Write 7,18 or, as PDAL has it, Classification[7:7]",
-                )  # fmt: skip
-            else:
-                out, opens, low, high, closes = span.groups()
-                inside = range(
-                    int(low or 0) + (opens == "(" and bool(low)),
-                    int(high or 255) + (closes == "]" or not high),
-                )
-                codes += [code for code in range(256) if (code in inside) != bool(out)]
-        return list(dict.fromkeys(codes))
+        chosen = self._parse_selection(value)
+        if chosen.spans:
+            raise OptionError(
+                f"option '{self.name}' must list class codes of 0 to 255", found=chosen.spans[0].dimension
+            )
+        return list(chosen.codes)
+
+    def _parse_selection(self, value: Any) -> Selection:
+        return Selection.parse(
+            self._parse_list(value.split(",") if isinstance(value, str) else value), self.name
+        )
 
     def _parse_mapping(self, value: Any) -> dict:
         if isinstance(value, str):
@@ -240,10 +234,6 @@ def _split(text: str) -> list[str]:
     return [p.strip() for p in parts if p.strip()]
 
 
-#: A range of classes as PDAL's filters write it: ``Classification[7:7]``, ``Classification(2:)``, ``Classification![2:2]``.
-_RANGE = re.compile(r"Classification\s*(!?)\s*([\[(])\s*(\d*)\s*:\s*(\d*)\s*([\])])", re.IGNORECASE)
-
-
 def parse_options(declared: Iterable[Option], given: Mapping[str, Any]) -> dict[str, Any]:
     """Every declared option with its value, given or default.
 
@@ -276,6 +266,8 @@ def parse_options(declared: Iterable[Option], given: Mapping[str, Any]) -> dict[
             raise OptionError(
                 f"option '{name}' is required", cure=f"It is {_READABLE[option.kind]}: {option.help}"
             )
+        elif option.kind == "selection" and option.default is not None:
+            values[name] = option.parse(option.default)
         else:
             values[name] = list(option.default) if isinstance(option.default, tuple) else option.default
     return values

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import DimensionError, StageError
 from ..base.units import Units, units_of_wkt
+from .selection import Selection
 from .where import Expression
 
 #: Which stage makes a dimension that a user may lack.
@@ -25,6 +26,8 @@ MAKERS = {
     "ReturnNumber": "The reader does not give it; leave it out of the model's dimensions",
     "NumberOfReturns": "The reader does not give it; leave it out of the model's dimensions",
 }
+#: Flags of a point, in the order of their bits.
+_FLAGS = ("Synthetic", "KeyPoint", "Withheld", "Overlap")
 #: How the names of dimensions begin that are lengths upward, as Z is, so they follow the vertical unit.
 _HEIGHTS = "HeightAbove"
 
@@ -157,6 +160,38 @@ class Points:
             )
         codes = values.astype(np.uint8)
         return codes & np.uint8(LEGACY_LIMIT) if self.legacy_flags else codes
+
+    def flag(self, name: str) -> NDArray:
+        """A flag of each point, 0 or 1: a dimension in newer PDAL, a bit of another in PDAL 2.2."""
+        if name in self.arrays:
+            return self.arrays[name]
+        bit = _FLAGS.index(name)
+        if "ClassFlags" in self.arrays:
+            return self.arrays["ClassFlags"] >> np.uint8(bit) & 1
+        if self.legacy_flags and name != "Overlap":
+            return self.arrays["Classification"] >> np.uint8(LEGACY_LIMIT.bit_length() + bit) & 1
+        return np.zeros(self.count, np.uint8)
+
+    def chosen(self, selection: Selection) -> NDArray[np.bool_]:
+        """The points that a selection takes."""
+        found = np.zeros(self.count, bool)
+        if selection.codes and "Classification" in self.arrays:
+            found |= np.isin(self.class_codes, np.array(selection.codes, np.uint8))
+        for span in selection.spans:
+            name = span.dimension
+            found |= span.holds(self.flag(name) if name in _FLAGS else self.dimension(name, metres=False))
+        return found
+
+    def ignored(self, selection: Selection) -> NDArray[np.bool_]:
+        """The same, counted in the report as ``ignored``, where they are inside `where`."""
+        found = self.chosen(selection)
+        self.report["ignored"] = int(np.count_nonzero(found if self.mask is None else found & self.mask))
+        return found
+
+    def wanting(self, name: str, made_before: bool) -> NDArray[np.bool_]:
+        """The points that get a height: those inside `where`, and others that have none yet (0)."""
+        inside = np.ones(self.count, bool) if self.mask is None else self.mask
+        return inside if made_before else inside | (self.arrays[name] == 0)
 
     def with_codes(self, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """New class codes for `Classification`, with the flag bits of each point kept."""

@@ -109,7 +109,7 @@ class MinimaTerrain:
             raise NoTerrainError(
                 "no terrain: none of the points may form one",
                 found=f"{x.size:,} points, all of them not finite, noise, or outside 'where'",
-                cure="Relax 'ignore_classes' or 'where'",
+                cure="Relax 'ignore' or 'where'",
             )
         # Distinct fine cells first: many points share one.
         fine_x = np.floor(x[finite] / self.resolution)

@@ -15,6 +15,7 @@ from ..base.las import read_header
 from ..pipeline.callbacks import Callbacks
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import points_of
+from ..pipeline.writerlimits import check_writers
 from ..stages import registry
 from ..stages.base import Stage
 from .extract import Piece
@@ -97,6 +98,8 @@ def run_head(
                 reach = reaches[len(stages) - 1] = _Reach(recipe.grid.box(tile), later)
                 stages.append(callbacks.filter(reach))
         pipeline = Pipeline(stages)
+        ours_there = [(ours.stage, ours.place, ours.index) for ours in pipeline.lowered.ours]
+        check_writers([*pipeline.lowered.stages, *recipe.tail], ours_there)
         for ours in pipeline.lowered.ours:
             if ours.number in reaches:
                 reaches[ours.number].stage = ours.stage
@@ -168,8 +171,6 @@ class _Reach:
         assert self.stage is not None
         points = points_of(self.stage, module, ins)
         wanted = ins[MARGIN] <= self.later if self.later > 0 else ins[MARGIN] < 0
-        if points.mask is not None:
-            wanted &= points.mask
         box = [side * points.units.horizontal for side in self.box]
         self.need = max(self.need, self.stage.reach_of(points, wanted, box))
 

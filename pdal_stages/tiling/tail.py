@@ -13,6 +13,7 @@ from ..base.complete import check_complete
 from ..base.errors import StageError
 from ..base.files import whole_files
 from ..base.las import supersede_copc
+from ..pipeline import classflags
 from ..pipeline import pdal as pdal_env
 from ..pipeline.callbacks import Callbacks
 from .results import NewValues
@@ -58,7 +59,10 @@ def run_tail(
             stages.append({**reader, "tag": f"in{number}"})
             stages += _put(callbacks, values, f"in{number}", f"put{number}")
         inputs = [f"put{number}" for number in range(len(readers))]
-        stages.append({"type": "filters.merge", "inputs": inputs, "tag": "merged"})
+        stages.append({"type": "filters.merge", "inputs": inputs})
+        parted = classflags.splitter([*readers, *tail])
+        if parted is not None:
+            stages.append(parted[0])
         with whole_files(*outputs, check=finish) as partials:
             waiting = iter(partials)
             for stage in tail:

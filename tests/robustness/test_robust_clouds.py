@@ -275,7 +275,7 @@ def test_noise_below_ground(cell, tmp_path, write_las):
     source = las(tmp_path / "in.las", xyz, write_las, Classification=np.full(402, 7, np.uint8))
     (tmp_path / "out.las").unlink()
     meta.unlink()
-    cell("Clouds", "nothing but noise").refused(["pipeline", path], "no terrain", "ignore_classes")
+    cell("Clouds", "nothing but noise").refused(["pipeline", path], "no terrain", "ignore")
 
 
 def test_water_gap_is_counted(cell, tmp_path, write_las):
@@ -378,7 +378,7 @@ def test_labels_that_are_none(cell, tmp_path, write_las):
 
 def test_stage_error_in_a_thread_is_the_same(cloud):
     with pytest.raises(StageError, match="none"):
-        ps.run_pipeline([str(cloud), {**HAG, "where": "Z > 3", "ignore_classes": list(range(256))}])
+        ps.run_pipeline([str(cloud), {**HAG, "where": "Z > 3", "ignore": list(range(256))}])
 
 
 def test_no_heights(cell, tmp_path):

@@ -436,7 +436,7 @@ def test_a_closed_pipe(cell, tmp_path):
 def test_json_of_metadata_is_whole(cell, tmp_path, cloud):
     meta = tmp_path / "meta.json"
     meta.write_text("older")
-    path = job(tmp_path, str(cloud), {**HAG, "ignore_classes": list(range(256))}, str(tmp_path / "o.las"))
+    path = job(tmp_path, str(cloud), {**HAG, "ignore": list(range(256))}, str(tmp_path / "o.las"))
     cell("Environment", "older output and metadata when a run fails").refused(
         ["pipeline", path, "--metadata", meta], "no terrain"
     )

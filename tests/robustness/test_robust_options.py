@@ -40,9 +40,9 @@ WRONG = [
         {"cell": 1, "resolution": 5},
         ["not be larger than 'cell'", "Swap them"],
     ),
-    ("class code of 300", HAG, {"ignore_classes": [300]}, ["class codes of 0 to 255", "300"]),
-    ("class code of -1", HAG, {"ignore_classes": "-1"}, ["class codes of 0 to 255", "-1"]),
-    ("nested list", HAG, {"ignore_classes": [[7]]}, ["must be a list, or text separated by commas"]),
+    ("class code of 300", HAG, {"ignore": [300]}, ["class codes of 0 to 255", "300"]),
+    ("class code of -1", HAG, {"ignore": "-1"}, ["class codes of 0 to 255", "-1"]),
+    ("nested list", HAG, {"ignore": [[7]]}, ["must be a list, or text separated by commas"]),
     ("fraction for a whole number", FEATURES, {"seed": 1.5}, ["option 'seed' must be a whole number", "1.5"]),
     ("negative seed", FEATURES, {"seed": -1}, ["option 'seed' must be a whole number from 0 to"]),
     ("negative threads", HAG, {"threads": -2}, ["option 'threads' must be a whole number from 0"]),
@@ -229,9 +229,9 @@ def test_wrong_usage(cell, tmp_path, monkeypatch, cloud, case, words, code, says
 RIGHT = [
     ("number as text", {"cell": " 20 "}),
     ("whole number as a fraction", {"cell": 20.0, "threads": 1.0}),
-    ("list as text", {"ignore_classes": "7, 18"}),
-    ("list as one number", {"ignore_classes": 7}),
-    ("empty list where none is meant", {"ignore_classes": []}),
+    ("list as text", {"ignore": "7, 18"}),
+    ("list as one number", {"ignore": 7}),
+    ("empty list where none is meant", {"ignore": []}),
     ("unit named in capitals", {"horizontal_unit": "US-FT"}),
 ]
 

@@ -1,0 +1,247 @@
+"""Noise, withheld and overlap points, and the flags of old LAS files: through the command line."""
+
+from __future__ import annotations
+
+import json
+
+import laspy
+import numpy as np
+import pytest
+
+import pdal_stages as ps
+from pdal_stages.base.errors import OptionError
+from pdal_stages.cli import main
+from pdal_stages.pipeline import pdal as pdal_env
+from pdal_stages.stages.hag_minima import HagMinima
+from pdal_stages.stages.selection import Selection
+
+pytestmark = pytest.mark.pdal
+FLAGS = ("Synthetic", "KeyPoint", "Withheld")
+
+
+def scene(seed=1, n=900):
+    """Ground (2) and a block (6)."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0, 30, (2, n)).round(2)
+    block = (x > 15) & (y > 15)
+    z = (np.where(block, 5.0, 0.0) + rng.normal(0, 0.02, n)).round(2)
+    return {"X": x, "Y": y, "Z": z, "Classification": np.where(block, 6, 2).astype(np.uint8)}
+
+
+def flagged(seed=1):
+    arrays = scene(seed)
+    rng = np.random.default_rng(seed)
+    return {**arrays, **{name: (rng.random(len(arrays["X"])) < 0.2).astype(np.uint8) for name in FLAGS}}
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory, write_las):
+    folder = tmp_path_factory.mktemp("model")
+    source = write_las(folder / "train.las", scene(), point_format=1)
+    path = folder / "small.model"
+    words = ["train", source, "--model", path, "--neighborhoods", "k8", "--count", 200]
+    options = {
+        "trees": 8,
+        "passes": 1,
+        "feature_set": "Linearity,HeightRange",
+        "dimensions": "HeightAboveGround",
+    }
+    assert main([*map(str, words), *(f"--writers.classifiermodel.{k}={v}" for k, v in options.items())]) == 0
+    return path
+
+
+def run(capsys, *words):
+    code = main([str(w) for w in words])
+    return code, *capsys.readouterr()
+
+
+def same_flags(source, out):
+    for name in ("synthetic", "key_point", "withheld"):
+        assert np.array_equal(np.asarray(source[name]), np.asarray(out[name])), name
+
+
+# ---- flags of LAS 1.0-1.3 in LAS 1.4 -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+@pytest.mark.parametrize("tiles", [False, True])
+def test_flags_of_old_files_stay_flags_in_new_ones(tmp_path, capsys, write_las, model, suffix, tiles):
+    source, out = write_las(tmp_path / "in.las", flagged(), point_format=1), tmp_path / f"out.{suffix}"
+    newer = {"minor_version": 4, "dataformat_id": 6}
+    if tiles:
+        stages = [
+            str(source),
+            {"type": "filters.hag_minima"},
+            {"type": "filters.modelclassifier", "model": str(model), "ignore": ""},
+            {"type": "writers.las", "filename": str(out), "forward": "all", **newer},
+        ]
+        (tmp_path / "job.json").write_text(json.dumps(stages))
+        words = ["pipeline", tmp_path / "job.json", "--tile", 20, "--workers", 0]
+    else:
+        words = ["classify", source, out, "--model", model, "--filters.modelclassifier.ignore="]
+        words += [f"--writers.las.{k}={v}" for k, v in newer.items()]
+    code, _, err = run(capsys, *words)
+    assert code == 0, err
+    before, after = laspy.read(source), laspy.read(out)
+    assert after.header.point_format.id == 6 and set(np.unique(after.classification)) == {2, 6}
+    same_flags(before, after)
+
+
+def test_flags_beside_files_without_room_for_them_are_refused_before_work(tmp_path, capsys, write_las, model):
+    if pdal_env.splits_class_flags():
+        pytest.skip("this PDAL reads flags as dimensions of their own")
+    old = write_las(tmp_path / "old.las", flagged(), point_format=1)
+    new = write_las(tmp_path / "new.las", scene(2), point_format=6)
+    stages = [
+        str(old),
+        str(new),
+        {"type": "filters.hag_minima"},
+        {"type": "writers.las", "filename": str(tmp_path / "o.las"), "minor_version": 4, "dataformat_id": 6},
+    ]
+    (tmp_path / "job.json").write_text(json.dumps(stages))
+    code, _, err = run(capsys, "pipeline", tmp_path / "job.json")
+    assert code == 1 and "flags" in err and "pdal-stages pipeline" in err
+    # The cure works.
+    convert = [str(old), {**stages[-1], "filename": str(tmp_path / "converted.las"), "forward": "all"}]
+    (tmp_path / "convert.json").write_text(json.dumps(convert))
+    assert run(capsys, "pipeline", tmp_path / "convert.json")[0] == 0
+    same_flags(laspy.read(old), laspy.read(tmp_path / "converted.las"))
+    stages[0] = str(tmp_path / "converted.las")
+    (tmp_path / "job.json").write_text(json.dumps(stages))
+    assert run(capsys, "pipeline", tmp_path / "job.json")[0] == 0
+
+
+def test_kept_codes_that_do_not_fit_are_refused_before_work(tmp_path, capsys, write_las, model):
+    arrays = scene()
+    arrays["Classification"][:7] = 65
+    source = write_las(tmp_path / "in.las", arrays, point_format=6)
+    words = ["--model", model, "--where", "Classification < 60"]
+    old = ["--writers.las.minor_version=2", "--writers.las.dataformat_id=1"]
+    code, _, err = run(capsys, "classify", source, tmp_path / "o.las", *words, *old)
+    assert code == 1 and "65: 7 points" in err and "minor_version" in err and "% " not in err
+    assert run(capsys, "classify", source, tmp_path / "o.las", *words)[0] == 0
+    assert np.count_nonzero(np.asarray(laspy.read(tmp_path / "o.las").classification) == 65) == 7
+
+
+# ---- noise, withheld, overlap ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("point_format", [1, 6])
+def test_noise_and_withheld_points_are_not_there(tmp_path, capsys, write_las, model, point_format):
+    """The others are classified as in a file without them; these keep their class."""
+    clean = scene()
+    n = len(clean["X"])
+    rng = np.random.default_rng(3)
+    bad = {name: np.concatenate([v, v[:120]]) for name, v in clean.items()}
+    bad["Z"][n:] += rng.uniform(-8, 8, 120)
+    bad["Classification"][n:] = np.tile([7, 18, 5], 40)
+    bad["Withheld"] = (bad["Classification"] == 5).astype(np.uint8)
+    out = {}
+    for name, arrays in (("clean", clean), ("bad", bad)):
+        source = write_las(tmp_path / f"{name}.las", arrays, point_format=point_format)
+        code, said, err = run(capsys, "classify", source, tmp_path / "o.las", "--model", model)
+        assert code == 0, err
+        out[name] = laspy.read(tmp_path / "o.las")
+    assert "left out: noise, withheld (ignore)" in said and "120" in said
+    for name in ("classification", "Reliability", "HeightAboveGround"):
+        assert np.array_equal(np.asarray(out["bad"][name])[:n], np.asarray(out["clean"][name])), name
+    assert np.array_equal(np.asarray(out["bad"].classification)[n:], bad["Classification"][n:])
+    assert np.abs(out["bad"].HeightAboveGround[n:]).max() > 1  # they still have heights
+
+
+def test_overlap_is_a_neighbor_and_keeps_its_class(tmp_path, capsys, write_las, model):
+    arrays = scene()
+    truth = arrays["Classification"].copy()
+    arrays["Classification"][::3] = 12
+    source = write_las(tmp_path / "in.las", arrays, point_format=1)
+    reliability = {}
+    for words in ((), ("--filters.modelclassifier.keep=",)):
+        code, said, err = run(capsys, "classify", source, tmp_path / "o.las", "--model", model, *words)
+        assert code == 0, err
+        out = laspy.read(tmp_path / "o.las")
+        assert np.array_equal(
+            np.asarray(out.classification) == 12, (arrays["Classification"] == 12) & (not words)
+        )
+        assert ("class kept (keep)" in said) == (not words)
+        reliability[words] = np.asarray(out.Reliability)
+    others = arrays["Classification"] != 12
+    assert np.array_equal(*(values[others] for values in reliability.values()))
+    assert (np.asarray(out.classification) == truth).mean() > 0.9
+
+
+def test_features_and_training_without_unwanted_points(tmp_path, capsys, write_las):
+    clean = scene(n=300)
+    bad = {name: np.concatenate([v, v[:60]]) for name, v in clean.items()}
+    bad["Z"][300:] += 1.0
+    bad["Classification"][300:330] = 7
+    bad["Withheld"] = np.repeat([0, 1], [330, 30]).astype(np.uint8)
+    features, models = [], []
+    for name, arrays in (("clean", clean), ("bad", bad)):
+        source = write_las(tmp_path / f"{name}.las", arrays, point_format=6)
+        made = ps.run_pipeline(
+            [
+                str(source),
+                {"type": "filters.multiscalefeatures", "neighborhoods": "k5", "feature_set": "covariance"},
+            ]
+        )
+        features.append(made.arrays[0]["Planarity_k5"])
+        train = {
+            "type": "writers.classifiermodel",
+            "filename": str(tmp_path / "m.model"),
+            "neighborhoods": "k5",
+            "passes": 1,
+            "trees": 2,
+            "count": 50,
+            "threads": 1,
+        }
+        ps.run_pipeline([str(source), {"type": "filters.hag_minima"}, train])
+        models.append(ps.load_model(tmp_path / "m.model").passes[0].arrays())
+    assert np.array_equal(features[0], features[1][:300]) and not features[1][300:].any()
+    assert all(np.array_equal(models[0][key], models[1][key]) for key in models[0])
+
+
+def test_withheld_points_are_not_scored(tmp_path, capsys, write_las):
+    arrays = scene()
+    arrays["Withheld"] = (np.arange(900) < 100).astype(np.uint8)
+    reference = write_las(tmp_path / "reference.las", arrays, point_format=1)
+    arrays["Classification"][:100] = 9
+    judged = write_las(tmp_path / "judged.las", arrays, point_format=1)
+    for words, compared, right in (((), 800, 1.0), (("--filters.accuracy.ignore=",), 900, 8 / 9)):
+        out = tmp_path / "a.json"
+        code, _, err = run(capsys, "accuracy", judged, "--reference", reference, "--json", out, *words)
+        assert code == 0, err
+        figures = json.loads(out.read_text())
+        assert figures["points"] == compared and figures["overall_accuracy"] == pytest.approx(right)
+
+
+@pytest.mark.parametrize("type_name", ["filters.hag_minima", "filters.hag_morphological"])
+def test_points_outside_where_have_heights(tmp_path, write_las, type_name):
+    """They do not form the ground, but 0 would be a height too."""
+    arrays = scene()
+    arrays["Classification"][::5] = 7
+    arrays["Z"][::5] -= 20
+    source = str(write_las(tmp_path / "in.las", arrays, point_format=1))
+    where = {"type": type_name, "where": "Classification != 7", "ignore": ""}
+    heights = ps.run_pipeline([source, where]).arrays[0]["HeightAboveGround"]
+    assert (heights[::5] < -10).all()
+    # What another stage gave them stays.
+    before = {"type": "filters.hag_minima", "ignore": ""}
+    first = ps.run_pipeline([source, before]).arrays[0]["HeightAboveGround"]
+    both = ps.run_pipeline([source, before, where]).arrays[0]["HeightAboveGround"]
+    assert np.array_equal(both[::5], first[::5]) and not np.array_equal(both, first)
+
+
+@pytest.mark.parametrize(
+    ("text", "codes", "dimensions"),
+    [
+        ("7,18,withheld", (7, 18), ["Withheld"]),
+        ("Classification[65:67], Overlap[1:1]", (65, 66, 67), ["Overlap"]),
+        ("ReturnNumber![1:1]", (), ["ReturnNumber"]),
+    ],
+)
+def test_ranges_of_dimensions(text, codes, dimensions):
+    chosen = HagMinima({"ignore": text}).ignore
+    assert isinstance(chosen, Selection) and chosen.codes == codes
+    assert [span.dimension for span in chosen.spans] == dimensions
+    with pytest.raises(OptionError, match="class codes"):
+        HagMinima({"ignore": text + ",noise"})
