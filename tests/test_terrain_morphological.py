@@ -407,18 +407,18 @@ def test_through_pdal_with_noise_where_and_classes_kept(tmp_path, write_las):
         array["X"], array["Y"], array["Z"], mask=codes != 7, openings=(5, 17), slope_too=True
     )
     for name, values in want.items():
-        assert np.array_equal(array[name], values), name
+        assert np.array_equal(array[name], values.astype(array[name].dtype)), name
     assert np.array_equal(array["Classification"], codes)
     assert (array["Ground"].dtype, array["HeightAboveOpening_5"].dtype) == (np.uint8, np.float32)
     metadata = pipeline.metadata["metadata"]["filters.hag_morphological"]
     assert metadata["ignored"] == (codes == 7).sum() and metadata["ground_points"] == want["Ground"].sum()
 
-    half = {"type": "filters.hag_morphological", "where": "X < 40"}
+    half = {"type": "filters.hag_morphological", "where": "X < 40", "ground": True}
     array = ps.run_pipeline([str(source), half]).arrays[0]
     inside = array["X"] < 40
     alone = filtered_ground(*(array[k][inside] for k in "XYZ"), mask=codes[inside] != 7)
-    assert np.array_equal(array["HeightAboveGround"][inside], alone["HeightAboveGround"])
-    assert not array["HeightAboveGround"][~inside].any()
+    assert np.array_equal(array["HeightAboveGround"][inside], alone["HeightAboveGround"].astype("f4"))
+    assert array["HeightAboveGround"][~inside].any() and not array["Ground"][~inside].any()
 
 
 @pytest.mark.pdal
@@ -428,7 +428,7 @@ def test_feet_in_feet_out(data_dir):
     array = ps.run_pipeline([str(data_dir / "units" / "autzen_feet.las"), stage]).arrays[0]
     foot = 0.3048
     want = filtered_ground(*(array[k] * foot for k in "XYZ"), openings=(9,))
-    assert np.allclose(array["HeightAboveGround"], want["HeightAboveGround"] / foot, atol=1e-9)
+    assert np.allclose(array["HeightAboveGround"], want["HeightAboveGround"] / foot, atol=1e-4)
     assert np.allclose(array["HeightAboveOpening_9"], want["HeightAboveOpening_9"] / foot, atol=1e-4)
     ground = array["Classification"] == 2
     assert array["Ground"][ground].mean() > 0.99

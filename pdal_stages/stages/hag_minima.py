@@ -92,6 +92,8 @@ the unit of Z.
             return {"HeightAboveGround": np.empty(0)}
         x, y, z = points.xyz.T
         forms = self.forms_terrain(points)
+        if points.mask is not None and not points.mask.any():  # which the report says
+            return {}
         terrain = MinimaTerrain.fit(x, y, z, cell=self.cell, resolution=self.resolution, mask=forms)
         wanted = points.wanting("HeightAboveGround", self.makes_again)
         height = np.array(points.arrays["HeightAboveGround"], np.float64)

@@ -237,8 +237,11 @@ def terrain_reach(
     """
     from scipy.spatial import cKDTree
 
-    if not wanted.any() or not forms.any():
+    if not wanted.any():
         return 0.0
+    if not forms.any():  # farther than what was read
+        around = max(box[0] - x.min(), box[1] - y.min(), x.max() - box[2], y.max() - box[3], 0.0)
+        return float(around + box[2] - box[0])
     filled = np.unique(np.column_stack([np.floor(x[forms] / cell), np.floor(y[forms] / cell)]), axis=0)
     fine = np.unique(
         np.column_stack([np.floor(x[wanted] / resolution), np.floor(y[wanted] / resolution)]), axis=0
