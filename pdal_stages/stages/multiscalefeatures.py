@@ -16,8 +16,8 @@ from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.adaptive import LEAST_RADIUS
 from ..features.neighborhoods import Neighborhood, parse_neighborhoods
-from ..features.voxels import represent
 from ..features.voxels import reach as reach_of_voxels
+from ..features.voxels import represent
 from .base import Stage
 from .options import option
 from .points import Points
