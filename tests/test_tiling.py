@@ -314,6 +314,28 @@ def test_flag_bits_of_old_formats_stay_and_are_not_counted(tmp_path, town_file, 
     assert set(run.summary["classes"]) == {"0", "2", "5", "6"}  # withheld points keep theirs
 
 
+def test_flag_bits_beside_a_file_of_a_new_format(tmp_path, town_file, model_file, write_las):
+    """Old PDAL reads the flags of one as bits of the class, of the other apart."""
+    las = laspy.read(town_file)
+    number = np.arange(len(las))
+    flags = {"Withheld": number % 2, "Synthetic": number % 3 == 0, "KeyPoint": number % 5 == 0}
+    for name, point_format, shift in (("old", 1, 0), ("new", 6, 60)):
+        arrays = {"X": las.x + shift, "Y": las.y, "Z": las.z, **flags}
+        write_las(tmp_path / f"{name}.laz", arrays, point_format=point_format)
+    paths = [tmp_path / "old.laz", tmp_path / "new.laz"]
+    run = run_tiled(clouds.stages(paths, tmp_path / "o_#.laz", model_file), 60, workers=0)
+    assert not run.failures
+    for name in ("old", "new"):
+        made = laspy.read(tmp_path / f"o_{name}.laz")
+        assert set(np.unique(made.classification)) <= {2, 5, 6}
+        for flag, dimension in (
+            ("withheld", "Withheld"),
+            ("synthetic", "Synthetic"),
+            ("key_point", "KeyPoint"),
+        ):
+            assert np.array_equal(made[flag], flags[dimension]), (name, flag)
+
+
 @pytest.mark.data
 @pytest.mark.slow
 def test_delft_comes_back_bit_for_bit(tmp_path, data_dir, model_file):

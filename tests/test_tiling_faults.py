@@ -6,9 +6,11 @@ import contextlib
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 import zipfile
 from pathlib import Path
@@ -407,6 +409,24 @@ def test_stopped_while_workers_start(tmp_path, folder, number, after):
     assert not any(map(_lives, workers)) and not clouds.hidden(tmp_path)
 
 
+def test_a_name_that_is_not_utf8(tmp_path, folder):
+    """It is told, and both reports are written."""
+    try:
+        shutil.copy(folder / "west.laz", tmp_path / os.fsdecode(b"w\xe4st.laz"))
+    except OSError:
+        pytest.skip("this file system has UTF-8 names only")
+    shutil.copy(folder / "east.laz", tmp_path)
+    for report in ("r.html", "r.json"):
+        run = command(
+            tmp_path / "job.json",
+            pipeline(tmp_path, tmp_path / "o_#.laz"),
+            *("--workers", "0", "--report", str(tmp_path / report)),
+        )
+        _, err = run.communicate(timeout=100)
+        assert run.returncode == 1 and "the name of the file is not UTF-8" in err and "Traceback" not in err
+        assert "w\\udce4st" in (tmp_path / report).read_text()
+
+
 # ---- what a run keeps -------------------------------------------------------------------------------------
 
 
@@ -592,3 +612,88 @@ def test_a_file_that_changes_during_the_run_is_told(tmp_path, folder):
         pipeline(inputs, tmp_path / "o_#.laz", python_filter(change)), 20, workers=0, buffer=0.0, resume=True
     )
     assert not run.failures and run.summary["states"]["done"] >= 4
+
+
+# ---- clusters --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture()
+def cluster(tmp_path):
+    """A Dask scheduler and a worker without a nanny, as processes: (address, scheduler, worker)."""
+    pytest.importorskip("distributed")
+    note = tmp_path / "scheduler.json"
+    words = [
+        sys.executable,
+        "-m",
+        "distributed.cli.dask_scheduler",
+        "--host",
+        "127.0.0.1",
+        "--port",
+        "0",
+        "--no-dashboard",
+    ]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": tmp_path}
+    scheduler = subprocess.Popen([*words, "--scheduler-file", note], **quiet)
+    words = [
+        sys.executable,
+        "-m",
+        "distributed.cli.dask_worker",
+        "--scheduler-file",
+        note,
+        "--no-nanny",
+        "--nthreads",
+        "1",
+    ]
+    worker = subprocess.Popen([*words, "--no-dashboard", "--memory-limit", "0"], **quiet)
+    until = time.monotonic() + 60
+    while not note.exists() and time.monotonic() < until:
+        time.sleep(0.1)
+    yield json.loads(note.read_text())["address"], scheduler, worker
+    for process in (worker, scheduler):
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.parametrize("who", ["scheduler", "worker"])
+def test_a_cluster_that_is_lost(tmp_path, folder, expected, cluster, monkeypatch, who):
+    """The run ends, says why, and --resume goes on elsewhere."""
+    address, *processes = cluster
+    monkeypatch.setattr("pdal_stages.tiling.scheduler._ASK", 1.0)
+    flag = tmp_path / "working"
+    stages = pipeline(
+        folder, tmp_path / "o_#.laz", python_filter(f"open({str(flag)!r}, 'w').close(); time.sleep(1)")
+    )
+
+    def kill():
+        while not flag.exists():
+            time.sleep(0.05)
+        monkeypatch.setattr("pdal_stages.tiling.scheduler._WAIT", 2.0)
+        processes[("scheduler", "worker").index(who)].kill()
+
+    threading.Thread(target=kill, daemon=True).start()
+    run = run_tiled(stages, 20, scheduler=address, buffer=0.0)
+    said = {reason for _, reason in run.failures}
+    lost = (
+        "the Dask scheduler cannot be reached any more"
+        if who == "scheduler"
+        else "all workers of the Dask scheduler are gone"
+    )
+    assert lost in said, said
+    assert not run_tiled(stages, 20, workers=0, resume=True, buffer=0.0).failures
+    check_same(tmp_path, expected)
+
+
+def test_a_cluster_of_another_version(tmp_path, folder, cluster, monkeypatch):
+    """Refused before any work; and by a worker that joins later, with each task."""
+    from pdal_stages.tiling import scheduler
+
+    monkeypatch.setattr(scheduler, "build", lambda: "0.0.9 (0)")
+    with pytest.raises(StageError, match="other versions than this program") as caught:
+        run_tiled(pipeline(folder, tmp_path / "o_#.laz"), 20, scheduler=cluster[0])
+    assert (
+        "0.0.9" in str(caught.value)
+        and "on all hosts" in str(caught.value)
+        and not list(tmp_path.glob("o_*"))
+    )
+    answer = scheduler.perform_for(("0.1.0 (1)", "2.2.0"), b"no task")
+    assert "other versions" in answer.reason and answer.again

@@ -27,7 +27,8 @@ def render(template: str, *, date: str | None = None, **context: Any) -> str:
         What the template is given: `title`, `subtitle` and its own.
     """
     context = {"subtitle": "", "version": __version__, "date": date or _today(), **context}
-    return _templates().get_template(template).render(context)
+    page = _templates().get_template(template).render(context)
+    return page.encode(errors="backslashreplace").decode()  # names that are not UTF-8
 
 
 @lru_cache(maxsize=1)

@@ -45,7 +45,7 @@ class Source:
     @property
     def key(self) -> str:
         """A short name, the same in every run."""
-        return hashlib.sha1(self.path.encode()).hexdigest()[:12]
+        return hashlib.sha1(os.fsencode(self.path)).hexdigest()[:12]
 
     @property
     def stem(self) -> str:
@@ -145,13 +145,15 @@ def read_header(source: Source) -> Header:
 
 
 def check_source(source: Source) -> None:
-    """Refuse an input whose header does not fit its file. Where it lies is known all the same.
+    """Refuse an input whose header does not fit its file, or whose name is not text. Where it lies is known all the same.
 
     Raises
     ------
     StageError
-        If the file is damaged.
+        If the file is damaged, or PDAL cannot be told its name.
     """
+    if any("\ud800" <= character <= "\udfff" for character in source.path):
+        raise StageError("the name of the file is not UTF-8", where=source.path, cure="Rename the file")
     if source.kind == "las":
         las.check_readable(source.path)
 

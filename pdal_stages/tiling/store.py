@@ -123,7 +123,8 @@ class Store:
 
     def finish(self, name: str, mark: str, report: dict[str, Any]) -> None:
         """Remember that a tile is done."""
-        write_whole(self._done(name), _sealed({**report, "fingerprint": mark}).encode(), "result")
+        path = self._done(name)
+        write_whole(path, _sealed(path, {**report, "fingerprint": mark}).encode(), "result")
 
     def finished(self, name: str) -> dict[str, Any] | None:
         """The report of a tile that is done, with its fingerprint; otherwise None."""
@@ -138,7 +139,7 @@ class Store:
         found: dict[str, Any] = {}
         with contextlib.suppress(OSError):
             for line in self.files.read_bytes().splitlines():
-                found |= _opened(line) or {}
+                found |= _opened(self.files, line) or {}
         return found
 
     def written(self, name: str) -> dict[str, Any] | None:
@@ -157,7 +158,7 @@ class Store:
         """Remember outputs."""
         self._written[name] = {**report, "fingerprint": mark}
         with _open_own(self.files) as file:
-            file.write("\n" + _sealed({name: self._written[name]}))
+            file.write("\n" + _sealed(self.files, {name: self._written[name]}))
 
     # ---- indexes -------------------------------------------------------------------------------------
 
@@ -168,8 +169,9 @@ class Store:
 
     def keep_index(self, mark: str, index: CloudIndex) -> None:
         """Keep the index of an input, where there is room."""
+        path = self.indexes / f"{mark}.json"
         with contextlib.suppress(StageError, OSError):
-            write_whole(self.indexes / f"{mark}.json", _sealed(asdict(index)).encode(), "index")
+            write_whole(path, _sealed(path, asdict(index)).encode(), "index")
 
 
 # ---- files that nobody else put there ----------------------------------------------------------------------
@@ -207,17 +209,17 @@ def _open_own(path: Path) -> TextIO:
     return os.fdopen(os.open(path, flags, 0o666), "a+", encoding="utf-8")
 
 
-def _sealed(value: dict[str, Any]) -> str:
-    """An object as a line of JSON, with a digest that tells later whether it is still what was written."""
-    return json.dumps({"digest": fingerprint(value), "content": value})
+def _sealed(path: Path, value: dict[str, Any]) -> str:
+    """An object as a line of JSON, with a digest that tells later whether it is still what was written there."""
+    return json.dumps({"digest": fingerprint(path.parts[-2:], value), "content": value})
 
 
-def _opened(text: bytes) -> dict[str, Any] | None:
+def _opened(path: Path, text: bytes) -> dict[str, Any] | None:
     """The object in a line of JSON; None where it is cut or changed."""
     try:
         found = strictjson.loads(text)
         content = found["content"]
-        return content if isinstance(content, dict) and found["digest"] == fingerprint(content) else None
+        return content if isinstance(content, dict) and found["digest"] == fingerprint(path.parts[-2:], content) else None
     except (ValueError, TypeError, KeyError, RecursionError):
         return None
 
@@ -225,6 +227,6 @@ def _opened(text: bytes) -> dict[str, Any] | None:
 def _read(path: Path) -> dict[str, Any] | None:
     """The object in a file; None where it cannot be read."""
     try:
-        return _opened(path.read_bytes())
+        return _opened(path, path.read_bytes())
     except OSError:
         return None

@@ -27,7 +27,7 @@ def locations(path: str, column: str = "location") -> list[str]:
             names = _sqlite(file, column)
         elif suffix in (".geojson", ".json"):
             features = json.loads(file.read_text(encoding="utf-8"))["features"]
-            names = [str(feature["properties"][column]) for feature in features]
+            names = [feature["properties"][column] for feature in features]
         else:
             raise StageError(
                 "a tile index of this kind is not read",
@@ -35,16 +35,27 @@ def locations(path: str, column: str = "location") -> list[str]:
                 found=suffix or "no suffix",
                 cure="Write it as .gpkg, .sqlite, .shp or .geojson",
             )
-    except (OSError, ValueError, KeyError, TypeError, struct.error, sqlite3.Error) as error:
+        if odd := [name for name in names if not (isinstance(name, str) and name) or "\0" in name]:
+            raise ValueError(f"{odd[0]!r} is not a file's name")
+        found = [_resolve(name, file.absolute().parent) for name in dict.fromkeys(names)]
+    except (
+        OSError,
+        ValueError,
+        LookupError,
+        TypeError,
+        RecursionError,
+        struct.error,
+        sqlite3.Error,
+    ) as error:
         raise StageError(
             "the tile index cannot be read",
             where=path,
             found=f"{type(error).__name__}: {error}",
             cure=f"It needs a column '{column}' with file names (option tindex_name)",
         ) from None
-    if not names:
+    if not found:
         raise StageError("the tile index names no file", where=path)
-    return [_resolve(name, file.absolute().parent) for name in dict.fromkeys(names)]
+    return found
 
 
 def _resolve(name: str, folder: Path) -> str:
@@ -54,18 +65,20 @@ def _resolve(name: str, folder: Path) -> str:
 
 def _sqlite(file: Path, column: str) -> list[str]:
     file.stat()  # sqlite3 would make a missing file
-    with sqlite3.connect(f"file:{file.absolute().as_posix()}?mode=ro", uri=True) as base:
+    with sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro", uri=True) as base:
         for (table,) in base.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall():
             quoted = table.replace('"', '""')
             columns = [row[1] for row in base.execute(f'PRAGMA table_info("{quoted}")')]
             if column in columns:
-                return [str(row[0]) for row in base.execute(f'SELECT "{column}" FROM "{quoted}"')]
+                return [row[0] for row in base.execute(f'SELECT "{column}" FROM "{quoted}"')]
     raise KeyError(column)
 
 
 def _dbf(data: bytes, column: str) -> list[str]:
     """Values of one text column of a dBASE table."""
     rows, start, width = struct.unpack_from("<IHH", data, 4)
+    if not width or start + rows * width > len(data):
+        raise ValueError(f"{rows:,} rows in {len(data):,} bytes")
     at, offset = 32, 1
     while data[at] != 0x0D:
         name = data[at : at + 11].split(b"\0")[0].decode("latin-1")

@@ -1,6 +1,6 @@
-"""Fuzz a parser with atheris: ``python tests/fuzz/fuzz.py pipeline -max_total_time=1800``.
+"""Fuzz a parser or reader with atheris: ``python tests/fuzz/fuzz.py pipeline -max_total_time=1800``.
 
-The first word names the target (see targets.py), the rest are libFuzzer's options. A corpus grows in
+The first word names the target (see targets.py and hostile.py), the rest are libFuzzer's options. A corpus grows in
 ``build/fuzz/NAME``; a finding is written to ``crash-...`` in the folder this is started in. When it is fixed,
 move the file to ``tests/fuzz/cases/NAME/``, where the tests run it for ever.
 """
@@ -24,6 +24,7 @@ _KERNELS = [
     "pdal_stages.synthetic",
 ]
 with atheris.instrument_imports(include=["pdal_stages", "json", "zipfile"], exclude=_KERNELS):
+    import hostile
     import targets
 
 
@@ -31,10 +32,11 @@ def main() -> None:
     name, *options = sys.argv[1:]
     corpus = HERE.parents[1] / "build" / "fuzz" / name
     corpus.mkdir(parents=True, exist_ok=True)
-    for number, seed in enumerate(targets.seeds(name)):
+    own = targets if name in targets.TARGETS else hostile
+    for number, seed in enumerate(own.seeds(name)):
         (corpus / f"seed{number}").write_bytes(seed)
     words = _dictionary(name, corpus.parent)
-    target = targets.TARGETS[name]
+    target = own.TARGETS[name]
 
     def one(data: bytes) -> None:
         target(data)

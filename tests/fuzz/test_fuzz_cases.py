@@ -1,27 +1,41 @@
-"""The fuzzers' findings, and a short run of random changes to good inputs, without atheris."""
+"""The fuzzers' findings, and a short run of random changes to good inputs, without atheris.
+
+``PDAL_STAGES_FUZZ_SECONDS=600 python -m pytest tests/fuzz -k where`` changes inputs for so long.
+"""
 
 from __future__ import annotations
 
+import os
 import random
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
+import hostile
 import targets
 
 HERE = Path(__file__).resolve().parent
 CASES = sorted(path for path in (HERE / "cases").rglob("*") if path.is_file())
 
+TARGETS = targets.TARGETS | hostile.TARGETS
 #: Changed inputs that are tried for each target.
-TRIES = {"pipeline": 1500, "model": 250}
+TRIES = {"pipeline": 1500, "model": 250, "where": 300, "cloud": 1000, "index": 1000, "ept": 1500, "store": 700, "result": 500, "network": 150}
+#: Or seconds of them.
+SECONDS = float(os.environ.get("PDAL_STAGES_FUZZ_SECONDS", 0))
+OUTCOMES = ("refused", "lowered", "loaded", "read", "evaluated")
 WORDS = [b"null", b"-1", b"1e999", b'"', b"[", b"}", b",", b"/*", b"\\u0000", b"\\ud800", b"\xff", b"kopt(9,2)", b"NaN", b"0", b'"inputs":5,']
 
 
 @pytest.mark.parametrize("path", CASES, ids=[f"{p.parent.name}-{p.name}" for p in CASES])
 def test_findings_stay_fixed(path):
-    assert targets.TARGETS[path.parent.name](path.read_bytes()) in ("refused", "lowered", "loaded")
+    assert TARGETS[path.parent.name](path.read_bytes()) in OUTCOMES
+
+
+def seeds_of(name: str) -> list[bytes]:
+    return list(targets.seeds(name) if name in targets.TARGETS else hostile.seeds(name))
 
 
 def change(data: bytes, rng: random.Random, others: list[bytes]) -> bytes:
@@ -48,17 +62,23 @@ def change(data: bytes, rng: random.Random, others: list[bytes]) -> bytes:
     return bytes(out)
 
 
-@pytest.mark.parametrize("name", sorted(targets.TARGETS))
-def test_changed_inputs_are_refused_or_right(name, tmp_path, monkeypatch):
+@pytest.mark.timeout(SECONDS + 600)
+@pytest.mark.parametrize("name", sorted(TARGETS))
+def test_changed_inputs_are_refused_or_right(name, tmp_path, monkeypatch, request):
+    if name == "where":
+        request.getfixturevalue("pdal_module")
     monkeypatch.chdir(tmp_path)
-    rng, seeds = random.Random(7), targets.seeds(name)
-    seen = {targets.TARGETS[name](seed) for seed in seeds}
-    for _ in range(TRIES[name]):
+    rng, seeds = random.Random(time.time_ns() if SECONDS else 7), seeds_of(name)
+    seen = {TARGETS[name](seed) for seed in seeds}
+    tried, until = 0, time.monotonic() + SECONDS
+    while time.monotonic() < until if SECONDS else tried < TRIES[name]:
         data = change(rng.choice(seeds), rng, seeds)
+        tried += 1
         try:
-            seen.add(targets.TARGETS[name](data))
+            seen.add(TARGETS[name](data))
         except BaseException:
             (tmp_path / "finding").write_bytes(data)  # pytest keeps the folder
             raise
+    print(f"{name}: {tried:,} changed inputs")
     assert len(seen) == 2  # both ways were taken
     assert not list(tmp_path.iterdir())  # parsing writes nothing
