@@ -202,8 +202,11 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--density", type=float, default=7.0, help="Points per square metre")
     command.add_argument("--seed", type=int, default=1)
 
-    add(
+    command = add(
         "warmup", _warmup, "Compile the kernels for this machine once, so that later runs start without delay"
+    )
+    command.add_argument(
+        "--all", action="store_true", help="Those of kopt, ropt, copt and shape distributions too"
     )
     return parser
 
@@ -395,11 +398,13 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def _warmup(options: argparse.Namespace) -> None:
-    from .features import warmup
-    from .terrain import filtered_ground
+    from .classifier.warmup import warmup
 
     warmup()
-    filtered_ground([0.0], [0.0], [0.0], openings=(5,))
+    if options.all:
+        from .features import warmup as every_neighborhood
+
+        every_neighborhood()
 
 
 if __name__ == "__main__":

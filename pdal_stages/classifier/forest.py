@@ -152,7 +152,8 @@ class Forest:
                 "the leaf table and the list of classes differ",
                 found=f"{arrays['leaf_counts'].shape[1]} and {n_classes} classes",
             )
-        return cls(**{name: arrays[name] for name in cls.rules}, n_features=n_features)
+        # copies: kernels are compiled once more for arrays that cannot be written
+        return cls(**{name: np.array(arrays[name]) for name in cls.rules}, n_features=n_features)
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """The arrays a model file stores."""

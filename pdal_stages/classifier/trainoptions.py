@@ -112,9 +112,9 @@ class TrainingOptions:
     background: int = 1
     count: int = 10_000
     seed: int = 0
-    trees: int | Sequence[int] = 100
+    trees: int | Sequence[int] = 50
     max_depth: int | Sequence[int | None] | None = None
-    min_samples_leaf: int | Sequence[int] = 3
+    min_samples_leaf: int | Sequence[int] = 5
     max_samples: float = 1.0
     max_features: str | int | float = "auto"
     prior_weight: float = 0.2

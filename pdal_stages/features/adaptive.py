@@ -76,7 +76,7 @@ class AdaptiveNeighborhoods:
         nearest = [n for n, spec in enumerate(self.specs) if spec.kind == "knn" and not spec.shaped]
         nearest.sort(key=lambda n: self.specs[n].parameters[0])
         #: Places in `specs` of plain nearest neighbors, which one search of the largest k serves.
-        self._nearest = nearest if len(nearest) > 1 else []
+        self._nearest = nearest
         self._tree: KdTree | None = None
         if len(grid):
             with CompilationNote():
@@ -89,14 +89,13 @@ class AdaptiveNeighborhoods:
     def _touch(self) -> None:
         """Compile what the plan needs, on one point, before threads do."""
         one = self.grid.x[:1], self.grid.y[:1], self.grid.z[:1]
-        for spec in self.specs:
+        together = self._compute_nearest(*one) if self._nearest else {}
+        for number, spec in enumerate(self.specs):
             shapes = count_shapes(np.zeros((5, 9)), 1) if spec.shaped else no_shapes()
-            table, radius, _ = self._compute(spec, *one, 0, 0.0, shapes)
+            table, radius, _ = together.get(number) or self._compute(spec, *one, 0, 0.0, shapes)
             few, copies = np.zeros(1, np.int64), np.ones(1, np.int64)
             nowhere = np.full(len(spec.columns), -1, np.int64)
             write_columns(table, radius, one[2], few, copies, nowhere, np.zeros((1, 1), np.float32))
-        if self._nearest:
-            self._compute_nearest(*one)
 
     def curvatures(self, threads: int | None = None) -> np.ndarray:
         """The curvature of every point of the cloud, in the order of the grid, (n,) float64 [H17]."""
