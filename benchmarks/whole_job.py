@@ -1,0 +1,203 @@
+"""A whole job, from the command to the written file: time, memory, and where both go.
+
+    python benchmarks/whole_job.py                                  # 500,000 points of a generated town
+    python benchmarks/whole_job.py --sizes 0.5 5 20                 # millions of points, peak memory
+    python benchmarks/whole_job.py --densities 1 7 50 200 500       # points per square metre, time per point
+    python benchmarks/whole_job.py --parts                          # CPU seconds of each part, one thread
+    python benchmarks/whole_job.py --json FILE
+
+Trains a model with all defaults on one generated town (kept in --folder), classifies another with `pdal-stages classify`,
+and tells least / median / largest of --repeats runs. The command runs as a process of its own, so start, import, reading
+and writing LAZ are in its times; memory is the largest that the process ever held.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+
+from pdal_stages.base.version import __version__
+from pdal_stages.classifier import Forest, load_model
+from pdal_stages.classifier import context as contexts
+from pdal_stages.features import blocks as feature_blocks
+from pdal_stages.synthetic import make_town, write_town
+from pdal_stages.terrain import filtered_ground
+
+CLASSES = '{"2":2,"3":3,"4":4,"5":5,"6":6}'
+
+
+def command(*words: object) -> list[str]:
+    """The command line in this interpreter."""
+    return [sys.executable, "-m", "pdal_stages.cli", *map(str, words)]
+
+
+def town(folder: Path, millions: float, density: float, seed: int) -> Path:
+    """A generated town of so many points, made once."""
+    path = folder / f"town-{millions:g}-{density:g}-{seed}.laz"
+    if not path.exists():
+        size = (millions * 1e6 / density) ** 0.5
+        if size < 20.0:
+            raise SystemExit(
+                f"{millions:g} million points at {density:g} per square metre are too small a town"
+            )
+        write_town(make_town(size=size, density=density, seed=seed, progress=False), path)
+    return path
+
+
+def trained(folder: Path) -> Path:
+    """A model with all defaults, trained once on a town of half a million points."""
+    path = folder / f"defaults-{__version__}.model"
+    if not path.exists():
+        cloud = town(folder, 0.5, 7.0, 1)
+        subprocess.run(
+            command("train", cloud, "--model", path, f"--writers.classifiermodel.classes={CLASSES}"),
+            check=True,
+            capture_output=True,
+        )
+    return path
+
+
+def once(cloud: Path, model: str, out: Path) -> dict[str, float]:
+    """Wall and CPU seconds of one run, and the most memory of it in MiB."""
+    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    process = subprocess.Popen(
+        command("classify", cloud, out, "--model", model),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
+    assert process.stderr is not None
+    said = process.stderr.read()
+    _, status, usage = os.wait4(process.pid, 0)
+    if status:
+        raise SystemExit(said.decode(errors="replace"))
+    wall = time.perf_counter() - began
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {"wall": wall, "cpu": cpu, "memory": usage.ru_maxrss / 1024}
+
+
+def measured(cloud: Path, model: str, repeats: int) -> dict[str, Any]:
+    """Some runs over a cloud."""
+    with laspy.open(cloud) as reader:
+        points = reader.header.point_count
+    with tempfile.TemporaryDirectory() as folder:
+        runs = [once(cloud, model, Path(folder, "out.laz")) for _ in range(repeats)]
+    line: dict[str, Any] = {"cloud": cloud.name, "points": points}
+    for key in ("wall", "cpu", "memory"):
+        found = [run[key] for run in runs]
+        line[key] = [min(found), statistics.median(found), max(found)]
+    return line
+
+
+def table(lines: list[dict[str, Any]]) -> str:
+    """As Markdown."""
+    out = [
+        "| cloud | points | wall s | CPU s | CPU microseconds a point | memory, MiB | bytes a point |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    for line in lines:
+        wall, cpu = (" / ".join(f"{v:.1f}" for v in line[key]) for key in ("wall", "cpu"))
+        memory, points = line["memory"][1], line["points"]
+        out.append(
+            f"| {line['cloud']} | {points:,} | {wall} | {cpu} | {1e6 * line['cpu'][1] / points:.1f} | {memory:.0f} | "
+            f"{memory * 2**20 / points:.0f} |"
+        )
+    return "\n".join(out)
+
+
+def parts(cloud: Path, model_file: str) -> dict[str, float]:
+    """CPU seconds of each part of the job, in this process with one thread."""
+    spent: dict[str, float] = {}
+
+    def timed(name: str, work: Callable[..., Any]) -> Callable[..., Any]:
+        def run(*given: Any, **more: Any) -> Any:
+            began = time.process_time()
+            try:
+                return work(*given, **more)
+            finally:
+                spent[name] = spent.get(name, 0.0) + time.process_time() - began
+
+        return run
+
+    def start() -> None:
+        subprocess.run([sys.executable, "-c", "import pdal_stages.cli, pdal_stages.classifier"], check=True)
+
+    before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+    start()
+    spent["start and import"] = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
+    las = timed("reading", laspy.read)(cloud)
+    xyz = np.column_stack([las.x, las.y, las.z])
+    heights = timed("heights", filtered_ground)
+    dimensions = heights(*np.ascontiguousarray(xyz.T), openings=(5, 17), threads=1)
+    dimensions["ReturnNumber"] = np.asarray(las.return_number)
+    dimensions["NumberOfReturns"] = np.asarray(las.number_of_returns)
+    model = load_model(model_file)
+    with tempfile.TemporaryDirectory() as folder:
+        model.predict(xyz[:2000], {k: v[:2000] for k, v in dimensions.items()}, threads=1)  # kernels
+        forest, around, compute = Forest.predict_proba, contexts.cell_means, feature_blocks.Run.compute
+        Forest.predict_proba = timed("forests", forest)  # type: ignore[method-assign]
+        contexts.cell_means = timed("context", around)
+        feature_blocks.Run.compute = timed("features", compute)  # type: ignore[method-assign]
+        try:
+            found = timed("classification", model.predict)(xyz, dimensions, threads=1)
+        finally:
+            Forest.predict_proba, contexts.cell_means = forest, around  # type: ignore[method-assign]
+            feature_blocks.Run.compute = compute  # type: ignore[method-assign]
+        las.classification = found.classification
+        timed("writing", las.write)(Path(folder, "out.laz"))
+    inside = ("features", "forests", "context")
+    spent["the rest of classification"] = spent.pop("classification") - sum(spent.get(k, 0.0) for k in inside)
+    return spent
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    options.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir(), "pdal-stages-whole-job"))
+    options.add_argument("--sizes", type=float, nargs="+", help="millions of points")
+    options.add_argument("--densities", type=float, nargs="+", help="points per square metre")
+    options.add_argument("--parts", action="store_true")
+    options.add_argument("--model", help="a model file, or standard; by default one is trained")
+    options.add_argument("--repeats", type=int, default=3)
+    options.add_argument("--json", type=Path)
+    given = options.parse_args()
+    given.folder.mkdir(parents=True, exist_ok=True)
+    model = given.model or str(trained(given.folder))
+    found: dict[str, Any] = {
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "python": platform.python_version(),
+        "version": __version__,
+        "model": Path(model).name,
+    }
+    if given.parts:
+        found["parts"] = parts(town(given.folder, 0.5, 7.0, 2), model)
+        for name, seconds in found["parts"].items():
+            print(f"{name:<28}{seconds:6.2f} CPU s")
+    else:
+        if given.densities:
+            clouds = [town(given.folder, 0.5, density, 2) for density in given.densities]
+        else:
+            clouds = [town(given.folder, size, 7.0, 2) for size in given.sizes or [0.5]]
+        found["runs"] = [measured(cloud, model, given.repeats) for cloud in clouds]
+        print(table(found["runs"]))
+    if given.json:
+        given.json.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
