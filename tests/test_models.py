@@ -7,7 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from pdal_stages.base.errors import StageError
+from pdal_stages import Filter
+from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.classifier import load_model
 from pdal_stages.cli import main
 from pdal_stages.models import STANDARD, find, shipped
@@ -109,3 +110,35 @@ def test_heights_follow_from_what_is_read():
     assert heights_for(["Ground", "HeightAboveOpening_17", "HeightAboveOpening_5"]) == [
         {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]}
     ]
+
+
+@pytest.mark.pdal
+@pytest.mark.parametrize("reject", [{}, {"reject_below": 0.8}])
+def test_vegetation_by_height(town, reject):
+    """``vegetation_heights``: low below the first, medium below the second, nothing else touched."""
+    plain, split = classified(town, **reject), classified(town, vegetation_heights="0.5,2", **reject)
+    height, sure = (
+        plain["HeightAboveGround"],
+        plain["Reliability"] >= np.float32(reject.get("reject_below", 0)),
+    )
+    expected = plain["Classification"].copy()
+    called = (expected == 5) & sure
+    assert called.sum() > 100
+    expected[called & (height < 2.0)] = 4
+    expected[called & (height < 0.5)] = 3
+    assert np.array_equal(split["Classification"], expected)
+
+
+def classified(town, **options):
+    preparation = load_model(shipped()[STANDARD]).info["preparation"]
+    job = Pipeline(
+        [str(town), *preparation, {"type": "filters.modelclassifier", "model": STANDARD, **options}]
+    )
+    job.execute()
+    return job.arrays[0]
+
+
+@pytest.mark.parametrize("wrong", [[2.0], [2.0, 0.5], ["a", "b"], [0.0, 1.0]])
+def test_vegetation_heights_that_mean_nothing(wrong):
+    with pytest.raises(OptionError, match="vegetation_heights"):
+        Filter.modelclassifier(model=STANDARD, vegetation_heights=wrong)

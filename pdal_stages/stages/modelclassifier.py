@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..base.asprs import OVERLAP
 from ..base.errors import DimensionError, OptionError
 from ..base.progress import Progress
-from ..classifier import Model, load_model
+from ..classifier import Model, Prediction, load_model
 from ..classifier.smoothing import FARTHEST
 from ..models import find
 from .base import Stage
@@ -20,6 +20,10 @@ from .options import option
 from .points import Points
 from .preparation import as_json, same
 from .selection import UNWANTED, Selection
+
+HEIGHT = "HeightAboveGround"
+#: Vegetation in ASPRS's codes.
+LOW, MEDIUM, HIGH = 3, 4, 5
 
 
 class ModelClassifier(Stage):
@@ -82,6 +86,13 @@ class ModelClassifier(Stage):
         maximum=FARTHEST,
         unit="m",
     )
+    vegetation_heights: list = option(
+        "list",
+        (),
+        "Two heights above ground in metres, e.g. 0.5,2: points the model calls vegetation (5) become low (3) below the "
+        "first and medium (4) below the second",
+        may_be_empty=True,
+    )
     memory: int = option(
         "integer", 512, "Memory for blocks of points, in addition to the cloud itself", minimum=16, unit="MB"
     )
@@ -94,6 +105,8 @@ these are classified too; class, reliability and margin follow.
 Noise and withheld points would spoil the features of all around them, so by default these are as good as not there
 (`ignore`), and keep their class. `keep` names what is a neighbor but is not overwritten. Both are counted in the
 metadata; `"ignore": "", "keep": ""` classifies everything.
+Where a model knows vegetation (5) as one class, `vegetation_heights` splits it by `HeightAboveGround`: 0.5 and 2 m are
+the limits of many national surveys, 2 and 5 m those of others.
 With LAS 1.0-1.3 the synthetic, key-point and withheld flags of each point stay. Codes above 31
 need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before any work is done.
 """
@@ -112,6 +125,31 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
                 found=self.model.algorithm.name,
                 cure="Use 'margin'",
             )
+        self.bands  # noqa: B018  refused here where it means nothing
+
+    @cached_property
+    def bands(self) -> tuple[float, float] | None:
+        """Below these heights in metres vegetation is low, and medium."""
+        if not self.vegetation_heights:
+            return None
+        try:
+            low, medium = (float(one) for one in self.vegetation_heights)
+        except (TypeError, ValueError):
+            low = medium = 0.0
+        if not 0.0 < low < medium < 1000.0:
+            raise OptionError(
+                "option 'vegetation_heights' must be two heights in metres, the lower one first",
+                found=", ".join(map(str, self.vegetation_heights)),
+                cure="For example 0.5,2",
+            )
+        codes = [code for code, _ in self.model.classes]
+        if HIGH not in codes or {LOW, MEDIUM} & set(codes):
+            raise OptionError(
+                "option 'vegetation_heights' is for models that know vegetation as one class, 5",
+                found=f"classes {', '.join(map(str, codes))}",
+                cure="Leave it out",
+            )
+        return low, medium
 
     @cached_property
     def model(self) -> Model:
@@ -135,7 +173,7 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         return self.model.plan.most_neighbors
 
     def reads(self) -> list[str]:
-        return list(self.model.required_dimensions)
+        return list(dict.fromkeys([*self.model.required_dimensions, *([HEIGHT] if self.bands else [])]))
 
     def creates(self) -> dict[str, str]:
         out = {"Classification": "uint8_t", "Reliability": "float"}
@@ -195,6 +233,8 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
                 smooth=self.smooth,
                 progress=progress,
             )
+        if self.bands:
+            self._split_vegetation(points, found, wanted)
         values: dict[str, NDArray] = {
             "Classification": found.classification,
             "Reliability": found.reliability,
@@ -214,6 +254,17 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         points.report.update({k: v for k, v in found.report.items() if k not in points.report})
         points.report["outside_where"] = int(np.count_nonzero(~inside))
         return values
+
+    def _split_vegetation(self, points: Points, found: Prediction, wanted: NDArray[np.bool_]) -> None:
+        """Low and medium vegetation by height, where the model called a point vegetation."""
+        height, codes = self.take(points, HEIGHT), found.classification
+        given = wanted & (codes == HIGH)
+        if self.reject_below is not None:
+            given &= found.reliability >= np.float32(self.reject_below)
+        for code, limit in zip((MEDIUM, LOW), reversed(self.bands or ()), strict=True):
+            codes[given & (height < limit)] = code
+        code, number = np.unique(codes[wanted], return_counts=True)
+        found.report["classes"] = {str(int(c)): int(m) for c, m in zip(code, number, strict=True)}
 
     def _refuse_codes_that_stay(self, points: Points, wanted: NDArray[np.bool_]) -> None:
         """Before any work: codes that points keep must fit the file, as those do that the model gives."""
