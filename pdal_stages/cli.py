@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import logging
 import os
 import signal
 import sys
@@ -16,6 +17,7 @@ from .base import kinds
 from .base.errors import StageError
 from .base.outputs import Output, check_outputs
 from .base.plain import PlainStream
+from .base.runlog import RunLog
 from .base.version import __version__
 from .pipeline.overrides import parse_overrides
 
@@ -33,16 +35,22 @@ _LEFT_ALONE = {
 }
 #: Lines of PDAL's log that are shown without -v.
 _SAID = 10
+_VERBOSE = ("-v", "--verbose")
+_LEVELS = {0: logging.ERROR, 1: logging.WARNING, 2: logging.INFO}
+#: Commands that work long enough for a log and progress.
+_LOGGED = ("pipeline", "classify", "train", "accuracy", "demo")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code (0 fine, 1 an error, 2 wrong usage, 130 interrupted)."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments or os.environ.get("PDAL_STAGES_DEBUG", "") not in ("", "0")
-    arguments = [a for a in arguments if a != "--debug"]
+    arguments = _levels([a for a in arguments if a != "--debug"])
     _print_anything()
     streams = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = map(PlainStream, streams)  # type: ignore[assignment]
+    log: RunLog | None = None
+    code = 1
     try:
         overrides, rest = parse_overrides(arguments)
         options = _parser().parse_args(rest)
@@ -50,6 +58,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise StageError(f"'{options.command}' takes no stage options", found=overrides[0].flag)
         options.overrides = overrides
         options.is_program = argv is None
+        if getattr(options, "progress", None) is not None:
+            os.environ["PDAL_STAGES_PROGRESS"] = "1" if options.progress else "0"
+        if getattr(options, "log", None):
+            check_outputs([Output(options.log, "log", "")], [])
+            log = sys.stderr = RunLog(options.log, sys.stderr, arguments)  # type: ignore[assignment]
         code = int(options.run(options) or 0)
         sys.stdout.flush()  # a full disk or a closed pipe shows here, not at exit
         return code
@@ -57,16 +70,32 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 0
     except KeyboardInterrupt:
+        code = 130
         print("pdal-stages: interrupted; nothing half-written was left", file=sys.stderr)
-        return 130
+        return code
     except Exception as error:
+        code = 1
         if debug:
             raise
         message = error if isinstance(error, StageError) else _unforeseen(error)
         print(f"pdal-stages: {message}", file=sys.stderr)
-        return 1
+        return code
     finally:
+        if log is not None:
+            log.end(code)
         sys.stdout, sys.stderr = streams
+
+
+def _levels(arguments: list[str]) -> list[str]:
+    """PDAL's ``-v 4``, and ``-v`` alone, in one form."""
+    out: list[str] = []
+    for number, word in enumerate(arguments):
+        if word in _VERBOSE:
+            level = arguments[number + 1] if arguments[number + 1 : number + 2] else ""
+            out.append(f"--verbose={level if level.isdigit() else 2}")
+        elif not (word.isdigit() and number and arguments[number - 1] in _VERBOSE):
+            out.append(word)
+    return out
 
 
 def _print_anything() -> None:
@@ -115,6 +144,11 @@ def _parser() -> argparse.ArgumentParser:
             name, help=help, description=help + ".", epilog=_OVERRIDES if overrides else None
         )
         command.set_defaults(run=run, takes_overrides=overrides)
+        if name in _LOGGED:
+            command.add_argument("--log", metavar="FILE", help="Add what the run says to a log file")
+            command.add_argument(
+                "--progress", action=argparse.BooleanOptionalAction, default=None, help="Show progress"
+            )
         return command
 
     command = add("pipeline", _pipeline, "Run a pipeline that may contain our stages", overrides=True)
@@ -124,14 +158,18 @@ def _parser() -> argparse.ArgumentParser:
         "--validate", action="store_true", help="Check the pipeline without reading points, then stop"
     )
     command.add_argument(
-        "--progress", action=argparse.BooleanOptionalAction, default=None, help="Show progress"
-    )
-    command.add_argument(
         "--nostream",
         action="store_true",
         help="Accepted for compatibility with PDAL; our stages never stream",
     )
-    command.add_argument("-v", "--verbose", action="count", default=0, help="Print PDAL's log")
+    command.add_argument(
+        "-v",
+        "--verbose",
+        type=int,
+        default=1,
+        metavar="LEVEL",
+        help="Print more of PDAL's log: 1 warnings (default), 2 what it does (-v alone), 3 and more everything",
+    )
     from .tiling.command import add_arguments
 
     add_arguments(command)
@@ -241,17 +279,13 @@ def _build(options: argparse.Namespace):
 
 
 def _pipeline(options: argparse.Namespace) -> int | None:
-    if options.progress is not None:
-        os.environ["PDAL_STAGES_PROGRESS"] = "1" if options.progress else "0"
     from .tiling.command import run_command, wants_tiles
 
     if wants_tiles(options):
         return run_command(options, _source(options))
-    pipeline = _build(options)
     if options.validate:
-        print(pipeline.validate())
-        return None
-    _run(options, pipeline)
+        return _validate(options)
+    _run(options, _build(options))
     return None
 
 
@@ -259,23 +293,18 @@ def _run(options: argparse.Namespace, pipeline) -> int:
     """Run a pipeline and tell what it has to say; the number of points."""
     from .base.files import write_whole
 
-    metadata, verbose = getattr(options, "metadata", None), bool(getattr(options, "verbose", 0))
+    metadata, verbose = getattr(options, "metadata", None), getattr(options, "verbose", 1)
     pipeline.check_outputs(*([Output(metadata, "metadata", kinds.JSON)] if metadata else []))
     _end_at_once(options)
-    count = pipeline.execute(arrays=False)
-    # What PDAL calls an error although it goes on: a reader that sets what it cannot read to 0, say.
-    said = pipeline.log.strip().splitlines()
-    for line in said if verbose else said[:_SAID]:
+    count = pipeline.execute(arrays=False, loglevel=_LEVELS.get(verbose, logging.DEBUG))
+    # Warnings, and what PDAL calls an error although it goes on: a reader that sets what it cannot read to 0, say.
+    lines = pipeline.said
+    for line in lines if verbose > 1 else lines[:_SAID]:
         print(f"pdal-stages: PDAL says: {line}", file=sys.stderr)
-    if len(said) > _SAID and not verbose:
-        print(f"pdal-stages: PDAL says {len(said) - _SAID:,} more lines; -v shows them", file=sys.stderr)
-    for remark in pipeline.remarks:
+    if len(lines) > _SAID and verbose <= 1:
+        print(f"pdal-stages: PDAL says {len(lines) - _SAID:,} more lines; -v shows them", file=sys.stderr)
+    for remark in pipeline.told:
         print(f"pdal-stages: {remark}", file=sys.stderr)
-    for place, reports in pipeline.reports:
-        for report in reports:
-            for key in ("warning", "note"):
-                if report.get(key):
-                    print(f"pdal-stages: {place}: {report[key]}", file=sys.stderr)
     if metadata:
         write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
     return count
@@ -293,8 +322,16 @@ def _expand(options: argparse.Namespace) -> None:
         sys.stdout.write(text)
 
 
-def _validate(options: argparse.Namespace) -> None:
-    print(_build(options).validate())
+def _validate(options: argparse.Namespace) -> int:
+    """Print PDAL's verdict or ours as JSON, on standard output; an error goes to standard error too."""
+    try:
+        print(_build(options).validate())
+    except StageError as error:
+        verdict = {"valid": False, "error_detail": str(error), "streamable": False}
+        print(json.dumps(verdict, indent=2))
+        print(f"pdal-stages: {error}", file=sys.stderr)
+        return 1
+    return 0
 
 
 def _drivers(options: argparse.Namespace) -> None:

@@ -256,6 +256,36 @@ def _records(file: BinaryIO, header: LasHeader) -> Iterator[_Record]:
         place += size + length
 
 
+#: Types of extra dimensions by number, 1 to 10 (LAS 1.4 R15, table 24), in PDAL's words.
+_EXTRA_TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float", "double")
+
+
+def extra_dimensions(path: str | os.PathLike) -> dict[str, str]:
+    """Extra dimensions that a LAS file describes, by name: the types PDAL holds them in. Empty where there are none.
+
+    Scaled ones are ``double``; those that are no numbers are left out.
+    """
+    found: dict[str, str] = {}
+    try:
+        header = read_header(path)
+        if header is None:
+            return {}
+        with open(path, "rb") as file:
+            for record in islice(_records(file, header), _MOST_RECORDS):
+                if (record.user, record.number) != (b"LASF_Spec", 4) or record.length > _LARGEST_RECORD:
+                    continue
+                file.seek(record.data)
+                data = file.read(record.length)
+                for start in range(0, len(data) - 191, 192):
+                    kind, options = data[start + 2 : start + 4]
+                    name = data[start + 4 : start + 36].split(b"\0")[0].decode("utf-8", "replace")
+                    if name and 1 <= kind <= len(_EXTRA_TYPES):
+                        found[name] = "double" if options & 0x18 else _EXTRA_TYPES[kind - 1]
+    except (OSError, ValueError):
+        return {}
+    return found
+
+
 def _chunk_table(path: str | os.PathLike, size: int, header: LasHeader) -> int:
     """Where a LAZ file's table of chunks is, which is written last; -1 where that is not in the file."""
     with open(path, "rb") as file:

@@ -5,9 +5,11 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 from ..stages import registry
+from ..stages.base import Stage
 from . import pdal as pdal_env
 from . import runtime
 from .lowering import lower_stage
@@ -22,32 +24,59 @@ class _Family:
     def __getattr__(self, name: str):
         if name.startswith("_"):
             raise AttributeError(name)
-        kind = registry.get(f"{self._family}.{name}")
+        try:
+            kind = registry.get(f"{self._family}.{name}")
+        except Exception as error:
+            raise AttributeError(str(error)) from None  # as completion and hasattr expect
+        signature = _signature(kind)
 
-        def make(filename: str | None = None, *, merge: Any = True, **options: Any):
+        def make(*given: Any, **options: Any):
+            options = signature.bind_partial(*given).arguments | options
+            merge = options.pop("merge", True)
             if not isinstance(merge, bool):  # filters.accuracy has an option of this name
                 options["merge"], merge = merge, True
-            if filename is not None:
-                options["filename"] = filename
             # Points of several readers must see each other; of one reader merging costs nothing.
-            wired = {"inputs": options.pop("inputs")} if merge and "inputs" in options else {}
-            lowered = lower_stage({"type": kind.type, **options})
+            wired = {"inputs": options["inputs"]} if merge and "inputs" in options else {}
+            own = {k: v for k, v in options.items() if k not in wired}
+            lowered = lower_stage({"type": kind.type, **own})
             runtime.remember_stdout()
-            said = ", ".join(f"{key}={value!r}" for key, value in options.items())
-            made = pdal_env.python_object(lowered.plain, f"{kind.type}({said})")
-            made.made_from = lowered.stage  # or it would be forgotten, and options parsed again
-            return pdal_env.python_object({"type": "filters.merge", **wired}) | made if merge else made
+            before = [{"type": "filters.merge", **wired}] if merge else []
+            return pdal_env.python_object([*before, lowered.plain], kind.type, options, lowered.stage)
 
-        make.__name__ = name
-        make.__doc__ = (
-            f"{kind.summary}.\n\nOptions: {', '.join(o.name for o in kind.all_options())}; tag, inputs.\n"
-            "merge=False keeps point views apart (after filters.splitter, say)."
-        )
+        make.__name__ = make.__qualname__ = name
+        make.__signature__ = signature  # type: ignore[attr-defined]
+        make.__doc__ = _help(kind)
         return make
 
     def __dir__(self):
         prefix = self._family + "."
         return [name[len(prefix) :] for name in registry.stages() if name.startswith(prefix)]
+
+
+def _signature(kind: type[Stage]) -> inspect.Signature:
+    """The required option first, by place or by name; the others by name, with their defaults."""
+    by_place, by_name = [], []
+    for option in kind.all_options():
+        if option.required:
+            by_place.append(inspect.Parameter(option.name, inspect.Parameter.POSITIONAL_OR_KEYWORD))
+        else:
+            by_name.append(
+                inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, default=option.default)
+            )
+    names = {parameter.name for parameter in by_name}
+    for name, default in (("tag", None), ("inputs", None), ("merge", True)):
+        if name not in names:
+            by_name.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default))
+    return inspect.Signature([*by_place, *by_name])
+
+
+def _help(kind: type[Stage]) -> str:
+    lines = [f"{kind.summary}.", "", "Parameters", "----------"]
+    for option in kind.all_options():
+        unit = f", {option.unit}" if option.unit else ""
+        lines += [f"{option.name} : {option.kind}{unit}", f"    {option.help}"]
+    lines += ["tag, inputs", "    As for PDAL's stages", "merge : bool"]
+    return "\n".join([*lines, "    False keeps point views apart (after filters.splitter, say)"])
 
 
 #: ``Filter.hag_minima(...)``, ``Filter.multiscalefeatures(...)``, ``Filter.modelclassifier(...)``, ...

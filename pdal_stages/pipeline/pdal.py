@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import re
 import shutil
@@ -81,7 +82,9 @@ def ask_program(*arguments: str) -> str:
 
 
 @fragile
-def execute(stages: list[dict[str, Any]], *, arrays: bool = True) -> Execution:
+def execute(
+    stages: list[dict[str, Any]], *, arrays: bool = True, loglevel: int = logging.WARNING
+) -> Execution:
     """Run a plain PDAL pipeline in this process.
 
     Raises
@@ -94,16 +97,21 @@ def execute(stages: list[dict[str, Any]], *, arrays: bool = True) -> Execution:
     pdal = bindings()
     stdout = sys.stdout
     try:
-        pipeline = pdal.Pipeline(json.dumps(adapted(stages)))
+        text = json.dumps(adapted(stages))
+    except (TypeError, ValueError) as error:  # a pipeline of Python objects that are not JSON
+        raise PipelineError("the pipeline holds what JSON cannot say", found=str(error)) from None
+    pipeline = None
+    try:
+        pipeline = pdal.Pipeline(text, loglevel=loglevel)
         count = pipeline.execute()
-    except RuntimeError as error:
-        raise translate(str(error)) from None
+    except (RuntimeError, ValueError, IndexError, OverflowError) as error:  # C++'s errors, as Python has them
+        if stdout not in _kept:
+            _kept.append(stdout)
+        raise translate("; ".join([str(error), *said(getattr(pipeline, "log", ""))[-3:]])) from None
     except MemoryError:
         raise PipelineError(
             "memory ran out", cure="Work in tiles (--tile), or read less, e.g. with filters.crop"
         ) from None
-    except TypeError as error:  # json.dumps: a pipeline of Python objects that are not JSON
-        raise PipelineError("the pipeline holds what JSON cannot say", found=str(error)) from None
     finally:
         # A stage that raises leaves sys.stdout pointing into PDAL's log.
         sys.stdout = stdout
@@ -118,15 +126,73 @@ def execute(stages: list[dict[str, Any]], *, arrays: bool = True) -> Execution:
     )
 
 
+#: What sys.stdout was when a script failed: PDAL remembers it without holding it, so it must not be freed.
+_kept: list[Any] = []
 _FAILED_WRITER = re.compile(r"(writers\.\w+) Error\) (GDAL failure.*)")
 
 
-def python_object(stage: dict[str, Any], shown: str = ""):
-    """A filter as an object of python-pdal, to be joined by ``|``; `shown` is what it prints as."""
-    kind = bindings().Filter
-    if shown:
-        kind = type("Filter", (kind,), {"__repr__": lambda _: shown})
-    return kind(**stage)
+def said(log: str) -> list[str]:
+    """Warnings and errors of a log, once each: ``filters.smrf: ...``."""
+    lines = [_BY_PROGRAM.sub(r"\1: ", line.strip()) for line in str(log or "").splitlines()]
+    return list(dict.fromkeys(line for line in lines if line))
+
+
+#: How PDAL begins a line of its log.
+_BY_PROGRAM = re.compile(r"^\((?:pypipeline|pdal pipeline)\s+(\S+?)\s+\w+\)\s*", re.IGNORECASE)
+
+
+def python_object(stages: list[dict[str, Any]], type_name: str, given: dict[str, Any], made_from: Any):
+    """Filters as one object that joins others by ``|`` and answers as python-pdal's stages do.
+
+    Parameters
+    ----------
+    stages : list of dict
+        What PDAL runs.
+    type_name, given
+        What the user asked for.
+    made_from : object
+        Kept as long as the filters are.
+    """
+    pdal = bindings()
+
+    class Step(pdal.Filter):
+        def __repr__(self) -> str:
+            return repr(made)
+
+    class Filter(pdal.Pipeline):
+        type = type_name
+        tag = given.get("tag")
+
+        @property
+        def options(self) -> dict[str, Any]:
+            return {"type": type_name, **given}
+
+        def pipeline(self, *arrays, loglevel: int = logging.ERROR):
+            whole = pdal.Pipeline(arrays=arrays, loglevel=loglevel)
+            whole |= self
+            return whole
+
+        def __copy__(self):
+            return self.pipeline(loglevel=self.loglevel)
+
+        def __repr__(self) -> str:
+            return f"{type_name}({', '.join(f'{key}={value!r}' for key, value in given.items())})"
+
+    made = Filter()
+    for stage in stages:
+        one = Step(**stage)
+        one.made_from = made_from
+        made |= one
+    return made
+
+
+def stages_of(thing: Any) -> list[dict[str, Any]] | None:
+    """The stages of an object of python-pdal; None where it is not one."""
+    pdal = bindings()
+    stages = thing.stages if isinstance(thing, pdal.Pipeline) else [thing]
+    if not all(isinstance(stage, pdal.pipeline.Stage) for stage in stages):
+        return None
+    return [{"type": stage.type, **stage.options} for stage in stages]
 
 
 def validate(stages: list[dict[str, Any]]) -> None:
@@ -166,6 +232,11 @@ def translate(message: str) -> PipelineError | DependencyError:
             found=text.splitlines()[-1],
             cure="Install pdal_stages into the Python that the plugin of filters.python was built for",
         )
+    if "Traceback (most recent call last)" in text:  # of a script, as the pieces of a list in older PDAL
+        lines = [line.strip(" '") for line in text.replace("\\n", "\n").splitlines()]
+        place = [line for line in lines if line.startswith("File ")][-1:]
+        last = [line for line in lines if line][-1]
+        return PipelineError("a script of filters.python failed", found="; ".join([last, *place]))
     return PipelineError("PDAL could not run the pipeline", found=text)
 
 

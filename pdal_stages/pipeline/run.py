@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import re
 import signal
 from collections.abc import Iterable
@@ -18,6 +19,7 @@ from ..stages import registry
 from . import pdal as pdal_env
 from . import runtime
 from .filenames import is_writer, named_files, readers_files, stage_files, with_outputs, writers_outputs
+from .foreseen import check_dimensions, unread_extra_dimensions
 from .interrupts import gentle
 from .lowering import Lowered, lower
 from .overrides import Override, apply_overrides
@@ -56,9 +58,20 @@ class Pipeline:
         self.lowered: Lowered = lower(self.source)
         self.metadata: dict[str, Any] = {}
         self.arrays: list = []
-        self.log = ""
+        self.said: list[str] = []
         self.reports: list[tuple[str, list[dict[str, Any]]]] = []
         self.remarks: list[str] = []
+
+    @property
+    def told(self) -> list[str]:
+        """Remarks, and the notes and warnings of our stages: the same of several stages once."""
+        by_text: dict[str, list[str]] = {}
+        for place, reports in self.reports:
+            for report in reports:
+                for text in (report[key] for key in ("warning", "note") if report.get(key)):
+                    by_text.setdefault(text, []).append(place)
+        notes = [f"{', '.join(dict.fromkeys(places))}: {text}" for text, places in by_text.items()]
+        return [*self.remarks, *notes]
 
     @property
     def json(self) -> str:
@@ -67,9 +80,9 @@ class Pipeline:
 
     def validate(self) -> str:
         """Check outputs and let PDAL check its own stages' options, without reading points; PDAL's answer, as JSON."""
-        self._check_inputs()
         self.check_outputs()
         try:
+            self._check_inputs()
             pdal_env.validate(self.lowered.stages)
         except StageError as error:
             raise self._located(error) from None
@@ -93,7 +106,15 @@ class Pipeline:
         named = [name for stage in ours for name in stage_files(stage)]
         return [*readers_files(stages), *named_files(stages), *named, *filter(None, [self.source.name])]
 
-    def execute(self, *, arrays: bool = True) -> int:
+    def __or__(self, other: Any) -> Pipeline:
+        """The pipeline with more stages: objects of python-pdal, ours or PDAL's."""
+        stages = pdal_env.stages_of(other)
+        if stages is None:
+            return NotImplemented
+        lines = [*self.source.lines, *(0 for _ in stages)]
+        return Pipeline(PipelineSource([*self.source.stages, *stages], lines, self.source.name))
+
+    def execute(self, *, arrays: bool = True, loglevel: int = logging.WARNING) -> int:
         """Run the pipeline in this process; the number of points that came out.
 
         Files are written in hidden folders and renamed at the end, so an output is whole
@@ -122,7 +143,9 @@ class Pipeline:
             with whole_files(*outputs, check=finish) as partials:
                 try:
                     with gentle(signal.SIGINT) as interrupts:
-                        result = pdal_env.execute(with_outputs(stages, partials), arrays=arrays)
+                        result = pdal_env.execute(
+                            with_outputs(stages, partials), arrays=arrays, loglevel=loglevel
+                        )
                         interrupts.check()
                 finally:
                     self.reports = []
@@ -137,8 +160,9 @@ class Pipeline:
             if isinstance(failure, InterruptedStage):
                 raise KeyboardInterrupt from None
             raise failure or self._located(error) from None
-        self.metadata = _named_metadata(result.metadata, self.reports)
-        self.arrays, self.log = result.arrays, result.log
+        names = {str(made): final for made, final in zip(partials, outputs, strict=True)}
+        self.metadata = _renamed(_named_metadata(result.metadata, self.reports), names)
+        self.arrays, self.said = result.arrays, pdal_env.said(result.log)
         return result.count
 
     def _check_inputs(self) -> None:
@@ -151,7 +175,8 @@ class Pipeline:
                 raise PipelineError(
                     "the file cannot be read", where=path, found=error.strerror or str(error)
                 ) from None
-        self.remarks = list(self.lowered.remarks)
+        check_dimensions(self.lowered)
+        self.remarks = [*self.lowered.remarks, *unread_extra_dimensions(self.lowered.stages)]
         self.remarks += [
             r for path in readers_files(self.lowered.stages, las=True) if (r := check_readable(path))
         ]
@@ -221,6 +246,15 @@ def _named_metadata(
                 before = inner[kind] if isinstance(inner[kind], list) else [inner[kind]]
                 inner[kind] = [*before, report]
     return metadata
+
+
+def _renamed(node: Any, names: dict[str, str]) -> Any:
+    """Metadata with the names that files have in the end."""
+    if isinstance(node, dict):
+        return {key: _renamed(value, names) for key, value in node.items()}
+    if isinstance(node, list):
+        return [_renamed(value, names) for value in node]
+    return names.get(node, node) if isinstance(node, str) else node
 
 
 def _is_ours(node: Any) -> bool:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import LEGACY_LIMIT
+from ..base.asprs import LEGACY_LIMIT, OVERLAP
 from ..base.errors import DimensionError, StageError
 from ..base.units import Units, units_of_wkt
 from .selection import Selection
@@ -177,6 +177,8 @@ class Points:
         found = np.zeros(self.count, bool)
         if selection.codes and "Classification" in self.arrays:
             found |= np.isin(self.class_codes, np.array(selection.codes, np.uint8))
+            if OVERLAP in selection.codes:  # which newer PDAL reads as class 0 and a flag
+                found |= (self.class_codes == 0) & (self.flag("Overlap") != 0)
         for span in selection.spans:
             name = span.dimension
             found |= span.holds(self.flag(name) if name in _FLAGS else self.dimension(name, metres=False))

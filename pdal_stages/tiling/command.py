@@ -156,7 +156,7 @@ def _print(run: TiledRun) -> None:
 def _print_dry(run: TiledRun) -> None:
     s = run.summary
     print(f"{len(run.tiles)} tiles of {s['tile']:g}, each read with {s['buffer_metres']:g} m of surroundings")
-    print(f"{s['inputs']} inputs, {s['points']:,} points; one output for each {s['per']}")
+    print(f"{_inputs(s['inputs'])}, {s['points']:,} points; one output for each {s['per']}")
     print(
         f"about {s['points_read_by_a_tile']:,} points read for a tile, {s['points_of_largest_tile']:,} its own at most"
     )
@@ -164,13 +164,17 @@ def _print_dry(run: TiledRun) -> None:
     print(f"up to {memory:,.0f} MB for each of {s['workers']} workers with {s['threads_per_worker']} threads")
     print(f"roughly {s['core_hours']:.2f} core hours at {rate:,} points/s and core; the model decides")
     for job in run.tiles[:50]:
-        print(f"  {job.name:24s} {job.points:>14,} points  {len(job.sources)} inputs")
+        print(f"  {job.name:24s} {job.points:>14,} points  {_inputs(len(job.sources))}")
     if len(run.tiles) > 50:
         print(f"  and {len(run.tiles) - 50} more")
     for note in run.notes:
         print(f"pdal-stages: {note}", file=sys.stderr)
     for what, reason in run.failures:
         print(f"pdal-stages: {what}: {reason}", file=sys.stderr)
+
+
+def _inputs(count: int) -> str:
+    return f"{count:,} input{'s' * (count != 1)}"
 
 
 def _write_report(name: str, run: TiledRun) -> None:

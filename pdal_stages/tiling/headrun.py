@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -62,10 +62,11 @@ class Recipe:
 
 @dataclass
 class HeadRun:
-    """What a run of the head gave; `need`: the metres of surroundings that it took."""
+    """What a run of the head gave; `need`: the metres of surroundings that it took; `said`: warnings and notes."""
 
     results: list[PieceResults]
     need: float
+    said: list[str] = field(default_factory=list)
 
 
 def run_head(
@@ -109,7 +110,8 @@ def run_head(
     if not everything and any(_looked_far(r) for _, reports in pipeline.reports for r in reports):
         most = max(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
         need = max(need, _far_neighbors(pipeline.arrays, most, recipe, tile))
-    return HeadRun(results, need)
+    said = [*(f"PDAL says: {line}" for line in pipeline.said), *pipeline.told]
+    return HeadRun(results, need, said)
 
 
 class _Mark:

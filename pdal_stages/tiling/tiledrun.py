@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -89,6 +90,7 @@ def run_tiled(
             sweep(folder)  # what workers left that were killed
     summary = survey.figures(plan) | {"workers": pool.slots, "threads_per_worker": pool.threads}
     summary |= summarize(work.jobs, work.outputs, time.monotonic() - started)
+    survey.notes += _said(work)
     short = [job.name for job in work.jobs if job.state == "done" and job.report.get("short")]
     if short:
         survey.notes.append(
@@ -96,6 +98,19 @@ def run_tiled(
             f"{chosen.most_points:,} points; they may differ from an untiled run: " + ", ".join(short[:5])
         )
     return TiledRun(work.jobs, work.outputs, survey.unreadable, survey.changed(), survey.notes, summary)
+
+
+#: Most different warnings of tiles that a run repeats.
+_MOST_SAID = 20
+
+
+def _said(work: Worklist) -> list[str]:
+    """Warnings and notes of tiles, once each, the most frequent first."""
+    told = Counter(
+        text for job in work.jobs if job.state == "done" for text in set(job.report.get("said", ()))
+    )
+    notes = [f"{text} ({n} tile{'s' * (n != 1)})" for text, n in told.most_common(_MOST_SAID)]
+    return notes + ([f"and {len(told) - _MOST_SAID} more; see --report"] if len(told) > _MOST_SAID else [])
 
 
 def _folder(plan: TilePlan) -> Path:

@@ -108,6 +108,7 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
         "widened": buffer > recipe.halo,
         "dropped": own - sum(len(result.rows) for result in head.results),
         "classes": class_counts(head.results),
+        "said": head.said,
     }
     return head.results, report
 

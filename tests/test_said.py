@@ -1,0 +1,182 @@
+"""What a run says and where: warnings once, a log, verdicts as JSON, names of outputs, errors of others."""
+
+from __future__ import annotations
+
+import inspect
+import io
+import json
+
+import laspy
+import numpy as np
+import pytest
+
+import pdal_stages as ps
+from pdal_stages.base.progress import Progress
+from pdal_stages.cli import main
+
+pytestmark = pytest.mark.pdal
+
+
+@pytest.fixture()
+def cloud(tmp_path, write_las):
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(0, 30, (2, 500))
+    arrays = {"X": x, "Y": y, "Z": rng.normal(0, 0.02, 500), "Amplitude": rng.random(500).astype("f4")}
+    return write_las(tmp_path / "cloud.las", arrays, point_format=1)
+
+
+@pytest.fixture()
+def run(tmp_path, capsys):
+    """Write a pipeline and run a command on it: (exit code, standard output, standard error)."""
+
+    def go(stages, *words, command="pipeline"):
+        path = tmp_path / "job.json"
+        path.write_text(json.dumps([str(s) if not isinstance(s, dict) else s for s in stages]))
+        code = main([command, str(path), *map(str, words)])
+        return code, *capsys.readouterr()
+
+    return go
+
+
+@pytest.mark.parametrize("tiles", [(), ("--tile", 20, "--workers", 0, "--buffer", 5)])
+def test_warnings_of_pdal_are_shown_once(cloud, tmp_path, run, tiles):
+    """filters.hag_nn warns of ground points that are not there."""
+    smrf = {"type": "filters.smrf", "cell": 40}
+    stages = [cloud, smrf, {"type": "filters.hag_minima"}, {"type": "filters.hag_minima", "tag": "b"}]
+    code, _, err = run([*stages, tmp_path / "o.las"], *tiles)
+    assert code == 0, err
+    assert err.count("small number of cells") == 1 and "pypipeline" not in err
+    assert err.count("no spatial reference") == 1
+
+
+def test_levels_as_pdal_takes_them(cloud, tmp_path, run):
+    stages = [
+        cloud,
+        {"type": "filters.hag_minima"},
+        {"type": "writers.las", "filename": str(tmp_path / "o.las")},
+    ]
+    for words in (("-v", 4), ("-v",), ("--verbose", "3"), ("--verbose=0",)):
+        assert run(stages, *words)[0] == 0, words
+    path = str(tmp_path / "job.json")
+    assert main(["pipeline", "-v", "4", path]) == 0 and main(["pipeline", "-v", path]) == 0
+
+
+def test_a_log_file(cloud, tmp_path, run):
+    log = tmp_path / "run.log"
+    assert run([cloud, {"type": "filters.hag_minima"}, tmp_path / "o.las"], "--log", log)[0] == 0
+    assert run([cloud, {"type": "filters.hag_minima", "cell": -1}, tmp_path / "o.las"], "--log", log)[0] == 1
+    lines = log.read_text().splitlines()
+    assert "pipeline" in lines[0] and "--log" in lines[0] and lines[0][:4].isdigit()
+    assert any("metres were assumed" in line for line in lines)
+    assert any("must be a number above 0" in line for line in lines)
+    assert [line.split(" ", 2)[2].split(" after")[0] for line in lines if "exit code" in line] == [
+        "exit code 0",
+        "exit code 1",
+    ]
+
+
+def test_metadata_names_the_output(cloud, tmp_path, run):
+    out = tmp_path / "o.las"
+    writer = {"type": "writers.las", "filename": str(out)}
+    assert run([cloud, {"type": "filters.hag_minima"}, writer], "--metadata", tmp_path / "m.json")[0] == 0
+    assert json.loads((tmp_path / "m.json").read_text())["metadata"]["writers.las"]["filename"] == [str(out)]
+
+
+def test_extra_dimensions_that_pdal_does_not_read_are_named(cloud, tmp_path, run):
+    stages = [
+        {"type": "readers.las", "filename": str(cloud)},
+        {"type": "filters.hag_minima"},
+        tmp_path / "o.las",
+    ]
+    code, _, err = run(stages)
+    assert code == 0 and "Amplitude" in err and "use_eb_vlr" in err
+    stages[0]["use_eb_vlr"] = True
+    assert "Amplitude" not in run(stages)[2]
+
+
+@pytest.mark.parametrize("command", ["pipeline", "validate"])
+@pytest.mark.parametrize(
+    ("stage", "says"),
+    [
+        ({"type": "filters.accuracy"}, "'Reference' is missing"),
+        ({"type": "filters.modelclassifier", "model": "standard"}, "'HeightAboveGround' is missing"),
+        ({"type": "filters.hag_minima", "cell": -1}, "above 0"),
+        ({"type": "filters.hag_nonsense"}, "no stage|Couldn't create"),
+        ("degrees", "degrees"),
+    ],
+)
+def test_what_cannot_run_is_not_valid(cloud, tmp_path, run, stage, says, command):
+    before = []
+    if stage == "degrees":
+        before = [{"type": "filters.reprojection", "in_srs": "EPSG:32632", "out_srs": "EPSG:4326"}]
+        stage = {"type": "filters.hag_minima"}
+    code, out, err = run(
+        [cloud, *before, stage, tmp_path / "o.las"],
+        *(["--validate"] if command == "pipeline" else []),
+        command=command,
+    )
+    verdict = json.loads(out)
+    assert code == 1 and verdict["valid"] is False and verdict["error_detail"].strip() in err
+    assert any(word in err for word in says.split("|")) and not (tmp_path / "o.las").exists()
+
+
+def test_dimensions_that_a_file_or_a_stage_brings_are_valid(tmp_path, run, write_las):
+    xyz = dict(zip("XYZ", np.random.default_rng(0).uniform(0, 9, (3, 50)), strict=True))
+    mine = write_las(tmp_path / "mine.las", {**xyz, "Reference": np.full(50, 2, "u1")}, point_format=6)
+    plain = write_las(tmp_path / "plain.las", xyz, point_format=6)
+    ferry = {"type": "filters.ferry", "dimensions": "Classification=>Reference"}
+    for stages in ([mine], [plain, ferry]):
+        assert run([*stages, {"type": "filters.accuracy"}], command="validate")[0] == 0
+    assert run([plain, {"type": "filters.accuracy"}], command="validate")[0] == 1
+
+
+def test_errors_of_others_are_told_as_such(cloud, tmp_path, run):
+    script = "def f(ins, outs):\n    raise ValueError('my own problem')\n"
+    theirs = {"type": "filters.python", "module": "x", "function": "f", "source": script}
+    code, _, err = run([cloud, theirs, {"type": "filters.hag_minima"}, tmp_path / "o.las"])
+    assert code == 1 and "ValueError: my own problem" in err and "line 2" in err
+    assert "Traceback" not in err and "internal error" not in err
+
+
+def test_slow_rates_are_no_zero():
+    out = io.StringIO()
+    with Progress(10, "growing", "trees", stream=out, delay=0.0, log_every=0.0) as bar:
+        bar.started -= 20
+        bar.update(1)
+    assert "0.05 trees/s" in out.getvalue()
+
+
+# ---- objects that behave like python-pdal's ----------------------------------------------------------------
+
+
+def test_objects_like_those_of_python_pdal(cloud, tmp_path, pdal_module):
+    reader = pdal_module.Reader.las(str(cloud)).pipeline()
+    reader.execute()
+    alone = ps.Filter.hag_minima(tag="h").pipeline(reader.arrays[0])
+    assert alone.execute() == 500 and "HeightAboveGround" in alone.arrays[0].dtype.names
+    stage = ps.Filter.hag_minima(cell=10, tag="h")
+    assert (stage.type, stage.tag, stage.options["cell"]) == ("filters.hag_minima", "h", 10)
+    assert repr(stage) == "filters.hag_minima(cell=10, tag='h')"
+    out = tmp_path / "o.las"
+    job = ps.Pipeline([str(cloud), {"type": "filters.hag_minima"}]) | pdal_module.Writer.las(
+        str(out), extra_dims="all"
+    )
+    assert job.execute() == 500 and "HeightAboveGround" in laspy.read(out).point_format.dimension_names
+    more = ps.Pipeline([str(cloud)]) | stage | pdal_module.Writer(str(tmp_path / "b.las"))
+    assert more.execute() == 500 and (tmp_path / "b.las").exists()
+    with pytest.raises(TypeError):
+        job | 5
+
+
+def test_signatures_and_completion():
+    first, *others = inspect.signature(ps.Filter.modelclassifier).parameters.values()
+    assert first.name == "model" and {"smooth", "ignore", "tag"} <= {p.name for p in others}
+    assert inspect.signature(ps.Filter.hag_minima).parameters["cell"].default == 20.0
+    assert ps.Filter.modelclassifier("standard").options == {
+        "type": "filters.modelclassifier",
+        "model": "standard",
+    }
+    assert "Side of the coarse cells" in ps.Filter.hag_minima.__doc__
+    assert "hag_minima" in dir(ps.Filter) and not hasattr(ps.Filter, "nonsense")
+    with pytest.raises(TypeError):
+        ps.Filter.hag_minima(20)
