@@ -12,6 +12,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from .base import kinds
 from .base.errors import StageError
@@ -192,12 +193,25 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--showjson", action="store_true", help="As JSON Schema")
 
     command = add("classify", _classify, "Classify a cloud with a model file", overrides=True)
-    command.add_argument("input", help="A file PDAL can read")
-    command.add_argument("output", help="A file PDAL can write; other dimensions and the header are kept")
+    command.add_argument("inputs", nargs="+", metavar="input", help="Files PDAL can read, folders, patterns")
+    command.add_argument(
+        "output",
+        help="A file PDAL can write; of several inputs a folder, or a name with # where the input's goes. Other dimensions "
+        "and the header are kept",
+    )
     command.add_argument(
         "--model",
         default="standard",
         help="A model file, or a shipped model's name (pdal-stages models); default standard",
+    )
+    command.add_argument(
+        "--dimensions",
+        metavar="LIST",
+        help="Extra dimensions to write beside the input's own: e.g. Reliability,Margin,Probability_6, all, or none; "
+        "default HeightAboveGround,Reliability",
+    )
+    command.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="Files classified at the same time (1)"
     )
     command.add_argument(
         "--where", help="Classify only the points for which this holds; the others serve as neighbors"
@@ -346,25 +360,70 @@ def _options(options: argparse.Namespace) -> None:
     print(describe.stage_options(options.stage, as_json=options.showjson), end="")
 
 
-def _classify(options: argparse.Namespace) -> None:
-    from .base.asprs import class_name
-    from .pipeline.jobs import classify_pipeline
-    from .pipeline.run import Pipeline
-    from .stages.modelclassifier import loaded_model
+def _classify(options: argparse.Namespace) -> int:
+    from .pipeline.jobs import las_files, outputs_of
+    from .pipeline.manyfiles import each_file
 
+    inputs = las_files(options.inputs)
+    outputs = outputs_of(inputs, options.output)
+    if len(inputs) > 1 and options.metadata:
+        raise StageError(
+            "--metadata is of one run", found=f"{len(inputs)} inputs", cure="Classify one at a time"
+        )
+    work = [(source, target, options) for source, target in zip(inputs, outputs, strict=True)]
+    if len(work) == 1:
+        _print_classes([_classify_one(*work[0])], options.model)
+        return 0
+    done, failed = [], 0
+    for (source, *_), result in each_file(_classify_one, work, options.workers):
+        if isinstance(result, StageError):
+            failed += 1
+            print(f"pdal-stages: {source}: {result}", file=sys.stderr)
+        else:
+            done.append(result)
+    print(
+        "Each file was classified by itself; --tile of 'pipeline' lets them see each other's points",
+        file=sys.stderr,
+    )
+    _print_classes(done, options.model)
+    if failed:
+        print(f"pdal-stages: {failed} of {len(work)} files failed", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _classify_one(source: str, target: str, options: argparse.Namespace) -> tuple[str, int, dict[str, Any]]:
+    """Classify a file: the output, its points, and the classifier's report."""
+    from .pipeline.jobs import WRITTEN, classify_pipeline
+    from .pipeline.run import Pipeline
+
+    listed = options.dimensions
+    named = WRITTEN if listed is None else tuple(name.strip() for name in listed.split(",") if name.strip())
     stages = classify_pipeline(
-        options.input, options.output, options.model, options.overrides, where=options.where
+        source, target, options.model, options.overrides, where=options.where, dimensions=named
     )
     pipeline = Pipeline(stages, options.overrides)
     count = _run(options, pipeline)
-    print(f"{count:,} points written to {options.output}")
-    names = dict(loaded_model(options.model).classes)
-    report = pipeline.reports[-1][1][-1]
-    for code, points in report.get("classes", {}).items():
-        print(f"  {int(code):3d} {names.get(int(code), class_name(int(code))):28s} {points:>12,}")
+    return target, count, pipeline.reports[-1][1][-1]
+
+
+def _print_classes(done: Sequence[tuple[str, int, dict[str, Any]]], model: str) -> None:
+    """The files that were written, and the points of each class in all of them."""
+    from .base.asprs import class_name
+    from .stages.modelclassifier import loaded_model
+
+    for target, count, _ in done:
+        print(f"{count:,} points written to {target}")
+    names = dict(loaded_model(model).classes)
+    classes: dict[int, int] = {}
+    for _, _, report in done:
+        for code, points in report.get("classes", {}).items():
+            classes[int(code)] = classes.get(int(code), 0) + points
+    for code, points in sorted(classes.items()):
+        print(f"  {code:3d} {names.get(code, class_name(code)):28s} {points:>12,}")
     for key, what in _LEFT_ALONE.items():
-        if report.get(key):
-            print(f"  {what:32s} {report[key]:>12,}")
+        number = sum(report.get(key) or 0 for _, _, report in done)
+        if number:
+            print(f"  {what:32s} {number:>12,}")
 
 
 def _models(options: argparse.Namespace) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -10,27 +11,99 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import DimensionError, StageError
+from ..base.errors import DimensionError, OptionError, StageError, suggest
+from ..base.las import extra_dimensions
 from ..base.outputs import check_outputs
+from ..stages import preparation, registry
 from ..stages.points import Points
+from . import pdal as pdal_env
 from .filenames import stage_files
 from .lowering import lower_stage
 from .overrides import Override, apply_overrides
 
+#: Dimensions that `classify` writes beside the input's own.
+WRITTEN = ("HeightAboveGround", "Reliability")
+
 
 def classify_pipeline(
-    source: str, target: str, model: str, overrides: Iterable[Override] = (), *, where: str | None = None
+    source: str,
+    target: str,
+    model: str,
+    overrides: Iterable[Override] = (),
+    *,
+    where: str | None = None,
+    dimensions: Sequence[str] = WRITTEN,
 ) -> list[dict[str, Any]]:
     """Read, give heights if the model wants them, classify, write with everything else kept.
 
-    The overrides are those of the run: they may name another model.
+    Parameters
+    ----------
+    source, target, model : str
+    overrides : iterable of Override
+        Those of the run: they may name another model.
+    where : str, optional
+    dimensions : sequence of str
+        Which of the dimensions made on the way are written beside the input's own, or ``all``.
     """
     from ..stages.modelclassifier import loaded_model
 
     classifier = {"type": "filters.modelclassifier", "model": model, **({"where": where} if where else {})}
+    for option, name in (("margin", "Margin"), ("variance", "Variance"), ("probabilities", "Probability_")):
+        if any(one.startswith(name) for one in dimensions):
+            classifier[option] = True
     loaded = loaded_model(_overridden(classifier, overrides)["model"])
     prepared = loaded.info.get("preparation") or heights_for(loaded.required_dimensions)
-    return [_reader(source, "input"), *prepared, classifier, _writer(target)]
+    stages = [*prepared, classifier]
+    made: dict[str, str] = {}
+    for stage in stages:
+        if stage["type"] in registry.stages():
+            made |= lower_stage(_overridden(stage, overrides)).stage.creates()
+        elif stage["type"] in preparation.OF_PDAL:
+            made["HeightAboveGround"] = "double"
+    return [_reader(source, "input"), *stages, _writer(target, _extra_dims(source, made, dimensions))]
+
+
+def _extra_dims(source: str, made: dict[str, str], wanted: Sequence[str]) -> str:
+    """The option of the writer: the input's own extra dimensions, and those wanted of what the stages make."""
+    names = [name for name in made if name != "Classification"]
+    for name in wanted:
+        if name not in ("all", "none", *names) and list(wanted) != list(WRITTEN):
+            raise OptionError(
+                "--dimensions names what is not made",
+                found=name,
+                cure=f"{suggest(name, names)}There are {', '.join(names)}; or all, or none",
+            )
+    chosen = names if "all" in wanted else [name for name in names if name in wanted]
+    is_las = Path(source).suffix.lower() in (".las", ".laz")
+    own = extra_dimensions(source) if is_las else {}
+    if "all" in wanted or not is_las or not all(re.fullmatch(r"[A-Za-z_]\w*", name) for name in own):
+        return "all"  # what other formats hold is not known here
+    return ",".join(f"{name}={kind}" for name, kind in {**own, **{n: made[n] for n in chosen}}.items())
+
+
+def outputs_of(sources: Sequence[str], target: str) -> list[str]:
+    """An output for each input: in a folder under the input's name, or with the input's name for ``#``.
+
+    Raises
+    ------
+    StageError
+        Where several inputs would be written to one file.
+    """
+    path = Path(target)
+    if path.is_dir():
+        outputs = [str(path / Path(source).name) for source in sources]
+    elif "#" in path.name:
+        outputs = [str(path.with_name(path.name.replace("#", Path(source).stem))) for source in sources]
+    else:
+        outputs = [target]
+    if len(set(outputs)) < len(sources):
+        raise StageError(
+            "several inputs would be written to one file",
+            found=f"{len(sources)} inputs, {target}",
+            cure="Name a folder that exists, or put '#' where the input's name should be, e.g. classified_#.laz. To merge "
+            "them into one file, use a pipeline",
+        )
+    return outputs
 
 
 def train_pipeline(
@@ -169,7 +242,6 @@ def paired(sources: Sequence[str], references: Sequence[str]) -> list[tuple[str,
 
 def _points_of(name: str, dimension: str) -> tuple[Any, str, NDArray]:
     """All points of a file with class codes freed of flag bits, its spatial reference, and the withheld flags."""
-    from . import pdal as pdal_env
     from .run import Pipeline
     from .runtime import wkt_of
 
@@ -216,9 +288,11 @@ def _reader(source: str, tag: str) -> dict[str, Any]:
     return stage
 
 
-def _writer(target: str) -> dict[str, Any]:
-    """A writer that keeps the input's header and all dimensions, where it is a LAS file."""
+def _writer(target: str, extra_dims: str) -> dict[str, Any]:
+    """A writer that keeps the input's header and its dimensions, where it is a LAS file."""
     stage: dict[str, Any] = {"filename": target, "tag": "output"}
-    if Path(target).suffix.lower() in (".las", ".laz"):
-        stage.update({"type": "writers.las", "forward": "all", "extra_dims": "all"})
-    return stage
+    if target.lower().endswith(".copc.laz") and pdal_env.writes_copc():
+        stage.update({"type": "writers.copc", "forward": "all"})
+    elif Path(target).suffix.lower() in (".las", ".laz"):
+        stage.update({"type": "writers.las", "forward": "all"})
+    return {**stage, "extra_dims": extra_dims} if "type" in stage and extra_dims else stage

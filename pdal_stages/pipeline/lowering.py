@@ -18,7 +18,7 @@ from . import classflags
 from .optionfile import settled
 from .read import PipelineSource
 from .runtime import TRAMPOLINE, known, place, python_filter
-from .writerlimits import check_writers
+from .writerlimits import check_copc, check_writers
 
 #: Options of every PDAL stage that a lowered stage hands on.
 PDAL_OWN = ("tag", "inputs", "user_data", "log")
@@ -77,6 +77,7 @@ def lower(source: PipelineSource) -> Lowered:
         _refuse_near_miss(stages[-1], source.where(index))
     views = _Views()
     out = Lowered([])
+    check_copc(stages)
     parted = classflags.splitter(stages)
     tags = {str(s["tag"]) for s in stages if "tag" in s}
     for index, stage in enumerate(stages):

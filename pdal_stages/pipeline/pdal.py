@@ -300,6 +300,11 @@ def writes_extended_classes_to_laz() -> bool:
     return version() >= (2, 3, 0)
 
 
+def writes_copc() -> bool:
+    """Whether this PDAL has writers.copc."""
+    return version() >= (2, 4, 0)
+
+
 #: Dimensions of newer PDAL for the flags of a point.
 FLAGS = ("Synthetic", "KeyPoint", "Withheld", "Overlap")
 

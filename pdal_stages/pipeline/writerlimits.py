@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.asprs import LEGACY_LIMIT
-from ..base.errors import DimensionError, OptionError
+from ..base.errors import DimensionError, OptionError, PipelineError
 from ..base.las import LasHeader, read_header
 from ..stages.base import CodeLimit, Stage
 from . import pdal as pdal_env
@@ -53,6 +53,25 @@ def check_writers(stages: list[dict[str, Any]], ours: list[tuple[Stage, str, int
                     "writers.tiledb), or use writers.classifiermodel and filters.modelclassifier, which need no "
                     "dimensions",
                 )
+
+
+def check_copc(stages: list[dict[str, Any]]) -> None:
+    """Refuse a plain LAZ file under the name of a COPC file."""
+    for stage in stages:
+        name, kind = str(stage.get("filename", "")), stage.get("type", "")
+        last = stage is stages[-1] and len(stages) > 1
+        if not name.lower().endswith(".copc.laz") or not (kind == "writers.las" or (last and not kind)):
+            continue
+        if not pdal_env.writes_copc():
+            raise PipelineError(
+                f"PDAL {'.'.join(map(str, pdal_env.version()))} cannot write COPC",
+                found=name,
+                cure="Name the output .laz, or use PDAL 2.4 or later",
+            )
+        if kind:
+            raise PipelineError(
+                "writers.las writes plain LAZ, not COPC", found=name, cure='Use "type": "writers.copc"'
+            )
 
 
 def writes_las(stage: dict[str, Any]) -> bool:

@@ -1,0 +1,123 @@
+"""`classify` of one file and of many: outputs, dimensions, COPC."""
+
+from __future__ import annotations
+
+import laspy
+import numpy as np
+import pytest
+
+from pdal_stages.cli import main
+from pdal_stages.pipeline import pdal as pdal_env
+
+pytestmark = pytest.mark.pdal
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, write_las):
+    """Three clouds, the first with an extra dimension, and a model."""
+    base = tmp_path_factory.mktemp("many")
+    (base / "in").mkdir()
+    for number in range(3):
+        rng = np.random.default_rng(number)
+        x, y = rng.uniform(0, 30, (2, 500))
+        block = (x > 15) & (y > 15)
+        arrays = {"X": x, "Y": y, "Z": np.where(block, 5, 0) + rng.normal(0, 0.02, 500)}
+        arrays["Classification"] = np.where(block, 6, 2).astype("u1")
+        if number == 0:
+            arrays["Amplitude"] = rng.random(500).astype("f4")
+        write_las(base / "in" / f"t{number}.laz", arrays, point_format=1)
+    options = {
+        "trees": 8,
+        "passes": 1,
+        "feature_set": "Linearity,HeightRange",
+        "dimensions": "HeightAboveGround",
+    }
+    words = [
+        "train",
+        base / "in" / "t0.laz",
+        "--model",
+        base / "m.model",
+        "--neighborhoods",
+        "k8",
+        "--count",
+        100,
+    ]
+    assert main([*map(str, words), *(f"--writers.classifiermodel.{k}={v}" for k, v in options.items())]) == 0
+    return base
+
+
+@pytest.fixture()
+def classify(folder, capsys):
+    def go(*words):
+        code = main([str(w) for w in ("classify", *words, "--model", folder / "m.model", "--no-progress")])
+        return code, *capsys.readouterr()
+
+    return go
+
+
+@pytest.mark.parametrize(
+    ("given", "output", "workers", "names"),
+    [
+        ("in", "out", 1, ["t0.laz", "t1.laz", "t2.laz"]),
+        ("in/t[12].laz", "out/c_#.las", 1, ["c_t1.las", "c_t2.las"]),
+        ("in", "out", 2, ["t0.laz", "t1.laz", "t2.laz"]),
+        ("in/t0.laz", "out", 1, ["t0.laz"]),
+    ],
+)
+def test_an_output_for_each_input(folder, classify, tmp_path, given, output, workers, names):
+    (tmp_path / "out").mkdir()
+    code, out, err = classify(folder / given, tmp_path / output, "--workers", workers)
+    assert code == 0, err
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
+    assert all(name in out for name in names)
+    for name in names:
+        made = np.asarray(laspy.read(tmp_path / "out" / name).classification)
+        assert len(made) == 500 and set(np.unique(made)) == {2, 6}
+
+
+def test_several_inputs_are_not_merged_into_one(folder, classify, tmp_path):
+    code, _, err = classify(folder / "in", tmp_path / "all.laz")
+    assert code == 1 and "#" in err and not list(tmp_path.iterdir())
+
+
+def test_a_file_that_fails_does_not_stop_the_others(folder, classify, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "bad.laz").write_bytes(b"LASF")
+    code, out, err = classify(tmp_path / "bad.laz", folder / "in" / "t1.laz", tmp_path / "out")
+    assert code == 1 and "bad.laz" in err and "1 of 2 files failed" in err and "t1.laz" in out
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["t1.laz"]
+
+
+@pytest.mark.parametrize(
+    ("words", "made"),
+    [
+        ((), ["Amplitude", "HeightAboveGround", "Reliability"]),
+        (("--dimensions", "none"), ["Amplitude"]),
+        (("--dimensions", "Margin,Probability_6"), ["Amplitude", "Margin", "Probability_6"]),
+    ],
+)
+def test_dimensions_are_chosen(folder, classify, tmp_path, words, made):
+    code, _, err = classify(folder / "in" / "t0.laz", tmp_path / "o.laz", *words)
+    assert code == 0, err
+    extra = laspy.read(tmp_path / "o.laz").point_format.extra_dimensions
+    assert sorted(d.name for d in extra) == made and all(d.dtype == np.float32 for d in extra)
+
+
+def test_a_dimension_that_is_not_made(folder, classify, tmp_path):
+    code, _, err = classify(folder / "in" / "t0.laz", tmp_path / "o.laz", "--dimensions", "Reliabilty")
+    assert code == 1 and "Did you mean 'Reliability'" in err
+
+
+def test_copc_or_a_refusal(folder, classify, tmp_path, capsys):
+    out = tmp_path / "o.copc.laz"
+    code, _, err = classify(folder / "in" / "t0.laz", out)
+    if not pdal_env.writes_copc():
+        assert code == 1 and "cannot write COPC" in err and not out.exists()
+        return
+    assert code == 0, err
+    with laspy.open(out) as reader:
+        assert reader.header.vlrs[0].user_id == "copc"
+    plain = f'["{folder}/in/t0.laz", {{"type": "writers.las", "filename": "{out}"}}]'
+    (tmp_path / "job.json").write_text(plain)
+    assert main(["pipeline", str(tmp_path / "job.json")]) == 1
+    assert "writers.copc" in capsys.readouterr().err
