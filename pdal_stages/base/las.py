@@ -12,11 +12,11 @@ import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
+from itertools import accumulate, islice
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from . import chunks
+from . import chunks, copc
 from .errors import StageError
 
 #: Bytes of a point of each format, without extra bytes (LAS 1.4 R15, tables 7 to 18).
@@ -105,7 +105,7 @@ def check_readable(path: str | os.PathLike) -> str | None:
         if header is not None and header.records_after and not wrong:
             wrong = _wrong_records(path, header, size)
         if header is not None and header.compressed and header.count and not wrong:
-            wrong = _wrong_chunks(path, header, table)
+            wrong = _wrong_chunks(path, header, table, size)
     except OSError as error:
         raise StageError(
             "the file cannot be read", where=str(path), found=error.strerror or str(error)
@@ -297,7 +297,9 @@ def _chunk_table(path: str | os.PathLike, size: int, header: LasHeader) -> int:
     return struct.unpack("<q", place)[0] if len(place) == 8 else -1
 
 
-def _wrong_chunks(path: str | os.PathLike, header: LasHeader, table: int) -> tuple[str, str] | None:
+def _wrong_chunks(
+    path: str | os.PathLike, header: LasHeader, table: int, size: int
+) -> tuple[str, str] | None:
     """What is wrong with the chunks of a LAZ file whose table is at `table`."""
     with open(path, "rb") as file:
         own = [r for r in _records(file, header) if r.user == b"laszip encoded" and r.number == 22204]
@@ -310,16 +312,34 @@ def _wrong_chunks(path: str | os.PathLike, header: LasHeader, table: int) -> tup
         begin = file.read(8)
         file.seek(table)
         # A number takes less than eight bytes, and a chunk has two at most.
-        data = file.read(
-            64 + 16 * min(chunks.MOST_DECODED, struct.unpack("<4xI", begin)[0] if len(begin) == 8 else 0)
+        number = struct.unpack("<4xI", begin)[0] if len(begin) == 8 else 0
+        data = file.read(64 + 16 * min(chunks.MOST_DECODED, number))
+        variable = of_chunk in (0, 2**32 - 1)
+        wrong = chunks.what_is_wrong(
+            data,
+            table - header.offset - 8,
+            points=header.count,
+            point_bytes=header.point_bytes,
+            chunk_points=None if variable else of_chunk,
         )
-    return chunks.what_is_wrong(
-        data,
-        table - header.offset - 8,
-        points=header.count,
-        point_bytes=header.point_bytes,
-        chunk_points=None if of_chunk in (0, 2**32 - 1) else of_chunk,
-    )
+        if wrong or not Path(path).name.lower().endswith(".copc.laz"):
+            return wrong
+        return _wrong_octree(file, header, size, data if variable and number <= chunks.MOST_DECODED else b"")
+
+
+def _wrong_octree(file: BinaryIO, header: LasHeader, size: int, table: bytes) -> tuple[str, str] | None:
+    """What is wrong with the octree of a file that calls itself COPC; `table`: of its chunks, where each has its count."""
+    first = next(_records(file, header), None)
+    if first is None or first.user != b"copc" or first.number != 1:
+        return "it is called .copc.laz, but its first record does not describe an octree", str(
+            first and first.user
+        )
+    known = None
+    if table:
+        sizes, counts = chunks.decode(table[8:], struct.unpack_from("<I", table, 4)[0], variable=True)
+        places = accumulate(sizes, initial=header.offset + 8)
+        known = [place for place in zip(places, sizes, counts, strict=False) if place[2]]
+    return copc.what_is_wrong(file, first.data, size, header.count, known)
 
 
 def odd_text(path: str | os.PathLike) -> tuple[str, bytes] | None:

@@ -63,8 +63,8 @@ class Lowered:
     remarks: list[str] = field(default_factory=list)
 
 
-def lower(source: PipelineSource) -> Lowered:
-    """Lower a pipeline.
+def lower(source: PipelineSource, whole: bool = True) -> Lowered:
+    """Lower a pipeline; not `whole`: to be cut into tiles, whose outputs part flags from classes themselves.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def lower(source: PipelineSource) -> Lowered:
     views = _Views()
     out = Lowered([])
     check_copc(stages)
-    parted = classflags.splitter(stages)
+    parted = classflags.splitter(stages) if whole else None
     tags = {str(s["tag"]) for s in stages if "tag" in s}
     for index, stage in enumerate(stages):
         type_name = stage.get("type", "")

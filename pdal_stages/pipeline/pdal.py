@@ -115,7 +115,7 @@ def execute(
     finally:
         # A stage that raises leaves sys.stdout pointing into PDAL's log.
         sys.stdout = stdout
-    log = str(pipeline.log or "")
+    log = _log(pipeline)
     if failed := _FAILED_WRITER.search(log):  # after which PDAL goes on
         raise PipelineError("an output file could not be written", found=": ".join(failed.groups()))
     return Execution(
@@ -238,6 +238,14 @@ def translate(message: str) -> PipelineError | DependencyError:
         last = [line for line in lines if line][-1]
         return PipelineError("a script of filters.python failed", found="; ".join([last, *place]))
     return PipelineError("PDAL could not run the pipeline", found=text)
+
+
+def _log(pipeline) -> str:
+    """What PDAL and GDAL said; they quote files, whatever bytes those hold."""
+    try:
+        return str(pipeline.log or "")
+    except UnicodeDecodeError as error:
+        return error.object.decode(errors="backslashreplace")
 
 
 def _metadata(pipeline) -> dict[str, Any]:

@@ -36,6 +36,8 @@ class Pipeline:
         A file name, JSON text, the stages themselves, or what :func:`parse_pipeline` made of text.
     overrides : iterable of Override, optional
         Options set from outside (see :mod:`pdal_stages.pipeline.overrides`).
+    whole : bool
+        False: only to be run in tiles.
 
     Raises
     ------
@@ -51,11 +53,15 @@ class Pipeline:
     """
 
     def __init__(
-        self, source: str | Path | list | dict | PipelineSource, overrides: Iterable[Override] = ()
+        self,
+        source: str | Path | list | dict | PipelineSource,
+        overrides: Iterable[Override] = (),
+        *,
+        whole: bool = True,
     ) -> None:
         read = source if isinstance(source, PipelineSource) else read_pipeline(source)
         self.source = PipelineSource(apply_overrides(read.stages, overrides), read.lines, read.name)
-        self.lowered: Lowered = lower(self.source)
+        self.lowered: Lowered = lower(self.source, whole)
         self.metadata: dict[str, Any] = {}
         self.arrays: list = []
         self.said: list[str] = []

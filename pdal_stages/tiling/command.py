@@ -96,7 +96,7 @@ def run_command(options: argparse.Namespace, source: str | Path) -> int:
         resume=options.resume,
         retries=options.retries,
     )
-    pipeline = Pipeline(source, options.overrides)
+    pipeline = Pipeline(source, options.overrides, whole=False)
     if options.validate:
         make_plan(pipeline, chosen.buffer)
         print(pipeline.validate())

@@ -118,7 +118,7 @@ class _Mark:
     """Numbers a reader's points, and keeps what they were where changes are to be found later.
 
     Old PDAL reads the flags of LAS 1.0 to 1.3 as bits of the class. Beside a file of LAS 1.4, whose flags it reads apart,
-    stages could not tell: the bits are then taken off, and put back into the results.
+    stages could not tell: the bits then go where those are, and back into the results.
 
     Attributes
     ----------
@@ -155,6 +155,10 @@ class _Mark:
             codes = ins["Classification"]
             self._flags = codes[self.piece.own] & ~np.uint8(LEGACY_LIMIT)
             outs["Classification"] = codes & np.uint8(LEGACY_LIMIT)
+            if "ClassFlags" in ins:
+                outs["ClassFlags"] = codes >> np.uint8(LEGACY_LIMIT.bit_length())
+                if self.keep:
+                    self.original["ClassFlags"] = outs["ClassFlags"][self.piece.own]
 
     def put_flags_back(self, rows: NDArray[np.int64], values: dict[str, NDArray]) -> None:
         """Give new class codes of some rows the flags that were taken off."""

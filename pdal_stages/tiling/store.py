@@ -219,7 +219,11 @@ def _opened(path: Path, text: bytes) -> dict[str, Any] | None:
     try:
         found = strictjson.loads(text)
         content = found["content"]
-        return content if isinstance(content, dict) and found["digest"] == fingerprint(path.parts[-2:], content) else None
+        return (
+            content
+            if isinstance(content, dict) and found["digest"] == fingerprint(path.parts[-2:], content)
+            else None
+        )
     except (ValueError, TypeError, KeyError, RecursionError):
         return None
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from ..base.errors import StageError
 from ..base.files import sweep
+from ..pipeline import classflags
 from ..pipeline.overrides import Override
 from ..pipeline.run import Pipeline
 from .dispatch import run_all
@@ -67,9 +68,11 @@ def run_tiled(
     """
     started = time.monotonic()
     chosen = tile if isinstance(tile, TilingOptions) else TilingOptions(tile, **options)
-    pipeline = source if isinstance(source, Pipeline) else Pipeline(source, overrides)
+    pipeline = source if isinstance(source, Pipeline) else Pipeline(source, overrides, whole=False)
     plan = make_plan(pipeline, chosen.buffer)
     survey = Survey(plan, chosen)
+    if survey.per == "tile":  # whose outputs have points of all readers
+        classflags.splitter([*plan.readers, *plan.tail])
     if dry_run:
         return estimate(plan, survey, chosen)
     folder = _folder(plan)

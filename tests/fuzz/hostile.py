@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sqlite3
 import struct
 import tempfile
@@ -21,6 +22,7 @@ import numpy as np
 from pdal_stages.base import las
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.strictjson import loads
+from pdal_stages.pipeline.pdal import version
 from pdal_stages.stages.where import Expression
 from pdal_stages.tiling import results, sources, tindex
 from pdal_stages.tiling.cloudindex import index_las
@@ -73,10 +75,15 @@ def where(data: bytes) -> str:
     return "evaluated"
 
 
+_MINUS = re.compile(r"(^|[^\w).\s])\s*-\s*(?![\d.])")
+
+
 def _of_pdal(text: str) -> np.ndarray | None:
-    """Where PDAL sees a condition hold; None where it refuses it."""
+    """Where PDAL sees a condition hold; None where it refuses it, or older ones would crash: on a minus before a name."""
     import pdal
 
+    if version() < (2, 9, 0) and _MINUS.search(text):
+        return None
     stage = {"type": "filters.assign", "value": f"GpsTime = -1 WHERE {text}"}
     pipeline = pdal.Pipeline(json.dumps([stage]), arrays=[points()])
     try:
