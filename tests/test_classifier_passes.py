@@ -10,7 +10,6 @@ from pdal_stages.base.errors import ModelError, OptionError
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, modelfile, train
 from pdal_stages.classifier.folds import Folds
 from pdal_stages.features import FeatureEngine
-from pdal_stages.features.voxels import reach
 
 FEW = {
     **{key: value for key, value in SMALL.items() if key != "passes"},
@@ -57,7 +56,7 @@ def test_a_second_pass_sees_more_than_the_first(two, other):
     one = (learnt(1).predict(xyz, dimensions).classification == label).mean()
     assert 1 - (two.predict(xyz, dimensions).classification == label).mean() < 0.5 * (1 - one)
     inner = max(two.passes[0].plan.halo + 8.0, two.passes[1].plan.halo)
-    assert two.halo == inner + reach(two.max_density)
+    assert two.halo == inner + two.voxel
     assert two.required_dimensions == ("HeightAboveGround",)
 
 

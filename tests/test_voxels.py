@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 import pdal_stages as ps
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, train
-from pdal_stages.features import compute_features, voxels
-from pdal_stages.features.voxels import COLUMN, represent
+from pdal_stages.features import compute_features
+from pdal_stages.features.voxels import represent
 
 
 def crowd(seed=0, n=6000, side=12.0, dense=4.0):
@@ -20,50 +20,34 @@ def crowd(seed=0, n=6000, side=12.0, dense=4.0):
     return np.round(xyz, 3) + np.array([600_000.0, 5_000_000.0, 100.0])
 
 
-def plainly(xyz, density):
-    """Voxel of each point of a crowded column, None for the others."""
-    along = max(round(COLUMN * density**0.5), 1)
-    column = [tuple(np.floor(p[:2] / COLUMN)) for p in xyz]
-    many = {c: column.count(c) for c in set(column)}
-    out = []
-    for p, c in zip(xyz, column, strict=True):
-        base = np.floor(p / COLUMN) * COLUMN
-        inside = np.minimum(((p - base) * (along / COLUMN)).astype(int), along - 1)
-        out.append((*base, *inside) if many[c] > density * COLUMN**2 else None)
-    return out
-
-
-@pytest.mark.parametrize("density", [0.5, 9.0, 16.0, 30.0])
-def test_one_of_each_voxel(density):
+@pytest.mark.parametrize("side", [0.25, 0.3, 1.0, 2.5])
+def test_one_of_each_voxel(side):
     xyz = crowd(n=2500)
-    found = represent(xyz, density)
-    voxel = plainly(xyz, density)
+    found = represent(xyz, side)
+    voxel = [tuple(np.floor(p * (1.0 / side))) for p in xyz]
     assert found is not None
     points, place = found.members(np.arange(len(found.rows)))
     assert sorted(points) == list(range(len(xyz)))
-    for point, stands in zip(points, found.rows[place], strict=True):
-        assert voxel[point] == voxel[stands]
-        assert voxel[point] is not None or point == stands
-    assert len(found.rows) == len(set(filter(None, voxel))) + voxel.count(None)
+    assert all(voxel[p] == voxel[r] for p, r in zip(points, found.rows[place], strict=True))
+    assert len(found.rows) == len(set(voxel))
 
 
 @settings(deadline=None, max_examples=20)
-@given(st.integers(0, 2**31), st.sampled_from([3.0, 16.0, 50.0]))
-def test_any_order_and_any_tile(seed, density):
+@given(st.integers(0, 2**31), st.sampled_from([0.2, 0.25, 1.0]))
+def test_any_order_and_any_tile(seed, side):
     xyz = crowd(seed % 7)
     value = np.random.default_rng(seed).integers(0, 3, len(xyz))
-    whole = represent(xyz, density, [value])
+    whole = represent(xyz, side, [value])
     order = np.random.default_rng(seed).permutation(len(xyz))
-    other = represent(xyz[order], density, [value[order]])
+    other = represent(xyz[order], side, [value[order]])
     if whole is None:
         assert other is None
         return
     rows = lambda points, v, kept: sorted(map(tuple, np.column_stack([points[kept], v[kept]])))  # noqa: E731
     assert rows(xyz, value, whole.rows) == rows(xyz[order], value[order], other.rows)
     core = (xyz[:, 0] < 600_003.1) & (xyz[:, 1] < 5_000_003.7)
-    halo = voxels.reach(density)
-    near = np.flatnonzero((xyz[:, 0] < 600_003.1 + halo) & (xyz[:, 1] < 5_000_003.7 + halo))
-    tile = represent(xyz[near], density, [value[near]])
+    near = np.flatnonzero((xyz[:, 0] < 600_003.1 + side) & (xyz[:, 1] < 5_000_003.7 + side))
+    tile = represent(xyz[near], side, [value[near]])
     kept = np.arange(len(near)) if tile is None else tile.rows
     inside = lambda chosen: {r for r in chosen if core[r]}  # noqa: E731
     assert {tuple(xyz[r]) for r in inside(near[kept])} == {tuple(xyz[r]) for r in inside(whole.rows)}
@@ -72,13 +56,14 @@ def test_any_order_and_any_tile(seed, density):
 def test_points_asked_for():
     xyz = crowd()
     rows = np.flatnonzero(np.arange(len(xyz)) % 5 == 0)
-    found = represent(xyz, 16.0, (), rows)
+    found = represent(xyz, 0.25, (), rows)
     points, _ = found.members(found.wanted)
     assert np.array_equal(np.sort(points), rows)
 
 
 def test_sparse_clouds_stay():
-    assert represent(crowd(), 1e4) is None
+    assert represent(np.unique(crowd(), axis=0), 1e-4) is None
+    assert represent(crowd(), 0.0) is None
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +71,7 @@ def model():
     xyz = crowd(n=9000)
     labels = np.where(xyz[:, 2] > 100.1, 5, 2)
     options = TrainingOptions(
-        neighborhoods="s1,k10", dimensions=(), trees=8, count=200, max_density=16.0, threads=2
+        neighborhoods="s1,k10", dimensions=(), trees=8, count=200, voxel=0.25, threads=2
     )
     return train(TrainingCloud(xyz, labels), options, progress=False)
 
@@ -99,7 +84,7 @@ def test_members_get_the_same(model, how, tmp_path):
     where = xyz[:, 0] < 600_006.0
     old = np.full(len(xyz), 9)
     found = model.predict(xyz, {}, where, current=old, **how)
-    few = represent(xyz, 16.0)
+    few = represent(xyz, 0.25)
     thin = model.predict(xyz[few.rows], {}, where[few.rows], current=old[few.rows], **how)
     assert (found.classification[~where] == 9).all()
     stands = few.rows
@@ -115,7 +100,7 @@ def test_members_get_the_same(model, how, tmp_path):
     assert found.classified == where.sum()
     model.save(tmp_path / "m.model")
     again = load_model(tmp_path / "m.model")
-    assert again.max_density == 16.0
+    assert again.voxel == 0.25
     assert np.array_equal(
         again.predict(xyz, {}, where, current=old, **how).classification, found.classification
     )
@@ -136,13 +121,13 @@ def test_tile_is_the_whole(model):
 
 @pytest.mark.pdal
 def test_features_of_dense_clouds(pdal_module):
-    """``filters.multiscalefeatures`` with ``max_density``: those of the cloud of representatives."""
+    """``filters.multiscalefeatures`` with ``voxel``: those of the cloud of representatives."""
     xyz = crowd(2)
-    few = represent(xyz, 16.0)
+    few = represent(xyz, 0.25)
     array = np.zeros(len(xyz), [("X", "f8"), ("Y", "f8"), ("Z", "f8")])
     for axis, name in enumerate("XYZ"):
         array[name] = xyz[:, axis]
-    options = {"neighborhoods": "s1,k10", "feature_set": "Linearity", "max_density": 16.0}
+    options = {"neighborhoods": "s1,k10", "feature_set": "Linearity", "voxel": 0.25}
     stage = ps.Filter.multiscalefeatures(**options, where="X < 600006")
     job = pdal_module.Pipeline(stage.stages, arrays=[array])
     job.execute()

@@ -35,7 +35,7 @@ OPTIONS = TrainingOptions(
     pass_folds=len(SURVEYS),
     context=("own", "box1", "columnvotes2", "columnvotes8"),
     scale=False,
-    max_density=16.0,
+    voxel=0.25,
 )
 
 
@@ -55,7 +55,7 @@ def copies(cloud: Cloud) -> Iterator[Cloud]:
 
 def training_cloud(cloud: Cloud) -> TrainingCloud:
     """As dense as it is trained on, with a mask of :data:`SAMPLES` points of each class, chosen by their coordinates."""
-    few = represent(cloud.xyz, OPTIONS.max_density, cloud.dimensions.values())
+    few = represent(cloud.xyz, OPTIONS.voxel, cloud.dimensions.values())
     if few is not None:
         cloud = cloud.taken(few.rows)
     order = np.argsort(coordinate_hash(cloud.xyz, 1), kind="stable")

@@ -93,7 +93,7 @@ def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: 
             **{name: number for name, number in notes.items() if number},
         },
         "densities": density_range(checked),
-        "max_density": float(options.max_density),
+        "voxel": float(options.voxel),
         "accuracy": {"cross_validation": None},
         "passes": [
             {

@@ -72,7 +72,7 @@ Source = TrainingCloud | Callable[[], TrainingCloud]
 
 
 def prepared(sources: Iterable[Source], options: TrainingOptions) -> Iterator[TrainingCloud]:
-    """The clouds without ignored points and no denser than `max_density`, each followed by its thinned copies."""
+    """The clouds without ignored points and with one point per voxel, each followed by its thinned copies."""
     named: set[int] = set()
     if options.classes is not None:
         named.update(label for part in ClassMap.parse(options.classes).labels for label in part)
@@ -82,11 +82,7 @@ def prepared(sources: Iterable[Source], options: TrainingOptions) -> Iterator[Tr
         labels = _checked_labels(cloud)
         if ignored and (gone := np.isin(labels, ignored)).any():
             cloud = cloud.part(np.flatnonzero(~gone))
-        few = (
-            represent(cloud.xyz, options.max_density, cloud.dimensions.values())
-            if options.max_density
-            else None
-        )
+        few = represent(cloud.xyz, options.voxel, cloud.dimensions.values())
         if few is not None:
             cloud = cloud.part(few.rows)
         yield cloud

@@ -114,7 +114,7 @@ def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: 
         },
         "priors": _priors(samples, len(classes.codes), float(options.prior_weight)),
         "densities": density_range(cloud.xyz for cloud in clouds),
-        "max_density": float(options.max_density),
+        "voxel": float(options.voxel),
         "accuracy": {"cross_validation": validation, "leave_one_survey_out": left_out},
         "passes": passes.scores,
         "created_by": _versions(),

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError, OptionError
-from ..features.voxels import Representatives, reach, represent
+from ..features.voxels import Representatives, represent
 from . import modelfile, summary
 from .algorithms import Inputs, Question, algorithm
 from .deciding import Outcome, Prediction, PredictionOptions, decide
@@ -84,14 +84,14 @@ class Model:
         return welcome(self.plan.dimensions)
 
     @property
-    def max_density(self) -> float:
-        """Points per square metre above which one point represents a voxel; 0: none does."""
-        return float(self.info.get("max_density") or 0.0)
+    def voxel(self) -> float:
+        """Side in metres of voxels that one point represents; 0: each point stands for itself."""
+        return float(self.info.get("voxel") or 0.0)
 
     @property
     def halo(self) -> float:
         """Metres around a tile whose points a tile's results depend on."""
-        return self.plan.halo + reach(self.max_density)
+        return self.plan.halo + self.voxel
 
     @property
     def gives_variance(self) -> bool:
@@ -292,12 +292,10 @@ class Model:
         dimensions: Mapping[str, npt.ArrayLike],
         rows: npt.NDArray[np.int64] | None,
     ) -> Representatives | None:
-        """Who stands for whom where the cloud is denser than the model wants it."""
-        if not self.max_density:
-            return None
+        """Who stands for whom."""
         read = (*self.required_dimensions, *self.welcome_dimensions)
         used = [dimensions[name] for name in read if name in dimensions]
-        return represent(xyz, self.max_density, used, rows)
+        return represent(xyz, self.voxel, used, rows)
 
     def _density_report(
         self, xyz: npt.NDArray[np.float64], count: int, report: Mapping[str, Any]

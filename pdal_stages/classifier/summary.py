@@ -74,10 +74,8 @@ def text(info: Mapping[str, Any]) -> str:
         lines.append(
             f"densities      {info['densities']['low']:.3g} to {info['densities']['high']:.3g} points/m2"
         )
-    if info.get("max_density"):
-        lines.append(
-            f"max density    {info['max_density']:g} points/m2; one point per voxel where there are more"
-        )
+    if info.get("voxel"):
+        lines.append(f"voxel          {info['voxel']:g} m, which one point stands for")
     for cloud in training.get("clouds", []):
         lines.append(f"trained on     {cloud['name']}, {cloud['points']:,} points")
     lines += ["", f"{'class':<34}{'available':>12}{'samples':>10}{'duplicates':>12}{'F1 out of bag':>15}"]

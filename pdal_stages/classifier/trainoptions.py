@@ -12,6 +12,7 @@ from ..base import checks
 from ..base.asprs import NOISE
 from ..base.errors import OptionError, suggest
 from ..base.threads import resolve_threads
+from ..features.voxels import LARGEST
 from .algorithms import algorithm_names, trainer
 from .context import Context
 
@@ -67,10 +68,9 @@ class TrainingOptions:
     thin : sequence of float
         Points per square metre of sparser copies that each cloud is also trained in. Features are computed on the
         copies; dimensions keep the values they have in the whole cloud.
-    max_density : float
-        Points per square metre, 0 for no limit: where a column of 4 m holds more, one point represents each voxel of the
-        side at which a level surface has so many, in training and in classifying; the others get its class. Bounds
-        the cost of a point in a drone's cloud, and keeps a model in the densities it knows.
+    voxel : float
+        Side in metres, 0 for none: one point represents each voxel, in training and in classifying, and the others get its
+        class. Bounds the cost of a point in a drone's cloud, and keeps a model near the densities it knows.
     ignore : sequence of int
         Labels whose points are not even neighbors, unless `classes` names them: noise.
     scale : bool
@@ -120,7 +120,7 @@ class TrainingOptions:
     prior_weight: float = 0.2
     balance: bool = True
     thin: Sequence[float] = ()
-    max_density: float = 64.0
+    voxel: float = 0.125
     ignore: Sequence[int] = NOISE
     scale: bool = True
     folds: int = 0
@@ -168,7 +168,7 @@ class TrainingOptions:
         checks.number("'block_size'", self.block_size, 0, 10**6, above=True, unit="m")
         checks.number("'memory_mb'", self.memory_mb, 0, 10**9, above=True)
         checks.number("'prior_weight'", self.prior_weight, 0, 1)
-        checks.number("'max_density'", self.max_density, 0, 10**6, unit="points/m2")
+        checks.number("'voxel'", self.voxel, 0, LARGEST, unit="m")
         if self.gap is not None:
             checks.number("'gap'", self.gap, 0, 10**6, unit="m")
         m = self.max_features

@@ -1,10 +1,9 @@
-"""One point for each voxel where a cloud is very dense: what bounds the cost of a point, whatever the sensor.
+"""One point for each voxel of an absolute grid: what bounds the cost of a point, and evens out how clouds are sampled.
 
 A sphere of 5 m holds 100,000 points of a drone's cloud, and 50 nearest neighbors there are a hand's breadth: features
-take long and mean something else than in the clouds a model was trained on. Where an absolute column of :data:`COLUMN`
-metres holds more points than wanted, each voxel in it, of the side at which a level surface has as many points as wanted, is
-represented by one of its points, and the others take its result. Which one it is follows from the points' own
-coordinates and values: the same in any order and in any tile that holds whole columns.
+take long and mean something else than in the clouds a model was trained on. So each voxel is represented by one of its
+points, and the others take its result. Which one it is follows from the points' own coordinates and values: the same in
+any order and in any tile that holds whole voxels.
 """
 
 from __future__ import annotations
@@ -16,21 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.hashing import coordinate_hash
-from .cells import grid_keys
-from .index import cell_numbers
+from .cells import cell_keys
 
-#: Side in metres of the columns in which density is looked at; a power of two.
-COLUMN = 4.0
-
-
-def reach(density: float | None) -> float:
-    """Metres around a tile that decide which points represent its voxels."""
-    return 0.0 if not density else COLUMN + COLUMN / _along(density)
-
-
-def _along(density: float) -> int:
-    """Voxels along a column's side."""
-    return max(round(COLUMN * density**0.5), 1)
+#: Largest side in metres.
+LARGEST = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,52 +51,40 @@ class Representatives:
 
 def represent(
     xyz: npt.NDArray[np.float64],
-    density: float,
+    side: float,
     values: Iterable[npt.ArrayLike] = (),
     rows: npt.NDArray[np.int64] | None = None,
 ) -> Representatives | None:
-    """Representatives of a cloud's points, or None where no column holds more than `density`.
+    """Representatives of a cloud's points, or None where no voxel holds two.
 
     Parameters
     ----------
     xyz : (n, 3) float64
         Coordinates in metres.
-    density : float
-        Points per square metre of a column above which its voxels get one representative each.
+    side : float
+        Of a voxel, metres; 0 for none.
     values : iterable of (n,) arrays
         What else is known of the points; decides between points of the same coordinates.
     rows : (m,) int64, ascending, optional
         Points asked for; the others are represented too, but are nobody's members.
     """
-    along = _along(density)
-    numbers = [_voxel_numbers(xyz[:, axis], along) for axis in range(3)]
-    columns, _ = grid_keys([number // along for number in numbers[:2]])
-    _, column, number = np.unique(columns, return_inverse=True, return_counts=True)
-    crowded = np.flatnonzero((number > density * COLUMN**2)[column])
-    if not len(crowded):
+    if not side or not len(xyz):
         return None
-    keys, _ = grid_keys([number[crowded] for number in numbers])
-    lots = coordinate_hash(
-        np.column_stack([xyz[crowded], *(np.asarray(column, np.float64)[crowded] for column in values)]), 0
-    )
-    order = np.lexsort((lots, keys))
+    keys, _ = cell_keys(xyz, side)
+    known = np.column_stack([xyz, *(np.asarray(one, np.float64) for one in values)])
+    order = np.lexsort((coordinate_hash(known, 0), keys))
     first = np.append(True, keys[order[1:]] != keys[order[:-1]])
-    chosen = crowded[order[first]]
-    represented = np.arange(len(xyz))  # by whom
-    represented[crowded[order]] = chosen[np.cumsum(first) - 1]
-    keep = np.zeros(len(xyz), np.bool_)
-    keep[represented] = True
-    kept = np.flatnonzero(keep)
-    by = np.searchsorted(kept, represented if rows is None else represented[rows])
+    if first.all():
+        return None
+    chosen = order[first]
+    kept = np.sort(chosen)
+    place = np.searchsorted(kept, chosen)
+    by = np.empty(len(xyz), np.int64)
+    by[order] = place[np.cumsum(first) - 1]
+    if rows is not None:
+        by = by[rows]
     members = np.argsort(by, kind="stable")
     start = np.zeros(len(kept) + 1, np.int64)
     np.cumsum(np.bincount(by, minlength=len(kept)), out=start[1:])
     wanted = None if rows is None else np.flatnonzero(np.diff(start))
     return Representatives(kept, wanted, members if rows is None else rows[members], start)
-
-
-def _voxel_numbers(values: npt.NDArray[np.float64], along: int) -> npt.NDArray[np.int64]:
-    """Numbers of the voxels; those of a column lie in it whatever is rounded."""
-    column = cell_numbers(values, COLUMN)
-    inside = (values - column * COLUMN) * (along / COLUMN)
-    return column * along + np.clip(inside.astype(np.int64), 0, along - 1)

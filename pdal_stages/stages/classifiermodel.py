@@ -19,6 +19,7 @@ from ..classifier.classes import ClassMap
 from ..classifier.dimensions import required, welcome
 from ..classifier.trainoptions import MOST_PASSES
 from ..features.returns import SOURCES
+from ..features.voxels import LARGEST
 from .base import Stage
 from .options import option
 from .points import Points
@@ -154,12 +155,13 @@ class ClassifierModel(Stage):
         "Points per square metre of sparser copies to train on as well, so that the model bears sparse clouds",
         may_be_empty=True,
     )
-    max_density: float = option(
+    voxel: float = option(
         "number",
-        _default("max_density"),
-        "Where the cloud is denser, one point represents each voxel, in training and in classifying; 0 for no limit",
+        _default("voxel"),
+        "Side of voxels: in training and in classifying one point represents each, and the others get its class; 0 for none",
         minimum=0,
-        unit="points/m2",
+        maximum=LARGEST,
+        unit="m",
     )
     ignore: Selection = option(
         "selection",

@@ -16,8 +16,7 @@ from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.adaptive import LEAST_RADIUS
 from ..features.neighborhoods import Neighborhood, parse_neighborhoods
-from ..features.voxels import reach as reach_of_voxels
-from ..features.voxels import represent
+from ..features.voxels import LARGEST, represent
 from .base import Stage
 from .options import option
 from .points import Points
@@ -68,13 +67,14 @@ class MultiscaleFeatures(Stage):
         False,
         "Also write the neighborhood that kopt chose as PDAL does: OptimalKNN (the point itself counted) and OptimalRadius",
     )
-    max_density: float = option(
+    voxel: float = option(
         "number",
         0.0,
-        "Where the cloud is denser, features are those of a cloud with one point per voxel, each point taking its voxel's; "
-        "0 for no limit",
+        "Side of voxels, for very dense clouds: features are those of a cloud of one point per voxel, and each point takes "
+        "its voxel's; 0 for none",
         minimum=0,
-        unit="points/m2",
+        maximum=LARGEST,
+        unit="m",
     )
     memory: int = option(
         "integer", 512, "Memory for blocks of points, in addition to the cloud itself", minimum=16, unit="MB"
@@ -85,7 +85,7 @@ of radius 2 m. See [neighborhoods and features](../features.md) for all tokens, 
 Shape distributions (`shapes`) need histogram thresholds, which are fitted to the points unless `bins` names a file;
 name one when several files must have comparable features. Features are 32-bit floats. LAS writers need
 `"extra_dims": "all"`, and one file describes at most 341 extra dimensions: training and classification compute
-features inside and need no dimensions at all. In clouds of hundreds of points per square metre `max_density` keeps the
+features inside and need no dimensions at all. In clouds of hundreds of points per square metre `voxel` keeps the
 time per point bounded, whatever the radius: see [dense clouds](../features.md#dense-clouds).
 """
     after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)
@@ -144,7 +144,7 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
         return {**dict.fromkeys(self.columns, "float"), **(_OPTIMAL if self.optimal else {})}
 
     def halo(self) -> float:
-        return self.plan.halo + reach_of_voxels(self.max_density)
+        return self.plan.halo + self.voxel
 
     def most_neighbors(self) -> int:
         return self.plan.most_neighbors
@@ -172,7 +172,7 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
         queries = None if points.mask is None else np.flatnonzero(points.mask[there])
         total = len(there) if queries is None else len(queries)
         own = {name: points.dimension(name)[there] for name in plan.dimensions}
-        few = represent(xyz, self.max_density, own.values(), queries) if self.max_density else None
+        few = represent(xyz, self.voxel, own.values(), queries)
         if few is not None:
             xyz, queries = xyz[few.rows], few.wanted
             own = {name: values[few.rows] for name, values in own.items()}
