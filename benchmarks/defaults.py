@@ -46,6 +46,11 @@ TABLES: dict[str, dict[str, dict[str, Any]]] = {
         "without heights above openings": {**ONE, "dimensions": (*DIMENSIONS[:2], "returns")},
         "heights above ground alone": {**ONE, "dimensions": DIMENSIONS[:1]},
     },
+    "voxel": {
+        "0.125 m": {},
+        "none": {"voxel": 0.0},
+        "0.25 m": {"voxel": 0.25},
+    },
     "passes": {
         "1": ONE,
         "2": {},

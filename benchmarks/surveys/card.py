@@ -40,6 +40,7 @@ def main() -> None:
             stage=json.dumps(PREPARATION),
             passes=len(model.passes),
             trees=OPTIONS.trees,
+            voxel=OPTIONS.voxel,
             size=args.model.stat().st_size / 1e6,
             digest=hashlib.sha256(args.model.read_bytes()).hexdigest()[:16],
             scores=tables(scores["surveys"], scores["isprs"]),

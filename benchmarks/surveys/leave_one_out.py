@@ -22,14 +22,20 @@ from recipe import train_on
 
 from pdal_stages.accuracy import Accuracy
 from pdal_stages.classifier import Model, load_model
+from pdal_stages.reports.panels import triptych
+from pdal_stages.reports.pictures import write_png
 
 SAMPLES = (11, 12, 21, 31, 41, 51, 54, 61)
 NAMES = {2: "ground", 5: "vegetation", 6: "building"}
 
 
-def score(model: Model, cloud: Cloud) -> dict[str, Any]:
-    """How well the model does on a cloud."""
+def score(model: Model, cloud: Cloud, pictures: Path | None = None) -> dict[str, Any]:
+    """How well the model does on a cloud; with a picture of it where a folder for these is given."""
     found = model.predict(cloud.xyz, cloud.dimensions).classification
+    if pictures is not None:
+        shown = cloud.truth > 0
+        drawn = triptych(*cloud.xyz[shown].T, found[shown], cloud.truth[shown])
+        write_png(pictures / f"standard-{cloud.name.replace(' ', '-')}.png", drawn, palette=True)
     known = cloud.truth > 0
     codes = sorted(set(cloud.truth[known].tolist()) | {2, 5, 6})
     result = Accuracy.from_labels(cloud.truth[known], found[known], classes=codes)
@@ -100,6 +106,7 @@ def main() -> None:
     options.add_argument("--json", type=Path, help="where the figures go")
     options.add_argument("--surveys", nargs="+", default=list(SURVEYS), choices=list(SURVEYS))
     options.add_argument("--ground", type=Path, help="model file to score on the ISPRS samples")
+    options.add_argument("--pictures", type=Path, help="folder for pictures of the surveys at their own density")
     args = options.parse_args()
     runs: list[dict[str, Any]] = []
     for left_out in args.surveys:
@@ -108,7 +115,7 @@ def main() -> None:
         cloud = load(args.data, left_out)
         for one in (cloud, thinned(cloud, 2.0), thinned(cloud, 0.5)):
             if one is not None:
-                runs.append(score(model, one))
+                runs.append(score(model, one, args.pictures if one is cloud else None))
                 print(json.dumps(runs[-1]), flush=True)
         print(f"{left_out}: {time.process_time() - started:.0f} CPU s", flush=True)
     samples = []
