@@ -67,14 +67,14 @@ TABLES: dict[str, dict[str, dict[str, Any]]] = {
         },
     },
     "trees": {
-        "50, leaves of 5 (default)": {},
+        "50, leaves of 3 (default)": {},
         "100, leaves of 3": {"trees": 100, "min_samples_leaf": 3},
         "60, leaves of 3": {"trees": 60, "min_samples_leaf": 3},
         "40, leaves of 3": {"trees": 40, "min_samples_leaf": 3},
         "60, leaves of 5": {"trees": 60, "min_samples_leaf": 5},
         "60, leaves of 10": {"trees": 60, "min_samples_leaf": 10},
         "30, leaves of 5": {"trees": 30, "min_samples_leaf": 5},
-        "50, leaves of 5, 10,000 samples of a class": {"count": 10_000},
+        "50, leaves of 3, 10,000 samples of a class": {"count": 10_000},
     },
 }
 CODES = {"Montpellier": (2, 3, 4, 5, 6), "Delft": (1, 2, 6)}

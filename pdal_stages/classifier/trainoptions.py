@@ -114,7 +114,7 @@ class TrainingOptions:
     seed: int = 0
     trees: int | Sequence[int] = 50
     max_depth: int | Sequence[int | None] | None = None
-    min_samples_leaf: int | Sequence[int] = 5
+    min_samples_leaf: int | Sequence[int] = 3
     max_samples: float = 1.0
     max_features: str | int | float = "auto"
     prior_weight: float = 0.2
