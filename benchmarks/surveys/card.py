@@ -48,7 +48,7 @@ def main() -> None:
             f"{worst['oa']:.1f}.",
             surveys="\n".join(surveys),
             densities=", ".join(f"{density:g}" for density in DENSITIES),
-            slopes=f"{100 * max(slope for slope, _ in SLOPES):.0f}",
+            slopes=f"{100 * max(slope for slope, *_ in SLOPES):.0f}",
             samples=SAMPLES,
         ),
         end="",

@@ -207,8 +207,9 @@ def without_returns(cloud: Cloud) -> Cloud:
     )
 
 
-def on_slopes(cloud: Cloud, slope: float, seed: int, most: int = 250_000) -> Cloud:
-    """A copy that stands on synthetic terrain: a tilted plane and waves, up to about that slope (rise over run).
+def on_slopes(cloud: Cloud, slope: float, seed: int, terraces: bool = False, most: int = 250_000) -> Cloud:
+    """A copy that stands on synthetic terrain: a tilted plane and waves, up to about that slope (rise over run);
+    with `terraces`, most of it in steps of 1.5 to 3 m.
 
     Of a large cloud a strip of at most `most` points is taken.
     """
@@ -232,5 +233,10 @@ def on_slopes(cloud: Cloud, slope: float, seed: int, most: int = 250_000) -> Clo
             number = 2 * np.pi / (length * random.uniform(0.7, 1.4))
             wave = np.sin(number * (u @ direction()) + random.uniform(0, 2 * np.pi))
             rise += share * slope / number / 3 * wave
+    if terraces:
+        height = random.uniform(1.5, 3.0)
+        level, above = np.divmod(rise, height)
+        stepped = height * (level + np.clip((above / height - 0.75) / 0.25, 0.0, 1.0))
+        rise = np.where(np.sin(u @ direction() / 40.0 + 1.0) > -0.3, stepped, rise)
     xyz[:, 2] = np.round(xyz[:, 2] + rise, 3)
     return cloud.part(part, f"{cloud.name}, slopes to {100 * slope:.0f} %", xyz)

@@ -14,8 +14,8 @@ from pdal_stages.features.voxels import represent
 
 #: Points per square metre of thinned copies.
 DENSITIES = (8.0, 2.0, 0.6)
-#: (slope, points per square metre) of copies on synthetic terrain.
-SLOPES = ((0.3, 8.0), (0.6, 3.0), (0.9, 1.0), (0.5, 0.3))
+#: (slope, points per square metre, whether in terraces) of copies on synthetic terrain.
+SLOPES = ((0.3, 8.0, False), (0.6, 3.0, False), (0.9, 1.0, False), (0.5, 0.3, False), (0.5, 1.0, True))
 #: Samples of each class from each copy.
 SAMPLES = 1500
 
@@ -42,8 +42,8 @@ OPTIONS = TrainingOptions(
 def copies(cloud: Cloud) -> Iterator[Cloud]:
     """A survey and its thinned and tilted copies; each once more without return numbers, where it has them."""
     made = [cloud, *(thinned(cloud, density) for density in DENSITIES)]
-    for number, (slope, density) in enumerate(SLOPES):
-        steep = on_slopes(cloud, slope, seed=number)
+    for number, (slope, density, terraces) in enumerate(SLOPES):
+        steep = on_slopes(cloud, slope, number, terraces)
         made.append(thinned(steep, density) or steep)
     for one in made:
         if one is None:
