@@ -126,7 +126,7 @@ def trained(cloud: TrainingCloud, classes, network: dict, args, what: str) -> tu
     start = clock()
     options = TrainingOptions(
         algorithm="alsnet", alsnet=network, dimensions=args.dimensions, classes=classes, seed=args.seed,
-        threads=args.threads,
+        threads=args.threads, voxel=0.0,
     )  # fmt: skip
     model = train([cloud], options, not args.quiet)
     took = since(start)
