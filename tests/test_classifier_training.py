@@ -19,6 +19,7 @@ SMALL = {
     "trees": 12,
     "min_samples_leaf": 1,
     "passes": 1,
+    "voxel": 0.0,
 }
 
 

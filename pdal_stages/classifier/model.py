@@ -16,7 +16,7 @@ from ..features.voxels import Representatives, represent
 from . import modelfile, summary
 from .algorithms import Inputs, Question, algorithm
 from .deciding import Outcome, Prediction, PredictionOptions, decide
-from .dimensions import required, welcome
+from .dimensions import gather, required, welcome
 from .passes import Passes
 from .smoothing import count_shares, smooth
 from .thinning import density, out_of_range
@@ -293,9 +293,9 @@ class Model:
         rows: npt.NDArray[np.int64] | None,
     ) -> Representatives | None:
         """Who stands for whom."""
-        read = (*self.required_dimensions, *self.welcome_dimensions)
-        used = [dimensions[name] for name in read if name in dimensions]
-        return represent(xyz, self.voxel, used, rows)
+        there = [name for name in self.welcome_dimensions if name in dimensions]
+        values, _ = gather((*self.required_dimensions, *there), dimensions, len(xyz))
+        return represent(xyz, self.voxel, values.values(), rows)
 
     def _density_report(
         self, xyz: npt.NDArray[np.float64], count: int, report: Mapping[str, Any]
