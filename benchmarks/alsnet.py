@@ -128,7 +128,7 @@ def trained(cloud: TrainingCloud, classes, network: dict, args, what: str) -> tu
         algorithm="alsnet", alsnet=network, dimensions=args.dimensions, classes=classes, seed=args.seed,
         threads=args.threads, voxel=0.0,
     )  # fmt: skip
-    model = train([cloud], options, not args.quiet)
+    model = train([cloud], options, progress=not args.quiet)
     took = since(start)
     notes = model.info["training"]
     for row in notes["curve"][:: max(1, len(notes["curve"]) // 8)]:
@@ -280,7 +280,7 @@ def scenes(args) -> list[dict]:
             options = TrainingOptions(
                 dimensions=args.dimensions, classes=classes, seed=args.seed, threads=args.threads
             )
-            model = train([cloud], options, not args.quiet)
+            model = train([cloud], options, progress=not args.quiet)
             what = f"{scene}: forest, {options.neighborhoods}"
         else:
             what = f"{scene}: alsNet, {args.network.get('configuration', 'small')}"

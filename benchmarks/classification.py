@@ -105,7 +105,7 @@ def score(data: Path, scene: str, options: TrainingOptions, smooth: float, progr
         test_dimensions = with_height(test, test_dimensions)
     warm(options)
     with timer("train"):
-        model = train([TrainingCloud(xyz, labels, dimensions, name=scene)], options, progress)
+        model = train([TrainingCloud(xyz, labels, dimensions, name=scene)], options, progress=progress)
     with timer("classify"):
         prediction = model.predict(test, test_dimensions, threads=options.threads, smooth=smooth)
     reference, merged = truth, MERGED[scene]

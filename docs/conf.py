@@ -36,4 +36,5 @@ html_theme_options = {
 html_static_path = ["static"]
 html_css_files = ["custom.css"]
 autodoc_member_order = "bysource"
+autodoc_typehints = "none"  # docstrings say shapes and units; NumPy's own names of types fill ten lines
 suppress_warnings = ["myst.xref_missing"]

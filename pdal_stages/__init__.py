@@ -15,7 +15,9 @@ _WHERE = {
     "Accuracy": "accuracy",
     "Filter": "pipeline.native",
     "Model": "classifier",
+    "FeatureTable": "features",
     "Pipeline": "pipeline",
+    "PointClassifier": "classifier.estimator",
     "StageError": "base.errors",
     "TrainingCloud": "classifier",
     "TrainingOptions": "classifier",
@@ -29,6 +31,7 @@ _WHERE = {
     "run_pipeline": "pipeline",
     "run_stage": "pipeline.runtime",
     "run_tiled": "tiling",
+    "TilingOptions": "tiling.settings",
     "train": "classifier",
     "write_accuracy_report": "reports",
 }
@@ -39,7 +42,8 @@ if TYPE_CHECKING:
     from .accuracy.measures import Accuracy
     from .base.errors import StageError
     from .classifier import Model, TrainingCloud, TrainingOptions, load_model, train
-    from .features import compute_features
+    from .classifier.estimator import PointClassifier
+    from .features import FeatureTable, compute_features
     from .features.neighborhoods import parse_neighborhoods
     from .pipeline import Pipeline, run_pipeline
     from .pipeline.native import Filter, Writer
@@ -47,6 +51,7 @@ if TYPE_CHECKING:
     from .synthetic import make_town
     from .terrain import filtered_ground, hag_minima
     from .tiling import run_tiled
+    from .tiling.settings import TilingOptions
 
 
 def __getattr__(name: str):

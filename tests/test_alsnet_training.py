@@ -29,7 +29,7 @@ def fit(clouds=None, progress=False, dimensions=("HeightAboveGround",), **networ
         clouds = [TrainingCloud(xyz, labels, values, name="scene")]
     network = {"configuration": TINY, "validation": 0, "epochs": 2, "histogram_threshold": 100, **network}
     options = TrainingOptions(algorithm="alsnet", alsnet=network, dimensions=dimensions, seed=3, threads=1)
-    return train(clouds, options, progress)
+    return train(clouds, options, progress=progress)
 
 
 # ---- which batches (no PyTorch) ------------------------------------------------------------------------------

@@ -37,7 +37,7 @@ def cloud():
 @pytest.fixture(scope="module")
 def whole(cloud):
     """All features of all kinds for every point, with fitted bins and threshold."""
-    return compute_features(cloud, None, KINDS, threads=1)
+    return compute_features(cloud, None, KINDS, "all", threads=1)
 
 
 def again(whole, cloud, queries=None, neighborhoods=KINDS, feature_set="all", **options):
@@ -142,7 +142,7 @@ def test_any_order_threads_and_blocks(cloud, whole):
 
 
 def test_fitting_does_not_depend_on_order(cloud, whole):
-    other = compute_features(cloud[::-1], [0], KINDS, threads=2)
+    other = compute_features(cloud[::-1], [0], KINDS, "all", threads=2)
     assert other.bins == whole.bins and other.copt_threshold == whole.copt_threshold
     assert np.array_equal(other.values[0], whole.values[-1])
 
@@ -183,14 +183,14 @@ def test_tile_with_halo(cloud, whole):
 def test_tile_smaller_than_the_cloud(cloud):
     """As above where the halo is a small part of the cloud, for neighborhoods with a radius."""
     spec = "c1,s1.5,ropt(0.5,1.5,0.25)"
-    everything = compute_features(cloud, None, spec)
+    everything = compute_features(cloud, None, spec, "all")
     halo = FeaturePlan.parse(spec).halo
     assert halo == 2.5
     low = cloud.min(axis=0)[:2] + 7.3
     inside = ((cloud[:, :2] >= low) & (cloud[:, :2] < low + 6.0)).all(axis=1)
     near = ((cloud[:, :2] >= low - halo) & (cloud[:, :2] < low + 6.0 + halo)).all(axis=1)
     assert near.sum() < 0.6 * len(cloud)
-    part = compute_features(cloud[near], np.flatnonzero(inside[near]), spec, bins=everything.bins)
+    part = compute_features(cloud[near], np.flatnonzero(inside[near]), spec, "all", bins=everything.bins)
     assert np.array_equal(part.values, everything.values[inside])
 
 
@@ -406,7 +406,7 @@ def test_few_points(count):
             len(FeaturePlan.parse(KINDS, MOMENTS).names),
         )
         return
-    table = compute_features(xyz, None, KINDS)
+    table = compute_features(xyz, None, KINDS, "all")
     assert np.isfinite(table.values).all() and len(table) == count
 
 

@@ -150,7 +150,7 @@ def test_large_spheres_in_a_dense_cloud(rng):
 
 def test_sparse_cloud_has_no_nan(rng):
     xyz = rng.uniform(0, 100, (3000, 3)) * [1, 1, 0.1]  # 0.3 points a square metre
-    values = compute_features(xyz, None, "c0.5,c1,c5,s0.5,s1,s5,k3,kopt,ropt,copt").values
+    values = compute_features(xyz, None, "c0.5,c1,c5,s0.5,s1,s5,k3,kopt,ropt,copt", "all").values
     assert np.isfinite(values).all()
 
 

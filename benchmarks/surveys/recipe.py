@@ -70,6 +70,6 @@ def training_cloud(cloud: Cloud) -> TrainingCloud:
 def train_on(data: Path, surveys: Iterable[str], progress: bool = True) -> Model:
     """The model of these surveys."""
     made = [training_cloud(copy) for name in surveys for copy in copies(load(data, name))]
-    model = train(made, OPTIONS, progress)
+    model = train(made, OPTIONS, progress=progress)
     model.info["preparation"] = [PREPARATION]
     return model

@@ -17,6 +17,7 @@ from . import modelfile, summary
 from .algorithms import Inputs, Question, algorithm
 from .deciding import Outcome, Prediction, PredictionOptions, decide
 from .dimensions import gather, required, welcome
+from .heights import heights
 from .passes import Passes
 from .smoothing import count_shares, smooth
 from .thinning import density, out_of_range
@@ -165,8 +166,9 @@ class Model:
         ----------
         xyz : (n, 3) float64
             Coordinates in metres.
-        dimensions : mapping
-            Name to (n,) values; must have ``required_dimensions``.
+        dimensions : mapping, optional
+            Name to (n,) values; must have ``required_dimensions``. Without, heights are made as in training, where the
+            model says how.
         where : (n,) bool, optional
             Points to classify. The others keep their class but still serve as neighbors.
         current : (n,) int, optional
@@ -181,6 +183,9 @@ class Model:
         """
         how = PredictionOptions(**options)
         xyz = np.asarray(xyz, dtype=np.float64)
+        if dimensions is None and self.required_dimensions:
+            usable = None if ignore is None else ~np.asarray(ignore, bool)
+            dimensions = heights(self.info.get("preparation") or [], xyz, usable, how.threads)
         if how.variance and not self.gives_variance:
             raise OptionError(
                 "only a network gives a variance",

@@ -3,28 +3,46 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from ..base.errors import OptionError
 from .algorithms import trainer
 from .clouds import Source, TrainingCloud, prepared
+from .dimensions import required
+from .heights import ALWAYS, WHERE_THERE, heights, preparation_of
 from .model import Model
 from .spool import spooled
 from .trainoptions import TrainingOptions
 
 
 def train(
-    clouds: TrainingCloud | Iterable[Source], options: TrainingOptions | None = None, progress: bool = True
+    clouds: TrainingCloud | Iterable[Source] | npt.ArrayLike,
+    labels: npt.ArrayLike | TrainingOptions | None = None,
+    options: TrainingOptions | None = None,
+    *,
+    dimensions: Mapping[str, npt.ArrayLike] | None = None,
+    progress: bool = True,
 ) -> Model:
-    """Train a model.
+    """Train a model: ``train(xyz, labels)``, or ``train(clouds, options)``.
 
     Parameters
     ----------
-    clouds : iterable of TrainingCloud, or of functions that make one
-        One per file or view. Features see only their own cloud. Where functions are given, or anything but a list or
-        tuple, one cloud at a time is in memory; all are kept in a temporary folder while training lasts.
+    clouds : (n, 3) array, TrainingCloud, iterable of TrainingCloud, or of functions that make one
+        Coordinates in metres of points that have `labels`; or one cloud per file or view. Features see only their own
+        cloud. Where functions are given, or anything but a list or tuple, one cloud at a time is in memory; all are
+        kept in a temporary folder while training lasts.
+    labels : (n,) int, optional
+        Class codes, with coordinates; the options may stand here otherwise.
     options : TrainingOptions
+    dimensions : mapping, optional
+        With coordinates: name to (n,) values, as the options' `dimensions` need. Without, heights are made of the
+        coordinates as ``filters.hag_morphological`` makes them, and the model knows how.
     progress : bool
         Whether to show progress on stderr.
 
@@ -32,12 +50,34 @@ def train(
     ------
     OptionError, DimensionError
     """
+    if isinstance(labels, TrainingOptions):
+        options, labels = labels, None
     options = options or TrainingOptions()
-    sources: Iterable[Source] = [clouds] if isinstance(clouds, TrainingCloud) else clouds
+    preparation: list[dict[str, Any]] = []
+    sources: Any = [clouds] if isinstance(clouds, TrainingCloud) else clouds
+    if labels is not None:
+        xyz = np.asarray(clouds, np.float64)
+        if dimensions is None:
+            dimensions, options, preparation = _prepared(xyz, labels, options)
+        sources = [TrainingCloud(xyz, labels, dimensions)]
     with tempfile.TemporaryDirectory(prefix="pdal-stages-") as folder:
         at_hand = isinstance(sources, list | tuple) and not any(callable(one) for one in sources)
         each = prepared(sources, options)
         made = list(each) if at_hand else spooled(each, Path(folder))
         if not made:
             raise OptionError("no training cloud was given")
-        return trainer(options.algorithm).train(made, options, progress)
+        model = trainer(options.algorithm).train(made, options, progress)
+    if preparation:
+        model.info["preparation"] = preparation
+    return model
+
+
+def _prepared(
+    xyz: npt.NDArray[np.float64], labels: npt.ArrayLike, options: TrainingOptions
+) -> tuple[dict[str, npt.NDArray[Any]], TrainingOptions, list[dict[str, Any]]]:
+    """Heights of bare points, the options that use them, and the stage that makes them."""
+    if tuple(options.dimensions) == ALWAYS and options.algorithm == "random_forest":
+        options = replace(options, dimensions=(*ALWAYS, *WHERE_THERE))
+    preparation = preparation_of(required(options.inputs))
+    usable = ~np.isin(np.asarray(labels), options.ignore)
+    return heights(preparation, xyz, usable, options.threads), options, preparation

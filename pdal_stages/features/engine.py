@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base import checks
-from ..base.errors import OptionError, StageError
+from ..base.errors import OptionError, StageError, optional_import
 from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
 from .blocks import Fitted, Run, Tally, compile_once
-from .plan import FeaturePlan
+from .plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS, FeaturePlan
 from .samples import smallest_hashes
 
 if TYPE_CHECKING:
@@ -254,7 +254,7 @@ class FeatureEngine:
 
 @dataclass
 class FeatureTable:
-    """Features of queries.
+    """Features of queries: an array with names, which NumPy and scikit-learn take as it is.
 
     Attributes
     ----------
@@ -276,8 +276,35 @@ class FeatureTable:
     def __len__(self) -> int:
         return len(self.values)
 
-    def __getitem__(self, name: str) -> np.ndarray:
-        """The column of that name, a view."""
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.values.shape
+
+    def __array__(self, dtype=None, copy=None) -> np.ndarray:
+        return np.array(self.values, dtype) if copy else np.asarray(self.values, dtype)
+
+    def __iter__(self) -> Iterator[str]:
+        """The names, as a data frame iterates."""
+        return iter(self.names)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.names
+
+    def to_dataframe(self):
+        """A pandas.DataFrame with a column for each feature.
+
+        Raises
+        ------
+        DependencyError
+            pandas is not installed.
+        """
+        pandas = optional_import("pandas", "table", "to_dataframe")
+        return pandas.DataFrame(self.values, columns=list(self.names))
+
+    def __getitem__(self, name: str | list[str]) -> np.ndarray:
+        """The column of that name, a view; or those of several names, (m, names)."""
+        if isinstance(name, list):
+            return np.stack([self[one] for one in name], axis=1)
         if name not in self.names:
             from ..base.errors import suggest
 
@@ -288,8 +315,8 @@ class FeatureTable:
 def compute_features(
     xyz: npt.ArrayLike,
     queries: npt.ArrayLike | None = None,
-    neighborhoods="weinmann2018",
-    feature_set="all",
+    neighborhoods=DEFAULT_NEIGHBORHOODS,
+    feature_set=DEFAULT_FEATURES,
     *,
     dimensions: Mapping[str, npt.ArrayLike] | None = None,
     bins: ShapeBins | None = None,
@@ -310,7 +337,8 @@ def compute_features(
     neighborhoods : str or list of str
         Presets and tokens, e.g. ``"weinmann2018"`` or ``"c1, s2, kopt"``.
     feature_set : str or list of str
-        Groups (``all``, ``covariance``, ``geometric``, ``shapes``, ``A3``, ``D1`` .. ``D4``) or single features.
+        Groups (``all``, ``covariance``, ``geometric``, ``shapes``, ``A3``, ``D1`` .. ``D4``) or single features. The
+        defaults of both are those of ``filters.multiscalefeatures``.
     dimensions : mapping of str to (m,) array
         The queries' own dimensions that the plan uses as features (HeightAboveGround for weinmann2018).
     bins, copt_threshold, seed, threads
@@ -340,5 +368,5 @@ def compute_features(
 def warmup() -> None:
     """Compile every kernel and fill the cache, e.g. at installation; seconds where it is filled already."""
     xyz = np.random.default_rng(0).uniform(0.0, 3.0, (60, 3))
-    compute_features(xyz, neighborhoods="c1,s1,k5,kopt(2,5),ropt,copt", threads=1)
+    compute_features(xyz, None, "c1,s1,k5,kopt(2,5),ropt,copt", "all", threads=1)
     compute_features(xyz, np.zeros((1, 3)), neighborhoods="c1", feature_set="covariance", threads=1)

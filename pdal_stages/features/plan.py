@@ -14,6 +14,9 @@ from . import returns
 from .names import ALL_FEATURES, GROUPS, WITH_DIMENSIONS, parse_feature_set
 from .neighborhoods import LEAST_MEMBERS, Neighborhood, parse_neighborhoods, preset_dimensions
 
+#: What is computed where nothing is asked for, by the function and the stage alike.
+DEFAULT_NEIGHBORHOODS = ("c1", "c2", "c3", "c5", "kopt")
+DEFAULT_FEATURES = ("covariance", "geometric")
 #: Halo of neighborhoods whose size is a number of points, metres: see :attr:`FeaturePlan.halo`.
 POINTS_HALO = 15.0
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..base.errors import DimensionError, OptionError, StageError, suggest
 from ..base.las import extra_dimensions
 from ..base.outputs import check_outputs
+from ..classifier.heights import preparation_of
 from ..stages import preparation, registry
 from ..stages.points import Points
 from . import pdal as pdal_env
@@ -52,7 +53,7 @@ def classify_pipeline(
         if any(one.startswith(name) for one in dimensions):
             classifier[option] = True
     loaded = loaded_model(_overridden(classifier, overrides)["model"])
-    prepared = loaded.info.get("preparation") or heights_for(loaded.required_dimensions)
+    prepared = loaded.info.get("preparation") or preparation_of(loaded.required_dimensions)
     stages = [*prepared, classifier]
     made: dict[str, str] = {}
     for stage in stages:
@@ -114,7 +115,7 @@ def train_pipeline(
 
     writer = {"type": "writers.classifiermodel", "filename": model, **options}
     stage = cast(ClassifierModel, lower_stage(_overridden(writer, overrides)).stage)
-    heights = heights_for(stage.wished)
+    heights = preparation_of(stage.wished)
     return [*(_reader(name, f"input{i}") for i, name in enumerate(sources, 1)), *heights, writer]
 
 
@@ -122,18 +123,6 @@ def _overridden(stage: dict[str, Any], overrides: Iterable[Override]) -> dict[st
     """A stage with the overrides of its type."""
     of_type = [o for o in overrides if not o.by_tag and o.selector == stage["type"]]
     return apply_overrides([stage], of_type)[0]
-
-
-def heights_for(dimensions: Iterable[str]) -> list[dict[str, Any]]:
-    """The stage that makes these dimensions, as far as they are heights."""
-    names = list(dimensions)
-    openings = [int(name.rpartition("_")[2]) for name in names if name.startswith("HeightAboveOpening_")]
-    if openings or "Ground" in names:
-        stage: dict[str, Any] = {"type": "filters.hag_morphological"}
-        if "Ground" in names:
-            stage["ground"] = True
-        return [{**stage, "openings": sorted(openings)}] if openings else [stage]
-    return [{"type": "filters.hag_minima"}] if "HeightAboveGround" in names else []
 
 
 def accuracy_pipeline(

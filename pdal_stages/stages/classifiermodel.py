@@ -17,6 +17,7 @@ from ..base.outputs import Output
 from ..classifier import TrainingCloud, TrainingOptions, train
 from ..classifier.classes import ClassMap
 from ..classifier.dimensions import required, welcome
+from ..classifier.heights import ALWAYS, WHERE_THERE
 from ..classifier.trainoptions import MOST_PASSES
 from ..features.returns import SOURCES
 from ..features.voxels import LARGEST
@@ -34,10 +35,8 @@ def _default(name: str) -> Any:
     return TrainingOptions.__dataclass_fields__[name].default
 
 
-#: The word for the dimensions that follow from what the points have: always these, and those where they are there.
+#: The word for the dimensions that follow from what the points have.
 AUTO = "auto"
-ALWAYS = ("HeightAboveGround",)
-WHERE_THERE = ("Ground", "HeightAboveOpening_5", "HeightAboveOpening_17")
 
 
 class ClassifierModel(Stage):

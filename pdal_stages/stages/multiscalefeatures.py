@@ -16,6 +16,7 @@ from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.adaptive import LEAST_RADIUS
 from ..features.neighborhoods import Neighborhood, parse_neighborhoods
+from ..features.plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS
 from ..features.voxels import LARGEST, represent
 from .base import Stage
 from .options import option
@@ -37,13 +38,13 @@ class MultiscaleFeatures(Stage):
     where_help = "Features are computed for the points inside; all points are neighbors."
     neighborhoods: list = option(
         "list",
-        ("c1", "c2", "c3", "c5", "kopt"),
+        DEFAULT_NEIGHBORHOODS,
         "Neighborhoods: tokens (c2 cylinder, s1 sphere, k50 nearest, kopt, ropt, copt) or a preset "
         "(blomley2016, weinmann2018, he2017)",
     )
     feature_set: list = option(
         "list",
-        ("covariance", "geometric"),
+        DEFAULT_FEATURES,
         "Groups (covariance, geometric, shapes, all) or single features (Linearity, A3, ...)",
     )
     seed: int = option(

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base import checks
 from ..base.errors import NoTerrainError, OptionError, StageError
+from .columns import columns
 
 #: Largest cell index either side of zero; beyond it coordinates cannot be terrain.
 _INDEX_LIMIT = 2**31 - 2
@@ -158,8 +159,8 @@ class MinimaTerrain:
 
 def hag_minima(
     x: ArrayLike,
-    y: ArrayLike,
-    z: ArrayLike,
+    y: ArrayLike | None = None,
+    z: ArrayLike | None = None,
     *,
     cell: float = 20.0,
     resolution: float = 0.5,
@@ -170,7 +171,7 @@ def hag_minima(
     Parameters
     ----------
     x, y, z : array_like, shape (n,)
-        Coordinates in metres (or any one unit, with `cell` and `resolution` in it too).
+        Coordinates in metres (or any one unit, with `cell` and `resolution` in it too); or `x` alone, of shape (n, 3).
     cell : float, default 20
         Side of the coarse cells whose lowest points form the terrain.
     resolution : float, default 0.5
@@ -195,11 +196,7 @@ def hag_minima(
     >>> hag_minima([1.0, 2.0], [1.0, 2.0], [10.0, 13.5]).tolist()
     [0.0, 3.5]
     """
-    x, y, z = (np.asarray(a, np.float64) for a in (x, y, z))
-    if not (x.shape == y.shape == z.shape and x.ndim == 1):
-        raise StageError(
-            "x, y and z must be one-dimensional and of one length", found=(x.shape, y.shape, z.shape)
-        )
+    x, y, z = columns(x, y, z)
     if x.size == 0:
         _check_sizes(cell, resolution)
         return np.empty(0)

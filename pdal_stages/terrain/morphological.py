@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..base.errors import OptionError, StageError
 from ..base.jit import njit
 from ..base.threads import map_blocks
+from .columns import columns
 from .lowest import COMPANY, SURROUNDINGS, cell_values, lowest_points, pits
 from .minima import cell_numbers
 from .openings import HOLE
@@ -52,8 +53,8 @@ _PARTS = 2.0**20
 
 def filtered_ground(
     x: ArrayLike,
-    y: ArrayLike,
-    z: ArrayLike,
+    y: ArrayLike | None = None,
+    z: ArrayLike | None = None,
     *,
     mask: ArrayLike | None = None,
     cell: float = 1.0,
@@ -71,7 +72,7 @@ def filtered_ground(
     Parameters
     ----------
     x, y, z : array_like, shape (n,)
-        Coordinates in metres.
+        Coordinates in metres; or `x` alone, of shape (n, 3).
     mask : array_like of bool, shape (n,), optional
         Points that may be ground, e.g. all but noise; the others only receive heights.
     cell : float, default 1
@@ -107,11 +108,7 @@ def filtered_ground(
         If shapes differ or coordinates are too large.
     """
     check_sizes(cell, slope, window, threshold, scalar, openings)
-    x, y, z = (np.ascontiguousarray(a, np.float64) for a in (x, y, z))
-    if not (x.shape == y.shape == z.shape and x.ndim == 1):
-        raise StageError(
-            "x, y and z must be one-dimensional and of one length", found=(x.shape, y.shape, z.shape)
-        )
+    x, y, z = columns(x, y, z)
     use = np.ones(len(x), bool) if mask is None else np.array(mask, bool)
     if use.shape != x.shape:
         raise StageError("'mask' must have one value per point", found=f"{use.shape}, {len(x):,} points")

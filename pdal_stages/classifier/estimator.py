@@ -1,0 +1,138 @@
+"""A classifier of points in the manner of scikit-learn."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from sklearn.base import BaseEstimator, ClassifierMixin
+from sklearn.utils.validation import check_is_fitted
+
+from ..base.errors import OptionError
+from .model import Model
+from .training import train
+from .trainoptions import TrainingOptions
+
+_DEFAULT = {name: field.default for name, field in TrainingOptions.__dataclass_fields__.items()}
+
+
+class PointClassifier(ClassifierMixin, BaseEstimator):
+    """A forest on the multi-scale features of points: ``PointClassifier().fit(xyz, y).predict(xyz)``.
+
+    ``X`` is a whole cloud, coordinates in metres: a point's features follow from the points around it, so rows cannot be
+    dealt out as scikit-learn's own cross-validation does. Labels 0, 1, 7, 12 and 18 are left out unless `classes`
+    names them, as in all training here.
+
+    Parameters
+    ----------
+    neighborhoods, feature_set, classes, count, trees, min_samples_leaf, prior_weight, passes, thin, seed, threads
+        As for :class:`TrainingOptions`, which says what the defaults are.
+    options : TrainingOptions, optional
+        All options instead; the others are not looked at.
+
+    Attributes
+    ----------
+    model_ : Model
+        Its `save` writes the file that ``filters.modelclassifier`` applies.
+    classes_ : (k,) uint8
+        ASPRS codes, in the order of the columns of :meth:`predict_proba`.
+    n_features_in_ : int
+        3.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> rng = np.random.default_rng(0)
+    >>> xyz = rng.uniform(0, 30, (2000, 3)) * [1, 1, 0.01]
+    >>> xyz[:500] += [0, 0, 6]
+    >>> y = np.where(xyz[:, 2] > 3, 6, 2)
+    >>> model = PointClassifier(neighborhoods="k10", count=100, trees=5, passes=1).fit(xyz, y)
+    >>> float((model.predict(xyz) == y).mean())
+    1.0
+    """
+
+    def __init__(
+        self,
+        neighborhoods: Any = _DEFAULT["neighborhoods"],
+        feature_set: Any = _DEFAULT["feature_set"],
+        *,
+        classes: Any = _DEFAULT["classes"],
+        count: int = _DEFAULT["count"],
+        trees: Any = _DEFAULT["trees"],
+        min_samples_leaf: Any = _DEFAULT["min_samples_leaf"],
+        prior_weight: float = _DEFAULT["prior_weight"],
+        passes: int = _DEFAULT["passes"],
+        thin: Any = _DEFAULT["thin"],
+        seed: int = _DEFAULT["seed"],
+        threads: int | None = _DEFAULT["threads"],
+        options: TrainingOptions | None = None,
+    ) -> None:
+        self.neighborhoods = neighborhoods
+        self.feature_set = feature_set
+        self.classes = classes
+        self.count = count
+        self.trees = trees
+        self.min_samples_leaf = min_samples_leaf
+        self.prior_weight = prior_weight
+        self.passes = passes
+        self.thin = thin
+        self.seed = seed
+        self.threads = threads
+        self.options = options
+
+    def fit(
+        self,
+        X: npt.ArrayLike,
+        y: npt.ArrayLike,
+        dimensions: Mapping[str, npt.ArrayLike] | None = None,
+    ) -> PointClassifier:
+        """Train on a labelled cloud.
+
+        Parameters
+        ----------
+        X : (n, 3) array
+        y : (n,) int
+            Class codes, 0 to 255.
+        dimensions : mapping, optional
+            Name to (n,) values; without, heights are made of the coordinates.
+        """
+        options = self.options
+        if options is None:
+            given = {k: v for k, v in self.get_params(deep=False).items() if k != "options"}
+            options = TrainingOptions(**given)
+        model = train(_cloud(X), np.asarray(y), options, dimensions=dimensions, progress=False)
+        self.model_: Model = model
+        self.classes_ = model.codes
+        self.n_features_in_ = 3
+        return self
+
+    def predict(
+        self, X: npt.ArrayLike, dimensions: Mapping[str, npt.ArrayLike] | None = None
+    ) -> npt.NDArray[np.uint8]:
+        """ASPRS codes of a cloud's points, (n,)."""
+        check_is_fitted(self)
+        return self.model_.predict(_cloud(X), dimensions, threads=self.threads).classification
+
+    def predict_proba(
+        self, X: npt.ArrayLike, dimensions: Mapping[str, npt.ArrayLike] | None = None
+    ) -> npt.NDArray[np.float32]:
+        """Probabilities of ``classes_``, (n, k)."""
+        check_is_fitted(self)
+        found = self.model_.predict(_cloud(X), dimensions, threads=self.threads, probabilities=True)
+        assert found.probabilities is not None
+        return found.probabilities
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the model file."""
+        check_is_fitted(self)
+        self.model_.save(path)
+
+
+def _cloud(X: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    xyz = np.asarray(X, np.float64)
+    if xyz.ndim != 2 or xyz.shape[1] != 3:
+        raise OptionError("points must be an array of shape (n, 3)", found=xyz.shape)
+    return xyz

@@ -1,0 +1,134 @@
+"""The Python interface: defaults that work, arrays in and out, scikit-learn's manners."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pdal_stages as ps
+from pdal_stages.base.errors import DependencyError, OptionError, StageError
+from pdal_stages.stages.multiscalefeatures import MultiscaleFeatures
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Ground (2) and a block (6), metres."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, 40, (2, 1500))
+    block = (x > 25) & (y > 25)
+    z = np.where(block, 6.0, 0.0) + rng.normal(0, 0.03, 1500)
+    return np.column_stack([x, y, z]), np.where(block, 6, 2)
+
+
+@pytest.fixture(scope="module")
+def small():
+    return ps.TrainingOptions("k10", "Linearity,HeightRange", count=100, trees=5, passes=1)
+
+
+def test_features_with_defaults(scene):
+    xyz = scene[0][:300]
+    table = ps.compute_features(xyz)
+    stage = MultiscaleFeatures({})
+    assert list(table) == list(stage.plan.names) and "Linearity_c1" in table
+    assert np.asarray(table).shape == table.shape == (300, len(list(table)))
+    assert np.array_equal(np.asarray(table, np.float64), table.values)
+    both = table[["Linearity_c1", "Planarity_c2"]]
+    assert np.array_equal(both[:, 1], table["Planarity_c2"])
+    assert np.array_equal(np.vstack([table, table])[300:], table.values)
+
+
+def test_a_table_is_what_scikit_learn_takes(scene):
+    from sklearn.tree import DecisionTreeClassifier
+
+    xyz, y = scene
+    table = ps.compute_features(xyz, neighborhoods="k10", feature_set="geometric")
+    assert DecisionTreeClassifier(random_state=0).fit(table, y).score(table, y) > 0.99
+
+
+def test_a_data_frame_or_what_is_missing(scene):
+    table = ps.compute_features(scene[0][:50], neighborhoods="k5", feature_set="covariance")
+    try:
+        import pandas
+    except ImportError:
+        with pytest.raises(DependencyError, match="pandas"):
+            table.to_dataframe()
+        return
+    frame = table.to_dataframe()
+    assert isinstance(frame, pandas.DataFrame) and list(frame) == list(table) and len(frame) == 50
+
+
+def test_heights_of_one_array(scene):
+    xyz = scene[0]
+    assert np.array_equal(ps.hag_minima(xyz), ps.hag_minima(*xyz.T))
+    one, three = ps.filtered_ground(xyz), ps.filtered_ground(*xyz.T)
+    assert all(np.array_equal(one[name], three[name]) for name in three)
+    with pytest.raises(StageError, match=r"\(n, 3\)"):
+        ps.hag_minima(xyz[:, :2])
+
+
+def test_train_and_predict_on_coordinates_alone(scene, small, tmp_path):
+    xyz, y = scene
+    model = ps.train(xyz, y, small, progress=False)
+    model.save(tmp_path / "m.model")
+    loaded = ps.load_model(tmp_path / "m.model")
+    assert loaded.info["preparation"][0]["type"] == "filters.hag_morphological"
+    found = loaded.predict(xyz)
+    assert (found.classification == y).mean() > 0.98
+
+
+@pytest.mark.pdal
+def test_a_model_of_arrays_classifies_files_alike(scene, small, tmp_path, write_las):
+    """Heights that were made of arrays are those of the stage that the model names."""
+    from pdal_stages.cli import main
+
+    xyz, y = scene[0].round(3), scene[1]
+    model = ps.train(xyz, y, small, progress=False)
+    model.save(tmp_path / "m.model")
+    source = write_las(tmp_path / "in.las", dict(zip("XYZ", xyz.T, strict=True)), offset=(0, 0, 0))
+    assert main(["classify", str(source), str(tmp_path / "o.las"), "--model", str(tmp_path / "m.model")]) == 0
+    import laspy
+
+    made = laspy.read(tmp_path / "o.las")
+    xyz = np.column_stack([made.x, made.y, made.z])
+    assert np.array_equal(np.asarray(made.classification), model.predict(xyz).classification)
+
+
+def test_the_estimator_keeps_the_conventions(scene, tmp_path):
+    from sklearn.base import clone, is_classifier
+    from sklearn.exceptions import NotFittedError
+
+    xyz, y = scene
+    made = ps.PointClassifier("k10", "Linearity,HeightRange", count=100, trees=5, passes=1, threads=1)
+    with pytest.raises(NotFittedError):
+        made.predict(xyz)
+    assert is_classifier(made) and clone(made).get_params() == made.get_params()
+    assert "trees=5" in repr(made) and made.set_params(trees=6).trees == 6
+    assert made.fit(xyz, y) is made and made.classes_.tolist() == [2, 6] and made.n_features_in_ == 3
+    p = made.predict_proba(xyz)
+    assert p.shape == (len(xyz), 2) and np.allclose(p.sum(axis=1), 1, atol=1e-5)
+    assert np.array_equal(made.classes_[p.argmax(axis=1)], made.predict(xyz))
+    assert made.score(xyz, y) > 0.98
+    order = np.random.default_rng(1).permutation(len(xyz))
+    assert np.array_equal(clone(made).fit(xyz[order], y[order]).predict(xyz), made.predict(xyz))
+    made.save(tmp_path / "m.model")
+    assert np.array_equal(ps.load_model(tmp_path / "m.model").predict(xyz).classification, made.predict(xyz))
+    with pytest.raises(OptionError, match=r"\(n, 3\)"):
+        made.fit(xyz[:, :2], y)
+
+
+def test_one_set_of_defaults():
+    options = ps.TrainingOptions()
+    for name, parameter in inspect.signature(ps.PointClassifier).parameters.items():
+        if name != "options":
+            assert parameter.default == getattr(options, name), name
+
+
+def test_every_public_name_is_on_the_api_page():
+    page = (ROOT / "docs" / "api.md").read_text()
+    missing = [name for name in ps.__all__ if f".{name}\n" not in page and name != "__version__"]
+    assert not missing
