@@ -69,7 +69,9 @@ def _row(stage: type[Stage], option) -> str:
         default = f"`{shown}`{' ' + option.unit if option.unit else ''}"
     text = f"{stage.where_help}" if option.name == "where" and stage.where_help else f"{option.help}."
     if option.name == "where":
-        text = f"A condition on points, as PDAL has it, whose own filters do not see the points outside. {text}"
+        text = (
+            f"A condition on points, as PDAL has it, whose own filters do not see the points outside. {text}"
+        )
     if option.choices:
         text += f" One of {', '.join(f'`{c}`' for c in option.choices)}."
     bounds = []

@@ -29,7 +29,10 @@ def double(ins, outs):
     return True
 """.replace("PREFIX", repr(sys.prefix))
 READER = {"type": "readers.faux", "mode": "constant", "count": 3, "bounds": "([1, 2], [1, 2], [21, 22])"}
-PIPELINE = [READER, {"type": "filters.python", "source": SOURCE, "function": "double", "module": "check_pdal"}]
+PIPELINE = [
+    READER,
+    {"type": "filters.python", "source": SOURCE, "function": "double", "module": "check_pdal"},
+]
 
 
 def driver_path() -> str | None:

@@ -192,7 +192,10 @@ def test_saved_and_loaded_gives_the_same_labels(tmp_path):
     assert isinstance(again.algorithm, AlsNet) and again.halo == model.halo
     one, other = (m.predict(xyz, dimensions, probabilities=True) for m in (model, again))
     assert np.array_equal(one.probabilities, other.probabilities)
-    assert "alsnet" in str(again) and again.describe()["passes"][0]["parameters"]["configuration"]["name"] == "test"
+    assert (
+        "alsnet" in str(again)
+        and again.describe()["passes"][0]["parameters"]["configuration"]["name"] == "test"
+    )
 
 
 def rewritten(path, weights=None, **parameters):

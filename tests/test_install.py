@@ -50,7 +50,9 @@ def test_ci_runs_the_readme_command_strictly():
 
 
 def test_pytorch_of_the_tests_is_one_version_without_cuda():
-    said = subprocess.run([ROOT / "scripts/setup", "--torch"], capture_output=True, text=True, check=True).stdout
+    said = subprocess.run(
+        [ROOT / "scripts/setup", "--torch"], capture_output=True, text=True, check=True
+    ).stdout
     assert re.fullmatch(r"torch==\d+\.\d+\.\d+(\+cpu)?\n", said)
     assert ("+cpu" in said) == (sys.platform != "darwin")
 
@@ -70,7 +72,9 @@ def test_pytorch_of_the_tests_is_one_version_without_cuda():
     ],
 )
 def test_failed_step_says_why(tmp_path, output, message):
-    done = bash('fail() { echo "$1"; false; echo never; }\nstep "The step" fail "$OUTPUT"', tmp_path, OUTPUT=output)
+    done = bash(
+        'fail() { echo "$1"; false; echo never; }\nstep "The step" fail "$OUTPUT"', tmp_path, OUTPUT=output
+    )
     assert done.returncode == 1
     assert "The step" in done.stdout and "FAILED" in done.stdout
     assert message in done.stderr and output in done.stderr and "never" not in done.stderr
@@ -99,10 +103,14 @@ def test_wrapper_survives_any_path(tmp_path, name):
     assert made.returncode == 0, made.stderr
     environment = {k: v for k, v in os.environ.items() if k != "PDAL_DRIVER_PATH"}
     command = [venv / "bin/pdal", "info", "x y"]
-    said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.splitlines()
+    said = subprocess.run(
+        command, env=environment, capture_output=True, text=True, check=True
+    ).stdout.splitlines()
     assert said == [str(venv / "bin"), str(venv / "plugins"), "info", "x y"]
     environment["PDAL_DRIVER_PATH"] = "/elsewhere"
-    said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.splitlines()
+    said = subprocess.run(
+        command, env=environment, capture_output=True, text=True, check=True
+    ).stdout.splitlines()
     assert said[1] == "/elsewhere"
 
 
@@ -151,7 +159,9 @@ def repository_files():
     """Text files of the repository, without a need for git."""
     made = {"build", "dist", "_build", "__pycache__"}
     for folder, folders, names in os.walk(ROOT):
-        folders[:] = [f for f in folders if f == ".ci" or (f[0] != "." and f not in made and f[-9:] != ".egg-info")]
+        folders[:] = [
+            f for f in folders if f == ".ci" or (f[0] != "." and f not in made and f[-9:] != ".egg-info")
+        ]
         for name in names:
             path = Path(folder, name)
             if path.suffix in {".py", ".md", ".sh", ".toml", ".yml", ".yaml", ".json", ".cfg", ".txt", ""}:
@@ -159,7 +169,9 @@ def repository_files():
 
 
 def test_no_registry_or_mirror_is_named():
-    host = re.compile(r"https?://[\w.-]*(pypi|pythonhosted|debian|ubuntu|anaconda|conda-forge)[\w.-]*", re.IGNORECASE)
+    host = re.compile(
+        r"https?://[\w.-]*(pypi|pythonhosted|debian|ubuntu|anaconda|conda-forge)[\w.-]*", re.IGNORECASE
+    )
     found = [
         f"{path.relative_to(ROOT)}: {match.group()}"
         for path in repository_files()
@@ -186,9 +198,13 @@ def test_every_data_file_is_packaged():
     patterns = project()["tool"]["setuptools"]["package-data"]["pdal_stages"]
     package = ROOT / "pdal_stages"
     code = {".py", ".pyc", ".nbi", ".nbc"}
-    data = [p.relative_to(package).as_posix() for p in package.rglob("*") if p.is_file() and p.suffix not in code]
+    data = [
+        p.relative_to(package).as_posix() for p in package.rglob("*") if p.is_file() and p.suffix not in code
+    ]
     assert data and not [name for name in data if not any(fnmatch.fnmatch(name, p) for p in patterns)]
-    without_init = {p.parent for p in package.rglob("*.py")} - {p.parent for p in package.rglob("__init__.py")}
+    without_init = {p.parent for p in package.rglob("*.py")} - {
+        p.parent for p in package.rglob("__init__.py")
+    }
     assert not without_init
 
 
@@ -216,13 +232,29 @@ def test_torch():
 
 
 @pytest.mark.parametrize(
-    ("required", "failed", "skipped"), [("", 0, 5), ("pdal", 2, 3), ("data", 1, 4), ("torch", 1, 4), ("pdal,data", 3, 2)]
+    ("required", "failed", "skipped"),
+    [("", 0, 5), ("pdal", 2, 3), ("data", 1, 4), ("torch", 1, 4), ("pdal,data", 3, 2)],
 )
 def test_skips_that_must_not_happen_fail(tmp_path, required, failed, skipped):
     shutil.copy(ROOT / "tests/conftest.py", tmp_path)
     (tmp_path / "test_skips.py").write_text(SKIPS)
-    environment = {**os.environ, "PDAL_STAGES_REQUIRE": required, "PDAL_STAGES_DATA": str(tmp_path / "absent")}
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", os.devnull, "--rootdir", tmp_path]
+    environment = {
+        **os.environ,
+        "PDAL_STAGES_REQUIRE": required,
+        "PDAL_STAGES_DATA": str(tmp_path / "absent"),
+    }
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-c",
+        os.devnull,
+        "--rootdir",
+        tmp_path,
+    ]
     done = subprocess.run([*command, tmp_path], env=environment, capture_output=True, text=True, timeout=120)
     counts = dict.fromkeys(("failed", "error", "skipped"), 0)
     for number, word in re.findall(r"(\d+) (failed|error|skipped)", done.stdout.splitlines()[-1]):

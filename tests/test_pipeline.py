@@ -151,7 +151,9 @@ def test_door_2_python_objects(cloud, pdal_module, model):
 
 
 def test_door_3_filters_python_by_hand(cloud, pdal_module):
-    source = "from pdal_stages import run_stage\ndef f(ins, outs):\n    return run_stage(globals(), ins, outs)\n"
+    source = (
+        "from pdal_stages import run_stage\ndef f(ins, outs):\n    return run_stage(globals(), ins, outs)\n"
+    )
     stages = [
         str(cloud),
         {

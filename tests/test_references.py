@@ -25,7 +25,11 @@ def mercator(meridian: int, unit: str) -> str:
 
 
 METRES, OTHER = mercator(9, '"metre",1'), mercator(15, '"metre",1')
-ALIKE = METRES.replace("WGS 84", "GRS 1980").replace("WGS_1984", "ETRS_1989").replace("298.257223563", "298.257222101")
+ALIKE = (
+    METRES.replace("WGS 84", "GRS 1980")
+    .replace("WGS_1984", "ETRS_1989")
+    .replace("298.257223563", "298.257222101")
+)
 FEET = mercator(9, '"US survey foot",0.3048006096012192')
 
 

@@ -106,7 +106,9 @@ def main() -> None:
     options.add_argument("--json", type=Path, help="where the figures go")
     options.add_argument("--surveys", nargs="+", default=list(SURVEYS), choices=list(SURVEYS))
     options.add_argument("--ground", type=Path, help="model file to score on the ISPRS samples")
-    options.add_argument("--pictures", type=Path, help="folder for pictures of the surveys at their own density")
+    options.add_argument(
+        "--pictures", type=Path, help="folder for pictures of the surveys at their own density"
+    )
     args = options.parse_args()
     runs: list[dict[str, Any]] = []
     for left_out in args.surveys:

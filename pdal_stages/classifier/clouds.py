@@ -83,7 +83,9 @@ def prepared(sources: Iterable[Source], options: TrainingOptions) -> Iterator[Tr
         labels = _checked_labels(cloud)
         if ignored and (gone := np.isin(labels, ignored)).any():
             cloud = cloud.part(np.flatnonzero(~gone))
-        read = [name for name in (*required(options.inputs), *welcome(options.inputs)) if name in cloud.dimensions]
+        read = [
+            name for name in (*required(options.inputs), *welcome(options.inputs)) if name in cloud.dimensions
+        ]
         values, _ = gather(read, cloud.dimensions, len(cloud.xyz), where=cloud.name)
         few = represent(cloud.xyz, options.voxel, values.values())
         if few is not None:

@@ -41,7 +41,9 @@ def main() -> None:
     def one(data: bytes) -> None:
         target(data)
 
-    atheris.Setup([sys.argv[0], f"-dict={words}", "-timeout=60", "-max_len=20000", *options, str(corpus)], one)
+    atheris.Setup(
+        [sys.argv[0], f"-dict={words}", "-timeout=60", "-max_len=20000", *options, str(corpus)], one
+    )
     atheris.Fuzz()
 
 
@@ -49,16 +51,51 @@ def _dictionary(name: str, folder: Path) -> Path:
     """Words the formats know, which bytes alone would take long to find."""
     from pdal_stages.stages import registry
 
-    words = {"pipeline", "type", "tag", "inputs", "filename", "//", "/*", "*/", "\\u0000", "\\ud800", "null", "true", "1e999"}
+    words = {
+        "pipeline",
+        "type",
+        "tag",
+        "inputs",
+        "filename",
+        "//",
+        "/*",
+        "*/",
+        "\\u0000",
+        "\\ud800",
+        "null",
+        "true",
+        "1e999",
+    }
     if name == "pipeline":
         for kind, stage in registry.stages().items():
             words |= {kind, *(option.name for option in stage.all_options())}
-        words |= {"kopt", "ropt", "copt", "c1", "s2", "k50", "weinmann2018", "extra_dims", "minor_version", "all"}
+        words |= {
+            "kopt",
+            "ropt",
+            "copt",
+            "c1",
+            "s2",
+            "k50",
+            "weinmann2018",
+            "extra_dims",
+            "minor_version",
+            "all",
+        }
     else:
         import json
 
         manifest = json.loads(targets.good_model()["manifest.json"])
-        words |= {*manifest, *manifest["passes"][0], *manifest["passes"][0]["features"], *manifest["arrays"], "PK", "<f4", "|u1", "-1", "NaN"}
+        words |= {
+            *manifest,
+            *manifest["passes"][0],
+            *manifest["passes"][0]["features"],
+            *manifest["arrays"],
+            "PK",
+            "<f4",
+            "|u1",
+            "-1",
+            "NaN",
+        }
     path = folder / f"{name}.dict"
     escaped = [word.replace("\\", "\\\\").replace('"', '\\"') for word in sorted(words)]
     path.write_text("".join(f'"{word}"\n' for word in escaped))

@@ -22,11 +22,37 @@ CASES = sorted(path for path in (HERE / "cases").rglob("*") if path.is_file())
 
 TARGETS = targets.TARGETS | hostile.TARGETS
 #: Changed inputs that are tried for each target.
-TRIES = {"pipeline": 1500, "model": 250, "where": 300, "cloud": 1000, "index": 1000, "ept": 1500, "store": 700, "result": 500, "network": 150}
+TRIES = {
+    "pipeline": 1500,
+    "model": 250,
+    "where": 300,
+    "cloud": 1000,
+    "index": 1000,
+    "ept": 1500,
+    "store": 700,
+    "result": 500,
+    "network": 150,
+}
 #: Or seconds of them.
 SECONDS = float(os.environ.get("PDAL_STAGES_FUZZ_SECONDS", 0))
 OUTCOMES = ("refused", "lowered", "loaded", "read", "evaluated")
-WORDS = [b"null", b"-1", b"1e999", b'"', b"[", b"}", b",", b"/*", b"\\u0000", b"\\ud800", b"\xff", b"kopt(9,2)", b"NaN", b"0", b'"inputs":5,']
+WORDS = [
+    b"null",
+    b"-1",
+    b"1e999",
+    b'"',
+    b"[",
+    b"}",
+    b",",
+    b"/*",
+    b"\\u0000",
+    b"\\ud800",
+    b"\xff",
+    b"kopt(9,2)",
+    b"NaN",
+    b"0",
+    b'"inputs":5,',
+]
 
 
 @pytest.mark.parametrize("path", CASES, ids=[f"{p.parent.name}-{p.name}" for p in CASES])

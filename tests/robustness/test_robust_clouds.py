@@ -412,7 +412,9 @@ def test_boxes_and_tiles_of_odd_sizes(cell, tmp_path, cloud, case, side, tile, s
     if side is not None:
         struct.pack_into("<4d", data, 179, side, -side, side, -side)
     (tmp_path / "in.las").write_bytes(data)
-    path = job(tmp_path, str(tmp_path / "in.las"), {"type": "writers.las", "filename": str(tmp_path / "o_#.las")})
+    path = job(
+        tmp_path, str(tmp_path / "in.las"), {"type": "writers.las", "filename": str(tmp_path / "o_#.las")}
+    )
     it = cell("Clouds", f"in tiles: {case}")
     done = it.command("pipeline", path, "--tile", tile, "--workers", 0)
     if says is not None:

@@ -190,7 +190,11 @@ def test_no_rights(cell, open_folder, write_las):
     text = open_folder / "in.txt"
     text.write_text("X,Y,Z\n1,1,1\n")
     text.chmod(0o000)
-    it.refused(it.process("pipeline", job(open_folder, str(text), HAG, name="t.json"), **words), "in.txt", "Permission denied")
+    it.refused(
+        it.process("pipeline", job(open_folder, str(text), HAG, name="t.json"), **words),
+        "in.txt",
+        "Permission denied",
+    )
     it = cell("Environment", "no right to read the pipeline")
     plain.chmod(0o000)
     it.refused(it.process("pipeline", plain, **words), "p.json", "Permission denied")

@@ -13,7 +13,10 @@ from robustness_kit import job
 
 pytestmark = pytest.mark.pdal
 
-STAGES = [{"type": "filters.hag_minima"}, {"type": "filters.multiscalefeatures", "neighborhoods": "c1", "feature_set": "Linearity"}]
+STAGES = [
+    {"type": "filters.hag_minima"},
+    {"type": "filters.multiscalefeatures", "neighborhoods": "c1", "feature_set": "Linearity"},
+]
 
 
 def pipeline(tmp_path, source, model, *stages, **writer):
@@ -22,14 +25,23 @@ def pipeline(tmp_path, source, model, *stages, **writer):
         tmp_path,
         {"type": "readers.las", "filename": str(source), "use_eb_vlr": True},
         *(stages or (*STAGES, {"type": "filters.modelclassifier", "model": str(model)})),
-        {"type": "writers.las", "filename": str(tmp_path / "out.las"), "extra_dims": "all", "forward": "all", **writer},
+        {
+            "type": "writers.las",
+            "filename": str(tmp_path / "out.las"),
+            "extra_dims": "all",
+            "forward": "all",
+            **writer,
+        },
     )
 
 
 def check(tmp_path, n=600):
     out = laspy.read(tmp_path / "out.las")
     assert len(out) == n
-    assert np.isin(out.classification, [2, 6]).all() and np.mean(np.asarray(out.classification) == scene()["Classification"]) > 0.8
+    assert (
+        np.isin(out.classification, [2, 6]).all()
+        and np.mean(np.asarray(out.classification) == scene()["Classification"]) > 0.8
+    )
     assert np.allclose(np.asarray(out["HeightAboveGround"]).max(), 5, atol=0.3)
     return out
 
@@ -37,7 +49,12 @@ def check(tmp_path, n=600):
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 @pytest.mark.parametrize(
     ("version", "point_format"),
-    [(v, f) for v, top in ((0, 1), (1, 1), (2, 3), (3, 5), (4, 10)) for f in range(top + 1) if v in (0, 4) or f == top],
+    [
+        (v, f)
+        for v, top in ((0, 1), (1, 1), (2, 3), (3, 5), (4, 10))
+        for f in range(top + 1)
+        if v in (0, 4) or f == top
+    ],
 )
 def test_versions_and_formats(cell, tmp_path, write_las, model, version, point_format, suffix):
     waves = point_format in (4, 5, 9, 10)
@@ -46,7 +63,12 @@ def test_versions_and_formats(cell, tmp_path, write_las, model, version, point_f
     source = tmp_path / f"in{suffix}"
     if version <= 1 and suffix == ".laz":
         pytest.skip("laspy does not write LAZ of LAS 1.0 and 1.1")
-    source = write_las(source, scene(), point_format=point_format, minor_version=max(version, 2) if not waves or version == 4 else 3)
+    source = write_las(
+        source,
+        scene(),
+        point_format=point_format,
+        minor_version=max(version, 2) if not waves or version == 4 else 3,
+    )
     if version <= 1:
         data = bytearray(source.read_bytes())
         data[25] = version
@@ -57,7 +79,12 @@ def test_versions_and_formats(cell, tmp_path, write_las, model, version, point_f
         it.refused(done, "format")
         return
     kept = version >= 1
-    it.runs(done, "classes; version and point format are kept" if kept else "classes; written as LAS 1.2, as PDAL writes no LAS 1.0")
+    it.runs(
+        done,
+        "classes; version and point format are kept"
+        if kept
+        else "classes; written as LAS 1.2, as PDAL writes no LAS 1.0",
+    )
     out = check(tmp_path)
     assert (out.header.version.minor, out.header.point_format.id) == (version if kept else 2, point_format)
 
@@ -75,7 +102,9 @@ def test_extra_bytes_of_every_type(cell, tmp_path, write_las, model, kind):
 def test_scaled_extra_bytes(cell, tmp_path, model):
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.scales, header.offsets = np.full(3, 0.001), [500_000, 5_400_000, 0]
-    header.add_extra_dim(laspy.ExtraBytesParams(name="Scaled", type="i2", scales=np.array([0.01]), offsets=np.array([5.0])))
+    header.add_extra_dim(
+        laspy.ExtraBytesParams(name="Scaled", type="i2", scales=np.array([0.01]), offsets=np.array([5.0]))
+    )
     las = laspy.LasData(header)
     data = scene()
     las.x, las.y, las.z, las.classification = data["X"], data["Y"], data["Z"], data["Classification"]
@@ -97,7 +126,9 @@ def test_dimensions_named_like_ours(cell, tmp_path, write_las, model, kind):
     source = write_las(tmp_path / "in.las", {**scene(), **before}, point_format=6)
     classify = {"type": "filters.modelclassifier", "model": str(model), "margin": True, "probabilities": True}
     it = cell("LAS files", f"dimensions named like ours of type {np.dtype(kind).name}")
-    it.runs(["pipeline", pipeline(tmp_path, source, model, *STAGES, classify)], "are overwritten, fractions kept")
+    it.runs(
+        ["pipeline", pipeline(tmp_path, source, model, *STAGES, classify)], "are overwritten, fractions kept"
+    )
     out = check(tmp_path)
     clean = write_las(tmp_path / "in.las", scene(), point_format=6)
     (tmp_path / "out.las").unlink()
@@ -122,8 +153,12 @@ def test_a_height_of_another_type_and_where(cell, tmp_path, write_las, model):
 
 
 def test_only_gps_time(cell, tmp_path, write_las, model):
-    source = write_las(tmp_path / "in.las", {**scene(), "GpsTime": np.linspace(1e8, 1e8 + 5, 600)}, point_format=1)
-    cell("LAS files", "GPS time and no colours").runs(["pipeline", pipeline(tmp_path, source, model)], "times are kept")
+    source = write_las(
+        tmp_path / "in.las", {**scene(), "GpsTime": np.linspace(1e8, 1e8 + 5, 600)}, point_format=1
+    )
+    cell("LAS files", "GPS time and no colours").runs(
+        ["pipeline", pipeline(tmp_path, source, model)], "times are kept"
+    )
     assert np.array_equal(check(tmp_path).gps_time, np.linspace(1e8, 1e8 + 5, 600))
 
 
@@ -180,14 +215,19 @@ def test_damaged_las(cell, tmp_path, model, good, case, edit):
     else:
         damaged(good, edit)
     it = cell("LAS files", case)
-    says = "no LAS file" if case.rpartition(" ")[2] in ("file", "header", "signature", ".las") and "points" not in case else "damaged"
+    says = (
+        "no LAS file"
+        if case.rpartition(" ")[2] in ("file", "header", "signature", ".las") and "points" not in case
+        else "damaged"
+    )
     it.refused(["pipeline", pipeline(tmp_path, good, model)], "in.las", says)
 
 
 def test_fewer_points_in_the_header(cell, tmp_path, good, model):
     damaged(good, header("count", 100))
     done = cell("LAS files", "LAS: fewer points in the header than in the file").runs(
-        ["pipeline", pipeline(tmp_path, good, model, *STAGES)], "the points of the header, and a remark on the bytes beyond"
+        ["pipeline", pipeline(tmp_path, good, model, *STAGES)],
+        "the points of the header, and a remark on the bytes beyond",
     )
     assert "bytes beyond the 100 points" in done.err
     assert len(laspy.read(tmp_path / "out.las")) == 100
@@ -260,14 +300,21 @@ def test_damaged_headers_of_las_1_4(cell, tmp_path, write_las, model, case, suff
     source = damaged(write_las(tmp_path / f"in{suffix}", scene(), point_format=6), edit)
     it = cell("LAS files", case)
     it.refused(["pipeline", pipeline(tmp_path, source, model)], f"in{suffix}", "damaged", says)
-    tiled = job(tmp_path, str(source), {"type": "filters.hag_minima"}, {"type": "writers.las", "filename": str(tmp_path / "o_#.las")})
+    tiled = job(
+        tmp_path,
+        str(source),
+        {"type": "filters.hag_minima"},
+        {"type": "writers.las", "filename": str(tmp_path / "o_#.las")},
+    )
     done = it.command("pipeline", tiled, "--tile", 20, "--workers", 0)
     assert done.code == 1 and says in done.err
 
 
 def test_a_record_after_the_points(cell, tmp_path, write_las, model):
     source = damaged(write_las(tmp_path / "in.las", scene(), point_format=6), after())
-    cell("LAS files", "LAS 1.4: a record after the points").runs(["pipeline", pipeline(tmp_path, source, model)], "classes")
+    cell("LAS files", "LAS 1.4: a record after the points").runs(
+        ["pipeline", pipeline(tmp_path, source, model)], "classes"
+    )
     check(tmp_path)
 
 
@@ -276,12 +323,18 @@ def test_a_file_without_points(cell, tmp_path, write_las):
     for suffix in (".las", ".laz"):
         source = write_las(tmp_path / f"in{suffix}", dict(none), point_format=6)
         it = cell("LAS files", f"{suffix[1:].upper()}: a file without points")
-        it.runs(["pipeline", pipeline(tmp_path, source, None, {"type": "filters.hag_minima"})], "a file without points")
+        it.runs(
+            ["pipeline", pipeline(tmp_path, source, None, {"type": "filters.hag_minima"})],
+            "a file without points",
+        )
         assert len(laspy.read(tmp_path / "out.las")) == 0
 
 
 def test_header_texts_in_latin_1(cell, tmp_path, good, model, pdal_program):
-    damaged(good, lambda d: d.__setitem__(slice(26, 58), "Vermessungsb\u00fcro".encode("latin-1").ljust(32, b"\0")))
+    damaged(
+        good,
+        lambda d: d.__setitem__(slice(26, 58), "Vermessungsb\u00fcro".encode("latin-1").ljust(32, b"\0")),
+    )
     it = cell("LAS files", "header texts in Latin-1")
     done = it.command("pipeline", pipeline(tmp_path, good, model))
     if done.code == 0:  # not every PDAL stumbles

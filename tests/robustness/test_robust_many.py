@@ -172,5 +172,10 @@ def test_copc(cell, tmp_path, case, change, says):
     data = bytearray(COPC.read_bytes())
     change(data)
     (tmp_path / "town.copc.laz").write_bytes(data)
-    path = job(tmp_path, str(tmp_path / "town.copc.laz"), HAG, {"type": "writers.las", "filename": str(tmp_path / "o.las")})
+    path = job(
+        tmp_path,
+        str(tmp_path / "town.copc.laz"),
+        HAG,
+        {"type": "writers.las", "filename": str(tmp_path / "o.las")},
+    )
     cell("LAS files", case).refused(["pipeline", path], "the LAS file is damaged", *says)

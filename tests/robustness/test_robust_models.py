@@ -246,11 +246,20 @@ def test_names_that_command_a_terminal(cell, tmp_path, cloud, model):
 
 
 def test_figures_of_any_size(cell, tmp_path, model):
-    curve = [{"epoch": e, "loss": v, "mean_f1": v} for e, v in ((0, 1), (10**400, 10**400), (1, 0.5), (2, 0.25), (-3, -1))]
+    curve = [
+        {"epoch": e, "loss": v, "mean_f1": v}
+        for e, v in ((0, 1), (10**400, 10**400), (1, 0.5), (2, 0.25), (-3, -1))
+    ]
     for case, changes in (
-        ("model with integers of 400 digits", {"training__huge": 10**400, "passes__0__parameters__trees": 10**400}),
+        (
+            "model with integers of 400 digits",
+            {"training__huge": 10**400, "passes__0__parameters__trees": 10**400},
+        ),
         ("model with a curve of epochs 0, -3 and 10^400", {"training__curve": curve}),
-        ("model whose curve is of epoch 0 alone", {"training__curve": [{"epoch": 0, "loss": 0, "mean_f1": 0}] * 2}),
+        (
+            "model whose curve is of epoch 0 alone",
+            {"training__curve": [{"epoch": 0, "loss": 0, "mean_f1": 0}] * 2},
+        ),
     ):
         odd = rewritten(model, tmp_path / "odd.model", **changes)
         it = cell("Models", case)

@@ -97,7 +97,12 @@ WRONG = [
     ("unknown strategy", TRAIN, {"filename": "m", "strategy": "multi"}, ["must be one of", "Did you mean"]),
     ("no trees", TRAIN, {"filename": "m", "trees": 0}, ["'trees'", "0"]),
     ("half a tree", TRAIN, {"filename": "m", "trees": 1.5}, ["'trees'", "1.5"]),
-    ("no samples", TRAIN, {"filename": "m", "count": 0}, ["option 'count' must be a whole number of 1 or more"]),
+    (
+        "no samples",
+        TRAIN,
+        {"filename": "m", "count": 0},
+        ["option 'count' must be a whole number of 1 or more"],
+    ),
     ("one fold", TRAIN, {"filename": "m", "folds": 1}, ["'folds' must be 0 or at least 2"]),
     ("share of 2", TRAIN, {"filename": "m", "max_samples": 2}, ["option 'max_samples'", "at most 1"]),
     ("no file name", TRAIN, {}, ["option 'filename' is required"]),

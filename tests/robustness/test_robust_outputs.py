@@ -69,7 +69,10 @@ def test_links(cell, tmp_path, cloud):
     link, target = tmp_path / "out.las", tmp_path / "there" / "real.las"
     link.symlink_to(target)
     it = cell(GROUP, "output that is a link")
-    it.runs(["pipeline", job(tmp_path, str(cloud), HAG, str(link))], "the file it leads to is written; the link stays")
+    it.runs(
+        ["pipeline", job(tmp_path, str(cloud), HAG, str(link))],
+        "the file it leads to is written; the link stays",
+    )
     assert link.is_symlink() and len(laspy.read(target)) == 600
 
 
@@ -94,7 +97,9 @@ def test_text_to_standard_output(cell, tmp_path, cloud):
     for case, stage in (("writers.text to STDOUT", {"type": "writers.text", "filename": "STDOUT"}),
                         ("a last stage named STDOUT", "STDOUT")):  # fmt: skip
         it = cell(GROUP, case)
-        done = it.runs(it.process("pipeline", job(tmp_path, str(cloud), stage)), "the points are printed; no file")
+        done = it.runs(
+            it.process("pipeline", job(tmp_path, str(cloud), stage)), "the points are printed; no file"
+        )
         assert done.out.count("\n") == 601 and '"X"' in done.out
         assert not (tmp_path / "STDOUT").exists()
 
@@ -149,18 +154,30 @@ def test_files_that_must_not_be_replaced(cell, files, monkeypatch, case, words, 
     shutil.copy("m.model", "other.laz")
     shutil.copy("a.las", "t_1.las")
     job(files, "a.las", HAG, name="p.json")
-    bins = {"type": "filters.multiscalefeatures", "neighborhoods": "c1", "bins": "thresholds.json", "feature_set": "D1"}
+    bins = {
+        "type": "filters.multiscalefeatures",
+        "neighborhoods": "c1",
+        "bins": "thresholds.json",
+        "feature_set": "D1",
+    }
     job(files, "a.las", bins, name="first.json")
     job(files, "a.las", bins, name="bins.json")
     if "bins.json" in words:
         assert cell(GROUP, case).command("pipeline", "first.json").code == 0
     (files / "poly.geojson").write_text('{"type": "FeatureCollection", "features": []}')
-    overlay = {"type": "filters.overlay", "dimension": "Classification", "datasource": "poly.geojson", "column": "c"}
+    overlay = {
+        "type": "filters.overlay",
+        "dimension": "Classification",
+        "datasource": "poly.geojson",
+        "column": "c",
+    }
     job(files, "a.las", overlay, {"type": "writers.text", "filename": "poly.geojson"}, name="overlay.json")
     split = {"type": "filters.splitter", "length": 10}
     job(files, "t_1.las", split, {"type": "writers.las", "filename": "t_#.las"}, name="split.json")
     job(files, "a.las", "o.las", {"type": "writers.las", "filename": "./o.las"}, name="twice.json")
-    text = (files / "twice.json").read_text().replace('"o.las"', '{"type": "writers.las", "filename": "o.las"}')
+    text = (
+        (files / "twice.json").read_text().replace('"o.las"', '{"type": "writers.las", "filename": "o.las"}')
+    )
     (files / "twice.json").write_text(text)
     cell(GROUP, case).refused(words, says)
 

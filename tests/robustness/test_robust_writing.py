@@ -71,7 +71,17 @@ LEFT_OUT = {
     "writers.raster": "writes what other stages made; as writers.gdal",
 }
 _WRITING = {"write_whole", "whole_files"}
-_METHODS = {"write_text", "write_bytes", "savez", "save", "savetxt", "tofile", "mkstemp", "mkdtemp", "NamedTemporaryFile"}
+_METHODS = {
+    "write_text",
+    "write_bytes",
+    "savez",
+    "save",
+    "savetxt",
+    "tofile",
+    "mkstemp",
+    "mkdtemp",
+    "NamedTemporaryFile",
+}
 
 
 def writing_sites() -> set[str]:
@@ -105,17 +115,22 @@ def _writes(call: ast.Call) -> bool:
     words = [*call.args, *(keyword.value for keyword in call.keywords if keyword.arg in (None, "mode"))]
     modes = [w.value for w in words if isinstance(w, ast.Constant) and isinstance(w.value, str)]
     return any(set(mode) <= set("rwaxbt+") and set(mode) & set("wax+") for mode in modes) or any(
-        isinstance(w, ast.BinOp) for w in words  # flags of os.open
+        isinstance(w, ast.BinOp)
+        for w in words  # flags of os.open
     )
 
 
 def test_every_place_that_writes_is_known():
-    assert writing_sites() == set(SITES), "give a new place a case in writing_faults.py, or say here why it has none"
+    assert writing_sites() == set(SITES), (
+        "give a new place a case in writing_faults.py, or say here why it has none"
+    )
 
 
 @pytest.mark.pdal
 def test_every_writer_of_pdal_has_a_case(pdal_program):
-    drivers = json.loads(subprocess.run([pdal_program, "--drivers", "--showjson"], capture_output=True, check=True).stdout)
+    drivers = json.loads(
+        subprocess.run([pdal_program, "--drivers", "--showjson"], capture_output=True, check=True).stdout
+    )
     writers = {driver["name"] for driver in drivers if driver["name"].startswith("writers.")}
     tested = {case.split()[0] for case in CASES}
     known = {"writers.copc", "writers.draco", "writers.e57", "writers.fbi", "writers.gdal", "writers.matlab", "writers.nitf",
@@ -135,7 +150,11 @@ def results(tmp_path_factory, pdal_program):
     words = [sys.executable, HERE / "writing_faults.py", folder]
     with open(folder / "errors", "w") as errors:
         done = subprocess.run(words, env=environment, stdout=subprocess.PIPE, stderr=errors, text=True)
-    assert done.returncode == 0, (done.returncode, done.stdout[-2000:], (folder / "errors").read_text()[-2000:])
+    assert done.returncode == 0, (
+        done.returncode,
+        done.stdout[-2000:],
+        (folder / "errors").read_text()[-2000:],
+    )
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
@@ -158,12 +177,16 @@ def test_writes_that_fail(cell, results, case):
             outcomes[row["kind"]].add("the right file")
         else:
             assert row["hits"] and row["code"] == 1 and "pdal-stages" in row["said"], where
-            assert row["content"] == older or same(row["content"], good["content"], suffix, good["exact"]), where
+            assert row["content"] == older or same(row["content"], good["content"], suffix, good["exact"]), (
+                where
+            )
             outcomes[row["kind"]].add("an error")
     assert any(row["hits"] for row in tries), "no write was caught"
     for kind, seen in outcomes.items():
         it = cell("Outputs", f"{case}: {kind}")
-        it.note("error" if "an error" in seen else "result", " or ".join(sorted(seen)) + ", never a part of one")
+        it.note(
+            "error" if "an error" in seen else "result", " or ".join(sorted(seen)) + ", never a part of one"
+        )
 
 
 def same(content: str | None, good: str, suffix: str, exact: bool) -> bool:

@@ -16,7 +16,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-FAUX = {"type": "readers.faux", "count": 3000, "mode": "ramp", "bounds": "([500000,500060],[5400000,5400060],[0,9])"}
+FAUX = {
+    "type": "readers.faux",
+    "count": 3000,
+    "mode": "ramp",
+    "bounds": "([500000,500060],[5400000,5400060],[0,9])",
+}
 HAG = {"type": "filters.hag_minima"}
 FOREST = {"neighborhoods": "c1", "feature_set": "covariance", "dimensions": [], "count": 50, "trees": 2}
 KINDS = {"short write": 1, "disk full": 2, "disk full once": 3, "I/O error once": 4}
@@ -66,10 +71,16 @@ def ours(output: str, stage: dict, option: str, exact: bool = True) -> Case:
     return Case(output, words, exact)
 
 
-def tiled(output: str, name: str, *flags: str, folder: str = "", exact: bool = True, report: bool = False) -> Case:
+def tiled(
+    output: str, name: str, *flags: str, folder: str = "", exact: bool = True, report: bool = False
+) -> Case:
     def words(inputs: Path, target: Path) -> list:
         writer = target.parent.parent / name if report else target.parent / name
-        stages = [str(inputs / "in.las"), HAG, {"type": "writers.las", "filename": str(writer), "extra_dims": "all"}]
+        stages = [
+            str(inputs / "in.las"),
+            HAG,
+            {"type": "writers.las", "filename": str(writer), "extra_dims": "all"},
+        ]
         (inputs / "job.json").write_text(json.dumps(stages))
         more = ["--report", target] if report else []
         return ["pipeline", inputs / "job.json", "--tile", 30, "--workers", 0, "--retries", 0, *flags, *more]
@@ -127,7 +138,12 @@ def prepare(inputs: Path) -> None:
     las.classification = np.where(las.x > 500_030, 6, 2)
     las.write(inputs / "in.las")
     (inputs / "plain.json").write_text(json.dumps([str(inputs / "in.las"), HAG]))
-    ps.run_pipeline([str(inputs / "in.las"), {"type": "writers.classifiermodel", "filename": str(inputs / "in.model"), **FOREST}])
+    ps.run_pipeline(
+        [
+            str(inputs / "in.las"),
+            {"type": "writers.classifiermodel", "filename": str(inputs / "in.model"), **FOREST},
+        ]
+    )
 
 
 def run(words: list) -> tuple[int, str]:
@@ -182,7 +198,11 @@ def main() -> None:
         for kind, number in KINDS.items():
             for after in sorted({0, size // 2, max(0, size - 1)}):
                 result = attempt(number, after, kind == "disk full")
-                print(json.dumps({"case": name, "kind": kind, "after": after, **result}), file=answers, flush=True)
+                print(
+                    json.dumps({"case": name, "kind": kind, "after": after, **result}),
+                    file=answers,
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":
