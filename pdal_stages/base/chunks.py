@@ -12,6 +12,8 @@ from bisect import bisect_right
 
 #: More chunks than this (ten billion points in chunks of the usual size) are not decoded one by one.
 MOST_DECODED = 200_000
+#: Points of a chunk; 50,000 are usual.
+_LARGEST = 2**24
 _TOP = 2**32
 
 
@@ -36,6 +38,8 @@ def what_is_wrong(
     version, count = struct.unpack_from("<II", table)
     if version:
         return "its table of chunks is of an unknown version", str(version)
+    if chunk_points is not None and chunk_points > _LARGEST:  # for which lazrs takes memory at once
+        return "its chunks are larger than any program makes them", f"{chunk_points:,} points"
     if count * point_bytes > room:  # a chunk begins with a whole point
         return "it has more chunks than there is room for", f"{count:,} chunks in {room:,} bytes"
     if count > MOST_DECODED:
@@ -49,6 +53,8 @@ def what_is_wrong(
     held = count * chunk_points if chunk_points is not None else sum(counts)
     if held < points:
         return "it has fewer points than its header counts", f"at most {held:,} of {points:,}"
+    if chunk_points is None and held > points:
+        return "its chunks hold more points than its header counts", f"{held:,}, not {points:,}"
     return None
 
 
