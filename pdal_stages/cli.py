@@ -370,17 +370,19 @@ def _classify(options: argparse.Namespace) -> int:
         raise StageError(
             "--metadata is of one run", found=f"{len(inputs)} inputs", cure="Classify one at a time"
         )
+    check_outputs([Output(name) for name in outputs], inputs)
     work = [(source, target, options) for source, target in zip(inputs, outputs, strict=True)]
     if len(work) == 1:
         _print_classes([_classify_one(*work[0])], options.model)
         return 0
     done, failed = [], 0
-    for (source, *_), result in each_file(_classify_one, work, options.workers):
-        if isinstance(result, StageError):
+    for (source, *_), answer in each_file(_classify_one, work, options.workers):
+        if answer.reason:
             failed += 1
-            print(f"pdal-stages: {source}: {result}", file=sys.stderr)
+            print(f"pdal-stages: {source}: {answer.reason}", file=sys.stderr)
         else:
-            done.append(result)
+            done.append(answer.result)
+    done.sort(key=lambda one: one[0])
     print(
         "Each file was classified by itself; --tile of 'pipeline' lets them see each other's points",
         file=sys.stderr,

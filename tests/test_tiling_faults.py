@@ -280,7 +280,7 @@ def _workers(parent: int) -> list[int]:
     found = []
     for child in _children(parent):
         with contextlib.suppress(OSError):
-            if b"tiling.worker" in Path(f"/proc/{child}/cmdline").read_bytes():
+            if b"pipeline.worker" in Path(f"/proc/{child}/cmdline").read_bytes():
                 found.append(child)
     return found
 
@@ -387,7 +387,7 @@ open({str(tmp_path / "looked")!r}, 'a').write('x')"""
 
 def test_workers_that_cannot_start(tmp_path, folder):
     prepare = (
-        "import sys, pdal_stages.tiling.processes as p; before = p._command()\n"
+        "import sys, pdal_stages.pipeline.processes as p; before = p._command()\n"
         "p._command = lambda: [*before[:-1], 'raise SystemExit(\"no room here\")']\n"
         "from pdal_stages.cli import main; sys.exit(main())"
     )

@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 from ..base import checks
-from ..base.errors import StageError
 from ..base.threads import available_threads
+from .processes import Processes
+from .work import Answer, perform
+
+
+@dataclass
+class _Call:
+    """A function and what it is given."""
+
+    function: Callable[..., Any]
+    given: tuple
+
+    def run(self) -> Any:
+        return self.function(*self.given)
 
 
 def each_file(
     function: Callable[..., Any], work: Sequence[tuple], workers: int = 1
-) -> Iterator[tuple[tuple, Any]]:
-    """Each item of work with what the function gave for it, or the error, in order.
+) -> Iterator[tuple[tuple, Answer]]:
+    """Each item of work with what became of it, as they finish.
 
     Parameters
     ----------
@@ -30,22 +41,7 @@ def each_file(
     workers = min(checks.whole("--workers", workers, 1, 1024), len(work))
     if workers == 1:
         for item in work:
-            yield item, _outcome(function, item)
+            yield item, perform(_Call(function, item))
         return
-    threads = max(1, available_threads() // workers)
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, _share, (threads,)) as pool:
-        waiting = [pool.submit(_outcome, function, item) for item in work]
-        for item, answer in zip(work, waiting, strict=True):
-            yield item, answer.result()
-
-
-def _share(threads: int) -> None:
-    os.environ["LOKY_MAX_CPU_COUNT"] = str(threads)  # which available_threads heeds
-
-
-def _outcome(function: Callable[..., Any], item: tuple) -> Any:
-    try:
-        return function(*item)
-    except StageError as error:
-        return error
+    with Processes(workers, max(1, available_threads() // workers)) as pool:
+        yield from pool.run(deque(work), lambda item: _Call(function, item))

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from ..pipeline.interrupts import gentle
-from .processes import Processes
+from ..pipeline.processes import Processes
+from ..pipeline.work import Answer, Task, perform
 from .scheduler import OnDask
 from .settings import TilingOptions
-from .work import Answer, Task, perform
 
 
 class Here:
@@ -29,7 +29,7 @@ class Here:
     def __exit__(self, *exc: object) -> None: ...
 
     def run(self, waiting: deque, task_of: Callable[[Any], Task]) -> Iterator[tuple[Any, Answer]]:
-        """Yield (item, answer) for every item; see :meth:`pdal_stages.tiling.processes.Processes.run`."""
+        """Yield (item, answer) for every item; see :meth:`pdal_stages.pipeline.processes.Processes.run`."""
         with gentle() as interrupts:
             while waiting:
                 item = waiting.popleft()
@@ -57,4 +57,4 @@ def open_pool(options: TilingOptions) -> Pool:
     """Where the tasks of a run are done."""
     if options.scheduler:
         return OnDask(options)
-    return Processes(options) if options.local_workers > 0 else Here(options)
+    return Processes(options.local_workers, options.threads) if options.local_workers else Here(options)

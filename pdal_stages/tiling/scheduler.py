@@ -13,8 +13,8 @@ from typing import Any
 from ..base.errors import StageError, optional_import
 from ..base.version import build
 from ..pipeline import pdal as pdal_env
+from ..pipeline.work import Answer, Task, perform
 from .settings import TilingOptions
-from .work import Answer, Task, perform
 
 #: Seconds to wait for a worker: at the beginning, and when all are gone.
 _WAIT = 120.0
@@ -73,7 +73,7 @@ class OnDask:
                 raise StageError(_OTHER, found=_difference(worker, theirs, versions()), cure=_SAME)
 
     def run(self, waiting: deque, task_of: Callable[[Any], Task]) -> Iterator[tuple[Any, Answer]]:
-        """Yield (item, answer) for every item; see :meth:`pdal_stages.tiling.processes.Processes.run`.
+        """Yield (item, answer) for every item; see :meth:`pdal_stages.pipeline.processes.Processes.run`.
 
         Notes
         -----

@@ -179,3 +179,30 @@ def test_copc(cell, tmp_path, case, change, says):
         {"type": "writers.las", "filename": str(tmp_path / "o.las")},
     )
     cell("LAS files", case).refused(["pipeline", path], "the LAS file is damaged", *says)
+
+
+# ---- many files, one output each ------------------------------------------------------------------------------
+
+
+def test_an_output_that_is_another_input(cell, tmp_path, cloud, model):
+    for name in ("a.las", "c_a.las"):
+        (tmp_path / name).write_bytes(cloud.read_bytes())
+    it = cell("Outputs", "classify of many files, one onto another")
+    words = ["classify", tmp_path / "a.las", tmp_path / "c_a.las", tmp_path / "c_#.las", "--model", model]
+    it.refused(words, "the output file is one of the inputs", "c_a.las")
+    assert (tmp_path / "c_a.las").read_bytes() == cloud.read_bytes()
+
+
+def test_modules_that_lie_about(cell, tmp_path, cloud, model):
+    """Workers import nothing from the current folder."""
+    for name in ("signal", "struct", "numpy", "laspy", "pickle"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'taken')!r}, 'a').write('{name} ')\n")
+    for name in ("a.las", "b.las"):
+        (tmp_path / name).write_bytes(cloud.read_bytes())
+    start = f"import sys; sys.path[0] = {str(Path(__file__).parents[2])!r}; from pdal_stages.cli import main; sys.exit(main())"
+    it = cell("Environment", "classify of many files with workers, in a folder with a signal.py")
+    words = ["classify", "a.las", "b.las", "c_#.las", "--workers", 2, "--model", model]
+    environment = {"PYTHONPATH": None}
+    done = it.process(*words, command=[sys.executable, "-c", start], env=environment)
+    it.runs(done, "is not taken for Python's own")
+    assert (tmp_path / "c_a.las").exists() and not (tmp_path / "taken").exists()

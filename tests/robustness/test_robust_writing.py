@@ -61,7 +61,7 @@ SITES = {
     "tiling/store:_open_own": "tiles: what a run keeps",
     "tiling/tail:run_tail": "tiles: output of a tile",
     "tiling/tilework:TileTask.run": "tiles: what a run keeps",
-    "tiling/worker:serve": "opens pipes",
+    "pipeline/worker:serve": "opens pipes",
 }
 #: PDAL's writers without a case.
 LEFT_OUT = {

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import StageError
-from .settings import TilingOptions
 from .work import Answer, Task
 
 _KILLED = "it killed its worker each time it was tried: too little memory, or a crash in a library"
@@ -30,8 +29,8 @@ class Processes:
 
     address = "processes of this machine"
 
-    def __init__(self, options: TilingOptions) -> None:
-        self.slots, self.threads = options.local_workers, options.threads
+    def __init__(self, slots: int, threads: int) -> None:
+        self.slots, self.threads = slots, threads
         self._workers: list[_Worker] = []
         self._answers: queue.SimpleQueue[tuple[_Worker, Answer | None]] = queue.SimpleQueue()
 
@@ -140,7 +139,7 @@ def _command() -> list[str]:
     paths = [path for path in sys.path[1:] if path] if sys.version_info < (3, 11) else []
     program = (
         f"import sys; sys.path += {paths!r}; sys.path.insert(0, {root!r}); import pdal_stages; "
-        f"sys.path.remove({root!r}); from pdal_stages.tiling.worker import serve; serve()"
+        f"sys.path.remove({root!r}); from pdal_stages.pipeline.worker import serve; serve()"
     )
     safe = "-P" if sys.version_info >= (3, 11) else "-I"
     return [sys.executable, safe, "-X", f"utf8={sys.flags.utf8_mode}", "-c", program]
@@ -149,6 +148,7 @@ def _command() -> list[str]:
 def _environment(threads: int) -> dict[str, str]:
     out = {**os.environ, "PDAL_STAGES_PROGRESS": "0"}
     out |= {f"{name}_NUM_THREADS": str(threads) for name in ("OMP", "OPENBLAS", "MKL")}
+    out["LOKY_MAX_CPU_COUNT"] = str(threads)  # which available_threads heeds
     if "PYTHONPATH" in out:  # where an empty entry means the current folder
         out["PYTHONPATH"] = os.pathsep.join(filter(None, out["PYTHONPATH"].split(os.pathsep)))
     return out

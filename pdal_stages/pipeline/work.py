@@ -1,4 +1,4 @@
-"""The tasks of a tiled run, as workers do them."""
+"""Tasks as workers do them: tiles, files."""
 
 from __future__ import annotations
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import pickle
 import queue
+import sys
 import threading
 from typing import Any, BinaryIO
 
+from ..base.plain import PlainStream
 from .processes import READY
 from .work import perform
 
@@ -17,6 +19,7 @@ def serve() -> None:
     tasks, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     os.dup2(2, 1)  # what libraries print is not an answer
+    sys.stdout, sys.stderr = PlainStream(sys.stdout), PlainStream(sys.stderr)
     waiting: queue.SimpleQueue[Any] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(tasks, waiting), daemon=True).start()
     _say(answers, READY)
