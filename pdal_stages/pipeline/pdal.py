@@ -10,6 +10,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -107,7 +108,7 @@ def execute(
     except (RuntimeError, ValueError, IndexError, OverflowError) as error:  # C++'s errors, as Python has them
         if stdout not in _kept:
             _kept.append(stdout)
-        raise translate("; ".join([str(error), *said(getattr(pipeline, "log", ""))[-3:]])) from None
+        raise translate(str(error), said(_log(pipeline))[-3:]) from None
     except MemoryError:
         raise PipelineError(
             "memory ran out", cure="Work in tiles (--tile), or read less, e.g. with filters.crop"
@@ -219,8 +220,8 @@ def validate(stages: list[dict[str, Any]]) -> None:
         raise translate(str(verdict.get("error_detail") or "the pipeline is not valid"))
 
 
-def translate(message: str) -> PipelineError | DependencyError:
-    """PDAL's error text as an error of ours, with a cure where the cause is known."""
+def translate(message: str, before: Sequence[str] = ()) -> PipelineError | DependencyError:
+    """PDAL's error text, and what it said `before`, as an error of ours, with a cure where the cause is known."""
     text = message.strip()
     if re.search(r"(create|load|find).*filters\.python", text) or (
         "filters.python" in text and "driver" in text.lower()
@@ -237,13 +238,13 @@ def translate(message: str) -> PipelineError | DependencyError:
         place = [line for line in lines if line.startswith("File ")][-1:]
         last = [line for line in lines if line][-1]
         return PipelineError("a script of filters.python failed", found="; ".join([last, *place]))
-    return PipelineError("PDAL could not run the pipeline", found=text)
+    return PipelineError("PDAL could not run the pipeline", found="; ".join([text, *before]))
 
 
 def _log(pipeline) -> str:
     """What PDAL and GDAL said; they quote files, whatever bytes those hold."""
     try:
-        return str(pipeline.log or "")
+        return str(getattr(pipeline, "log", "") or "")
     except UnicodeDecodeError as error:
         return error.object.decode(errors="backslashreplace")
 
