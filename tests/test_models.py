@@ -10,10 +10,10 @@ import pytest
 from pdal_stages import Filter
 from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.classifier import load_model
+from pdal_stages.classifier.heights import preparation_of
 from pdal_stages.cli import main
 from pdal_stages.models import STANDARD, find, shipped
 from pdal_stages.pipeline import Pipeline
-from pdal_stages.pipeline.jobs import heights_for
 from pdal_stages.synthetic import TownOptions, write_town
 
 
@@ -105,9 +105,9 @@ def test_training_keeps_the_stages_before_it(town, tmp_path):
 
 
 def test_heights_follow_from_what_is_read():
-    assert heights_for(["X", "Intensity"]) == []
-    assert heights_for(["HeightAboveGround"]) == [{"type": "filters.hag_minima"}]
-    assert heights_for(["Ground", "HeightAboveOpening_17", "HeightAboveOpening_5"]) == [
+    assert preparation_of(["X", "Intensity"]) == []
+    assert preparation_of(["HeightAboveGround"]) == [{"type": "filters.hag_minima"}]
+    assert preparation_of(["Ground", "HeightAboveOpening_17", "HeightAboveOpening_5"]) == [
         {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]}
     ]
 
