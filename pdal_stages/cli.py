@@ -221,11 +221,15 @@ def _parser() -> argparse.ArgumentParser:
     add("models", _models, "List the models that come with the package")
 
     command = add("train", _train, "Train a model on labelled clouds", overrides=True)
-    command.add_argument("inputs", nargs="+", help="Labelled files PDAL can read")
+    command.add_argument(
+        "inputs", nargs="+", metavar="input", help="Labelled files PDAL can read, folders, patterns"
+    )
     command.add_argument("--model", required=True, help="The model file to write")
     command.add_argument("--classes", help="Codes (2,5,6) or a JSON mapping of labels to classes")
-    command.add_argument("--neighborhoods", help="Preset or tokens; default weinmann2018")
+    command.add_argument("--neighborhoods", help="Preset or tokens, e.g. s5,k10,k50")
+    command.add_argument("--feature-set", help="Groups or single features, e.g. covariance,geometric")
     command.add_argument("--count", type=int, help="Samples of each class")
+    command.add_argument("--trees", help="Number of trees; of several the best is found")
 
     command = add("accuracy", _accuracy, "Compare two class dimensions, or two files", overrides=True)
     command.add_argument("inputs", nargs="+", metavar="input", help="Classified files, folders or patterns")
@@ -441,11 +445,12 @@ def _models(options: argparse.Namespace) -> None:
 
 def _train(options: argparse.Namespace) -> None:
     from .classifier import load_model
-    from .pipeline.jobs import train_pipeline
+    from .pipeline.jobs import las_files, train_pipeline
     from .pipeline.run import Pipeline
 
-    extra = {k: v for k in ("classes", "neighborhoods", "count") if (v := getattr(options, k)) is not None}
-    stages = train_pipeline(options.inputs, options.model, options.overrides, **extra)
+    named = ("classes", "neighborhoods", "feature_set", "count", "trees")
+    extra = {name: value for name in named if (value := getattr(options, name)) is not None}
+    stages = train_pipeline(las_files(options.inputs), options.model, options.overrides, **extra)
     _run(options, Pipeline(stages, options.overrides))
     if Path(options.model).is_file():  # not written into a pipe or device
         print(load_model(options.model))

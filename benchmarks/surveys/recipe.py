@@ -35,6 +35,7 @@ OPTIONS = TrainingOptions(
     pass_folds=len(SURVEYS),
     context=("own", "box1", "columnvotes2", "columnvotes8"),
     scale=False,
+    folds=0,
     voxel=0.25,
 )
 

@@ -100,12 +100,14 @@ def search(
     block_size: float,
     gap: float,
     seed: int,
+    fold: npt.NDArray[np.int16] | None = None,
     threads: int | None = None,
     progress: bool = True,
 ) -> list[dict[str, Any]]:
     """Score every candidate by spatial cross-validation.
 
-    One forest of the largest size is grown per fold and candidate; smaller ones are its first trees.
+    `fold` is of each sample, where these are not blocks of ground. One forest of the largest size is grown per fold and
+    candidate; smaller ones are its first trees.
 
     Returns
     -------
@@ -113,7 +115,8 @@ def search(
         Per combination: trees, max_depth, min_samples_leaf, overall_accuracy, kappa, mean_f1, f1 by code, and
         mean_f1_by_fold. Samples count as often as they were drawn, so classes weigh the same.
     """
-    fold = block_folds(xy, label, weight, folds, block_size)
+    if fold is None:
+        fold = block_folds(xy, label, weight, folds, block_size)
     sums = {
         (c, t): np.zeros((folds, len(codes), len(codes)), np.int64)
         for c in range(len(candidates))

@@ -84,7 +84,8 @@ def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: 
         mine = samples.cloud == number
         xy[mine] = cloud.xyz[samples.row[mine], :2]
 
-    chosen, validation = _validate(values, samples, xy, classes, plan, options, progress)
+    flights = np.array([cloud.flight for cloud in clouds])[samples.cloud]
+    chosen, validation = _validate(values, samples, xy, flights, classes, plan, options, progress)
     started = time.perf_counter()
     passes = _Passes(labelled, samples, features, context, chosen, options)
     passes.grow(values, limits, progress)
@@ -149,41 +150,56 @@ def _validate(
     values,
     samples: Samples,
     xy,
+    flights: npt.NDArray[Any],
     classes: ClassMap,
     plan: FeaturePlan,
     options: TrainingOptions,
     progress: bool,
 ) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """(chosen trees, depth, leaf size; the cross-validation for the manifest or None)."""
-    counts = options.tree_counts()
-    candidates = options.candidates()
-    folds = options.folds or (5 if options.searches else 0)
-    if not folds:
-        return {"trees": counts[-1], **candidates[0]}, None
-    gap = _gap(plan, options)
-    rows = crossval.search(
-        values,
-        samples.label,
-        samples.weight,
-        xy,
-        classes.codes,
-        [_tree_options(options, **candidate) for candidate in candidates],
-        counts,
-        folds=folds,
-        block_size=float(options.block_size),
-        gap=gap,
-        seed=options.seed,
-        threads=options.threads,
-        progress=progress,
-    )
-    chosen = crossval.choose(rows)
-    return chosen, {
-        "folds": folds,
-        "block_size": float(options.block_size),
-        "gap": gap,
-        "tried": rows,
-        "chosen": chosen,
-    }
+    counts, candidates = options.tree_counts(), options.candidates()
+    as_given = {"trees": counts[-1], **candidates[0]}
+    if options.folds == 0 and not options.searches:
+        return as_given, None
+    quick = options.folds is None and not options.searches
+    if quick:
+        counts = [max(1, math.ceil(counts[-1] * FOLD_TREES))]
+    names, of_flight = np.unique(flights, return_inverse=True)
+    ways = [("surveys", of_flight)] if quick and len(names) > 1 else []
+    for by, flight in [*ways, ("blocks", None)]:
+        folds = min(5, len(names)) if flight is not None else options.folds or 5
+        fold = None if flight is None else (flight.reshape(-1) % folds).astype(np.int16)
+        try:
+            rows = crossval.search(
+                values,
+                samples.label,
+                samples.weight,
+                xy,
+                classes.codes,
+                [_tree_options(options, **candidate) for candidate in candidates],
+                counts,
+                folds=folds,
+                block_size=float(options.block_size),
+                gap=_gap(plan, options),
+                seed=options.seed,
+                fold=fold,
+                threads=options.threads,
+                progress=progress,
+            )
+        except OptionError:  # too little ground, or a class in one place
+            if not quick:
+                raise
+            continue
+        chosen = crossval.choose(rows)
+        return as_given if quick else chosen, {
+            "by": by,
+            "folds": folds,
+            "block_size": float(options.block_size),
+            "gap": _gap(plan, options),
+            "tried": rows,
+            "chosen": chosen,
+        }
+    return as_given, None
 
 
 class _Passes:

@@ -48,7 +48,7 @@ def describe(manifest: Mapping[str, Any], columns: Sequence[Sequence[Column]]) -
 
 def text(info: Mapping[str, Any]) -> str:
     """What :func:`describe` gives as a page of text."""
-    lines = []
+    lines = scores(info, info.get("training", {}).get("held_out"))
     for number, one in enumerate(info["passes"], 1):
         if len(info["passes"]) > 1:
             lines.append(f"pass {number}")
@@ -86,7 +86,7 @@ def text(info: Mapping[str, Any]) -> str:
             f"{entry['code']:>3} {entry['name'][:29]:<30}{entry['available']:>12,}{entry['samples']:>10,}"
             f"{entry['duplicates']:>12,}{_percent(f1):>15}"
         )
-    lines += ["", *_scores(info, training.get("held_out"))]
+    lines.append("")
     for number, one in enumerate(info["passes"], 1):
         if "importances" in one and len(info["passes"]) > 1:
             lines.append(f"pass {number}")
@@ -96,8 +96,8 @@ def text(info: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _scores(info: Mapping[str, Any], held_out: dict[str, Any] | None = None) -> list[str]:
-    """`held_out`: a network's own, over points as they lie."""
+def scores(info: Mapping[str, Any], held_out: dict[str, Any] | None = None) -> list[str]:
+    """Lines of scores, the most honest first; `held_out`: a network's own, over points as they lie."""
     names = ("overall_accuracy", "kappa", "mean_f1")
     if isinstance(held_out, dict) and all(isinstance(held_out.get(n), float | None) for n in names):
         return [
@@ -116,7 +116,8 @@ def _scores(info: Mapping[str, Any], held_out: dict[str, Any] | None = None) -> 
             f"mean F1 {_percent(left_out['mean_f1'])}"
         )
     crossed = info["accuracy"]["cross_validation"]
-    rows = [("blocks held out", crossed and crossed["chosen"])]
+    by = crossed.get("by", "blocks") if crossed else "blocks"
+    rows = [(f"{by} held out", crossed and crossed["chosen"])]
     for number, one in enumerate(info["passes"], 1):
         rows.append((f"out of bag{f' {number}' if len(info['passes']) > 1 else ''}", one["out_of_bag"]))
     for label, row in rows:

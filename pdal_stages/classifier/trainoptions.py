@@ -76,8 +76,9 @@ class TrainingOptions:
     scale : bool
         Limit features to the 1st and 99th percentile of the samples, from 0 where the smallest value is 0
         [B16 3.3].
-    folds : int
-        Folds of the spatial cross-validation; 0: none (5 where there is a grid to search).
+    folds : int, optional
+        Folds of the spatial cross-validation; 0: none (5 where there is a grid to search). None: 5 with a quarter of the
+        trees, by survey where there are several, so that every model has an honest score; it chooses nothing then.
     block_size : float
         Side of the cross-validation's blocks in metres.
     gap : float or None
@@ -123,7 +124,7 @@ class TrainingOptions:
     voxel: float = 0.125
     ignore: Sequence[int] = NOISE
     scale: bool = True
-    folds: int = 0
+    folds: int | None = None
     block_size: float = 25.0
     gap: float | None = None
     leave_one_survey_out: bool = False
@@ -140,7 +141,6 @@ class TrainingOptions:
         for name, low, high in (
             ("count", 1, 10**8),
             ("seed", 0, 2**63 - 1),
-            ("folds", 0, 1000),
             ("passes", 1, MOST_PASSES),
             ("pass_folds", 2, 100),
         ):
@@ -148,6 +148,8 @@ class TrainingOptions:
         for name, low, high in (("trees", 1, 10_000), ("min_samples_leaf", 1, 10**6)):
             _values(name, getattr(self, name), low, high)
         _values("max_depth", self.max_depth, 1, 10_000, none=True)
+        if self.folds is not None:
+            set_(self, "folds", checks.whole("'folds'", self.folds, 0, 1000))
         if self.folds == 1:
             raise OptionError("'folds' must be 0 or at least 2", found=1)
         checks.one_of("'strategy'", self.strategy, STRATEGIES)

@@ -74,7 +74,7 @@ class Pipeline:
         by_text: dict[str, list[str]] = {}
         for place, reports in self.reports:
             for report in reports:
-                for text in (report[key] for key in ("warning", "note") if report.get(key)):
+                for text in (report[key] for key in ("warning", "note", "score") if report.get(key)):
                     by_text.setdefault(text, []).append(place)
         notes = [f"{', '.join(dict.fromkeys(places))}: {text}" for text, places in by_text.items()]
         return [*self.remarks, *notes]

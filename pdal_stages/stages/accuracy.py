@@ -20,7 +20,7 @@ from ..base.files import check_writable, write_whole
 from ..base.outputs import Output
 from ..base.plain import plain
 from ..base.units import name_of_wkt
-from .base import Stage
+from .base import Stage, files_read
 from .modelclassifier import ModelClassifier, loaded_model
 from .options import option
 from .points import Points
@@ -94,8 +94,7 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
 
     @classmethod
     def from_pipeline(cls, given: Mapping[str, Any], before: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        readers = [s for s in before if str(s.get("type") or "readers.").startswith("readers.")]
-        taken: dict[str, Any] = {"files": [str(s["filename"]) for s in readers if "filename" in s]}
+        taken: dict[str, Any] = {"files": files_read(before)}
         models = [s["model"] for s in before if s.get("type") == ModelClassifier.type and "model" in s]
         if models and given.get("dimension", "Classification") == "Classification":
             taken["model"] = models[-1]

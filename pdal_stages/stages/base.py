@@ -23,6 +23,12 @@ HEIGHTS_OUTSIDE = (
 )
 
 
+def files_read(stages: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Files of the readers among stages, as they are written."""
+    readers = [s for s in stages if str(s.get("type") or "readers.").startswith("readers.")]
+    return [str(s["filename"]) for s in readers if "filename" in s]
+
+
 class CodeLimit(NamedTuple):
     """The largest class code that a later writer can hold, and what to say of larger ones."""
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,20 +15,30 @@ from ..base import kinds
 from ..base.errors import StageError
 from ..base.files import check_writable
 from ..base.outputs import Output
-from ..classifier import TrainingCloud, TrainingOptions, train
+from ..classifier import TrainingCloud, TrainingOptions, summary, train
 from ..classifier.classes import ClassMap
 from ..classifier.dimensions import required, welcome
 from ..classifier.heights import ALWAYS, WHERE_THERE
 from ..classifier.trainoptions import MOST_PASSES
 from ..features.returns import SOURCES
 from ..features.voxels import LARGEST
-from .base import Stage
+from .base import Stage, files_read
 from .options import option
 from .points import Points
 from .selection import UNWANTED, Selection
 
 #: Options of this stage that are not the trainer's.
-_OWN = {"filename", "label", "survey", "where", "threads", "memory", "horizontal_unit", "vertical_unit"}
+_OWN = {
+    "filename",
+    "files",
+    "label",
+    "survey",
+    "where",
+    "threads",
+    "memory",
+    "horizontal_unit",
+    "vertical_unit",
+}
 
 
 def _default(name: str) -> Any:
@@ -35,6 +46,8 @@ def _default(name: str) -> Any:
     return TrainingOptions.__dataclass_fields__[name].default
 
 
+#: Most files that a model names.
+_NAMED = 20
 #: The word for the dimensions that follow from what the points have.
 AUTO = "auto"
 
@@ -136,7 +149,12 @@ class ClassifierModel(Stage):
         minimum=0,
         maximum=1,
     )
-    folds: int = option("integer", 0, "Folds of cross-validation over spatial blocks; 0 for none", minimum=0)
+    folds: int | None = option(
+        "integer",
+        None,
+        "Folds of cross-validation over spatial blocks; 0 for none; default: 5, with a quarter of the trees",
+        minimum=0,
+    )
     block_size: float = option("number", 25.0, "Side of these blocks", minimum=0, exclusive=True, unit="m")
     survey: str = option(
         "string",
@@ -191,6 +209,7 @@ class ClassifierModel(Stage):
         minimum=2,
         maximum=100,
     )
+    files: list = option("list", (), "Files that the model names; default: those of the readers")
     memory: int = option(
         "integer", 512, "Memory for blocks of points, in addition to the samples", minimum=16, unit="MB"
     )
@@ -227,6 +246,10 @@ holds the classes.
             given["max_features"] = str(share)
         self._preparation: list[dict[str, Any]] = []
         super().__init__(given, place)
+
+    @classmethod
+    def from_pipeline(cls, given: Mapping[str, Any], before: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        return {"files": files_read(before)}
 
     def follows(self, preparation: list[dict[str, Any]]) -> str | None:
         self._preparation = preparation
@@ -294,7 +317,9 @@ holds the classes.
             labels=points.codes_of(self.label),
             dimensions={name: points.dimension(name) for name in required(training.inputs)}
             | {name: points.arrays[name] for name in welcome(training.inputs) if name in points.arrays},
-            name="the points",
+            name=", ".join(Path(name).name for name in self.files[:_NAMED])
+            + ", ..." * (len(self.files) > _NAMED)
+            or "the points",
             mask=points.mask,
         )
         gone = points.ignored(replace(self.ignore, codes=()))  # the labels among them are left to the trainer
@@ -304,6 +329,8 @@ holds the classes.
         model.info["preparation"] = self._preparation
         model.save(self.filename)
         points.report.update({"model": self.filename, **_brief(model.info), "seconds": model.seconds})
+        if scores := summary.scores(model.info):
+            points.report["score"] = scores[0]
         if self.algorithm == "alsnet":  # with the curve
             points.report["training"] = _plain(model.info["training"])
         return {}
