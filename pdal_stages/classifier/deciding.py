@@ -94,7 +94,8 @@ class Decided(NamedTuple):
 
     def taken(self, place: npt.NDArray[np.int64]) -> Decided:
         """The rows of these places."""
-        return Decided(*(None if part is None else part[place] for part in self))
+        probabilities = None if self.probabilities is None else self.probabilities[place]
+        return Decided(self.code[place], self.reliability[place], self.margin[place], probabilities)
 
 
 def decide(p: npt.NDArray[np.floating], codes: npt.NDArray[np.uint8], options: PredictionOptions) -> Decided:

@@ -31,7 +31,8 @@ def smallest_hashes(xyz: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]
     hashes, rows = np.zeros(0, np.uint64), np.zeros(0, np.int64)
     for start in range(0, len(xyz), CHUNK):
         part = np.asarray(xyz[start : start + CHUNK])
-        hashes = np.concatenate((hashes, point_seeds(*part.T, seed, "samples")))
+        x, y, z = part.T
+        hashes = np.concatenate((hashes, point_seeds(x, y, z, seed, "samples")))
         rows = np.concatenate((rows, np.arange(start, start + len(part))))
         hashes, first = np.unique(hashes, return_index=True)
         hashes, rows = hashes[:SAMPLES], rows[first[:SAMPLES]]

@@ -263,8 +263,8 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
             given &= found.reliability >= np.float32(self.reject_below)
         for code, limit in zip((MEDIUM, LOW), reversed(self.bands or ()), strict=True):
             codes[given & (height < limit)] = code
-        code, number = np.unique(codes[wanted], return_counts=True)
-        found.report["classes"] = {str(int(c)): int(m) for c, m in zip(code, number, strict=True)}
+        there, number = np.unique(codes[wanted], return_counts=True)
+        found.report["classes"] = {str(int(c)): int(m) for c, m in zip(there, number, strict=True)}
 
     def _refuse_codes_that_stay(self, points: Points, wanted: NDArray[np.bool_]) -> None:
         """Before any work: codes that points keep must fit the file, as those do that the model gives."""
