@@ -303,7 +303,8 @@ def report(runs: list[dict[str, Any]], found: dict[str, Any]) -> str:
             some = choose(runs, **main, name=name, depth=depth)
             if some:
                 cells = [*_scores(some), spread(values(some, "kappa"))]
-                rows.append([f"{name} ours, {len(some)} seeds", str(depth or "unlimited"), *cells])
+                words = f"{name} ours, {len(some)} seed{'s' * (len(some) > 1)}"
+                rows.append([words, str(depth or "unlimited"), *cells])
     text.append(
         "Precision and recall of the published rows stand exchanged, as they must be (published.md)\n"
     )
