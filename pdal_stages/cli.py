@@ -312,7 +312,8 @@ def _run(options: argparse.Namespace, pipeline) -> int:
     from .base.files import write_whole
 
     metadata, verbose = getattr(options, "metadata", None), getattr(options, "verbose", 1)
-    pipeline.check_outputs(*([Output(metadata, "metadata", kinds.JSON)] if metadata else []))
+    more = [Output(options.log, "log")] if getattr(options, "log", None) else []
+    pipeline.check_outputs(*more, *([Output(metadata, "metadata", kinds.JSON)] if metadata else []))
     _end_at_once(options)
     count = pipeline.execute(arrays=False, loglevel=_LEVELS.get(verbose, logging.DEBUG))
     # Warnings, and what PDAL calls an error although it goes on: a reader that sets what it cannot read to 0, say.

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import shlex
 import time
 from collections.abc import Sequence
 from typing import Any
 
 from .errors import StageError
+from .kinds import kind_of
 from .version import __version__
 
 
@@ -25,13 +27,15 @@ class RunLog:
     Raises
     ------
     StageError
-        The file cannot be written.
+        The file cannot be written, or is one of another kind.
     """
 
     def __init__(self, path: str, stream: Any, arguments: Sequence[str]) -> None:
         self.stream = stream
+        if kind := kind_of(path):
+            raise StageError(f"the log would be added to {kind}", where="--log", found=path)
         try:
-            self._file = open(path, "a", encoding="utf-8", errors="backslashreplace")  # noqa: SIM115
+            self._file: Any = open(path, "a", encoding="utf-8", errors="backslashreplace")  # noqa: SIM115
         except OSError as error:
             raise StageError(
                 "the log cannot be written", where="--log", found=f"{path}: {error.strerror}"
@@ -50,11 +54,20 @@ class RunLog:
     def end(self, code: int) -> None:
         """Write the exit code and the time that was needed, and close the file."""
         self._add(f"exit code {code} after {time.monotonic() - self._started:.1f} s")
-        self._file.close()
+        if self._file is not None:
+            self._file.close()
 
     def _add(self, line: str) -> None:
-        self._file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line.strip()}\n")
-        self._file.flush()
+        if self._file is None:
+            return
+        try:
+            self._file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line.strip()}\n")
+            self._file.flush()
+        except OSError as error:  # the run goes on without its log
+            with contextlib.suppress(OSError):
+                self._file.close()
+            self._file = None
+            self.stream.write(f"pdal-stages: the log cannot be written any more: {error.strerror}\n")
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.stream, name)

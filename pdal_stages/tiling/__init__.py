@@ -1,4 +1,4 @@
-"""Pipelines over inputs of any number and size: tiles with a halo, run on Dask, written seamlessly."""
+"""Pipelines over inputs of any number and size: tiles with a halo, on one host or many, written seamlessly."""
 
 from .outcome import TiledRun
 from .settings import TilingOptions

@@ -30,7 +30,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--workers",
         type=int,
         metavar="N",
-        help="Worker processes; 0 runs everything in this process, without Dask (default: half the cores)",
+        help="Worker processes; 0 runs everything in this process (default: half the cores)",
     )
     group.add_argument(
         "--scheduler", default="", metavar="ADDRESS", help="A running Dask scheduler, tcp://HOST:8786"

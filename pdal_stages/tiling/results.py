@@ -84,6 +84,7 @@ def save(path: str | Path, results: Iterable[PieceResults]) -> None:
         content[f"{key}/index"] = result.piece.index[result.rows]
         content[f"{key}/core"] = np.array(len(result.piece.own))
         content |= {f"{key}/dim/{name}": values for name, values in result.values.items()}
+    content["names"] = np.array(sorted(content))
     with whole_files(path, what="result") as (partial,):
         np.savez(partial, **content)  # type: ignore[arg-type]
 
@@ -93,6 +94,8 @@ def _opened(name: str) -> Iterator[Any]:
     """The results in a file; one that cannot be read is removed, so that a later run makes it anew."""
     try:
         with np.load(name, allow_pickle=False) as tile:
+            if sorted({*tile.files} - {"names"}) != tile["names"].tolist():
+                raise ValueError("its members have other names")
             yield tile
     except StageError:
         raise

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from ..base.version import __version__
+from ..base.version import build
 from .assemble import FileTask
 from .headrun import Recipe
 from .outcome import Job, Output
@@ -34,7 +34,7 @@ class Worklist:
         self.plan, self.survey, self.options = plan, survey, options
         self._tail = [plan.tail, survey.stamps_of(plan.tail)]
         self._common = fingerprint(
-            __version__,
+            build(),
             plan.head,
             survey.stamps_of(plan.head),
             plan.creates,

@@ -186,7 +186,8 @@ def _result() -> tuple[bytes, sources.Source]:
         "dim/Classification": (index % 7).astype(np.uint8),
         "dim/H": index / 7,
     }
-    np.savez(path, **{f"{source.key}/{name}": value for name, value in content.items()})
+    content = {f"{source.key}/{name}": value for name, value in content.items()}
+    np.savez(path, names=np.array(sorted(content)), **content)
     return path.read_bytes(), source
 
 

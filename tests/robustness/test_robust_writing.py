@@ -32,7 +32,9 @@ SITES = {
     "base/files:_pour": "writes into devices and pipes; test_robust_outputs",
     "base/files:_remove_dead": _OWN,
     "base/files:write_whole": "metadata",
+    "base/runlog:RunLog.__init__": "adds lines to a log, and the run goes on without it; a test here",
     "base/las:supersede_copc": "overwrites a few bytes of a file already checked; test_newer_pdal",
+    "classifier/estimator:PointClassifier.save": "through classifier/modelfile:write",
     "classifier/modelfile:write": "model",
     "classifier/spool:_mapped.kept": _SCRATCH,
     "cli:_expand": "expanded pipeline",
@@ -207,3 +209,20 @@ def shape(value):
     if isinstance(value, dict):
         return {key: shape(inner) for key, inner in value.items()}
     return [shape(inner) for inner in value] if isinstance(value, list) else type(value).__name__
+
+
+@pytest.mark.pdal
+def test_a_log_that_cannot_be_written(cell, tmp_path, cloud):
+    path = tmp_path / "job.json"
+    path.write_text(json.dumps([str(cloud), {"type": "filters.hag_minima"}, str(tmp_path / "o.las")]))
+    it = cell("Outputs", "--log onto a cloud")
+    (tmp_path / "other.las").write_bytes(cloud.read_bytes())
+    it.refused(["pipeline", path, "--log", tmp_path / "other.las"], "the log would be added to a LAS or LAZ file")
+    it = cell("Outputs", "--log and the output onto one file")
+    done = it.command("pipeline", path, "--log", tmp_path / "o.las")
+    assert done.code == 1 and "the log file is the output file too" in done.err
+    it.note("error", done.err.removeprefix("pdal-stages: "))
+    if os.path.exists("/dev/full"):
+        it = cell("Outputs", "--log on a full disk")
+        done = it.runs(["pipeline", path, "--log", "/dev/full"], "the run goes on, and says that its log does not")
+        assert "the log cannot be written any more: No space left on device" in done.err
