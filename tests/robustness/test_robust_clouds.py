@@ -146,7 +146,7 @@ def test_training_on_odd_clouds(cell, tmp_path, write_las):
     def train(case, xyz, *says, passes=1, **more):
         source = las(tmp_path / "in.las", xyz, write_las, **more)
         stage = {"type": "writers.classifiermodel", "filename": str(tmp_path / "m"), "count": 50, "trees": 3,
-                 "neighborhoods": "c1,k5", "feature_set": "covariance", "passes": passes}  # fmt: skip
+                 "neighborhoods": "c1,k5", "feature_set": "covariance", "passes": passes, "voxel": 0}  # fmt: skip
         path = job(tmp_path, str(source), HAG, stage)
         it = cell("Clouds", case)
         if says:
