@@ -14,7 +14,7 @@ from typing import Any
 from ..base.errors import OptionError, StageError
 from ..base.files import check_writable, write_whole
 from ..pipeline.run import Pipeline
-from .outcome import TiledRun
+from .outcome import InterruptedRun, TiledRun
 from .settings import PER, TilingOptions
 from .tiledrun import run_tiled
 from .tileplan import make_plan
@@ -101,11 +101,22 @@ def run_command(options: argparse.Namespace, source: str | Path) -> int:
         make_plan(pipeline, chosen.buffer)
         print(pipeline.validate())
         return 0
+    interrupted = False
     with _terminated_as_interrupted():
-        run = run_tiled(pipeline, chosen, dry_run=options.dry_run, progress=_progress(options.progress))
+        try:
+            run = run_tiled(pipeline, chosen, dry_run=options.dry_run, progress=_progress(options.progress))
+        except InterruptedRun as stopped:
+            run, interrupted = stopped.run, True
     _print_dry(run) if options.dry_run else _print(run)
     for name in [*options.report, *([options.metadata] if options.metadata else [])]:
         _write_report(name, run)
+    if interrupted:
+        print(
+            f"pdal-stages: interrupted; nothing half-written was left. Run it again with --resume for the rest of the "
+            f"{len(run.tiles)} tiles",
+            file=sys.stderr,
+        )
+        return 130
     return 1 if run.failures else 0
 
 
@@ -161,7 +172,8 @@ def _print_dry(run: TiledRun) -> None:
         f"about {s['points_read_by_a_tile']:,} points read for a tile, {s['points_of_largest_tile']:,} its own at most"
     )
     memory, rate = s["memory_mb_of_a_worker"], s["assumed_points_per_core_second"]
-    print(f"up to {memory:,.0f} MB for each of {s['workers']} workers with {s['threads_per_worker']} threads")
+    workers = f"each of {s['workers']} workers" if s["workers"] else "this process"
+    print(f"up to {memory:,.0f} MB for {workers} with {s['threads_per_worker']} threads")
     print(f"roughly {s['core_hours']:.2f} core hours at {rate:,} points/s and core; the model decides")
     for job in run.tiles[:50]:
         print(f"  {job.name:24s} {job.points:>14,} points  {_inputs(len(job.sources))}")

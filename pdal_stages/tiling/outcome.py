@@ -66,6 +66,14 @@ _CHANGED = (
 )
 
 
+class InterruptedRun(KeyboardInterrupt):
+    """Ctrl-C in a tiled run; `run` says what it did until then."""
+
+    def __init__(self, run: TiledRun) -> None:
+        super().__init__()
+        self.run = run
+
+
 @dataclass
 class TiledRun:
     """What a tiled run did.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import Counter
 from collections.abc import Iterable
@@ -15,7 +16,7 @@ from ..pipeline.overrides import Override
 from ..pipeline.run import Pipeline
 from .dispatch import run_all
 from .estimate import estimate
-from .outcome import TiledRun, summarize
+from .outcome import InterruptedRun, TiledRun, summarize
 from .pool import open_pool
 from .settings import TilingOptions
 from .store import Store
@@ -58,6 +59,8 @@ def run_tiled(
     ------
     StageError
         For what is wrong before any tile, or with every tile.
+    InterruptedRun
+        A KeyboardInterrupt with what was done until then.
 
     Examples
     --------
@@ -87,8 +90,11 @@ def run_tiled(
                 work = Worklist(plan, survey, chosen)
                 if chosen.resume:
                     work.take_over(store)
-                run_all(work, store, pool, chosen.retries, progress)
-                work.forget_results(store)
+                with contextlib.suppress(KeyboardInterrupt):
+                    interrupted = True
+                    run_all(work, store, pool, chosen.retries, progress)
+                    interrupted = False
+                    work.forget_results(store)
         finally:
             sweep(folder)  # what workers left that were killed
     summary = survey.figures(plan) | {"workers": pool.slots, "threads_per_worker": pool.threads}
@@ -100,7 +106,10 @@ def run_tiled(
             f"{len(short)} tiles have points whose neighborhoods or terrain reach farther than could be read within "
             f"{chosen.most_points:,} points; they may differ from an untiled run: " + ", ".join(short[:5])
         )
-    return TiledRun(work.jobs, work.outputs, survey.unreadable, survey.changed(), survey.notes, summary)
+    run = TiledRun(work.jobs, work.outputs, survey.unreadable, survey.changed(), survey.notes, summary)
+    if interrupted:
+        raise InterruptedRun(run)
+    return run
 
 
 #: Most different warnings of tiles that a run repeats.
