@@ -5,9 +5,11 @@ As in targets.py: bytes in; only :class:`StageError` is caught, so anything else
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
 import re
+import shutil
 import sqlite3
 import struct
 import tempfile
@@ -34,9 +36,11 @@ PATIENCE = 10.0
 
 @cache
 def folder() -> Path:
-    """A folder in memory."""
+    """A folder in memory, until the process ends."""
     memory = Path("/dev/shm")
-    return Path(tempfile.mkdtemp(prefix="fuzz-", dir=memory if os.access(memory, os.W_OK) else None))
+    made = Path(tempfile.mkdtemp(prefix="fuzz-", dir=memory if os.access(memory, os.W_OK) else None))
+    atexit.register(shutil.rmtree, made, ignore_errors=True)
+    return made
 
 
 def put(name: str, data: bytes) -> Path:
