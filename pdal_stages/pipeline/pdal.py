@@ -249,8 +249,6 @@ def _log(pipeline) -> str:
         return ""
     except UnicodeDecodeError as error:
         return error.object.decode(errors="backslashreplace")
-    except RuntimeError:  # a pipeline that PDAL could not even make has none
-        return ""
 
 
 def _metadata(pipeline) -> dict[str, Any]:
