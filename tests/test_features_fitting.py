@@ -70,7 +70,8 @@ def test_training_stores_what_all_clouds_give():
         TrainingCloud(xyz, np.where(xyz[:, 2] > 0, 5, 2), name=f"cloud {k}") for k, xyz in enumerate(CLOUDS)
     ]
     options = TrainingOptions(
-        neighborhoods="copt,s2", feature_set=("covariance", "D2"), dimensions=(), count=50, trees=2, passes=1, threads=1
+        neighborhoods="copt,s2", feature_set=("covariance", "D2"), dimensions=(), count=50, trees=2, passes=1, voxel=0.0,
+        threads=1,
     )  # fmt: skip
     model = train(clouds, options, progress=False)
     features = model.passes[0].features
