@@ -245,8 +245,6 @@ def _log(pipeline) -> str:
     """What PDAL and GDAL said; they quote files, whatever bytes those hold."""
     try:
         return str(getattr(pipeline, "log", "") or "")
-    except RuntimeError:  # a pipeline that could not even be put together has none
-        return ""
     except UnicodeDecodeError as error:
         return error.object.decode(errors="backslashreplace")
 
