@@ -16,6 +16,7 @@ from ..base.las import extra_dimensions
 from ..base.outputs import check_outputs
 from ..classifier.heights import preparation_of
 from ..stages import preparation, registry
+from ..stages.accuracy import AccuracyStage
 from ..stages.points import Points
 from . import pdal as pdal_env
 from .filenames import stage_files
@@ -48,7 +49,11 @@ def classify_pipeline(
     """
     from ..stages.modelclassifier import loaded_model
 
-    classifier = {"type": "filters.modelclassifier", "model": model, **({"where": where} if where else {})}
+    classifier: dict[str, Any] = {
+        "type": "filters.modelclassifier",
+        "model": model,
+        **({"where": where} if where else {}),
+    }
     for option, name in (("margin", "Margin"), ("variance", "Variance"), ("probabilities", "Probability_")):
         if any(one.startswith(name) for one in dimensions):
             classifier[option] = True
@@ -167,7 +172,7 @@ def compare_files(
     wanted: dict[str, Any] = {"type": "filters.accuracy", **listed, **outputs}
     (given,) = apply_overrides([wanted], overrides)
     renamed = {"dimension": "Classification", "reference": "Reference"}
-    stage = lower_stage({**given, **renamed}).stage
+    stage = cast(AccuracyStage, lower_stage({**given, **renamed}).stage)
     check_outputs(stage.outputs(), [*listed["files"], *stage_files(stage)])
     parts, wkt = [], ""
     for source, reference in pairs:
@@ -259,7 +264,7 @@ def _refuse_other_points(mine: np.ndarray, true: np.ndarray, source: str, refere
             found=f"{len(mine):,} points in {source}, {len(true):,} in {reference}",
             cure="Compare files of the same points, or keep the labels with filters.ferry while classifying",
         )
-    for axis in sorted({"X", "Y", "Z"} & set(mine.dtype.names) & set(true.dtype.names)):
+    for axis in sorted({"X", "Y", "Z"} & set(mine.dtype.names or ()) & set(true.dtype.names or ())):
         apart = np.abs(mine[axis] - true[axis])
         if apart.size and apart.max() > 0.01:
             raise StageError(

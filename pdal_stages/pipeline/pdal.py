@@ -156,11 +156,11 @@ def python_object(stages: list[dict[str, Any]], type_name: str, given: dict[str,
     """
     pdal = bindings()
 
-    class Step(pdal.Filter):
+    class Step(pdal.Filter):  # type: ignore[name-defined]
         def __repr__(self) -> str:
             return repr(made)
 
-    class Filter(pdal.Pipeline):
+    class Filter(pdal.Pipeline):  # type: ignore[name-defined]
         type = type_name
         tag = given.get("tag")
 
