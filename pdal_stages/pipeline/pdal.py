@@ -247,6 +247,8 @@ def _log(pipeline) -> str:
         return str(getattr(pipeline, "log", "") or "")
     except UnicodeDecodeError as error:
         return error.object.decode(errors="backslashreplace")
+    except RuntimeError:  # a pipeline that PDAL could not even make has none
+        return ""
 
 
 def _metadata(pipeline) -> dict[str, Any]:
