@@ -145,7 +145,7 @@ def _terminated_as_interrupted():
 def _print(run: TiledRun) -> None:
     s = run.summary
     states = s["states"]
-    line = f"{states['done']} tiles done"
+    line = f"{states['done']} tile{'' if states['done'] == 1 else 's'} done"
     if states["kept"]:
         line += f", {states['kept']} kept from an earlier run"
     if states["failed"]:
