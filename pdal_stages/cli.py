@@ -51,6 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     streams = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = map(PlainStream, streams)  # type: ignore[assignment]
     log: RunLog | None = None
+    shown = os.environ.get("PDAL_STAGES_PROGRESS")
     code = 1
     try:
         overrides, rest = parse_overrides(arguments)
@@ -85,6 +86,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         if log is not None:
             log.end(code)
         sys.stdout, sys.stderr = streams
+        if shown is not None:
+            os.environ["PDAL_STAGES_PROGRESS"] = shown
+        else:
+            os.environ.pop("PDAL_STAGES_PROGRESS", None)
 
 
 def _levels(arguments: list[str]) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections import Counter
@@ -272,3 +273,10 @@ def test_importing_the_package_is_light():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_what_is_asked_of_one_command_ends_with_it(cloud, tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("PDAL_STAGES_PROGRESS", raising=False)
+    (tmp_path / "job.json").write_text(json.dumps([str(cloud)]))
+    assert run(capsys, "pipeline", tmp_path / "job.json", "--no-progress")[0] == 0
+    assert "PDAL_STAGES_PROGRESS" not in os.environ
