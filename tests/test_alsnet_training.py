@@ -28,7 +28,9 @@ def fit(clouds=None, progress=False, dimensions=("HeightAboveGround",), **networ
         xyz, labels, values = scene()
         clouds = [TrainingCloud(xyz, labels, values, name="scene")]
     network = {"configuration": TINY, "validation": 0, "epochs": 2, "histogram_threshold": 100, **network}
-    options = TrainingOptions(algorithm="alsnet", alsnet=network, dimensions=dimensions, seed=3, threads=1)
+    options = TrainingOptions(
+        algorithm="alsnet", alsnet=network, dimensions=dimensions, seed=3, threads=1, voxel=0.0
+    )
     return train(clouds, options, progress=progress)
 
 
