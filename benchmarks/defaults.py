@@ -23,10 +23,11 @@ import numpy as np
 
 from pdal_stages.accuracy import Accuracy
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
+from pdal_stages.classifier.heights import ALWAYS, WHERE_THERE
 from pdal_stages.terrain import filtered_ground
 
-MOMENTS = "covariance,Verticality,HeightRange,HeightStd,HeightAboveLowest"
-DIMENSIONS = ("HeightAboveGround", "Ground", "HeightAboveOpening_5", "HeightAboveOpening_17", "returns")
+#: What ``pdal-stages train`` takes where points have it.
+DIMENSIONS = (*ALWAYS, *WHERE_THERE, "returns")
 PAPERS = "c1,c2,c3,c5,s1,s2,s3,s5,kopt"
 ONE = {"passes": 1}
 #: Table -> row -> what differs from today's defaults.
@@ -42,9 +43,9 @@ TABLES: dict[str, dict[str, dict[str, Any]]] = {
         "without s5": {**ONE, "neighborhoods": "k10,k20,k50"},
         "without k10": {**ONE, "neighborhoods": "s5,k20,k50"},
         "with c2": {**ONE, "neighborhoods": "c2,s5,k10,k20,k50"},
-        "without return numbers": {**ONE, "dimensions": DIMENSIONS[:4]},
-        "without heights above openings": {**ONE, "dimensions": (*DIMENSIONS[:2], "returns")},
-        "heights above ground alone": {**ONE, "dimensions": DIMENSIONS[:1]},
+        "without return numbers": {**ONE, "dimensions": (*ALWAYS, *WHERE_THERE)},
+        "without heights above openings": {**ONE, "dimensions": (*ALWAYS, "Ground", "returns")},
+        "heights above ground alone": {**ONE, "dimensions": ALWAYS},
     },
     "voxel": {
         "0.125 m": {},
@@ -91,30 +92,22 @@ def cloud(files: list[Path], codes: tuple[int, ...], name: str) -> TrainingCloud
     return TrainingCloud(xyz, np.where(np.isin(labels, codes), labels, 0), dimensions, name=name)
 
 
-def part(whole: TrainingCloud, rows: np.ndarray, name: str) -> TrainingCloud:
-    """Some of a cloud's points."""
-    given = {key: np.asarray(values)[rows] for key, values in whole.dimensions.items()}
-    return TrainingCloud(whole.xyz[rows], whole.labels[rows], given, name=name)
-
-
 def held_out(data: Path) -> Iterator[tuple[str, TrainingCloud, TrainingCloud]]:
     """(scene, what is trained on, what is classified)."""
     whole = cloud(sorted((data / "montpellier").glob("train_*.laz")), CODES["Montpellier"], "Montpellier")
     tile = np.unique(np.floor((whole.xyz[:, :2] - 1e-6) / 50.0), axis=0, return_inverse=True)[1].ravel()
     for number in range(4):
-        yield "Montpellier", part(whole, tile != number, "rest"), part(whole, tile == number, "tile")
+        yield "Montpellier", *(whole.part(np.flatnonzero(rows)) for rows in (tile != number, tile == number))
     whole = cloud([data / "delft" / "train.laz"], CODES["Delft"], "Delft")
     third = np.searchsorted(np.quantile(whole.xyz[:, 1], [1 / 3, 2 / 3]), whole.xyz[:, 1])
     for number in range(3):
-        yield "Delft", part(whole, third != number, "rest"), part(whole, third == number, "third")
+        yield "Delft", *(whole.part(np.flatnonzero(rows)) for rows in (third != number, third == number))
 
 
 def options(changes: dict[str, Any], codes: tuple[int, ...], count: int) -> TrainingOptions:
     """Today's defaults with changes."""
-    given = {"neighborhoods": "s5,k10,k20,k50", "feature_set": MOMENTS, "dimensions": DIMENSIONS}
-    return TrainingOptions(
-        **{**given, "classes": {str(code): code for code in codes}, "count": count, "threads": 1, **changes}
-    )
+    given = {"dimensions": DIMENSIONS, "classes": list(codes), "count": count, "threads": 1, "folds": 0}
+    return TrainingOptions(**{**given, **changes})
 
 
 def run(data: Path, rows: dict[str, dict[str, Any]], count: int) -> list[dict[str, Any]]:

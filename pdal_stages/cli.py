@@ -405,15 +405,13 @@ def _classify(options: argparse.Namespace) -> int:
 
 def _classify_one(source: str, target: str, options: argparse.Namespace) -> tuple[str, int, dict[str, Any]]:
     """Classify a file: the output, its points, and the classifier's report."""
-    from .pipeline.jobs import WRITTEN, classify_pipeline
-    from .pipeline.run import Pipeline
+    from .pipeline.jobs import WRITTEN, classify_job
 
     listed = options.dimensions
     named = WRITTEN if listed is None else tuple(name.strip() for name in listed.split(",") if name.strip())
-    stages = classify_pipeline(
+    pipeline = classify_job(
         source, target, options.model, options.overrides, where=options.where, dimensions=named
     )
-    pipeline = Pipeline(stages, options.overrides)
     count = _run(options, pipeline)
     return target, count, pipeline.reports[-1][1][-1]
 

@@ -15,9 +15,11 @@ from pathlib import Path
 import numpy as np
 from clouds import SURVEYS
 from leave_one_out import tables
-from recipe import DENSITIES, OPTIONS, PREPARATION, SAMPLES, SLOPES
+from recipe import DENSITIES, OPTIONS, SAMPLES, SLOPES
 
 from pdal_stages.classifier import load_model
+from pdal_stages.classifier.heights import PREPARATION
+from pdal_stages.stages.preparation import as_json
 
 
 def main() -> None:
@@ -37,7 +39,7 @@ def main() -> None:
         .with_suffix(".md")
         .read_text()
         .format(
-            stage=json.dumps(PREPARATION),
+            stage=as_json(PREPARATION),
             passes=len(model.passes),
             trees=OPTIONS.trees,
             voxel=OPTIONS.voxel,

@@ -10,6 +10,7 @@ from clouds import SURVEYS, Cloud, load, on_slopes, thinned, without_returns
 
 from pdal_stages.base.hashing import coordinate_hash
 from pdal_stages.classifier import Model, TrainingCloud, TrainingOptions, train
+from pdal_stages.classifier.heights import PREPARATION
 from pdal_stages.features.voxels import represent
 
 #: Points per square metre of thinned copies.
@@ -18,9 +19,6 @@ DENSITIES = (8.0, 2.0, 0.6)
 SLOPES = ((0.3, 8.0, False), (0.6, 3.0, False), (0.9, 1.0, False), (0.5, 0.3, False), (0.5, 1.0, True))
 #: Samples of each class from each copy.
 SAMPLES = 1500
-
-#: The stage that makes in a pipeline what ``clouds.with_heights`` makes here.
-PREPARATION = {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]}
 
 OPTIONS = TrainingOptions(
     neighborhoods="s5,k10,k20,k50",
@@ -72,5 +70,5 @@ def train_on(data: Path, surveys: Iterable[str], progress: bool = True) -> Model
     """The model of these surveys."""
     made = [training_cloud(copy) for name in surveys for copy in copies(load(data, name))]
     model = train(made, OPTIONS, progress=progress)
-    model.info["preparation"] = [PREPARATION]
+    model.info["preparation"] = list(PREPARATION)
     return model

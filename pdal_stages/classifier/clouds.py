@@ -13,7 +13,7 @@ from ..base.asprs import UNINFORMATIVE
 from ..base.errors import OptionError
 from ..features.voxels import represent
 from .classes import ClassMap, as_labels
-from .dimensions import gather, required, welcome
+from .dimensions import known
 from .thinning import thinned
 from .trainoptions import TrainingOptions
 
@@ -83,11 +83,8 @@ def prepared(sources: Iterable[Source], options: TrainingOptions) -> Iterator[Tr
         labels = _checked_labels(cloud)
         if ignored and (gone := np.isin(labels, ignored)).any():
             cloud = cloud.part(np.flatnonzero(~gone))
-        read = [
-            name for name in (*required(options.inputs), *welcome(options.inputs)) if name in cloud.dimensions
-        ]
-        values, _ = gather(read, cloud.dimensions, len(cloud.xyz), where=cloud.name)
-        few = represent(cloud.xyz, options.voxel, values.values())
+        values = known(options.inputs, cloud.dimensions, len(cloud.xyz), where=cloud.name)
+        few = represent(cloud.xyz, options.voxel, values)
         if few is not None:
             cloud = cloud.part(few.rows)
         yield cloud

@@ -153,9 +153,18 @@ class Outcome:
             instead = np.uint8(UNCLASSIFIED) if self._current is None else self._current[rows]
         self.classification[rows] = np.where(low, instead, decided.code)
 
-    def prediction(self, rows: npt.NDArray[np.int64] | None, counted: dict[str, Any]) -> Prediction:
-        """The result once all blocks are written; `rows` are the points that were to be classified."""
+    def prediction(
+        self,
+        rows: npt.NDArray[np.int64] | None,
+        there: npt.NDArray[np.int64] | None,
+        counted: dict[str, Any],
+    ) -> Prediction:
+        """The result once all blocks are written.
+
+        `rows` are the points that were to be classified, `there` those that were not ignored; None: all.
+        """
         n = len(self.classification)
+        ignored = 0 if there is None else n - len(there)
         count = n if rows is None else len(rows)
         given = self.classification if rows is None else self.classification[rows]
         code, number = np.unique(given, return_counts=True)
@@ -163,7 +172,8 @@ class Outcome:
             "points": n,
             "classified": count - self.rejected,
             "rejected": self.rejected,
-            "outside_where": n - count,
+            "outside_where": n - ignored - count,
+            **({"ignored": ignored} if ignored else {}),
             "classes": {str(int(c)): int(m) for c, m in zip(code, number, strict=True)},
             **counted,
         }

@@ -41,6 +41,21 @@ def welcome(names: Iterable[str]) -> tuple[str, ...]:
     return returns.SOURCES if any(returns.parse(name) is not None for name in names) else ()
 
 
+def known(
+    names: Iterable[str],
+    dimensions: Mapping[str, npt.ArrayLike],
+    n: int,
+    rows: npt.NDArray[np.int64] | None = None,
+    where: str | None = None,
+) -> list[npt.NDArray[Any]]:
+    """Values of the dimensions that these features must have, and of those they use where a cloud has them.
+
+    Parameters and errors as for :func:`gather`.
+    """
+    there = (name for name in welcome(names) if name in dimensions)
+    return list(gather((*required(names), *there), dimensions, n, rows, where)[0].values())
+
+
 def with_returns(
     names: Iterable[str], xyz: npt.NDArray[np.float64], dimensions: Mapping[str, npt.ArrayLike]
 ) -> Mapping[str, npt.ArrayLike]:

@@ -16,7 +16,9 @@ from .model import Model
 from .training import train
 from .trainoptions import TrainingOptions
 
-_DEFAULT: dict[str, Any] = {name: field.default for name, field in TrainingOptions.__dataclass_fields__.items()}
+_DEFAULT: dict[str, Any] = {
+    name: field.default for name, field in TrainingOptions.__dataclass_fields__.items()
+}
 
 
 class PointClassifier(ClassifierMixin, BaseEstimator):

@@ -20,7 +20,6 @@ from . import crossval
 from .classes import ClassMap
 from .clouds import Labelled, TrainingCloud, label_classes
 from .context import Context
-from .dimensions import gather, required
 from .featureforest import FeatureForest, Features
 from .folds import Folds
 from .forest import Forest
@@ -64,10 +63,6 @@ def feature_plan(options: TrainingOptions) -> FeaturePlan:
 def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model:
     started = time.perf_counter()
     plan = feature_plan(options)
-    for cloud in clouds:  # before any work
-        for name in required(plan.dimensions):
-            if name not in cloud.dimensions:
-                gather((name,), cloud.dimensions, len(cloud.xyz), where=cloud.name)
     labelled = label_classes(clouds, options)
     classes = labelled.classes
     groups = [f"{cloud.flight} {cloud.copy}" for cloud in clouds] if options.balance else None
@@ -262,7 +257,8 @@ class _Passes:
         for name in names:
             mine = flight == name
             *_, columns = self._columns(values, weight * ~mine, progress)
-            forest = self._plain_forest(columns, weight * ~mine, f"growing without {name}", progress)
+            grown = self._grown(columns, weight * ~mine, f"growing without {name}", progress)
+            forest = Forest.from_sklearn([tree.tree_ for tree, _, _ in grown], columns.shape[1])
             best = forest.predict_proba(np.ascontiguousarray(columns[mine])).argmax(axis=1)
             matrix = np.zeros((len(self.codes), len(self.codes)), np.int64)
             np.add.at(matrix, (label[mine], best), weight[mine])
@@ -339,22 +335,27 @@ class _Passes:
                 )
         return out
 
-    def _plain_forest(
-        self, columns: npt.NDArray[np.float32], weight: npt.NDArray[np.int64], what: str, progress: bool
-    ) -> Forest:
-        options = self.options
+    def _grown(
+        self,
+        columns: npt.NDArray[np.float32],
+        weight: npt.NDArray[np.int64],
+        what: str,
+        progress: bool,
+        **more: Any,
+    ) -> Iterator[tuple[Any, Any, Any]]:
+        """The trees of a forest, as :func:`grow` gives them."""
         with Progress(self.chosen["trees"], what, "trees", enabled=None if progress else False) as bar:
-            grown = grow(
+            yield from grow(
                 columns,
                 self.samples.label,
                 weight,
                 self.chosen["trees"],
                 self.setting,
-                options.seed,
-                threads=options.threads,
+                self.options.seed,
+                threads=self.options.threads,
                 progress=bar,
+                **more,
             )
-            return Forest.from_sklearn([tree.tree_ for tree, _, _ in grown], columns.shape[1])
 
     def _forest(
         self, values: npt.NDArray[np.float32], number: int, progress: bool
@@ -365,21 +366,10 @@ class _Passes:
         trees = []
         importance = np.zeros(values.shape[1])
         what = f"growing pass {number + 1}" if self.options.passes > 1 else "growing"
-        with Progress(self.chosen["trees"], what, "trees", enabled=None if progress else False) as bar:
-            for tree, rows, shares in grow(
-                values,
-                label,
-                weight,
-                self.chosen["trees"],
-                self.setting,
-                self.options.seed,
-                score="out of bag",
-                threads=self.options.threads,
-                progress=bar,
-            ):
-                trees.append(tree.tree_)
-                importance += tree.feature_importances_
-                total[rows] += shares
+        for tree, rows, shares in self._grown(values, weight, what, progress, score="out of bag"):
+            trees.append(tree.tree_)
+            importance += tree.feature_importances_
+            total[rows] += shares
         scored = total.sum(axis=1) > 0
         bag = None
         if scored.any():

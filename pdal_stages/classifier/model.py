@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError, OptionError
-from ..features.voxels import Representatives, represent
+from ..features.voxels import represent
 from . import modelfile, summary
 from .algorithms import Inputs, Question, algorithm
 from .deciding import Outcome, Prediction, PredictionOptions, decide
-from .dimensions import gather, required, welcome
+from .dimensions import known, required, welcome
 from .heights import heights
 from .passes import Passes
 from .smoothing import count_shares, smooth
@@ -194,63 +194,23 @@ class Model:
             )
         rows = _rows(where, len(xyz))
         old = None if current is None else _codes_now(current, len(xyz))
-        gone = np.zeros(0, np.int64) if ignore is None else mask_of("ignore", ignore, len(xyz)).nonzero()[0]
-        if len(gone):
-            return self._without(xyz, dimensions or {}, rows, old, gone, how, progress)
-        return self._predict(xyz, dimensions or {}, rows, old, how, progress)
-
-    def _without(
-        self,
-        xyz: npt.NDArray[np.float64],
-        dimensions: Mapping[str, npt.ArrayLike],
-        rows: npt.NDArray[np.int64] | None,
-        old: npt.NDArray[np.uint8] | None,
-        gone: npt.NDArray[np.int64],
-        how: PredictionOptions,
-        progress: Any,
-    ) -> Prediction:
-        """Classify as if the points of the rows `gone` were not there."""
-        n = len(xyz)
-        keep = np.delete(np.arange(n), gone)
-        wanted = None
-        if rows is not None:
-            wanted = np.searchsorted(keep, rows[np.isin(rows, keep, assume_unique=True)])
-        part = self._predict(
-            xyz[keep],
-            {name: np.asarray(dimensions[name])[keep] for name in dimensions},
-            wanted,
-            None if old is None else old[keep],
-            how,
-            progress,
-        )
-
-        def spread(values: Any, first: Any = None) -> Any:
-            if values is None:
-                return None
-            out = np.zeros((n, *values.shape[1:]), values.dtype) if first is None else first.copy()
-            out[keep] = values
-            return out
-
-        return Prediction(
-            spread(part.classification, old),
-            spread(part.reliability),
-            spread(part.margin),
-            spread(part.probabilities),
-            spread(part.variance),
-            part.classified,
-            part.rejected,
-            {**part.report, "points": n, "ignored": len(gone)},
-        )
+        there = None
+        if ignore is not None and (gone := mask_of("ignore", ignore, len(xyz))).any():
+            there = np.flatnonzero(~gone)
+            rows = there if rows is None else rows[~gone[rows]]
+        return self._predict(xyz, dimensions or {}, rows, there, old, how, progress)
 
     def _predict(
         self,
         xyz: npt.NDArray[np.float64],
         dimensions: Mapping[str, npt.ArrayLike],
         rows: npt.NDArray[np.int64] | None,
+        there: npt.NDArray[np.int64] | None,
         old: npt.NDArray[np.uint8] | None,
         how: PredictionOptions,
         progress: Any,
     ) -> Prediction:
+        """Classify the points `rows` of those that are `there`; None: all."""
         codes = self.codes
 
         def finish(p):
@@ -258,8 +218,9 @@ class Model:
             return count_shares(p) if how.smooth else decide(p, codes, how)
 
         outcome = Outcome(len(xyz), len(codes), old, how)
-        few = self._representatives(xyz, dimensions, rows)
-        asked = rows
+        values = known(self.plan.dimensions, dimensions, len(xyz), there)
+        few = represent(xyz, self.voxel, values, rows, there)
+        asked, count = rows, len(xyz if there is None else there)
         if few is not None:
             xyz, asked = xyz[few.rows], few.wanted
             dimensions = {name: np.asarray(dimensions[name])[few.rows] for name in dimensions}
@@ -269,9 +230,8 @@ class Model:
                 at, place = few.members(at)
                 decided = None if decided is None else decided.taken(place)
                 variance = None if variance is None else variance[place]
-                if progress is not None:
-                    progress.update(len(at))
             outcome.write(at, decided, variance)
+            return len(at)
 
         question = Question(
             xyz, dimensions, asked, how.threads, how.memory_mb, progress if few is None else None
@@ -281,26 +241,17 @@ class Model:
         for block in answer.blocks:
             if shares is not None:
                 shares[block.rows] = block.result
-            write(block.rows, None if how.smooth else block.result, block.variance)
+            written = write(block.rows, None if how.smooth else block.result, block.variance)
+            if few is not None and progress is not None:
+                progress.update(written)
         if shares is not None and question.count:
             for part, p in _smoothed(xyz, asked, shares, how):
                 write(part, decide(p, codes, how))
             answer.report["smooth"] = how.smooth
-        if few is not None:
-            answer.report["representatives"] = len(few.rows)
+        if len(xyz) < count:
+            answer.report["representatives"] = len(xyz)
         answer.report.update(self._density_report(xyz, question.count, answer.report))
-        return outcome.prediction(rows, answer.report)
-
-    def _representatives(
-        self,
-        xyz: npt.NDArray[np.float64],
-        dimensions: Mapping[str, npt.ArrayLike],
-        rows: npt.NDArray[np.int64] | None,
-    ) -> Representatives | None:
-        """Who stands for whom."""
-        there = [name for name in self.welcome_dimensions if name in dimensions]
-        values, _ = gather((*self.required_dimensions, *there), dimensions, len(xyz))
-        return represent(xyz, self.voxel, values.values(), rows)
+        return outcome.prediction(rows, there, answer.report)
 
     def _density_report(
         self, xyz: npt.NDArray[np.float64], count: int, report: Mapping[str, Any]

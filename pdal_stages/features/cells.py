@@ -59,13 +59,7 @@ def cell_keys(
     offsets : (3 or 9,) int64
         Added to a key, the middle cells of the rows of three around it.
     """
-    return grid_keys([cell_numbers(coordinates[:, k], side) for k in _ORDER[coordinates.shape[1]]])
-
-
-def grid_keys(
-    numbers: list[npt.NDArray[np.int64]],
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """The same from the numbers of cells along each axis, the slowest first."""
+    numbers = [cell_numbers(coordinates[:, k], side) for k in _ORDER[coordinates.shape[1]]]
     lengths = []
     for attempt in (_from_zero, _without_gaps):
         numbers = [attempt(number) for number in numbers]

@@ -54,8 +54,9 @@ def represent(
     side: float,
     values: Iterable[npt.ArrayLike] = (),
     rows: npt.NDArray[np.int64] | None = None,
+    there: npt.NDArray[np.int64] | None = None,
 ) -> Representatives | None:
-    """Representatives of a cloud's points, or None where no voxel holds two.
+    """Representatives of a cloud's points, or None where each stands for itself.
 
     Parameters
     ----------
@@ -63,11 +64,36 @@ def represent(
         Coordinates in metres.
     side : float
         Of a voxel, metres; 0 for none.
-    values : iterable of (n,) arrays
-        What else is known of the points; decides between points of the same coordinates.
+    values : iterable of (k,) arrays
+        What else is known of the points that are there; decides between points of the same coordinates.
     rows : (m,) int64, ascending, optional
         Points asked for; the others are represented too, but are nobody's members.
+    there : (k,) int64, ascending, optional
+        Points that are there at all, `rows` among them; all n by default.
     """
+    found = _one_each(xyz if there is None else xyz[there], side, values)
+    if there is None:
+        if found is None:
+            return None
+        kept, by = found
+    else:
+        kept, place = found or (np.arange(len(there)), np.arange(len(there)))
+        by = np.zeros(len(xyz), np.int64)
+        kept, by[there] = there[kept], place
+        rows = there if rows is None else rows
+    if rows is not None:
+        by = by[rows]
+    members = np.argsort(by, kind="stable")
+    start = np.zeros(len(kept) + 1, np.int64)
+    np.cumsum(np.bincount(by, minlength=len(kept)), out=start[1:])
+    wanted = None if rows is None else np.flatnonzero(np.diff(start))
+    return Representatives(kept, wanted, members if rows is None else rows[members], start)
+
+
+def _one_each(
+    xyz: npt.NDArray[np.float64], side: float, values: Iterable[npt.ArrayLike]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
+    """(rows of one point per voxel, place therein of each point's), or None where no voxel holds two."""
     if not side or not len(xyz):
         return None
     keys, _ = cell_keys(xyz, side)
@@ -78,13 +104,6 @@ def represent(
         return None
     chosen = order[first]
     kept = np.sort(chosen)
-    place = np.searchsorted(kept, chosen)
     by = np.empty(len(xyz), np.int64)
-    by[order] = place[np.cumsum(first) - 1]
-    if rows is not None:
-        by = by[rows]
-    members = np.argsort(by, kind="stable")
-    start = np.zeros(len(kept) + 1, np.int64)
-    np.cumsum(np.bincount(by, minlength=len(kept)), out=start[1:])
-    wanted = None if rows is None else np.flatnonzero(np.diff(start))
-    return Representatives(kept, wanted, members if rows is None else rows[members], start)
+    by[order] = np.searchsorted(kept, chosen)[np.cumsum(first) - 1]
+    return kept, by

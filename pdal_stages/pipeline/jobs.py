@@ -15,34 +15,36 @@ from ..base.errors import DimensionError, OptionError, StageError, suggest
 from ..base.las import extra_dimensions
 from ..base.outputs import check_outputs
 from ..classifier.heights import preparation_of
-from ..stages import preparation, registry
+from ..stages import preparation
 from ..stages.accuracy import AccuracyStage
 from ..stages.points import Points
 from . import pdal as pdal_env
 from .filenames import stage_files
 from .lowering import lower_stage
 from .overrides import Override, apply_overrides
+from .run import Pipeline
+from .runtime import wkt_of
+from .writerlimits import LAS_WRITERS
 
 #: Dimensions that `classify` writes beside the input's own.
 WRITTEN = ("HeightAboveGround", "Reliability")
 
 
-def classify_pipeline(
+def classify_job(
     source: str,
     target: str,
     model: str,
-    overrides: Iterable[Override] = (),
+    overrides: Sequence[Override] = (),
     *,
     where: str | None = None,
     dimensions: Sequence[str] = WRITTEN,
-) -> list[dict[str, Any]]:
+) -> Pipeline:
     """Read, give heights if the model wants them, classify, write with everything else kept.
 
     Parameters
     ----------
     source, target, model : str
-    overrides : iterable of Override
-        Those of the run: they may name another model.
+    overrides : sequence of Override
     where : str, optional
     dimensions : sequence of str
         Which of the dimensions made on the way are written beside the input's own, or ``all``.
@@ -59,14 +61,16 @@ def classify_pipeline(
             classifier[option] = True
     loaded = loaded_model(_overridden(classifier, overrides)["model"])
     prepared = loaded.info.get("preparation") or preparation_of(loaded.required_dimensions)
-    stages = [*prepared, classifier]
-    made: dict[str, str] = {}
-    for stage in stages:
-        if stage["type"] in registry.stages():
-            made |= lower_stage(_overridden(stage, overrides)).stage.creates()
-        elif stage["type"] in preparation.OF_PDAL:
-            made["HeightAboveGround"] = "double"
-    return [_reader(source, "input"), *stages, _writer(target, _extra_dims(source, made, dimensions))]
+    pipeline = Pipeline([_reader(source, "input"), *prepared, classifier, _writer(target)], overrides)
+    of_pdal = any(stage["type"] in preparation.OF_PDAL for stage in prepared)
+    made = {"HeightAboveGround": "double"} if of_pdal else {}
+    for ours in pipeline.lowered.ours:
+        made |= ours.stage.creates()
+    keep = _extra_dims(source, made, dimensions)
+    writer = pipeline.lowered.stages[-1]
+    if keep and writer.get("type") in LAS_WRITERS:
+        writer.setdefault("extra_dims", keep)
+    return pipeline
 
 
 def _extra_dims(source: str, made: dict[str, str], wanted: Sequence[str]) -> str:
@@ -236,9 +240,6 @@ def paired(sources: Sequence[str], references: Sequence[str]) -> list[tuple[str,
 
 def _points_of(name: str, dimension: str) -> tuple[Any, str, NDArray]:
     """All points of a file with class codes freed of flag bits, its spatial reference, and the withheld flags."""
-    from .run import Pipeline
-    from .runtime import wkt_of
-
     pipeline = Pipeline([_reader(name, "input")])
     pipeline.execute()
     array: Any = np.concatenate(pipeline.arrays) if pipeline.arrays else np.empty(0)
@@ -282,11 +283,11 @@ def _reader(source: str, tag: str) -> dict[str, Any]:
     return stage
 
 
-def _writer(target: str, extra_dims: str) -> dict[str, Any]:
-    """A writer that keeps the input's header and its dimensions, where it is a LAS file."""
+def _writer(target: str) -> dict[str, Any]:
+    """A writer that keeps the input's header, where it is a LAS file."""
     stage: dict[str, Any] = {"filename": target, "tag": "output"}
     if target.lower().endswith(".copc.laz") and pdal_env.writes_copc():
         stage.update({"type": "writers.copc", "forward": "all"})
     elif Path(target).suffix.lower() in (".las", ".laz"):
         stage.update({"type": "writers.las", "forward": "all"})
-    return {**stage, "extra_dims": extra_dims} if "type" in stage and extra_dims else stage
+    return stage

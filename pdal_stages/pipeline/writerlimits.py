@@ -14,7 +14,8 @@ from ..stages.base import CodeLimit, Stage
 from . import pdal as pdal_env
 from .filenames import reader_files
 
-_LAS_WRITERS = ("writers.las", "writers.copc")
+#: Writers of LAS and what is made of it.
+LAS_WRITERS = ("writers.las", "writers.copc")
 #: A variable-length record of LAS holds 65,535 bytes; an extra dimension's description takes 192.
 _MOST_EXTRA = 65_535 // 192
 
@@ -78,7 +79,7 @@ def writes_las(stage: dict[str, Any]) -> bool:
     """Whether a stage writes LAS."""
     type_name = stage.get("type", "")
     suffix = Path(str(stage.get("filename", ""))).suffix.lower()
-    return type_name in _LAS_WRITERS or (not type_name and suffix in (".las", ".laz"))
+    return type_name in LAS_WRITERS or (not type_name and suffix in (".las", ".laz"))
 
 
 def _code_limit(writer: dict[str, Any], before: list[dict[str, Any]]) -> CodeLimit | None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from ..base.errors import StageError
 from ..base.files import write_whole
 from ..base.version import __version__
+from ..classifier.heights import PREPARATION
 from ..models import STANDARD
 
 #: Classes of the town that the demo tells apart; small ones are left to the reader.
@@ -20,9 +21,6 @@ CLASSES = {
     "6": "Building",
     "14": "Wire - conductor (phase)",
 }
-
-#: What heights are made of, as the shipped model asks for them.
-HEIGHTS = {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]}
 
 
 def run_demo(folder: str | Path, *, size: float = 200.0, density: float = 7.0, seed: int = 1) -> dict:
@@ -80,7 +78,7 @@ def _work(folder: Path, size: float, density: float, seed: int) -> None:
     train = [
         {"type": "readers.las", "filename": str(town)},
         {"type": "filters.range", "limits": f"X[:{middle})"},
-        HEIGHTS,
+        *PREPARATION,
         {
             "type": "writers.classifiermodel",
             "filename": str(folder / "town.model"),
@@ -93,7 +91,7 @@ def _work(folder: Path, size: float, density: float, seed: int) -> None:
         {"type": "readers.las", "filename": str(town)},
         {"type": "filters.range", "limits": f"X[{middle}:]"},
         {"type": "filters.ferry", "dimensions": "Classification=>Reference"},
-        HEIGHTS,
+        *PREPARATION,
         {"type": "filters.modelclassifier", "model": str(folder / "town.model"), "margin": True},
         {
             "type": "filters.accuracy",

@@ -217,12 +217,16 @@ def test_a_log_that_cannot_be_written(cell, tmp_path, cloud):
     path.write_text(json.dumps([str(cloud), {"type": "filters.hag_minima"}, str(tmp_path / "o.las")]))
     it = cell("Outputs", "--log onto a cloud")
     (tmp_path / "other.las").write_bytes(cloud.read_bytes())
-    it.refused(["pipeline", path, "--log", tmp_path / "other.las"], "the log would be added to a LAS or LAZ file")
+    it.refused(
+        ["pipeline", path, "--log", tmp_path / "other.las"], "the log would be added to a LAS or LAZ file"
+    )
     it = cell("Outputs", "--log and the output onto one file")
     done = it.command("pipeline", path, "--log", tmp_path / "o.las")
     assert done.code == 1 and "the log file is the output file too" in done.err
     it.note("error", done.err.removeprefix("pdal-stages: "))
     if os.path.exists("/dev/full"):
         it = cell("Outputs", "--log on a full disk")
-        done = it.runs(["pipeline", path, "--log", "/dev/full"], "the run goes on, and says that its log does not")
+        done = it.runs(
+            ["pipeline", path, "--log", "/dev/full"], "the run goes on, and says that its log does not"
+        )
         assert "the log cannot be written any more: No space left on device" in done.err
