@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import pdal_stages as ps
+from pdal_stages.base.errors import DimensionError
 from pdal_stages.cli import main
 
 QUICK = {"feature_set": "Linearity,HeightRange", "trees": 8, "passes": 1, "dimensions": ""}
@@ -40,10 +41,10 @@ def test_train_takes_folders_and_says_an_honest_score_first(tmp_path, write_las,
     more = [f"--writers.classifiermodel.{k}={v}" for k, v in QUICK.items() if k in ("passes", "dimensions")]
     assert main([*map(str, words), *more]) == 0
     out = capsys.readouterr().out
-    assert out.startswith("blocks held out") and "out of bag" in out.splitlines()[1]
+    assert out.startswith("files held out") and "out of bag" in out.splitlines()[1]
     assert "t0.laz, t1.laz" in out
     found = ps.load_model(tmp_path / "m.model").info["accuracy"]["cross_validation"]
-    assert found["by"] == "blocks" and found["chosen"]["trees"] == 2
+    assert (found["by"], found["folds"]) == ("groups", 2) and found["chosen"]["trees"] == 2
 
 
 @pytest.mark.pdal
@@ -54,6 +55,75 @@ def test_training_by_pipeline_prints_its_score(tmp_path, write_las, capsys):
     (tmp_path / "job.json").write_text(json.dumps(stages))
     assert main(["pipeline", str(tmp_path / "job.json")]) == 0
     assert "blocks held out" in capsys.readouterr().err
+
+
+QUICK_WORDS = [
+    *("--count", "200", "--neighborhoods", "k8", "--trees", "8", "--feature-set", "Linearity,HeightRange"),
+    *("--no-progress", "--writers.classifiermodel.passes=1", "--writers.classifiermodel.dimensions="),
+]
+
+
+def words(tmp_path, *files):
+    return ["train", *map(str, files), "--model", str(tmp_path / "m.model"), *QUICK_WORDS]
+
+
+@pytest.mark.pdal
+def test_each_file_is_held_out_whole(tmp_path, write_las, monkeypatch):
+    """The fold of every sample is that of its file, whatever lies beside it."""
+    from pdal_stages.classifier import crossval
+
+    seen = []
+    search = crossval.search
+
+    def spy(values, label, weight, xy, *rest, fold, **named):
+        seen.append((xy.copy(), fold))
+        return search(values, label, weight, xy, *rest, fold=fold, **named)
+
+    monkeypatch.setattr(crossval, "search", spy)
+    files = [write_las(tmp_path / f"t{n}.laz", scene(n, 70.0 * n), point_format=1) for n in range(7)]
+    assert main(words(tmp_path, *files)) == 0
+    ((xy, fold),) = seen
+    file = np.floor_divide(xy[:, 0], 70.0).astype(int)
+    assert np.array_equal(fold, file % 5) and set(file) == set(range(7))
+
+
+@pytest.mark.pdal
+def test_a_class_in_one_file_alone(tmp_path, write_las, capsys):
+    """Held out with its file it would not be known: blocks instead, and a word on why."""
+    one, other = scene(1), scene(2, 60.0)
+    other["Classification"][other["Classification"] == 6] = 5
+    files = [
+        write_las(tmp_path / name, points, point_format=1)
+        for name, points in (("a.laz", one), ("b.laz", other))
+    ]
+    assert main(words(tmp_path, *files)) == 0
+    out = capsys.readouterr()
+    assert out.out.startswith("blocks held out")
+    assert "blocks are held out, not files: without fold" in out.err
+
+
+@pytest.mark.pdal
+def test_groups_of_a_pipeline_or_of_an_array(tmp_path, write_las, capsys):
+    points = scene(3)
+    points["PointSourceId"] = (points["X"] // 15 + 40).astype("u2")
+    cloud = write_las(tmp_path / "a.laz", points, point_format=1)
+    writer = {"type": "writers.classifiermodel", "filename": str(tmp_path / "m.model"), "neighborhoods": "k8"}
+    writer |= {"count": 100, "groups": "PointSourceId", **QUICK}
+    (tmp_path / "job.json").write_text(json.dumps([str(cloud), writer]))
+    assert main(["pipeline", str(tmp_path / "job.json")]) == 0
+    assert "PointSourceId held out" in capsys.readouterr().err
+    found = ps.load_model(tmp_path / "m.model").info["accuracy"]["cross_validation"]
+    assert (found["groups"], found["folds"], found["gap"]) == ("PointSourceId", 4, 0.0)
+
+    xyz = np.column_stack([points[k] for k in "XYZ"])
+    quick = {**QUICK, "dimensions": (), "passes": 2, "folds": 3}
+    options = ps.TrainingOptions("k8", **quick, count=100, groups="Tile")
+    dimensions = {"Tile": points["PointSourceId"], "HeightAboveGround": points["Z"]}
+    model = ps.train(xyz, points["Classification"], options, dimensions=dimensions, progress=False)
+    assert model.info["accuracy"]["cross_validation"]["folds"] == 3
+    assert model.info["training"]["pass_folds"] == 4 and "Tile" not in model.required_dimensions
+    with pytest.raises(DimensionError, match="Tile"):
+        ps.train([ps.TrainingCloud(xyz, points["Classification"])], options, progress=False)
 
 
 def test_surveys_are_held_out_where_there_are_several(tmp_path):

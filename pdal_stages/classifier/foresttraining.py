@@ -20,8 +20,9 @@ from . import crossval
 from .classes import ClassMap
 from .clouds import Labelled, TrainingCloud, label_classes
 from .context import Context
+from .dimensions import gather, required
 from .featureforest import FeatureForest, Features
-from .folds import Folds
+from .folds import Folds, Groups
 from .forest import Forest
 from .growing import TreeOptions, grow
 from .model import Model
@@ -63,10 +64,11 @@ def feature_plan(options: TrainingOptions) -> FeaturePlan:
 def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model:
     started = time.perf_counter()
     plan = feature_plan(options)
+    groups = _groups(clouds, options)
     labelled = label_classes(clouds, options)
     classes = labelled.classes
-    groups = [f"{cloud.flight} {cloud.copy}" for cloud in clouds] if options.balance else None
-    samples = draw_samples(labelled, len(classes.codes), options.count, options.seed, groups)
+    shares = [f"{cloud.flight} {cloud.copy}" for cloud in clouds] if options.balance else None
+    samples = draw_samples(labelled, len(classes.codes), options.count, options.seed, shares)
     context = Context.parse(options.context)
     must_fit(len(plan.names) + (options.passes > 1) * len(context.tokens) * len(classes.codes), len(samples))
     share = np.bincount(samples.cloud, minlength=len(clouds)).tolist()
@@ -79,10 +81,11 @@ def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: 
         mine = samples.cloud == number
         xy[mine] = cloud.xyz[samples.row[mine], :2]
 
-    flights = np.array([cloud.flight for cloud in clouds])[samples.cloud]
-    chosen, validation = _validate(values, samples, xy, flights, classes, plan, options, progress)
+    chosen, validation = _validate(
+        values, samples, xy, _group_of(samples, groups), classes, plan, options, progress
+    )
     started = time.perf_counter()
-    passes = _Passes(labelled, samples, features, context, chosen, options)
+    passes = _Passes(labelled, samples, features, context, groups, chosen, options)
     passes.grow(values, limits, progress)
     left_out = passes.without_each_survey(values, progress) if options.leave_one_survey_out else None
     timed["trees"] = time.perf_counter() - started
@@ -141,11 +144,35 @@ def _gap(plan: FeaturePlan, options: TrainingOptions) -> float:
     return max((one.reach or 0.0 for one in plan.neighborhoods), default=0.0)
 
 
+def _groups(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> list[Groups]:
+    """What is held out together: each cloud's survey, or its points' `groups`."""
+    name = options.groups
+    if not name:
+        return [cloud.flight for cloud in clouds]
+    if required((name,)) != (name,):
+        raise OptionError(
+            "'groups' must name a dimension other than coordinates and what is made of them", found=name
+        )
+    return [gather((name,), cloud.dimensions, len(cloud.xyz), where=cloud.name)[0][name] for cloud in clouds]
+
+
+def _group_of(samples: Samples, groups: Sequence[Groups]) -> npt.NDArray[Any]:
+    """The survey or group of each sample."""
+    parts = [
+        group if isinstance(group, str) else group[samples.row[samples.cloud == k]]
+        for k, group in enumerate(groups)
+    ]
+    out = np.empty(len(samples), np.result_type(*map(np.asarray, parts)))
+    for number, part in enumerate(parts):
+        out[samples.cloud == number] = part
+    return out
+
+
 def _validate(
     values,
     samples: Samples,
     xy,
-    flights: npt.NDArray[Any],
+    group: npt.NDArray[Any],
     classes: ClassMap,
     plan: FeaturePlan,
     options: TrainingOptions,
@@ -159,11 +186,16 @@ def _validate(
     quick = options.folds is None and not options.searches
     if quick:
         counts = [max(1, math.ceil(counts[-1] * FOLD_TREES))]
-    names, of_flight = np.unique(flights, return_inverse=True)
-    ways = [("surveys", of_flight)] if quick and len(names) > 1 else []
-    for by, flight in [*ways, ("blocks", None)]:
-        folds = min(5, len(names)) if flight is not None else options.folds or 5
-        fold = None if flight is None else (flight.reshape(-1) % folds).astype(np.int16)
+    names, index = np.unique(group, return_inverse=True)
+    by_group = len(names) > 1 and (quick or bool(options.groups))
+    ways = ["groups" if options.groups else "surveys"] if by_group else []
+    asked = {"groups": options.groups} if options.groups else {}
+    for by in [*ways, "blocks"]:
+        folds = options.folds or 5
+        fold = None
+        if by != "blocks":
+            folds = min(folds, len(names))
+            fold = (index.reshape(-1) % folds).astype(np.int16)
         try:
             rows = crossval.search(
                 values,
@@ -181,13 +213,16 @@ def _validate(
                 threads=options.threads,
                 progress=progress,
             )
-        except OptionError:  # too little ground, or a class in one place
-            if not quick:
+        except OptionError as error:  # too little ground, or a class in one place
+            if not quick and by == "blocks":
                 raise
+            if options.groups and by == "groups":
+                asked["instead"] = f"{error.what}: {error.found}"
             continue
         chosen = crossval.choose(rows)
         return as_given if quick else chosen, {
             "by": by,
+            **asked,
             "folds": folds,
             "block_size": float(options.block_size),
             "gap": _gap(plan, options),
@@ -206,6 +241,7 @@ class _Passes:
         samples: Samples,
         features: Features,
         context: Context,
+        groups: Sequence[Groups],
         chosen: Mapping[str, Any],
         options: TrainingOptions,
     ) -> None:
@@ -216,8 +252,9 @@ class _Passes:
         self.scores: list[dict[str, Any]] = []
         self.notes: dict[str, Any] = {}
         self.flights = [cloud.flight for cloud in self.clouds]
+        self.groups = groups
         if options.passes > 1:
-            self.folds = Folds.of(labelled, self.flights, options.pass_folds)
+            self.folds = Folds.of(labelled, self.groups, options.pass_folds)
             self.notes["pass_folds"] = self.folds.count
 
     def grow(
@@ -286,7 +323,8 @@ class _Passes:
         fold = np.empty(len(self.samples), np.int16)
         for k, cloud in enumerate(self.clouds):
             mine = self.samples.cloud == k
-            fold[mine] = self.folds.points(cloud.xyz[self.samples.row[mine]], self.flights[k])
+            rows, group = self.samples.row[mine], self.groups[k]
+            fold[mine] = self.folds.points(cloud.xyz[rows], group if isinstance(group, str) else group[rows])
         with Progress(
             trees * self.folds.count,
             f"pass {number} without each fold",
@@ -317,7 +355,7 @@ class _Passes:
                 at, rows = self.samples.of_cloud(number)
                 if not len(at):
                     continue
-                fold = self.folds.points(cloud.xyz, self.flights[number])
+                fold = self.folds.points(cloud.xyz, self.groups[number])
                 passes = [
                     FoldForests(self.features, self.context if k else None, forests, fold)
                     for k, forests in enumerate(held_out)

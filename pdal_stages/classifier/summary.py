@@ -8,6 +8,8 @@ from typing import Any
 from ..base.errors import ModelError, OptionError
 from .algorithms import Column
 
+#: The dimension in which the command `train` numbers its files.
+FILE_NUMBER = "FileNumber"
 GROUPINGS = ("column", "feature", "group", "neighborhood", "dimension")
 
 
@@ -116,8 +118,7 @@ def scores(info: Mapping[str, Any], held_out: dict[str, Any] | None = None) -> l
             f"mean F1 {_percent(left_out['mean_f1'])}"
         )
     crossed = info["accuracy"]["cross_validation"]
-    by = crossed.get("by", "blocks") if crossed else "blocks"
-    rows = [(f"{by} held out", crossed and crossed["chosen"])]
+    rows = [(held_out_by(crossed), crossed and crossed["chosen"])]
     for number, one in enumerate(info["passes"], 1):
         rows.append((f"out of bag{f' {number}' if len(info['passes']) > 1 else ''}", one["out_of_bag"]))
     for label, row in rows:
@@ -130,6 +131,17 @@ def scores(info: Mapping[str, Any], held_out: dict[str, Any] | None = None) -> l
         lines.append("(classes weigh the same; out of bag is flattered by neighboring samples)")
         lines.append("")
     return lines
+
+
+def held_out_by(crossed: Mapping[str, Any] | None) -> str:
+    """What the cross-validation held out: ``blocks held out``."""
+    by = crossed.get("by", "blocks") if crossed else "blocks"
+    return f"{groups_word(crossed['groups']) if by == 'groups' and crossed else by} held out"
+
+
+def groups_word(dimension: str) -> str:
+    """What the values of a dimension of groups stand for."""
+    return "files" if dimension == FILE_NUMBER else dimension
 
 
 def _percent(value: float | None) -> str:

@@ -79,6 +79,9 @@ class TrainingOptions:
     folds : int, optional
         Folds of the spatial cross-validation; 0: none (5 where there is a grid to search). None: 5 with a quarter of the
         trees, by survey where there are several, so that every model has an honest score; it chooses nothing then.
+    groups : str
+        Dimension whose points of one value are held out together, in cross-validation and for the passes after the first:
+        a flight line, a file. Where that takes all points of a class away, parts of the ground are held out instead.
     block_size : float
         Side of the cross-validation's blocks in metres.
     gap : float or None
@@ -92,7 +95,7 @@ class TrainingOptions:
     context : sequence of str
         What of the surroundings is read; see :class:`pdal_stages.classifier.context.Context`.
     pass_folds : int
-        Parts of the training ground that are held out in turn for that: whole surveys where there are three or
+        Parts of the training ground that are held out in turn for that: whole surveys or `groups` where there are three or
         more, else every so many-th strip of 10 m.
     algorithm : {"random_forest", "alsnet"}
         A forest on features, or a network on the points themselves [WM19], which uses `dimensions`, `classes`,
@@ -125,6 +128,7 @@ class TrainingOptions:
     ignore: Sequence[int] = NOISE
     scale: bool = True
     folds: int | None = None
+    groups: str = ""
     block_size: float = 25.0
     gap: float | None = None
     leave_one_survey_out: bool = False
@@ -150,6 +154,8 @@ class TrainingOptions:
         _values("max_depth", self.max_depth, 1, 10_000, none=True)
         if self.folds is not None:
             set_(self, "folds", checks.whole("'folds'", self.folds, 0, 1000))
+        if not isinstance(self.groups, str):
+            raise OptionError("'groups' must be the name of a dimension", found=repr(self.groups)[:60])
         if self.folds == 1:
             raise OptionError("'folds' must be 0 or at least 2", found=1)
         checks.one_of("'strategy'", self.strategy, STRATEGIES)

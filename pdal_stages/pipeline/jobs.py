@@ -15,6 +15,7 @@ from ..base.errors import DimensionError, OptionError, StageError, suggest
 from ..base.las import extra_dimensions
 from ..base.outputs import check_outputs
 from ..classifier.heights import preparation_of
+from ..classifier.summary import FILE_NUMBER
 from ..stages import preparation
 from ..stages.accuracy import AccuracyStage
 from ..stages.points import Points
@@ -23,11 +24,21 @@ from .filenames import stage_files
 from .lowering import lower_stage
 from .overrides import Override, apply_overrides
 from .run import Pipeline
-from .runtime import wkt_of
+from .runtime import python_filter, wkt_of
 from .writerlimits import LAS_WRITERS
 
 #: Dimensions that `classify` writes beside the input's own.
 WRITTEN = ("HeightAboveGround", "Reliability")
+#: PDAL calls this for the points of one reader after the other.
+_NUMBER = f"""\
+import numpy as np
+number = 0
+def stage(ins, outs):
+    global number
+    number += 1
+    outs["{FILE_NUMBER}"] = np.full(len(ins["X"]), number, np.uint32)
+    return True
+"""
 
 
 def classify_job(
@@ -119,13 +130,17 @@ def outputs_of(sources: Sequence[str], target: str) -> list[str]:
 def train_pipeline(
     sources: Iterable[str], model: str, overrides: Iterable[Override] = (), **options: Any
 ) -> list[dict[str, Any]]:
-    """Read labelled files, give heights if wanted, train, write the model."""
+    """Read labelled files, give heights if wanted, train, write the model; of several files the score is by file."""
     from ..stages.classifiermodel import ClassifierModel
 
     writer = {"type": "writers.classifiermodel", "filename": model, **options}
     stage = cast(ClassifierModel, lower_stage(_overridden(writer, overrides)).stage)
     heights = preparation_of(stage.wished)
-    return [*(_reader(name, f"input{i}") for i, name in enumerate(sources, 1)), *heights, writer]
+    readers = [_reader(name, f"input{i}") for i, name in enumerate(sources, 1)]
+    if len(readers) == 1 or stage.groups or stage.survey or stage.algorithm != "random_forest":
+        return [*readers, *heights, writer]
+    number = python_filter("pdal_stages_file_number", _NUMBER, {}, {FILE_NUMBER: "uint32_t"})
+    return [*readers, number, *heights, {**writer, "groups": FILE_NUMBER}]
 
 
 def _overridden(stage: dict[str, Any], overrides: Iterable[Override]) -> dict[str, Any]:

@@ -173,6 +173,10 @@ def python_object(stages: list[dict[str, Any]], type_name: str, given: dict[str,
             whole |= self
             return whole
 
+        def __or__(self, other):
+            known = isinstance(other, pdal.Pipeline | pdal.pipeline.Stage)
+            return super().__or__(other) if known else NotImplemented
+
         def __copy__(self):
             return self.pipeline(loglevel=self.loglevel)
 

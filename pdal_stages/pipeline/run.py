@@ -113,12 +113,17 @@ class Pipeline:
         return [*readers_files(stages), *named_files(stages), *named, *filter(None, [self.source.name])]
 
     def __or__(self, other: Any) -> Pipeline:
-        """The pipeline with more stages: objects of python-pdal, ours or PDAL's."""
-        stages = pdal_env.stages_of(other)
+        """The pipeline with more stages: objects of python-pdal, ours or PDAL's, or another pipeline's."""
+        stages = other.source.stages if isinstance(other, Pipeline) else pdal_env.stages_of(other)
         if stages is None:
             return NotImplemented
         lines = [*self.source.lines, *(0 for _ in stages)]
         return Pipeline(PipelineSource([*self.source.stages, *stages], lines, self.source.name))
+
+    def __ror__(self, other: Any) -> Pipeline:
+        """Stages before the pipeline: objects of ours; PDAL's own raise before they ask."""
+        stages = pdal_env.stages_of(other)
+        return NotImplemented if stages is None else Pipeline(stages) | self
 
     def execute(self, *, arrays: bool = True, loglevel: int = logging.WARNING) -> int:
         """Run the pipeline in this process; the number of points that came out.

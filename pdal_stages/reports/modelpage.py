@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from ..accuracy.text import percent
 from ..base import checks
 from ..base.files import write_whole
+from ..classifier.summary import held_out_by
 from .charts import Chart
 from .page import render
 
@@ -66,7 +67,7 @@ def _scores(d: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     if isinstance(held, dict) and held:
         row, remark = held, "on ground held out, which chose the epoch"
     elif crossed:
-        row, remark = crossed["chosen"], "on blocks held out; classes weigh the same"
+        row, remark = crossed["chosen"], f"{held_out_by(crossed)}; classes weigh the same"
     elif d["passes"][-1]["out_of_bag"]:
         row, remark = d["passes"][-1]["out_of_bag"], "out of bag, flattered by neighboring samples"
     else:

@@ -152,8 +152,14 @@ class ClassifierModel(Stage):
     folds: int | None = option(
         "integer",
         None,
-        "Folds of cross-validation over spatial blocks; 0 for none; default: 5, with a quarter of the trees",
+        "Folds of cross-validation over groups or spatial blocks; 0 for none; default: 5, with a quarter of the trees",
         minimum=0,
+    )
+    groups: str = option(
+        "string",
+        "",
+        "Dimension whose points of one value are held out together, such as the number of a tile or flight, so that the "
+        "score is of tiles or flights that the model has not seen",
     )
     block_size: float = option("number", 25.0, "Side of these blocks", minimum=0, exclusive=True, unit="m")
     survey: str = option(
@@ -218,8 +224,10 @@ Samples `count` points of each class, spread over space; computes features for t
 percentiles and histogram thresholds; grows a Random Forest; writes [one model file](../model-file.md). A class with
 fewer points has them several times, and the counts are in the file. Lists in `trees`, `max_depth` and
 `min_samples_leaf` are searched by cross-validation over spatial blocks, so that neighbors never stand on both
-sides. With `passes` 2, a second forest also reads the first one's [probabilities all around a
-point](../model-file.md#context), and is trained on what they are on ground the first has not seen. With
+sides. Where there is nothing to search, a quarter of the trees is cross-validated all the same, for the score alone
+(`folds` 0: not). With `groups`, points of one tile or flight are held out together instead of blocks; `pdal-stages
+train` holds out each of several files. With `passes` 2, a second forest also reads the first one's [probabilities all
+around a point](../model-file.md#context), and is trained on what they are on ground the first has not seen. With
 `"algorithm": "alsnet"` a network is trained instead, from `dimensions`, `classes`, `strategy`, `seed` and the options
 in `alsnet` ([alsNet](../alsnet.md)). Points of several readers are merged first. `label` names the dimension that
 holds the classes.
@@ -302,7 +310,7 @@ holds the classes.
         return found
 
     def reads(self) -> list[str]:
-        own = [self.survey] if self.survey else []
+        own = [name for name in (self.survey, self.groups) if name]
         return [self.label, *own, *required(self.training.inputs)]
 
     def run(self, points: Points) -> dict[str, NDArray]:
@@ -315,7 +323,10 @@ holds the classes.
         cloud = TrainingCloud(
             xyz=points.xyz,
             labels=points.codes_of(self.label),
-            dimensions={name: points.dimension(name) for name in required(training.inputs)}
+            dimensions={
+                name: points.dimension(name)
+                for name in required((*training.inputs, *filter(None, [self.groups])))
+            }
             | {name: points.arrays[name] for name in welcome(training.inputs) if name in points.arrays},
             name=", ".join(Path(name).name for name in self.files[:_NAMED])
             + ", ..." * (len(self.files) > _NAMED)
@@ -331,6 +342,11 @@ holds the classes.
         points.report.update({"model": self.filename, **_brief(model.info), "seconds": model.seconds})
         if scores := summary.scores(model.info):
             points.report["score"] = scores[0]
+        crossed = model.info["accuracy"]["cross_validation"] or {}
+        if "instead" in crossed:
+            points.report["note"] = (
+                f"blocks are held out, not {summary.groups_word(self.groups)}: {crossed['instead']}"
+            )
         if self.algorithm == "alsnet":  # with the curve
             points.report["training"] = _plain(model.info["training"])
         return {}
