@@ -231,7 +231,7 @@ class Model:
                 decided = None if decided is None else decided.taken(place)
                 variance = None if variance is None else variance[place]
             outcome.write(at, decided, variance)
-            return len(at)
+            return 0 if few is None else len(at)
 
         question = Question(
             xyz, dimensions, asked, how.threads, how.memory_mb, progress if few is None else None
