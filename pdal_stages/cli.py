@@ -18,7 +18,7 @@ from .base import kinds
 from .base.errors import StageError
 from .base.outputs import Output, check_outputs
 from .base.plain import PlainStream
-from .base.runlog import RunLog
+from .base.runlog import LoggedStream, RunLog
 from .base.version import __version__
 from .pipeline.overrides import parse_overrides
 
@@ -64,7 +64,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             os.environ["PDAL_STAGES_PROGRESS"] = "1" if options.progress else "0"
         if getattr(options, "log", None):
             check_outputs([Output(options.log, "log", "")], [])
-            log = sys.stderr = RunLog(options.log, sys.stderr, arguments)  # type: ignore[assignment]
+            log = RunLog(options.log, arguments, sys.stderr)
+            sys.stdout, sys.stderr = LoggedStream(sys.stdout, log), LoggedStream(sys.stderr, log)  # type: ignore[assignment]
         code = int(options.run(options) or 0)
         sys.stdout.flush()  # a full disk or a closed pipe shows here, not at exit
         return code
@@ -151,7 +152,9 @@ def _parser() -> argparse.ArgumentParser:
         )
         command.set_defaults(run=run, takes_overrides=overrides)
         if name in _LOGGED:
-            command.add_argument("--log", metavar="FILE", help="Add what the run says to a log file")
+            command.add_argument(
+                "--log", metavar="FILE", help="Add all that the run and its workers print to a log file"
+            )
             command.add_argument(
                 "--progress", action=argparse.BooleanOptionalAction, default=None, help="Show progress"
             )

@@ -75,6 +75,43 @@ def test_a_log_file(cloud, tmp_path, run):
     ]
 
 
+def test_the_log_hears_the_workers_of_tiles_and_the_summary(cloud, tmp_path, run):
+    """What libraries print in the workers' processes is in the log, and what goes to standard output."""
+    says = "import os\ndef f(ins, outs):\n    os.write(2, b'said by a worker\\n')\n    return True\n"
+    script = {"type": "filters.python", "source": says, "function": "f", "module": "m"}
+    log, stages = tmp_path / "run.log", [cloud, {"type": "filters.hag_minima"}, script, tmp_path / "o.las"]
+    assert run(stages, "--log", log, "--tile", 100, "--workers", 2, "--buffer", 0)[0] == 0
+    lines = log.read_text().splitlines()
+    assert any(line.endswith("said by a worker") for line in lines)
+    assert any(" tiles done; " in line or " tile done; " in line for line in lines)
+    assert all(line[:2] == "20" and line[10] == " " for line in lines) and "exit code 0" in lines[-1]
+
+
+def test_a_log_keeps_lines_of_threads_apart(tmp_path):
+    from io import StringIO
+    from threading import Thread
+
+    from pdal_stages.base.runlog import LoggedStream, RunLog
+
+    shown = StringIO()
+    log = RunLog(str(tmp_path / "l.log"), ["x"], shown)
+    stream = LoggedStream(shown, log)
+
+    def say(word):
+        for _ in range(200):
+            stream.write(word)
+            stream.write(f" {word}\n")
+
+    threads = [Thread(target=say, args=(word,)) for word in ("one", "two", "three")]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    log.end(0)
+    said = [line.split(" ", 2)[2] for line in (tmp_path / "l.log").read_text().splitlines()[1:-1]]
+    assert sorted(said) == sorted(200 * ["one one", "two two", "three three"])
+
+
 def test_metadata_names_the_output(cloud, tmp_path, run):
     out = tmp_path / "o.las"
     writer = {"type": "writers.las", "filename": str(out)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import shlex
+import threading
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -14,15 +15,15 @@ from .version import __version__
 
 
 class RunLog:
-    """A stream that writes to another and, each line with its time, to the end of a log file.
+    """A file to whose end go lines, each with its time.
 
     Parameters
     ----------
     path : str
-    stream : text stream
-        Where what is said goes as well.
     arguments : sequence of str
         The command's, for the first line.
+    stderr : text stream
+        Hears when the log cannot be written any more.
 
     Raises
     ------
@@ -30,8 +31,8 @@ class RunLog:
         The file cannot be written, or is one of another kind.
     """
 
-    def __init__(self, path: str, stream: Any, arguments: Sequence[str]) -> None:
-        self.stream = stream
+    def __init__(self, path: str, arguments: Sequence[str], stderr: Any) -> None:
+        self._stderr, self._one = stderr, threading.Lock()
         if kind := kind_of(path):
             raise StageError(f"the log would be added to {kind}", where="--log", found=path)
         try:
@@ -41,33 +42,42 @@ class RunLog:
                 "the log cannot be written", where="--log", found=f"{path}: {error.strerror}"
             ) from None
         self._started = time.monotonic()
-        self._line = ""
-        self._add(f"pdal-stages {__version__}: {shlex.join(arguments)}")
-
-    def write(self, text: str) -> int:
-        self.stream.write(text)
-        *lines, self._line = (self._line + text).split("\n")
-        for line in lines:
-            self._add(line)
-        return len(text)
+        self.add(f"pdal-stages {__version__}: {shlex.join(arguments)}")
 
     def end(self, code: int) -> None:
         """Write the exit code and the time that was needed, and close the file."""
-        self._add(f"exit code {code} after {time.monotonic() - self._started:.1f} s")
+        self.add(f"exit code {code} after {time.monotonic() - self._started:.1f} s")
         if self._file is not None:
             self._file.close()
 
-    def _add(self, line: str) -> None:
-        if self._file is None:
-            return
-        try:
-            self._file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line.strip()}\n")
-            self._file.flush()
-        except OSError as error:  # the run goes on without its log
-            with contextlib.suppress(OSError):
-                self._file.close()
-            self._file = None
-            self.stream.write(f"pdal-stages: the log cannot be written any more: {error.strerror}\n")
+    def add(self, line: str) -> None:
+        """Write a line, from any thread."""
+        with self._one:
+            if self._file is None:
+                return
+            try:
+                self._file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line.strip()}\n")
+                self._file.flush()
+            except OSError as error:  # the run goes on without its log
+                with contextlib.suppress(OSError):
+                    self._file.close()
+                self._file = None
+                self._stderr.write(f"pdal-stages: the log cannot be written any more: {error.strerror}\n")
+
+
+class LoggedStream:
+    """A text stream whose lines go to a log as well."""
+
+    def __init__(self, stream: Any, log: RunLog) -> None:
+        self.stream, self.log = stream, log
+        self._begun = threading.local()  # a line may come in parts; those of threads are not mixed
+
+    def write(self, text: str) -> int:
+        self.stream.write(text)
+        *lines, self._begun.line = (getattr(self._begun, "line", "") + text).split("\n")
+        for line in lines:
+            self.log.add(line)
+        return len(text)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.stream, name)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import StageError
+from ..base.runlog import LoggedStream
 from .work import Answer, Task
 
 _KILLED = "it killed its worker each time it was tried: too little memory, or a crash in a library"
@@ -95,10 +96,13 @@ class _Worker:
             _command(),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE if isinstance(sys.stderr, LoggedStream) else None,
             env=_environment(threads),
             start_new_session=True,  # Ctrl-C is for this process, which ends the others
         )
         threading.Thread(target=self._listen, daemon=True).start()
+        self._hearer = threading.Thread(target=self._hear, args=(sys.stderr,), daemon=True)
+        self._hearer.start()
 
     def give(self, task: Task) -> None:
         """Send a task; where the process has ended, :meth:`_listen` tells."""
@@ -116,6 +120,11 @@ class _Worker:
                 self._answers.put((self, pickle.load(self._process.stdout)))
         self._answers.put((self, None))
 
+    def _hear(self, stream: Any) -> None:
+        """Say what the process says, where a log hears it."""
+        for line in self._process.stderr or ():
+            stream.write(line.decode("utf-8", "backslashreplace"))
+
     def status(self) -> int:
         """How it ended."""
         return self._process.wait()
@@ -124,6 +133,7 @@ class _Worker:
         """End the process, whatever it does."""
         self._process.kill()
         self._process.wait()
+        self._hearer.join(1.0)
         for pipe in (self._process.stdin, self._process.stdout):
             with contextlib.suppress(OSError):
                 pipe.close()  # type: ignore[union-attr]
