@@ -233,31 +233,13 @@ def test_folds_are_strips_or_whole_surveys():
         some = random.permutation(len(xyz))[:50]  # a thinned copy: the same ground in the same fold
         assert np.array_equal(folds.points(xyz[some], "x"), mine[some])
     folds = Folds.of(clouds, ("x", "y", "z"), 5)
-    assert folds.count == 3 and sorted(folds.of_group.values()) == [0, 1, 2]
-    assert (folds.points(clouds[1][0], "y") == folds.of_group["y"]).all()
-    assert Folds.of(clouds, ("x", "y", "x"), 5).of_group is None
+    assert folds.count == 3 and sorted(folds.surveys.values()) == [0, 1, 2]
+    assert (folds.points(clouds[1][0], "y") == folds.surveys["y"]).all()
+    assert Folds.of(clouds, ("x", "y", "x"), 5).surveys is None
     small = [(clouds[0][0] / 20, clouds[0][1])]
     assert 0.01 < Folds.of(small, ("x",), 5).width < 10
     with pytest.raises(OptionError, match="too small"):
         Folds.of([(np.ones((9, 3)), np.ones(9, int))], ("x",), 5)
-
-
-def test_folds_are_whole_groups_of_points():
-    random = np.random.default_rng(1)
-    xyz, position = random.random((900, 3)) * 90, random.integers(-1, 3, 900)
-    group = random.integers(10, 17, 900).astype(float)
-    both = [(xyz[:400], position[:400]), (xyz[400:], position[400:])]  # a group may lie in two clouds
-    folds = Folds.of(both, (group[:400], group[400:]), 5)
-    assert folds.count == 5 and set(folds.of_group) == set(range(10, 17))
-    found = np.concatenate([folds.points(xyz[:400], group[:400]), folds.points(xyz[400:], group[400:])])
-    assert all(len(set(found[group == name])) == 1 for name in range(10, 17)) and set(found) == set(range(5))
-    used = np.bincount(found[position >= 0])
-    assert used.max() < 2 * used.min()  # seven groups: two of the five folds have two
-    few = np.minimum(group, 11)  # two groups are not enough
-    assert Folds.of(both, (few[:400], few[400:]), 5).of_group is None
-    alone = np.where(group == 12, 3, np.minimum(position, 2))  # a class in one group alone
-    with_alone = [(xyz[:400], alone[:400]), (xyz[400:], alone[400:])]
-    assert Folds.of(with_alone, (group[:400], group[400:]), 5).of_group is None
 
 
 def test_options():

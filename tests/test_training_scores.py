@@ -121,7 +121,11 @@ def test_groups_of_a_pipeline_or_of_an_array(tmp_path, write_las, capsys):
     dimensions = {"Tile": points["PointSourceId"], "HeightAboveGround": points["Z"]}
     model = ps.train(xyz, points["Classification"], options, dimensions=dimensions, progress=False)
     assert model.info["accuracy"]["cross_validation"]["folds"] == 3
-    assert model.info["training"]["pass_folds"] == 4 and "Tile" not in model.required_dimensions
+    assert "Tile" not in model.required_dimensions
+    without = ps.TrainingOptions("k8", **quick, count=100)
+    same = ps.train(xyz, points["Classification"], without, dimensions=dimensions, progress=False)
+    for one, other in zip(model.passes, same.passes, strict=True):  # the score alone is another
+        assert all(np.array_equal(a, other.arrays()[key]) for key, a in one.arrays().items())
     with pytest.raises(DimensionError, match="Tile"):
         ps.train([ps.TrainingCloud(xyz, points["Classification"])], options, progress=False)
 

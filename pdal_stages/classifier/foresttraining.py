@@ -22,7 +22,7 @@ from .clouds import Labelled, TrainingCloud, label_classes
 from .context import Context
 from .dimensions import gather, required
 from .featureforest import FeatureForest, Features
-from .folds import Folds, Groups
+from .folds import Folds
 from .forest import Forest
 from .growing import TreeOptions, grow
 from .model import Model
@@ -64,7 +64,7 @@ def feature_plan(options: TrainingOptions) -> FeaturePlan:
 def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model:
     started = time.perf_counter()
     plan = feature_plan(options)
-    groups = _groups(clouds, options)
+    groups = _groups(clouds, options)  # before any work: a dimension may be missing
     labelled = label_classes(clouds, options)
     classes = labelled.classes
     shares = [f"{cloud.flight} {cloud.copy}" for cloud in clouds] if options.balance else None
@@ -85,7 +85,7 @@ def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: 
         values, samples, xy, _group_of(samples, groups), classes, plan, options, progress
     )
     started = time.perf_counter()
-    passes = _Passes(labelled, samples, features, context, groups, chosen, options)
+    passes = _Passes(labelled, samples, features, context, chosen, options)
     passes.grow(values, limits, progress)
     left_out = passes.without_each_survey(values, progress) if options.leave_one_survey_out else None
     timed["trees"] = time.perf_counter() - started
@@ -144,11 +144,11 @@ def _gap(plan: FeaturePlan, options: TrainingOptions) -> float:
     return max((one.reach or 0.0 for one in plan.neighborhoods), default=0.0)
 
 
-def _groups(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> list[Groups]:
-    """What is held out together: each cloud's survey, or its points' `groups`."""
+def _groups(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> list[npt.NDArray[Any]]:
+    """What a cloud's points are held out with: their `groups`, or all of them with the survey."""
     name = options.groups
     if not name:
-        return [cloud.flight for cloud in clouds]
+        return [np.broadcast_to(np.array(cloud.flight), len(cloud.xyz)) for cloud in clouds]
     if required((name,)) != (name,):
         raise OptionError(
             "'groups' must name a dimension other than coordinates and what is made of them", found=name
@@ -156,15 +156,12 @@ def _groups(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> list[G
     return [gather((name,), cloud.dimensions, len(cloud.xyz), where=cloud.name)[0][name] for cloud in clouds]
 
 
-def _group_of(samples: Samples, groups: Sequence[Groups]) -> npt.NDArray[Any]:
-    """The survey or group of each sample."""
-    parts = [
-        group if isinstance(group, str) else group[samples.row[samples.cloud == k]]
-        for k, group in enumerate(groups)
-    ]
-    out = np.empty(len(samples), np.result_type(*map(np.asarray, parts)))
-    for number, part in enumerate(parts):
-        out[samples.cloud == number] = part
+def _group_of(samples: Samples, groups: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
+    """The group of each sample."""
+    out = np.empty(len(samples), np.concatenate([group[:0] for group in groups]).dtype)
+    for number, group in enumerate(groups):
+        mine = samples.cloud == number
+        out[mine] = group[samples.row[mine]]
     return out
 
 
@@ -241,7 +238,6 @@ class _Passes:
         samples: Samples,
         features: Features,
         context: Context,
-        groups: Sequence[Groups],
         chosen: Mapping[str, Any],
         options: TrainingOptions,
     ) -> None:
@@ -252,9 +248,8 @@ class _Passes:
         self.scores: list[dict[str, Any]] = []
         self.notes: dict[str, Any] = {}
         self.flights = [cloud.flight for cloud in self.clouds]
-        self.groups = groups
         if options.passes > 1:
-            self.folds = Folds.of(labelled, self.groups, options.pass_folds)
+            self.folds = Folds.of(labelled, self.flights, options.pass_folds)
             self.notes["pass_folds"] = self.folds.count
 
     def grow(
@@ -323,8 +318,7 @@ class _Passes:
         fold = np.empty(len(self.samples), np.int16)
         for k, cloud in enumerate(self.clouds):
             mine = self.samples.cloud == k
-            rows, group = self.samples.row[mine], self.groups[k]
-            fold[mine] = self.folds.points(cloud.xyz[rows], group if isinstance(group, str) else group[rows])
+            fold[mine] = self.folds.points(cloud.xyz[self.samples.row[mine]], self.flights[k])
         with Progress(
             trees * self.folds.count,
             f"pass {number} without each fold",
@@ -355,7 +349,7 @@ class _Passes:
                 at, rows = self.samples.of_cloud(number)
                 if not len(at):
                     continue
-                fold = self.folds.points(cloud.xyz, self.groups[number])
+                fold = self.folds.points(cloud.xyz, self.flights[number])
                 passes = [
                     FoldForests(self.features, self.context if k else None, forests, fold)
                     for k, forests in enumerate(held_out)

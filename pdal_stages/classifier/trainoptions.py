@@ -80,8 +80,9 @@ class TrainingOptions:
         Folds of the spatial cross-validation; 0: none (5 where there is a grid to search). None: 5 with a quarter of the
         trees, by survey where there are several, so that every model has an honest score; it chooses nothing then.
     groups : str
-        Dimension whose points of one value are held out together, in cross-validation and for the passes after the first:
-        a flight line, a file. Where that takes all points of a class away, parts of the ground are held out instead.
+        Dimension whose points of one value are held out together in cross-validation: a tile, a file. Where that takes all
+        samples of a class away, blocks of ground are held out instead. It changes the score alone, unless there is a grid
+        to search.
     block_size : float
         Side of the cross-validation's blocks in metres.
     gap : float or None
@@ -95,7 +96,7 @@ class TrainingOptions:
     context : sequence of str
         What of the surroundings is read; see :class:`pdal_stages.classifier.context.Context`.
     pass_folds : int
-        Parts of the training ground that are held out in turn for that: whole surveys or `groups` where there are three or
+        Parts of the training ground that are held out in turn for that: whole surveys where there are three or
         more, else every so many-th strip of 10 m.
     algorithm : {"random_forest", "alsnet"}
         A forest on features, or a network on the points themselves [WM19], which uses `dimensions`, `classes`,
