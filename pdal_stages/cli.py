@@ -518,4 +518,6 @@ def _warmup(options: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from pdal_stages import cli  # workers know its functions by this name
+
+    sys.exit(cli.main())

@@ -81,3 +81,14 @@ def _with(model, curve):
     info["training"]["curve"] = curve
     object.__setattr__(other, "info", info)
     return other
+
+
+def test_what_was_held_out(searched):
+    for held, words in (
+        ({"by": "surveys"}, "3 folds of whole surveys with"),
+        ({"by": "groups", "groups": "FileNumber"}, "3 folds of whole files with"),
+    ):
+        other = _with(searched, None)
+        other.info["accuracy"]["cross_validation"] |= held
+        shown = read(model_page(other, "x"))
+        assert words in shown and words.split()[-2] + " held out" in shown

@@ -56,6 +56,7 @@ def model_page(model: Model, name: str = "") -> str:
         prior_factors=priors,
         curves=_curves(described["training"].get("curve")),
         crossed=described["accuracy"]["cross_validation"],
+        held_out=held_out_by(described["accuracy"]["cross_validation"]).removesuffix(" held out"),
         settings=_settings(described),
     )
 

@@ -83,7 +83,9 @@ def _figures(run: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     size, unit = (f"{points:,}", "") if points < 10_000_000 else (f"{points / 1e6:,.1f}", "million")
     out = [("Tiles", tiles, "", rest), ("Points", size, unit, "; ".join(remarks))]
     if "seconds" in run:
-        out.append(("Time", duration(run["seconds"]), "", f"{run['workers']} workers"))
+        out.append(
+            ("Time", duration(run["seconds"]), "", f"{run['workers']} worker{'s' * (run['workers'] != 1)}")
+        )
         out.append(("Speed", f"{run['points_per_second']:,.0f}", "points/s", ""))
         out.append(("Most memory of a worker", f"{run['peak_mb_of_a_worker']:,.0f}", "MB", ""))
     return out

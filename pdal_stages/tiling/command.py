@@ -113,7 +113,7 @@ def run_command(options: argparse.Namespace, source: str | Path) -> int:
     if interrupted:
         print(
             f"pdal-stages: interrupted; nothing half-written was left. Run it again with --resume for the rest of the "
-            f"{len(run.tiles)} tiles",
+            f"{_counted(len(run.tiles), 'tile')}",
             file=sys.stderr,
         )
         return 130
@@ -145,7 +145,7 @@ def _terminated_as_interrupted():
 def _print(run: TiledRun) -> None:
     s = run.summary
     states = s["states"]
-    line = f"{states['done']} tile{'' if states['done'] == 1 else 's'} done"
+    line = f"{_counted(states['done'], 'tile')} done"
     if states["kept"]:
         line += f", {states['kept']} kept from an earlier run"
     if states["failed"]:
@@ -166,17 +166,20 @@ def _print(run: TiledRun) -> None:
 
 def _print_dry(run: TiledRun) -> None:
     s = run.summary
-    print(f"{len(run.tiles)} tiles of {s['tile']:g}, each read with {s['buffer_metres']:g} m of surroundings")
-    print(f"{_inputs(s['inputs'])}, {s['points']:,} points; one output for each {s['per']}")
+    print(
+        f"{_counted(len(run.tiles), 'tile')} of {s['tile']:g}, each read with {s['buffer_metres']:g} m of surroundings"
+    )
+    print(f"{_counted(s['inputs'], 'input')}, {s['points']:,} points; one output for each {s['per']}")
     print(
         f"about {s['points_read_by_a_tile']:,} points read for a tile, {s['points_of_largest_tile']:,} its own at most"
     )
     memory, rate = s["memory_mb_of_a_worker"], s["assumed_points_per_core_second"]
-    workers = f"each of {s['workers']} workers" if s["workers"] else "this process"
-    print(f"up to {memory:,.0f} MB for {workers} with {s['threads_per_worker']} threads")
-    print(f"roughly {s['core_hours']:.2f} core hours at {rate:,} points/s and core; the model decides")
+    workers = {0: "this process", 1: "the worker"}.get(s["workers"], f"each of {s['workers']} workers")
+    print(f"up to {memory:,.0f} MB for {workers} with {_counted(s['threads_per_worker'], 'thread')}")
+    hours = f"roughly {s['core_hours']:.2f}" if s["core_hours"] >= 0.01 else "less than 0.01"
+    print(f"{hours} core hours at {rate:,} points/s and core; the model decides")
     for job in run.tiles[:50]:
-        print(f"  {job.name:24s} {job.points:>14,} points  {_inputs(len(job.sources))}")
+        print(f"  {job.name:24s} {job.points:>14,} points  {_counted(len(job.sources), 'input')}")
     if len(run.tiles) > 50:
         print(f"  and {len(run.tiles) - 50} more")
     for note in run.notes:
@@ -185,8 +188,8 @@ def _print_dry(run: TiledRun) -> None:
         print(f"pdal-stages: {what}: {reason}", file=sys.stderr)
 
 
-def _inputs(count: int) -> str:
-    return f"{count:,} input{'s' * (count != 1)}"
+def _counted(count: int, word: str) -> str:
+    return f"{count:,} {word}{'s' * (count != 1)}"
 
 
 def _write_report(name: str, run: TiledRun) -> None:
