@@ -317,6 +317,14 @@ def _pipeline(options: argparse.Namespace) -> int | None:
 
 def _run(options: argparse.Namespace, pipeline) -> int:
     """Run a pipeline and tell what it has to say; the number of points."""
+    count, said = _ran(options, pipeline)
+    for line in said:
+        print(f"pdal-stages: {line}", file=sys.stderr)
+    return count
+
+
+def _ran(options: argparse.Namespace, pipeline) -> tuple[int, list[str]]:
+    """Run a pipeline: the number of points, and what is to be told."""
     from .base.files import write_whole
 
     metadata, verbose = getattr(options, "metadata", None), getattr(options, "verbose", 1)
@@ -326,15 +334,12 @@ def _run(options: argparse.Namespace, pipeline) -> int:
     count = pipeline.execute(arrays=False, loglevel=_LEVELS.get(verbose, logging.DEBUG))
     # Warnings, and what PDAL calls an error although it goes on: a reader that sets what it cannot read to 0, say.
     lines = pipeline.said
-    for line in lines if verbose > 1 else lines[:_SAID]:
-        print(f"pdal-stages: PDAL says: {line}", file=sys.stderr)
+    said = [f"PDAL says: {line}" for line in (lines if verbose > 1 else lines[:_SAID])]
     if len(lines) > _SAID and verbose <= 1:
-        print(f"pdal-stages: PDAL says {len(lines) - _SAID:,} more lines; -v shows them", file=sys.stderr)
-    for remark in pipeline.told:
-        print(f"pdal-stages: {remark}", file=sys.stderr)
+        said.append(f"PDAL says {len(lines) - _SAID:,} more lines; -v shows them")
     if metadata:
         write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
-    return count
+    return count, said + pipeline.told
 
 
 def _expand(options: argparse.Namespace) -> None:
@@ -386,28 +391,57 @@ def _classify(options: argparse.Namespace) -> int:
     check_outputs([Output(name) for name in outputs], inputs)
     work = [(source, target, options) for source, target in zip(inputs, outputs, strict=True)]
     if len(work) == 1:
-        _print_classes([_classify_one(*work[0])], options.model)
+        result, said = _classify_one(*work[0])
+        for line in said:
+            print(f"pdal-stages: {line}", file=sys.stderr)
+        _print_classes([result], options.model)
         return 0
-    done, failed = [], 0
+    done, failed, told = [], 0, _ToldOnce()
     for (source, *_), answer in each_file(_classify_one, work, options.workers):
         if answer.reason:
             failed += 1
-            print(f"pdal-stages: {source}: {answer.reason}", file=sys.stderr)
+            told.tell(source, answer.reason)
         else:
-            done.append(answer.result)
+            result, said = answer.result
+            done.append(result)
+            for line in said:
+                told.tell(source, line)
+    told.end()
     done.sort(key=lambda one: one[0])
-    print(
-        "Each file was classified by itself; --tile of 'pipeline' lets them see each other's points",
-        file=sys.stderr,
-    )
+    if done:
+        print(
+            "Each file was classified by itself; --tile of 'pipeline' lets them see each other's points",
+            file=sys.stderr,
+        )
     _print_classes(done, options.model)
     if failed:
         print(f"pdal-stages: {failed} of {len(work)} files failed", file=sys.stderr)
     return 1 if failed else 0
 
 
-def _classify_one(source: str, target: str, options: argparse.Namespace) -> tuple[str, int, dict[str, Any]]:
-    """Classify a file: the output, its points, and the classifier's report."""
+class _ToldOnce:
+    """What is said of many files: at once for the first, and in the end which others it holds for."""
+
+    def __init__(self) -> None:
+        self._files: dict[str, list[str]] = {}
+
+    def tell(self, file: str, text: str) -> None:
+        text = text.removeprefix(f"{file}: ")
+        if text not in self._files:
+            print(f"pdal-stages: {file}: {text}", file=sys.stderr)
+        self._files.setdefault(text, []).append(file)
+
+    def end(self) -> None:
+        for text, (_, *others) in self._files.items():
+            if others:
+                more = f" and {len(others) - 3:,} more" if len(others) > 3 else ""
+                print(f"pdal-stages: also {', '.join(others[:3])}{more}: {text}", file=sys.stderr)
+
+
+def _classify_one(
+    source: str, target: str, options: argparse.Namespace
+) -> tuple[tuple[str, int, dict[str, Any]], list[str]]:
+    """Classify a file: the output, its points and the classifier's report; and what is to be told."""
     from .pipeline.jobs import WRITTEN, classify_job
 
     listed = options.dimensions
@@ -415,8 +449,8 @@ def _classify_one(source: str, target: str, options: argparse.Namespace) -> tupl
     pipeline = classify_job(
         source, target, options.model, options.overrides, where=options.where, dimensions=named
     )
-    count = _run(options, pipeline)
-    return target, count, pipeline.reports[-1][1][-1]
+    count, said = _ran(options, pipeline)
+    return (target, count, pipeline.reports[-1][1][-1]), said
 
 
 def _print_classes(done: Sequence[tuple[str, int, dict[str, Any]]], model: str) -> None:

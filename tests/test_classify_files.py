@@ -88,6 +88,23 @@ def test_a_file_that_fails_does_not_stop_the_others(folder, classify, tmp_path):
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["t1.laz"]
 
 
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_same_is_said_once(folder, classify, tmp_path, workers):
+    """Of the first file at once, then which others it holds for; a file's name stands there once."""
+    (tmp_path / "out").mkdir()
+    cut = (folder / "in" / "t0.laz").read_bytes()[:2000]
+    for name in ("u0.laz", "u1.laz"):
+        (tmp_path / name).write_bytes(cut)
+    code, _, err = classify(
+        folder / "in", tmp_path / "u0.laz", tmp_path / "u1.laz", tmp_path / "out", "--workers", workers
+    )
+    lines = err.splitlines()
+    assumed = [line for line in lines if "metres were assumed" in line]
+    assert code == 1 and "2 of 5 files failed" in lines[-1]
+    assert len(assumed) == 2 and assumed[1].startswith("pdal-stages: also ") and assumed[1].count(".laz") == 2
+    assert sum("damaged" in line for line in lines) == 2 and all(line.count("u0.laz") < 2 for line in lines)
+
+
 @pytest.mark.parametrize(
     ("words", "made"),
     [
