@@ -12,13 +12,14 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import laspy
 import numpy as np
 from clouds import SURVEYS, Cloud, load, thinned, with_heights
-from recipe import train_on
+from recipe import OPTIONS, train_on
 
 from pdal_stages.accuracy import Accuracy
 from pdal_stages.classifier import Model, load_model
@@ -105,6 +106,7 @@ def main() -> None:
     options.add_argument("--data", type=Path, required=True, help="folder of the clouds")
     options.add_argument("--json", type=Path, help="where the figures go")
     options.add_argument("--surveys", nargs="+", default=list(SURVEYS), choices=list(SURVEYS))
+    options.add_argument("--passes", type=int, default=OPTIONS.passes, help="of the models")
     options.add_argument("--ground", type=Path, help="model file to score on the ISPRS samples")
     options.add_argument(
         "--pictures", type=Path, help="folder for pictures of the surveys at their own density"
@@ -113,7 +115,8 @@ def main() -> None:
     runs: list[dict[str, Any]] = []
     for left_out in args.surveys:
         started = time.process_time()
-        model = train_on(args.data, [name for name in SURVEYS if name != left_out])
+        others = [name for name in SURVEYS if name != left_out]
+        model = train_on(args.data, others, replace(OPTIONS, passes=args.passes))
         cloud = load(args.data, left_out)
         for one in (cloud, thinned(cloud, 2.0), thinned(cloud, 0.5)):
             if one is not None:

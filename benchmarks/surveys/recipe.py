@@ -66,9 +66,9 @@ def training_cloud(cloud: Cloud) -> TrainingCloud:
     )
 
 
-def train_on(data: Path, surveys: Iterable[str], progress: bool = True) -> Model:
+def train_on(data: Path, surveys: Iterable[str], options: TrainingOptions = OPTIONS) -> Model:
     """The model of these surveys."""
     made = [training_cloud(copy) for name in surveys for copy in copies(load(data, name))]
-    model = train(made, OPTIONS, progress=progress)
+    model = train(made, options)
     model.info["preparation"] = list(PREPARATION)
     return model

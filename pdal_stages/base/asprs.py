@@ -67,8 +67,6 @@ OVERLAP = 12
 UNINFORMATIVE = (*UNLABELLED, *NOISE, OVERLAP)
 #: Largest code LAS 1.0-1.3 point formats (0-5) hold: five bits.
 LEGACY_LIMIT = 31
-#: Largest code point formats 6-10 hold: one byte.
-EXTENDED_LIMIT = 255
 
 
 def class_name(code: int) -> str:
@@ -86,8 +84,3 @@ def class_color(code: int) -> tuple[int, int, int]:
         return _COLORS[code]
     mixed = (code * 2654435761) & 0xFFFFFFFF
     return (70 + (mixed & 127), 70 + ((mixed >> 8) & 127), 70 + ((mixed >> 16) & 127))
-
-
-def class_limit(dataformat_id: int) -> int:
-    """The largest class code a LAS point format holds (31 for formats 0-5, 255 for 6-10)."""
-    return LEGACY_LIMIT if int(dataformat_id) <= 5 else EXTENDED_LIMIT
