@@ -4,9 +4,9 @@ Does what ``pdal-stages train`` and ``pdal-stages classify`` do, on the fixed tr
 2, 3, 4, 5, 6) and Delft (1, 2, 6). Test parts are scored, never fitted.
 
     python benchmarks/real_clouds.py --data FOLDER [--work FOLDER] [--only delft] [--json FILE]
-        [--pipelines] [--model-option neighborhoods=blomley2016 ...] [--pictures FOLDER]
+        [--model-option neighborhoods=blomley2016 ...] [--pictures FOLDER]
 
-``--pipelines`` runs pipelines/train.json and pipelines/evaluate.json instead. ``--pictures`` draws heights, classes and errors of the test parts.
+``--pictures`` draws heights, classes and errors of the test parts.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ from pdal_stages.pipeline.run import Pipeline
 from pdal_stages.reports.panels import triptych
 from pdal_stages.reports.pictures import write_png
 
-PIPELINES = Path(__file__).resolve().parent.parent / "pipelines"
 CLOUDS = {
     "montpellier": {
         "train": "train_*.laz",
@@ -44,38 +43,11 @@ CLOUDS = {
 PEER = {"montpellier": (85.1, 79.2, 75.6, 90.7), "delft": (94.4, None, 93.5, None)}
 
 
-def run(name: str, *words: str) -> None:
-    """One of the pipelines of the repository."""
-    Pipeline(PIPELINES / f"{name}.json", parse_overrides(words)[0]).execute(arrays=False)
-
-
-def train(sources: str, model: Path, classes: str, more: list[str], pipelines: bool) -> None:
+def train(sources: str, model: Path, classes: str, more: list[str]) -> None:
     """A model of these files."""
-    if pipelines:
-        given = {"input.filename": sources, "model.filename": model, "model.classes": classes}
-        words = [f"--stage.{key}={value}" for key, value in given.items()]
-        run("train", *words, *(f"--stage.model.{option}" for option in more))
-        return
     overrides, _ = parse_overrides(f"--writers.classifiermodel.{option}" for option in more)
-    job = train_pipeline(las_files([sources]), str(model), overrides, classes=classes)
-    Pipeline(job, overrides).execute(arrays=False)
-
-
-def classify(source: Path, target: Path, model: Path, classes: str, pipelines: bool) -> None:
-    """A classified copy of a file."""
-    if not pipelines:
-        classify_job(str(source), str(target), str(model)).execute(arrays=False)
-        return
-    given = {
-        "input.filename": source,
-        "classifier.model": model,
-        "accuracy.classes": classes,
-        "accuracy.print": "false",
-        "accuracy.json": target.with_suffix(".json"),
-        "accuracy.html": target.with_suffix(".html"),
-        "output.filename": target,
-    }
-    run("evaluate", *(f"--stage.{key}={value}" for key, value in given.items()))
+    stages = train_pipeline(las_files([sources]), str(model), overrides, classes=classes)
+    Pipeline(stages, overrides).execute(arrays=False)
 
 
 def job(name: str, options: argparse.Namespace, work: Path) -> dict:
@@ -83,7 +55,7 @@ def job(name: str, options: argparse.Namespace, work: Path) -> dict:
     spec, data = CLOUDS[name], Path(options.data) / name
     model = work / f"{name}.model"
     started = time.process_time()
-    train(str(data / spec["train"]), model, spec["classes"], options.model_option, options.pipelines)
+    train(str(data / spec["train"]), model, spec["classes"], options.model_option)
     trained = time.process_time()
     total: Accuracy | None = None
     merged: Accuracy | None = None
@@ -91,7 +63,7 @@ def job(name: str, options: argparse.Namespace, work: Path) -> dict:
     drawn = []
     for source in sorted(data.glob(str(spec["test"]))):
         target = work / f"classified_{source.name}"
-        classify(source, target, model, spec["classes"], options.pipelines)
+        classify_job(str(source), str(target), str(model)).execute(arrays=False)
         points += unchanged(source, target)
         before, after = laspy.read(source), laspy.read(target)
         codes = [int(c) for c in str(spec["classes"]).split(",")]
@@ -142,7 +114,6 @@ def main() -> None:
     parser.add_argument("--work", default="real-clouds", help="folder for models, clouds and reports")
     parser.add_argument("--only", choices=list(CLOUDS))
     parser.add_argument("--json", help="write the figures here")
-    parser.add_argument("--pipelines", action="store_true", help="run the pipelines of the repository")
     parser.add_argument("--pictures", type=Path, help="folder for pictures")
     parser.add_argument("--model-option", action="append", default=[], metavar="NAME=VALUE")
     options = parser.parse_args()
