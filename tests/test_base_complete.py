@@ -54,7 +54,8 @@ def folder(tmp_path_factory, pdal_program):
 @pytest.mark.parametrize("name", CASES)
 def test_cut_files_are_refused(folder, tmp_path, name):
     if error := (folder / f"{name}.error").read_text():
-        pytest.skip(f"PDAL here does not write it: {error.strip()[:100]}")
+        assert "Couldn't create" in error, error
+        pytest.skip(f"{CASES[name]['type']} was left out of this build")
     content = (folder / name).read_bytes()
     path = tmp_path / name
     count = None if name == "p.glb" else COUNT

@@ -89,7 +89,7 @@ def test_flags_of_old_files_stay_flags_in_new_ones(tmp_path, capsys, write_las, 
 
 def test_flags_beside_files_without_room_for_them_are_refused_before_work(tmp_path, capsys, write_las, model):
     if pdal_env.splits_class_flags():
-        pytest.skip("this PDAL reads flags as dimensions of their own")
+        pytest.skip("PDAL 2.6 and newer read flags as dimensions of their own")
     old = write_las(tmp_path / "old.las", flagged(), point_format=1)
     new = write_las(tmp_path / "new.las", scene(2), point_format=6)
     stages = [

@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import pickle
 import resource
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -706,5 +708,38 @@ def test_a_cluster_of_another_version(tmp_path, folder, cluster, monkeypatch):
         and "on all hosts" in str(caught.value)
         and not list(tmp_path.glob("o_*"))
     )
-    answer = scheduler.perform_for(("0.1.0 (1)", "2.2.0"), b"no task")
+    answer = scheduler.perform_for(("0.1.0 (1)", "2.2.0"), str(tmp_path), "here", b"no task")
     assert "other versions" in answer.reason and answer.again
+
+
+def test_a_host_without_the_folder(tmp_path, folder, cluster, monkeypatch):
+    """Refused before any work; and by a worker that joins later, with each task."""
+    from pdal_stages.tiling import scheduler
+
+    elsewhere = str(tmp_path / "mounted elsewhere")
+    usual = scheduler.OnDask.__init__
+    monkeypatch.setattr(
+        scheduler.OnDask, "__init__", lambda self, options, _: usual(self, options, elsewhere)
+    )
+    with pytest.raises(StageError, match="does not see the output folder") as caught:
+        run_tiled(pipeline(folder, tmp_path / "o_#.laz"), 20, scheduler=cluster[0])
+    assert elsewhere in str(caught.value) and "same paths on all hosts" in str(caught.value)
+    monkeypatch.setattr(scheduler.time, "sleep", lambda seconds: None)
+    answer = scheduler.perform_for(scheduler.versions(), elsewhere, "here", b"no task")
+    assert "does not see" in answer.reason and answer.again
+
+
+def test_a_failure_on_another_host_names_it(tmp_path):
+    from pdal_stages.pipeline import work
+    from pdal_stages.tiling import scheduler
+
+    task = pickle.dumps(Failing())
+    answer = scheduler.perform_for(scheduler.versions(), str(tmp_path), "another host", task)
+    assert answer.reason == f"on {socket.gethostname()}: it failed." and isinstance(answer, work.Answer)
+    answer = scheduler.perform_for(scheduler.versions(), str(tmp_path), socket.gethostname(), task)
+    assert answer.reason == "it failed."
+
+
+class Failing:
+    def run(self):
+        raise StageError("it failed")

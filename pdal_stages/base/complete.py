@@ -5,6 +5,7 @@ Each format says in its header how much must follow, except text, where lines ar
 
 from __future__ import annotations
 
+import json
 import os
 import struct
 from collections.abc import Callable, Mapping
@@ -14,6 +15,7 @@ from typing import Any, BinaryIO
 from .errors import StageError
 from .files import disk_is_full
 from .las import check_readable, read_header
+from .readback import chunks_are_whole
 
 _CURE = "Make room on the disk (or raise the limit on file sizes)"
 
@@ -91,13 +93,14 @@ def _las(file: BinaryIO, size: int, count: int | None, writer: Mapping[str, Any]
     # The count is written last: none of it, but points and no records after them, is a header left behind.
     if not header.count and not header.records_after and size >= header.offset + header.point_bytes:
         return header.compressed
-    return count is None or header.count == count
+    if count is not None and header.count != count:
+        return False
+    return not (header.compressed and header.count) or chunks_are_whole(file.name, header)
 
 
 def _text(file: BinaryIO, size: int, count: int | None, writer: Mapping[str, Any]) -> bool:
     if str(writer.get("format", "csv")).lower() == "geojson":
-        file.seek(max(0, size - 64))
-        return file.read().rstrip(b" \n;)").endswith(b"}]}")
+        return _geojson(file, size, count)
     if str(writer.get("newline", "\n")) != "\n":
         return size > 0
     header = str(writer.get("write_header", True)).lower() not in ("false", "0", "no", "off")
@@ -105,6 +108,24 @@ def _text(file: BinaryIO, size: int, count: int | None, writer: Mapping[str, Any
     while block := file.read(1 << 20):
         lines, last = lines + block.count(b"\n"), block[-1:]
     return last == b"\n" and lines >= header and (count is None or lines == count + header)
+
+
+def _geojson(file: BinaryIO, size: int, count: int | None) -> bool:
+    file.seek(max(0, size - 64))
+    if not file.read().rstrip(_AFTER_JSON).endswith(b"]}"):
+        return False
+    file.seek(0)
+    found, rest = -1, b""  # what stands before the first feature is none
+    while block := file.read(1 << 20):
+        *features, rest = (rest + block).split(_FEATURE)
+        if found < 0 and not features:
+            return True  # no points, or other words than PDAL's, of which only the end is known
+        for feature in features:
+            if found >= 0:  # PDAL 2.2 forgets the comma
+                json.loads(_FEATURE + feature.removesuffix(b","))
+            found += 1
+    json.loads(_FEATURE + rest.rstrip(_AFTER_JSON).removesuffix(b"]}"))
+    return count is None or found + 1 == count
 
 
 def _ply(file: BinaryIO, size: int, count: int | None, writer: Mapping[str, Any]) -> bool:
@@ -121,8 +142,8 @@ def _ply(file: BinaryIO, size: int, count: int | None, writer: Mapping[str, Any]
     if count is not None and elements[0][0] != count:
         return False
     if ascii_:
-        return _lines(file, sum(number for number, _ in elements))
-    return size - file.tell() >= sum(number * width for number, width in elements)
+        return _lines(file, sum(number for number, _ in elements), elements[-1][0])
+    return size - file.tell() == sum(number * width for number, width in elements)
 
 
 def _pcd(file: BinaryIO, size: int, count: int | None, writer: Mapping[str, Any]) -> bool:
@@ -131,13 +152,13 @@ def _pcd(file: BinaryIO, size: int, count: int | None, writer: Mapping[str, Any]
     if count is not None and points != count:
         return False
     if said[b"DATA"] == [b"ascii"]:
-        return _lines(file, points)
+        return _lines(file, points, points)
     if said[b"DATA"] == [b"binary_compressed"]:
         start = file.tell()
         packed = struct.unpack("<I", file.read(8)[:4])[0] if points else 0
         return size >= start + 8 * bool(points) + packed
     width = sum(int(a) * int(b) for a, b in zip(said[b"SIZE"], said[b"COUNT"], strict=True))
-    return size - file.tell() >= points * width
+    return size - file.tell() == points * width
 
 
 def _bpf(file: BinaryIO, size: int, count: int | None, writer: Mapping[str, Any]) -> bool:
@@ -188,13 +209,17 @@ def _header(file: BinaryIO, end: bytes) -> list[list[bytes]]:
     raise ValueError("the header does not end")
 
 
-def _lines(file: BinaryIO, count: int) -> bool:
-    lines, last = 0, b"\n"
+def _lines(file: BinaryIO, count: int, alike: int) -> bool:
+    """Whether `count` lines follow, of which the last `alike` have as many words; PDAL 2.2 may write some twice."""
+    lines, end = 0, b"\n"
     while block := file.read(1 << 20):
-        lines, last = lines + block.count(b"\n"), block[-1:]
-    return last == b"\n" and lines >= count
+        lines, end = lines + block.count(b"\n"), (end + block)[-100_000:]
+    words = [len(line.split()) for line in end.split(b"\n")[-3:-1]]
+    return end.endswith(b"\n") and lines == count and (alike < 2 or words[0] == words[-1])
 
 
+#: How PDAL begins a feature, and what may follow the last brace.
+_FEATURE, _AFTER_JSON = b'{ "type":"Feature",', b" \n;)"
 _PLY_BYTES = {
     **dict.fromkeys((b"int8", b"uint8", b"char", b"uchar"), 1),
     **dict.fromkeys((b"int16", b"uint16", b"short", b"ushort"), 2),

@@ -327,6 +327,34 @@ def _wrong_chunks(
         return _wrong_octree(file, header, size, data if variable and number <= chunks.MOST_DECODED else b"")
 
 
+class LazChunks(NamedTuple):
+    """The chunks of a LAZ file: the record on their coding, where the first begins, bytes and points of each."""
+
+    record: bytes
+    begin: int
+    sizes: list[int]
+    points: list[int]
+
+
+def laz_chunks(path: str | os.PathLike, header: LasHeader) -> LazChunks | None:
+    """The chunks of a LAZ file that `check_readable` takes; None where they are too many to be listed."""
+    table = _chunk_table(path, os.stat(path).st_size, header)
+    with open(path, "rb") as file:
+        own = next(r for r in _records(file, header) if (r.user, r.number) == (b"laszip encoded", 22204))
+        file.seek(own.data)
+        record = file.read(own.length)
+        (of_chunk,) = struct.unpack_from("<I", record, 12)
+        file.seek(table)
+        (number,) = struct.unpack("<4xI", file.read(8))
+        if number > chunks.MOST_DECODED:
+            return None
+        variable = of_chunk in (0, 2**32 - 1)
+        sizes, points = chunks.decode(file.read(64 + 16 * number), number, variable=variable)
+    if not variable:
+        points = [max(0, min(of_chunk, header.count - done * of_chunk)) for done in range(number)]
+    return LazChunks(record, header.offset + 8, sizes, points)
+
+
 def _wrong_octree(file: BinaryIO, header: LasHeader, size: int, table: bytes) -> tuple[str, str] | None:
     """What is wrong with the octree of a file that calls itself COPC; `table`: of its chunks, where each has its count."""
     first = next(_records(file, header), None)

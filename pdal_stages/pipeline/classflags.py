@@ -1,6 +1,6 @@
 """Flags of LAS 1.0-1.3 on their way to other formats.
 
-PDAL before 2.4 reads them as the upper bits of the class, and writes class and flags of LAS 1.4 from two dimensions.
+PDAL before 2.6 reads them as the upper bits of the class, and writes class and flags of LAS 1.4 from two dimensions.
 Written as they were read, a withheld point of class 2 would become one of class 130.
 """
 

@@ -53,8 +53,8 @@ def last_tries(
 Pool = Here | Processes | OnDask
 
 
-def open_pool(options: TilingOptions) -> Pool:
-    """Where the tasks of a run are done."""
+def open_pool(options: TilingOptions, folder: str) -> Pool:
+    """Where the tasks of a run are done, which keeps what it makes in `folder`."""
     if options.scheduler:
-        return OnDask(options)
+        return OnDask(options, folder)
     return Processes(options.local_workers, options.threads) if options.local_workers else Here(options)

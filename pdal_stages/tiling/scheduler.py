@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import pickle
+import socket
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -25,8 +27,8 @@ _ASK = 10.0
 class OnDask:
     """Tasks on the workers of a scheduler; they may join and leave."""
 
-    def __init__(self, options: TilingOptions) -> None:
-        self.address = options.scheduler
+    def __init__(self, options: TilingOptions, folder: str) -> None:
+        self.address, self.folder = options.scheduler, folder
         self.threads, self.slots = options.threads, 1
         self._stack = contextlib.ExitStack()
 
@@ -48,7 +50,7 @@ class OnDask:
                 raise StageError(
                     "the scheduler has no workers", found=self.address, cure="Start dask worker on some hosts"
                 )
-            self._check_versions()
+            self._check_workers()
             self._stack = stack.pop_all()
         self.slots = len(threads)
         # One tile at a time in a process; what Dask calls its threads are the cores it may use.
@@ -58,19 +60,21 @@ class OnDask:
     def __exit__(self, *exc: object) -> None:
         self._stack.close()
 
-    def _check_versions(self) -> None:
-        """Refuse workers whose results would not be those of this program."""
+    def _check_workers(self) -> None:
+        """Refuse workers whose results would not be those of this program, or would not get here."""
         try:
-            found = self._client.run(versions)
+            found = self._client.run(at_hand, self.folder)
         except Exception as error:
             raise StageError(
                 "a worker of the scheduler cannot say which pdal-stages it has",
                 found=f"{type(error).__name__}: {error}",
                 cure=_SAME,
             ) from None
-        for worker, theirs in found.items():
+        for worker, (theirs, host, sees) in found.items():
             if theirs != versions():
                 raise StageError(_OTHER, found=_difference(worker, theirs, versions()), cure=_SAME)
+            if not sees:
+                raise StageError(_APART, found=f"no {self.folder} on {host}", cure=_SHARE)
 
     def run(self, waiting: deque, task_of: Callable[[Any], Task]) -> Iterator[tuple[Any, Answer]]:
         """Yield (item, answer) for every item; see :meth:`pdal_stages.pipeline.processes.Processes.run`.
@@ -117,7 +121,8 @@ class OnDask:
         # As bytes: Dask would look for its own keys in all that a task holds.
         content = pickle.dumps(task)
         try:
-            return self._client.submit(perform_for, versions(), content, pure=False, retries=0)
+            words = versions(), self.folder, socket.gethostname(), content
+            return self._client.submit(perform_for, *words, pure=False, retries=0)
         except (OSError, RuntimeError):
             raise _LostError(_LOST) from None
 
@@ -152,6 +157,8 @@ class _LostError(Exception):
 _LOST = "the Dask scheduler cannot be reached any more"
 _OTHER = "a worker of the scheduler has other versions than this program"
 _SAME = "Install the same versions of pdal-stages and PDAL on all hosts"
+_APART = "a worker of the scheduler does not see the output folder"
+_SHARE = "Inputs, model and outputs must be there under the same paths on all hosts"
 
 
 def versions() -> tuple[str, str]:
@@ -159,11 +166,30 @@ def versions() -> tuple[str, str]:
     return build(), ".".join(map(str, pdal_env.version()))
 
 
-def perform_for(wanted: tuple[str, str], task: bytes) -> Answer:
-    """Do a task on a worker, if it has the versions of the program that sent it."""
+def at_hand(folder: str) -> tuple[tuple[str, str], str, bool]:
+    """Of a worker: its versions, its host, and whether it sees a folder."""
+    return versions(), socket.gethostname(), _sees(folder)
+
+
+def _sees(folder: str) -> bool:
+    for _ in range(5):  # network file systems may show a new folder late
+        if os.path.isdir(folder):
+            return True
+        time.sleep(1)
+    return False
+
+
+def perform_for(wanted: tuple[str, str], folder: str, host: str, task: bytes) -> Answer:
+    """Do a task on a worker, if it has the versions of the program that sent it, from `host`, and sees its folder."""
+    here = socket.gethostname()
     if versions() != wanted:
         return Answer(reason=f"{_OTHER} ({_difference('it', versions(), wanted)}). {_SAME}", again=True)
-    return perform(pickle.loads(task))
+    if not _sees(folder):
+        return Answer(reason=f"{_APART} (found no {folder} on {here}). {_SHARE}", again=True)
+    answer = perform(pickle.loads(task))
+    if answer.reason and here != host:
+        answer.reason = f"on {here}: {answer.reason}"
+    return answer
 
 
 def _difference(worker: str, theirs: tuple[str, str], ours: tuple[str, str]) -> str:

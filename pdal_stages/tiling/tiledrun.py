@@ -85,7 +85,7 @@ def run_tiled(
         if survey.per == "file":  # refused now, not after reading all inputs
             outputs_for(plan, [source.stem for source in survey.sources], survey.paths)
         try:
-            with open_pool(chosen) as pool:
+            with open_pool(chosen, str(store.folder)) as pool:
                 survey.read_indexes(store, pool, chosen.retries, progress)
                 work = Worklist(plan, survey, chosen)
                 if chosen.resume:

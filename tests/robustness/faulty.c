@@ -8,7 +8,7 @@
 #include <sys/uio.h>
 #include <unistd.h>
 
-enum { OFF, SHORT, FULL, FULL_ONCE, BROKEN_ONCE };
+enum { OFF, SHORT, FULL, FULL_ONCE, BROKEN_ONCE, PART_ONCE };
 static char folder[4096];
 static long left;
 static int kind, hits;
@@ -38,7 +38,7 @@ static ssize_t allowed(size_t n) {
     ssize_t part = left;
     left = 0;
     if (kind == SHORT) { kind = OFF; return part > 0 ? part : 1; }
-    if (kind == FULL && part > 0) return part;
+    if ((kind == FULL || kind == PART_ONCE) && part > 0) return part;
     errno = kind == BROKEN_ONCE ? EIO : ENOSPC;
     if (kind != FULL) kind = OFF;
     return -1;
@@ -71,6 +71,7 @@ size_t fwrite(const void *data, size_t size, size_t n, FILE *file) {
     REAL(fwrite);
     if (size && n && kind != SHORT && watched(fileno(file))) {
         ssize_t may = allowed(size * n);
+        if (kind == PART_ONCE && hits) kind = OFF; /* the C library has tried the rest, and met the error */
         return may < 0 ? 0 : real(data, size, may / size, file);
     }
     return real(data, size, n, file);

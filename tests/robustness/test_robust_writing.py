@@ -166,6 +166,8 @@ def results(tmp_path_factory, pdal_program):
 def test_writes_that_fail(cell, results, case):
     mine = [row for row in results if row["case"] == case]
     good, *tries = mine
+    if "Couldn't create writer stage" in good["said"]:
+        pytest.skip(f"{case.split()[0]} was left out of this build")
     assert good["code"] == 0 and good["content"], good["said"]
     suffix = Path(CASES[case].output).suffix
     outcomes = {kind: set() for kind in KINDS}
