@@ -38,7 +38,7 @@ SITES = {
     "classifier/modelfile:write": "model",
     "classifier/spool:_mapped.kept": _SCRATCH,
     "cli:_expand": "expanded pipeline",
-    "cli:_run": "metadata",
+    "cli:_ran": "metadata",
     "pipeline/run:Pipeline.execute": "writers.las .las",
     "reports/accuracypage:write_accuracy_report": "accuracy html",
     "reports/modelpage:write_model_report": "model page",
