@@ -134,7 +134,11 @@ def test_another_numpy(cell, tmp_path, cloud):
     fake.mkdir(parents=True)
     (fake / "__init__.py").write_text("raise ImportError('numpy.core.multiarray failed to import')\n")
     it = cell("Environment", "packages built for another NumPy")
-    done = it.process("pipeline", simple(tmp_path, cloud), env={"PYTHONPATH": str(fake.parent)})
+    done = it.process(
+        "pipeline",
+        simple(tmp_path, cloud),
+        env={"PYTHONPATH": str(fake.parent), "PYTHONDONTWRITEBYTECODE": "1"},
+    )
     it.refused(done, "cannot be imported", "numpy.core.multiarray failed to import", "one environment")
 
 
