@@ -542,9 +542,16 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def _warmup(options: argparse.Namespace) -> None:
-    from .classifier.warmup import warmup
+    from .base.threads import available_threads
+    from .classifier.warmup import compile_part, features_part, other_part, warmup
+    from .pipeline.manyfiles import each_file
+    from .synthetic.demo import compile_kernels
 
-    warmup()
+    parts = [(part,) for part in (features_part, other_part, compile_kernels)]
+    for _, answer in each_file(compile_part, parts, min(2, available_threads())):
+        if answer.reason:
+            raise StageError("the kernels cannot be compiled", found=answer.reason)
+    warmup()  # shows that all are there and work together
     if options.all:
         from .features import warmup as every_neighborhood
 

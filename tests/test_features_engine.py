@@ -480,6 +480,21 @@ def test_cached_code_follows_the_kernels_it_calls(tmp_path):
     assert found == [["1", "0"], ["1", "1"], ["2", "0"]]
 
 
+def test_cached_code_follows_device_functions_too(tmp_path):
+    """And these run as plain Python where Python calls them."""
+    (tmp_path / "outer.py").write_text(
+        "from inner import value\nfrom pdal_stages.base.jit import njit\n@njit\ndef f():\n    return value()\n"
+    )
+    found = []
+    for number in (1, 1, 2):
+        (tmp_path / "inner.py").write_text(
+            f"from pdal_stages.base.jit import device\n@device\ndef value():\n    return {number}\n"
+        )
+        code = "from outer import f, value; print(f(), value(), sum(f.stats.cache_hits.values()))"
+        found.append(run_python(code, PYTHONPATH=str(tmp_path), PYTHONDONTWRITEBYTECODE="1").split())
+    assert found == [["1", "1", "0"], ["1", "1", "1"], ["2", "2", "0"]]
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 def test_memory_budget_is_honoured():

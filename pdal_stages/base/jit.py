@@ -34,6 +34,7 @@ try:
     import numba
     from numba.core import config
     from numba.core.compiler_lock import global_compiler_lock
+    from numba.extending import register_jitable
 except ValueError as error:  # of an environment variable of its own
     raise DependencyError(
         "numba cannot be started",
@@ -44,6 +45,9 @@ except ValueError as error:  # of an environment variable of its own
 #: Flags that allow sums to be reordered and contracted, but keep NaN and infinity meaningful.
 FAST = frozenset({"reassoc", "contract", "nsz", "arcp"})
 
+#: Divisions as in NumPy.
+_ERRORS = {"error_model": "numpy"}
+
 _stamps: dict[Any, frozenset[str]] = {}
 
 
@@ -51,13 +55,27 @@ def njit(function: Callable | None = None, **options):
     """``numba.njit`` with the package's defaults; see the module's text. Use as ``@njit`` or ``@njit(...)``."""
     if function is None:
         return lambda f: njit(f, **options)
-    options = {"nogil": True, "error_model": "numpy", "cache": True, **options}
+    options = {"nogil": True, "cache": True, "no_cfunc_wrapper": True, **_ERRORS, **options}
     try:
         dispatcher = numba.njit(**options)(function)
     except RuntimeError:  # "cannot cache function ...: no locator available"
         dispatcher = _elsewhere(function, options)
     _stamp(dispatcher, function)
+    file: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    if hasattr(file, "_source_stamp"):
+        file._source_stamp = "-".join(sorted(_stamps[dispatcher]))
     return dispatcher
+
+
+def device(function: Callable | None = None, **options):
+    """For a function that kernels call: compiled into them, without an entry of its own for Python.
+
+    That entry would take as long to compile as many a function. Where Python calls it, it runs as it is written.
+    """
+    if function is None:
+        return lambda f: device(f, **options)
+    _stamp(function, function)
+    return register_jitable(**_ERRORS, **options)(function)
 
 
 def _elsewhere(function: Callable, options: dict):
@@ -103,8 +121,8 @@ def _file_digest(path: str) -> str:
         return path
 
 
-def _stamp(dispatcher, function: Callable) -> None:
-    """Key the cached code by the source of this kernel and of every kernel it names."""
+def _stamp(kernel: Any, function: Callable) -> None:
+    """Note the sources that the code of a kernel (or device function) is made of: its own, and of all it names."""
     parts = {_file_digest(function.__code__.co_filename)}
     for name in function.__code__.co_names:
         called = function.__globals__.get(name)
@@ -112,10 +130,7 @@ def _stamp(dispatcher, function: Callable) -> None:
             parts |= _stamps.get(called, frozenset())
         except TypeError:  # a global that cannot be hashed is no kernel
             continue
-    _stamps[dispatcher] = frozenset(parts)
-    file: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-    if hasattr(file, "_source_stamp"):
-        file._source_stamp = "-".join(sorted(parts))
+    _stamps[kernel] = frozenset(parts)
 
 
 class CompilationNote:
@@ -146,10 +161,15 @@ class CompilationNote:
             return
         cls._said = True
         try:
-            stream.write("pdal_stages: compiling for this processor, once (about a minute)...\n")
+            stream.write("pdal_stages: compiling for this processor, once (half a minute)...\n")
             stream.flush()
         except (OSError, ValueError):  # a closed stderr must not stop the work
             pass
+
+    @classmethod
+    def leave_out(cls) -> None:
+        """Write no such note in this process."""
+        cls._said = True
 
     def __enter__(self) -> CompilationNote:
         threading.Thread(target=self._watch, daemon=True).start()

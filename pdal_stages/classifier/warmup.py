@@ -1,11 +1,21 @@
-"""Compiling ahead of time what the default heights, training and classification use."""
+"""Compiling ahead of time what the default heights, training and classification use.
+
+:func:`warmup` does it all; :func:`features_part` and :func:`other_part` are two halves with few kernels in common.
+"""
 
 from __future__ import annotations
 
+import gc
+from collections.abc import Callable
+
 import numpy as np
 
+from ..base.jit import CompilationNote
+from ..features import compute_features
 from ..terrain import filtered_ground, hag_minima
 from .clouds import TrainingCloud
+from .context import Context
+from .forest import Forest
 from .training import train
 from .trainoptions import TrainingOptions
 
@@ -15,12 +25,47 @@ def warmup() -> None:
 
     Other neighborhoods are compiled where they are first used, or by :func:`pdal_stages.features.warmup`.
     """
-    xyz = np.random.default_rng(0).uniform(0.0, 12.0, (400, 3))
-    axes = np.ascontiguousarray(xyz.T)
-    dimensions = filtered_ground(*axes, openings=(5,), threads=1)
-    dimensions["HeightAboveGround"] = hag_minima(*axes)
+    xyz = _cloud()
+    dimensions = _heights(xyz)
     dimensions |= dict.fromkeys(("ReturnNumber", "NumberOfReturns"), np.ones(len(xyz), np.uint8))
     read = ("HeightAboveGround", "Ground", "HeightAboveOpening_5", "returns")
     options = TrainingOptions(dimensions=read, trees=1, count=50, threads=1)
     model = train(TrainingCloud(xyz, np.where(xyz[:, 2] > 6.0, 6, 2), dimensions), options, progress=False)
     model.predict(xyz, dimensions, threads=1)
+
+
+def compile_part(part: Callable[[], None]) -> None:
+    """Call one of the parts in a process that does nothing else."""
+    gc.disable()  # a seventh of the time would go into looking for garbage
+    if part is not features_part:
+        CompilationNote.leave_out()  # the other process writes it
+    part()
+
+
+def features_part() -> None:
+    """The kernels of features."""
+    compute_features(_cloud(), None, "s5,k10", ("covariance", "geometric"), threads=1)
+
+
+def other_part() -> None:
+    """Those of heights, forests and context."""
+    xyz = _cloud()
+    _heights(xyz)
+    shares = np.zeros((len(xyz), 2), np.uint16)
+    tables = Context.parse(TrainingOptions().context).tables(xyz, shares, threads=1)
+    tables.fill(np.arange(len(xyz)), np.empty((len(xyz), 2 * len(tables.tokens)), np.float32))
+    leaf = np.zeros(1, np.float32), np.ones((1, 2), np.uint32)
+    Forest(np.ones(1, np.int32), np.full(1, -1, np.int16), *leaf, n_features=1).predict_proba(
+        np.zeros((1, 1), np.float32)
+    )
+
+
+def _cloud() -> np.ndarray:
+    return np.random.default_rng(0).uniform(0.0, 12.0, (400, 3))
+
+
+def _heights(xyz: np.ndarray) -> dict[str, np.ndarray]:
+    axes = np.ascontiguousarray(xyz.T)
+    dimensions = filtered_ground(*axes, openings=(5,), threads=1)
+    dimensions["HeightAboveGround"] = hag_minima(*axes)
+    return dimensions

@@ -15,7 +15,7 @@ from ..base.threads import map_blocks
 from .bins import ShapeBins
 from .index import Grid
 from .kdtree import KdTree, build_tree
-from .moments import BATCH, FEATURES, MOMENTS, finish
+from .moments import BATCH, FEATURES, MOMENTS, WIDTH, finish
 from .names import MOMENT_FEATURES, SHAPE_FEATURES
 from .optimal import kopt_block, nearest_block
 from .plan import Columns, FeaturePlan
@@ -235,14 +235,16 @@ def write_columns(table, radius, heights, few, copies, columns, out):
         Where in `out` each feature of ``moments.finish`` goes, and the radius; -1: nowhere.
     out : (m, F) float32 array
     """
-    volumes = np.empty(BATCH)
+    volumes, moments = np.empty(BATCH), np.empty((MOMENTS, WIDTH))
     for start in range(0, len(radius), BATCH):
         count = min(BATCH, len(radius) - start)
         for j in range(count):
             r = max(radius[start + j], LEAST_RADIUS)
             volumes[j] = 4.0 / 3.0 * math.pi * r * r * r
+            for row in range(MOMENTS):
+                moments[row, j] = table[row, start + j]
         part = slice(start, start + count)
-        values = finish(table, start, count, volumes, heights[part], few, copies[part])
+        values = finish(moments, count, volumes, heights[part], few, copies[part])
         for f in range(FEATURES):
             if columns[f] >= 0:
                 for j in range(count):

@@ -94,7 +94,7 @@ class Run:
             raise StageError("the cloud has no points", found=f"{count} queries")
         self.fitted = fit()
         if len(self.fitted.fixed):
-            compile_once("fixed")
+            compile_once("shapes" if self.fitted.fixed.shaped.any() else "fixed")
         self.candidates = self.fitted.fixed.candidates(self.grid.rows_of_cells(), self.grid.cell_ix)
         self._cut(float(memory_mb) * 2**20)
 
@@ -268,20 +268,22 @@ def _compile_index() -> None:
     build_grid(np.zeros((2, 3)), 1.0)
 
 
-def _compile_fixed() -> None:
+def _compile_fixed(feature: str) -> None:
     from .bins import ShapeBins
     from .fixed import FixedRadius
     from .index import build_grid, cut_blocks
 
     grid = build_grid(np.zeros((1, 3)), 1.0)
     none = np.zeros(0)
-    fixed = FixedRadius(grid, FeaturePlan.parse("c1,s1", "Density"))
+    fixed = FixedRadius(grid, FeaturePlan.parse("c1,s1", feature))
+    bins = ShapeBins(dict.fromkeys(fixed.tokens, np.zeros((5, 9))))
     cut_blocks(grid.cell_start, fixed.cost(fixed.candidates(grid.rows_of_cells(), grid.cell_ix)), 1.0, 1)
-    out = np.zeros((0, 2), np.float32)
-    fixed.fill(none, none, none, np.zeros(0, np.int64), ShapeBins({}), 0, 1, np.zeros(2, np.int64), out)
+    out = np.zeros((0, 20), np.float32)
+    fixed.fill(none, none, none, np.zeros(0, np.int64), bins, 0, 1, np.zeros(2, np.int64), out)
 
 
 _COMPILERS = {
     "index": _compile_index,
-    "fixed": _compile_fixed,
+    "fixed": lambda: _compile_fixed("Density"),
+    "shapes": lambda: _compile_fixed("D1"),
 }

@@ -13,7 +13,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from ..base.jit import njit
+from ..base.jit import device
 from .index import SPARE
 
 #: Coordinates of padding points: the square is still finite, and larger than any squared radius.
@@ -50,7 +50,6 @@ def from_order_bits(typingctx, value):
     return types.float64(types.int64), codegen
 
 
-@njit
 def half_widths(radius, cell):
     """Cells a neighborhood of `radius` can touch, and cells it surely covers, row by row.
 
@@ -65,7 +64,7 @@ def half_widths(radius, cell):
     """
     r2 = radius * radius
     reach = int(np.ceil(radius / cell)) + 1
-    while reach > 0 and ((reach - 1) * cell) ** 2 >= r2:
+    while reach > 0 and ((reach - 1) * cell) * ((reach - 1) * cell) >= r2:
         reach -= 1
     widths = np.empty((2, 2 * reach + 1), np.int64)
     for row in range(-reach, reach + 1):
@@ -81,7 +80,7 @@ def half_widths(radius, cell):
     return widths
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def _lower(values, first, last, wanted):
     """First position in the sorted ``values[first:last]`` whose value is not below `wanted`."""
     while first < last:
@@ -93,14 +92,14 @@ def _lower(values, first, last, wanted):
     return first
 
 
-@njit
+@device
 def fill_strip(cell_ix, cell_start, row_iy, row_start, iy, left, reach, columns, strip):
     """Make a dense table of where points begin, for the rows ``iy - reach .. iy + reach``.
 
     ``strip[k, c]`` becomes the first point of row ``iy - reach + k`` whose column is not below ``left + c``, for
     c in 0..columns: the points of columns a..b are ``strip[k, a - left]`` to ``strip[k, b + 1 - left]``.
     """
-    row = _lower(row_iy, 0, len(row_iy), iy - reach)
+    row = _lower(row_iy, np.int64(0), len(row_iy), iy - reach)
     for k in range(2 * reach + 1):
         if row >= len(row_iy) or row_iy[row] != iy - reach + k:
             strip[k, : columns + 1] = 0
@@ -140,7 +139,7 @@ def _copy8(typingctx, target, i, source, j):
     return signature, codegen
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def _copy(x, y, z, first, last, px, py, pz, at):
     """Append the points first..last; what a whole vector copies too much is overwritten by the next."""
     n = last - first
@@ -151,7 +150,7 @@ def _copy(x, y, z, first, last, px, py, pz, at):
     return at + n
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def _pad(px, py, pz, at):
     while at % LANES:
         px[at], py[at], pz[at] = FAR, FAR, 0.0
@@ -159,7 +158,7 @@ def _pad(px, py, pz, at):
     return at
 
 
-@njit
+@device
 def count_candidates(strip, reach, width, own, column):
     """How many points :func:`gather` would copy (without padding)."""
     total = 0
@@ -169,7 +168,7 @@ def count_candidates(strip, reach, width, own, column):
     return total
 
 
-@njit
+@device
 def gather(x, y, z, strip, reach, width, own, column, px, py, pz):
     """Copy the candidates of one radius: the wholly covered cells first, then the others, each padded.
 

@@ -18,7 +18,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from ..base.jit import njit
+from ..base.jit import device
 
 LN2_HI = 6.93147180369123816490e-01
 LN2_LO = 1.90821492927058770002e-10
@@ -47,7 +47,7 @@ def _from_bits(typingctx, value):
     return types.float64(types.int64), codegen
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def log_fast(x):
     """Natural logarithm of a positive normal float64 to 1e-15 relative (fdlibm's scheme, no branches)."""
     bits = _bits(x)
@@ -70,7 +70,7 @@ def log_fast(x):
     return k * LN2_HI - ((half - (s * (half + r) + k * LN2_LO)) - f)
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def cbrt_fast(x):
     """Cube root of a float64 >= 0 to 1e-15 relative; 0 for anything below 1e-290."""
     big = x > 1e-290
@@ -84,7 +84,7 @@ def cbrt_fast(x):
     return t if big else 0.0
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def _rotation(app, aqq, apq):
     """Cosine, sine and tangent of the rotation that makes `apq` zero."""
     d = 0.5 * (aqq - app)
@@ -97,7 +97,7 @@ def _rotation(app, aqq, apq):
     return c, t * c, t
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def eigenvalues3(xx, xy, xz, yy, yz, zz):
     """Eigenvalues l1 >= l2 >= l3 >= 0 of a symmetric positive semidefinite matrix.
 
@@ -122,7 +122,7 @@ def eigenvalues3(xx, xy, xz, yy, yz, zz):
     return max(high, zz), max(low, min(high, zz)), min(low, zz)
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def eigen3(xx, xy, xz, yy, yz, zz):
     """Eigenvalues as :func:`eigenvalues3`, and abs(nz) of the unit eigenvector of l3.
 
@@ -163,7 +163,7 @@ def eigen3(xx, xy, xz, yy, yz, zz):
     return xx, yy, zz, min(nz, 1.0)
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def entropy_term(e):
     """-e ln e, 0 for e = 0 (and below 1e-290)."""
     some = e > 1e-290
@@ -171,7 +171,7 @@ def entropy_term(e):
     return -e * log_fast(safe) if some else 0.0
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def eigenentropy(l1, l2, l3):
     """Eigenentropy -sum e ln e of e_i = l_i / (l1 + l2 + l3); 0 where all are 0."""
     total = l1 + l2 + l3
@@ -179,7 +179,7 @@ def eigenentropy(l1, l2, l3):
     return entropy_term(l1 * scale) + entropy_term(l2 * scale) + entropy_term(l3 * scale)
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def covariance_features(n, l1, l2, l3):
     """The eight eigen-features of eigenvalues l1 >= l2 >= l3 of `n` points.
 

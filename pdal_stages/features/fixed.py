@@ -11,7 +11,7 @@ from .candidates import LANES
 from .index import Grid
 from .names import MOMENT_FEATURES, SHAPE_FEATURES
 from .plan import FeaturePlan
-from .radius import count_block, radius_block, radius_values, width_table
+from .radius import ShapeColumns, count_block, radius_block, radius_values, width_table
 from .shapes import PULLS, make_work, point_seeds
 
 #: Estimated cost on one core, to cut blocks of about equal time: nanoseconds.
@@ -96,17 +96,23 @@ class FixedRadius:
         out: np.ndarray,
     ) -> None:
         """Compute the columns of these neighborhoods for queries sorted by cell; see ``radius.radius_block``."""
+        shapes = self._shapes(qx, qy, qz, bins, seed, room) if self.shaped.any() else None
+        radius_block(
+            self.grid.tables(), self.grid.cell, qx, qy, qz, copies, self.radii, self.widths, self.reaches,
+            self.wanted, self.columns, shapes, few, room, out,
+        )  # fmt: skip
+
+    def _shapes(
+        self, qx: np.ndarray, qy: np.ndarray, qz: np.ndarray, bins: Any, seed: int, room: int
+    ) -> ShapeColumns:
         thresholds = np.zeros((len(self.specs), 5, 9), np.float32)
-        seeds = np.zeros((len(self.specs), len(qx) if self.shaped.any() else 1), np.uint64)
+        seeds = np.zeros((len(self.specs), len(qx)), np.uint64)
         for number, spec in enumerate(self.specs):
             if spec.shaped:
                 thresholds[number] = bins.comparable([spec.token])[0]
                 seeds[number] = point_seeds(qx, qy, qz, seed, spec.token)
-        radius_block(
-            self.grid.tables(), self.grid.cell, qx, qy, qz, copies, self.radii, self.widths, self.reaches,
-            self.wanted, self.columns, self.shaped, self.shape_columns, thresholds, seeds, make_work(),
-            few, room, out,
-        )  # fmt: skip
+        record, counts = np.empty((room + 4 * LANES, 4), np.float32), np.empty(50, np.float32)
+        return ShapeColumns(self.shaped, self.shape_columns, thresholds, seeds, record, counts, make_work())
 
     def shape_values(
         self, token: str, points: tuple[np.ndarray, np.ndarray, np.ndarray], seed: int
@@ -123,7 +129,7 @@ class FixedRadius:
             room = max(room, int(count_block(g.cell_ix, g.cell_start, g.row_iy, g.row_start, *one, width)[0]))
         out = np.empty((len(points[0]), 5, PULLS), np.float32)
         radius_values(
-            g.tables(), g.cell, *points, spec.radius, float(spec.spherical),
+            g.tables(), g.cell, *points, spec.radius, width, float(spec.spherical),
             point_seeds(*points, seed, token), make_work(), room, out,
         )  # fmt: skip
         return out

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..base.errors import StageError
-from ..base.jit import njit
+from ..base.jit import device, njit
 
 #: Coordinates beyond this many metres are no point cloud (and would overflow cell numbers).
 LIMIT = 1e12
@@ -194,7 +194,7 @@ def _keys(xyz: np.ndarray, cell: float):
     return iy.view(np.uint64), np.uint64(width), x0, y0, ranks
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def _before(ax, ay, az, bx, by, bz):
     return ax < bx or (ax == bx and (ay < by or (ay == by and az < bz)))
 
@@ -216,11 +216,13 @@ def sort_cells(x, y, z, order, cell_start):
             x[j + 1], y[j + 1], z[j + 1], order[j + 1] = px, py, pz, po
 
 
-@njit
+@device
 def _merge_sort(x, y, z, order):
     """Bottom-up merge sort of row numbers, then one permutation."""
     n = len(x)
-    rows, spare = np.arange(n), np.empty(n, np.int64)
+    rows, spare = np.empty(n, np.int64), np.empty(n, np.int64)
+    for k in range(n):
+        rows[k] = k
     width = 1
     while width < n:
         for low in range(0, n, 2 * width):
@@ -239,7 +241,17 @@ def _merge_sort(x, y, z, order):
                     j += 1
         rows, spare = spare, rows
         width *= 2
-    x[:], y[:], z[:], order[:] = x[rows], y[rows], z[rows], order[rows]
+    _take(x, rows)
+    _take(y, rows)
+    _take(z, rows)
+    _take(order, rows)
+
+
+@device
+def _take(values, rows):
+    before = values.copy()
+    for k in range(len(rows)):
+        values[k] = before[rows[k]]
 
 
 @njit

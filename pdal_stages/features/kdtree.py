@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.jit import njit
+from ..base.jit import device, njit
 
 #: A leaf holds at most this many points.
 LEAF = 24
@@ -83,7 +83,7 @@ def build_tree(
         for level in range(2):  # the upper nodes one by one, then four subtrees at once
             upper = []
             for node, lo, hi, _ in tasks:
-                mid = _split_node(x, y, z, perm, keys, boxes, node, lo, hi)
+                mid = _split_node(x, y, z, perm, keys, boxes, node, lo, hi, False)
                 upper += [(2 * node + 1, lo, mid, level + 1), (2 * node + 2, mid, hi, level + 1)]
             tasks = upper
         run(lambda t: _build_below(x, y, z, perm, keys, boxes, t[0], t[1], t[2], depth - t[3]), tasks)
@@ -92,7 +92,7 @@ def build_tree(
     return KdTree(x, y, z, perm, boxes, depth)
 
 
-@njit
+@device
 def select_nth(keys, perm, lo, hi, nth):
     """Reorder keys[lo:hi], and perm with it, so that `nth` holds what sorting would put there.
 
@@ -132,7 +132,7 @@ def select_nth(keys, perm, lo, hi, nth):
             return
 
 
-@njit
+@device
 def bounding_box(x, y, z, perm, lo, hi):
     """Bounding box xmin, ymin, zmin, xmax, ymax, zmax of the points perm[lo:hi]."""
     x0 = y0 = z0 = np.inf
@@ -149,7 +149,7 @@ def bounding_box(x, y, z, perm, lo, hi):
     return x0, y0, z0, x1, y1, z1
 
 
-@njit
+@device
 def halve(x, y, z, perm, keys, lo, hi, box):
     """Reorder perm[lo:hi] so that its halves lie on either side along the longest side of `box`."""
     dx, dy, dz = box[3] - box[0], box[4] - box[1], box[5] - box[2]
@@ -162,11 +162,12 @@ def halve(x, y, z, perm, keys, lo, hi, box):
 
 
 @njit
-def _split_node(x, y, z, perm, keys, boxes, node, lo, hi):
+def _split_node(x, y, z, perm, keys, boxes, node, lo, hi, leaf):
+    """Fill a node's box and, where it is no leaf, halve its points."""
     box = bounding_box(x, y, z, perm, lo, hi)
     for i in range(6):
         boxes[node, i] = box[i]
-    return halve(x, y, z, perm, keys, lo, hi, box)
+    return hi if leaf else halve(x, y, z, perm, keys, lo, hi, box)
 
 
 @njit
@@ -178,19 +179,16 @@ def _build_below(x, y, z, perm, keys, boxes, node, lo, hi, depth):
     while top > 0:
         top -= 1
         node, lo, hi, depth = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
-        box = bounding_box(x, y, z, perm, lo, hi)
-        for i in range(6):
-            boxes[node, i] = box[i]
+        mid = _split_node(x, y, z, perm, keys, boxes, node, lo, hi, depth == 0)
         if depth == 0:
             continue
-        mid = halve(x, y, z, perm, keys, lo, hi, box)
         stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = 2 * node + 2, mid, hi, depth - 1
         top += 1
         stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = 2 * node + 1, lo, mid, depth - 1
         top += 1
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def _gap(lo, hi, low, high):
     """Distance along one axis between the intervals lo..hi and low..high."""
     a, b = lo - high, low - hi
@@ -198,7 +196,7 @@ def _gap(lo, hi, low, high):
     return gap if gap > 0.0 else 0.0
 
 
-@njit
+@device
 def farthest2(tree, box):
     """Squared distance no pair of a point of the cloud and a point of `box` exceeds."""
     total = 0.0
@@ -209,7 +207,7 @@ def farthest2(tree, box):
     return total
 
 
-@njit
+@device
 def gather(tree, box, reach2, copies, limit, stack, cx, cy, cz, ci):
     """Collect the points within sqrt(`reach2`) of `box` into the scratch cx, cy, cz, ci.
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.jit import njit
+from ..base.jit import device, njit
 from .kdtree import STACK, bounding_box, farthest2, gather, halve
 
 #: Queries that share one set of candidates.
@@ -49,7 +49,7 @@ MORE = 1.0 + 1e-12
 HEAP = 48
 
 
-@njit
+@device
 def make_groups(qx, qy, qz):
     """Order of a block's queries and where its groups of at most GROUP nearby queries start.
 
@@ -61,7 +61,9 @@ def make_groups(qx, qy, qz):
     starts : ndarray of int64, shape (groups + 1,)
     """
     m = len(qx)
-    order = np.arange(m).astype(np.uint32)
+    order = np.empty(m, np.uint32)
+    for i in range(m):
+        order[i] = i
     keys = np.empty(m)
     starts = np.empty(m + 1, np.int64)
     count = 0
@@ -86,7 +88,7 @@ def make_groups(qx, qy, qz):
     return order, starts[: count + 1]
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def _before(d, a, e, b, cx, cy, cz):
     """Whether candidate a at squared distance d comes before candidate b at e."""
     if d != e:
@@ -98,7 +100,7 @@ def _before(d, a, e, b, cx, cy, cz):
     return cz[a] < cz[b]
 
 
-@njit
+@device
 def _insertion_sort(d, pos, lo, hi, cx, cy, cz):
     for i in range(lo + 1, hi):
         key, item = d[i], pos[i]
@@ -113,7 +115,7 @@ def _insertion_sort(d, pos, lo, hi, cx, cy, cz):
         pos[j] = item
 
 
-@njit
+@device
 def _heap_sort(d, pos, lo, hi, cx, cy, cz):
     n = hi - lo
     start, end = n // 2, n
@@ -139,7 +141,7 @@ def _heap_sort(d, pos, lo, hi, cx, cy, cz):
             root = child
 
 
-@njit
+@device
 def _distances(qx, qy, qz, cx, cy, cz, count, scale, d2, bins):
     for i in range(count):
         dx, dy, dz = cx[i] - qx, cy[i] - qy, cz[i] - qz
@@ -150,7 +152,7 @@ def _distances(qx, qy, qz, cx, cy, cz, count, scale, d2, bins):
         bins[i] = np.uint32(np.int32(b))
 
 
-@njit
+@device
 def _bin_distances(d2, count, scale, bins):
     for i in range(count):
         b = d2[i] * scale
@@ -158,7 +160,7 @@ def _bin_distances(d2, count, scale, bins):
         bins[i] = np.uint32(np.int32(b))
 
 
-@njit
+@device
 def nearest_sorted(qx, qy, qz, need, reach2, final, work, cx, cy, cz, count):
     """Sort the `need` nearest of `count` candidates of one query to the front of `work`'s d and pos.
 
@@ -206,8 +208,8 @@ def nearest_sorted(qx, qy, qz, need, reach2, final, work, cx, cy, cz, count):
         pos[p] = i
     # hist[b] is now where bin b ends; only bins up to `last` matter.
     end = hist[last] if last < BINS else count
+    begin = np.int64(0)  # not a literal, for which sorts would be compiled once more
     if crowded:
-        begin = 0
         for b in range(min(last + 1, BINS)):
             if hist[b] - begin > HEAP:
                 _heap_sort(d, pos, begin, hist[b], cx, cy, cz)
@@ -215,7 +217,7 @@ def nearest_sorted(qx, qy, qz, need, reach2, final, work, cx, cy, cz, count):
                 _insertion_sort(d, pos, begin, hist[b], cx, cy, cz)
             begin = hist[b]
     else:
-        _insertion_sort(d, pos, 0, end, cx, cy, cz)
+        _insertion_sort(d, pos, begin, end, cx, cy, cz)
     found = min(need, count)
     if final:
         while found > 0 and d[found - 1] > reach2:
@@ -223,7 +225,7 @@ def nearest_sorted(qx, qy, qz, need, reach2, final, work, cx, cy, cz, count):
     return found, reach2
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def _count_bins(bins, count, need, hist):
     """Fill the histogram; the bin in which the `need`-th candidate lies, BINS where there are fewer."""
     hist[:] = 0
@@ -271,7 +273,7 @@ class Search(NamedTuple):
     state: np.ndarray  # float64: group, first query of it still to do, squared reach
 
 
-@njit
+@device
 def make_scratch(room):
     f, u = np.float64, np.uint32
     return Scratch(
@@ -288,19 +290,19 @@ def make_scratch(room):
     )
 
 
-@njit
+@device
 def make_rows(need):
     return Rows(np.zeros(GROUP, np.int64), np.empty((GROUP, need)), np.empty((GROUP, need), np.uint32))
 
 
-@njit
+@device
 def start_search(qx, qy, qz):
     """A search over the queries; go on with :func:`next_rows`."""
     order, starts = make_groups(qx, qy, qz)
     return Search(qx, qy, qz, order, starts, np.array([0.0, 0.0, FIRST_REACH * FIRST_REACH]))
 
 
-@njit
+@device
 def next_rows(tree, search, need, cap2, scratch, rows):
     """Find the neighbors of the next few queries.
 
@@ -327,11 +329,12 @@ def next_rows(tree, search, need, cap2, scratch, rows):
     lo, hi = max(first, int(search.state[1])), end
     if lo > first:
         hi = lo + 1
-    reach2 = search.state[2]
-    done, reach2, scratch = _search_group(tree, search, lo, hi, need, cap2, reach2, scratch, rows)
-    if done == 0:  # too crowded or too far apart to go together
-        hi = lo + 1
+    done, reach2 = 0, search.state[2]
+    while True:
         done, reach2, scratch = _search_group(tree, search, lo, hi, need, cap2, reach2, scratch, rows)
+        if done:
+            break
+        hi = lo + 1  # too crowded or too far apart to go together
     search.state[1] = hi
     if hi >= end:
         search.state[0] = group + 1
@@ -339,7 +342,7 @@ def next_rows(tree, search, need, cap2, scratch, rows):
     return lo, hi, done, scratch
 
 
-@njit
+@device
 def _search_group(tree, search, lo, hi, need, cap2, reach2, scratch, rows):
     """Rows filled (0: the group must be split), the reach to start the next group with, the scratch."""
     need = min(need, len(tree.perm))

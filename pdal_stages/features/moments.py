@@ -15,7 +15,7 @@ import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
-from ..base.jit import njit
+from ..base.jit import device
 from .candidates import from_order_bits, order_bits
 from .eigen import covariance_features, eigen3
 
@@ -60,7 +60,7 @@ def _mul(typingctx, a, b):
     return types.float64(types.float64, types.float64), codegen
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def cylinder_sums(px, py, pz, qx, qy, qz, r2, out, j):
     """Moments about (qx, qy, qz) of the candidates within sqrt(r2) of it in x and y, into ``out[:, j]``."""
     n = sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
@@ -84,7 +84,7 @@ def cylinder_sums(px, py, pz, qx, qy, qz, r2, out, j):
     out[LOW, j], out[HIGH, j] = from_order_bits(low), from_order_bits(high)
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def sphere_sums(px, py, pz, qx, qy, qz, r2, out, j):
     """Moments about (qx, qy, qz) of the candidates within sqrt(r2) of it, into ``out[:, j]``."""
     n = sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
@@ -108,7 +108,7 @@ def sphere_sums(px, py, pz, qx, qy, qz, r2, out, j):
     out[LOW, j], out[HIGH, j] = from_order_bits(low), from_order_bits(high)
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def add_shared(inner, dx, dy, dz, out, j):
     """Add the moments ``inner[:, 0]``, taken about a point at (dx, dy, dz) from the query, to ``out[:, j]``."""
     n, sx, sy, sz = inner[N, 0], inner[SX, 0], inner[SY, 0], inner[SZ, 0]
@@ -126,16 +126,16 @@ def add_shared(inner, dx, dy, dz, out, j):
     out[HIGH, j] = max(out[HIGH, j], inner[HIGH, 0])
 
 
-@njit
-def finish(moments, start, count, volumes, heights, few, copies):
+@device
+def finish(moments, count, volumes, heights, few, copies):
     """The thirteen features made of moments, of `count` neighborhoods, from their moments.
 
     Parameters
     ----------
     moments : (12, m) float64 array
-        Moments about the queries.
-    start, count : int
-        Which columns of it: at most BATCH of them.
+        Moments about the queries, in the first columns.
+    count : int
+        How many: at most BATCH.
     volumes : (count,) float64 array
         Area of the cylinder's base or volume of the sphere: what Density divides by.
     heights : (count,) float64 array
@@ -160,15 +160,14 @@ def finish(moments, start, count, volumes, heights, few, copies):
     # Made here and of a constant shape: rows known not to overlap let the loop be vectorised.
     out = np.empty((FEATURES, WIDTH))
     for j in range(count):
-        i = start + j
-        n = moments[N, i]
+        n = moments[N, j]
         inverse = 1.0 / (n if n > 0.0 else 1.0)
-        mx, my, mz = moments[SX, i] * inverse, moments[SY, i] * inverse, moments[SZ, i] * inverse
-        ax, ay, az = moments[SXX, i] * inverse, moments[SYY, i] * inverse, moments[SZZ, i] * inverse
+        mx, my, mz = moments[SX, j] * inverse, moments[SY, j] * inverse, moments[SZ, j] * inverse
+        ax, ay, az = moments[SXX, j] * inverse, moments[SYY, j] * inverse, moments[SZZ, j] * inverse
         xx, yy, zz = ax - mx * mx, ay - my * my, az - mz * mz
-        xy = moments[SXY, i] * inverse - mx * my
-        xz = moments[SXZ, i] * inverse - mx * mz
-        yz = moments[SYZ, i] * inverse - my * mz
+        xy = moments[SXY, j] * inverse - mx * my
+        xz = moments[SXZ, j] * inverse - mx * mz
+        yz = moments[SYZ, j] * inverse - my * mz
         apart = xx + yy + zz > COINCIDENT * (ax + ay + az)
         l1, l2, l3, nz = eigen3(xx, xy, xz, yy, yz, zz)
         real = (n >= 3.0) & apart
@@ -183,10 +182,10 @@ def finish(moments, start, count, volumes, heights, few, copies):
         out[7, j] = f[7]
         out[8, j] = n / volumes[j]
         out[9, j] = 1.0 - nz if real else 0.0
-        out[10, j] = moments[HIGH, i] - moments[LOW, i] if n > 0.0 else 0.0
+        out[10, j] = moments[HIGH, j] - moments[LOW, j] if n > 0.0 else 0.0
         out[11, j] = math.sqrt(max(zz, 0.0)) if apart else 0.0
-        out[12, j] = heights[j] - moments[LOW, i] if n > 0.0 else 0.0
+        out[12, j] = heights[j] - moments[LOW, j] if n > 0.0 else 0.0
     for j in range(count):
-        if moments[N, start + j] < 3.0:
+        if moments[N, j] < 3.0:
             few[0] += copies[j]
     return out

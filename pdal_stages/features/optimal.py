@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.jit import FAST, njit
+from ..base.jit import FAST, device, njit
 from .candidates import from_order_bits, order_bits
 from .eigen import eigenentropy, eigenvalues3, log_fast
 from .knn import CROWD, ROOM, make_rows, make_scratch, next_rows, start_search
@@ -67,7 +67,7 @@ class Members(NamedTuple):
     record: np.ndarray  # (room, 4) float32 offsets, for the shapes
 
 
-@njit
+@device
 def make_sums(count):
     return Sums(
         np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count),
@@ -75,7 +75,7 @@ def make_sums(count):
     )  # fmt: skip
 
 
-@njit
+@device
 def make_members(room):
     return Members(
         np.empty(room),
@@ -86,7 +86,7 @@ def make_members(room):
     )
 
 
-@njit(fastmath=set(FAST), forceinline=True)
+@device(fastmath=set(FAST), forceinline=True)
 def estimate_entropy(xx, xy, xz, yy, yz, zz, noise):
     """Eigenentropy of a covariance matrix to 1e-7, in closed form and without a branch.
 
@@ -131,7 +131,7 @@ def estimate_entropy(xx, xy, xz, yy, yz, zz, noise):
     return entropy if some else NEVER
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def _covariance(s, j):
     w = 1.0 / s.n[j]
     x, y, z = s.x[j] * w, s.y[j] * w, s.z[j] * w
@@ -145,7 +145,7 @@ def _covariance(s, j):
     )
 
 
-@njit
+@device
 def estimate_entropies(n, x, y, z, xx, xy, xz, yy, yz, zz, entropy, first, last, least):
     """Estimate the eigenentropies of the candidates first..last - 1 of at least `least` members."""
     for j in range(first, last):
@@ -158,7 +158,7 @@ def estimate_entropies(n, x, y, z, xx, xy, xz, yy, yz, zz, entropy, first, last,
         entropy[j] = value if n[j] >= least else NEVER
 
 
-@njit
+@device
 def lowest_entropy(s, first, last, least_members):
     """The candidate of first..last - 1 with the lowest eigenentropy; last - 1 where none qualifies.
 
@@ -203,7 +203,7 @@ def lowest_entropy(s, first, last, least_members):
     return last - 1
 
 
-@njit
+@device
 def take_members(tree, index, count, qx, qy, qz, members):
     """Offsets from the query and heights of the points index[:count]."""
     for i in range(count):
@@ -215,7 +215,7 @@ def take_members(tree, index, count, qx, qy, qz, members):
         members.height[i] = order_bits(z)
 
 
-@njit
+@device
 def running_sums(x, y, z, count, s):
     """Moments of the first 1, 2, ... `count` members."""
     sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
@@ -236,7 +236,7 @@ def running_sums(x, y, z, count, s):
         s.yy[i], s.yz[i], s.zz[i] = syy, syz, szz
 
 
-@njit
+@device
 def write_moments(s, j, members, count, table, column):
     """One column of the moment table: the sums `j`, and lowest and highest of the first `count` members."""
     table[N, column] = s.n[j]
@@ -251,7 +251,7 @@ def write_moments(s, j, members, count, table, column):
     table[LOW, column], table[HIGH, column] = from_order_bits(low), from_order_bits(high)
 
 
-@njit
+@device
 def write_shapes(members, count, s, j, seed, shapes, column):
     """The shapes of the first `count` members."""
     record = members.record
@@ -295,7 +295,7 @@ def kopt_block(tree, qx, qy, qz, k_min, k_max, cap2, table, radius, reach, seeds
     kopt_into(tree, qx, qy, qz, np.arange(len(qx)), k_min, k_max, cap2, table, radius, reach, seeds, shapes)
 
 
-@njit
+@device
 def kopt_into(tree, qx, qy, qz, target, k_min, k_max, cap2, table, radius, reach, seeds, shapes):
     """:func:`kopt_block` for the queries `target` (ndarray of int64) only; the others are left alone."""
     need = k_max + 1
@@ -367,12 +367,13 @@ def nearest_block(tree, qx, qy, qz, ks, tables, radius, reach):
         for i in range(lo + count, hi):  # queries that coincide with the first
             source, target = search.order[lo], search.order[i]
             for j in range(len(ks)):
-                tables[j, :, target] = tables[j, :, source]
+                for row in range(tables.shape[1]):
+                    tables[j, row, target] = tables[j, row, source]
                 radius[j, target] = radius[j, source]
                 reach[j, target] = reach[j, source]
 
 
-@njit
+@device
 def write_nothing(table, radius, shapes, column):
     """The result of a neighborhood without points."""
     table[:, column] = 0.0
@@ -383,7 +384,7 @@ def write_nothing(table, radius, shapes, column):
         shapes.values[column, :, :] = np.nan
 
 
-@njit
+@device
 def copy_column(table, radius, shapes, source, target):
     """Give query `target` the results of query `source`."""
     for i in range(table.shape[0]):

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from ..base.jit import njit
+from ..base.jit import device, njit
 from .candidates import FAR, LANES, count_candidates, fill_strip, gather, half_widths
 from .moments import (
     BATCH,
@@ -22,7 +23,7 @@ from .moments import (
     finish,
     sphere_sums,
 )
-from .shapes import shape_counts, shape_values
+from .shapes import Work, shape_counts, shape_values
 
 #: Columns of cells whose queries share one table of where points begin.
 STRIP = 256
@@ -31,17 +32,26 @@ STRIP = 256
 EVERYTHING = 1e290
 
 
-@njit
-def width_table(radii, cell):
+def width_table(radii: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
     """:func:`half_widths` of every radius in one (radii, 2, rows) table, and each one's reach in cells."""
-    reaches = np.zeros(len(radii), np.int64)
-    for k in range(len(radii)):
-        reaches[k] = (half_widths(radii[k], cell).shape[1] - 1) // 2
+    widths = [half_widths(radius, cell) for radius in radii.tolist()]
+    reaches = np.array([width.shape[1] // 2 for width in widths])
     table = np.zeros((len(radii), 2, 2 * reaches.max() + 1), np.int64)
-    for k in range(len(radii)):
-        one = half_widths(radii[k], cell)
-        table[k, :, : one.shape[1]] = one
+    for line, width in zip(table, widths, strict=True):
+        line[:, : width.shape[1]] = width
     return table, reaches
+
+
+class ShapeColumns(NamedTuple):
+    """The shape distributions wanted of the k neighborhoods of a plan, where any are."""
+
+    shaped: np.ndarray  # (k,) bool: of which neighborhoods
+    columns: np.ndarray  # (k, 50) int64: columns of the output, or -1
+    thresholds: np.ndarray  # (k, 5, 9) float32: of the bins, comparable (``ShapeBins.comparable``)
+    seeds: np.ndarray  # (k, m) uint64: ``point_seeds`` of the queries, used where `shaped`
+    record: np.ndarray  # (room + 4 * LANES, 4) float32: scratch
+    counts: np.ndarray  # (50,) float32: scratch
+    work: Work
 
 
 @njit
@@ -62,8 +72,7 @@ def count_block(cell_ix, cell_start, row_iy, row_start, iy, ix, width):
 
 @njit
 def radius_block(
-    grid, cell, qx, qy, qz, copies, radii, widths, reaches, wanted, columns,
-    shaped, shape_columns, thresholds, seeds, work, few, room, out,
+    grid, cell, qx, qy, qz, copies, radii, widths, reaches, wanted, columns, shapes, few, room, out
 ):  # fmt: skip
     """Fill the features of cylinders and spheres for a block of queries.
 
@@ -85,16 +94,8 @@ def radius_block(
         Number of the cylinder and of the sphere of each radius in `columns`, or -1.
     columns : (k, 13) int64 array
         Column of each neighborhood's features in `out`, or -1.
-    shaped : (k,) bool array
-        Whether shape distributions are wanted of a neighborhood.
-    shape_columns : (k, 50) int64 array
-        Their columns in `out`, or -1.
-    thresholds : (k, 5, 9) float32 array
-        Of the shape metrics' bins, comparable (``ShapeBins.comparable``).
-    seeds : (k, m) uint64 array
-        ``shapes.point_seeds`` of the queries, used where `shaped`.
-    work : shapes.Work
-        Scratch of this thread.
+    shapes : ShapeColumns or None
+        None compiles to a kernel without them, in half the time.
     few : (k,) int64 array
         Raised by the number of neighborhoods with fewer than three points.
     room : int
@@ -102,15 +103,13 @@ def radius_block(
     out : (m, F) float32 array
     """
     x, y, z, cell_ix, cell_start, row_iy, row_start = grid
-    reach = reaches.max()
+    reach = reaches[-1]
     strip = np.empty((2 * reach + 1, STRIP + 2 * reach + 1), np.int64)
     size = room + 4 * LANES
     px, py, pz = np.empty(size), np.empty(size), np.empty(size)
     moments = np.empty((len(columns), MOMENTS, WIDTH))
     inner = np.empty((MOMENTS, 1))
     volumes = np.empty(BATCH)
-    record = np.empty((size if shaped.any() else 1, 4), np.float32)
-    counts = np.empty(50, np.float32)
     line, left, right = 0, 1, 0  # row of the strip, columns of the queries it serves (none yet)
     for start in range(0, len(qx), BATCH):
         stop = min(start + BATCH, len(qx))
@@ -134,25 +133,15 @@ def radius_block(
                     cylinders(px, py, pz, shared, end, qx, qy, qz, a, b, r2, centre, inner, moments[c], start)
                 if s >= 0:
                     spheres(px[:end], py[:end], pz[:end], qx, qy, qz, a, b, r2, moments[s], start)
-                for kind in range(2):
-                    number = wanted[k, kind]
-                    if number < 0 or not shaped[number]:
-                        continue
-                    for j in range(a, b):
-                        n = members(
-                            px[:end], py[:end], pz[:end], qx[j], qy[j], qz[j], r2, float(kind), record
-                        )
-                        if n == 0:  # a query that is not a point of the cloud
-                            counts[:] = 0.0
-                        else:
-                            gx, gy, gz = centroid(moments[number], j - start)
-                            shape_counts(
-                                record, n, gx, gy, gz, seeds[number, j], thresholds[number], work, counts
-                            )
-                        for f in range(50):
-                            column = shape_columns[number, f]
-                            if column >= 0:
-                                out[j, column] = counts[f]
+                if shapes is not None:
+                    for kind in range(2):
+                        number = wanted[k, kind]
+                        if number >= 0 and shapes.shaped[number]:
+                            rows = px[:end], py[:end], pz[:end]
+                            write_shapes(
+                                shapes, number, rows, qx, qy, qz, a, b, r2, float(kind), moments[number],
+                                start, out,
+                            )  # fmt: skip
             a = b
         for k in range(len(radii)):
             r = radii[k]
@@ -162,7 +151,7 @@ def radius_block(
                     volumes[:] = math.pi * r * r if kind == 0 else 4.0 / 3.0 * math.pi * r * r * r
                     tally = few[number : number + 1]
                     values = finish(
-                        moments[number], 0, stop - start, volumes, qz[start:stop], tally, copies[start:stop]
+                        moments[number], stop - start, volumes, qz[start:stop], tally, copies[start:stop]
                     )
                     for f in range(FEATURES):
                         column = columns[number, f]
@@ -171,7 +160,7 @@ def radius_block(
                                 out[start + j, column] = values[f, j]
 
 
-@njit
+@device
 def _last_column(qx, qy, a, cell, iy, limit):
     """The last column, at most `limit`, of the queries from `a` on that lie in row `iy`."""
     last = math.floor(qx[a] / cell)
@@ -183,7 +172,7 @@ def _last_column(qx, qy, a, cell, iy, limit):
     return last
 
 
-@njit
+@device
 def cylinders(px, py, pz, shared, end, qx, qy, qz, a, b, r2, centre, inner, out, start):
     """Moments of one radius' cylinders for the queries a..b of one cell, whose centre is given."""
     cx, cy = centre
@@ -196,21 +185,41 @@ def cylinders(px, py, pz, shared, end, qx, qy, qz, a, b, r2, centre, inner, out,
                 cz += pz[i]
                 n += 1
         cz /= n
-        cylinder_sums(px[:shared], py[:shared], pz[:shared], cx, cy, cz, EVERYTHING, inner, 0)
+        zero = np.int64(0)  # not a literal, for which it would be compiled once more
+        cylinder_sums(px[:shared], py[:shared], pz[:shared], cx, cy, cz, EVERYTHING, inner, zero)
     for j in range(a, b):
         cylinder_sums(rx, ry, rz, qx[j], qy[j], qz[j], r2, out, j - start)
         if shared:
             add_shared(inner, cx - qx[j], cy - qy[j], cz - qz[j], out, j - start)
 
 
-@njit
+@device
 def spheres(px, py, pz, qx, qy, qz, a, b, r2, out, start):
     """Moments of one radius' spheres for the queries a..b of one cell."""
     for j in range(a, b):
         sphere_sums(px, py, pz, qx[j], qy[j], qz[j], r2, out, j - start)
 
 
-@njit
+@device
+def write_shapes(shapes, number, candidates, qx, qy, qz, a, b, r2, spherical, moments, start, out):
+    """Shape distributions of one neighborhood for the queries a..b of one cell."""
+    px, py, pz = candidates
+    record, counts = shapes.record, shapes.counts
+    for j in range(a, b):
+        n = members(px, py, pz, qx[j], qy[j], qz[j], r2, spherical, record)
+        if n == 0:  # a query that is not a point of the cloud
+            counts[:] = 0.0
+        else:
+            gx, gy, gz = centroid(moments, j - start)
+            seed, thresholds = shapes.seeds[number, j], shapes.thresholds[number]
+            shape_counts(record, n, gx, gy, gz, seed, thresholds, shapes.work, counts)
+        for f in range(50):
+            column = shapes.columns[number, f]
+            if column >= 0:
+                out[j, column] = counts[f]
+
+
+@device
 def members(px, py, pz, qx, qy, qz, r2, spherical, record):
     """List the members of one neighborhood in canonical order, as float32 offsets from the query.
 
@@ -225,7 +234,7 @@ def members(px, py, pz, qx, qy, qz, r2, spherical, record):
     return n
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def centroid(moments, j):
     """Centroid of one neighborhood relative to its query, from its moments."""
     n = moments[N, j]
@@ -233,14 +242,13 @@ def centroid(moments, j):
 
 
 @njit
-def radius_values(grid, cell, qx, qy, qz, radius, spherical, seeds, work, room, out):
+def radius_values(grid, cell, qx, qy, qz, radius, width, spherical, seeds, work, room, out):
     """The shape metrics of every pull for a few queries: what bins are fitted to.
 
-    Parameters are those of :func:`radius_block` for one neighborhood; `out` is (m, 5, 255) float32, in the
-    comparable form of ``shapes.shape_values``. Neighborhoods that are empty give NaN.
+    Parameters are those of :func:`radius_block` for one neighborhood, `width` its :func:`half_widths`; `out` is (m, 5, 255)
+    float32, in the comparable form of ``shapes.shape_values``. Neighborhoods that are empty give NaN.
     """
     x, y, z, cell_ix, cell_start, row_iy, row_start = grid
-    width = half_widths(radius, cell)
     reach = (width.shape[1] - 1) // 2
     strip = np.empty((2 * reach + 1, 2 * reach + 2), np.int64)
     size = room + 4 * LANES
@@ -257,8 +265,8 @@ def radius_values(grid, cell, qx, qy, qz, radius, spherical, seeds, work, room, 
             out[j] = np.nan
             continue
         if spherical > 0.0:
-            sphere_sums(px[:end], py[:end], pz[:end], qx[j], qy[j], qz[j], r2, sums, 0)
+            sphere_sums(px[:end], py[:end], pz[:end], qx[j], qy[j], qz[j], r2, sums, np.int64(0))
         else:
-            cylinder_sums(px[:end], py[:end], pz[:end], qx[j], qy[j], qz[j], r2, sums, 0)
-        gx, gy, gz = centroid(sums, 0)
+            cylinder_sums(px[:end], py[:end], pz[:end], qx[j], qy[j], qz[j], r2, sums, np.int64(0))
+        gx, gy, gz = centroid(sums, np.int64(0))
         shape_values(record, n, gx, gy, gz, seeds[j], work, out[j])

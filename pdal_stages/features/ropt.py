@@ -19,7 +19,7 @@ import math
 
 import numpy as np
 
-from ..base.jit import njit
+from ..base.jit import device, njit
 from .eigen import eigenvalues3
 from .kdtree import bounding_box, gather
 from .knn import make_groups, make_scratch
@@ -96,7 +96,7 @@ def curvature_threshold(curvatures: np.ndarray) -> float:
     return float(low + (high - low) * (n - split) / n) if low < high else float(low)
 
 
-@njit
+@device
 def _gather_sorted(tree, order, qx, qy, qz, lo, hi, reach2, scratch):
     """Points within reach of the queries order[lo:hi], ascending in the cloud; how many, and the scratch."""
     box = bounding_box(qx, qy, qz, order, lo, hi)
@@ -114,7 +114,7 @@ def _gather_sorted(tree, order, qx, qy, qz, lo, hi, reach2, scratch):
     return count, scratch
 
 
-@njit
+@device
 def _shells(qx, qy, qz, radii, scratch, count, ends):
     """Sort the candidates of a query by shell, into scratch.pos; ends[s] is how many lie within radii[s]."""
     cx, cy, cz, pos = scratch.cx, scratch.cy, scratch.cz, scratch.pos
@@ -151,7 +151,7 @@ def _shells(qx, qy, qz, radii, scratch, count, ends):
         ends[s] += 1
 
 
-@njit
+@device
 def _shell_sums(x, y, z, radii, ends, s):
     """Moments of the members within each radius."""
     sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
@@ -174,7 +174,7 @@ def _shell_sums(x, y, z, radii, ends, s):
         s.yy[shell], s.yz[shell], s.zz[shell] = syy, syz, szz
 
 
-@njit
+@device
 def ropt_into(tree, qx, qy, qz, target, radii, least, table, radius, seeds, shapes):
     """:func:`ropt_block` for the queries `target` (ndarray of int64) only; the others are left alone."""
     tx, ty, tz = qx[target], qy[target], qz[target]
@@ -238,7 +238,7 @@ def ropt_block(tree, qx, qy, qz, radii, least, table, radius, seeds, shapes):
     ropt_into(tree, qx, qy, qz, np.arange(len(qx)), radii, least, table, radius, seeds, shapes)
 
 
-@njit
+@device
 def curvature_of(table, j, least):
     """Surface variation of column j of a moment table; 1/3 for fewer than `least` or coinciding points."""
     n = table[0, j]

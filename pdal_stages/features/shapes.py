@@ -30,7 +30,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..base.hashing import GOLDEN, finalise
-from ..base.jit import njit
+from ..base.jit import device, njit
 
 #: Random pulls per neighborhood [B16].
 PULLS = 255
@@ -99,7 +99,7 @@ def _shapes(mode: int, thresholds: np.ndarray, counts: int, values: int) -> Shap
     )
 
 
-_mix64 = njit(finalise, forceinline=True)
+_mix64 = device(finalise, forceinline=True)
 
 
 @njit
@@ -134,7 +134,7 @@ def point_seeds(x: np.ndarray, y: np.ndarray, z: np.ndarray, seed: int, token: s
     return out
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def _mix32(h):
     """Bijective 32-bit hash of low bias (Wellons 2018: "lowbias32")."""
     h = np.uint32(h ^ np.uint32(h >> np.uint32(16)))
@@ -144,7 +144,7 @@ def _mix32(h):
     return np.uint32(h ^ np.uint32(h >> np.uint32(16)))
 
 
-@njit(forceinline=True)
+@device(forceinline=True)
 def _below(h, n):
     """A number in 0 .. n - 1 from 32 random bits (multiply-high)."""
     return np.uint32((np.uint64(h) * np.uint64(n)) >> np.uint64(32))
@@ -182,7 +182,7 @@ def draw(seed, n, draws):
         draws[3 * ROOM + i] = d
 
 
-@njit
+@device
 def _draw_few(low, high, n, draws):
     for i in range(ROOM):
         u = _mix32(np.uint32(low + np.uint32(np.uint32(i) * np.uint32(0x9E3779B9))))
@@ -200,7 +200,7 @@ def _draw_few(low, high, n, draws):
         draws[3 * ROOM + i] = d
 
 
-@njit
+@device
 def fetch(record, draws, points):
     """Copy the drawn members' records one after another (16 bytes at once: loads and stores, no more)."""
     for i in range(4 * ROOM):
@@ -212,7 +212,7 @@ def fetch(record, draws, points):
         points[4 * i + 3] = w
 
 
-@njit
+@device
 def measure(points, gx, gy, gz, values):
     """The five metrics of every pull, comparable; gx, gy, gz is the centroid."""
     for i in range(ROOM):
@@ -236,7 +236,7 @@ def measure(points, gx, gy, gz, values):
         values[4 * ROOM + i] = abs(nx * dx + ny * dy + nz * dz)
 
 
-@njit
+@device
 def pull(record, n, gx, gy, gz, seed, work):
     """The metrics of all pulls, into work.values."""
     draw(seed, n, work.draws)
@@ -247,7 +247,7 @@ def pull(record, n, gx, gy, gz, seed, work):
             work.values[m * ROOM + i] = -np.inf
 
 
-@njit(fastmath={"reassoc", "nsz"})  # sums of ones, exact in any order: what lets LLVM vectorise them
+@device(fastmath={"reassoc", "nsz"})  # sums of ones, exact in any order: what lets LLVM vectorise them
 def count_above(values, t, above):
     """How many of each metric's values lie above each of nine thresholds (no scatter: compare and add)."""
     one, zero = np.float32(1.0), np.float32(0.0)

@@ -55,6 +55,15 @@ def run_demo(folder: str | Path, *, size: float = 200.0, density: float = 7.0, s
     return json.loads((folder / "accuracy.json").read_text(encoding="utf-8"))
 
 
+def compile_kernels() -> None:
+    """Compile the kernels that making a town and drawing a map of it need."""
+    from ..reports.raster import Frame, surface
+    from . import make_town
+
+    town = make_town(20.0, 1.0, threads=1, progress=False)
+    surface(town.x, town.y, town.z, Frame.around(town.x, town.y, 16))
+
+
 def _same(stamp: Path, settings: dict) -> bool:
     try:
         return json.loads(stamp.read_text(encoding="utf-8")) == settings

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ..base.jit import njit
+from ..base.jit import device, njit
 from .solids import CELL, CLASS, COUNT, FIRST, LEAFY, SIDE, STEP, TOP, VEGETATION
 from .townplan import GRASS, LAWN, REFLECTANCE, SOIL, WATER, ground, patches
 
@@ -15,7 +15,7 @@ HALF_DIVERGENCE = 0.25e-3  # radians from the middle of a beam to its outer sub-
 SEPARATION = 0.6  # metres; returns closer in range are one (half the length of a 4 ns pulse)
 
 
-@njit
+@device
 def ground_range(ox, oy, oz, dx, dy, dz, t, plan):
     """Range to the ground along a steep beam, and the material, from a guess: gentle slopes let steps converge."""
     for _ in range(30):
@@ -26,7 +26,7 @@ def ground_range(ox, oy, oz, dx, dy, dz, t, plan):
     return t, material
 
 
-@njit
+@device
 def _crossing(things, planes, n, ox, oy, oz, dx, dy, dz):
     """Ranges at which a beam enters and leaves thing n (enter >= leave: missed), and the face entered (-1: none)."""
     near, far, face = -1e30, 1e30, -1
@@ -90,6 +90,7 @@ def cast(origin, direction, scene, plan, rng):
     """
     out, hit, count = np.empty((origin.shape[0] * SUB_BEAMS, 7)), np.empty((SUB_BEAMS, 7)), 0
     things, tested = scene.things, np.full(scene.things.shape[0], -1)
+    order = np.empty(SUB_BEAMS, np.int64)
     for pulse in range(origin.shape[0]):
         ox, oy, oz = origin[pulse, 0], origin[pulse, 1], origin[pulse, 2]
         dx, dy, dz = direction[pulse, 0], direction[pulse, 1], direction[pulse, 2]
@@ -117,13 +118,20 @@ def cast(origin, direction, scene, plan, rng):
                     t, code, material = t + tall / dz, VEGETATION, GRASS
             hit[s, 0], hit[s, 1], hit[s, 2], hit[s, 3] = t, x, y, oz + t * dz
             hit[s, 4], hit[s, 5], hit[s, 6] = code, cosine * REFLECTANCE[material] / SUB_BEAMS, pulse
-        order, first = np.argsort(hit[:, 0]), 0
+        for s in range(SUB_BEAMS):  # by range; numpy's sort takes seconds to compile
+            place = s
+            while place > 0 and hit[order[place - 1], 0] > hit[s, 0]:
+                order[place] = order[place - 1]
+                place -= 1
+            order[place] = s
+        first = 0
         while first < SUB_BEAMS and hit[order[first], 0] < math.inf:  # what is close in range is one return
             last, echo = first, hit[order[first], 5]
             while last + 1 < SUB_BEAMS and hit[order[last + 1], 0] - hit[order[last], 0] < SEPARATION:
                 last += 1
                 echo += hit[order[last], 5]
-            out[count] = hit[order[(first + last) // 2]]
+            for k in range(7):
+                out[count, k] = hit[order[(first + last) // 2], k]
             out[count, 5] = echo
             first, count = last + 1, count + 1
     return out[:count]

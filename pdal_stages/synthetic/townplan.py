@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.jit import njit
+from ..base.jit import device, njit
 
 PITCH_U, PITCH_V = 58.0, 68.0  # from one street's axis to the next
 FIRST_U, FIRST_V = 4.0, 26.0  # axes of line 0
@@ -49,20 +49,20 @@ def make_plan(seed: int) -> Plan:
     return Plan(seed, np.array(waves), int(rng.integers(5)), turn)
 
 
-@njit
+@device
 def block_at(u, v, plan):
     """Indices (i, j) of the block at a place, and its kind: every kind in turn, so that small towns hold all."""
     i, j = math.floor((u - FIRST_U) / PITCH_U), math.floor((v - FIRST_V) / PITCH_V)
     return i, j, (i + 2 * j + plan.shift) % 5
 
 
-@njit
+@device
 def _from_line(value, first, every):
     """Distance to the nearest of the lines ``first + n * every``."""
     return abs(value - first - every * math.floor((value - first) / every + 0.5))
 
 
-@njit
+@device
 def patches(u, v):
     """Smooth patches some ten metres wide: a number in [0, 1]."""
     a, b = u / 3.1 + 1.7 * math.sin(v / 7.3), v / 3.7 + 1.3 * math.sin(u / 5.9)

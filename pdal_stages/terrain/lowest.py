@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..base.jit import njit
+from ..base.jit import device, njit
 from .openings import HOLE
 
 #: Cells within which a lone low cell looks for company, and within which smooth surroundings are judged.
@@ -88,6 +88,18 @@ def _lonely(raster, offsets, distances, cell, out):
             out[j, i] = company < NEED and seen >= IN_VIEW
 
 
+@device
+def _sort(values, n):
+    """Sort the first n values, few of them: numpy's sort takes seconds to compile."""
+    for i in range(1, n):
+        value = values[i]
+        j = i
+        while j > 0 and values[j - 1] > value:
+            values[j] = values[j - 1]
+            j -= 1
+        values[j] = value
+
+
 @njit
 def _below_smooth(raster, out):
     h, w = raster.shape
@@ -110,8 +122,8 @@ def _below_smooth(raster, out):
                         n += 1
             if n < MANY or low > SHARE * (low + n):
                 continue
-            near = np.sort(higher[:n])
-            if near[n // 2] - near[n // 8] <= SPREAD:
+            _sort(higher, n)
+            if higher[n // 2] - higher[n // 8] <= SPREAD:
                 out[j, i] = 2
 
 

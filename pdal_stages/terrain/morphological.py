@@ -260,8 +260,8 @@ def _regain(ground, raster, place, planes, cell, threshold, scalar):
     for j in range(ground.shape[0]):
         for i in range(ground.shape[1]):
             if not ground[j, i] and raster[j, i] != HOLE:
-                height, across, along = planes[j, i]
-                x, y, z = place[j, i]
+                height, across, along = planes[j, i, 0], planes[j, i, 1], planes[j, i, 2]
+                x, y, z = place[j, i, 0], place[j, i, 1], place[j, i, 2]
                 gradient = np.sqrt(across * across + along * along) / cell
                 if abs(z - height - x * across - y * along) <= threshold + scalar * gradient:
                     ground[j, i] = True

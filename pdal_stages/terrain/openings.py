@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..base.jit import njit
+from ..base.jit import device, njit
 
 HOLE = np.float32(np.inf)
 _NOTHING = np.float32(-np.inf)
@@ -33,21 +33,27 @@ def opening_radii(largest: int) -> list[int]:
     return radii
 
 
-@njit
+@device
 def _higher(a, b, out):
     """Element by element maximum; a function of its own, or the compiler does not vectorise it."""
     for i in range(len(out)):
         out[i] = a[i] if a[i] > b[i] else b[i]
 
 
-@njit
+@device
+def _copy(source, out):
+    for i in range(len(out)):
+        out[i] = source[i]
+
+
+@device
 def _lowest_of_three(a, b, c, out):
     for i in range(len(out)):
         low = a[i] if a[i] < b[i] else b[i]
         out[i] = low if low < c[i] else c[i]
 
 
-@njit
+@device
 def _highest_of_cross(a, b, c, d, e, out):
     for i in range(len(out)):
         high = a[i] if a[i] > b[i] else b[i]
@@ -66,11 +72,11 @@ def erode_step(source, target, square):
     for j in range(h):
         above, here, below = source[max(j - 1, 0)], source[j], source[min(j + 1, h - 1)]
         _lowest_of_three(above, here, below, middle)
-        column[1:-1] = middle if square else here
+        _copy(middle if square else here, column[1:-1])
         _lowest_of_three(column[:-2], middle, column[2:], target[j])
 
 
-@njit
+@device
 def _line_maximum(one, two, dy, dx, length):
     """Running maximum of `length` cells along (dy, dx), starting at each cell, in `one`.
 
@@ -85,9 +91,9 @@ def _line_maximum(one, two, dy, dx, length):
         for j in range(h):
             if 0 <= j + sy < h:
                 _higher(one[j][: w - sx], one[j + sy][sx:], two[j][: w - sx])
-                two[j][w - sx :] = one[j][w - sx :]
+                _copy(one[j][w - sx :], two[j][w - sx :])
             else:
-                two[j] = one[j]
+                _copy(one[j], two[j])
         one, two = two, one
         done += step
     return one, two
@@ -114,14 +120,11 @@ def dilate(eroded, raster, radius, squares, one, two, target):
     # Running maxima look ahead; `top` and `left` say how far the middle of the window lies behind.
     side = 2 * squares + 1
     top, left = squares, squares
-    one, two = _line_maximum(one, two, 0, 1, side)
-    one, two = _line_maximum(one, two, 1, 0, side)
     diamonds = radius - squares
-    if diamonds > 0:
-        # A cross, then both diagonals: a full diamond.
-        one, two = _line_maximum(one, two, 1, 1, diamonds)
-        one, two = _line_maximum(one, two, -1, 1, diamonds)
-        left += diamonds - 1
+    # Rows and columns: a square. A cross, then both diagonals: a full diamond.
+    for dy, dx, length in ((0, 1, side), (1, 0, side), (1, 1, diamonds), (-1, 1, diamonds)):
+        one, two = _line_maximum(one, two, dy, dx, length)
+    left += max(diamonds - 1, 0)
     for j in range(h):
         y, x, out = j + pad - top, pad - left, target[j]
         here = one[y][x : x + w]
@@ -129,4 +132,4 @@ def dilate(eroded, raster, radius, squares, one, two, target):
             before, after = one[y][x - 1 : x - 1 + w], one[y][x + 1 : x + 1 + w]
             _highest_of_cross(one[y - 1][x : x + w], one[y + 1][x : x + w], before, after, here, out)
         else:
-            out[:] = here
+            _copy(here, out)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..base.jit import njit
+from ..base.jit import device, njit
 
 #: Weight of the coarser gradient per ground cell, for a lever of one block: it decides where all
 #: ground of a fit lies to one side or on a line.
@@ -26,7 +26,7 @@ def reach(levels: int) -> int:
     return 3 * 2**levels
 
 
-@njit
+@device
 def _add(total, m, dx, dy, weight):
     """Add moments whose origin lies at (dx, dy)."""
     n = m[0]
@@ -45,12 +45,13 @@ def _add(total, m, dx, dy, weight):
 @njit
 def _moments_of_cells(ground, place, left, bottom, out, out_left, out_bottom):
     """n, x, y, xx, xy, yy, z, xz, yz of the ground of each block of 2 x 2 cells, about its centre."""
-    one = np.empty(9)
+    one = np.ones(9)
     for j in range(ground.shape[0]):
         for i in range(ground.shape[1]):
             if ground[j, i]:
-                x, y, z = place[j, i]
-                one[:] = (1.0, x, y, x * x, x * y, y * y, z, x * z, y * z)
+                x, y, z = place[j, i, 0], place[j, i, 1], place[j, i, 2]
+                one[1], one[2], one[3], one[4], one[5] = x, y, x * x, x * y, y * y
+                one[6], one[7], one[8] = z, x * z, y * z
                 column, row = i + left, j + bottom
                 target = out[(row >> 1) - out_bottom, (column >> 1) - out_left]
                 _add(target, one, (column & 1) - 0.5, (row & 1) - 0.5, 1.0)
@@ -66,7 +67,7 @@ def _moments_of_blocks(fine, left, bottom, size, out, out_left, out_bottom):
             _add(target, fine[j, i], ((column & 1) - 0.5) * size, ((row & 1) - 0.5) * size, 1.0)
 
 
-@njit
+@device
 def blend(planes, i, j, s, t, size):
     """Height and gradient of the four planes round a place, weighted by nearness; NaN where none is known.
 
@@ -114,7 +115,8 @@ def _coarsest(floor, raster, left, bottom, level, out, out_left, out_bottom):
                     weight = (1.0 - 0.5 * abs(b - j)) * (1.0 - 0.5 * abs(a - i))
                     total += weight * sums[b, a, 0]
                     n += weight * sums[b, a, 1]
-            out[j, i] = (total / n if n > 0 else np.nan, 0.0, 0.0)
+            out[j, i, 0] = total / n if n > 0 else np.nan
+            out[j, i, 1] = out[j, i, 2] = 0.0
 
 
 @njit
@@ -124,7 +126,7 @@ def _fit(moments, size, planes):
     m = np.empty(9)
     for j in range(h):
         for i in range(w):
-            height, across, along = planes[j, i]
+            height, across, along = planes[j, i, 0], planes[j, i, 1], planes[j, i, 2]
             if np.isnan(height):
                 continue
             m[:] = 0.0
@@ -149,11 +151,8 @@ def _fit(moments, size, planes):
             determinant = xx * yy - xy * xy
             gx = (rx * yy - ry * xy) / determinant
             gy = (ry * xx - rx * xy) / determinant
-            planes[j, i] = (
-                height + (r - m[1] * gx - m[2] * gy) / n_held,
-                across + gx,
-                along + gy,
-            )
+            planes[j, i, 0] = height + (r - m[1] * gx - m[2] * gy) / n_held
+            planes[j, i, 1], planes[j, i, 2] = across + gx, along + gy
 
 
 @njit
@@ -166,7 +165,9 @@ def _from_parents(parents, parents_left, parents_bottom, size, left, bottom, pla
             s, t = 0.25 + 0.5 * (1 - (column & 1)), 0.25 + 0.5 * (1 - (row & 1))
             before = ((column + 1) >> 1) - 1 - parents_left
             below = ((row + 1) >> 1) - 1 - parents_bottom
-            planes[j, i] = blend(parents, before, below, s, t, 2.0 * size)
+            planes[j, i, 0], planes[j, i, 1], planes[j, i, 2] = blend(
+                parents, before, below, s, t, 2.0 * size
+            )
 
 
 @njit
@@ -175,7 +176,7 @@ def _through_ground(ground, place, planes):
     for j in range(ground.shape[0]):
         for i in range(ground.shape[1]):
             if ground[j, i]:
-                x, y, z = place[j, i]
+                x, y, z = place[j, i, 0], place[j, i, 1], place[j, i, 2]
                 planes[j, i, 0] = z - x * planes[j, i, 1] - y * planes[j, i, 2]
 
 
