@@ -161,7 +161,7 @@ class CompilationNote:
             return
         cls._said = True
         try:
-            stream.write("pdal_stages: compiling for this processor, once (half a minute)...\n")
+            stream.write("pdal_stages: compiling for this processor, once (less than a minute)...\n")
             stream.flush()
         except (OSError, ValueError):  # a closed stderr must not stop the work
             pass
