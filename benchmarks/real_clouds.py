@@ -80,7 +80,7 @@ def job(name: str, options: argparse.Namespace, work: Path) -> dict:
     if options.pictures:
         x, y, z, given, truth = np.concatenate(drawn).T
         picture = triptych(x, y, z, given.astype(np.uint8), truth.astype(np.uint8))
-        write_png(options.pictures / f"{name}.png", picture, palette=True)
+        write_png(options.pictures / f"{name}-errors.png", picture, palette=True)
     return {
         "overall_accuracy": total.overall_accuracy,
         "kappa": total.kappa,

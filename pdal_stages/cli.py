@@ -7,6 +7,7 @@ import contextlib
 import json
 import logging
 import os
+import re
 import signal
 import sys
 import threading
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from .base import kinds
-from .base.errors import StageError
+from .base.errors import StageError, suggest
 from .base.outputs import Output, check_outputs
 from .base.plain import PlainStream
 from .base.runlog import LoggedStream, RunLog
@@ -55,7 +56,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     code = 1
     try:
         overrides, rest = parse_overrides(arguments)
-        options = _parser().parse_args(rest)
+        options, unknown = _parser().parse_known_args(rest)
+        if unknown:
+            _refuse_words(options.parser, unknown)
         if overrides and not getattr(options, "takes_overrides", False):
             raise StageError(f"'{options.command}' takes no stage options", found=overrides[0].flag)
         options.overrides = overrides
@@ -137,6 +140,13 @@ def _end_at_once(options: argparse.Namespace) -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
+def _refuse_words(command: argparse.ArgumentParser, unknown: list[str]) -> None:
+    """Leave with the command's usage and the flag that may have been meant."""
+    flags = re.findall(r"(?<!\S)--[\w-]+", command.format_help())
+    near = suggest(unknown[0].partition("=")[0], flags)
+    command.error(f"unrecognized arguments: {' '.join(unknown)}. {near}".rstrip(". "))
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="pdal-stages",
@@ -150,7 +160,7 @@ def _parser() -> argparse.ArgumentParser:
         command = commands.add_parser(
             name, help=help, description=help + ".", epilog=_OVERRIDES if overrides else None
         )
-        command.set_defaults(run=run, takes_overrides=overrides)
+        command.set_defaults(run=run, takes_overrides=overrides, parser=command)
         if name in _LOGGED:
             command.add_argument(
                 "--log", metavar="FILE", help="Add all that the run and its workers print to a log file"

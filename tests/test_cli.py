@@ -297,3 +297,11 @@ def test_after_warmup_the_demo_and_the_defaults_compile_nothing(tmp_path):
     there = compiled("warmup")
     assert len(there) > 20
     assert compiled("demo", tmp_path / "demo", "--size", 60, "--density", 4) == there
+
+
+def test_a_mistyped_flag_is_named_with_its_command(capsys):
+    with pytest.raises(SystemExit) as left:
+        main(["classify", "a.laz", "b.laz", "--modle", "x"])
+    said = capsys.readouterr().err
+    assert left.value.code == 2 and "usage: pdal-stages classify" in said
+    assert "unrecognized arguments: --modle x. Did you mean '--model'?" in said
