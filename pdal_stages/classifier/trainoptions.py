@@ -20,7 +20,7 @@ STRATEGIES = ("multiclass", "binary")
 #: Most passes a model can have.
 MOST_PASSES = 3
 #: What passes after the first read of the surroundings.
-DEFAULT_CONTEXT = ("own", "box2", "columnvotes1", "columnvotes4")
+DEFAULT_CONTEXT = ("own", "box1", "columnvotes2", "columnvotes8")
 
 
 @dataclass(frozen=True)

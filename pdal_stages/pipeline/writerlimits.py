@@ -109,23 +109,27 @@ def _code_limit(writer: dict[str, Any], before: list[dict[str, Any]]) -> CodeLim
 
 def las_version(writer: dict[str, Any], before: Iterable[dict[str, Any]]) -> tuple[int, int]:
     """(minor_version, dataformat_id) the writer will use: its options, the forwarded header, PDAL's defaults."""
-    minor, format_id = pdal_env.las_writer_defaults()
+    minor, format_id = _whole(writer.get("minor_version")), _whole(writer.get("dataformat_id"))
     forward = str(writer.get("forward", ""))
     headers = las_headers(before)
     if headers and ("all" in forward or "header" in forward or "minor_version" in forward):
-        if len({h.minor for h in headers}) == 1:
+        if minor is None and len({h.minor for h in headers}) == 1:
             minor = headers[0].minor
-        if len({h.point_format for h in headers}) == 1:
+        if format_id is None and len({h.point_format for h in headers}) == 1:
             format_id = headers[0].point_format
-    return _whole(writer.get("minor_version"), minor), _whole(writer.get("dataformat_id"), format_id)
+    if minor is None or format_id is None:  # PDAL is asked only then: it is another process
+        defaults = pdal_env.las_writer_defaults()
+        minor = defaults[0] if minor is None else minor
+        format_id = defaults[1] if format_id is None else format_id
+    return minor, format_id
 
 
-def _whole(value: Any, otherwise: int) -> int:
+def _whole(value: Any) -> int | None:
     """An option of PDAL's as a whole number; what is not one is left for PDAL to refuse."""
     try:
-        return otherwise if value is None else int(value)
+        return None if value is None else int(value)
     except (TypeError, ValueError, OverflowError):
-        return otherwise
+        return None
 
 
 def las_headers(readers: Iterable[dict[str, Any]]) -> list[LasHeader]:
