@@ -57,8 +57,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         overrides, rest = parse_overrides(arguments)
         options, unknown = _parser().parse_known_args(rest)
+        command = vars(options).pop("parser")  # it cannot travel to workers
         if unknown:
-            _refuse_words(options.parser, unknown)
+            _refuse_words(command, unknown)
         if overrides and not getattr(options, "takes_overrides", False):
             raise StageError(f"'{options.command}' takes no stage options", found=overrides[0].flag)
         options.overrides = overrides
