@@ -329,9 +329,13 @@ def _pipeline(options: argparse.Namespace) -> int | None:
 def _run(options: argparse.Namespace, pipeline) -> int:
     """Run a pipeline and tell what it has to say; the number of points."""
     count, said = _ran(options, pipeline)
+    _tell(said)
+    return count
+
+
+def _tell(said: Sequence[str]) -> None:
     for line in said:
         print(f"pdal-stages: {line}", file=sys.stderr)
-    return count
 
 
 def _ran(options: argparse.Namespace, pipeline) -> tuple[int, list[str]]:
@@ -403,8 +407,7 @@ def _classify(options: argparse.Namespace) -> int:
     work = [(source, target, options) for source, target in zip(inputs, outputs, strict=True)]
     if len(work) == 1:
         result, said = _classify_one(*work[0])
-        for line in said:
-            print(f"pdal-stages: {line}", file=sys.stderr)
+        _tell(said)
         _print_classes([result], options.model)
         return 0
     done, failed, told = [], 0, _ToldOnce()

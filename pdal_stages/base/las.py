@@ -302,33 +302,51 @@ def _wrong_chunks(
 ) -> tuple[str, str] | None:
     """What is wrong with the chunks of a LAZ file whose table is at `table`."""
     with open(path, "rb") as file:
-        own = [r for r in _records(file, header) if r.user == b"laszip encoded" and r.number == 22204]
-        file.seek(own[0].data + 12 if own else 0)
-        points = file.read(4)
-        if not own or len(points) < 4:
+        coding = _coding(file, header)
+        if coding is None:
             return "it has no record of how it is compressed", "no 'laszip encoded' among its records"
-        (of_chunk,) = struct.unpack("<I", points)
-        file.seek(table)
-        begin = file.read(8)
-        file.seek(table)
-        # A number takes less than eight bytes, and a chunk has two at most.
-        number = struct.unpack("<4xI", begin)[0] if len(begin) == 8 else 0
-        data = file.read(64 + 16 * min(chunks.MOST_DECODED, number))
-        variable = of_chunk in (0, 2**32 - 1)
+        of_chunk = _points_of_chunk(coding)
+        number, data = _table(file, table)
         wrong = chunks.what_is_wrong(
             data,
             table - header.offset - 8,
             points=header.count,
             point_bytes=header.point_bytes,
-            chunk_points=None if variable else of_chunk,
+            chunk_points=of_chunk,
         )
         if wrong or not Path(path).name.lower().endswith(".copc.laz"):
             return wrong
-        return _wrong_octree(file, header, size, data if variable and number <= chunks.MOST_DECODED else b"")
+        listed = of_chunk is None and number <= chunks.MOST_DECODED
+        return _wrong_octree(file, header, size, data if listed else b"")
+
+
+def _coding(file: BinaryIO, header: LasHeader) -> bytes | None:
+    """The record of how a LAZ file is compressed, None where it lacks one."""
+    for record in _records(file, header):
+        if (record.user, record.number) == (b"laszip encoded", 22204):
+            file.seek(record.data)
+            data = file.read(min(record.length, _LARGEST_RECORD))
+            return data if len(data) >= 16 else None
+    return None
+
+
+def _points_of_chunk(coding: bytes) -> int | None:
+    """Points of every chunk but the last; None where the table tells for each."""
+    (points,) = struct.unpack_from("<I", coding, 12)
+    return None if points in (0, 2**32 - 1) else points
+
+
+def _table(file: BinaryIO, place: int) -> tuple[int, bytes]:
+    """Number of chunks, and the file from their table on: as much as the table of so many can take."""
+    file.seek(place)
+    begin = file.read(8)
+    number = struct.unpack("<4xI", begin)[0] if len(begin) == 8 else 0
+    # A number takes less than eight bytes, and a chunk has two at most.
+    return number, begin + file.read(56 + 16 * min(chunks.MOST_DECODED, number))
 
 
 class LazChunks(NamedTuple):
-    """The chunks of a LAZ file: the record on their coding, where the first begins, bytes and points of each."""
+    """The chunks of a LAZ file: the record of their coding, where the first begins, bytes and points of each."""
 
     record: bytes
     begin: int
@@ -340,19 +358,15 @@ def laz_chunks(path: str | os.PathLike, header: LasHeader) -> LazChunks | None:
     """The chunks of a LAZ file that `check_readable` takes; None where they are too many to be listed."""
     table = _chunk_table(path, os.stat(path).st_size, header)
     with open(path, "rb") as file:
-        own = next(r for r in _records(file, header) if (r.user, r.number) == (b"laszip encoded", 22204))
-        file.seek(own.data)
-        record = file.read(own.length)
-        (of_chunk,) = struct.unpack_from("<I", record, 12)
-        file.seek(table)
-        (number,) = struct.unpack("<4xI", file.read(8))
-        if number > chunks.MOST_DECODED:
-            return None
-        variable = of_chunk in (0, 2**32 - 1)
-        sizes, points = chunks.decode(file.read(64 + 16 * number), number, variable=variable)
-    if not variable:
+        coding = _coding(file, header)
+        number, data = _table(file, table)
+    if coding is None or number > chunks.MOST_DECODED:
+        return None
+    of_chunk = _points_of_chunk(coding)
+    sizes, points = chunks.decode(data[8:], number, variable=of_chunk is None)
+    if of_chunk is not None:
         points = [max(0, min(of_chunk, header.count - done * of_chunk)) for done in range(number)]
-    return LazChunks(record, header.offset + 8, sizes, points)
+    return LazChunks(coding, header.offset + 8, sizes, points)
 
 
 def _wrong_octree(file: BinaryIO, header: LasHeader, size: int, table: bytes) -> tuple[str, str] | None:

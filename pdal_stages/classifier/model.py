@@ -231,7 +231,7 @@ class Model:
                 decided = None if decided is None else decided.taken(place)
                 variance = None if variance is None else variance[place]
             outcome.write(at, decided, variance)
-            return 0 if few is None else len(at)
+            return at
 
         question = Question(
             xyz, dimensions, asked, how.threads, how.memory_mb, progress if few is None else None
@@ -243,7 +243,7 @@ class Model:
                 shares[block.rows] = block.result
             written = write(block.rows, None if how.smooth else block.result, block.variance)
             if few is not None and progress is not None:
-                progress.update(written)
+                progress.update(len(written))
         if shares is not None and question.count:
             for part, p in _smoothed(xyz, asked, shares, how):
                 write(part, decide(p, codes, how))

@@ -86,7 +86,8 @@ def represent(
     members = np.argsort(by, kind="stable")
     start = np.zeros(len(kept) + 1, np.int64)
     np.cumsum(np.bincount(by, minlength=len(kept)), out=start[1:])
-    wanted = None if rows is None else np.flatnonzero(np.diff(start))
+    asked = np.flatnonzero(np.diff(start))
+    wanted = None if 0 < len(asked) == len(kept) else asked
     return Representatives(kept, wanted, members if rows is None else rows[members], start)
 
 
