@@ -180,7 +180,9 @@ class AlsNet:
         Batches are computed side by side, as many as fit into the memory, at least one.
         """
         values, notes = gather(
-            self.inputs, with_returns(self.inputs, question.xyz, question.dimensions), len(question.xyz)
+            self.inputs,
+            with_returns(self.inputs, question.xyz, question.dimensions, question.threads),
+            len(question.xyz),
         )
         report: dict[str, Any] = {name: number for name, number in notes.items() if number}
         if not question.count:

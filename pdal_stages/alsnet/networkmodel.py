@@ -58,7 +58,7 @@ def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: 
     notes: dict[str, int] = {}
     for cloud, xyz, position in zip(clouds, checked, positions, strict=True):
         values, counted = gather(
-            inputs, with_returns(inputs, xyz, cloud.dimensions), len(xyz), where=cloud.name
+            inputs, with_returns(inputs, xyz, cloud.dimensions, options.threads), len(xyz), where=cloud.name
         )
         for name, number in counted.items():
             notes[name] = notes.get(name, 0) + number

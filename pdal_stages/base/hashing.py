@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -30,8 +31,13 @@ def coordinate_hash(xyz: npt.NDArray[np.float64], seed: int) -> npt.NDArray[np.u
         Every bit counts, but -0.0 is 0.0.
     seed : int
     """
-    bits: npt.NDArray[Any] = (np.ascontiguousarray(xyz, dtype=np.float64) + 0.0).view(np.uint64)
-    value = np.full(len(bits), np.uint64(seed & 0xFFFFFFFFFFFFFFFF), np.uint64)
-    for axis in range(bits.shape[1]):
-        value = finalise((value ^ bits[:, axis]) + GOLDEN)
+    return hash_of(np.asarray(xyz).T, seed)
+
+
+def hash_of(columns: Iterable[npt.ArrayLike], seed: int) -> npt.NDArray[np.uint64]:
+    """The same of values that lie in an array each, (n,) of any type; there must be one at least."""
+    value: Any = np.uint64(seed & 0xFFFFFFFFFFFFFFFF)
+    for column in columns:
+        bits = (np.asarray(column, np.float64) + 0.0).view(np.uint64)
+        value = finalise((value ^ bits) + GOLDEN)
     return value

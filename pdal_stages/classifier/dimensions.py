@@ -57,10 +57,13 @@ def known(
 
 
 def with_returns(
-    names: Iterable[str], xyz: npt.NDArray[np.float64], dimensions: Mapping[str, npt.ArrayLike]
+    names: Iterable[str],
+    xyz: npt.NDArray[np.float64],
+    dimensions: Mapping[str, npt.ArrayLike],
+    threads: int | None = None,
 ) -> Mapping[str, npt.ArrayLike]:
     """The dimensions and those of `names` that are made of return numbers and the points around."""
-    made = returns.return_features(names, xyz, dimensions)
+    made = returns.return_features(names, xyz, dimensions, threads)
     return {**dimensions, **made} if made else dimensions
 
 

@@ -192,7 +192,7 @@ class Computing:
         self.report: dict[str, Any] = {}
         self._engine: FeatureEngine | None = None
         names = features.plan.dimensions
-        self._dimensions = with_returns(names, question.xyz, question.dimensions)
+        self._dimensions = with_returns(names, question.xyz, question.dimensions, question.threads)
         _, notes = gather(names, self._dimensions, len(question.xyz), question.rows)
         self.report.update({name: number for name, number in notes.items() if number})
 

@@ -67,7 +67,7 @@ def sample_features(
                 continue
             engine = features.engine(cloud.xyz, options.threads)
             own = features.plan.dimensions
-            there = with_returns(own, cloud.xyz, cloud.dimensions)
+            there = with_returns(own, cloud.xyz, cloud.dimensions, options.threads)
             fed, counted = gather(own, there, len(cloud.xyz), rows, cloud.name)
             for name, n in counted.items():
                 notes[name] = notes.get(name, 0) + n

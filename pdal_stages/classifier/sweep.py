@@ -105,14 +105,15 @@ class Sweep:
         at = self._place[block.rows]
         self._shares[at] = block.shares
         strip = np.searchsorted(self._start, at, side="right") - 1
-        np.subtract.at(self._left, strip, 1)
+        self._left -= np.bincount(strip, minlength=len(self._left))
         keep = np.arange(len(strip)) if self._wanted is None else np.flatnonzero(self._wanted[block.rows])
-        strip = strip[keep]
-        values = block.values if self._room > 0.0 else None
-        for number in np.unique(strip).tolist():
-            mine = keep[strip == number]
-            part = None if values is None else values if len(mine) == len(values) else values[mine]
-            if part is not None:
+        keep = keep[np.argsort(strip[keep], kind="stable")]  # in order already where a block runs along y
+        numbers, first = np.unique(strip[keep], return_index=True)
+        for number, mine in zip(numbers, np.split(keep, first)[1:], strict=True):
+            part = None
+            if block.values is not None and self._room > 0.0:
+                follow = mine[-1] - mine[0] + 1 == len(mine)  # then no copy is needed
+                part = block.values[mine[0] : mine[-1] + 1] if follow else block.values[mine]
                 self._room -= part.nbytes
             self._waiting[number].append((block.rows[mine], part))
 

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OptionError
+from ..base.threads import map_blocks
 from .neighborhoods import SIDES
 
 #: What they are made of.
@@ -82,7 +83,10 @@ def reach(names: Iterable[str]) -> float:
 
 
 def return_features(
-    names: Iterable[str], xyz: npt.NDArray[np.float64], dimensions: Mapping[str, npt.ArrayLike]
+    names: Iterable[str],
+    xyz: npt.NDArray[np.float64],
+    dimensions: Mapping[str, npt.ArrayLike],
+    threads: int | None = None,
 ) -> dict[str, npt.NDArray[np.float32]]:
     """Those of `names` that are return features, for every point of a cloud.
 
@@ -94,6 +98,8 @@ def return_features(
         Metres.
     dimensions : mapping
         ``ReturnNumber`` and ``NumberOfReturns``, (n,) each; without them all is 0.
+    threads : int, optional
+        ``None`` or 0: every core.
 
     Returns
     -------
@@ -109,17 +115,17 @@ def return_features(
     flags = np.empty((len(xyz), len(FLAGS)), np.uint16)
     flags[:, 0] = np.where(total > 1, WHOLE, 0)
     flags[:, 1] = np.where((number > 0) & (number < total), WHOLE, 0)
-    out: dict[str, npt.NDArray[np.float32]] = {}
-    tables: dict[tuple[int, float], npt.NDArray[np.float32]] = {}
     every = np.arange(len(xyz))
-    for name, one in wanted.items():
-        column = list(FLAGS).index(one.flag)
-        if not one.axes:
-            out[name] = (flags[:, column] > 0).astype(np.float32)
-            continue
-        key = (one.axes, one.side)
-        if key not in tables:
-            tables[key] = np.empty((len(xyz), len(FLAGS)), np.float32)
-            take_means(*cell_means(xyz[:, : one.axes], flags, one.side), every, tables[key])
-        out[name] = np.ascontiguousarray(tables[key][:, column])
-    return out
+
+    def table(scale: tuple[int, float]) -> npt.NDArray[np.float32]:
+        out = np.empty((len(xyz), len(FLAGS)), np.float32)
+        take_means(*cell_means(xyz[:, : scale[0]], flags, scale[1]), every, out)
+        return out
+
+    scales = list(dict.fromkeys((one.axes, one.side) for one in wanted.values() if one.axes))
+    tables = dict(zip(scales, map_blocks(table, scales, threads), strict=True))
+    tables[0, 0.0] = (flags > 0).astype(np.float32)
+    columns = {
+        name: tables[one.axes, one.side][:, list(FLAGS).index(one.flag)] for name, one in wanted.items()
+    }
+    return {name: np.ascontiguousarray(column) for name, column in columns.items()}

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ..base.hashing import coordinate_hash
+from ..base.hashing import hash_of
 from .cells import cell_keys
 
 #: Largest side in metres.
@@ -98,13 +98,19 @@ def _one_each(
     if not side or not len(xyz):
         return None
     keys, _ = cell_keys(xyz, side)
-    known = np.column_stack([xyz, *(np.asarray(one, np.float64) for one in values)])
-    order = np.lexsort((coordinate_hash(known, 0), keys))
-    first = np.append(True, keys[order[1:]] != keys[order[:-1]])
+    order = np.argsort(keys)
+    ascending = keys[order]
+    first = np.append(True, ascending[1:] != ascending[:-1])
     if first.all():
         return None
-    chosen = order[first]
-    kept = np.sort(chosen)
+    start = np.flatnonzero(first)
+    voxel = np.cumsum(first) - 1
+    # Of each voxel the point of the least hash, among equals the one that comes first.
+    hashes = hash_of([*xyz.T, *values], 0)[order]
+    least = hashes == np.minimum.reduceat(hashes, start)[voxel]
+    chosen = np.minimum.reduceat(np.where(least, order, len(xyz)), start)
+    is_kept = np.zeros(len(xyz), np.bool_)
+    is_kept[chosen] = True
     by = np.empty(len(xyz), np.int64)
-    by[order] = np.searchsorted(kept, chosen)[np.cumsum(first) - 1]
-    return kept, by
+    by[order] = (np.cumsum(is_kept) - 1)[chosen][voxel]
+    return np.flatnonzero(is_kept), by
