@@ -393,6 +393,18 @@ def test_sparse_points_widen_the_surroundings(tmp_path, random_cloud, write_las)
     assert any(job.report["short"] for job in run.tiles)
 
 
+def test_sparse_points_widen_the_surroundings_of_a_model(tmp_path, random_cloud, write_las):
+    """A model of two passes says as well how many neighbors it looks for."""
+    xyz = random_cloud(900, seed=3, extent=(300, 300, 4))
+    path = write_las(tmp_path / "sparse.las", dict(zip("XYZ", xyz.T, strict=True)))
+    model_file = clouds.model(tmp_path / "m.model", "k30", "covariance")
+    assert len(ps.load_model(model_file).passes) == 2
+    ps.Pipeline(clouds.stages([path], tmp_path / "a.las", model_file)).execute(arrays=False)
+    run = run_tiled(clouds.stages([path], tmp_path / "b.las", model_file), 60, workers=0)
+    assert not run.failures and any(job.report["widened"] for job in run.tiles)
+    clouds.same_points(tmp_path / "a.las", tmp_path / "b.las")
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10_000), st.floats(0.002, 0.1))
 def test_terrain_within_its_reach_is_the_whole_terrain(seed, density):

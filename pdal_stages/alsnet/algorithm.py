@@ -17,7 +17,7 @@ import numpy.typing as npt
 from ..base import checks
 from ..base.errors import ModelError, OptionError, StageError
 from ..base.threads import map_blocks, resolve_threads
-from ..classifier.algorithms import Answer, Block, Column, Question
+from ..classifier.algorithms import Answer, Block, Column, InputPlan, Question
 from ..classifier.arrays import ArrayRule
 from ..classifier.dimensions import gather, with_returns
 from ..features.index import check_xyz
@@ -31,34 +31,6 @@ from .weights import Folded, Weights, check
 MOST_MB = 32_768
 #: Metres that become 1 where X, Y or Z is an input.
 METRES = 10.0
-
-
-@dataclass(frozen=True)
-class InputPlan:
-    """What a network needs of the points.
-
-    Attributes
-    ----------
-    dimensions : tuple of str
-        Inputs in order. X, Y and Z are taken from the batch's centre.
-    halo : float
-        Metres around a tile that its results depend on.
-    most_neighbors : int
-        None: batches are cut by area.
-    """
-
-    dimensions: tuple[str, ...]
-    halo: float
-    most_neighbors: ClassVar[int] = 0
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The inputs."""
-        return self.dimensions
-
-    def to_dict(self) -> dict[str, Any]:
-        """As the manifest has it."""
-        return {"neighborhoods": [], "features": [], "dimensions": list(self.dimensions)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +115,7 @@ class AlsNet:
         """What a model file says of it beside its arrays; nothing is fitted but the weights."""
         return {
             "parameters": self.parameters(),
-            "features": self.plan.to_dict(),
+            "features": {"neighborhoods": [], "features": [], "dimensions": list(self.inputs)},
             "feature_names": list(self.inputs),
             "dimensions": list(self.inputs),
             "context": [],
@@ -158,8 +130,8 @@ class AlsNet:
 
     @property
     def plan(self) -> InputPlan:
-        """What it needs of the points."""
-        return InputPlan(self.inputs, circles_.halo(self.spacing))
+        """Its inputs; X, Y and Z are taken from the batch's centre, and batches are cut by area."""
+        return InputPlan(self.inputs, self.inputs, circles_.halo(self.spacing))
 
     # ---- applying ------------------------------------------------------------------------------------------
 

@@ -22,35 +22,37 @@ from .epochs import LabelledCloud, train_network
 from .networkoptions import NetworkOptions
 
 
-class NetworkTrainer:
-    """How ``alsnet`` is trained."""
-
-    @staticmethod
-    def own_options(given: Any) -> NetworkOptions:
-        """The options of the network."""
-        if isinstance(given, NetworkOptions):
-            return given
-        if given is not None and not isinstance(given, Mapping):
-            raise OptionError("'alsnet' must be a mapping of options", found=repr(given)[:60])
-        return NetworkOptions.from_dict(given or {})
-
-    @staticmethod
-    def inputs(options: TrainingOptions) -> tuple[str, ...]:
-        """Coordinates from the batch's centre, then dimensions."""
-        return input_names(options.alsnet.coordinates, options.dimensions)
-
-    @staticmethod
-    def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model:
-        """See :func:`pdal_stages.classifier.train`. A batch sees only its own cloud."""
-        return _train(clouds, options, progress)
+def own_options(given: Any) -> NetworkOptions:
+    """The options of the network."""
+    if isinstance(given, NetworkOptions):
+        return given
+    if given is not None and not isinstance(given, Mapping):
+        raise OptionError("'alsnet' must be a mapping of options", found=repr(given)[:60])
+    return NetworkOptions.from_dict(given or {})
 
 
-def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model:
+def inputs(options: TrainingOptions) -> tuple[str, ...]:
+    """The network's inputs: coordinates from the batch's centre, then dimensions.
+
+    Raises
+    ------
+    OptionError
+        There are none.
+    """
+    names = tuple(dict.fromkeys([*options.alsnet.coordinates, *options.dimensions]))
+    if not names:
+        raise OptionError(
+            "a network needs at least one input", cure="Name a dimension, or set 'coordinates' to Z or XYZ"
+        )
+    return names
+
+
+def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model:
+    """See :func:`pdal_stages.classifier.train`. A batch sees only its own cloud."""
     from .network import torch  # before any work: says what to install where it is missing
 
     started = time.perf_counter()
-    network = options.alsnet
-    inputs = input_names(network.coordinates, options.dimensions)
+    names = inputs(options)
     checked = [check_xyz(np.asarray(cloud.xyz), cloud.name) for cloud in clouds]
     known = label_classes(clouds, options)
     classes, positions = known.classes, [position for _, position in known]
@@ -58,17 +60,23 @@ def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: 
     notes: dict[str, int] = {}
     for cloud, xyz, position in zip(clouds, checked, positions, strict=True):
         values, counted = gather(
-            inputs, with_returns(inputs, xyz, cloud.dimensions, options.threads), len(xyz), where=cloud.name
+            names, with_returns(names, xyz, cloud.dimensions, options.threads), len(xyz), where=cloud.name
         )
         for name, number in counted.items():
             notes[name] = notes.get(name, 0) + number
         labelled.append(LabelledCloud(xyz, position, values))
     trained = train_network(
-        labelled, inputs, classes, network, seed=options.seed, threads=options.threads, progress=progress
+        labelled,
+        names,
+        classes,
+        options.alsnet,
+        seed=options.seed,
+        threads=options.threads,
+        progress=progress,
     )
     used = [np.bincount(p[p >= 0], minlength=len(classes.codes)) for p in positions]
     count = np.sum(used, axis=0)
-    low, high = zip(*(_range(name, labelled) for name in inputs), strict=True)
+    low, high = zip(*(_range(name, labelled) for name in names), strict=True)
     info: dict[str, Any] = {
         "strategy": options.strategy,
         "target": options.target,
@@ -111,22 +119,6 @@ def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: 
     }
     seconds = {**trained.seconds, "whole": round(time.perf_counter() - started, 3)}
     return Model((trained.net,), list(zip(classes.codes, classes.names, strict=True)), info, seconds)
-
-
-def input_names(coordinates: str, dimensions: Sequence[str]) -> tuple[str, ...]:
-    """The network's inputs: coordinates from the batch's centre, then dimensions.
-
-    Raises
-    ------
-    OptionError
-        There are none.
-    """
-    names = tuple(dict.fromkeys([*coordinates, *dimensions]))
-    if not names:
-        raise OptionError(
-            "a network needs at least one input", cure="Name a dimension, or set 'coordinates' to Z or XYZ"
-        )
-    return names
 
 
 def _range(name: str, clouds: Sequence[LabelledCloud]) -> tuple[float, float]:

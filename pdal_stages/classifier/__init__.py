@@ -1,6 +1,5 @@
 """Classifiers: training on labelled clouds, the model file, classifying clouds. NumPy in and out; no PDAL."""
 
-from .algorithms import register
 from .clouds import TrainingCloud
 from .deciding import Prediction
 from .featureforest import FeatureForest
@@ -19,9 +18,3 @@ __all__ = [
     "load_model",
     "train",
 ]
-
-register(
-    "random_forest",
-    "pdal_stages.classifier.featureforest:FeatureForest",
-    "pdal_stages.classifier.foresttraining:ForestTrainer",
-)

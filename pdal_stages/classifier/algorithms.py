@@ -1,12 +1,8 @@
-"""What a classifier of clouds is, whatever is inside: one interface, and the names under which kinds are known.
-
-A package brings its kinds by calling :func:`register` when it is imported. A model file, and an option, name a
-kind by its word; the packages of :data:`PACKAGES` are imported then, not before.
-"""
+"""What a classifier of clouds is, whatever is inside: one interface, and the names under which kinds are known."""
 
 from __future__ import annotations
 
-import importlib
+import pkgutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple, Protocol
@@ -15,36 +11,39 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError
+from ..features import FeaturePlan
 from .arrays import ArrayRule
 
-#: Packages that register kinds when they are imported.
-PACKAGES = ("pdal_stages.classifier", "pdal_stages.alsnet")
+#: Each kind by its word in manifests and options: its Algorithm and its Trainer, imported when asked for.
+KINDS = {
+    "random_forest": (
+        "pdal_stages.classifier.featureforest:FeatureForest",
+        "pdal_stages.classifier.foresttraining",
+    ),
+    "alsnet": ("pdal_stages.alsnet.algorithm:AlsNet", "pdal_stages.alsnet.networkmodel"),
+}
 
 
-class Inputs(Protocol):
-    """What a classifier looks at.
+@dataclass(frozen=True)
+class InputPlan:
+    """What a classifier looks at, where a :class:`FeaturePlan` does not say it.
 
     Attributes
     ----------
     names : tuple of str
         Its inputs, in order.
     dimensions : tuple of str
-        Which of them, at the end, are dimensions of the points.
+        Which of them are dimensions of the points.
     halo : float
         Metres around a tile whose points the tile's results depend on.
     most_neighbors : int
         The most neighbors a point is asked for, where their number decides how far away they are.
     """
 
-    @property
-    def names(self) -> tuple[str, ...]: ...
-    @property
-    def dimensions(self) -> tuple[str, ...]: ...
-    @property
-    def halo(self) -> float: ...
-    @property
-    def most_neighbors(self) -> int: ...
-    def to_dict(self) -> dict[str, Any]: ...
+    names: tuple[str, ...]
+    dimensions: tuple[str, ...]
+    halo: float
+    most_neighbors: int = 0
 
 
 class Column(NamedTuple):
@@ -118,7 +117,7 @@ class Algorithm(Protocol):
         Array of a model file to what it must be; a name that ends in ``*`` stands for many.
     gives_variance : bool
         Whether its blocks have a variance.
-    plan : Inputs
+    plan : FeaturePlan or InputPlan
     """
 
     name: ClassVar[str]
@@ -126,7 +125,7 @@ class Algorithm(Protocol):
     gives_variance: ClassVar[bool]
 
     @property
-    def plan(self) -> Inputs: ...
+    def plan(self) -> FeaturePlan | InputPlan: ...
 
     @classmethod
     def from_file(
@@ -156,64 +155,32 @@ class Algorithm(Protocol):
 
 
 class Trainer(Protocol):
-    """How a kind is trained.
+    """How a kind is trained: a module with these functions.
 
     `options` are ``TrainingOptions``, `clouds` ``TrainingCloud``s, and what comes out is a ``Model``: all of them rooms
     that stand on this one.
     """
 
-    @staticmethod
-    def own_options(given: Any) -> Any:
+    def own_options(self, given: Any) -> Any:
         """The kind's own options, checked; None where it has none."""
 
-    @staticmethod
-    def inputs(options: Any) -> tuple[str, ...]:
+    def inputs(self, options: Any) -> tuple[str, ...]:
         """Dimensions it uses as inputs, X, Y and Z among them."""
 
-    @staticmethod
-    def train(clouds: Sequence[Any], options: Any, progress: bool) -> Any: ...
-
-
-_KINDS: dict[str, tuple[str, str]] = {}
-
-
-def register(name: str, algorithm: str, trainer: str) -> None:
-    """Make a kind known.
-
-    Parameters
-    ----------
-    name : str
-        Its word in manifests and options.
-    algorithm, trainer : str
-        ``module:class`` of its :class:`Algorithm` and its :class:`Trainer`, imported when asked for.
-    """
-    _KINDS[name] = (algorithm, trainer)
-
-
-def algorithm_names() -> list[str]:
-    """The kinds there are."""
-    for package in PACKAGES:
-        importlib.import_module(package)
-    return list(_KINDS)
+    def train(self, clouds: Sequence[Any], options: Any, progress: bool) -> Any: ...
 
 
 def algorithm(name: str) -> type[Algorithm]:
     """The class of a kind by its name; ModelError where there is none."""
-    if name not in algorithm_names():
+    if name not in KINDS:
         raise ModelError(
             "the model uses an algorithm this release does not know",
             found=repr(name)[:60],
             cure="Update pdal-stages",
         )
-    return _imported(_KINDS[name][0])
+    return pkgutil.resolve_name(KINDS[name][0])
 
 
-def trainer(name: str) -> type[Trainer]:
-    """What trains a kind, by its name, which is one of :func:`algorithm_names`."""
-    algorithm_names()
-    return _imported(_KINDS[name][1])
-
-
-def _imported(place: str) -> Any:
-    module, _, name = place.partition(":")
-    return getattr(importlib.import_module(module), name)
+def trainer(name: str) -> Trainer:
+    """What trains a kind, one of :data:`KINDS`."""
+    return pkgutil.resolve_name(KINDS[name][1])

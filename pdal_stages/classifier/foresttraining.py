@@ -36,22 +36,13 @@ from .trainoptions import TrainingOptions
 FOLD_TREES = 0.25
 
 
-class ForestTrainer:
-    """How ``random_forest`` is trained."""
+def own_options(given: Any) -> None:
+    """A forest has none beside ``TrainingOptions``."""
 
-    @staticmethod
-    def own_options(given: Any) -> None:
-        """A forest has none beside ``TrainingOptions``."""
 
-    @staticmethod
-    def inputs(options: TrainingOptions) -> tuple[str, ...]:
-        """Dimensions used as features."""
-        return feature_plan(options).dimensions
-
-    @staticmethod
-    def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model:
-        """See :func:`pdal_stages.classifier.train`."""
-        return _train(clouds, options, progress)
+def inputs(options: TrainingOptions) -> tuple[str, ...]:
+    """Dimensions used as features."""
+    return feature_plan(options).dimensions
 
 
 def feature_plan(options: TrainingOptions) -> FeaturePlan:
@@ -61,7 +52,8 @@ def feature_plan(options: TrainingOptions) -> FeaturePlan:
     )
 
 
-def _train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model:
+def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model:
+    """See :func:`pdal_stages.classifier.train`."""
     started = time.perf_counter()
     plan = feature_plan(options)
     groups = _groups(clouds, options)  # before any work: a dimension may be missing

@@ -12,9 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError, OptionError
+from ..features import FeaturePlan
 from ..features.voxels import represent
 from . import modelfile, summary
-from .algorithms import Inputs, Question, algorithm
+from .algorithms import InputPlan, Question, algorithm
 from .deciding import Outcome, Prediction, PredictionOptions, decide
 from .dimensions import known, required, welcome
 from .heights import heights
@@ -59,7 +60,7 @@ class Model:
         return self.passes[0] if len(self.passes) == 1 else Passes(self.passes, len(self.classes))
 
     @property
-    def plan(self) -> Inputs:
+    def plan(self) -> FeaturePlan | InputPlan:
         """Features and dimensions it needs."""
         return self.algorithm.plan
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .algorithms import Answer, Block, Question
+from .algorithms import Answer, Block, InputPlan, Question
 from .context import around
 from .featureforest import Computing, Features
 from .smoothing import count_shares
@@ -18,43 +18,6 @@ from .sweep import Passed, Sweep
 
 #: Of the memory for work under way, what features that wait for the next pass may take.
 _KEPT = 0.5
-
-
-@dataclass(frozen=True)
-class JointInputs:
-    """What several passes look at.
-
-    Attributes
-    ----------
-    names, dimensions : tuple of str
-        Of all passes, each once.
-    halo : float
-        Metres around a tile: the passes' own, one after the other.
-    neighborhoods : tuple
-    """
-
-    names: tuple[str, ...]
-    dimensions: tuple[str, ...]
-    halo: float
-    neighborhoods: tuple[Any, ...]
-
-    @classmethod
-    def of(cls, passes: Sequence[Any]) -> JointInputs:
-        """The inputs of these passes; each after the first has a context."""
-
-        def joined(parts) -> tuple[Any, ...]:
-            return tuple(dict.fromkeys(item for part in parts for item in part))
-
-        halo = passes[0].plan.halo
-        for one in passes[1:]:
-            halo = max(one.plan.halo, halo + one.context.reach)
-        plans = [one.plan for one in passes]
-        return cls(
-            joined(plan.names for plan in plans),
-            joined(plan.dimensions for plan in plans),
-            halo,
-            joined(plan.neighborhoods for plan in plans),
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +43,18 @@ class Passes:
         return self.members[-1].name
 
     @cached_property
-    def plan(self) -> JointInputs:
-        """What all passes look at."""
-        return JointInputs.of(self.members)
+    def plan(self) -> InputPlan:
+        """What all passes look at; the halo is the passes' own, one after the other."""
+        plans = [one.plan for one in self.members]
+        halo = plans[0].halo
+        for one in self.members[1:]:
+            halo = max(one.plan.halo, halo + one.context.reach)
+        return InputPlan(
+            tuple(dict.fromkeys(name for plan in plans for name in plan.names)),
+            tuple(dict.fromkeys(name for plan in plans for name in plan.dimensions)),
+            halo,
+            max(plan.most_neighbors for plan in plans),
+        )
 
     def predict(self, question: Question, finish: Callable[[npt.NDArray[np.float64]], Any]) -> Answer:
         """Classify; see ``Algorithm.predict``."""

@@ -13,7 +13,7 @@ from ..base.asprs import NOISE
 from ..base.errors import OptionError, suggest
 from ..base.threads import resolve_threads
 from ..features.voxels import LARGEST
-from .algorithms import algorithm_names, trainer
+from .algorithms import KINDS, trainer
 from .context import Context
 
 STRATEGIES = ("multiclass", "binary")
@@ -206,9 +206,8 @@ class TrainingOptions:
         resolve_threads(self.threads)
 
     def _check_algorithm(self) -> None:
-        known = algorithm_names()
-        checks.one_of("'algorithm'", self.algorithm, known)
-        for name in known:  # an algorithm's own options stand under its name
+        checks.one_of("'algorithm'", self.algorithm, KINDS)
+        for name in KINDS:  # an algorithm's own options stand under its name
             if name != self.algorithm and getattr(self, name, None):
                 raise OptionError(
                     f"'{name}' means something only with algorithm '{name}'", found=self.algorithm
