@@ -395,7 +395,7 @@ def _options(options: argparse.Namespace) -> None:
 
 def _classify(options: argparse.Namespace) -> int:
     from .pipeline.jobs import las_files, outputs_of
-    from .pipeline.manyfiles import each_file
+    from .pipeline.processes import each_file
 
     inputs = las_files(options.inputs)
     outputs = outputs_of(inputs, options.output)
@@ -558,7 +558,7 @@ def _demo(options: argparse.Namespace) -> None:
 def _warmup(options: argparse.Namespace) -> None:
     from .base.threads import available_threads
     from .classifier.warmup import compile_part, features_part, other_part, warmup
-    from .pipeline.manyfiles import each_file
+    from .pipeline.processes import each_file
     from .synthetic.demo import compile_kernels
 
     parts = [(part,) for part in (features_part, other_part, compile_kernels)]

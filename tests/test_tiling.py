@@ -18,9 +18,9 @@ from pdal_stages.base.errors import OptionError, PipelineError, StageError
 from pdal_stages.synthetic.townfile import wkt
 from pdal_stages.terrain.minima import terrain_reach
 from pdal_stages.tiling import TilingOptions, run_tiled
-from pdal_stages.tiling.cloudindex import blocks_near, index_las
+from pdal_stages.tiling.cloudindex import index_las
 from pdal_stages.tiling.extract import cut, plain_header
-from pdal_stages.tiling.grid import Grid, inside, touch
+from pdal_stages.tiling.grid import Grid, inside, touching
 from pdal_stages.tiling.sources import find_sources, las_header
 from pdal_stages.tiling.tileplan import make_plan
 from pdal_stages.tiling.tindex import locations
@@ -78,8 +78,8 @@ def test_every_point_has_one_tile(size, values, edge):
 
 def test_boxes_touch_on_their_edges():
     grid = Grid(10)
-    assert touch(grid.box((0, 0)), grid.box((1, 1)))
-    assert not touch(grid.box((0, 0)), grid.box((2, 0)))
+    boxes = [grid.box((1, 1)), grid.box((2, 0)), grid.box((0, -1))]
+    assert touching(boxes, grid.box((0, 0))) == [0, 2]
     assert inside(grid.box((0, 0)), grid.box((0, 0), 1)) and not inside(grid.box((0, 0), 1), grid.box((0, 0)))
     assert grid.covering((0, 0, 10, 5)) == [(0, 0), (1, 0)]
     assert Grid(500).name((1000, -1)) == "500000_-500"
@@ -102,7 +102,7 @@ def test_a_cut_is_the_files_own_bytes(tmp_path, random_cloud, write_las, suffix,
     )
     index = index_las(str(path), Grid(25.0))
     assert index.count == len(xyz) and sum(n for _, _, n in index.tiles) == len(xyz)
-    assert blocks_near(index, (0, 0, 10, 100)) == [0]
+    assert touching(index.boxes, (0, 0, 10, 100)) == [0]
     target = tmp_path / "piece.las"
     piece = cut(str(path), index, Grid(25.0), (1, 2), 3.0, str(target), str(tmp_path / "core.las"))
     las, all_ = laspy.read(target), laspy.read(path)

@@ -16,7 +16,7 @@ class StageError(Exception):
     where : str, optional
         The stage type and tag, the file, or the option.
     found : object, optional
-        The value that was found.
+        The value that was found; an OSError, for what the system said.
     cure : str, optional
         What to do about it.
     """
@@ -26,7 +26,7 @@ class StageError(Exception):
     ) -> None:
         self.what = what
         self.where = where
-        self.found = found
+        self.found = (found.strerror or str(found)) if isinstance(found, OSError) else found
         self.cure = cure
         super().__init__(what)
 

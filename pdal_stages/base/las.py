@@ -107,9 +107,7 @@ def check_readable(path: str | os.PathLike) -> str | None:
         if header is not None and header.compressed and header.count and not wrong:
             wrong = _wrong_chunks(path, header, table, size)
     except OSError as error:
-        raise StageError(
-            "the file cannot be read", where=str(path), found=error.strerror or str(error)
-        ) from None
+        raise StageError("the file cannot be read", where=str(path), found=error) from None
     if header is None:
         raise StageError(
             "this is no LAS file", where=str(path), found=f"{size:,} bytes without a LAS header", cure=_CURE

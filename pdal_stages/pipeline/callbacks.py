@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import uuid
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from typing import Any
 
 from .interrupts import catches
@@ -20,36 +21,18 @@ def stage(ins, outs):
 _functions: dict[str, Function] = {}
 
 
-class Callbacks:
+class Callbacks(AbstractContextManager):
     """Filters that call functions of this process, which are forgotten when the ``with`` block ends."""
 
     def __init__(self) -> None:
         self._labels: list[str] = []
 
-    def __enter__(self) -> Callbacks:
-        return self
-
     def __exit__(self, *exc: object) -> None:
         for label in self._labels:
             _functions.pop(label, None)
 
-    def filter(
-        self,
-        function: Function,
-        adds: Mapping[str, str] | None = None,
-        **own: Any,
-    ) -> dict[str, Any]:
-        """A ``filters.python`` that calls a function.
-
-        Parameters
-        ----------
-        function : callable
-            Gets the script's globals, the dimensions, and a dict for those to write back.
-        adds : mapping, optional
-            Dimensions to add: name -> PDAL type.
-        **own
-            `tag` and `inputs`.
-        """
+    def filter(self, function: Function, adds: Mapping[str, str] | None = None, **own: Any) -> dict[str, Any]:
+        """A ``filters.python`` that calls a function and adds dimensions (name -> PDAL type); `own`: its tag, inputs."""
         label = f"pdal_stages_callback_{uuid.uuid4().hex}"
         _functions[label] = function
         self._labels.append(label)

@@ -12,9 +12,9 @@ from typing import Any
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import PipelineError
 from . import pdal as pdal_env
-from .filenames import is_writer
+from .filenames import is_writer, writes_las
 from .runtime import python_filter
-from .writerlimits import las_headers, las_version, writes_las
+from .writerlimits import las_headers, las_version
 
 _SCRIPT = f"""\
 def stage(ins, outs):
@@ -29,12 +29,12 @@ _CONVERT = (
 )
 
 
-def splitter(stages: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], int] | None:
+def splitter(stages: list[dict[str, Any]]) -> tuple[dict[str, Any], int] | None:
     """A filter that parts classes from flags, and the number of the last reader, after which it belongs.
 
     Parameters
     ----------
-    stages : sequence of dict
+    stages : list of dict
         A pipeline.
 
     Returns
@@ -49,7 +49,6 @@ def splitter(stages: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], int] | N
     """
     if pdal_env.splits_class_flags():
         return None
-    stages = list(stages)
     writers = [n for n, stage in enumerate(stages) if is_writer(stage, stages)]
     readers = [n for n, stage in enumerate(stages) if n not in writers and _reads(stage)]
     old = [header.point_format <= 5 for header in las_headers(stages[n] for n in readers)]
@@ -61,9 +60,7 @@ def splitter(stages: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], int] | N
     if not all(old) or any(fit):
         raise PipelineError(
             "this PDAL cannot bring the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 into a pipeline with LAS 1.4",
-            found=f"PDAL {'.'.join(map(str, pdal_env.version()))}, "
-            + ("readers" if not all(old) else "writers")
-            + " of both",
+            found=f"PDAL {pdal_env.dotted_version()}, {'writers' if all(old) else 'readers'} of both",
             cure=_CONVERT,
         )
     last = readers[-1]

@@ -11,6 +11,8 @@ from ..base import kinds
 from ..base.outputs import Output
 from ..stages.base import Stage
 
+#: Writers of LAS and what is made of it.
+LAS_WRITERS = ("writers.las", "writers.copc")
 #: What stages of PDAL have that never names a file.
 _NO_FILES = ("type", "tag", "inputs", "user_data", "pdalargs")
 
@@ -84,17 +86,16 @@ def is_writer(stage: dict[str, Any], stages: list[dict[str, Any]]) -> bool:
     return kind not in ("", "writers.text") or name.upper() != "STDOUT"  # which PDAL prints
 
 
+def writes_las(writer: dict[str, Any]) -> bool:
+    """Whether a writer, or a stage without a type, writes LAS."""
+    kind, name = writer.get("type", ""), str(writer.get("filename", ""))
+    return kind in LAS_WRITERS or (not kind and name.lower().endswith((".las", ".laz")))
+
+
 def writers_outputs(stages: list[dict[str, Any]]) -> list[Output]:
     """Files that PDAL's writers write."""
-    found = []
-    for stage in stages:
-        if is_writer(stage, stages):
-            name = stage["filename"]
-            las = stage.get("type") in ("writers.las", "writers.copc") or (
-                "type" not in stage and name.lower().endswith((".las", ".laz"))
-            )
-            found.append(Output(name, "output", kinds.LAS if las else ""))
-    return found
+    writers = [stage for stage in stages if is_writer(stage, stages)]
+    return [Output(s["filename"], "output", kinds.LAS if writes_las(s) else "") for s in writers]
 
 
 def with_outputs(stages: list[dict[str, Any]], names: list[Any]) -> list[dict[str, Any]]:

@@ -20,12 +20,11 @@ from ..stages import preparation
 from ..stages.accuracy import AccuracyStage
 from ..stages.points import Points
 from . import pdal as pdal_env
-from .filenames import stage_files
+from .filenames import LAS_WRITERS, stage_files
 from .lowering import lower_stage
 from .overrides import Override, apply_overrides
 from .run import Pipeline
 from .runtime import python_filter, wkt_of
-from .writerlimits import LAS_WRITERS
 
 #: Dimensions that `classify` writes beside the input's own.
 WRITTEN = ("HeightAboveGround", "Reliability")

@@ -7,6 +7,8 @@ inputs work as PDAL makes them work.
 from __future__ import annotations
 
 import copy
+import difflib
+import itertools
 import uuid
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,13 +19,13 @@ from ..stages.base import Stage
 from . import classflags
 from .optionfile import settled
 from .read import PipelineSource
-from .runtime import TRAMPOLINE, known, place, python_filter
+from .runtime import TRAMPOLINE, made, place, python_filter
 from .writerlimits import check_copc, check_writers
 
 #: Options of every PDAL stage that a lowered stage hands on.
 PDAL_OWN = ("tag", "inputs", "user_data", "log")
-#: Stages after which several views are what the user asked for.
-_SPLITTERS = {"filters.splitter", "filters.chipper", "filters.divider", "filters.groupby", "filters.returns"}
+#: Stages after which there is one view, or several are what the user asked for.
+_ONE_VIEW = {f"filters.{name}" for name in ("merge", "splitter", "chipper", "divider", "groupby", "returns")}
 
 
 @dataclass
@@ -73,7 +75,8 @@ def lower(source: PipelineSource, whole: bool = True) -> Lowered:
     """
     stages: list[dict[str, Any]] = []
     for index, given in enumerate(source.stages):
-        stages.append(_as_object(given))
+        # File names stand for readers and writers; PDAL tells which, so they stay without a type.
+        stages.append(copy.deepcopy(given) if isinstance(given, dict) else {"filename": given})
         _refuse_near_miss(stages[-1], source.where(index))
     views = _Views()
     out = Lowered([])
@@ -90,11 +93,13 @@ def lower(source: PipelineSource, whole: bool = True) -> Lowered:
                 out.stages.append(parted[0])
             continue
         try:
-            if views.unmerged(stage):
+            if views.reaching(stage) > 1:  # points of several readers
                 merge: dict[str, Any] = {"type": "filters.merge"}
                 if "inputs" in stage:
                     merge["inputs"] = stage.pop("inputs")
-                    merge["tag"] = _fresh_tag(tags)
+                    names = (f"pdal_stages_merge_{number}" for number in itertools.count(1))
+                    merge["tag"] = next(name for name in names if name not in tags)
+                    tags.add(merge["tag"])
                     stage["inputs"] = [merge["tag"]]
                 views.add(merge)
                 out.stages.append(merge)
@@ -132,31 +137,18 @@ def _tell_preparations(lowered: Lowered) -> None:
             lowered.remarks.append(remark)
 
 
-def _as_object(given: Any) -> dict[str, Any]:
-    """File names stand for readers and writers; PDAL tells which, so they stay without a type."""
-    if isinstance(given, dict):
-        return copy.deepcopy(given)
-    return {"filename": given}
-
-
 def _refuse_near_miss(stage: dict[str, Any], where: str) -> None:
     """A mistyped type of ours would reach PDAL, whose message cannot name our stages."""
     type_name = stage.get("type", "")
     if type_name in registry.stages() or not type_name:
         return
-    near = suggest(type_name, registry.stages())
-    ours = {name.partition(".")[2] for name in registry.stages()}
-    word = type_name.rpartition(".")[2]
-    if word in ours or (near and _distance_is_typo(type_name)):
-        raise PipelineError(f"there is no stage '{type_name}'", where=where, cure=near or None)
-
-
-def _distance_is_typo(type_name: str) -> bool:
-    """Whether a type is a misspelling of one of ours, not another PDAL stage such as filters.hag_nn."""
-    import difflib
-
-    close = difflib.get_close_matches(type_name, list(registry.stages()), n=1, cutoff=0.88)
-    return bool(close)
+    ours = list(registry.stages())
+    # Nearer than another of PDAL's stages, such as filters.hag_nn.
+    misspelt = difflib.get_close_matches(type_name, ours, n=1, cutoff=0.88)
+    if misspelt or type_name.rpartition(".")[2] in {name.partition(".")[2] for name in ours}:
+        raise PipelineError(
+            f"there is no stage '{type_name}'", where=where, cure=suggest(type_name, ours) or None
+        )
 
 
 def lower_stage(given: dict[str, Any], number: int = 0, index: int = 0) -> LoweredStage:
@@ -175,16 +167,8 @@ def lower_stage(given: dict[str, Any], number: int = 0, index: int = 0) -> Lower
         arguments["tag"] = given["tag"]
     plain = python_filter(label, TRAMPOLINE, arguments, stage.creates())
     plain.update({key: given[key] for key in PDAL_OWN if key in given})
-    known(label, stage)
+    made[label] = stage
     return LoweredStage(stage, named, label, number, index, given, plain)
-
-
-def _fresh_tag(tags: set[str]) -> str:
-    number = 1
-    while f"pdal_stages_merge_{number}" in tags:
-        number += 1
-    tags.add(f"pdal_stages_merge_{number}")
-    return f"pdal_stages_merge_{number}"
 
 
 class _Views:
@@ -194,16 +178,13 @@ class _Views:
         self._waiting: list[int] = []  # views of stages not yet taken as an input
         self._tagged: dict[str, int] = {}
 
-    def _inputs(self, stage: dict[str, Any]) -> int:
+    def reaching(self, stage: dict[str, Any]) -> int:
+        """How many views reach a stage."""
         names = stage.get("inputs")
         if names is None:
             return sum(self._waiting)
         names = [names] if isinstance(names, str) else names
         return sum(self._tagged.get(str(n), 1) for n in names)
-
-    def unmerged(self, stage: dict[str, Any]) -> bool:
-        """Whether views of more than one reader would reach the stage."""
-        return self._inputs(stage) > 1
 
     def add(self, stage: dict[str, Any], last: bool = False) -> None:
         type_name = str(stage.get("type", ""))
@@ -212,13 +193,11 @@ class _Views:
         reader = type_name.startswith("readers.") or (not type_name and not last)
         if reader:
             count = 2 if any(c in filename for c in "*?[") else 1
-            self._waiting.append(count)
         else:
-            count = self._inputs(stage)
-            if type_name == "filters.merge" or type_name in _SPLITTERS:
-                count = 1  # one cloud, or pieces the user asked for
+            # One cloud, or pieces the user asked for, are one.
+            count = 1 if type_name in _ONE_VIEW else self.reaching(stage)
             if "inputs" not in stage:
                 self._waiting = []
-            self._waiting.append(count)
+        self._waiting.append(count)
         if "tag" in stage:
             self._tagged[str(stage["tag"])] = count

@@ -63,6 +63,11 @@ def version() -> tuple[int, int, int]:
     return major, minor, patch
 
 
+def dotted_version() -> str:
+    """PDAL's version as text, e.g. 2.2.0."""
+    return ".".join(map(str, version()))
+
+
 def program() -> str:
     """Path of the program `pdal`, the one beside this Python first."""
     beside = os.path.join(os.path.dirname(sys.executable), "pdal")
@@ -106,8 +111,7 @@ def execute(
         pipeline = pdal.Pipeline(text, loglevel=loglevel)
         count = pipeline.execute()
     except (RuntimeError, ValueError, IndexError, OverflowError) as error:  # C++'s errors, as Python has them
-        if stdout not in _kept:
-            _kept.append(stdout)
+        keep(stdout)
         raise translate(str(error), said(_log(pipeline))[-3:]) from None
     except MemoryError:
         raise PipelineError(
@@ -127,8 +131,15 @@ def execute(
     )
 
 
-#: What sys.stdout was when a script failed: PDAL remembers it without holding it, so it must not be freed.
 _kept: list[Any] = []
+
+
+def keep(stdout: Any) -> None:
+    """Hold what sys.stdout was when a script failed: PDAL remembers it without holding it, until a run succeeds."""
+    if not any(kept is stdout for kept in _kept):
+        _kept.append(stdout)
+
+
 _FAILED_WRITER = re.compile(r"(writers\.\w+) Error\) (GDAL failure.*)")
 
 
@@ -286,7 +297,7 @@ def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
             beyond = [name for name in stage if name in _COPC_OPTIONS]
             if beyond:
                 raise PipelineError(
-                    f"PDAL {'.'.join(map(str, version()))} reads COPC files whole, without {', '.join(beyond)}",
+                    f"PDAL {dotted_version()} reads COPC files whole, without {', '.join(beyond)}",
                     where="readers.copc",
                     found=str(stage.get("filename", "")),
                     cure="Use PDAL 2.4 or later, or filters.crop after the reader",

@@ -10,33 +10,30 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..base import checks
 from ..base.errors import StageError
 from ..base.runlog import LoggedStream
-from .work import Answer, Task
+from ..base.threads import available_threads
+from .work import Answer, Call, Task, perform
 
 _KILLED = "it killed its worker each time it was tried: too little memory, or a crash in a library"
 
 
-class Processes:
+class Processes(contextlib.AbstractContextManager):
     """Tasks in processes of their own, one at a time in each, started as they are needed.
 
     A worker looks for modules where this Python is installed, never in the current folder. When this process ends,
     however it does, its workers see their pipe end and end too.
     """
 
-    address = "processes of this machine"
-
     def __init__(self, slots: int, threads: int) -> None:
         self.slots, self.threads = slots, threads
         self._workers: list[_Worker] = []
         self._answers: queue.SimpleQueue[tuple[_Worker, Answer | None]] = queue.SimpleQueue()
-
-    def __enter__(self) -> Processes:
-        return self
 
     def __exit__(self, *exc: object) -> None:
         for worker in self._workers:
@@ -57,7 +54,10 @@ class Processes:
         while waiting or busy:
             while waiting and len(busy) < self.slots:
                 item = waiting.popleft()
-                worker = next((w for w in self._workers if w not in busy), None) or self._start()
+                worker = next((w for w in self._workers if w not in busy), None)
+                if worker is None:
+                    worker = _Worker(self.threads, self._answers)
+                    self._workers.append(worker)
                 busy[worker] = item
                 worker.give(task_of(item))
             worker, answer = self._answers.get()
@@ -66,18 +66,13 @@ class Processes:
                 if not worker.began:
                     raise StageError(
                         "a worker process could not be started",
-                        found=f"it ended with status {worker.status()}",
+                        found=f"it ended with status {worker.process.wait()}",
                         cure="What it said stands above. --workers 0 works in this process",
                     )
                 if worker not in busy:
                     continue
                 answer = Answer(reason=_KILLED, again=True)
             yield busy.pop(worker), answer
-
-    def _start(self) -> _Worker:
-        worker = _Worker(self.threads, self._answers)
-        self._workers.append(worker)
-        return worker
 
 
 class _Worker:
@@ -92,7 +87,7 @@ class _Worker:
     def __init__(self, threads: int, answers: queue.SimpleQueue) -> None:
         self.began = False
         self._answers = answers
-        self._process = subprocess.Popen(
+        self.process = subprocess.Popen(
             _command(),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -106,35 +101,31 @@ class _Worker:
 
     def give(self, task: Task) -> None:
         """Send a task; where the process has ended, :meth:`_listen` tells."""
-        assert self._process.stdin is not None
+        assert self.process.stdin is not None
         with contextlib.suppress(OSError):
-            pickle.dump(task, self._process.stdin)
-            self._process.stdin.flush()
+            pickle.dump(task, self.process.stdin)
+            self.process.stdin.flush()
 
     def _listen(self) -> None:
         """Hand on answers, and None at the end."""
-        assert self._process.stdout is not None
+        assert self.process.stdout is not None
         with contextlib.suppress(EOFError, OSError, ValueError, pickle.UnpicklingError):
-            self.began = pickle.load(self._process.stdout) == READY
+            self.began = pickle.load(self.process.stdout) == READY
             while self.began:
-                self._answers.put((self, pickle.load(self._process.stdout)))
+                self._answers.put((self, pickle.load(self.process.stdout)))
         self._answers.put((self, None))
 
     def _hear(self, stream: Any) -> None:
         """Say what the process says, where a log hears it."""
-        for line in self._process.stderr or ():
+        for line in self.process.stderr or ():
             stream.write(line.decode("utf-8", "backslashreplace"))
-
-    def status(self) -> int:
-        """How it ended."""
-        return self._process.wait()
 
     def stop(self) -> None:
         """End the process, whatever it does."""
-        self._process.kill()
-        self._process.wait()
+        self.process.kill()
+        self.process.wait()
         self._hearer.join(1.0)
-        for pipe in (self._process.stdin, self._process.stdout):
+        for pipe in (self.process.stdin, self.process.stdout):
             with contextlib.suppress(OSError):
                 pipe.close()  # type: ignore[union-attr]
 
@@ -162,3 +153,26 @@ def _environment(threads: int) -> dict[str, str]:
     if "PYTHONPATH" in out:  # where an empty entry means the current folder
         out["PYTHONPATH"] = os.pathsep.join(filter(None, out["PYTHONPATH"].split(os.pathsep)))
     return out
+
+
+def each_file(
+    function: Callable[..., Any], work: Sequence[tuple], workers: int = 1
+) -> Iterator[tuple[tuple, Answer]]:
+    """Each item of work with what became of it, as they finish; one that fails does not stop the others.
+
+    Parameters
+    ----------
+    function : callable
+        Of a module's own, so that other processes find it.
+    work : sequence of tuple
+        Arguments.
+    workers : int
+        Processes; they share the cores.
+    """
+    workers = min(checks.whole("--workers", workers, 1, 1024), len(work))
+    if workers == 1:
+        for item in work:
+            yield item, perform(Call(function, item))
+        return
+    with Processes(workers, max(1, available_threads() // workers)) as pool:
+        yield from pool.run(deque(work), lambda item: Call(function, item))

@@ -74,7 +74,7 @@ def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
             ) from None
         except OSError as error:
             raise PipelineError(
-                "the pipeline file cannot be read", where=str(path)[:200], found=error.strerror or str(error)
+                "the pipeline file cannot be read", where=str(path)[:200], found=error
             ) from None
         return parse_pipeline(decode(data, str(path)), str(path))
     if isinstance(source, str):
@@ -82,8 +82,7 @@ def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
     stages = source.get("pipeline") if isinstance(source, dict) else source
     if not isinstance(stages, list):
         raise PipelineError("a pipeline is a list of stages, or an object with a list named 'pipeline'")
-    _check(stages, [0] * len(stages), "")
-    return PipelineSource(list(stages), [0] * len(stages))
+    return _checked(PipelineSource(stages, [0] * len(stages)))
 
 
 def decode(data: bytes, name: str) -> str:
@@ -137,21 +136,20 @@ def parse_pipeline(text: str, name: str = "") -> PipelineSource:
             "the pipeline must be a list or an object", where=name or None, found=type(value).__name__
         )
     lines = _lines(clean, len(stages), isinstance(value, dict))
-    _check(stages, lines, name)
-    return PipelineSource(stages, lines, name)
+    return _checked(PipelineSource(stages, lines, name))
 
 
-def _check(stages: list, lines: list[int], name: str) -> None:
-    if not stages:
-        raise PipelineError("the pipeline has no stages", where=name or None)
-    for index, stage in enumerate(stages):
+def _checked(source: PipelineSource) -> PipelineSource:
+    if not source.stages:
+        raise PipelineError("the pipeline has no stages", where=source.name or None)
+    for index, stage in enumerate(source.stages):
+        where = source.where(index)
         if not isinstance(stage, str | dict):
             raise PipelineError(
                 "a stage is an object, or a file name",
-                where=PipelineSource(stages, lines, name).where(index),
+                where=where,
                 found=json.dumps(stage, default=str)[:80],
             )
-        where = PipelineSource(stages, lines, name).where(index)
         _check_values(stage, where)
         if not isinstance(stage, dict):
             continue
@@ -161,10 +159,9 @@ def _check(stages: list, lines: list[int], name: str) -> None:
                 isinstance(value, list) and not all(isinstance(v, str) for v in value)
             ):
                 raise PipelineError(
-                    f"a stage's '{key}' is {what}",
-                    where=where,
-                    found=json.dumps(value, default=str)[:80],
+                    f"a stage's '{key}' is {what}", where=where, found=json.dumps(value, default=str)[:80]
                 )
+    return source
 
 
 #: What PDAL wants of the options that wire stages together.
@@ -258,18 +255,17 @@ def _excerpt(text: str, position: int) -> str:
 def _cure(text: str, error: json.JSONDecodeError) -> str | None:
     before = text[: error.pos].rstrip()
     after = text[error.pos :].lstrip()[:1]
-    if (before.endswith(",") and after in ("]", "}")) or (after == "," and before.endswith(",")):
+    closing = after in ("]", "}")
+    if (before.endswith(",") and (closing or after == ",")) or (closing and "trailing comma" in error.msg):
         return "Remove the comma before the closing bracket"
-    if after in ("]", "}") and "Illegal trailing comma" in error.msg:
-        return "Remove the comma before the closing bracket"
-    if after == "'" or (error.msg.startswith("Expecting property name") and after == "'"):
+    if after == "'":
         return 'JSON wants double quotes: "text"'
     if error.msg == "Extra data":
         return "A pipeline is one list or object; remove what follows it"
     return None
 
 
-_SPACE = re.compile(r"[\s]*")
+_VISIBLE = re.compile(r"\S")
 
 
 def _lines(text: str, count: int, is_object: bool) -> list[int]:
@@ -277,8 +273,7 @@ def _lines(text: str, count: int, is_object: bool) -> list[int]:
     decoder = json.JSONDecoder(parse_constant=_no_constant)
 
     def skip(at: int) -> int:
-        match = _SPACE.match(text, at)
-        return match.end() if match else at
+        return len(text) if (found := _VISIBLE.search(text, at)) is None else found.start()
 
     at = skip(0)
     begin = at

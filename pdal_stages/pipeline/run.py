@@ -102,14 +102,13 @@ class Pipeline:
         *more : Output
             What the caller will write beside the pipeline's own.
         """
-        ours = [lowered.stage for lowered in self.lowered.ours]
-        outputs = [*writers_outputs(self.lowered.stages), *(o for stage in ours for o in stage.outputs())]
-        check_outputs([*outputs, *more], self.inputs())
+        own = [output for ours in self.lowered.ours for output in ours.stage.outputs()]
+        check_outputs([*writers_outputs(self.lowered.stages), *own, *more], self.inputs())
 
     def inputs(self) -> list[str]:
         """Local files that are read: by readers, by other stages, and the pipeline itself."""
-        stages, ours = self.lowered.stages, [lowered.stage for lowered in self.lowered.ours]
-        named = [name for stage in ours for name in stage_files(stage)]
+        stages = self.lowered.stages
+        named = [name for ours in self.lowered.ours for name in stage_files(ours.stage)]
         return [*readers_files(stages), *named_files(stages), *named, *filter(None, [self.source.name])]
 
     def __or__(self, other: Any) -> Pipeline:
@@ -183,19 +182,15 @@ class Pipeline:
                 with open(path, "rb"):
                     pass
             except OSError as error:
-                raise PipelineError(
-                    "the file cannot be read", where=path, found=error.strerror or str(error)
-                ) from None
+                raise PipelineError("the file cannot be read", where=path, found=error) from None
         check_dimensions(self.lowered)
         self.remarks = [*self.lowered.remarks, *unread_extra_dimensions(self.lowered.stages)]
         self.remarks += [
             r for path in readers_files(self.lowered.stages, las=True) if (r := check_readable(path))
         ]
-        ours = [lowered.stage for lowered in self.lowered.ours]
-        if ours:
-            check_readers(
-                self.lowered.stages, next((s.horizontal_unit for s in ours if s.horizontal_unit), "")
-            )
+        units = [ours.stage.horizontal_unit for ours in self.lowered.ours]
+        if units:
+            check_readers(self.lowered.stages, next(filter(None, units), ""))
 
     def _located(self, error: StageError) -> StageError:
         """PDAL's words, with the line of the stage that they name and the nearest stage there is."""
@@ -244,19 +239,15 @@ def _named_metadata(
     inner = metadata.get("metadata")
     if not isinstance(inner, dict):
         return metadata
-    theirs = inner.pop("filters.python", None)
-    rest = [m for m in (theirs if isinstance(theirs, list) else [theirs]) if m and not _is_ours(m)]
-    if rest:
-        inner["filters.python"] = rest if len(rest) > 1 else rest[0]
-    for name, views in reports:
-        kind = name.partition(" ")[0]
-        for report in views:
-            if kind not in inner:
-                inner[kind] = report
-            else:
-                before = inner[kind] if isinstance(inner[kind], list) else [inner[kind]]
-                inner[kind] = [*before, report]
+    theirs = [node for node in _several(inner.pop("filters.python", None)) if node and not _is_ours(node)]
+    named = [(name.partition(" ")[0], report) for name, views in reports for report in views]
+    for kind, node in [*(("filters.python", node) for node in theirs), *named]:
+        inner[kind] = [*_several(inner[kind]), node] if kind in inner else node
     return metadata
+
+
+def _several(node: Any) -> list[Any]:
+    return node if isinstance(node, list) else [node]
 
 
 def _renamed(node: Any, names: dict[str, str]) -> Any:

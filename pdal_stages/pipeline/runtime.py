@@ -44,9 +44,8 @@ _lock = threading.Lock()
 _reports: dict[str, list[dict[str, Any]]] = {}
 _failures: dict[str, StageError] = {}
 _usual_stdout: Any = sys.__stdout__
-_kept: list[Any] = []
-#: Stages made in this process, as long as someone holds them; in another process options are parsed anew.
-_made: WeakValueDictionary[str, Stage] = WeakValueDictionary()
+#: Stages made in this process by label, as long as someone holds them; in another process options are parsed anew.
+made: WeakValueDictionary[str, Stage] = WeakValueDictionary()
 
 
 def place(type_name: str, tag: str | None) -> str:
@@ -118,7 +117,7 @@ def points_of(stage: Stage, module: Mapping[str, Any], ins: Mapping[str, Any]) -
 def run_on_view(module, arguments, ins, outs) -> dict[str, Any]:
     """Run a stage on one view; its report. What it raises may be anything, Ctrl-C too."""
     interrupts.check()
-    stage = _made.get(arguments.get("label", ""))
+    stage = made.get(arguments.get("label", ""))
     if stage is None:
         kind = registry.get(arguments["stage"])
         stage = kind(arguments.get("options", {}), place(kind.type, arguments.get("tag")))
@@ -206,11 +205,6 @@ def _leaf(name: str, value: str, kind: str) -> dict[str, Any]:
 # ---- for the runners in the same process -----------------------------------------------------------
 
 
-def known(label: str, stage: Stage) -> None:
-    """Let a stage made in this process be found by its label."""
-    _made[label] = stage
-
-
 def remember_stdout() -> None:
     """Keep this process's ``sys.stdout``, to be put back if a stage fails."""
     global _usual_stdout
@@ -222,9 +216,7 @@ def restore_stdout() -> None:
     """Put ``sys.stdout`` back: PDAL does so only after a run that succeeds, and its log is gone by now."""
     if _redirected():
         sys.stdout = _usual_stdout
-        # PDAL remembers the object without holding it, until a run succeeds: it must not be freed.
-        if not any(kept is _usual_stdout for kept in _kept):
-            _kept.append(_usual_stdout)
+        pdal_env.keep(_usual_stdout)
 
 
 def _redirected() -> bool:

@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -27,6 +28,17 @@ class Task(Protocol):
 
     def run(self) -> Any:
         """Do it."""
+
+
+@dataclass
+class Call:
+    """A function of a module's own, and what it is given."""
+
+    function: Callable[..., Any]
+    given: tuple
+
+    def run(self) -> Any:
+        return self.function(*self.given)
 
 
 @dataclass
@@ -60,7 +72,10 @@ def perform(task: Task) -> Answer:
         except InterruptedStage:
             raise KeyboardInterrupt from None
         except StageError as error:
-            answer = Answer(reason=str(error), again=_may_pass(error))
+            wrong = isinstance(error, OptionError | ModelError | DimensionError | DependencyError)
+            answer = Answer(
+                reason=str(error), again=not wrong
+            )  # nothing helps where the request itself is wrong
         except MemoryError:
             answer = Answer(reason="memory ran out. Take smaller tiles or fewer workers", again=True)
         except Exception as error:
@@ -73,11 +88,6 @@ def perform(task: Task) -> Answer:
             "peak_mb": _peak(),
         }
         return answer
-
-
-def _may_pass(error: StageError) -> bool:
-    """Whether an error may be gone when the task is tried again: not where the request itself is wrong."""
-    return not isinstance(error, OptionError | ModelError | DimensionError | DependencyError)
 
 
 def _peak() -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 from ..base.asprs import LEGACY_LIMIT
@@ -12,10 +11,8 @@ from ..base.errors import DimensionError, OptionError, PipelineError
 from ..base.las import LasHeader, read_header
 from ..stages.base import CodeLimit, Stage
 from . import pdal as pdal_env
-from .filenames import reader_files
+from .filenames import reader_files, writes_las
 
-#: Writers of LAS and what is made of it.
-LAS_WRITERS = ("writers.las", "writers.copc")
 #: A variable-length record of LAS holds 65,535 bytes; an extra dimension's description takes 192.
 _MOST_EXTRA = 65_535 // 192
 
@@ -65,7 +62,7 @@ def check_copc(stages: list[dict[str, Any]]) -> None:
             continue
         if not pdal_env.writes_copc():
             raise PipelineError(
-                f"PDAL {'.'.join(map(str, pdal_env.version()))} cannot write COPC",
+                f"PDAL {pdal_env.dotted_version()} cannot write COPC",
                 found=name,
                 cure="Name the output .laz, or use PDAL 2.4 or later",
             )
@@ -73,13 +70,6 @@ def check_copc(stages: list[dict[str, Any]]) -> None:
             raise PipelineError(
                 "writers.las writes plain LAZ, not COPC", found=name, cure='Use "type": "writers.copc"'
             )
-
-
-def writes_las(stage: dict[str, Any]) -> bool:
-    """Whether a stage writes LAS."""
-    type_name = stage.get("type", "")
-    suffix = Path(str(stage.get("filename", ""))).suffix.lower()
-    return type_name in LAS_WRITERS or (not type_name and suffix in (".las", ".laz"))
 
 
 def _code_limit(writer: dict[str, Any], before: list[dict[str, Any]]) -> CodeLimit | None:
@@ -100,7 +90,7 @@ def _code_limit(writer: dict[str, Any], before: list[dict[str, Any]]) -> CodeLim
     if compressed and not pdal_env.writes_extended_classes_to_laz():
         return CodeLimit(
             LEGACY_LIMIT,
-            f"PDAL {'.'.join(map(str, pdal_env.version()))} cannot write class codes above {LEGACY_LIMIT} to LAZ 1.4: they "
+            f"PDAL {pdal_env.dotted_version()} cannot write class codes above {LEGACY_LIMIT} to LAZ 1.4: they "
             "would come out wrong",
             "Write .las and compress it afterwards, or use PDAL 2.3 or later",
         )

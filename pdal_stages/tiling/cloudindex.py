@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ..base.errors import StageError
-from .grid import Box, Grid, check_number, touch
+from .grid import Box, Grid, check_number
 
 #: Points of a block: LAZ is compressed in pieces of so many.
 BLOCK = 50_000
@@ -39,15 +40,16 @@ def open_las(path: str):
     try:
         return laspy.open(path)
     except OSError as error:
-        raise StageError("the input cannot be read", where=path, found=error.strerror or str(error)) from None
+        raise StageError("the input cannot be read", where=path, found=error) from None
     except Exception as error:  # laspy and the decompressor raise many types
         raise StageError(
             "the input cannot be read", where=path, found=f"{type(error).__name__}: {error}"
         ) from None
 
 
-def read_block(reader: Any, path: str, start: int, count: int):
-    """`count` points from number `start`; StageError where the file is cut short or damaged."""
+def read_block(reader: Any, path: str, start: int, end: int):
+    """Points from number `start` to `end`, a block at most; StageError where the file is cut short or damaged."""
+    count = min(BLOCK, end - start)
     try:
         reader.seek(start)
         points = reader.read_points(count)
@@ -73,33 +75,15 @@ def index_las(path: str, grid: Grid) -> CloudIndex:
         If any of it cannot be read.
     """
     boxes: list[Box] = []
-    tiles: dict[tuple[int, int], int] = {}
+    tiles: Counter[tuple[int, int]] = Counter()
     with open_las(path) as reader:
         total = int(reader.header.point_count)
         for start in range(0, total, BLOCK):
-            points = read_block(reader, path, start, min(BLOCK, total - start))
+            points = read_block(reader, path, start, total)
             x, y = np.asarray(points.x), np.asarray(points.y)
             boxes.append((float(x.min()), float(y.min()), float(x.max()), float(y.max())))
-            pairs, counts = np.unique(
-                np.column_stack([grid.index(x), grid.index(y)]), axis=0, return_counts=True
-            )
-            for (i, j), number in zip(pairs.tolist(), counts.tolist(), strict=True):
-                tiles[i, j] = tiles.get((i, j), 0) + number
+            rows = np.column_stack([grid.index(x), grid.index(y)])
+            pairs, counts = np.unique(rows, axis=0, return_counts=True)
+            tiles.update(dict(zip(map(tuple, pairs.tolist()), counts.tolist(), strict=True)))
             check_number(len(tiles), f"{path}, tiles of {grid.size:g}")
     return CloudIndex(total, boxes, [(i, j, n) for (i, j), n in sorted(tiles.items())])
-
-
-@dataclass(frozen=True)
-class IndexTask:
-    """An input to be read once, by a worker."""
-
-    path: str
-    grid: Grid
-
-    def run(self) -> CloudIndex:
-        return index_las(self.path, self.grid)
-
-
-def blocks_near(index: CloudIndex, box: Box) -> list[int]:
-    """Numbers of the blocks that may hold points of a box."""
-    return [number for number, one in enumerate(index.boxes) if touch(one, box)]

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import signal
 import sys
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 from ..base.errors import OptionError, StageError
 from ..base.files import check_writable, write_whole
@@ -66,12 +65,12 @@ def wants_tiles(options: argparse.Namespace) -> bool:
         return True
     given = {
         "--workers": options.workers is not None,
-        "--scheduler": bool(options.scheduler),
+        "--scheduler": options.scheduler,
         "--per": options.per != "auto",
         "--buffer": options.buffer is not None,
         "--resume": options.resume,
         "--dry-run": options.dry_run,
-        "--report": bool(options.report),
+        "--report": options.report,
     }
     for flag, used in given.items():
         if used:
@@ -87,15 +86,8 @@ def run_command(options: argparse.Namespace, source: str | Path) -> int:
         check_writable(name, "report")
     if options.metadata:
         check_writable(options.metadata, "metadata")
-    chosen = TilingOptions(
-        tile=options.tile,
-        workers=options.workers,
-        scheduler=options.scheduler,
-        per=options.per,
-        buffer=options.buffer,
-        resume=options.resume,
-        retries=options.retries,
-    )
+    names = {field.name for field in fields(TilingOptions)}
+    chosen = TilingOptions(**{name: value for name, value in vars(options).items() if name in names})
     pipeline = Pipeline(source, options.overrides, whole=False)
     if options.validate:
         make_plan(pipeline, chosen.buffer)
@@ -104,7 +96,7 @@ def run_command(options: argparse.Namespace, source: str | Path) -> int:
     interrupted = False
     with _terminated_as_interrupted():
         try:
-            run = run_tiled(pipeline, chosen, dry_run=options.dry_run, progress=_progress(options.progress))
+            run = run_tiled(pipeline, chosen, dry_run=options.dry_run)
         except InterruptedRun as stopped:
             run, interrupted = stopped.run, True
     _print_dry(run) if options.dry_run else _print(run)
@@ -120,19 +112,11 @@ def run_command(options: argparse.Namespace, source: str | Path) -> int:
     return 1 if run.failures else 0
 
 
-def _progress(asked: bool | None) -> bool | None:
-    return asked if asked is not None else os.environ.get("PDAL_STAGES_PROGRESS", "1") != "0"
-
-
 @contextmanager
 def _terminated_as_interrupted():
     """A run stopped by a service manager or batch system cleans up like one stopped by Ctrl-C."""
-
-    def stop(number: int, frame: Any) -> None:
-        raise KeyboardInterrupt
-
     try:
-        before = signal.signal(signal.SIGTERM, stop)
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     except ValueError:  # not in the main thread
         yield
         return

@@ -8,7 +8,8 @@ from .settings import TilingOptions
 from .survey import Survey
 from .tileplan import TilePlan, outputs_for
 
-#: Memory of a worker: programs and model, a tile's point, a file's point, and the `memory` option of our stages.
+#: Memory of a worker, as docs/large-areas.md has it.
+#: Programs and model, a tile's point, a file's point, and the `memory` option of our stages.
 _BASE_MB, _TILE_BYTES, _FILE_BYTES, _BLOCKS_MB = 350, 350, 250, 512
 #: Points a core does in a second, for the estimate of a dry run; the figure of the default features.
 _RATE = 5_000
@@ -16,9 +17,8 @@ _RATE = 5_000
 
 def estimate(plan: TilePlan, survey: Survey, options: TilingOptions) -> TiledRun:
     """Tiles and points as the headers tell."""
-    grid, jobs, area = survey.grid, {}, 0.0
-    for tile in survey.tiles():
-        jobs[tile] = Job(tile, grid.name(tile), 0, [])
+    grid, area = survey.grid, 0.0
+    jobs = {tile: Job(tile, grid.name(tile), 0, []) for tile in survey.tiles()}
     for source in survey.sources:
         header = survey.headers.get(source.path)
         if header is None or not header.count:
@@ -35,33 +35,20 @@ def estimate(plan: TilePlan, survey: Survey, options: TilingOptions) -> TiledRun
     listed = list(jobs.values())
     names = [s.stem for s in survey.sources] if survey.per == "file" else [job.name for job in listed]
     outputs_for(plan, names, survey.paths)
-    count = survey.points
+    count = sum(header.count for header in survey.headers.values())
     side = grid.size + 2 * survey.margin
     read = min(count, round(count / area * side * side if area else 0.0))
-    files = len(survey.headers) if survey.per == "file" else 0
+    a_file = count / max(len(survey.headers), 1) if survey.per == "file" else 0
+    held = max(read * _TILE_BYTES + _BLOCKS_MB * 2**20, min(a_file, MOST_AT_ONCE) * _FILE_BYTES)
     summary = survey.figures(plan) | {
         "workers": options.local_workers,
         "threads_per_worker": options.threads,
         "points": count,
         "points_of_largest_tile": max((job.points for job in listed), default=0),
         "points_read_by_a_tile": read,
-        "memory_mb_of_a_worker": estimate_memory(read, count if files else 0, files),
+        "memory_mb_of_a_worker": _BASE_MB + held / 2**20,
         "assumed_points_per_core_second": _RATE,
         "core_hours": count / _RATE / 3600,
         "states": {"waiting": len(listed)},
     }
     return TiledRun(listed, [], survey.unreadable, [], survey.notes, summary)
-
-
-def estimate_memory(read: int, count: int, files: int) -> float:
-    """Megabytes a worker holds at most: see docs/large-areas.md.
-
-    Parameters
-    ----------
-    read : int
-        Points of a tile with its surroundings.
-    count, files : int
-        Points of all inputs and their number, where each becomes one output; else 0.
-    """
-    at_once = min(count / max(files, 1), MOST_AT_ONCE)
-    return _BASE_MB + max(read * _TILE_BYTES + _BLOCKS_MB * 2**20, at_once * _FILE_BYTES) / 2**20

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
-from .cloudindex import BLOCK, CloudIndex, blocks_near, open_las, read_block
-from .grid import Grid
+from .cloudindex import BLOCK, CloudIndex, open_las, read_block
+from .grid import Grid, touching
 
 _COMPRESSOR = b"laszip encoded"
 
@@ -127,7 +127,7 @@ def cut(
         None where the file has no point there.
     """
     box = grid.box(tile, margin)
-    blocks = blocks_near(index, box)
+    blocks = touching(index.boxes, box)
     if not blocks:
         return None
     rows_cut: list[NDArray[np.int64]] = []
@@ -144,7 +144,7 @@ def cut(
             core_out.write(head)
             for block in blocks:
                 start = block * BLOCK
-                points = read_block(reader, path, start, min(BLOCK, index.count - start))
+                points = read_block(reader, path, start, index.count)
                 x, y = np.asarray(points.x), np.asarray(points.y)
                 rows = np.flatnonzero((x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3]))
                 if not rows.size:
@@ -165,9 +165,7 @@ def cut(
             if core:
                 finish(core_out, bytearray(head), tail, cores)
     except OSError as error:
-        raise StageError(
-            "a tile could not be cut out", where=path, found=error.strerror or str(error)
-        ) from error
+        raise StageError("a tile could not be cut out", where=path, found=error) from error
     if not rows_cut:
         os.unlink(target)
         if core:

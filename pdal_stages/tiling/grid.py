@@ -89,9 +89,10 @@ def check_number(tiles: int, found: str) -> None:
         )
 
 
-def touch(a: Box, b: Box) -> bool:
-    """Whether two boxes share a point, edges included."""
-    return a[0] <= b[2] and b[0] <= a[2] and a[1] <= b[3] and b[1] <= a[3]
+def touching(boxes: list[Box] | NDArray[np.float64], box: Box) -> list[int]:
+    """Numbers of the boxes that share a point with a box, edges included."""
+    b = np.asarray(boxes, np.float64).reshape(-1, 4)
+    return np.flatnonzero(((b[:, :2] <= box[2:]) & (b[:, 2:] >= box[:2])).all(axis=1)).tolist()
 
 
 def inside(a: Box, b: Box) -> bool:

@@ -22,7 +22,7 @@ from .extract import Piece
 from .grid import Box, Grid
 from .results import PieceResults
 from .sources import Source
-from .tileplan import MARGIN, ROW, SOURCE
+from .tileplan import MARGIN, ROW, SOURCE, TilePlan
 
 _MARK_TYPES = {ROW: "uint32_t", SOURCE: "uint32_t", MARGIN: "double"}
 
@@ -33,13 +33,12 @@ class Recipe:
 
     Attributes
     ----------
+    plan : TilePlan
     grid : Grid
     unit : float
         Metres per unit of the coordinates.
     bounds : Box
         Of all inputs.
-    head, later, tail, halo, creates
-        As in :class:`~pdal_stages.tiling.tileplan.TilePlan`.
     threads : int
     most_points : int
         A tile is not read with wider surroundings that hold more.
@@ -47,14 +46,10 @@ class Recipe:
         Folder for temporary files.
     """
 
+    plan: TilePlan
     grid: Grid
     unit: float
     bounds: Box
-    head: list[dict[str, Any]]
-    later: list[float]
-    tail: list[dict[str, Any]]
-    halo: float
-    creates: list[str] | None
     threads: int
     most_points: int
     scratch: str
@@ -73,7 +68,8 @@ def run_head(
     recipe: Recipe, tile: tuple[int, int], cuts: list[tuple[Source, Piece]], everything: bool
 ) -> HeadRun:
     """Run the head once; `everything`: all inputs were read, so nothing can lie farther away."""
-    if not recipe.head:
+    plan = recipe.plan
+    if not plan.head:
         return HeadRun([PieceResults(source, piece, piece.own, {}) for source, piece in cuts], 0.0)
     marks = [_Mark(number, piece, recipe) for number, (_, piece) in enumerate(cuts)]
     old = [mark.old_format for mark in marks]
@@ -87,7 +83,7 @@ def run_head(
             marked = callbacks.filter(marks[number], _MARK_TYPES, inputs=[f"in{number}"], tag=f"mark{number}")
             stages += [reader, marked]
         inputs = {"inputs": [f"mark{number}" for number in range(len(cuts))]}
-        for given, later in zip(recipe.head, recipe.later, strict=True):
+        for given, later in zip(plan.head, plan.later, strict=True):
             stage = {**given, **inputs}
             inputs = {}
             kind = registry.stages().get(stage["type"])
@@ -100,12 +96,12 @@ def run_head(
                 stages.append(callbacks.filter(reach))
         pipeline = Pipeline(stages)
         ours_there = [(ours.stage, ours.place, ours.index) for ours in pipeline.lowered.ours]
-        check_writers([*pipeline.lowered.stages, *recipe.tail], ours_there)
+        check_writers([*pipeline.lowered.stages, *plan.tail], ours_there)
         for ours in pipeline.lowered.ours:
             if ours.number in reaches:
                 reaches[ours.number].stage = ours.stage
         pipeline.execute(arrays=True)
-    results = _collect(pipeline.arrays, cuts, recipe.creates, marks)
+    results = _collect(pipeline.arrays, cuts, plan.creates, marks)
     need = max((reach.need for reach in reaches.values()), default=0.0)
     if not everything and any(_looked_far(r) for _, reports in pipeline.reports for r in reports):
         most = max(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
@@ -133,7 +129,7 @@ class _Mark:
     """
 
     def __init__(self, number: int, piece: Piece, recipe: Recipe) -> None:
-        self.number, self.piece, self.keep = number, piece, recipe.creates is None
+        self.number, self.piece, self.keep = number, piece, recipe.plan.creates is None
         self.margin = np.where(piece.margin < 0, -1.0, piece.margin * recipe.unit)
         header = read_header(piece.path)
         self.old_format = header is not None and header.point_format <= 5

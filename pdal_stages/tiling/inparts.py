@@ -15,7 +15,7 @@ from .cloudindex import BLOCK, open_las, read_block
 from .extract import finish, plain_header
 from .results import NewValues
 from .sources import Source
-from .tail import run_tail, stamp
+from .tail import run_tail, written
 
 
 class HeadersDifferError(Exception):
@@ -58,10 +58,7 @@ def write_in_parts(
             run_tail([reader], [new_values(start, end)], _uncompressed(tail), parts)
             for one, part in zip(joined, parts, strict=True):
                 one.add(part)
-    return {
-        "outputs": [[path, *stamp(path)] for path in outputs],
-        "written": joined[0].count if joined else 0,
-    }
+    return written(outputs, joined[0].count if joined else 0)
 
 
 def _uncompressed(tail: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -76,7 +73,7 @@ def _copy(path: str, start: int, end: int, target: str) -> None:
     with open_las(path) as reader, open(target, "wb") as out:
         out.write(head)
         for first in range(start, end, BLOCK):
-            out.write(read_block(reader, path, first, min(BLOCK, end - first)).array.tobytes())
+            out.write(read_block(reader, path, first, end).array.tobytes())
         finish(out, head, tail, end - start)
 
 
@@ -110,7 +107,7 @@ class _Joined:
                 raise HeadersDifferError
             total = int(header.point_count)
             for first in range(0, total, BLOCK):
-                self._writer.write_points(read_block(reader, part, first, min(BLOCK, total - first)))
+                self._writer.write_points(read_block(reader, part, first, total))
             self.count += total
         os.unlink(part)
 

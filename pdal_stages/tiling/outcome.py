@@ -10,8 +10,31 @@ from ..base.version import __version__
 from .sources import Source
 
 
+@dataclass(kw_only=True)
+class _Work:
+    """What became of a tile or an output.
+
+    Attributes
+    ----------
+    state : str
+        ``waiting``, ``ready`` (an output whose tiles are done), ``done``, ``kept`` (from an earlier run) or ``failed``.
+    report : dict
+    reason : str
+        Why it failed.
+    blocked_by : str
+        The unreadable input that it failed for, where that is the reason.
+    tries : int
+    """
+
+    state: str = "waiting"
+    report: dict[str, Any] = field(default_factory=dict)
+    reason: str = ""
+    blocked_by: str = ""
+    tries: int = 0
+
+
 @dataclass
-class Job:
+class Job(_Work):
     """A tile to run.
 
     Attributes
@@ -24,14 +47,6 @@ class Job:
         Inputs that may hold points of it or its surroundings.
     outputs : list of str, optional
         What the writers write, where each tile is an output.
-    state : str
-        ``waiting``, ``done``, ``kept`` (from an earlier run) or ``failed``.
-    report : dict
-    reason : str
-        Why it failed.
-    blocked_by : str
-        The unreadable input that it failed for, where that is the reason.
-    tries : int
     """
 
     tile: tuple[int, int]
@@ -39,25 +54,15 @@ class Job:
     points: int
     sources: list[Source]
     outputs: list[str] | None = None
-    state: str = "waiting"
-    report: dict[str, Any] = field(default_factory=dict)
-    reason: str = ""
-    blocked_by: str = ""
-    tries: int = 0
 
 
 @dataclass
-class Output:
-    """An input file whose output is put together from tiles; `state` may be ``ready`` too, when all of these are done."""
+class Output(_Work):
+    """An input file whose output is put together from tiles."""
 
     source: Source
     paths: list[str]
     jobs: list[Job] = field(default_factory=list)
-    state: str = "waiting"
-    report: dict[str, Any] = field(default_factory=dict)
-    reason: str = ""
-    blocked_by: str = ""
-    tries: int = 0
 
 
 _CHANGED = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from typing import Any
 
 from ..pipeline.interrupts import gentle
@@ -13,18 +14,11 @@ from .scheduler import OnDask
 from .settings import TilingOptions
 
 
-class Here:
+class Here(AbstractContextManager):
     """Tasks one after the other in this process."""
 
-    slots = 1
-    threads: int
-    address = "this process"
-
-    def __init__(self, options: TilingOptions) -> None:
-        self.threads = options.threads
-
-    def __enter__(self) -> Here:
-        return self
+    def __init__(self, threads: int) -> None:
+        self.slots, self.threads = 1, threads
 
     def __exit__(self, *exc: object) -> None: ...
 
@@ -57,4 +51,5 @@ def open_pool(options: TilingOptions, folder: str) -> Pool:
     """Where the tasks of a run are done, which keeps what it makes in `folder`."""
     if options.scheduler:
         return OnDask(options, folder)
-    return Processes(options.local_workers, options.threads) if options.local_workers else Here(options)
+    workers, threads = options.local_workers, options.threads
+    return Processes(workers, threads) if workers else Here(threads)

@@ -163,7 +163,7 @@ _SHARE = "Inputs, model and outputs must be there under the same paths on all ho
 
 def versions() -> tuple[str, str]:
     """Of this package and of PDAL, where it is called."""
-    return build(), ".".join(map(str, pdal_env.version()))
+    return build(), pdal_env.dotted_version()
 
 
 def at_hand(folder: str) -> tuple[tuple[str, str], str, bool]:

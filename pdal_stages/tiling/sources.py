@@ -119,15 +119,7 @@ def _bare(reader: dict[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Header:
-    """What an input says of itself.
-
-    Attributes
-    ----------
-    count : int
-        Points.
-    box : Box
-        Bounding box.
-    """
+    """What an input says of itself: number of points, and bounding box."""
 
     count: int
     box: Box
@@ -163,7 +155,7 @@ def las_header(path: str) -> Header:
     try:
         found = las.read_header(path)
     except OSError as error:
-        raise StageError("the input cannot be read", where=path, found=error.strerror or str(error)) from None
+        raise StageError("the input cannot be read", where=path, found=error) from None
     if found is None:
         raise StageError("the input is not a LAS or LAZ file", where=path)
     x0, y0, x1, y1 = found.box

@@ -58,15 +58,14 @@ class Store:
             self._take()
             _remove(self.scratch)
             self.scratch.mkdir()
-        except OSError as error:
+        except BaseException as error:
             self._release()
+            if not isinstance(error, OSError):
+                raise
             raise StageError(
                 "the output folder cannot be written to",
                 found=f"{error.filename or self.folder}: {error.strerror}",
             ) from None
-        except BaseException:
-            self._release()
-            raise
         self._written = self._load()
         return self
 
@@ -123,8 +122,7 @@ class Store:
 
     def finish(self, name: str, mark: str, report: dict[str, Any]) -> None:
         """Remember that a tile is done."""
-        path = self._done(name)
-        write_whole(path, _sealed(path, {**report, "fingerprint": mark}).encode(), "result")
+        _keep(self._done(name), {**report, "fingerprint": mark}, "result")
 
     def finished(self, name: str) -> dict[str, Any] | None:
         """The report of a tile that is done, with its fingerprint; otherwise None."""
@@ -169,9 +167,8 @@ class Store:
 
     def keep_index(self, mark: str, index: CloudIndex) -> None:
         """Keep the index of an input, where there is room."""
-        path = self.indexes / f"{mark}.json"
         with contextlib.suppress(StageError, OSError):
-            write_whole(path, _sealed(path, asdict(index)).encode(), "index")
+            _keep(self.indexes / f"{mark}.json", asdict(index), "index")
 
 
 # ---- files that nobody else put there ----------------------------------------------------------------------
@@ -183,17 +180,16 @@ def _make_own(folder: Path) -> None:
         folder.mkdir()
     status, parent = os.lstat(folder), os.stat(folder.parent)
     if not stat.S_ISDIR(status.st_mode):
-        raise StageError(
-            "the run's own folder beside the outputs is a link or a file",
-            found=str(folder),
-            cure="Remove it, or write to another folder",
-        )
-    if hasattr(os, "geteuid") and status.st_uid not in (os.geteuid(), parent.st_uid):
-        raise StageError(
-            "the run's own folder beside the outputs belongs to another user",
-            found=str(folder),
-            cure="Remove it, or write to another folder",
-        )
+        wrong = "is a link or a file"
+    elif hasattr(os, "geteuid") and status.st_uid not in (os.geteuid(), parent.st_uid):
+        wrong = "belongs to another user"
+    else:
+        return
+    raise StageError(
+        f"the run's own folder beside the outputs {wrong}",
+        found=str(folder),
+        cure="Remove it, or write to another folder",
+    )
 
 
 def _remove(folder: Path) -> None:
@@ -219,13 +215,15 @@ def _opened(path: Path, text: bytes) -> dict[str, Any] | None:
     try:
         found = strictjson.loads(text)
         content = found["content"]
-        return (
-            content
-            if isinstance(content, dict) and found["digest"] == fingerprint(path.parts[-2:], content)
-            else None
-        )
+        same = isinstance(content, dict) and found["digest"] == fingerprint(path.parts[-2:], content)
+        return content if same else None
     except (ValueError, TypeError, KeyError, RecursionError):
         return None
+
+
+def _keep(path: Path, value: dict[str, Any], what: str) -> None:
+    """Write an object into a file."""
+    write_whole(path, _sealed(path, value).encode(), what)
 
 
 def _read(path: Path) -> dict[str, Any] | None:

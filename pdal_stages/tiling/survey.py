@@ -17,8 +17,9 @@ from ..base.stamps import stamp
 from ..base.units import Units
 from ..pipeline.filenames import named_files
 from ..pipeline.references import Reference, check_one_reference, reference_of
-from .cloudindex import CloudIndex, IndexTask
-from .grid import Box, Grid, check_number, union
+from ..pipeline.work import Call
+from .cloudindex import CloudIndex, index_las
+from .grid import Box, Grid, check_number, touching, union
 from .pool import Pool, last_tries
 from .settings import TilingOptions
 from .sources import Header, Source, check_source, find_sources, read_ept, read_header
@@ -31,7 +32,8 @@ class Survey:
 
     Attributes
     ----------
-    sources : list of Source
+    sources, placed : list of Source
+        All of them, and those that are known to have points somewhere.
     headers : dict of str to Header
         Of sources by path, where the header can be read.
     unreadable : dict of str to str
@@ -135,23 +137,18 @@ class Survey:
 
     def _place(self) -> None:
         """Note where inputs lie, as headers or indexes say; thousands of them are compared at once."""
-        self._placed = [s for s in self.sources if s.path in self.headers and self.headers[s.path].count]
+        self.placed = [s for s in self.sources if s.path in self.headers and self.headers[s.path].count]
         boxes = []
-        for source in self._placed:
+        for source in self.placed:
             index = self.indexes.get(source.path)
             boxes.append(union(index.boxes) if index else self.headers[source.path].box)
-        self._boxes = np.array(boxes, np.float64).reshape(-1, 4)
+        self._boxes = np.array(boxes, np.float64)
         self.bounds: Box = union(boxes)
 
     @property
     def paths(self) -> list[str]:
         """Of all inputs."""
         return [source.path for source in self.sources]
-
-    @property
-    def placed(self) -> int:
-        """How many inputs have a place."""
-        return len(self._placed)
 
     def stamps_of(self, stages: list[dict[str, Any]]) -> list[Any]:
         """Names and stamps of the files that stages read."""
@@ -164,17 +161,9 @@ class Survey:
             path for path, then in self.stamps.items() if now.get(path, lambda p=path: stamp(p))() != then
         ]
 
-    @property
-    def points(self) -> int:
-        """Points of all inputs, as their headers say."""
-        return sum(header.count for header in self.headers.values())
-
-    def near(self, box: Box, margin: float) -> list[Source]:
-        """Inputs that may hold points of a box or its surroundings."""
-        b = self._boxes
-        hits = (b[:, 0] <= box[2] + margin) & (b[:, 2] >= box[0] - margin)
-        hits &= (b[:, 1] <= box[3] + margin) & (b[:, 3] >= box[1] - margin)
-        return [self._placed[n] for n in np.flatnonzero(hits)]
+    def near(self, tile: tuple[int, int], margin: float) -> list[Source]:
+        """Inputs that may hold points of a tile or its surroundings."""
+        return [self.placed[n] for n in touching(self._boxes, self.grid.box(tile, margin))]
 
     def tiles(self) -> dict[tuple[int, int], int]:
         """Every tile that may have points of its own, row by row, and how many where that is known (else 0)."""
@@ -217,7 +206,7 @@ class Survey:
         total = sum(self.headers[reading.path].count for reading in waiting)
         with Progress(total, "reading the inputs", enabled=show) as progress:
             for reading, answer in last_tries(
-                pool, waiting, lambda reading: IndexTask(reading.path, self.grid), retries
+                pool, waiting, lambda reading: Call(index_las, (reading.path, self.grid)), retries
             ):
                 if answer.reason:
                     self.unreadable[reading.path] = answer.reason

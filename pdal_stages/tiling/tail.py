@@ -18,12 +18,8 @@ from ..pipeline import pdal as pdal_env
 from ..pipeline.callbacks import Callbacks
 from .results import NewValues
 
-_PDAL_TYPES = {
-    "f8": "double",
-    "f4": "float",
-    **{f"u{size}": f"uint{8 * size}_t" for size in (1, 2, 4, 8)},
-    **{f"i{size}": f"int{8 * size}_t" for size in (1, 2, 4, 8)},
-}
+#: PDAL's names of types that are not NumPy's with ``_t``.
+_FLOATS = {"float64": "double", "float32": "float"}
 
 
 def run_tail(
@@ -71,7 +67,7 @@ def run_tail(
                     stage["filename"] = str(next(waiting))
                 stages.append(stage)
             run = pdal_env.execute(stages, arrays=False)
-    return {"outputs": [[path, *stamp(path)] for path in outputs], "written": run.count}
+    return written(outputs, run.count)
 
 
 def _put(callbacks: Callbacks, new: NewValues, after: str, tag: str) -> list[dict[str, Any]]:
@@ -90,7 +86,8 @@ def _put(callbacks: Callbacks, new: NewValues, after: str, tag: str) -> list[dic
     def drop(module, ins, outs) -> None:
         outs["Mask"] = np.ascontiguousarray(new.kept, bool)
 
-    adds = {name: _PDAL_TYPES[values.dtype.str[1:]] for name, (_, values) in new.values.items()}
+    types = {name: values.dtype.name for name, (_, values) in new.values.items()}
+    adds = {name: _FLOATS.get(kind, f"{kind}_t") for name, kind in types.items()}
     if new.kept.all():
         return [callbacks.filter(put, adds, inputs=[after], tag=tag)]
     return [
@@ -99,7 +96,7 @@ def _put(callbacks: Callbacks, new: NewValues, after: str, tag: str) -> list[dic
     ]
 
 
-def stamp(path: str | Path) -> list[int]:
-    """Size and time of change of a file."""
-    stat = os.stat(path)
-    return [stat.st_size, stat.st_mtime_ns]
+def written(outputs: Sequence[str], count: int) -> dict[str, Any]:
+    """What a report says of files just written: their size and time of change, and the points that came out."""
+    found = [(path, os.stat(path)) for path in outputs]
+    return {"outputs": [[path, s.st_size, s.st_mtime_ns] for path, s in found], "written": count}

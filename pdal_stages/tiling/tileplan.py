@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -12,6 +11,7 @@ from typing import Any
 from ..base import kinds
 from ..base.errors import PipelineError, StageError
 from ..base.outputs import Output, check_outputs
+from ..pipeline.filenames import writes_las
 from ..pipeline.run import Pipeline
 from ..stages.base import Stage
 
@@ -35,6 +35,10 @@ _GLOBAL = _filters(
     "chipper colorinterp cpd divider fps georeference gpstimeconvert groupby head hexbin icp iqr locate mad mortonorder "
     "randomize relaxationdartthrowing returns shell sort splitter stats tail teaser"
 )
+
+#: What PDAL takes for bare file names.
+_DRIVERS = {f".{name}": name for name in ("las", "ply", "bpf", "pcd")}
+_DRIVERS |= {".laz": "las", ".txt": "text", ".csv": "text", ".tif": "gdal"}
 
 
 @dataclass(frozen=True)
@@ -75,7 +79,7 @@ class TilePlan:
 
     @property
     def writers(self) -> list[dict[str, Any]]:
-        return [s for s in self.tail if str(s["type"]).startswith("writers.")]
+        return [s for s in self.tail if s["type"].startswith("writers.")]
 
 
 @dataclass(frozen=True)
@@ -88,7 +92,7 @@ class _Step:
 
     @property
     def type(self) -> str:
-        return str(self.given["type"])
+        return self.given["type"]
 
     @property
     def rank(self) -> int:
@@ -160,7 +164,7 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
         creates=None
         if foreign
         else list(dict.fromkeys(name for stage in stages for name in stage.creates())),
-        unit=next((stage.horizontal_unit for stage in stages if stage.horizontal_unit), ""),
+        unit=next(filter(None, (stage.horizontal_unit for stage in stages)), ""),
         notes=notes,
         name=source.name,
     )
@@ -168,27 +172,19 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
 
 def _object(stage: Any, index: int, count: int) -> dict[str, Any]:
     """A stage as an object with a type; bare names become readers and the writer that PDAL would take."""
-    out = copy.deepcopy(stage) if isinstance(stage, dict) else {"filename": stage}
+    out = dict(stage) if isinstance(stage, dict) else {"filename": stage}
     if not out.get("type"):
-        writes = 0 < index == count - 1
-        name = str(out.get("filename", ""))
-        if writes:
-            out["type"] = _driver(name, "writers")
-        else:
-            out["type"] = "readers.ept" if name.endswith("ept.json") else _driver(name, "readers")
+        name, kind = str(out.get("filename", "")), "writers" if 0 < index == count - 1 else "readers"
+        driver = _DRIVERS.get(Path(name).suffix.lower())
+        if kind == "readers" and name.endswith("ept.json"):
+            driver = "ept"
+        if driver is None:
+            raise PipelineError(
+                f"the {kind[:-1]} of '{name}' is not known by its name",
+                cure=f'Give the stage a type: "{kind}.las"',
+            )
+        out["type"] = f"{kind}.{driver}"
     return out
-
-
-def _driver(name: str, kind: str) -> str:
-    suffix = Path(name).suffix.lower()
-    if suffix in (".las", ".laz"):
-        return f"{kind}.las"
-    known = {".txt": "text", ".csv": "text", ".ply": "ply", ".bpf": "bpf", ".tif": "gdal", ".pcd": "pcd"}
-    if suffix in known:
-        return f"{kind}.{known[suffix]}"
-    raise PipelineError(
-        f"the {kind[:-1]} of '{name}' is not known by its name", cure=f'Give the stage a type: "{kind}.las"'
-    )
 
 
 def _check_row(steps: list[_Step]) -> None:
@@ -297,7 +293,7 @@ def outputs_for(plan: TilePlan, names: list[str], inputs: Iterable[str]) -> list
             raise PipelineError(
                 "'#' goes into the file's name, not its folder", where=writer["type"], found=str(path)
             )
-        kind = kinds.LAS if writer["type"] in ("writers.las", "writers.copc") else ""
+        kind = kinds.LAS if writes_las(writer) else ""
         path = path.absolute()
         found.append([Output(str(path.with_name(path.name.replace("#", n))), "output", kind) for n in names])
     flat = [output for outputs in found for output in outputs]

@@ -62,15 +62,15 @@ class TileTask:
         ) as folder:
             results, report = _settle(self, folder)
             if self.outputs is not None:
-                return report | write_tile(results, self.recipe.tail, self.outputs)
+                return report | write_tile(results, self.recipe.plan.tail, self.outputs)
             save(self.result, results)
         return report | {"result_bytes": os.path.getsize(self.result)}
 
 
 def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, Any]]:
     """Run the head with surroundings that suffice; results, and the report."""
-    recipe, tile = task.recipe, task.tile
-    side, buffer, short = recipe.grid.size * recipe.unit, recipe.halo, False
+    recipe, tile, halo = task.recipe, task.tile, task.recipe.plan.halo
+    side, buffer, short = recipe.grid.size * recipe.unit, halo, False
     head: HeadRun | None = None
     for attempt in range(_WIDENINGS + 1):
         cuts = _cut_all(task, buffer / recipe.unit, folder)
@@ -85,7 +85,7 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
         except NoTerrainError:
             if everything:
                 raise
-            head, need = None, side + 2 * recipe.halo  # look farther away
+            head, need = None, side + 2 * halo  # look farther away
         if everything or need <= buffer:
             break
         short = True
@@ -105,7 +105,7 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
         "read": read,
         "buffer": buffer,
         "short": short,
-        "widened": buffer > recipe.halo,
+        "widened": buffer > halo,
         "dropped": own - sum(len(result.rows) for result in head.results),
         "classes": class_counts(head.results),
         "said": head.said,

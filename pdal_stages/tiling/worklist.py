@@ -9,6 +9,7 @@ from typing import Any
 
 from ..base.version import build
 from .assemble import FileTask
+from .cloudindex import CloudIndex
 from .headrun import Recipe
 from .outcome import Job, Output
 from .settings import TilingOptions
@@ -50,7 +51,7 @@ class Worklist:
         plan, survey = self.plan, self.survey
         jobs = []
         for tile, points in survey.tiles().items():
-            near = survey.near(survey.grid.box(tile), survey.margin)
+            near = survey.near(tile, survey.margin)
             job = Job(tile, survey.grid.name(tile), points, near)
             bad = [s.path for s in near if s.path in survey.unreadable]
             if bad:
@@ -70,7 +71,7 @@ class Worklist:
         """
         survey = self.survey
         margin = max(float(report.get("buffer", 0.0)) / survey.unit, survey.margin)
-        read = survey.near(survey.grid.box(job.tile), margin)
+        read = survey.near(job.tile, margin)
         return fingerprint(self._common, job.tile, [[s.path, survey.stamps[s.path], s.reader] for s in read])
 
     def output_mark(self, out: Output, marks: Mapping[tuple[int, int], str]) -> str:
@@ -139,19 +140,9 @@ class Worklist:
     def tasks(self, store: Store, threads: int):
         """A function that gives the task of a tile or an output."""
         plan, survey = self.plan, self.survey
-        recipe = Recipe(
-            grid=survey.grid,
-            unit=survey.unit,
-            bounds=survey.bounds,
-            head=plan.head,
-            later=plan.later,
-            tail=plan.tail,
-            halo=plan.halo,
-            creates=plan.creates,
-            threads=threads,
-            most_points=self.options.most_points,
-            scratch=str(store.scratch),
-        )
+        most, scratch = self.options.most_points, str(store.scratch)
+        run = replace(plan, readers=[])  # tasks travel, and there may be thousands
+        recipe = Recipe(run, survey.grid, survey.unit, survey.bounds, threads, most, scratch)
         # Farther inputs too: a tile may have to be read with wider surroundings.
         far = max(4 * survey.margin, survey.margin + survey.grid.size)
 
@@ -159,21 +150,20 @@ class Worklist:
             if isinstance(item, Output):
                 count = survey.indexes[item.source.path].count
                 results = [str(store.result(job.name)) for job in item.jobs]
-                return FileTask(item.source, count, results, plan.tail, item.paths, recipe.scratch)
-            sources = survey.near(survey.grid.box(item.tile), far)
+                return FileTask(item.source, count, results, plan.tail, item.paths, scratch)
+            sources = survey.near(item.tile, far)
             return TileTask(
                 recipe,
                 item.tile,
                 [self._with_index(s) for s in sources if s.path not in survey.unreadable],
-                math.inf if len(sources) == survey.placed else far * survey.unit,
+                math.inf if len(sources) == len(survey.placed) else far * survey.unit,
                 str(store.result(item.name)),
                 item.outputs,
             )
 
         return task_of
 
-    def _with_index(self, source: Source):
+    def _with_index(self, source: Source) -> tuple[Source, CloudIndex | None]:
+        """A source and its index, of which the blocks are all that a worker needs."""
         index = self.survey.indexes.get(source.path)
-        return source, None if index is None else replace(
-            index, tiles=[]
-        )  # blocks are all that a worker needs
+        return source, index and replace(index, tiles=[])
