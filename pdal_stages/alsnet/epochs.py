@@ -173,7 +173,7 @@ class _Session:
             self._resume(options.checkpoint)
         left = max(options.epochs - len(self.curve), 0)
         total = left * (len(self.choice.batches) + len(self.held_batches))
-        with Progress(total, "training alsNet", "batches", enabled=None if progress else False) as bar:
+        with Progress(total, "training alsNet", "batches", enabled=progress) as bar:
             while len(self.curve) < options.epochs and not self._patience_is_over():
                 epoch = len(self.curve)
                 loss = self._epoch(epoch, bar)

@@ -78,20 +78,9 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     count = np.sum(used, axis=0)
     low, high = zip(*(_range(name, labelled) for name in names), strict=True)
     info: dict[str, Any] = {
-        "strategy": options.strategy,
-        "target": options.target,
-        "background": options.background if options.strategy == "binary" else None,
-        "classes": [
-            {
-                "code": code,
-                "name": name,
-                "labels": list(labels),
-                "available": int(m),
-                "samples": int(m),
-                "duplicates": 0,
-            }
-            for code, name, labels, m in zip(classes.codes, classes.names, classes.labels, count, strict=True)
-        ],
+        **known.described(
+            options, ({"available": int(m), "samples": int(m), "duplicates": 0} for m in count)
+        ),
         "training": {
             "clouds": [{"name": os.path.basename(c.name), "points": len(c.xyz)} for c in clouds],
             "count": int(count.sum()),
@@ -101,7 +90,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
             **{name: number for name, number in notes.items() if number},
         },
         "densities": density_range(checked),
-        "voxel": float(options.voxel),
+        "voxel": options.voxel,
         "accuracy": {"cross_validation": None},
         "passes": [
             {

@@ -23,6 +23,8 @@ class Progress:
         What is being done, e.g. the stage type.
     unit : str
         The word after the count.
+    enabled : bool, optional
+        False silences it, too.
     """
 
     def __init__(
@@ -39,12 +41,11 @@ class Progress:
         self.total, self.label, self.unit = int(total), label, unit
         # filters.python redirects sys.stdout, never stderr: stderr is always the user's.
         self.stream = stream if stream is not None else sys.__stderr__
-        self.enabled = os.environ.get("PDAL_STAGES_PROGRESS", "1") != "0" if enabled is None else enabled
-        if self.stream is None:
-            self.enabled = False
+        silenced = enabled is False or os.environ.get("PDAL_STAGES_PROGRESS", "1") == "0"
+        self.enabled = self.stream is not None and not silenced
         self.count = 0
         self.started = time.monotonic()
-        self._terminal = bool(self.enabled and self.stream is not None and self.stream.isatty())
+        self._terminal = self.stream is not None and self.enabled and self.stream.isatty()
         self._every = 0.2 if self._terminal else log_every
         self._next = self.started + delay
         self._shown = False

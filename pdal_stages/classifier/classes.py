@@ -16,6 +16,8 @@ from ..base.errors import OptionError, suggest
 
 #: The largest code a point can carry.
 MAX_CODE = 255
+#: The largest label.
+MAX_LABEL = 65535
 
 # Words people use where ASPRS has another.
 _WORDS = {
@@ -127,9 +129,7 @@ class ClassMap:
                 "nothing is left for the background: 'classes' names the target only", cure=_CURE
             )
         both = sorted([(target, self.names[i], self.labels[i]), (background, "Background", rest)])
-        return ClassMap(
-            tuple(c for c, _, _ in both), tuple(n for _, n, _ in both), tuple(m for _, _, m in both)
-        )
+        return ClassMap(*zip(*both, strict=True))
 
     def index(self, labels: npt.NDArray[Any]) -> npt.NDArray[np.int16]:
         """Position of each label's class in `codes`, -1 where it is dropped."""
@@ -152,9 +152,9 @@ def as_labels(labels: npt.ArrayLike, where: str) -> npt.NDArray[Any]:
         array = array.astype(np.int64)
     elif array.dtype.kind not in "iu" and len(array):
         raise OptionError("labels must be whole numbers", where=where, found=f"type {array.dtype}")
-    if len(array) and (array.min() < 0 or array.max() > 65535):
+    if len(array) and (array.min() < 0 or array.max() > MAX_LABEL):
         raise OptionError(
-            "labels must be from 0 to 65535", where=where, found=f"{array.min()} to {array.max()}"
+            f"labels must be from 0 to {MAX_LABEL}", where=where, found=f"{array.min()} to {array.max()}"
         )
     return array.astype(np.uint16)
 
@@ -179,14 +179,14 @@ def _labels(text: Any) -> tuple[int, ...]:
         if span is None:
             raise OptionError("'classes' has a key that is no list of labels", found=repr(text), cure=_CURE)
         first, last = int(span[1]), int(span[2] or span[1])
-        if last < first or last > 65535:
+        if last < first or last > MAX_LABEL:
             raise OptionError("'classes' has a range of labels that is none", found=part.strip(), cure=_CURE)
         labels.extend(range(first, last + 1))
     return tuple(dict.fromkeys(labels))
 
 
 def _code(value: Any, what: str) -> int:
-    limit = MAX_CODE if what == "code" else 65535
+    limit = MAX_CODE if what == "code" else MAX_LABEL
     if isinstance(value, str) and value.strip().isdigit():
         value = int(value)
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value <= limit:

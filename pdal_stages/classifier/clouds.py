@@ -12,7 +12,7 @@ import numpy.typing as npt
 from ..base.asprs import UNINFORMATIVE
 from ..base.errors import OptionError
 from ..features.voxels import represent
-from .classes import ClassMap, as_labels
+from .classes import MAX_LABEL, ClassMap, as_labels
 from .dimensions import known
 from .thinning import thinned
 from .trainoptions import TrainingOptions
@@ -114,15 +114,28 @@ class Labelled:
     def __iter__(self) -> Iterator[tuple[npt.NDArray[np.float64], npt.NDArray[np.int16]]]:
         return (self[number] for number in range(len(self)))
 
+    def described(self, options: TrainingOptions, counts: Iterable[Mapping[str, int]]) -> dict[str, Any]:
+        """What a manifest says of the task and of each class, whose samples `counts` tells."""
+        classes = zip(self.classes.codes, self.classes.names, self.classes.labels, counts, strict=True)
+        return {
+            "strategy": options.strategy,
+            "target": options.target,
+            "background": options.background if options.strategy == "binary" else None,
+            "classes": [
+                {"code": code, "name": name, "labels": list(labels), **counted}
+                for code, name, labels, counted in classes
+            ],
+        }
+
 
 def label_classes(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> Labelled:
     """The classes that the clouds' labels make."""
-    found: dict[int, int] = {}
+    number = np.zeros(MAX_LABEL + 1, np.int64)
     for cloud in clouds:
-        labels = _checked_labels(cloud)
-        number = np.bincount(labels if cloud.mask is None else labels[np.asarray(cloud.mask)])
-        for label in np.flatnonzero(number).tolist():
-            found[label] = found.get(label, 0) + int(number[label])
+        labels = as_labels(cloud.labels, cloud.name)
+        used = labels if cloud.mask is None else labels[np.asarray(cloud.mask)]
+        number += np.bincount(used, minlength=len(number))
+    found = {int(label): int(number[label]) for label in np.flatnonzero(number)}
     listing = ", ".join(f"{label}: {n:,}" for label, n in sorted(found.items())[:20]) or "no points"
     classes = ClassMap.parse(options.classes, found)
     if options.strategy == "binary" and options.target is not None:

@@ -126,7 +126,7 @@ def search(
         folds * len(candidates) * tree_counts[-1],
         "cross-validation",
         "trees",
-        enabled=None if progress else False,
+        enabled=progress,
     ) as bar:
         for number in range(folds):
             train, rows = split(xy, fold, number, gap)

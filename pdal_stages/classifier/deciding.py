@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base import checks
-from .smoothing import checked_radius
+from .smoothing import FARTHEST
 
 #: The class of a rejected point where its old class is not known: ASPRS "Unclassified".
 UNCLASSIFIED = 1
@@ -44,12 +44,11 @@ class PredictionOptions:
     smooth: float = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "smooth", checked_radius(self.smooth))
-        low, code = self.reject_below, self.rejected_code
-        if low is not None:
-            checks.number("'reject_below'", low, 0, 1)
-        if code is not None:
-            checks.whole("'rejected_code'", code, 0, 255)
+        object.__setattr__(self, "smooth", checks.number("'smooth'", self.smooth, 0, FARTHEST, unit="m"))
+        if self.reject_below is not None:
+            checks.number("'reject_below'", self.reject_below, 0, 1)
+        if self.rejected_code is not None:
+            checks.whole("'rejected_code'", self.rejected_code, 0, 255)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,10 +16,6 @@ from .model import Model
 from .training import train
 from .trainoptions import TrainingOptions
 
-_DEFAULT: dict[str, Any] = {
-    name: field.default for name, field in TrainingOptions.__dataclass_fields__.items()
-}
-
 
 class PointClassifier(ClassifierMixin, BaseEstimator):
     """A forest on the multi-scale features of points: ``PointClassifier().fit(xyz, y).predict(xyz)``.
@@ -58,18 +54,18 @@ class PointClassifier(ClassifierMixin, BaseEstimator):
 
     def __init__(
         self,
-        neighborhoods: Any = _DEFAULT["neighborhoods"],
-        feature_set: Any = _DEFAULT["feature_set"],
+        neighborhoods: Any = TrainingOptions.neighborhoods,
+        feature_set: Any = TrainingOptions.feature_set,
         *,
-        classes: Any = _DEFAULT["classes"],
-        count: int = _DEFAULT["count"],
-        trees: Any = _DEFAULT["trees"],
-        min_samples_leaf: Any = _DEFAULT["min_samples_leaf"],
-        prior_weight: float = _DEFAULT["prior_weight"],
-        passes: int = _DEFAULT["passes"],
-        thin: Any = _DEFAULT["thin"],
-        seed: int = _DEFAULT["seed"],
-        threads: int | None = _DEFAULT["threads"],
+        classes: Any = TrainingOptions.classes,
+        count: int = TrainingOptions.count,
+        trees: Any = TrainingOptions.trees,
+        min_samples_leaf: Any = TrainingOptions.min_samples_leaf,
+        prior_weight: float = TrainingOptions.prior_weight,
+        passes: int = TrainingOptions.passes,
+        thin: Any = TrainingOptions.thin,
+        seed: int = TrainingOptions.seed,
+        threads: int | None = TrainingOptions.threads,
         options: TrainingOptions | None = None,
     ) -> None:
         self.neighborhoods = neighborhoods

@@ -16,8 +16,8 @@ from ..base.errors import OptionError
 from ..base.progress import Progress
 from ..base.version import __version__
 from ..features import FeaturePlan
+from ..features.fitting import fit_clouds
 from . import crossval
-from .classes import ClassMap
 from .clouds import Labelled, TrainingCloud, label_classes
 from .context import Context
 from .dimensions import gather, required
@@ -27,7 +27,7 @@ from .forest import Forest
 from .growing import TreeOptions, grow
 from .model import Model
 from .outoffold import FoldForests, grow_folds, sample_context
-from .samplefeatures import fit, must_fit, percentiles, sample_features
+from .samplefeatures import must_fit, percentiles, sample_features
 from .sampling import Samples, draw_samples
 from .thinning import density_range
 from .trainoptions import TrainingOptions
@@ -61,51 +61,41 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     classes = labelled.classes
     shares = [f"{cloud.flight} {cloud.copy}" for cloud in clouds] if options.balance else None
     samples = draw_samples(labelled, len(classes.codes), options.count, options.seed, shares)
-    context = Context.parse(options.context)
-    must_fit(len(plan.names) + (options.passes > 1) * len(context.tokens) * len(classes.codes), len(samples))
-    share = np.bincount(samples.cloud, minlength=len(clouds)).tolist()
-    features = fit(clouds, share, plan, options)
+    of_context = len(options.context) * len(classes.codes) if options.passes > 1 else 0
+    must_fit(len(plan.names) + of_context, len(samples))
+    share = np.bincount(samples.cloud, minlength=len(clouds))
+    used = [cloud.xyz for cloud, n in zip(clouds, share, strict=True) if n]
+    fitted = fit_clouds(used, plan, seed=options.seed, threads=options.threads)
+    features = Features(plan, *fitted, options.seed)
     values, notes = sample_features(clouds, samples, features, options, progress)
     timed = {"features": time.perf_counter() - started}
     limits = percentiles(values, plan, options)
-    xy = np.empty((len(samples), 2))
-    for number, cloud in enumerate(clouds):
-        mine = samples.cloud == number
-        xy[mine] = cloud.xyz[samples.row[mine], :2]
-
+    xy = samples.take([cloud.xyz[:, :2] for cloud in clouds])
     chosen, validation = _validate(
-        values, samples, xy, _group_of(samples, groups), classes, plan, options, progress
+        values, samples, xy, samples.take(groups), classes.codes, plan, options, progress
     )
     started = time.perf_counter()
-    passes = _Passes(labelled, samples, features, context, chosen, options)
-    passes.grow(values, limits, progress)
-    left_out = passes.without_each_survey(values, progress) if options.leave_one_survey_out else None
+    passes = _Passes(labelled, samples, values, features, chosen, options, progress)
+    passes.grow(*limits)
+    left_out = passes.without_each_survey() if options.leave_one_survey_out else None
     timed["trees"] = time.perf_counter() - started
     info = {
-        "strategy": options.strategy,
-        "target": options.target,
-        "background": options.background if options.strategy == "binary" else None,
-        "classes": [
-            {"code": code, "name": name, "labels": list(labels), **samples.counts(position)}
-            for position, (code, name, labels) in enumerate(
-                zip(classes.codes, classes.names, classes.labels, strict=True)
-            )
-        ],
+        **labelled.described(options, map(samples.counts, range(len(classes.codes)))),
         "training": {
             "clouds": [{"name": os.path.basename(c.name), "points": len(c.xyz)} for c in clouds],
             "count": options.count,
             "seed": options.seed,
             "samples": len(samples),
-            "max_samples": float(options.max_samples),
+            "max_samples": options.max_samples,
             "max_features": options.max_features,
             "min_samples_leaf": chosen["min_samples_leaf"],
             "max_depth": chosen["max_depth"],
             **passes.notes,
             **notes,
         },
-        "priors": _priors(samples, len(classes.codes), float(options.prior_weight)),
+        "priors": _priors(samples, len(classes.codes), options.prior_weight),
         "densities": density_range(cloud.xyz for cloud in clouds),
-        "voxel": float(options.voxel),
+        "voxel": options.voxel,
         "accuracy": {"cross_validation": validation, "leave_one_survey_out": left_out},
         "passes": passes.scores,
         "created_by": _versions(),
@@ -126,13 +116,13 @@ def _priors(samples: Samples, n_classes: int, weight: float) -> dict[str, Any] |
 
 
 def _tree_options(options: TrainingOptions, max_depth: int | None, min_samples_leaf: int) -> TreeOptions:
-    return TreeOptions(max_depth, min_samples_leaf, float(options.max_samples), options.max_features)
+    return TreeOptions(max_depth, min_samples_leaf, options.max_samples, options.max_features)
 
 
 def _gap(plan: FeaturePlan, options: TrainingOptions) -> float:
     """Metres between samples trained on and ground held out."""
     if options.gap is not None:
-        return float(options.gap)
+        return options.gap
     return max((one.reach or 0.0 for one in plan.neighborhoods), default=0.0)
 
 
@@ -148,21 +138,12 @@ def _groups(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> list[n
     return [gather((name,), cloud.dimensions, len(cloud.xyz), where=cloud.name)[0][name] for cloud in clouds]
 
 
-def _group_of(samples: Samples, groups: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
-    """The group of each sample."""
-    out = np.empty(len(samples), np.concatenate([group[:0] for group in groups]).dtype)
-    for number, group in enumerate(groups):
-        mine = samples.cloud == number
-        out[mine] = group[samples.row[mine]]
-    return out
-
-
 def _validate(
-    values,
+    values: npt.NDArray[np.float32],
     samples: Samples,
-    xy,
+    xy: npt.NDArray[np.float64],
     group: npt.NDArray[Any],
-    classes: ClassMap,
+    codes: Sequence[int],
     plan: FeaturePlan,
     options: TrainingOptions,
     progress: bool,
@@ -191,11 +172,11 @@ def _validate(
                 samples.label,
                 samples.weight,
                 xy,
-                classes.codes,
+                codes,
                 [_tree_options(options, **candidate) for candidate in candidates],
                 counts,
                 folds=folds,
-                block_size=float(options.block_size),
+                block_size=options.block_size,
                 gap=_gap(plan, options),
                 seed=options.seed,
                 fold=fold,
@@ -213,7 +194,7 @@ def _validate(
             "by": by,
             **asked,
             "folds": folds,
-            "block_size": float(options.block_size),
+            "block_size": options.block_size,
             "gap": _gap(plan, options),
             "tried": rows,
             "chosen": chosen,
@@ -228,13 +209,16 @@ class _Passes:
         self,
         labelled: Labelled,
         samples: Samples,
+        values: npt.NDArray[np.float32],
         features: Features,
-        context: Context,
         chosen: Mapping[str, Any],
         options: TrainingOptions,
+        progress: bool,
     ) -> None:
-        self.clouds, self.codes, self.samples = labelled.clouds, labelled.classes.codes, samples
-        self.features, self.context, self.chosen, self.options = features, context, chosen, options
+        self.clouds, self.codes = labelled.clouds, labelled.classes.codes
+        self.samples, self.values, self.features = samples, values, features
+        self.chosen, self.options, self.progress = chosen, options, progress
+        self.context = Context(tuple(options.context))
         self.setting = _tree_options(options, chosen["max_depth"], chosen["min_samples_leaf"])
         self.made: list[FeatureForest] = []
         self.scores: list[dict[str, Any]] = []
@@ -244,26 +228,20 @@ class _Passes:
             self.folds = Folds.of(labelled, self.flights, options.pass_folds)
             self.notes["pass_folds"] = self.folds.count
 
-    def grow(
-        self, values: npt.NDArray[np.float32], limits: tuple[list[float], list[float]], progress: bool
-    ) -> None:
-        """Fill `made` and `scores`."""
-        for number, columns in enumerate(self._columns(values, self.samples.weight, progress)):
-            forest, importances, bag = self._forest(columns, number, progress)
+    def grow(self, low: list[float], high: list[float]) -> None:
+        """Fill `made` and `scores`; `low` and `high` are the percentiles of the features."""
+        for number, columns in enumerate(self._columns(self.samples.weight)):
+            forest, importances, bag = self._forest(columns, number)
             self.made.append(FeatureForest(self.features, forest, self.context if number else None))
-            low, high = (
-                [*side, *column.tolist()]
-                for side, column in zip(limits, _ends(columns[:, values.shape[1] :]), strict=True)
-            )
-            self.scores.append(
-                {
-                    "percentiles": {"low": low, "high": high, "limited": self.options.scale},
-                    "importances": importances,
-                    "out_of_bag": bag,
-                }
-            )
+            read = columns[:, self.values.shape[1] :]
+            percentiles = {
+                "low": [*low, *read.min(axis=0).tolist()],
+                "high": [*high, *read.max(axis=0).tolist()],
+                "limited": self.options.scale,
+            }
+            self.scores.append({"percentiles": percentiles, "importances": importances, "out_of_bag": bag})
 
-    def without_each_survey(self, values: npt.NDArray[np.float32], progress: bool) -> dict[str, Any]:
+    def without_each_survey(self) -> dict[str, Any]:
         """Scores of each survey's samples by passes grown without that survey.
 
         Raises
@@ -277,33 +255,29 @@ class _Passes:
                 "'leave_one_survey_out' needs clouds of at least two surveys", found=", ".join(names)
             )
         flight = np.array(self.flights)[self.samples.cloud]
-        label, weight, rows = self.samples.label, self.samples.weight, []
+        weight, rows = self.samples.weight, []
         for name in names:
             mine = flight == name
-            *_, columns = self._columns(values, weight * ~mine, progress)
-            grown = self._grown(columns, weight * ~mine, f"growing without {name}", progress)
+            *_, columns = self._columns(weight * ~mine)
+            grown = self._grown(columns, weight * ~mine, f"growing without {name}")
             forest = Forest.from_sklearn([tree.tree_ for tree, _, _ in grown], columns.shape[1])
             best = forest.predict_proba(np.ascontiguousarray(columns[mine])).argmax(axis=1)
-            matrix = np.zeros((len(self.codes), len(self.codes)), np.int64)
-            np.add.at(matrix, (label[mine], best), weight[mine])
-            rows.append({"name": os.path.basename(name), **crossval.figures(matrix, self.codes)})
+            rows.append({"name": os.path.basename(name), **self._figures(mine, best)})
         means = {key: float(np.mean([row[key] for row in rows])) for key in ("overall_accuracy", "mean_f1")}
         return {"surveys": rows, **means}
 
-    def _columns(
-        self, values: npt.NDArray[np.float32], weight: npt.NDArray[np.int64], progress: bool
-    ) -> Iterator[npt.NDArray[np.float32]]:
+    def _columns(self, weight: npt.NDArray[np.int64]) -> Iterator[npt.NDArray[np.float32]]:
         """What each pass reads of the samples; those of weight 0 teach none of them anything."""
         held_out: list[list[Forest]] = []
-        columns = values
+        columns = self.values
         yield columns
         for number in range(1, self.options.passes):
-            held_out.append(self._hold_out(columns, weight, number, progress))
-            columns = np.concatenate([values, self._context(held_out, progress)], axis=1)
+            held_out.append(self._hold_out(columns, weight, number))
+            columns = np.concatenate([self.values, self._context(held_out)], axis=1)
             yield columns
 
     def _hold_out(
-        self, columns: npt.NDArray[np.float32], weight: npt.NDArray[np.int64], number: int, progress: bool
+        self, columns: npt.NDArray[np.float32], weight: npt.NDArray[np.int64], number: int
     ) -> list[Forest]:
         """The pass `number` once more, a forest without each fold."""
         trees = max(1, math.ceil(self.chosen["trees"] * FOLD_TREES))
@@ -311,12 +285,8 @@ class _Passes:
         for k, cloud in enumerate(self.clouds):
             mine = self.samples.cloud == k
             fold[mine] = self.folds.points(cloud.xyz[self.samples.row[mine]], self.flights[k])
-        with Progress(
-            trees * self.folds.count,
-            f"pass {number} without each fold",
-            "trees",
-            enabled=None if progress else False,
-        ) as bar:
+        what = f"pass {number} without each fold"
+        with Progress(trees * self.folds.count, what, "trees", enabled=self.progress) as bar:
             return grow_folds(
                 columns,
                 self.samples.label,
@@ -330,13 +300,12 @@ class _Passes:
                 progress=bar,
             )
 
-    def _context(self, held_out: Sequence[Sequence[Forest]], progress: bool) -> npt.NDArray[np.float32]:
+    def _context(self, held_out: Sequence[Sequence[Forest]]) -> npt.NDArray[np.float32]:
         """The samples' context, (samples, columns), by passes that have not seen them."""
         classes = len(self.codes)
         out = np.empty((len(self.samples), len(self.context.tokens) * classes), np.float32)
-        with Progress(
-            len(self.samples), f"context for pass {len(held_out) + 1}", enabled=None if progress else False
-        ) as bar:
+        what = f"context for pass {len(held_out) + 1}"
+        with Progress(len(self.samples), what, enabled=self.progress) as bar:
             for number, cloud in enumerate(self.clouds):
                 at, rows = self.samples.of_cloud(number)
                 if not len(at):
@@ -360,15 +329,10 @@ class _Passes:
         return out
 
     def _grown(
-        self,
-        columns: npt.NDArray[np.float32],
-        weight: npt.NDArray[np.int64],
-        what: str,
-        progress: bool,
-        **more: Any,
+        self, columns: npt.NDArray[np.float32], weight: npt.NDArray[np.int64], what: str, **more: Any
     ) -> Iterator[tuple[Any, Any, Any]]:
         """The trees of a forest, as :func:`grow` gives them."""
-        with Progress(self.chosen["trees"], what, "trees", enabled=None if progress else False) as bar:
+        with Progress(self.chosen["trees"], what, "trees", enabled=self.progress) as bar:
             yield from grow(
                 columns,
                 self.samples.label,
@@ -382,31 +346,31 @@ class _Passes:
             )
 
     def _forest(
-        self, values: npt.NDArray[np.float32], number: int, progress: bool
+        self, columns: npt.NDArray[np.float32], number: int
     ) -> tuple[Forest, list[float], dict[str, Any] | None]:
         """(forest, importances, out-of-bag score)."""
-        label, weight, n, k = self.samples.label, self.samples.weight, len(self.samples), len(self.codes)
-        total = np.zeros((n, k))
+        total = np.zeros((len(self.samples), len(self.codes)))
         trees = []
-        importance = np.zeros(values.shape[1])
+        importance = np.zeros(columns.shape[1])
         what = f"growing pass {number + 1}" if self.options.passes > 1 else "growing"
-        for tree, rows, shares in self._grown(values, weight, what, progress, score="out of bag"):
+        for tree, rows, shares in self._grown(columns, self.samples.weight, what, score="out of bag"):
             trees.append(tree.tree_)
             importance += tree.feature_importances_
             total[rows] += shares
         scored = total.sum(axis=1) > 0
         bag = None
         if scored.any():
-            matrix = np.zeros((k, k), np.int64)
-            np.add.at(matrix, (label[scored], total[scored].argmax(axis=1)), weight[scored])
-            bag = {**crossval.figures(matrix, self.codes), "samples": int(np.count_nonzero(scored))}
+            bag = self._figures(scored, total[scored].argmax(axis=1))
+            bag["samples"] = int(np.count_nonzero(scored))
         whole = importance.sum()
         importances = (importance / whole if whole else importance).tolist()
-        return Forest.from_sklearn(trees, values.shape[1]), importances, bag
+        return Forest.from_sklearn(trees, columns.shape[1]), importances, bag
 
-
-def _ends(columns: npt.NDArray[np.float32]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-    return columns.min(axis=0), columns.max(axis=0)
+    def _figures(self, mine: npt.NDArray[np.bool_], best: npt.NDArray[np.int64]) -> dict[str, Any]:
+        """Scores of some samples by their most probable classes."""
+        matrix = np.zeros((len(self.codes), len(self.codes)), np.int64)
+        np.add.at(matrix, (self.samples.label[mine], best), self.samples.weight[mine])
+        return crossval.figures(matrix, self.codes)
 
 
 def _versions() -> dict[str, str]:

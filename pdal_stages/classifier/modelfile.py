@@ -152,7 +152,7 @@ def _check_end(stream) -> int:
     """The file's size, after a look at zip's last record: how long is the list zipfile is about to load?"""
     size = stream.seek(0, os.SEEK_END)
     if size < _END.size:
-        raise ModelError("this is not a model file", found=f"{size} bytes", cure=CURE)
+        raise ModelError("this is not a model file", found=f"{size} bytes")
     if size > FILE_LIMIT:
         raise ModelError("the model file is larger than 4 GiB", found=f"{size:,} bytes")
     tail = min(size, _END.size + 20)
@@ -160,13 +160,13 @@ def _check_end(stream) -> int:
     data = stream.read(tail)
     signature, disk, first, here, total, length, offset, comment = _END.unpack(data[-_END.size :])
     if signature != b"PK\x05\x06" or comment:
-        raise ModelError("this is not a model file, or it is cut short", cure=CURE)
+        raise ModelError("this is not a model file, or it is cut short")
     if data[: -_END.size].startswith(b"PK\x06\x07"):
-        raise ModelError("the model file is a zip of a kind that is not used here", found="zip64", cure=CURE)
+        raise ModelError("the model file is a zip of a kind that is not used here", found="zip64")
     if disk or first or here != total or not 1 <= total <= MEMBER_LIMIT or length > MEMBER_LIMIT * 512:
-        raise ModelError("the model file's list of members is not right", found=f"{total} members", cure=CURE)
+        raise ModelError("the model file's list of members is not right", found=f"{total} members")
     if offset + length + _END.size != size:
-        raise ModelError("the model file has bytes that belong to nothing", cure=CURE)
+        raise ModelError("the model file has bytes that belong to nothing")
     stream.seek(0)
     return size
 
@@ -175,21 +175,18 @@ def _read(archive: zipfile.ZipFile, size: int, rules_of) -> tuple[dict[str, Any]
     members: dict[str, zipfile.ZipInfo] = {}
     for info in archive.infolist():
         if info.filename in members:
-            raise ModelError("the model file has a member twice", found=repr(info.filename), cure=CURE)
+            raise ModelError("the model file has a member twice", found=repr(info.filename))
         if info.flag_bits & 0x1 or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise ModelError(
-                "a member is packed in a way not used here", found=repr(info.filename), cure=CURE
-            )
+            raise ModelError("a member is packed in a way not used here", found=repr(info.filename))
         members[info.filename] = info
     declared = sum(info.file_size for info in members.values())
     if declared > RATIO_LIMIT * size + ALLOWANCE:
         raise ModelError(
             "the model file would unpack to far more than a model does",
             found=f"{declared:,} bytes from {size:,}",
-            cure=CURE,
         )
     if MANIFEST not in members:
-        raise ModelError("this is not a model file", found=f"a zip without {MANIFEST}", cure=CURE)
+        raise ModelError("this is not a model file", found=f"a zip without {MANIFEST}")
     if members[MANIFEST].file_size > MANIFEST_LIMIT:
         raise ModelError("the manifest is too large", found=f"{members[MANIFEST].file_size:,} bytes")
     manifest = parse(_unpack(archive, members[MANIFEST]))
@@ -198,9 +195,7 @@ def _read(archive: zipfile.ZipFile, size: int, rules_of) -> tuple[dict[str, Any]
     expected = {MANIFEST, *(entry["file"] for entry in table.values())}
     if len(expected) != 1 + len(table) or expected != set(members):
         odd = sorted(expected ^ set(members))
-        raise ModelError(
-            "the members and the manifest's list of arrays differ", found=odd[:3] or None, cure=CURE
-        )
+        raise ModelError("the members and the manifest's list of arrays differ", found=odd[:3] or None)
     arrays: Arrays = [{} for _ in rules]
     for label, entry in table.items():
         number, name = int(label[0]) - 1, label[2:]
@@ -208,9 +203,7 @@ def _read(archive: zipfile.ZipFile, size: int, rules_of) -> tuple[dict[str, Any]
             raise ModelError("the model file has an array of a pass it does not have", found=repr(label))
         data = _unpack(archive, members[entry["file"]])
         if hashlib.sha256(data).hexdigest() != entry["sha256"]:
-            raise ModelError(
-                f"the array '{name}' is not the one that was stored", found="another SHA-256", cure=CURE
-            )
+            raise ModelError(f"the array '{name}' is not the one that was stored", found="another SHA-256")
         array = from_bytes(data, _rule(rules[number], name), name)
         if list(array.shape) != entry["shape"] or array.dtype.newbyteorder("<").str != entry["dtype"]:
             raise ModelError(
@@ -220,7 +213,7 @@ def _read(archive: zipfile.ZipFile, size: int, rules_of) -> tuple[dict[str, Any]
     for there, needed in zip(arrays, rules, strict=True):
         missing = [name for name in needed if not name.endswith("*") and name not in there]
         if missing:
-            raise ModelError("the model file lacks an array", found=missing[0], cure=CURE)
+            raise ModelError("the model file lacks an array", found=missing[0])
     return manifest, arrays
 
 
@@ -230,14 +223,14 @@ def _rule(rules: Mapping[str, ArrayRule], name: str) -> ArrayRule:
     for pattern, rule in rules.items():
         if pattern.endswith("*") and name.startswith(pattern[:-1]):
             return rule
-    raise ModelError("the model file has an array its algorithm does not know", found=repr(name), cure=CURE)
+    raise ModelError("the model file has an array its algorithm does not know", found=repr(name))
 
 
 def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
     with archive.open(info) as stream:
         data = stream.read(info.file_size + 1)  # never more than was declared; the CRC is checked at the end
         if len(data) != info.file_size or stream.read(1):
-            raise ModelError("a member has another size than declared", found=repr(info.filename), cure=CURE)
+            raise ModelError("a member has another size than declared", found=repr(info.filename))
     return data
 
 
@@ -249,9 +242,9 @@ def parse(data: bytes) -> dict[str, Any]:
     try:
         manifest = strictjson.loads(data.decode("utf-8"))
     except RecursionError:
-        raise ModelError("the manifest is nested too deeply", cure=CURE) from None
+        raise ModelError("the manifest is nested too deeply") from None
     except (UnicodeDecodeError, ValueError) as error:
-        raise ModelError("the manifest is not valid JSON", found=str(error)[:200], cure=CURE) from None
+        raise ModelError("the manifest is not valid JSON", found=str(error)[:200]) from None
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ModelError("this is not a model file", found="a manifest of something else")
     version = manifest.get("version")

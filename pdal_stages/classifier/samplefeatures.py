@@ -13,7 +13,6 @@ from ..base.errors import DimensionError, OptionError
 from ..base.progress import Progress
 from ..base.threads import map_blocks
 from ..features import FeaturePlan
-from ..features.fitting import fit_clouds
 from ..features.names import SHAPES
 from .clouds import TrainingCloud
 from .dimensions import gather, with_returns
@@ -41,14 +40,6 @@ def must_fit(columns: int, n: int) -> None:
         )
 
 
-def fit(
-    clouds: Sequence[TrainingCloud], share: Sequence[int], plan: FeaturePlan, options: TrainingOptions
-) -> Features:
-    """Histogram and curvature thresholds, fitted to all clouds that have a `share` of the samples together."""
-    used = [cloud.xyz for cloud, n in zip(clouds, share, strict=True) if n]
-    return Features(plan, *fit_clouds(used, plan, seed=options.seed, threads=options.threads), options.seed)
-
-
 def sample_features(
     clouds: Sequence[TrainingCloud],
     samples: Samples,
@@ -60,7 +51,7 @@ def sample_features(
     names = features.plan.names
     values = np.empty((len(samples), len(names)), np.float32)
     notes: dict[str, Any] = {}
-    with Progress(len(samples), "features of the samples", enabled=None if progress else False) as bar:
+    with Progress(len(samples), "features of the samples", enabled=progress) as bar:
         for number, cloud in enumerate(clouds):
             at, rows = samples.of_cloud(number)
             if not len(at):

@@ -59,6 +59,14 @@ class Samples:
         at = at[np.argsort(self.row[at], kind="stable")]
         return at, self.row[at]
 
+    def take(self, arrays: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
+        """The samples' values in one array per cloud, of one value or row per point."""
+        out = np.empty((len(self), *arrays[0].shape[1:]), np.result_type(*(array.dtype for array in arrays)))
+        for number, array in enumerate(arrays):
+            mine = self.cloud == number
+            out[mine] = array[self.row[mine]]
+        return out
+
     def counts(self, position: int) -> dict[str, int]:
         """Points available, different points drawn, and duplicates of one class."""
         weight = self.weight[self.label == position]

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..base import checks
 from ..base.jit import njit
 from ..base.threads import map_blocks
 from ..features.cells import WHOLE
@@ -30,11 +29,6 @@ _PIECE = 100_000
 def count_shares(probabilities: npt.NDArray[Any]) -> npt.NDArray[np.uint16]:
     """Probabilities (n, classes) in 65535ths."""
     return np.rint(np.asarray(probabilities) * WHOLE).astype(np.uint16)
-
-
-def checked_radius(radius: float) -> float:
-    """The radius in metres, or an OptionError."""
-    return checks.number("'smooth'", radius, 0, FARTHEST, unit="m")
 
 
 def smooth(

@@ -14,6 +14,7 @@ from ..base.errors import OptionError, suggest
 from ..base.threads import resolve_threads
 from ..features.voxels import LARGEST
 from .algorithms import KINDS, trainer
+from .classes import MAX_LABEL
 from .context import Context
 
 STRATEGIES = ("multiclass", "binary")
@@ -142,26 +143,23 @@ class TrainingOptions:
     memory_mb: float = 512.0
 
     def __post_init__(self) -> None:
-        set_ = object.__setattr__
-        for name, low, high in (
-            ("count", 1, 10**8),
-            ("seed", 0, 2**63 - 1),
-            ("passes", 1, MOST_PASSES),
-            ("pass_folds", 2, 100),
-        ):
-            set_(self, name, checks.whole(f"'{name}'", getattr(self, name), low, high))
-        for name, low, high in (("trees", 1, 10_000), ("min_samples_leaf", 1, 10**6)):
-            _values(name, getattr(self, name), low, high)
-        _values("max_depth", self.max_depth, 1, 10_000, none=True)
+        def put(name: str, check: Any, *bounds: float, **more: Any) -> None:
+            object.__setattr__(self, name, check(f"'{name}'", getattr(self, name), *bounds, **more))
+
+        put("count", checks.whole, 1, 10**8)
+        put("seed", checks.whole, 0, 2**63 - 1)
+        put("passes", checks.whole, 1, MOST_PASSES)
+        put("pass_folds", checks.whole, 2, 100)
+        self.searches  # noqa: B018  wrong values to search are refused here
         if self.folds is not None:
-            set_(self, "folds", checks.whole("'folds'", self.folds, 0, 1000))
+            put("folds", checks.whole, 0, 1000)
         if not isinstance(self.groups, str):
             raise OptionError("'groups' must be the name of a dimension", found=repr(self.groups)[:60])
         if self.folds == 1:
             raise OptionError("'folds' must be 0 or at least 2", found=1)
         checks.one_of("'strategy'", self.strategy, STRATEGIES)
         self._check_algorithm()
-        set_(self, "context", Context.parse(self.context).tokens)
+        put("context", lambda _, tokens: Context.parse(tokens).tokens)
         if self.passes > 1 and not self.context:
             raise OptionError(
                 "several passes need a context", found="an empty list", cure="Leave 'context' out"
@@ -171,15 +169,15 @@ class TrainingOptions:
         if self.strategy == "multiclass" and self.target is not None:
             raise OptionError("'target' means something only with strategy 'binary'", found=self.target)
         if self.target is not None:
-            set_(self, "target", checks.whole("'target'", self.target, 0, 255))
-        set_(self, "background", checks.whole("'background'", self.background, 0, 255))
-        checks.number("'max_samples'", self.max_samples, 0, 1, above=True)
-        checks.number("'block_size'", self.block_size, 0, 10**6, above=True, unit="m")
-        checks.number("'memory_mb'", self.memory_mb, 0, 10**9, above=True)
-        checks.number("'prior_weight'", self.prior_weight, 0, 1)
-        checks.number("'voxel'", self.voxel, 0, LARGEST, unit="m")
+            put("target", checks.whole, 0, 255)
+        put("background", checks.whole, 0, 255)
+        put("max_samples", checks.number, 0, 1, above=True)
+        put("block_size", checks.number, 0, 10**6, above=True, unit="m")
+        put("memory_mb", checks.number, 0, 10**9, above=True)
+        put("prior_weight", checks.number, 0, 1)
+        put("voxel", checks.number, 0, LARGEST, unit="m")
         if self.gap is not None:
-            checks.number("'gap'", self.gap, 0, 10**6, unit="m")
+            put("gap", checks.number, 0, 10**6, unit="m")
         m = self.max_features
         if isinstance(m, str):
             good = m in ("auto", "sqrt", "log2")
@@ -192,17 +190,14 @@ class TrainingOptions:
                 "'max_features' must be auto, sqrt, log2, a number of features, or a share up to 1.0",
                 found=repr(m),
             )
-        set_(self, "dimensions", checks.names("'dimensions'", self.dimensions))
+        put("dimensions", checks.names)
         for name in ("scale", "balance", "leave_one_survey_out"):
-            checks.flag(f"'{name}'", getattr(self, name))
+            put(name, checks.flag)
         thin = [self.thin] if isinstance(self.thin, int | float) else self.thin
-        set_(
-            self,
-            "thin",
-            tuple(checks.number("'thin'", v, 0, 10**6, above=True, unit="points/m2") for v in thin),
-        )
+        rule: Any = {"low": 0, "high": 10**6, "above": True, "unit": "points/m2"}
+        put("thin", lambda what, _: tuple(checks.number(what, one, **rule) for one in thin))
         ignore = [self.ignore] if isinstance(self.ignore, int) else self.ignore
-        set_(self, "ignore", tuple(checks.whole("'ignore'", v, 0, 65535) for v in ignore))
+        put("ignore", lambda what, _: tuple(checks.whole(what, one, 0, MAX_LABEL) for one in ignore))
         resolve_threads(self.threads)
 
     def _check_algorithm(self) -> None:

@@ -144,7 +144,7 @@ def town_chunks(options: TownOptions, *, threads: int | None = None, progress: b
     with CompilationNote():
         survey = Survey(options)
     total, parts = int(options.density * options.size**2), survey.flight.parts(PULSES_PER_CHUNK)
-    with Progress(total, "synthetic", enabled=None if progress else False) as line:
+    with Progress(total, "synthetic", enabled=progress) as line:
         for piece in map_blocks(lambda part: survey.town(survey.flight, *part), parts, threads):
             line.update(len(piece))
             yield piece
