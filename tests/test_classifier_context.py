@@ -91,7 +91,7 @@ def test_strip_by_strip_is_the_same(seed, kind, asc, room, size):
     sweep = Sweep(xyz, coming, wanted, context, 3, threads=2, keep_bytes=room, again=again)
     got = np.full((300, 16), np.nan, np.float32)
     seen = np.zeros(300, int)
-    for rows, (values, columns) in sweep.run(blocks, lambda rows, values, columns: (values, columns)):
+    for rows, (values, columns) in sweep.run(blocks, lambda values, rows, columns: (values, columns)):
         seen[rows] += 1
         got[rows] = np.hstack([values, columns])
     rows = np.arange(300) if wanted is None else wanted

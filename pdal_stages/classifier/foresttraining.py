@@ -18,6 +18,7 @@ from ..base.version import __version__
 from ..features import FeaturePlan
 from ..features.fitting import fit_clouds
 from . import crossval
+from .algorithms import Question
 from .clouds import Labelled, TrainingCloud, label_classes
 from .context import Context
 from .dimensions import gather, required
@@ -26,7 +27,7 @@ from .folds import Folds
 from .forest import Forest
 from .growing import TreeOptions, grow
 from .model import Model
-from .outoffold import FoldForests, grow_folds, sample_context
+from .outoffold import FoldForests, sample_context
 from .samplefeatures import must_fit, percentiles, sample_features
 from .sampling import Samples, draw_samples
 from .thinning import density_range
@@ -255,12 +256,13 @@ class _Passes:
                 "'leave_one_survey_out' needs clouds of at least two surveys", found=", ".join(names)
             )
         flight = np.array(self.flights)[self.samples.cloud]
-        weight, rows = self.samples.weight, []
+        weight, trees, rows = self.samples.weight, self.chosen["trees"], []
         for name in names:
             mine = flight == name
             *_, columns = self._columns(weight * ~mine)
-            grown = self._grown(columns, weight * ~mine, f"growing without {name}")
-            forest = Forest.from_sklearn([tree.tree_ for tree, _, _ in grown], columns.shape[1])
+            with Progress(trees, f"growing without {name}", "trees", enabled=self.progress) as bar:
+                grown = self._grown(columns, weight * ~mine, trees, bar)
+                forest = Forest.from_sklearn([tree.tree_ for tree, _, _ in grown], columns.shape[1])
             best = forest.predict_proba(np.ascontiguousarray(columns[mine])).argmax(axis=1)
             rows.append({"name": os.path.basename(name), **self._figures(mine, best)})
         means = {key: float(np.mean([row[key] for row in rows])) for key in ("overall_accuracy", "mean_f1")}
@@ -279,30 +281,32 @@ class _Passes:
     def _hold_out(
         self, columns: npt.NDArray[np.float32], weight: npt.NDArray[np.int64], number: int
     ) -> list[Forest]:
-        """The pass `number` once more, a forest without each fold."""
+        """The pass `number` once more, a forest without each fold.
+
+        Ground beside a fold is not left out as in cross-validation: the forests miss the fold's samples already, and the
+        next pass should see probabilities as good as those it will see when the model is used.
+        """
         trees = max(1, math.ceil(self.chosen["trees"] * FOLD_TREES))
         fold = np.empty(len(self.samples), np.int16)
         for k, cloud in enumerate(self.clouds):
             mine = self.samples.cloud == k
             fold[mine] = self.folds.points(cloud.xyz[self.samples.row[mine]], self.flights[k])
-        what = f"pass {number} without each fold"
+        forests, what = [], f"pass {number} without each fold"
         with Progress(trees * self.folds.count, what, "trees", enabled=self.progress) as bar:
-            return grow_folds(
-                columns,
-                self.samples.label,
-                weight,
-                fold,
-                self.folds.count,
-                trees,
-                self.setting,
-                seed=self.options.seed,
-                threads=self.options.threads,
-                progress=bar,
-            )
+            for k in range(self.folds.count):
+                train = (fold != k) & (weight > 0)
+                if len(np.unique(self.samples.label[train])) < 2:
+                    raise OptionError(
+                        "without one of its folds the training ground has fewer than two classes left",
+                        cure="Give more training data, or set passes to 1",
+                    )
+                grown = self._grown(columns, weight * train, trees, bar)
+                forests.append(Forest.from_sklearn([tree.tree_ for tree, _, _ in grown], columns.shape[1]))
+        return forests
 
     def _context(self, held_out: Sequence[Sequence[Forest]]) -> npt.NDArray[np.float32]:
         """The samples' context, (samples, columns), by passes that have not seen them."""
-        classes = len(self.codes)
+        classes, o = len(self.codes), self.options
         out = np.empty((len(self.samples), len(self.context.tokens) * classes), np.float32)
         what = f"context for pass {len(held_out) + 1}"
         with Progress(len(self.samples), what, enabled=self.progress) as bar:
@@ -315,35 +319,23 @@ class _Passes:
                     FoldForests(self.features, self.context if k else None, forests, fold)
                     for k, forests in enumerate(held_out)
                 ]
-                out[at] = sample_context(
-                    cloud.xyz,
-                    cloud.dimensions,
-                    rows,
-                    passes,
-                    self.context,
-                    classes,
-                    threads=self.options.threads,
-                    memory_mb=self.options.memory_mb,
-                    progress=bar,
-                )
+                question = Question(cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb, bar)
+                out[at] = sample_context(question, passes, self.context, classes)
         return out
 
     def _grown(
-        self, columns: npt.NDArray[np.float32], weight: npt.NDArray[np.int64], what: str, **more: Any
+        self,
+        columns: npt.NDArray[np.float32],
+        weight: npt.NDArray[np.int64],
+        trees: int,
+        bar: Progress,
+        **more: Any,
     ) -> Iterator[tuple[Any, Any, Any]]:
         """The trees of a forest, as :func:`grow` gives them."""
-        with Progress(self.chosen["trees"], what, "trees", enabled=self.progress) as bar:
-            yield from grow(
-                columns,
-                self.samples.label,
-                weight,
-                self.chosen["trees"],
-                self.setting,
-                self.options.seed,
-                threads=self.options.threads,
-                progress=bar,
-                **more,
-            )
+        label, o = self.samples.label, self.options
+        return grow(
+            columns, label, weight, trees, self.setting, o.seed, threads=o.threads, progress=bar, **more
+        )
 
     def _forest(
         self, columns: npt.NDArray[np.float32], number: int
@@ -353,10 +345,12 @@ class _Passes:
         trees = []
         importance = np.zeros(columns.shape[1])
         what = f"growing pass {number + 1}" if self.options.passes > 1 else "growing"
-        for tree, rows, shares in self._grown(columns, self.samples.weight, what, score="out of bag"):
-            trees.append(tree.tree_)
-            importance += tree.feature_importances_
-            total[rows] += shares
+        count, weight = self.chosen["trees"], self.samples.weight
+        with Progress(count, what, "trees", enabled=self.progress) as bar:
+            for tree, rows, shares in self._grown(columns, weight, count, bar, score="out of bag"):
+                trees.append(tree.tree_)
+                importance += tree.feature_importances_
+                total[rows] += shares
         scored = total.sum(axis=1) > 0
         bag = None
         if scored.any():

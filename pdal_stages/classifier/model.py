@@ -23,9 +23,6 @@ from .passes import Passes
 from .smoothing import count_shares, smooth
 from .thinning import density, out_of_range
 
-#: What a file says of a pass that its classifier does not need.
-_SCORES = ("percentiles", "importances", "out_of_bag")
-
 #: Points decided on at a time after smoothing.
 _DECIDED = 500_000
 
@@ -113,31 +110,27 @@ class Model:
             Place of the pass in ``passes``; the last by default.
         """
         values = self.info["passes"][number]["importances"]
-        return summary.importances(values, self.passes[number].columns(self._codes), by)
+        return summary.importances(values, self.passes[number].columns(self.codes.tolist()), by)
 
     def describe(self) -> dict[str, Any]:
         """Everything about the model as plain data; ``str(model)`` is the same as text."""
         more = {"required_dimensions": list(self.required_dimensions), "halo": self.halo}
         return summary.describe(
-            {**self.manifest(), **more}, [one.columns(self._codes) for one in self.passes]
+            {**self.manifest(), **more}, [one.columns(self.codes.tolist()) for one in self.passes]
         )
 
     def __repr__(self) -> str:
-        return f"<Model {self.algorithm.name} of classes {self._codes}>"
+        return f"<Model {self.algorithm.name} of classes {self.codes.tolist()}>"
 
     def __str__(self) -> str:
         return summary.text(self.describe())
-
-    @property
-    def _codes(self) -> list[int]:
-        return [code for code, _ in self.classes]
 
     # ---- file ----------------------------------------------------------------------------------------------
 
     def manifest(self) -> dict[str, Any]:
         """What the model file says beside its arrays."""
         passes = [
-            {"algorithm": one.name, **one.to_file(self._codes), **scores}
+            {"algorithm": one.name, **one.to_file(self.codes.tolist()), **scores}
             for one, scores in zip(self.passes, self.info["passes"], strict=True)
         ]
         return {**self.info, "passes": passes}
@@ -193,7 +186,9 @@ class Model:
                 found=f"a model of {self.algorithm.name}",
                 cure="Use 'margin'",
             )
-        rows = _rows(where, len(xyz))
+        rows = None
+        if where is not None and not (mask := mask_of("where", where, len(xyz))).all():
+            rows = np.flatnonzero(mask)
         old = None if current is None else _codes_now(current, len(xyz))
         there = None
         if ignore is not None and (gone := mask_of("ignore", ignore, len(xyz))).any():
@@ -328,7 +323,8 @@ def assemble(manifest: dict[str, Any], arrays: modelfile.Arrays) -> Model:
                 raise ModelError(f"the manifest's {key} must have one value per feature", found=len(group))
         passes.append(made)
     info = {key: value for key, value in manifest.items() if key not in ("format", "version", "arrays")}
-    info["passes"] = [{key: entry[key] for key in _SCORES} for entry in manifest["passes"]]
+    scores = ("percentiles", "importances", "out_of_bag")
+    info["passes"] = [{key: entry[key] for key in scores} for entry in manifest["passes"]]
     return Model(tuple(passes), classes, info)
 
 
@@ -355,13 +351,6 @@ def mask_of(name: str, mask: npt.ArrayLike, n: int) -> npt.NDArray[np.bool_]:
             f"'{name}' must be one true or false per point", found=f"{array.dtype} of shape {array.shape}"
         )
     return array
-
-
-def _rows(where: npt.ArrayLike | None, n: int) -> npt.NDArray[np.int64] | None:
-    if where is None:
-        return None
-    mask = mask_of("where", where, n)
-    return None if mask.all() else np.flatnonzero(mask)
 
 
 def _codes_now(current: npt.ArrayLike, n: int) -> npt.NDArray[np.uint8]:

@@ -13,12 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..base.errors import OptionError
 from .algorithms import Question
 from .context import Context
 from .featureforest import Features
 from .forest import Forest
-from .growing import TreeOptions, grow
 from .passes import PassRun
 
 
@@ -61,64 +59,18 @@ class ContextOnly:
     features: None = None
 
 
-def grow_folds(
-    values: npt.NDArray[np.float32],
-    label: npt.NDArray[Any],
-    weight: npt.NDArray[np.int64],
-    fold: npt.NDArray[np.int16],
-    folds: int,
-    trees: int,
-    setting: TreeOptions,
-    *,
-    seed: int,
-    threads: int | None = None,
-    progress: Any = None,
-) -> list[Forest]:
-    """A forest for each fold, grown on the samples outside it.
-
-    Ground beside a fold is not left out as in cross-validation: the forests miss the fold's samples already, and the
-    next pass should see probabilities as good as those it will see when the model is used.
-    """
-    forests = []
-    for number in range(folds):
-        train = (fold != number) & (weight > 0)
-        if len(np.unique(label[train])) < 2:
-            raise OptionError(
-                "without one of its folds the training ground has fewer than two classes left",
-                cure="Give more training data, or set passes to 1",
-            )
-        grown = grow(values, label, weight * train, trees, setting, seed, threads=threads, progress=progress)
-        forests.append(Forest.from_sklearn([tree.tree_ for tree, _, _ in grown], values.shape[1]))
-    return forests
-
-
 def sample_context(
-    xyz: npt.NDArray[np.float64],
-    dimensions: Any,
-    rows: npt.NDArray[np.int64],
-    passes: Sequence[FoldForests],
-    context: Context,
-    classes: int,
-    *,
-    threads: int | None,
-    memory_mb: float,
-    progress: Any = None,
+    question: Question, passes: Sequence[FoldForests], context: Context, classes: int
 ) -> npt.NDArray[np.float32]:
-    """The context of some points of a cloud, as passes say that have not seen them.
-
-    Parameters
-    ----------
-    rows : (m,) int64, ascending
-    passes : sequence of FoldForests
-        One after the other.
+    """The context of the points that are asked for, as passes say, one after the other, that have not seen them.
 
     Returns
     -------
-    (m, columns of the context) float32
+    (points asked for, columns of the context) float32
     """
-    out = np.empty((len(rows), len(context.tokens) * classes), np.float32)
-    question = Question(xyz, dimensions, rows, threads, memory_mb, progress)
+    asked: Any = question.rows
+    out = np.empty((len(asked), len(context.tokens) * classes), np.float32)
     run = PassRun([*passes, ContextOnly(context)], classes, question)
-    for part, columns in run.blocks(lambda rows, _, columns: columns):
-        out[np.searchsorted(rows, part)] = columns
+    for part, columns in run.blocks(lambda _, rows, columns: columns):
+        out[np.searchsorted(asked, part)] = columns
     return out

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -60,7 +60,7 @@ class Passes:
         """Classify; see ``Algorithm.predict``."""
         run = PassRun(self.members, self.classes, question)
 
-        def last(rows, values, context):
+        def last(values, rows, context):
             return finish(self.members[-1].probabilities(joined(values, context), rows))
 
         return Answer((Block(rows, result) for rows, result in run.blocks(last)), run.report)
@@ -104,14 +104,14 @@ class PassRun:
         return self._computings[-1]
 
     def blocks(
-        self, last: Callable[[npt.NDArray[np.int64], Any, npt.NDArray[np.float32]], Any]
+        self, last: Callable[[Any, npt.NDArray[np.int64], npt.NDArray[np.float32]], Any]
     ) -> Iterator[tuple[npt.NDArray[np.int64], Any]]:
-        """Yield (rows, ``last(rows, values, context)``) for all points asked for; called in workers' threads."""
+        """Yield (rows, ``last(values, rows, context)``) for all points asked for; called in workers' threads."""
         if not self._question.count:
             return
         stream = self._first()
         for number in range(1, len(self._members) - 1):
-            stream = self._handed_on(number, stream)
+            stream = _passed(self._swept(number, stream, self._handing_on(number)))
         progress = self._question.progress
         for rows, result in self._swept(len(self._members) - 1, stream, last):
             if progress is not None:
@@ -121,7 +121,7 @@ class PassRun:
             self.report.update(one.report)
 
     def _first(self) -> Iterator[Passed]:
-        first, after = self._members[:2]
+        first = self._members[0]
         features = getattr(first, "features", None)
         if features is None:
             asked = self._question
@@ -132,27 +132,21 @@ class PassRun:
                 yield Passed(every[block.rows], block.result, None)
             self.report.update(answer.report)
             return
-        same = self._reads_same(first, after)
+        blocks = self._computing(features).blocks(
+            self._rows[0], self._handing_on(0), 1.0 - _KEPT, shown=False
+        )
+        yield from _passed(blocks)
 
-        def apply(values, rows):
-            return count_shares(first.probabilities(values, rows)), values if same else None
+    def _handing_on(self, number: int) -> Callable[..., tuple[npt.NDArray[np.uint16], Any]]:
+        """What a pass makes of a block: its shares, and the features where the next pass reads the same ones."""
+        one, after = self._members[number : number + 2]
+        same = after.features is not None and self._computing(one.features) is self._computing(after.features)
 
-        for rows, (shares, values) in self._computing(features).blocks(
-            self._rows[0], apply, 1.0 - _KEPT, shown=False
-        ):
-            yield Passed(rows, shares, values)
+        def apply(values, rows, context=None):
+            read = values if context is None else joined(values, context)
+            return count_shares(one.probabilities(read, rows)), values if same else None
 
-    def _handed_on(self, number: int, stream: Iterator[Passed]) -> Iterator[Passed]:
-        """A pass between the first and the last."""
-        one = self._members[number]
-        same = self._reads_same(one, self._members[number + 1])
-
-        def apply(rows, values, context):
-            shares = count_shares(one.probabilities(joined(values, context), rows))
-            return shares, values if same else None
-
-        for rows, (shares, values) in self._swept(number, stream, apply):
-            yield Passed(rows, shares, values)
+        return apply
 
     def _swept(self, number: int, stream: Iterator[Passed], apply) -> Iterator[tuple[Any, Any]]:
         one, asked = self._members[number], self._question
@@ -175,8 +169,9 @@ class PassRun:
         )
         return sweep.run(stream, apply)
 
-    def _reads_same(self, one: Any, after: Any) -> bool:
-        return after.features is not None and self._computing(one.features) is self._computing(after.features)
+
+def _passed(blocks: Iterable[tuple[npt.NDArray[np.int64], Any]]) -> Iterator[Passed]:
+    return (Passed(rows, shares, values) for rows, (shares, values) in blocks)
 
 
 def joined(values: npt.NDArray[np.float32], context: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

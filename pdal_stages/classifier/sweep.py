@@ -21,8 +21,8 @@ from .context import Context, Tables
 #: Points of strips that are worked on together, where there are so many.
 TOGETHER = 300_000
 
-#: rows of the cloud, their features, and the table of their context's columns -> whatever is wanted.
-Apply = Callable[[npt.NDArray[np.int64], Any, npt.NDArray[np.float32]], Any]
+#: Features of rows of the cloud, these rows, and the table of their context's columns -> whatever is wanted.
+Apply = Callable[[Any, npt.NDArray[np.int64], npt.NDArray[np.float32]], Any]
 
 
 class Passed(NamedTuple):
@@ -87,14 +87,14 @@ class Sweep:
         self._done = np.zeros(len(self._numbers), np.bool_)
 
     def run(self, blocks: Iterable[Passed], apply: Apply) -> Iterator[tuple[npt.NDArray[np.int64], Any]]:
-        """Yield (rows, ``apply(rows, values, context)``) for every wanted point once.
+        """Yield (rows, ``apply(values, rows, context)``) for every wanted point once.
 
         `apply` is called in workers' threads.
         """
         for block in blocks:
             self._take(block)
             ready = self._ready()
-            if len(ready) and (self._room <= 0.0 or self._points(ready) >= TOGETHER):
+            if len(ready) and (self._room <= 0.0 or np.diff(self._start)[ready].sum() >= TOGETHER):
                 yield from self._work(ready, apply)
         while len(ready := self._ready()):
             most = np.searchsorted(np.cumsum(np.diff(self._start)[ready]), TOGETHER) + 1
@@ -126,9 +126,6 @@ class Sweep:
         good[:-1] &= whole[1:] | ~beside
         return np.flatnonzero(good)
 
-    def _points(self, strips: npt.NDArray[np.int64]) -> int:
-        return int(np.diff(self._start)[strips].sum())
-
     def _work(
         self, strips: npt.NDArray[np.int64], apply: Apply
     ) -> Iterator[tuple[npt.NDArray[np.int64], Any]]:
@@ -147,14 +144,14 @@ class Sweep:
 
         def one(part):
             rows, values = part
-            return rows, apply(rows, values, self._columns(tables, rows, first))
+            return rows, apply(values, rows, self._columns(tables, rows, first))
 
         yield from map_blocks(one, kept, self._threads)
         self._room += sum(values.nbytes for _, values in kept if values is not None)
         if missing and self._again is not None:
             yield from self._again(
                 np.sort(np.concatenate(missing)),
-                lambda values, rows: apply(rows, values, self._columns(tables, rows, first)),
+                lambda values, rows: apply(values, rows, self._columns(tables, rows, first)),
             )
 
     def _columns(self, tables: Tables, rows: npt.NDArray[np.int64], first: int) -> npt.NDArray[np.float32]:
