@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from pdal_stages.base.asprs import class_color, class_name
 from pdal_stages.base.errors import StageError
-from pdal_stages.reports.panels import legend, present_classes, triptych
+from pdal_stages.reports.panels import legend, triptych
 from pdal_stages.reports.pictures import LARGE, fit_text, plain, png, text_width, write_png
 from pdal_stages.reports.raster import BACKGROUND, blur
 from pdal_stages.reports.views import (
@@ -220,12 +220,6 @@ def test_legend_shows_every_class_in_any_width():
         for code in codes:
             assert has_color(band, class_color(code)), (width, code)
     assert heights[0] > heights[1] > heights[2]
-    other = legend(codes, 1500, names={64: "Solar panel"})
-    assert not np.array_equal(other, legend(codes, 1500))
-
-
-def test_present_classes():
-    assert present_classes(np.array([2, 6, 2], np.uint8), np.array([200, 2])) == [2, 6, 200]
 
 
 def test_every_class_name_can_be_drawn():
@@ -243,14 +237,13 @@ def test_text_is_shortened():
     assert text_width("") == 0 and text_width("abc", LARGE) > text_width("abc") > text_width("ab")
 
 
-def test_triptych(tmp_path):
+def test_triptych():
     x, y, z = block(60)
     truth = np.where(x > 15, 6, 2)
     predicted = truth.copy()
     predicted[(x > 20) & (y > 20)] = 5
-    image = triptych(x, y, z, predicted, truth, width=1200, title="A town", path=tmp_path / "t.png")
+    image = triptych(x, y, z, predicted, truth, width=1200, title="A town")
     assert image.shape[1] == 1200
-    assert np.array_equal(pixels((tmp_path / "t.png").read_bytes()), image)
     for code in (2, 5, 6):
         assert has_color(image, class_color(code))
     assert has_color(image, RIGHT) and has_color(image, WRONG)

@@ -99,12 +99,8 @@ def _matrix_width(a: Accuracy) -> int:
 
 
 def _confidence(a: Accuracy) -> list[Charted]:
-    out = []
-    if a.reliability is not None and a.reliability.points:
-        out.append(_reliability(a.reliability))
-    if a.margin is not None and a.margin.points:
-        out.append(_margin(a.margin))
-    return out
+    drawn = (_reliability, a.reliability), (_margin, a.margin)
+    return [draw(grading) for draw, grading in drawn if grading is not None and grading.points]
 
 
 def _reliability(g: Grading) -> Charted:

@@ -185,26 +185,17 @@ def draw_scene(a: Accuracy, scene: Scene, unit: str = "m", section: Line | None 
         "scale": (100 * length / wide, f"{length:g} {unit}"),
         "line": "" if line is None else _path_over(frame, line),
     }
-    by_number = "classes from above, by number of points"
+
+    def classes(codes: npt.NDArray[Any], heading: str, word: str) -> Picture:
+        alt = f"Map of the {word} classes from above, by number of points: {shown(codes)}"
+        return Picture.of(top_view(x, y, z, codes, width=width), heading, alt, **over)
+
+    errors = error_view(x, y, z, scene.wrong, ~scene.compared, width=width)
+    alt = f"Map of the errors from above: {wrong:,} of {n:,} compared points are wrong"
     maps = (
-        Picture.of(
-            top_view(x, y, z, scene.reference, width=width),
-            "Reference",
-            f"Map of the reference {by_number}: {shown(scene.reference)}",
-            **over,
-        ),
-        Picture.of(
-            top_view(x, y, z, scene.predicted, width=width),
-            "Prediction",
-            f"Map of the predicted {by_number}: {shown(scene.predicted)}",
-            **over,
-        ),
-        Picture.of(
-            error_view(x, y, z, scene.wrong, ~scene.compared, width=width),
-            "Errors",
-            f"Map of the errors from above: {wrong:,} of {n:,} compared points are wrong",
-            **over,
-        ),
+        classes(scene.reference, "Reference", "reference"),
+        classes(scene.predicted, "Prediction", "predicted"),
+        Picture.of(errors, "Errors", alt, **over),
     )
     note = (
         f"{len(x):,} points, {wide:,.0f} x {tall:,.0f} {unit}, north up; lower left corner: x "

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +10,7 @@ from PIL import Image, ImageDraw
 
 from ..base.asprs import class_name
 from ..base.errors import StageError
-from .pictures import LARGE, fit_text, font, text_width, write_png
+from .pictures import LARGE, fit_text, font, text_width
 from .raster import BACKGROUND, paint, shading
 from .views import (
     CLASS_COLORS,
@@ -32,18 +31,7 @@ _GAP = 12
 Entry = tuple[str, tuple[int, int, int]]
 
 
-def present_classes(*columns: np.ndarray) -> list[int]:
-    """Class codes found in any of the arrays, ascending."""
-    return sorted({int(code) for column in columns for code in np.unique(class_codes(np.asarray(column)))})
-
-
-def legend(
-    codes: Sequence[int],
-    width: int,
-    *,
-    names: Mapping[int, str] | None = None,
-    extra: Sequence[Entry] = (),
-) -> np.ndarray:
+def legend(codes: Sequence[int], width: int, extra: Sequence[Entry] = ()) -> np.ndarray:
     """A band of colour patches with class names, in as many lines as the width needs.
 
     Parameters
@@ -51,8 +39,6 @@ def legend(
     codes : sequence of int
     width : int
         Pixels.
-    names : mapping of code to name, optional
-        Names that replace ASPRS's.
     extra : sequence of (text, (r, g, b))
         More patches, after the classes.
 
@@ -60,8 +46,7 @@ def legend(
     -------
     (height, width, 3) uint8
     """
-    names = names or {}
-    entries = [(f"{c} {names.get(c, class_name(c))}", tuple(CLASS_COLORS[c].tolist())) for c in codes]
+    entries = [(f"{c} {class_name(c)}", tuple(CLASS_COLORS[c].tolist())) for c in codes]
     spots, left, line = [], 16, 0
     for text, color in [*entries, *extra]:
         text = fit_text(text, width - 60)
@@ -87,11 +72,7 @@ def triptych(
     *,
     width: int = 1500,
     captions: Sequence[str] | None = None,
-    ignore: Sequence[int] = (),
-    names: Mapping[int, str] | None = None,
-    unit: str = "m",
     title: str | None = None,
-    path: str | os.PathLike[str] | None = None,
 ) -> np.ndarray:
     """Heights, classes and errors side by side, with captions, a scale and a legend.
 
@@ -105,15 +86,7 @@ def triptych(
         Pixels across all panels.
     captions : sequence of str, optional
         One for each panel.
-    ignore : sequence of int
-        Reference classes left out of the errors.
-    names : mapping of code to name, optional
-        Class names that replace ASPRS's.
-    unit : str
-        Unit of the coordinates, for the scale.
     title : str, optional
-    path : path, optional
-        Where to write a PNG as well.
 
     Returns
     -------
@@ -134,11 +107,9 @@ def triptych(
     if truth is not None:
         _, truth = checked_columns(x=x, truth=truth)
         truth = class_codes(truth)
-        left_out = np.isin(truth, list(ignore))
-        wrong = (predicted != truth) & ~left_out
-        images.append(paint(s, verdict(s, x, y, z, wrong, left_out), light))
-        scored = len(x) - int(left_out.sum())
-        texts.append(f"Errors: {100 * wrong.sum() / max(scored, 1):.1f} % of {scored:,} points")
+        wrong = predicted != truth
+        images.append(paint(s, verdict(s, x, y, z, wrong, np.zeros_like(wrong)), light))
+        texts.append(f"Errors: {100 * wrong.sum() / len(x):.1f} % of {len(x):,} points")
         extra = [("right", RIGHT), ("wrong", WRONG)]
     if captions is not None:
         if len(captions) != panels:
@@ -147,7 +118,7 @@ def triptych(
             )
         texts = list(captions)
 
-    band = legend(present_classes(predicted), int(width), names=names, extra=extra)
+    band = legend(np.unique(predicted).tolist(), int(width), extra)
     top = (38 if title else 6) + 30
     below = top + images[0].shape[0]
     sheet = Image.new("RGB", (int(width), below + 36 + band.shape[0]), BACKGROUND)
@@ -158,18 +129,15 @@ def triptych(
         left = _GAP + n * (each + _GAP)
         pen.text((left + 2, top - 14), fit_text(text, each), INK, font(), anchor="lm")
         sheet.paste(Image.fromarray(image), (left, top))
-    _scale_bar(pen, _GAP + 2, below + 17, each, s.frame.pixel, unit)
+    _scale_bar(pen, _GAP + 2, below + 17, each, s.frame.pixel)
     sheet.paste(Image.fromarray(band), (0, below + 36))
-    out = np.array(sheet)
-    if path is not None:
-        write_png(path, out)
-    return out
+    return np.array(sheet)
 
 
-def _scale_bar(pen: ImageDraw.ImageDraw, left: int, y: int, most: int, pixel: float, unit: str) -> None:
-    """A bar of a round length, at most about half as long as `most` pixels; `pixel` in units of the map."""
+def _scale_bar(pen: ImageDraw.ImageDraw, left: int, y: int, most: int, pixel: float) -> None:
+    """A bar of a round length, at most about half as long as `most` pixels; `pixel` in metres."""
     length = nice_step(0.2 * most * pixel)
     long = max(2, round(length / pixel))
     pen.rectangle((left, y - 2, left + long - 1, y + 2), fill=INK)
     pen.rectangle((left + long // 2, y - 1, left + long - 2, y + 1), fill=BACKGROUND)
-    pen.text((left + long + 8, y), f"{length:g} {unit}", INK, font(), anchor="lm")
+    pen.text((left + long + 8, y), f"{length:g} m", INK, font(), anchor="lm")

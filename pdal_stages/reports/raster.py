@@ -76,16 +76,8 @@ class Surface:
         return out
 
 
-def surface(x: np.ndarray, y: np.ndarray, z: np.ndarray, frame: Frame, gap: float | None = None) -> Surface:
-    """Grid the highest points; an empty pixel takes the nearest one within `gap` pixels.
-
-    Parameters
-    ----------
-    x, y, z : (n,) float
-    frame : Frame
-    gap : float, optional
-        1.6 times the typical spacing of the points where not given.
-    """
+def surface(x: np.ndarray, y: np.ndarray, z: np.ndarray, frame: Frame) -> Surface:
+    """Grid the highest points, (n,) float each; an empty pixel takes the nearest within 1.6 times the points' spacing."""
     if frame.width * frame.height > MOST_PIXELS:
         raise StageError(
             "the picture is too large",
@@ -112,7 +104,7 @@ def surface(x: np.ndarray, y: np.ndarray, z: np.ndarray, frame: Frame, gap: floa
         # Spacing inside the cloud: pixels near some point, per pixel that has one.
         share = math.sqrt(seen.size / seen.sum())
         spacing = max(1.0, math.sqrt((away <= share).sum() / seen.sum()))
-        fill = ~seen & (away <= (1.6 * spacing if gap is None else gap))
+        fill = ~seen & (away <= 1.6 * spacing)
         which[fill] = which[at[0][fill], at[1][fill]]
         top[fill] = top[at[0][fill], at[1][fill]]
     top[which < 0] = np.nan
@@ -133,7 +125,7 @@ def blur(image: np.ndarray, size: float) -> np.ndarray:
     return large[:height, :width]
 
 
-def shading(s: Surface, strength: float = 1.0) -> np.ndarray:
+def shading(s: Surface) -> np.ndarray:
     """Light on the surface, about 0.5 (dark) to 1.15: sun from the north-west and open sky.
 
     The sun gives shape to roofs and slopes; the sky term darkens what lies lower than its surroundings, as
@@ -152,21 +144,21 @@ def shading(s: Surface, strength: float = 1.0) -> np.ndarray:
 
     fine = height_around(0.45 * s.spacing)
     gy, gx = np.gradient(fine, s.frame.pixel)
-    gx, gy = gx * strength, -gy * strength  # rows run south
+    gy = -gy  # rows run south
     sun = (0.5 * gx - 0.5 * gy + 0.75) / np.sqrt(1 + gx * gx + gy * gy) / 0.75
     metres = 1.0 / s.frame.pixel
     low = 0.0
-    for size, share in ((1.5, 0.5), (6.0, 0.5)):
+    for size in (1.5, 6.0):
         around = height_around(max(size * metres, 1.2 * s.spacing))
-        low = low + share * np.clip((fine - around) / (1.2 * size), -1, 1)
+        low = low + 0.5 * np.clip((fine - around) / (1.2 * size), -1, 1)
     light = 0.62 + 0.34 * np.clip(sun, 0, 1.35) + 0.22 * low
     return np.where(known, np.clip(light, 0.42, 1.18), 1.0)
 
 
-def paint(s: Surface, colors: np.ndarray, light: np.ndarray | None, background=BACKGROUND) -> np.ndarray:
+def paint(s: Surface, colors: np.ndarray, light: np.ndarray | None) -> np.ndarray:
     """Pixels from per-pixel colours and light; empty ones get the background."""
     out = colors.astype(float)
     if light is not None:
         out = np.where(light[..., None] <= 1, out * light[..., None], 255 - (255 - out) / light[..., None])
-    out[s.which < 0] = background
+    out[s.which < 0] = BACKGROUND
     return np.clip(np.round(out), 0, 255).astype(np.uint8)

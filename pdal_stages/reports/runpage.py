@@ -43,21 +43,14 @@ def write_run_report(path: str | os.PathLike[str], run: Mapping[str, Any]) -> Pa
     return write_whole(path, run_page(run).encode())
 
 
-def run_page(run: Mapping[str, Any], title: str = "Run in tiles") -> str:
-    """The page about a tiled run.
-
-    Parameters
-    ----------
-    run : mapping
-        What ``TiledRun.to_dict`` gives.
-    title : str
-    """
+def run_page(run: Mapping[str, Any]) -> str:
+    """The page about a tiled run, of which `run` is what ``TiledRun.to_dict`` gives."""
     done = sorted((t for t in run["tiles"] if t["state"] == "done"), key=lambda t: -t["seconds"])
     classes = run.get("classes") or {}
     pipeline = f"{Path(run['pipeline']).name}, " if run.get("pipeline") else ""
     return render(
         "run.html",
-        title=title,
+        title="Run in tiles",
         subtitle=f"{pipeline}{len(run['tiles']):,} tiles of {run['tile']:g}",
         run=run,
         figures=_figures(run),
@@ -115,20 +108,9 @@ def _plan(tiles: Sequence[Mapping[str, Any]], side: float) -> dict[str, Any] | N
     slowest = max((t["seconds"] for t in tiles if t["state"] == "done"), default=0.0)
 
     def square(t: Mapping[str, Any]) -> dict[str, Any]:
-        seconds = t.get("seconds") if t["state"] == "done" else None
-        return {
-            "x": t["tile"][0] - left,
-            "y": top - t["tile"][1],
-            "name": t["name"],
-            "state": t["state"],
-            "corner": _corner(t["tile"], side),
-            "points": t["points"],
-            "seconds": seconds,
-            "shade": f"{0.25 + 0.75 * (seconds / slowest if slowest else 0.0):.2f}"
-            if seconds is not None
-            else "",
-            "reason": t.get("reason", ""),
-        }
+        shade = 0.25 + 0.75 * (t["seconds"] / slowest if slowest else 0.0) if t["state"] == "done" else None
+        x, y = t["tile"][0] - left, top - t["tile"][1]
+        return {"reason": "", **t, "x": x, "y": y, "corner": _corner(t["tile"], side), "shade": shade}
 
     wide, high = right - left + 1, top - low + 1
     return {
