@@ -71,3 +71,9 @@ def model_of(net, codes=(2, 5, 6)):
         "created_by": {"pdal_stages": "0.1.0"},
     }
     return Model((net,), [(c, str(c)) for c in codes], info)
+
+
+def coverage(circles):
+    """Circles each point is in."""
+    members = [circles.members(number) for number in range(len(circles))]
+    return np.bincount(np.concatenate(members))

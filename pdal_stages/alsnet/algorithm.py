@@ -167,6 +167,8 @@ class AlsNet:
         self, question: Question, dimensions: Mapping[str, npt.ArrayLike]
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], dict[str, Any]]:
         """Mean probabilities over the batches, a class's variance over them (mean over the classes), counts."""
+        from threadpoolctl import threadpool_limits
+
         rows, progress = question.rows, question.progress
         xyz = check_xyz(question.xyz)
         columns = self.inputs_of(xyz, dimensions)
@@ -182,7 +184,7 @@ class AlsNet:
         count = np.zeros(m, np.int64)
         each = self.configuration.memory_mb(len(self.inputs))
         side_by_side = max(1, min(resolve_threads(question.threads), int(question.memory_mb / each)))
-        apply = _Applier(self)
+        apply, device = _applied(self)
 
         def one(number: int):
             members = circles.members(number)
@@ -192,7 +194,8 @@ class AlsNet:
             return members[order], apply(pyramid)
 
         seen = 0
-        with single_threaded():
+        # BLAS on one thread: a batch's result then does not depend on how many are computed side by side.
+        with threadpool_limits(1):
             for members, p in map_blocks(one, numbers.tolist(), side_by_side, ahead=1):
                 at = place[members]
                 mine = at >= 0
@@ -215,24 +218,18 @@ class AlsNet:
                 "mean": round(float(count.mean()), 2),
                 "least": int(count.min()),
             },
-            "device": apply.device,
+            "device": device,
         }
         return mean, variance, report
 
 
-class _Applier:
-    """Runs a pyramid on a CUDA device where PyTorch finds one, otherwise with NumPy."""
+def _applied(net: AlsNet) -> tuple[Callable[[Pyramid], npt.NDArray[np.float64]], str]:
+    """What gives a pyramid's probabilities, and on which device: CUDA where PyTorch finds one, otherwise NumPy."""
+    if not _cuda():
+        return net.folded, "cpu"
+    from .network import Applied
 
-    def __init__(self, net: AlsNet) -> None:
-        self.device = "cpu"
-        self._run: Any = net.folded
-        if _cuda():
-            from .network import Applied
-
-            self.device, self._run = "cuda", Applied(net.weights, net.configuration, "cuda")
-
-    def __call__(self, pyramid: Pyramid) -> npt.NDArray[np.float64]:
-        return self._run(pyramid)
+    return Applied(net.weights, net.configuration, "cuda"), "cuda"
 
 
 def _cuda() -> bool:
@@ -248,13 +245,6 @@ def _cuda() -> bool:
     import torch
 
     return bool(torch.cuda.is_available())
-
-
-def single_threaded():
-    """BLAS on one thread: a batch's result then does not depend on how many are computed side by side."""
-    from threadpoolctl import threadpool_limits
-
-    return threadpool_limits(1)
 
 
 def scaled(

@@ -72,27 +72,27 @@ def load(
             infos = {info.filename: info for info in archive.infolist()}
             expected = {STATE, *(f"{name}.npy" for name in shapes)}
             if STATE not in infos or infos[STATE].file_size > _STATE_LIMIT:
-                raise ModelError("this is not a checkpoint", cure=_CURE)
+                raise ModelError("this is not a checkpoint")
             state = strictjson.loads(_read(archive, infos[STATE]))
             if not isinstance(state, dict) or state.get("format") != FORMAT:
-                raise ModelError("this is not a checkpoint of this release", cure=_CURE)
+                raise ModelError("this is not a checkpoint of this release")
             _same(state.get("identity"), identity)
             if set(infos) != expected or len(archive.infolist()) != len(expected):
-                raise ModelError("the checkpoint's arrays are not the network's", cure=_CURE)
+                raise ModelError("the checkpoint's arrays are not the network's")
             arrays = {}
             for name, shape in shapes.items():
                 info = infos[f"{name}.npy"]
                 if info.file_size > 4 * math.prod(shape) + 1024:
-                    raise ModelError("an array is larger than the network's", found=name, cure=_CURE)
+                    raise ModelError("an array is larger than the network's", found=name)
                 array = from_bytes(_read(archive, info), ArrayRule(("<f4",), len(shape)), name)
                 if array.shape != shape or not np.isfinite(array).all():
                     raise ModelError(
                         "an array of the checkpoint does not fit the network or is not finite",
                         found=f"{name} {array.shape}",
-                        cure=_CURE,
                     )
                 arrays[name] = array
     except ModelError as error:
+        error.cure = error.cure or _CURE
         raise error.at(str(path)) from None
     except (zipfile.BadZipFile, OSError, ValueError, KeyError, RuntimeError, NotImplementedError, EOFError,
             RecursionError, zlib.error) as error:  # fmt: skip
@@ -107,9 +107,7 @@ def load(
 
 def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
     if info.compress_type != zipfile.ZIP_STORED:
-        raise ModelError(
-            "a member is packed in a way not used here", found=repr(info.filename)[:60], cure=_CURE
-        )
+        raise ModelError("a member is packed in a way not used here", found=repr(info.filename)[:60])
     return archive.read(info)
 
 
@@ -121,5 +119,4 @@ def _same(found: Any, wanted: dict[str, Any]) -> None:
         raise ModelError(
             "the checkpoint belongs to another training",
             found=f"a different {', '.join(map(str, differs[:4]))}",
-            cure=_CURE,
         )

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -187,8 +186,6 @@ class Circles:
             return self.points
         return 0 if level < DEEPEST else within
 
-    # ---- how often -----------------------------------------------------------------------------------------
-
     def needed(self, rows: npt.NDArray[np.int64] | None) -> npt.NDArray[np.int64]:
         """Numbers of the circles that can hold any of these rows; all for None."""
         if rows is None:
@@ -203,14 +200,6 @@ class Circles:
             if len(at) and float(self._distance2(at, float(x), float(y)).min()) <= self.reach * self.reach:
                 keep.append(number)
         return np.array(keep, np.int64)
-
-    @cached_property
-    def coverage(self) -> npt.NDArray[np.int32]:
-        """Circles each point is in."""
-        count = np.zeros(len(self._xy), np.int32)
-        for number in range(len(self)):
-            count[self.members(number)] += 1
-        return count
 
 
 def _parts(at: npt.NDArray[np.int64], xy: npt.NDArray[np.float64], side: float):

@@ -7,8 +7,9 @@ perceptron that describes the ball, and the widths of the one that carries featu
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 from ..base import checks
@@ -42,6 +43,14 @@ class Level:
     mlp: tuple[int, ...]
     up: tuple[int, ...]
 
+    def __post_init__(self) -> None:
+        set_ = object.__setattr__
+        set_(self, "centres", checks.whole("'centres'", self.centres, 1, 10**7))
+        set_(self, "radius", checks.number("'radius'", self.radius, 1e-3, 1e4))
+        set_(self, "samples", checks.whole("'samples'", self.samples, 1, 1024))
+        set_(self, "mlp", _widths("mlp", self.mlp))
+        set_(self, "up", _widths("up", self.up))
+
 
 @dataclass(frozen=True)
 class Configuration:
@@ -66,18 +75,14 @@ class Configuration:
     dropout: float = 0.5
 
     def __post_init__(self) -> None:
-        _name(self.name)
-        checks.whole("'points'", self.points, 16, 10**7)
+        set_ = object.__setattr__
+        if not isinstance(self.name, str) or not 1 <= len(self.name) <= 60:
+            raise OptionError("a configuration's name must be text", found=repr(self.name)[:60])
+        set_(self, "points", checks.whole("'points'", self.points, 16, 10**7))
         if not 1 <= len(self.levels) <= 8:
             raise OptionError("a network must have 1 to 8 levels", found=len(self.levels))
-        for number, level in enumerate(self.levels, 1):
-            checks.whole(f"'levels/{number}/centres'", level.centres, 1, 10**7)
-            checks.whole(f"'levels/{number}/samples'", level.samples, 1, 1024)
-            checks.number(f"'levels/{number}/radius'", level.radius, 1e-3, 1e4)
-            _widths(f"levels/{number}/mlp", level.mlp)
-            _widths(f"levels/{number}/up", level.up)
-        _widths("head", self.head)
-        checks.number("'dropout'", self.dropout, 0.0, 0.95)
+        set_(self, "head", _widths("head", self.head))
+        set_(self, "dropout", checks.number("'dropout'", self.dropout, 0.0, 0.95))
         if self.layers > MAX_LAYERS:
             raise OptionError(f"a network may have {MAX_LAYERS} layers", found=self.layers)
 
@@ -150,12 +155,7 @@ class Configuration:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data; :func:`parse_configuration` reads it."""
-        out = asdict(self)
-        out["levels"] = [
-            {**level, "mlp": list(level["mlp"]), "up": list(level["up"])} for level in out["levels"]
-        ]
-        out["head"] = list(out["head"])
-        return out
+        return json.loads(json.dumps(asdict(self)))  # lists for tuples
 
 
 def parse_configuration(
@@ -189,40 +189,22 @@ def parse_configuration(
         made = _from_mapping(given)
     else:
         raise OptionError("a network configuration must be a name or a mapping", found=repr(given)[:60])
-    return made if points is None else replace(made, points=checks.whole("'points'", points, 16, 10**7))
+    return made if points is None else replace(made, points=points)
 
 
 def _from_mapping(given: Mapping[str, Any]) -> Configuration:
-    _only(
-        given,
-        {"name", "points", "levels", "head", "dropout"},
-        {"points", "levels"},
-        "a network configuration",
-    )
+    known = {field.name for field in fields(Configuration)}
+    _only(given, known, {"points", "levels"}, "a network configuration")
     if not isinstance(given["levels"], list | tuple):
         raise OptionError("'levels' must be a list", found=repr(given["levels"])[:60])
     levels = []
-    keys = {"centres", "radius", "samples", "mlp", "up"}
+    keys = {field.name for field in fields(Level)}
     for level in given["levels"][:9]:
         if not isinstance(level, Mapping):
             raise OptionError("a level must be a mapping", found=repr(level)[:60])
         _only(level, keys, keys, "a level")
-        levels.append(
-            Level(
-                checks.whole("'centres'", level["centres"], 1, 10**7),
-                checks.number("'radius'", level["radius"], 1e-3, 1e4),
-                checks.whole("'samples'", level["samples"], 1, 1024),
-                _widths("mlp", level["mlp"]),
-                _widths("up", level["up"]),
-            )
-        )
-    return Configuration(
-        _name(given.get("name", "own")),
-        checks.whole("'points'", given["points"], 16, 10**7),
-        tuple(levels),
-        _widths("head", given.get("head", (128,))),
-        checks.number("'dropout'", given.get("dropout", 0.5), 0.0, 0.95),
-    )
+        levels.append(Level(**level))
+    return Configuration(**{"name": "own", **given, "levels": tuple(levels)})
 
 
 def _only(given: Mapping[str, Any], known: set[str], needed: set[str], what: str) -> None:
@@ -232,12 +214,6 @@ def _only(given: Mapping[str, Any], known: set[str], needed: set[str], what: str
     lost = sorted(needed - set(given))
     if lost:
         raise OptionError(f"{what} needs '{lost[0]}'")
-
-
-def _name(value: Any) -> str:
-    if not isinstance(value, str) or not 1 <= len(value) <= 60:
-        raise OptionError("a configuration's name must be text", found=repr(value)[:60])
-    return value
 
 
 def _widths(name: str, value: Any) -> tuple[int, ...]:

@@ -18,6 +18,7 @@ from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
 from ..classifier import crossval
 from ..classifier.classes import ClassMap
+from ..classifier.model import Model, load_model
 from . import checkpoint, schedule
 from .algorithm import AlsNet, make_pyramid, scaled
 from .augment import Augmentation
@@ -118,9 +119,12 @@ class _Session:
         self.device = _device(options.device, torch)
         self.seconds = {"batches": 0.0, "steps": 0.0, "validation": 0.0}
         source = None if options.start_from is None else _source(options, inputs)
-        statistics = (source.mean, source.scale) if source else _statistics(clouds, inputs)
-        self.mean: tuple[float, ...] = statistics[0]
-        self.scale: tuple[float, ...] = statistics[1]
+        self.mean: tuple[float, ...]
+        self.scale: tuple[float, ...]
+        if source is None:
+            self.mean, self.scale = _statistics(clouds, inputs)
+        else:
+            self.mean, self.scale = source.algorithm.mean, source.algorithm.scale
         self.spacing = options.spacing or spacing_for(
             options.configuration.points, density([c.xyz for c in clouds])
         )
@@ -195,9 +199,7 @@ class _Session:
         return Trained(net, self._notes(), {name: round(value, 3) for name, value in self.seconds.items()})
 
     def _score(self, row: dict[str, Any] | None) -> float:
-        if row is None:
-            return -1.0
-        return float(row["mean_f1"] or 0.0)
+        return -1.0 if row is None else float(row["mean_f1"] or 0.0)
 
     def _best_row(self) -> dict[str, Any] | None:
         return self.curve[self.best_epoch - 1] if self.best_epoch else None
@@ -246,11 +248,12 @@ class _Session:
         members = circles.around(float(centre[0]), float(centre[1]))
         if not len(members):  # moved off the cloud's edge
             centre, members = circles.centres[number], circles.members(number)
-        order, pyramid = make_pyramid(
-            self.clouds[cloud].xyz, self.columns[cloud], members, centre, self.inputs,
-            self.options.configuration, change,
-        )  # fmt: skip
+        order, pyramid = self._pyramid(cloud, members, centre, change)
         return pyramid, self.train_labels[cloud][members[order]]
+
+    def _pyramid(self, cloud: int, members, centre, change: Any = None):
+        xyz, columns, configuration = self.clouds[cloud].xyz, self.columns[cloud], self.options.configuration
+        return make_pyramid(xyz, columns, members, centre, self.inputs, configuration, change)
 
     def _step(self, pyramid, labels: npt.NDArray[np.int64]) -> float:
         from .network import tensors
@@ -283,10 +286,7 @@ class _Session:
         def prepare(batch):
             cloud, number = batch
             members = self.circles[cloud].members(number)
-            order, pyramid = make_pyramid(
-                self.clouds[cloud].xyz, self.columns[cloud], members, self.circles[cloud].centres[number],
-                self.inputs, self.options.configuration,
-            )  # fmt: skip
+            order, pyramid = self._pyramid(cloud, members, self.circles[cloud].centres[number])
             return cloud, members[order], pyramid
 
         with torch.no_grad():
@@ -429,10 +429,8 @@ def _statistics(clouds, inputs) -> tuple[tuple[float, ...], tuple[float, ...]]:
     return tuple(mean), tuple(scale)
 
 
-def _source(options: NetworkOptions, inputs: tuple[str, ...]) -> Any:
+def _source(options: NetworkOptions, inputs: tuple[str, ...]) -> Model:
     """The model that training starts from, if its network is the same."""
-    from ..classifier.model import load_model
-
     path = str(options.start_from)
     model = load_model(path)
     net = model.algorithm
@@ -453,23 +451,14 @@ def _source(options: NetworkOptions, inputs: tuple[str, ...]) -> Any:
             "the model to start from has other inputs", where=path, found=", ".join(net.inputs),
             cure=f"Here they are {', '.join(inputs)}: change dimensions or coordinates",
         )  # fmt: skip
-    return _Source(dict(net.weights), net.mean, net.scale, [int(code) for code in model.codes])
+    return model
 
 
-@dataclass(frozen=True, eq=False)
-class _Source:
-    weights: Weights
-    mean: tuple[float, ...]
-    scale: tuple[float, ...]
-    codes: list[int]
-
-
-def _transfer(source: _Source, start: Weights, classes: ClassMap) -> Weights:
+def _transfer(source: Model, start: Weights, classes: ClassMap) -> Weights:
     """The source's weights; the last layer's rows only for classes both have."""
-    out = {name: array for name, array in source.weights.items() if name != "scores"}
+    weights, codes = source.algorithm.weights, source.codes.tolist()
     scores = start["scores"].copy()
     for k, code in enumerate(classes.codes):
-        if code in source.codes:
-            scores[k] = source.weights["scores"][source.codes.index(code)]
-    out["scores"] = scores
-    return {name: out[name] for name in start}
+        if code in codes:
+            scores[k] = weights["scores"][codes.index(code)]
+    return {name: scores if name == "scores" else weights[name] for name in start}

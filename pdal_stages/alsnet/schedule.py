@@ -36,15 +36,12 @@ class Choice:
     batches : list of (cloud, circle)
     all : int
         How many there were.
-    spread_ok : int
-        How many of them have mixed classes.
     added : int
         How many were taken in spite of their spread, for a class that had no other.
     """
 
     batches: list[Batch]
     all: int
-    spread_ok: int
     added: int
 
 
@@ -73,7 +70,7 @@ def choose(
             having = [batch for batch in histograms if histograms[batch][position]]
             if having:
                 chosen.add(min(having, key=lambda batch: (spreads[batch], batch)))
-    return Choice(sorted(chosen), len(histograms), len(good), len(chosen) - len(good))
+    return Choice(sorted(chosen), len(histograms), len(chosen) - len(good))
 
 
 def hold_out(
