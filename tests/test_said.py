@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import io
 import json
+import sys
 
 import laspy
 import numpy as np
@@ -175,9 +176,11 @@ def test_errors_of_others_are_told_as_such(cloud, tmp_path, run):
     assert "Traceback" not in err and "internal error" not in err
 
 
-def test_slow_rates_are_no_zero():
+def test_slow_rates_are_no_zero(monkeypatch):
     out = io.StringIO()
-    with Progress(10, "growing", "trees", stream=out, delay=0.0, log_every=0.0) as bar:
+    monkeypatch.setattr(sys, "__stderr__", out)
+    monkeypatch.setattr(Progress, "delay", 0.0)
+    with Progress(10, "growing", "trees") as bar:
         bar.started -= 20
         bar.update(1)
     assert "0.05 trees/s" in out.getvalue()

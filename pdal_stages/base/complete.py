@@ -21,10 +21,7 @@ _CURE = "Make room on the disk (or raise the limit on file sizes)"
 
 
 def check_complete(
-    path: str | os.PathLike,
-    name: str | os.PathLike,
-    writer: Mapping[str, Any],
-    count: int | None = None,
+    path: str | os.PathLike, name: str | os.PathLike, writer: Mapping[str, Any], count: int | None = None
 ) -> bool:
     """Refuse a file that a writer could not finish.
 

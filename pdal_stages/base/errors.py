@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from functools import partial
 
 
 class StageError(Exception):
@@ -48,16 +49,12 @@ class StageError(Exception):
         return self
 
     def __reduce__(self):  # keeps the keyword arguments across process borders (Dask)
-        return (_rebuild, (type(self), self.what, self.where, self.found, self.cure))
+        return partial(type(self), self.what, where=self.where, found=self.found, cure=self.cure), ()
 
 
 def _sentence(text: str) -> str:
     text = text.strip()
     return text if text.endswith((".", "?", "!")) else f"{text}."
-
-
-def _rebuild(kind, what, where, found, cure):
-    return kind(what, where=where, found=found, cure=cure)
 
 
 class OptionError(StageError):

@@ -26,40 +26,22 @@ _CURE = "Get the file again from its source, or repair it with a tool made for t
 
 @dataclass(frozen=True)
 class LasHeader:
-    """What a header says of the size of its file.
-
-    Attributes
-    ----------
-    minor, point_format, point_bytes : int
-    compressed : bool
-    header_bytes, offset : int
-        Size of the header, and where points (or LAZ chunks) begin.
-    records, records_after : int
-        Variable-length records before and after the points.
-    after : int
-        Where the records after the points begin.
-    count : int
-    scales, offsets : tuple of float
-    texts : dict
-        The texts of the header, as bytes.
-    box : tuple of float
-        (min x, min y, max x, max y).
-    """
+    """What a header says of the size of its file."""
 
     minor: int
     point_format: int
     point_bytes: int
     compressed: bool
     header_bytes: int
-    offset: int
-    records: int
+    offset: int  #: where points (or LAZ chunks) begin
+    records: int  #: variable-length records before the points
     records_after: int
-    after: int
+    after: int  #: where the records after the points begin
     count: int
     scales: tuple[float, ...]
     offsets: tuple[float, ...]
-    texts: dict[str, bytes]
-    box: tuple[float, float, float, float]
+    texts: dict[str, bytes]  #: the texts of the header
+    box: tuple[float, float, float, float]  #: (min x, min y, max x, max y)
 
     @property
     def end_of_points(self) -> int:
@@ -177,7 +159,7 @@ def _wrong_records(path: str | os.PathLike, header: LasHeader, size: int) -> tup
             f"{header.records_after:,} records at {header.after:,}, a file of {size:,} bytes",
         )
     with open(path, "rb") as file:
-        held = [r for r in _records(file, header) if r.after and r.data + r.length <= size]
+        held = [r for r in records(file, header) if r.after and r.data + r.length <= size]
     if len(held) < header.records_after:
         return (
             "the records after its points do not end within the file",
@@ -186,42 +168,34 @@ def _wrong_records(path: str | os.PathLike, header: LasHeader, size: int) -> tup
     return None
 
 
-def supersede_copc(path: str | os.PathLike) -> bool:
+def supersede_copc(path: str | os.PathLike) -> None:
     """Mark COPC records that do not describe this file, which PDAL forwards from a COPC input with the others.
 
     Readers of COPC would look for an octree where there is none. The records get the id with which LAS 1.4 (R15,
     section 2.5, "Superseded") negates a record in place.
-
-    Returns
-    -------
-    bool
-        Whether there were any.
     """
     header = read_header(path) if Path(path).suffix.lower() in (".las", ".laz") else None
     if header is None:
-        return False
+        return
     with open(path, "r+b") as file:
-        copc = [r for r in _records(file, header) if r.user == b"copc"]
-        if not copc:
-            return False
+        copc = [r for r in records(file, header) if r.user == b"copc"]
         root = None
         for record in copc:
             if record.number == 1 and record.length >= 48:
                 file.seek(record.data + 40)
                 (root,) = struct.unpack("<Q", file.read(8))
         if any(r.after and root is not None and 0 <= root - r.data < r.length for r in copc):
-            return False
+            return
         for record in copc:
             file.seek(record.place + 2)
             file.write(_SUPERSEDED)
-    return True
 
 
 #: User and record id of a record that no longer counts.
 _SUPERSEDED = b"LASF_Spec".ljust(16, b"\0") + struct.pack("<H", 7)
 
 
-class _Record(NamedTuple):
+class Record(NamedTuple):
     """A variable-length record: where its head is, whose it is, where its data are; `after` the points or before."""
 
     place: int
@@ -233,7 +207,7 @@ class _Record(NamedTuple):
     after: bool
 
 
-def _records(file: BinaryIO, header: LasHeader) -> Iterator[_Record]:
+def records(file: BinaryIO, header: LasHeader) -> Iterator[Record]:
     """The records of a file, as far as they are all there."""
     place = header.header_bytes
     for index in range(header.records + header.records_after):
@@ -250,8 +224,24 @@ def _records(file: BinaryIO, header: LasHeader) -> Iterator[_Record]:
         (number,) = struct.unpack_from("<H", head, 18)
         (length,) = struct.unpack_from("<Q" if after else "<H", head, 20)
         user, title = head[2:18].split(b"\0")[0], head[size - 32 :].split(b"\0")[0]
-        yield _Record(place, user, number, title, place + size, length, after)
+        yield Record(place, user, number, title, place + size, length, after)
         place += size + length
+
+
+#: Records that are looked through, and bytes of one that is read.
+_MOST_RECORDS, _LARGEST_RECORD = 10_000, 1 << 20
+
+
+def _read_records(path: str | os.PathLike, user: bytes) -> Iterator[tuple[Record, bytes]]:
+    """The records of a user, with their data."""
+    header = read_header(path)
+    if header is None:
+        return
+    with open(path, "rb") as file:
+        for record in islice(records(file, header), _MOST_RECORDS):
+            if record.user == user and record.length <= _LARGEST_RECORD:
+                file.seek(record.data)
+                yield record, file.read(record.length)
 
 
 #: Types of extra dimensions by number, 1 to 10 (LAS 1.4 R15, table 24), in PDAL's words.
@@ -265,20 +255,14 @@ def extra_dimensions(path: str | os.PathLike) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     try:
-        header = read_header(path)
-        if header is None:
-            return {}
-        with open(path, "rb") as file:
-            for record in islice(_records(file, header), _MOST_RECORDS):
-                if (record.user, record.number) != (b"LASF_Spec", 4) or record.length > _LARGEST_RECORD:
-                    continue
-                file.seek(record.data)
-                data = file.read(record.length)
-                for start in range(0, len(data) - 191, 192):
-                    kind, options = data[start + 2 : start + 4]
-                    name = data[start + 4 : start + 36].split(b"\0")[0].decode("utf-8", "replace")
-                    if name and 1 <= kind <= len(_EXTRA_TYPES):
-                        found[name] = "double" if options & 0x18 else _EXTRA_TYPES[kind - 1]
+        for record, data in _read_records(path, b"LASF_Spec"):
+            if record.number != 4:
+                continue
+            for start in range(0, len(data) - 191, 192):
+                kind, options = data[start + 2 : start + 4]
+                name = data[start + 4 : start + 36].split(b"\0")[0].decode("utf-8", "replace")
+                if name and 1 <= kind <= len(_EXTRA_TYPES):
+                    found[name] = "double" if options & 0x18 else _EXTRA_TYPES[kind - 1]
     except (OSError, ValueError):
         return {}
     return found
@@ -320,7 +304,7 @@ def _wrong_chunks(
 
 def _coding(file: BinaryIO, header: LasHeader) -> bytes | None:
     """The record of how a LAZ file is compressed, None where it lacks one."""
-    for record in _records(file, header):
+    for record in records(file, header):
         if (record.user, record.number) == (b"laszip encoded", 22204):
             file.seek(record.data)
             data = file.read(min(record.length, _LARGEST_RECORD))
@@ -361,7 +345,7 @@ def laz_chunks(path: str | os.PathLike, header: LasHeader) -> LazChunks | None:
     if coding is None or number > chunks.MOST_DECODED:
         return None
     of_chunk = _points_of_chunk(coding)
-    sizes, points = chunks.decode(data[8:], number, variable=of_chunk is None)
+    sizes, points = chunks.decode(data, variable=of_chunk is None)
     if of_chunk is not None:
         points = [max(0, min(of_chunk, header.count - done * of_chunk)) for done in range(number)]
     return LazChunks(coding, header.offset + 8, sizes, points)
@@ -369,14 +353,14 @@ def laz_chunks(path: str | os.PathLike, header: LasHeader) -> LazChunks | None:
 
 def _wrong_octree(file: BinaryIO, header: LasHeader, size: int, table: bytes) -> tuple[str, str] | None:
     """What is wrong with the octree of a file that calls itself COPC; `table`: of its chunks, where each has its count."""
-    first = next(_records(file, header), None)
+    first = next(records(file, header), None)
     if first is None or first.user != b"copc" or first.number != 1:
         return "it is called .copc.laz, but its first record does not describe an octree", str(
             first and first.user
         )
     known = None
     if table:
-        sizes, counts = chunks.decode(table[8:], struct.unpack_from("<I", table, 4)[0], variable=True)
+        sizes, counts = chunks.decode(table, variable=True)
         places = accumulate(sizes, initial=header.offset + 8)
         known = [place for place in zip(places, sizes, counts, strict=False) if place[2]]
     return copc.what_is_wrong(file, first.data, size, header.count, known)
@@ -390,7 +374,7 @@ def odd_text(path: str | os.PathLike) -> tuple[str, bytes] | None:
             return None
         texts = list(header.texts.items())
         with open(path, "rb") as file:
-            for record in islice(_records(file, header), min(header.records, 1000)):
+            for record in islice(records(file, header), min(header.records, 1000)):
                 texts += [("description of a record", record.title), ("user of a record", record.user)]
     except (OSError, ValueError):
         return None
@@ -410,18 +394,6 @@ def projection(path: str | os.PathLike) -> str:
     OSError
         If the file cannot be read.
     """
-    header = read_header(path)
-    if header is None:
-        return ""
-    digest, found = hashlib.sha256(), False
-    with open(path, "rb") as file:
-        for record in islice(_records(file, header), _MOST_RECORDS):
-            if record.user == b"LASF_Projection" and record.length <= _LARGEST_RECORD:
-                file.seek(record.data)
-                digest.update(struct.pack("<HQ", record.number, record.length) + file.read(record.length))
-                found = True
-    return digest.hexdigest()[:16] if found else ""
-
-
-#: Records that are looked through for a spatial reference, and bytes of one.
-_MOST_RECORDS, _LARGEST_RECORD = 10_000, 1 << 20
+    held = _read_records(path, b"LASF_Projection")
+    found = [struct.pack("<HQ", record.number, record.length) + data for record, data in held]
+    return hashlib.sha256(b"".join(found)).hexdigest()[:16] if found else ""

@@ -14,21 +14,11 @@ from .files import check_writable, is_stream
 
 @dataclass(frozen=True)
 class Output:
-    """A file to be written.
+    """A file to be written."""
 
-    Attributes
-    ----------
-    path : str
-        In its name '#' stands for numbers.
-    what : str
-        What messages call it: ``output``, ``model``, ``metadata``.
-    kind : str
-        One of :mod:`pdal_stages.base.kinds`, where it is known beforehand.
-    """
-
-    path: str
-    what: str = "output"
-    kind: str = ""
+    path: str  #: in its name '#' stands for numbers
+    what: str = "output"  #: what messages call it: ``output``, ``model``, ``metadata``
+    kind: str = ""  #: one of :mod:`pdal_stages.base.kinds`, where it is known beforehand
 
 
 def check_outputs(outputs: Iterable[Output], inputs: Iterable[str | os.PathLike]) -> None:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 import sys
 import time
-from typing import TextIO
+from contextlib import AbstractContextManager
 
 
-class Progress:
+class Progress(AbstractContextManager):
     """A line of progress: done, rate, time left.
 
     Silent until `delay` seconds have passed. On a terminal the line is redrawn; elsewhere
-    (a log) a new line is written every `log_every` seconds. The environment variable
+    (a log) a new line is written every 15 seconds. The environment variable
     ``PDAL_STAGES_PROGRESS=0`` silences it.
 
     Parameters
@@ -27,27 +27,19 @@ class Progress:
         False silences it, too.
     """
 
-    def __init__(
-        self,
-        total: int,
-        label: str,
-        unit: str = "points",
-        *,
-        stream: TextIO | None = None,
-        delay: float = 2.0,
-        log_every: float = 15.0,
-        enabled: bool | None = None,
-    ) -> None:
+    delay = 2.0
+
+    def __init__(self, total: int, label: str, unit: str = "points", *, enabled: bool | None = None) -> None:
         self.total, self.label, self.unit = int(total), label, unit
         # filters.python redirects sys.stdout, never stderr: stderr is always the user's.
-        self.stream = stream if stream is not None else sys.__stderr__
+        self.stream = sys.__stderr__
         silenced = enabled is False or os.environ.get("PDAL_STAGES_PROGRESS", "1") == "0"
         self.enabled = self.stream is not None and not silenced
         self.count = 0
         self.started = time.monotonic()
         self._terminal = self.stream is not None and self.enabled and self.stream.isatty()
-        self._every = 0.2 if self._terminal else log_every
-        self._next = self.started + delay
+        self._every = 0.2 if self._terminal else 15.0
+        self._next = self.started + self.delay
         self._shown = False
 
     def update(self, amount: int = 1) -> None:
@@ -87,9 +79,6 @@ class Progress:
             if self._terminal and self.stream is not None:
                 self.stream.write("\n")
         self.enabled = False
-
-    def __enter__(self) -> Progress:
-        return self
 
     def __exit__(self, *exc) -> None:
         self.close()

@@ -76,31 +76,14 @@ def _layers_fill(chunk: bytes, points: int, header: LasHeader) -> bool:
     return count == points and begin + sum(sizes) == len(chunk)
 
 
-class _Sips(io.RawIOBase):
+class _Sips(io.BytesIO):
     """Bytes that are given one at a time towards their end, so that what a reader took is what it needed."""
 
-    def __init__(self, data: bytes, slow: int) -> None:
-        self._data, self._slow, self.at = data, slow, 0
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        self.at = offset + (0, self.at, len(self._data))[whence]
-        return self.at
-
-    def tell(self) -> int:
-        return self.at
+    slow = 0
 
     def readinto(self, buffer) -> int:
-        left = max(0, len(self._data) - self.at)
-        number = min(len(buffer), left, max(1, left - self._slow))
-        buffer[:number] = self._data[self.at : self.at + number]
-        self.at += number
-        return number
+        left = len(self.getbuffer()) - self.tell()
+        return super().readinto(memoryview(buffer)[: max(1, left - self.slow)])
 
 
 def _decode(chunk: bytes, points: int, record: bytes, width: int) -> tuple[np.ndarray | None, int]:
@@ -109,7 +92,8 @@ def _decode(chunk: bytes, points: int, record: bytes, width: int) -> tuple[np.nd
 
     room = bytes(64)  # where a decoder finds more than the chunk has
     begin = struct.pack("<q", 8 + len(chunk) + len(room))
-    source = _Sips(begin + chunk + room + bytes(8), slow=len(room) + 8 + 64)
+    source = _Sips(begin + chunk + room + bytes(8))
+    source.slow = len(room) + 8 + 64
     out = np.empty(points * width, np.uint8)
     try:
         lazrs.LasZipDecompressor(source, record).decompress_many(out)
@@ -117,7 +101,7 @@ def _decode(chunk: bytes, points: int, record: bytes, width: int) -> tuple[np.nd
         if isinstance(error, Exception) or type(error).__name__ == "PanicException":  # of Rust
             return None, 0
         raise
-    return out.reshape(points, width), source.at - 8
+    return out.reshape(points, width), source.tell() - 8
 
 
 def _encode(decoded: np.ndarray, record: bytes) -> bytes:

@@ -32,11 +32,7 @@ def resolve_threads(threads: int | None) -> int:
 
 
 def map_blocks(
-    function: Callable[[Any], Any],
-    blocks: Sequence[Any],
-    threads: int | None = None,
-    done: Callable[[Any], None] | None = None,
-    ahead: int = 2,
+    function: Callable[[Any], Any], blocks: Sequence[Any], threads: int | None = None, ahead: int = 2
 ) -> Iterator[Any]:
     """Yield ``function(block)`` for every block, in order, computed by several threads.
 
@@ -52,16 +48,10 @@ def map_blocks(
         The pieces of work.
     threads : int, optional
         See :func:`resolve_threads`.
-    done : callable, optional
-        Called with the block in the reader's thread after each result (for progress).
     """
     count = resolve_threads(threads)
     if count == 1 or len(blocks) <= 1:
-        for block in blocks:
-            result = function(block)
-            if done is not None:
-                done(block)
-            yield result
+        yield from map(function, blocks)
         return
     stop = Event()
 
@@ -76,14 +66,10 @@ def map_blocks(
             while position < len(blocks) and len(pending) < count * ahead:
                 pending.append(pool.submit(guarded, blocks[position]))
                 position += 1
-            first = position - len(pending)
             # A bounded wait keeps the main thread answering Ctrl-C.
             while not pending[0].done():
                 wait([pending[0]], timeout=0.2, return_when=FIRST_COMPLETED)
-            result = pending.pop(0).result()
-            if done is not None:
-                done(blocks[first])
-            yield result
+            yield pending.pop(0).result()
     finally:
         stop.set()
         pool.shutdown(wait=True, cancel_futures=True)

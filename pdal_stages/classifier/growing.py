@@ -98,5 +98,7 @@ def grow(
             shares[part] = tree.predict_proba(np.ascontiguousarray(values[rows[part]]), check_input=False)
         return tree, rows, shares
 
-    done = None if progress is None else (lambda _: progress.update(1))
-    yield from map_blocks(one, range(n_trees), threads, done)
+    for tree in map_blocks(one, range(n_trees), threads):
+        if progress is not None:
+            progress.update(1)
+        yield tree

@@ -50,7 +50,8 @@ def splitter(stages: list[dict[str, Any]]) -> tuple[dict[str, Any], int] | None:
     if pdal_env.splits_class_flags():
         return None
     writers = [n for n, stage in enumerate(stages) if is_writer(stage, stages)]
-    readers = [n for n, stage in enumerate(stages) if n not in writers and _reads(stage)]
+    others = [n for n in range(len(stages)) if n not in writers]
+    readers = [n for n in others if (stages[n].get("type") or "readers.").startswith("readers.")]
     old = [header.point_format <= 5 for header in las_headers(stages[n] for n in readers)]
     if not writers or not any(old):
         return None
@@ -72,11 +73,6 @@ def splitter(stages: list[dict[str, Any]]) -> tuple[dict[str, Any], int] | None:
             cure=_CONVERT,
         )
     return python_filter("pdal_stages_class_flags", _SCRIPT, {}, {"ClassFlags": "uint8_t"}), last
-
-
-def _reads(stage: Mapping[str, Any]) -> bool:
-    kind = str(stage.get("type") or "")
-    return kind.startswith("readers.") or not kind
 
 
 def _inputs(stage: Mapping[str, Any]) -> list[str]:

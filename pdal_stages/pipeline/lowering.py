@@ -30,30 +30,15 @@ _ONE_VIEW = {f"filters.{name}" for name in ("merge", "splitter", "chipper", "div
 
 @dataclass
 class LoweredStage:
-    """One of our stages after lowering.
-
-    Attributes
-    ----------
-    stage : Stage
-    place : str
-        Its type and tag, for messages.
-    label : str
-        The unique `module` label, under which the runtime knows it.
-    number, index : int
-        Place in the given and in the lowered list.
-    given : dict
-        The stage as it was written, with the options of its `option_file`.
-    plain : dict
-        The ``filters.python`` that PDAL runs.
-    """
+    """One of our stages after lowering."""
 
     stage: Stage
-    place: str
-    label: str
-    number: int
-    index: int
-    given: dict[str, Any]
-    plain: dict[str, Any]
+    place: str  #: its type and tag, for messages
+    label: str  #: the unique `module` label, under which the runtime knows it
+    number: int  #: its place in the given list
+    index: int  #: its place in the lowered list
+    given: dict[str, Any]  #: the stage as it was written, with the options of its `option_file`
+    plain: dict[str, Any]  #: the ``filters.python`` that PDAL runs
 
 
 @dataclass

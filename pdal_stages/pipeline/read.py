@@ -17,21 +17,11 @@ _DEEPEST = 200
 
 @dataclass
 class PipelineSource:
-    """A parsed pipeline: its stages, and the line each begins on.
+    """A parsed pipeline: its stages, and the line each begins on."""
 
-    Attributes
-    ----------
-    stages : list
-        Objects or file names, as written.
-    lines : list of int
-        One per stage; 0 where it did not come from text.
-    name : str
-        The file, for messages; empty for text.
-    """
-
-    stages: list[Any]
-    lines: list[int]
-    name: str = ""
+    stages: list[Any]  #: objects or file names, as written
+    lines: list[int]  #: one per stage; 0 where it did not come from text
+    name: str = ""  #: the file, for messages; empty for text
 
     def __post_init__(self) -> None:
         self.stages = [_with_plain_name(stage) for stage in self.stages]
@@ -111,7 +101,7 @@ def parse_pipeline(text: str, name: str = "") -> PipelineSource:
         raise PipelineError(
             f"the pipeline is not valid JSON: {error.msg}",
             where=f"{name or 'pipeline'}, line {error.lineno}, column {error.colno}",
-            found=_excerpt(clean, error.pos),
+            found=repr(clean[max(0, error.pos - 20) : error.pos + 20].strip()),
             cure=_cure(clean, error),
         ) from None
     except RecursionError:
@@ -146,9 +136,7 @@ def _checked(source: PipelineSource) -> PipelineSource:
         where = source.where(index)
         if not isinstance(stage, str | dict):
             raise PipelineError(
-                "a stage is an object, or a file name",
-                where=where,
-                found=json.dumps(stage, default=str)[:80],
+                "a stage is an object, or a file name", where=where, found=json.dumps(stage, default=str)[:80]
             )
         _check_values(stage, where)
         if not isinstance(stage, dict):
@@ -246,10 +234,6 @@ def _without_comments(text: str, name: str = "") -> str:
 
 def _no_constant(word: str):
     raise ValueError(f"{word} is not a JSON number")
-
-
-def _excerpt(text: str, position: int) -> str:
-    return repr(text[max(0, position - 20) : position + 20].strip())
 
 
 def _cure(text: str, error: json.JSONDecodeError) -> str | None:

@@ -31,21 +31,11 @@ _ASIDE = (
 
 @dataclass(frozen=True)
 class Reference:
-    """What an input's coordinates mean.
-
-    Attributes
-    ----------
-    units : Units
-    plane : frozenset of str
-        The projection's parameters; empty where they are not known.
-    height : str
-        The authority's code of the heights' system, where it is known.
-    name : str
-    """
+    """What an input's coordinates mean."""
 
     units: Units
-    plane: frozenset[str] = frozenset()
-    height: str = ""
+    plane: frozenset[str] = frozenset()  #: the projection's parameters; empty where they are not known
+    height: str = ""  #: the authority's code of the heights' system, where it is known
     name: str = ""
 
 

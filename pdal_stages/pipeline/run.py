@@ -239,7 +239,8 @@ def _named_metadata(
     inner = metadata.get("metadata")
     if not isinstance(inner, dict):
         return metadata
-    theirs = [node for node in _several(inner.pop("filters.python", None)) if node and not _is_ours(node)]
+    scripts = filter(None, _several(inner.pop("filters.python", None)))
+    theirs = [s for s in scripts if not (isinstance(s, dict) and s.keys() & registry.stages().keys())]
     named = [(name.partition(" ")[0], report) for name, views in reports for report in views]
     for kind, node in [*(("filters.python", node) for node in theirs), *named]:
         inner[kind] = [*_several(inner[kind]), node] if kind in inner else node
@@ -257,7 +258,3 @@ def _renamed(node: Any, names: dict[str, str]) -> Any:
     if isinstance(node, list):
         return [_renamed(value, names) for value in node]
     return names.get(node, node) if isinstance(node, str) else node
-
-
-def _is_ours(node: Any) -> bool:
-    return isinstance(node, dict) and any(name in registry.stages() for name in node)

@@ -183,23 +183,22 @@ def wkt_of(reference: Any) -> str:
 
 def _metadata_node(name: str, report: Mapping[str, Any]) -> dict[str, Any]:
     """A report in the form PDAL takes metadata: every value as text, with its type."""
-    children = []
-    for key, value in report.items():
-        if isinstance(value, bool):
-            children.append(_leaf(key, str(value).lower(), "boolean"))
-        elif isinstance(value, int | np.integer):
-            children.append(_leaf(key, str(int(value)), "integer"))
-        elif isinstance(value, float | np.floating):
-            children.append(_leaf(key, repr(float(value)), "double"))
-        elif isinstance(value, str):
-            children.append(_leaf(key, value, "string"))
-        elif value is not None:
-            children.append(_leaf(key, json.dumps(value, default=str), "json"))
+    children = [_leaf(key, value) for key, value in report.items() if value is not None]
     return {"name": name, "value": "", "type": "", "description": "", "children": children}
 
 
-def _leaf(name: str, value: str, kind: str) -> dict[str, Any]:
-    return {"name": name, "value": _encodable(value), "type": kind, "description": "", "children": []}
+def _leaf(name: str, value: Any) -> dict[str, Any]:
+    if isinstance(value, bool):
+        text, kind = str(value).lower(), "boolean"
+    elif isinstance(value, int | np.integer):
+        text, kind = str(int(value)), "integer"
+    elif isinstance(value, float | np.floating):
+        text, kind = repr(float(value)), "double"
+    elif isinstance(value, str):
+        text, kind = value, "string"
+    else:
+        text, kind = json.dumps(value, default=str), "json"
+    return {"name": name, "value": _encodable(text), "type": kind, "description": "", "children": []}
 
 
 # ---- for the runners in the same process -----------------------------------------------------------

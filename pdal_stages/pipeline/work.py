@@ -43,23 +43,12 @@ class Call:
 
 @dataclass
 class Answer:
-    """What became of a task.
-
-    Attributes
-    ----------
-    result : object
-        What it gave.
-    reason : str
-        Why it failed; empty where it did not.
-    again : bool
-        Whether trying again can help.
-    cost : dict
-        ``seconds``, ``cpu_seconds``, ``peak_mb`` (the most memory the process has held so far).
-    """
+    """What became of a task."""
 
     result: Any = None
-    reason: str = ""
-    again: bool = False
+    reason: str = ""  #: why it failed; empty where it did not
+    again: bool = False  #: whether trying again can help
+    #: ``seconds``, ``cpu_seconds``, ``peak_mb`` (the most memory the process has held so far).
     cost: dict[str, float] = field(default_factory=dict)
 
 

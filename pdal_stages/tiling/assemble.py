@@ -17,29 +17,14 @@ MOST_AT_ONCE = 4_000_000
 
 @dataclass(frozen=True)
 class FileTask:
-    """An input file's output, to be put together from tiles.
-
-    Attributes
-    ----------
-    source : Source
-    count : int
-        Points of the input.
-    results : list of str
-        Files of tiles.
-    tail : list of dict
-        Stages to run, with the writers.
-    outputs : list of str
-        What each of the writers writes.
-    scratch : str
-        Folder for temporary files.
-    """
+    """An input file's output, to be put together from tiles."""
 
     source: Source
-    count: int
-    results: list[str]
-    tail: list[dict[str, Any]]
-    outputs: list[str]
-    scratch: str
+    count: int  #: points of the input
+    results: list[str]  #: files of tiles
+    tail: list[dict[str, Any]]  #: stages to run, with the writers
+    outputs: list[str]  #: what each of the writers writes
+    scratch: str  #: folder for temporary files
 
     def run(self) -> dict[str, Any]:
         """Write the outputs; see :func:`~pdal_stages.tiling.tail.run_tail`."""
@@ -48,7 +33,8 @@ class FileTask:
             return read_range(self.results, self.source, self.count, start, end)
 
         writers = [stage for stage in self.tail if stage["type"].startswith("writers.")]
-        if self.count > MOST_AT_ONCE and all(map(_writes_las, writers)):
+        kinds = {(writer["type"], Path(writer["filename"]).suffix.lower()) for writer in writers}
+        if self.count > MOST_AT_ONCE and kinds <= {("writers.las", ".las"), ("writers.las", ".laz")}:
             try:
                 return write_in_parts(
                     self.source, self.count, MOST_AT_ONCE, new_values, self.tail, self.outputs, self.scratch
@@ -66,7 +52,3 @@ def write_tile(results: list[PieceResults], tail: list[dict[str, Any]], outputs:
         return {"outputs": []}
     readers = [{**r.source.reader, "type": "readers.las", "filename": r.piece.core} for r in mine]
     return run_tail(readers, [of_own_points(result) for result in mine], tail, outputs)
-
-
-def _writes_las(writer: dict[str, Any]) -> bool:
-    return writer["type"] == "writers.las" and Path(writer["filename"]).suffix.lower() in (".las", ".laz")

@@ -17,20 +17,11 @@ BLOCK = 50_000
 
 @dataclass(frozen=True)
 class CloudIndex:
-    """Where the points of a file lie.
-
-    Attributes
-    ----------
-    count : int
-    boxes : list of Box
-        The bounding box of each block of 50,000 points.
-    tiles : list of (int, int, int)
-        Column, row and number of points of each tile.
-    """
+    """Where the points of a file lie."""
 
     count: int
-    boxes: list[Box]
-    tiles: list[tuple[int, int, int]]
+    boxes: list[Box]  #: of each block of 50,000 points
+    tiles: list[tuple[int, int, int]]  #: column, row and number of points of each tile
 
 
 def open_las(path: str):
@@ -39,12 +30,9 @@ def open_las(path: str):
 
     try:
         return laspy.open(path)
-    except OSError as error:
-        raise StageError("the input cannot be read", where=path, found=error) from None
     except Exception as error:  # laspy and the decompressor raise many types
-        raise StageError(
-            "the input cannot be read", where=path, found=f"{type(error).__name__}: {error}"
-        ) from None
+        found = error if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
+        raise StageError("the input cannot be read", where=path, found=found) from None
 
 
 def read_block(reader: Any, path: str, start: int, end: int):

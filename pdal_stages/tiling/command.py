@@ -35,10 +35,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--scheduler", default="", metavar="ADDRESS", help="A running Dask scheduler, tcp://HOST:8786"
     )
     group.add_argument(
-        "--per",
-        choices=PER,
-        default="auto",
-        help="One output per input file or per tile (auto: per file)",
+        "--per", choices=PER, default="auto", help="One output per input file or per tile (auto: per file)"
     )
     group.add_argument(
         "--buffer", type=float, metavar="METRES", help="Surroundings for PDAL filters that look at neighbors"

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base import las
 from ..base.errors import StageError
 from .cloudindex import BLOCK, CloudIndex, open_las, read_block
 from .grid import Grid, touching
@@ -20,23 +21,12 @@ _COMPRESSOR = b"laszip encoded"
 
 @dataclass
 class Piece:
-    """Points of one file, in that file's order, as an uncompressed LAS file.
-
-    Attributes
-    ----------
-    path : str
-        The LAS file.
-    core : str
-        Another one with the tile's own points alone; empty where none was asked for.
-    index : (n,) int64
-        Number of each point in the input file.
-    margin : (n,) float64
-        How far it lies outside the tile, in the unit of the coordinates; -1 inside.
-    """
+    """Points of one file, in that file's order, as an uncompressed LAS file."""
 
     path: str
-    core: str
-    index: NDArray[np.int64]
+    core: str  #: another file, with the tile's own points alone; empty where none was asked for
+    index: NDArray[np.int64]  #: (n,) number of each point in the input file
+    #: (n,) how far it lies outside the tile, in the unit of the coordinates; -1 inside
     margin: NDArray[np.float64]
 
     @cached_property
@@ -46,36 +36,22 @@ class Piece:
 
 
 def plain_header(path: str) -> tuple[bytearray, bytes]:
-    """Header and records of a file as an uncompressed one has them, and its extended records.
+    """All before the points of a file as an uncompressed one has them, and its extended records.
 
     Counts are left as they are; :func:`finish` sets them.
     """
+    header = las.read_header(path)
+    assert header is not None
     with open(path, "rb") as file:
-        head = bytearray(file.read(375))
-        size, start, count = struct.unpack_from("<HII", head, 94)
-        head = head[:size]
-        file.seek(size)
-        body = file.read(start - size)
-        tail = b""
-        if head[25] >= 4:
-            first, number = struct.unpack_from("<QI", head, 235)
-            if number:
-                file.seek(first)
-                tail = file.read()
-    at, kept, dropped = 0, [], 0
-    for _ in range(count):
-        (length,) = struct.unpack_from("<H", body, at + 20)
-        record = body[at : at + 54 + length]
-        at += len(record)
-        if record[2:18].split(b"\0")[0] == _COMPRESSOR:
-            dropped += 1
-        else:
-            kept.append(record)
-    records = b"".join(kept)
-    gap = body[at:]  # a signature or padding before the points
+        head = bytearray(file.read(header.offset))
+        coding = [r for r in las.records(file, header) if r.user == _COMPRESSOR and not r.after]
+        file.seek(header.after)
+        tail = file.read() if header.records_after else b""
+    for record in reversed(coding):
+        del head[record.place : record.data + record.length]
     head[104] &= 0x3F
-    struct.pack_into("<II", head, 96, size + len(records) + len(gap), count - dropped)
-    return head + records + gap, tail
+    struct.pack_into("<II", head, 96, len(head), header.records - len(coding))
+    return head, tail
 
 
 def finish(file: Any, head: bytearray, tail: bytes, count: int) -> None:
@@ -135,11 +111,7 @@ def cut(
     cores = 0
     head, tail = plain_header(path)
     try:
-        with (
-            open_las(path) as reader,
-            open(target, "wb") as out,
-            open(core or os.devnull, "wb") as core_out,
-        ):
+        with open_las(path) as reader, open(target, "wb") as out, open(core or os.devnull, "wb") as core_out:
             out.write(head)
             core_out.write(head)
             for block in blocks:

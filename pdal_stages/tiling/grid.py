@@ -20,15 +20,9 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Grid:
-    """Square tiles of one size; tile (i, j) holds ``i*size <= x < (i+1)*size``, likewise y.
+    """Square tiles of one size; tile (i, j) holds ``i*size <= x < (i+1)*size``, likewise y."""
 
-    Attributes
-    ----------
-    size : float
-        Side of a tile, in the unit of the coordinates.
-    """
-
-    size: float
+    size: float  #: side of a tile, in the unit of the coordinates
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.size) and self.size > 0):

@@ -29,39 +29,24 @@ _MARK_TYPES = {ROW: "uint32_t", SOURCE: "uint32_t", MARGIN: "double"}
 
 @dataclass(frozen=True)
 class Recipe:
-    """What all tiles of a run have in common.
-
-    Attributes
-    ----------
-    plan : TilePlan
-    grid : Grid
-    unit : float
-        Metres per unit of the coordinates.
-    bounds : Box
-        Of all inputs.
-    threads : int
-    most_points : int
-        A tile is not read with wider surroundings that hold more.
-    scratch : str
-        Folder for temporary files.
-    """
+    """What all tiles of a run have in common."""
 
     plan: TilePlan
     grid: Grid
-    unit: float
-    bounds: Box
+    unit: float  #: metres per unit of the coordinates
+    bounds: Box  #: of all inputs
     threads: int
-    most_points: int
-    scratch: str
+    most_points: int  #: a tile is not read with wider surroundings that hold more
+    scratch: str  #: folder for temporary files
 
 
 @dataclass
 class HeadRun:
-    """What a run of the head gave; `need`: the metres of surroundings that it took; `said`: warnings and notes."""
+    """What a run of the head gave."""
 
     results: list[PieceResults]
-    need: float
-    said: list[str] = field(default_factory=list)
+    need: float  #: the metres of surroundings that it took
+    said: list[str] = field(default_factory=list)  #: warnings and notes
 
 
 def run_head(
@@ -103,7 +88,8 @@ def run_head(
         pipeline.execute(arrays=True)
     results = _collect(pipeline.arrays, cuts, plan.creates, marks)
     need = max((reach.need for reach in reaches.values()), default=0.0)
-    if not everything and any(_looked_far(r) for _, reports in pipeline.reports for r in reports):
+    beyond = [report.get("beyond_halo") or {} for _, reports in pipeline.reports for report in reports]
+    if not everything and any(number for one in beyond for number in one.values()):
         most = max(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
         need = max(need, _far_neighbors(pipeline.arrays, most, recipe, tile))
     said = [*(f"PDAL says: {line}" for line in pipeline.said), *pipeline.told]
@@ -178,10 +164,7 @@ class _Reach:
 
 
 def _collect(
-    arrays: list[NDArray],
-    cuts: list[tuple[Source, Piece]],
-    creates: list[str] | None,
-    marks: list[_Mark],
+    arrays: list[NDArray], cuts: list[tuple[Source, Piece]], creates: list[str] | None, marks: list[_Mark]
 ) -> list[PieceResults]:
     """Results of the tile's own points, sorted as their pieces are."""
     names = [n for a in arrays[:1] for n in a.dtype.names or ()]
@@ -219,10 +202,6 @@ def _changed(result: PieceResults, name: str, original: Mapping[str, NDArray]) -
         return False
     before = np.searchsorted(result.piece.own, result.rows)
     return name not in original or not np.array_equal(original[name][before], result.values[name])
-
-
-def _looked_far(report: dict[str, Any]) -> bool:
-    return any((report.get("beyond_halo") or {}).values())
 
 
 def _far_neighbors(arrays: list[NDArray], most: int, recipe: Recipe, tile: tuple[int, int]) -> float:

@@ -12,48 +12,25 @@ from .sources import Source
 
 @dataclass(kw_only=True)
 class _Work:
-    """What became of a tile or an output.
+    """What became of a tile or an output."""
 
-    Attributes
-    ----------
-    state : str
-        ``waiting``, ``ready`` (an output whose tiles are done), ``done``, ``kept`` (from an earlier run) or ``failed``.
-    report : dict
-    reason : str
-        Why it failed.
-    blocked_by : str
-        The unreadable input that it failed for, where that is the reason.
-    tries : int
-    """
-
+    #: ``waiting``, ``ready`` (an output whose tiles are done), ``done``, ``kept`` (from an earlier run) or ``failed``.
     state: str = "waiting"
     report: dict[str, Any] = field(default_factory=dict)
-    reason: str = ""
-    blocked_by: str = ""
+    reason: str = ""  #: why it failed
+    blocked_by: str = ""  #: the unreadable input that it failed for, where that is the reason
     tries: int = 0
 
 
 @dataclass
 class Job(_Work):
-    """A tile to run.
-
-    Attributes
-    ----------
-    tile : (int, int)
-    name : str
-    points : int
-        The tile's own; 0 where not known before it is read.
-    sources : list of Source
-        Inputs that may hold points of it or its surroundings.
-    outputs : list of str, optional
-        What the writers write, where each tile is an output.
-    """
+    """A tile to run."""
 
     tile: tuple[int, int]
     name: str
-    points: int
-    sources: list[Source]
-    outputs: list[str] | None = None
+    points: int  #: its own; 0 where not known before it is read
+    sources: list[Source]  #: inputs that may hold points of it or its surroundings
+    outputs: list[str] | None = None  #: what the writers write, where each tile is an output
 
 
 @dataclass

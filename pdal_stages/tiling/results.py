@@ -20,40 +20,21 @@ from .sources import Source
 
 @dataclass
 class PieceResults:
-    """Results of a tile's own points of one source.
-
-    Attributes
-    ----------
-    source : Source
-    piece : Piece
-    rows : (n,) int64
-        Rows of the piece that came out, ascending.
-    values : dict of str to (n,) ndarray
-        New values of dimensions.
-    holds_flags : bool
-        Whether class codes hold the flag bits of LAS 1.0-1.3.
-    """
+    """Results of a tile's own points of one source."""
 
     source: Source
     piece: Piece
-    rows: NDArray[np.int64]
-    values: dict[str, NDArray]
-    holds_flags: bool = False
+    rows: NDArray[np.int64]  #: (n,) rows of the piece that came out, ascending
+    values: dict[str, NDArray]  #: (n,) new values of dimensions
+    holds_flags: bool = False  #: whether class codes hold the flag bits of LAS 1.0-1.3
 
 
 @dataclass(frozen=True)
 class NewValues:
-    """What points get that are read again, in the order they are read in.
+    """What points get that are read again, in the order they are read in."""
 
-    Attributes
-    ----------
-    kept : (n,) bool
-        Which of the points stay.
-    values : mapping of str to (rows or None, ndarray)
-        New values of dimensions and the rows they belong to; None for all.
-    """
-
-    kept: NDArray[np.bool_]
+    kept: NDArray[np.bool_]  #: (n,) which of the points stay
+    #: New values of dimensions and the rows they belong to; None for all.
     values: Mapping[str, tuple[NDArray[np.int64] | None, NDArray]]
 
 

@@ -26,21 +26,11 @@ _TINDEX_QUERIES = ("bounds", "polygon", "where", "sql", "count", "srs_column")
 
 @dataclass(frozen=True)
 class Source:
-    """One input.
+    """One input."""
 
-    Attributes
-    ----------
-    path : str
-        Absolute path, or an address.
-    reader : dict
-        The reader stage that reads it.
-    kind : str
-        ``las`` (LAS, LAZ, COPC) or ``ept``.
-    """
-
-    path: str
-    reader: dict[str, Any]
-    kind: str
+    path: str  #: absolute, or an address
+    reader: dict[str, Any]  #: the stage that reads it
+    kind: str  #: ``las`` (LAS, LAZ, COPC) or ``ept``
 
     @property
     def key(self) -> str:
@@ -119,9 +109,9 @@ def _bare(reader: dict[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Header:
-    """What an input says of itself: number of points, and bounding box."""
+    """What an input says of itself."""
 
-    count: int
+    count: int  #: points
     box: Box
 
 
@@ -133,7 +123,11 @@ def read_header(source: Source) -> Header:
     StageError
         If the input cannot be read.
     """
-    return _ept_header(source) if source.kind == "ept" else las_header(source.path)
+    if source.kind != "ept":
+        return las_header(source.path)
+    described = read_ept(source.path)
+    x0, y0, _, x1, y1, _ = map(float, described["boundsConforming"])
+    return Header(int(described["points"]), (x0, y0, x1, y1))
 
 
 def check_source(source: Source) -> None:
@@ -189,9 +183,3 @@ def read_ept(path: str) -> dict[str, Any]:
         return found
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise StageError("the EPT source cannot be read", where=path, found=str(error)) from None
-
-
-def _ept_header(source: Source) -> Header:
-    described = read_ept(source.path)
-    x0, y0, _, x1, y1, _ = (float(v) for v in described["boundsConforming"])
-    return Header(int(described["points"]), (x0, y0, x1, y1))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,39 +43,19 @@ _DRIVERS |= {".laz": "las", ".txt": "text", ".csv": "text", ".tif": "gdal"}
 
 @dataclass(frozen=True)
 class TilePlan:
-    """What a tiled run does to each tile.
+    """What a tiled run does to each tile."""
 
-    Attributes
-    ----------
-    readers : list of dict
-        The pipeline's readers, as given.
-    head : list of dict
-        Stages that see neighbors: run on a tile and its surroundings.
-    later : list of float
-        How far outside the tile, in metres, the results of each stage of the head are still used.
-    tail : list of dict
-        Stages that look at single points, and the writers: run on the points of one output.
-    halo : float
-        Metres of surroundings.
-    creates : list of str or None
-        Dimensions the head changes; None where PDAL's filters in it make that unknown.
-    unit : str
-        `horizontal_unit` of our stages, empty for the spatial reference's.
-    notes : list of str
-        What the user should know.
-    name : str
-        The pipeline's file, or what else its source is called.
-    """
-
-    readers: list[dict[str, Any]]
-    head: list[dict[str, Any]]
-    later: list[float]
+    readers: list[dict[str, Any]]  #: as given
+    head: list[dict[str, Any]]  #: stages that see neighbors: run on a tile and its surroundings
+    later: list[float]  #: metres outside the tile within which the results of each of them are still used
+    #: Stages that look at single points, and the writers: run on the points of one output.
     tail: list[dict[str, Any]]
-    halo: float
+    halo: float  #: metres of surroundings
+    #: Dimensions the head changes; None where PDAL's filters in it make that unknown.
     creates: list[str] | None
-    unit: str = ""
-    notes: list[str] = field(default_factory=list)
-    name: str = ""
+    unit: str  #: `horizontal_unit` of our stages, empty for the spatial reference's
+    notes: list[str]  #: what the user should know
+    name: str  #: the pipeline's file, or what else its source is called
 
     @property
     def writers(self) -> list[dict[str, Any]]:
@@ -84,10 +64,10 @@ class TilePlan:
 
 @dataclass(frozen=True)
 class _Step:
-    """One stage of the pipeline: as an object with a type, its place for messages, and ours where it is."""
+    """One stage of the pipeline."""
 
-    given: dict[str, Any]
-    where: str
+    given: dict[str, Any]  #: an object with a type
+    where: str  #: its place, for messages
     ours: Stage | None
 
     @property

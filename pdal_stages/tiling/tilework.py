@@ -25,28 +25,15 @@ _WIDENINGS = 3
 
 @dataclass(frozen=True)
 class TileTask:
-    """A tile to be worked on.
-
-    Attributes
-    ----------
-    recipe : Recipe
-    tile : (int, int)
-    sources : list of (Source, CloudIndex or None)
-        Inputs that may hold points of it or its surroundings; EPT sources have no index.
-    complete : float
-        Metres around the tile up to which these are all the inputs there are.
-    result : str
-        File for the results, where outputs are put together from tiles.
-    outputs : list of str
-        Otherwise: what each of the writers writes.
-    """
+    """A tile to be worked on."""
 
     recipe: Recipe
     tile: tuple[int, int]
+    #: Inputs that may hold points of it or its surroundings; EPT sources have no index.
     sources: list[tuple[Source, CloudIndex | None]]
-    complete: float
-    result: str = ""
-    outputs: list[str] | None = None
+    complete: float  #: metres around the tile up to which these are all the inputs there are
+    result: str  #: file for the results, where outputs are put together from tiles
+    outputs: list[str] | None  #: otherwise: what each of the writers writes
 
     def run(self) -> dict[str, Any]:
         """Run the head; write its results, or the outputs.
