@@ -1,4 +1,4 @@
-"""Time of the features, beside the libraries that compute some of the same: pgeof, jakteristics and PDAL.
+"""Time of features and forests beside libraries that do some of the same: pgeof, jakteristics, PDAL, scikit-learn.
 
     python benchmarks/features.py                               # generated town, 500,000 points, 7 per square metre
     python benchmarks/features.py --cloud delft montpellier     # real clouds, from PDAL_STAGES_DATA
@@ -31,8 +31,10 @@ import time
 from collections.abc import Callable, Iterable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from forests import Forests, clocked
 
 from pdal_stages.base.threads import resolve_threads
 from pdal_stages.features import FeatureEngine, FeaturePlan, compute_features, warmup
@@ -52,18 +54,25 @@ REAL = {
 Times = tuple[float, float]  # CPU and wall seconds
 
 
+class Cloud(NamedTuple):
+    """Points and their classes."""
+
+    xyz: np.ndarray
+    labels: np.ndarray
+
+
 # ---- clouds ------------------------------------------------------------------------------------------------
 
 
-def town(points: int, density: float) -> np.ndarray:
+def town(points: int, density: float) -> Cloud:
     """A generated town of about so many points."""
     from pdal_stages.synthetic import make_town
 
-    size = max((points / density) ** 0.5, 20.0)
-    return np.ascontiguousarray(make_town(size=size, density=density).xyz)
+    made = make_town(size=max((points / density) ** 0.5, 20.0), density=density)
+    return Cloud(np.ascontiguousarray(made.xyz), made.classification)
 
 
-def load(name: str, points: int, density: float) -> np.ndarray:
+def load(name: str, points: int, density: float) -> Cloud:
     """A cloud by name (town, delft, montpellier, oakland) or file."""
     import laspy
 
@@ -76,7 +85,9 @@ def load(name: str, points: int, density: float) -> np.ndarray:
         files = sorted(Path(folder).glob(REAL[name]))
     else:
         files = [Path(name)]
-    return np.ascontiguousarray(np.vstack([laspy.read(file).xyz for file in files]))
+    clouds = [laspy.read(file) for file in files]
+    xyz = np.ascontiguousarray(np.vstack([cloud.xyz for cloud in clouds]))
+    return Cloud(xyz, np.concatenate([np.asarray(cloud.classification) for cloud in clouds]))
 
 
 def point_density(xyz: np.ndarray) -> float:
@@ -87,11 +98,14 @@ def point_density(xyz: np.ndarray) -> float:
 # ---- what is timed -----------------------------------------------------------------------------------------
 
 
-def ours(neighborhoods: str, feature_set: str, threads: int) -> Callable[[np.ndarray], None]:
+Work = Callable[[np.ndarray, np.ndarray], Times | None]
+
+
+def ours(neighborhoods: str, feature_set: str, threads: int) -> Work:
     """Our features, block by block, nothing kept."""
     plan = FeaturePlan.parse(neighborhoods, feature_set)
 
-    def run(xyz: np.ndarray) -> None:
+    def run(xyz: np.ndarray, labels: np.ndarray) -> None:
         given = {name: np.zeros(len(xyz), np.float32) for name in plan.dimensions}
         for _ in FeatureEngine(xyz, plan, threads=threads).blocks(dimensions=given):
             pass
@@ -99,7 +113,7 @@ def ours(neighborhoods: str, feature_set: str, threads: int) -> Callable[[np.nda
     return run
 
 
-def pgeof_spheres(xyz: np.ndarray) -> None:
+def pgeof_spheres(xyz: np.ndarray, labels: np.ndarray) -> None:
     import pgeof
 
     ids = pgeof.EFeatureID
@@ -108,8 +122,8 @@ def pgeof_spheres(xyz: np.ndarray) -> None:
         pgeof.compute_features_selected(xyz, radius, 100_000 if len(xyz) > 100_000 else len(xyz), wanted)
 
 
-def jakteristics_spheres(threads: int) -> Callable[[np.ndarray], None]:
-    def run(xyz: np.ndarray) -> None:
+def jakteristics_spheres(threads: int) -> Work:
+    def run(xyz: np.ndarray, labels: np.ndarray) -> None:
         import jakteristics
 
         wanted = [
@@ -122,7 +136,7 @@ def jakteristics_spheres(threads: int) -> Callable[[np.ndarray], None]:
     return run
 
 
-def pgeof_optimal(xyz: np.ndarray) -> None:
+def pgeof_optimal(xyz: np.ndarray, labels: np.ndarray) -> None:
     """Its own neighbor search for 100 neighbors and its optimal neighborhoods of 10 to 100."""
     import pgeof
 
@@ -132,7 +146,7 @@ def pgeof_optimal(xyz: np.ndarray) -> None:
     pgeof.compute_features_optimal(near, found.astype(np.uint32).ravel(), pointers, 10, 1, 10)
 
 
-def cases(threads: int) -> dict[str, tuple[str, Callable, dict[str, Callable]]]:
+def cases(threads: int) -> dict[str, tuple[str, Work, dict[str, Work]]]:
     """Case -> (what ours computes, ours, peers)."""
     spheres = ",".join(f"s{r:g}" for r in RADII)
     cylinders = ",".join(f"c{r:g}" for r in RADII)
@@ -141,6 +155,7 @@ def cases(threads: int) -> dict[str, tuple[str, Callable, dict[str, Callable]]]:
         {"type": "filters.covariancefeatures", "radius": r, "feature_set": PDAL_FEATURES} for r in RADII
     ]
     pdal_optimal = [{"type": "filters.optimalneighborhood", "min_k": 10, "max_k": 100}]
+    forests = Forests(threads)
     return {
         "moments": (
             "12 features of c1 c2 c3 c5 s1 s2 s3 s5 (peers: of the four spheres alone)",
@@ -159,23 +174,28 @@ def cases(threads: int) -> dict[str, tuple[str, Callable, dict[str, Callable]]]:
             {},
         ),
         "all": ("560 features of weinmann2018", ours("weinmann2018", "all", threads), {}),
+        "forest": (
+            "a forest of 50 trees over 48 features (peer: the same trees)",
+            forests.ours,
+            {"scikit-learn": forests.scikit_learn},
+        ),
     }
 
 
 # ---- timing ------------------------------------------------------------------------------------------------
 
 
-def timed(function: Callable, xyz: np.ndarray) -> Times:
+def timed(function: Work, cloud: Cloud) -> Times:
     """CPU seconds of all threads and of programs started, and wall seconds; a function may return its own."""
-    cpu, wall = time.process_time(), time.perf_counter()
-    own = function(xyz)
-    return own if own else (time.process_time() - cpu, time.perf_counter() - wall)
+    own: list[Times | None] = []
+    both = clocked(lambda: own.append(function(*cloud)))
+    return own[0] or both
 
 
-def pdal(stages: list[dict]) -> Callable[[np.ndarray], Times]:
+def pdal(stages: list[dict]) -> Work:
     """Seconds that PDAL's own filters take in a process of their own."""
 
-    def run(xyz: np.ndarray) -> Times:
+    def run(xyz: np.ndarray, labels: np.ndarray) -> Times:
         beside = Path(sys.executable).parent / "pdal"
         program = str(beside) if beside.exists() else shutil.which("pdal")
         if program is None:
@@ -210,23 +230,23 @@ def pdal(stages: list[dict]) -> Callable[[np.ndarray], Times]:
     return run
 
 
-def measure(xyz: np.ndarray, only: Iterable[str], repeats: int, threads: int, peers: bool) -> list[dict]:
+def measure(cloud: Cloud, only: Iterable[str], repeats: int, threads: int, peers: bool) -> list[dict]:
     """Time every case in turns; one entry per case."""
-    few = xyz[: min(len(xyz), 2000)]
+    few = Cloud(cloud.xyz[:2000], cloud.labels[:2000])
     results = []
     for name, (what, run, others) in cases(threads).items():
         if name not in only:
             continue
-        run(few)  # compiled code is loaded before the clock starts
+        run(*few)  # compiled code is loaded before the clock starts
         entry: dict = {"case": name, "what": what, "ours": [], "peers": {}}
         alive = dict(others) if peers else {}
         for turn in range(repeats):
-            entry["ours"].append(timed(run, xyz))
+            entry["ours"].append(timed(run, cloud))
             for peer, function in list(alive.items()):
                 if peer == "PDAL" and turn:  # a minute a run: once
                     continue
                 try:
-                    times = timed(function, xyz)
+                    times = timed(function, cloud)
                 except (ImportError, RuntimeError) as error:
                     print(f"{peer} left out: {error}", file=sys.stderr)
                     del alive[peer]
@@ -287,16 +307,16 @@ def scaling(density: float, threads: int) -> list[dict]:
         "for i in range(times):\n"
         "    xyz[i * len(one) : (i + 1) * len(one)] = one + [i % 8 * side, i // 8 * side, 0]\n"
         "job = f.ours('c1,c2,c3,c5,s1,s2,s3,s5', f.TWELVE, threads)\n"
-        "job(xyz[:2000])\n"
+        "job(xyz[:2000], None)\n"
         "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
-        "cpu, wall = f.timed(job, xyz)\n"
+        "cpu, wall = f.timed(job, f.Cloud(xyz, None))\n"
         "after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         "print(len(xyz), cpu, wall, xyz.nbytes / 2**20, before / 1024, after / 1024)\n"
     )
     here = str(Path(__file__).resolve().parent)
     with tempfile.TemporaryDirectory() as folder:
         file = f"{folder}/town.npy"
-        np.save(file, town(250_000, density))
+        np.save(file, town(250_000, density).xyz)
         for times in (1, 2, 4, 8, 16, 32, 64):
             command = [sys.executable, "-c", code, here, file, str(times), str(threads)]
             done = subprocess.run(command, capture_output=True, text=True, check=True)
@@ -349,7 +369,7 @@ def profile(xyz: np.ndarray) -> str:
     lines = ["| part | CPU microseconds a point |", "|---|---:|"]
     for name, run in runs.items():
         run()
-        cpu = min(timed(lambda _, run=run: run() and None, xyz)[0] for _ in range(2))
+        cpu = min(clocked(run)[0] for _ in range(2))
         lines.append(f"| {name} | {cpu / len(xyz) * 1e6:.2f} |")
     return "\n".join(lines) + "\n"
 
@@ -359,7 +379,7 @@ def profile(xyz: np.ndarray) -> str:
 
 def versions() -> dict[str, str]:
     found = {"python": platform.python_version(), "numpy": np.__version__}
-    for package in ("pdal-stages", "numba", "pgeof", "jakteristics"):
+    for package in ("pdal-stages", "numba", "pgeof", "jakteristics", "scikit-learn"):
         try:
             found[package] = version(package)
         except PackageNotFoundError:
@@ -394,6 +414,7 @@ def plot(clouds: dict[str, tuple[int, list[dict]]], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     colours = {"pdal_stages": "#1b6ca8", "pgeof": "#b0b7bf", "jakteristics": "#8d97a1", "PDAL": "#6b7682"}
+    colours["scikit-learn"] = "#c7ccd1"
     entries = [
         (cloud, n, entry) for cloud, (n, results) in clouds.items() for entry in results if entry["peers"]
     ]
@@ -449,16 +470,15 @@ def main() -> None:
         data["scaling"] = scaling(options.density, threads)
         text = scaling_table(data["scaling"])
     elif options.profile:
-        text = profile(load(options.cloud[0], options.points, options.density))
+        text = profile(load(options.cloud[0], options.points, options.density).xyz)
         data["profile"] = text
     else:
         clouds = {}
         for name in options.cloud:
-            xyz = load(name, options.points, options.density)
-            label = Path(name).stem
-            clouds[label] = measure(xyz, options.only, options.repeats, threads, not options.no_peers)
-            shown[label] = len(xyz), clouds[label]
-            text += table(label, xyz, clouds[label], threads) + "\n"
+            cloud, label = load(name, options.points, options.density), Path(name).stem
+            clouds[label] = measure(cloud, options.only, options.repeats, threads, not options.no_peers)
+            shown[label] = len(cloud.xyz), clouds[label]
+            text += table(label, cloud.xyz, clouds[label], threads) + "\n"
         data["clouds"] = clouds
     text += "\n" + ", ".join(f"{name} {number}" for name, number in data["versions"].items())
     text += f"; {data['machine']}\n"

@@ -8,6 +8,8 @@ from sklearn.ensemble import ExtraTreesClassifier, RandomForestClassifier
 from sklearn.tree import DecisionTreeClassifier
 
 from pdal_stages.base.errors import ModelError
+from pdal_stages.classifier import forest as forest_module
+from pdal_stages.classifier import walk
 from pdal_stages.classifier.forest import MAX_DEPTH, Forest, float32_at_most
 from pdal_stages.classifier.growing import TreeOptions, grow
 
@@ -75,6 +77,38 @@ def test_equals_sklearn_on_any_forest(seed, trees, rows, depth, leaf):
     query = np.concatenate([x, (random.integers(-10, 11, (50, 3)) / 6).astype(np.float32)])
     assert np.array_equal(forest.predict_proba(query), reference.predict_proba(query))
     assert np.allclose(forest.predict_proba(query), oracle(forest, query), atol=1e-12)
+
+
+def test_words_of_64_bits_and_a_leaf_table_with_repeats_give_the_same(monkeypatch):
+    x, y = data()
+    trees = RandomForestClassifier(9, random_state=2).fit(x, y).estimators_
+    usual = Forest.from_sklearn(trees, 17).predict_proba(x)
+    with monkeypatch.context() as patch:  # as where a feature and a child need more than 32 bits
+        patch.setattr(walk, "WORDS", walk.WORDS[1:] * 2)
+        wide = Forest.from_sklearn(trees, 17)
+    with monkeypatch.context() as patch:  # as where two different leaves have one hash
+        patch.setattr(forest_module, "hash_of", lambda columns, seed: np.zeros(columns.shape[1], np.uint64))
+        repeats = Forest.from_sklearn(trees, 17)
+    assert np.array_equal(wide.predict_proba(x), usual)
+    assert np.array_equal(repeats.predict_proba(x), usual)
+
+
+def test_features_and_children_that_need_64_bits():
+    columns, n = 70_000, 70_000
+    values = np.zeros((n, 1), np.float32)
+    values[:, 0] = np.arange(n)
+    tree = DecisionTreeClassifier(random_state=0).fit(values, np.random.default_rng(0).integers(0, 2, n))
+    narrow = Forest.from_sklearn([tree], 1)
+    wide = Forest(
+        narrow.tree_sizes,
+        np.where(narrow.feature < 0, -1, columns - 1).astype(np.int32),
+        narrow.threshold,
+        narrow.leaf_counts,
+        columns,
+    )
+    rows = np.zeros((40, columns), np.float32)
+    rows[:, -1] = np.linspace(-5, n + 5, 40)
+    assert np.array_equal(wide.predict_proba(rows), narrow.predict_proba(rows[:, -1:]))
 
 
 def test_values_on_either_side_of_a_threshold():

@@ -14,13 +14,15 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError
+from ..base.hashing import hash_of
 from . import walk as kernels
 from .arrays import ArrayRule
 
 #: Levels below the root a tree may have.
 MAX_DEPTH = 10_000
-#: Bytes of feature values that pass over all trees together, about half a core's second level cache.
-_GROUP_BYTES = 1 << 19
+#: Bytes of feature values that pass over a tree before the next one's turn. Rows of up to so many bytes are read in one go
+#: from whatever memory, so many of them make a tree's nodes pay; wide ones, read here and there, had better fit the cache.
+_GROUP_BYTES, _NARROW, _WIDE_GROUP_BYTES = 1 << 22, 512, 1 << 20
 
 _FAULTS = {
     kernels.TOO_FEW: "a tree ends before all its branches do",
@@ -91,19 +93,10 @@ class Forest:
         totals = self.leaf_counts.sum(axis=1, dtype=np.uint64)
         if not totals.all():
             raise ModelError("a leaf holds no samples", found=f"leaf {int(np.argmin(totals))}")
-        leaf = self.feature < 0
-        packed = np.where(leaf, 0, self.feature).astype(np.uint64)
-        packed <<= kernels.SHIFT
-        packed |= left
-        rows = np.cumsum(leaf, dtype=np.int64)
-        rows -= 1
-        set_ = object.__setattr__
-        set_(self, "depths", depths)
-        set_(self, "_sizes", sizes.astype(np.int64))
-        set_(self, "_packed", packed)
-        set_(self, "_limits", np.where(leaf, np.float32(np.inf), self.threshold).astype(np.float32))
-        set_(self, "_leaf_row", rows.astype(np.int32))
-        set_(self, "_leaf_value", self.leaf_counts / totals[:, None].astype(np.float64))
+        leaf_value = self.leaf_counts / totals[:, None].astype(np.float64)
+        object.__setattr__(self, "depths", depths)
+        walked = _walkable(sizes, self.feature, self.threshold, left, leaf_value, self.n_features)
+        object.__setattr__(self, "_walked", walked)
 
     def _shapes(self) -> str:
         names = ("tree_sizes", "feature", "threshold", "leaf_counts")
@@ -189,19 +182,40 @@ class Forest:
                 f"the model takes {self.n_features} features per point", found=f"shape {values.shape}"
             )
         out = np.zeros((len(values), self.n_classes))
-        rows = _GROUP_BYTES // (4 * self.n_features) // kernels.LANES * kernels.LANES
-        kernels.walk(
-            values.reshape(-1),
-            self._sizes,  # type: ignore[attr-defined]
-            self._limits,  # type: ignore[attr-defined]
-            self._packed,  # type: ignore[attr-defined]
-            self._leaf_row,  # type: ignore[attr-defined]
-            self._leaf_value,  # type: ignore[attr-defined]
-            max(rows, 2 * kernels.LANES),
-            out,
-        )
+        width = 4 * self.n_features
+        rows = (_GROUP_BYTES if width <= _NARROW else _WIDE_GROUP_BYTES) // width
+        rows = max(rows // kernels.LANES, 2) * kernels.LANES
+        kernels.walk(values.reshape(-1), *self._walked, rows, out)  # type: ignore[attr-defined]
         out /= self.n_trees
         return out
+
+
+def _walkable(sizes, feature, threshold, left, leaf_value, n_features: int) -> tuple[Any, ...]:
+    """Trees as :func:`walk.walk` takes them: in words of 32 bits where a feature and a child fit into one."""
+    rows, table = _distinct(leaf_value)
+    child_bits = int(sizes.max()).bit_length()
+    fits = (n_features - 1).bit_length() + child_bits <= 32 and len(table) <= 1 << kernels.WORDS[0][2]
+    word, real, free_bits = kernels.WORDS[0 if fits else 1]
+    leaf = feature < 0
+    limits = np.empty((len(feature), 2), real)
+    limits[:, 0] = np.where(leaf, np.nan, threshold)
+    nodes = limits.view(word)
+    nodes[leaf, 0] |= rows.astype(word)
+    nodes[:, 1] = np.where(leaf, 0, feature).astype(word) << word(child_bits) | left
+    child, free = (word((1 << bits) - 1) for bits in (child_bits, free_bits))
+    flat = nodes.reshape(-1), limits.reshape(-1)
+    return sizes.astype(np.int64), *flat, word(child_bits), child, free, table.reshape(-1)
+
+
+def _distinct(values: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+    """(row of the table for each row, table of the different rows): a forest's leaves are much alike."""
+    hashes = hash_of(values.T, 0)
+    order = np.argsort(hashes)
+    new = np.append(True, hashes[order[1:]] != hashes[order[:-1]])
+    rows = np.empty(len(values), np.int64)
+    rows[order] = np.cumsum(new) - 1
+    table = values[order[new]]
+    return (rows, table) if np.array_equal(table[rows], values) else (np.arange(len(values)), values)
 
 
 def _level_order(tree) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
