@@ -176,28 +176,27 @@ def pair_counts(
 
 
 def regroup(
-    counts: npt.NDArray[np.int64],
-    row_classes: Iterable[int],
-    column_classes: Iterable[int],
-    rows: Sequence[int],
-    columns: Sequence[int],
-) -> npt.NDArray[np.int64]:
-    """Counts with the rows and columns of one class added up.
+    rows: Sequence[int], *tables: tuple[npt.NDArray[np.int64], Iterable[int], Iterable[int]]
+) -> tuple[tuple[int, ...], npt.NDArray[np.int64]]:
+    """One matrix of several tables, with the rows and columns of one class added up.
 
     Parameters
     ----------
-    counts : (R, C) int64
-    row_classes, column_classes : R and C codes
-        The class that each row and column of `counts` belongs to.
-    rows, columns : sequence of int
-        Classes of the new matrix; those of other rows and columns of `counts` are among them.
+    rows : sequence of int
+        Classes of the matrix's rows; every table's are among them.
+    *tables : ((R, C) int64, R codes, C codes)
+        Counts, and the class that each row and column belongs to.
 
     Returns
     -------
-    (len(rows), len(columns)) int64
+    columns : tuple of int
+        `rows`, then the other classes of the tables' columns, ascending.
+    matrix : (len(rows), len(columns)) int64
     """
+    columns = (*rows, *sorted({int(c) for _, _, given in tables for c in given} - set(rows)))
     out = np.zeros((len(rows), len(columns)), np.int64)
-    i = np.array([rows.index(int(c)) for c in row_classes], dtype=int)
-    j = np.array([columns.index(int(c)) for c in column_classes], dtype=int)
-    np.add.at(out, (i[:, None], j[None, :]), counts)
-    return out
+    for counts, of_rows, of_columns in tables:
+        i = np.array([rows.index(int(c)) for c in of_rows], dtype=int)
+        j = np.array([columns.index(int(c)) for c in of_columns], dtype=int)
+        np.add.at(out, (i[:, None], j[None, :]), counts)
+    return columns, out

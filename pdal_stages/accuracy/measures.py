@@ -166,9 +166,9 @@ class Accuracy:
                 cure="Name classes the reference has, or ignore fewer" if left else None,
             )
         counts = counts[kept]
-        given_classes = merged.target_of[found_predicted[counts.any(axis=0)]]
-        columns = rows + tuple(sorted(set(given_classes.tolist()) - set(rows)))
-        counts = counts[:, counts.any(axis=0)]
+        given_to = counts.any(axis=0)
+        of_rows, of_columns = merged.target_of[found[kept]], merged.target_of[found_predicted[given_to]]
+        columns, matrix = regroup(rows, (counts[:, given_to], of_rows, of_columns))
 
         compared = np.isin(np.arange(len(merged.target_of)), found[kept])
         graded = {key: Grading.empty() for key in confidences}
@@ -181,7 +181,7 @@ class Accuracy:
         return cls(
             rows,
             columns[len(rows) :],
-            regroup(counts, merged.target_of[found[kept]], given_classes, rows, columns),
+            matrix,
             class_names((*columns, *left), {**merged.names, **(names or {})}),
             left,
             graded.get("reliability"),
@@ -233,8 +233,9 @@ class Accuracy:
         do not know them, are dropped; use `merge` of :meth:`from_labels` to keep them.
         """
         merged = Merge.parse(mapping)
-        rows = tuple(sorted({int(merged.target_of[c]) for c in self.classes}))
-        columns = rows + tuple(sorted({int(merged.target_of[c]) for c in self.columns} - set(rows)))
+        of_rows, of_columns = merged.target_of[list(self.classes)], merged.target_of[list(self.columns)]
+        rows = tuple(np.unique(of_rows).tolist())
+        columns, matrix = regroup(rows, (self.matrix, of_rows, of_columns))
         self._refuse_clash(
             [int(merged.target_of[c]) for c in self.left_out],
             rows,
@@ -242,17 +243,10 @@ class Accuracy:
             "Compare the labels again with this merge",
         )
         known = {c: n for c, n in self.names.items() if int(merged.target_of[c]) == c}
-        counts = regroup(
-            self.matrix,
-            merged.target_of[list(self.classes)],
-            merged.target_of[list(self.columns)],
-            rows,
-            columns,
-        )
         return Accuracy(
             rows,
             columns[len(rows) :],
-            counts,
+            matrix,
             class_names((*columns, *self.left_out), {**known, **merged.names, **(names or {})}),
             self.left_out,
             merged={**{c: int(merged.target_of[t]) for c, t in self.merged.items()}, **merged.changed},
@@ -271,7 +265,8 @@ class Accuracy:
         if not isinstance(other, Accuracy):
             return NotImplemented
         rows = tuple(sorted(set(self.classes) | set(other.classes)))
-        columns = rows + tuple(sorted((set(self.columns) | set(other.columns)) - set(rows)))
+        tables = ((one.matrix, one.classes, one.columns) for one in (self, other))
+        columns, matrix = regroup(rows, *tables)
         left = {
             c: self.left_out.get(c, 0) + other.left_out.get(c, 0)
             for c in sorted(set(self.left_out) | set(other.left_out))
@@ -291,19 +286,17 @@ class Accuracy:
         graded = {}
         for key in ("reliability", "margin"):
             a, b = getattr(self, key), getattr(other, key)
+            # An empty tile has nothing to grade; anything else that lacks one would make it a curve of some points.
             if a is not None and b is not None:
                 graded[key] = a + b
-            elif a is None and b is None:
-                graded[key] = None
+            elif b is None:
+                graded[key] = a if other.points == 0 else None
             else:
-                have, lack = (self, other) if b is None else (other, self)
-                # An empty tile has nothing to grade; anything else would be a curve of only some points.
-                graded[key] = getattr(have, key) if lack.points == 0 else None
+                graded[key] = b if self.points == 0 else None
         return Accuracy(
             rows,
             columns[len(rows) :],
-            regroup(self.matrix, self.classes, self.columns, rows, columns)
-            + regroup(other.matrix, other.classes, other.columns, rows, columns),
+            matrix,
             {**other.names, **self.names},
             left,
             graded["reliability"],
