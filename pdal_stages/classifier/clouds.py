@@ -1,16 +1,17 @@
-"""Labelled clouds to train on, and the classes their labels make."""
+"""Labelled clouds to train on: prepared, kept on disk where they need not fit in memory, and the classes they have."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..base.asprs import UNINFORMATIVE
-from ..base.errors import OptionError
+from ..base.errors import OptionError, StageError
 from ..features.voxels import represent
 from .classes import MAX_LABEL, ClassMap, as_labels
 from .dimensions import known
@@ -92,6 +93,37 @@ def prepared(sources: Iterable[Source], options: TrainingOptions) -> Iterator[Tr
             rows = thinned(cloud.xyz, wanted, options.seed)
             if rows is not None and len(rows):
                 yield cloud.part(rows, f"thinned to {wanted:g} per m2")
+
+
+def spooled(clouds: Iterable[TrainingCloud], folder: Path) -> list[TrainingCloud]:
+    """The clouds with their arrays in files of `folder`, mapped when looked at: one cloud at a time is in memory."""
+    return [_mapped(one, folder, number) for number, one in enumerate(clouds)]
+
+
+def _mapped(cloud: TrainingCloud, folder: Path, number: int) -> TrainingCloud:
+    def kept(name: str, array: npt.ArrayLike | None) -> Any:
+        if array is None:
+            return None
+        path = folder / f"{number}.{name}.npy"
+        try:
+            np.save(path, np.asarray(array), allow_pickle=False)
+            return np.load(path, mmap_mode="r", allow_pickle=False)
+        except OSError as error:
+            raise StageError(
+                "training clouds cannot be kept in a temporary folder",
+                found=f"{folder}: {error.strerror or error}",
+                cure="Set TMPDIR to a folder with more room",
+            ) from error
+
+    return TrainingCloud(
+        kept("xyz", cloud.xyz),
+        kept("labels", cloud.labels),
+        {name: kept(f"d{place}", cloud.dimensions[name]) for place, name in enumerate(cloud.dimensions)},
+        cloud.name,
+        kept("mask", cloud.mask),
+        cloud.survey,
+        cloud.copy,
+    )
 
 
 @dataclass(frozen=True, eq=False)

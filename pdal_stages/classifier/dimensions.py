@@ -100,9 +100,8 @@ def gather(
     DimensionError
         A dimension is missing, of another length, or not finite somewhere.
     """
-    names = tuple(names)
-    picked: dict[str, npt.NDArray[Any]] = {}
-    for name in required(names):
+
+    def picked(name: str) -> npt.NDArray[Any]:
         if name not in dimensions:
             cure = _MAKERS.get(name, f"Put the stage that creates {name} before this one")
             raise DimensionError(f"the dimension {name} is missing", where=where, cure=cure)
@@ -115,35 +114,36 @@ def gather(
             )
         if values.dtype.kind not in "fiub":
             raise DimensionError(f"the dimension {name} is not numeric", where=where, found=str(values.dtype))
-        picked[name] = values if rows is None else values[rows]
-        if values.dtype.kind == "f":
-            bad = int(np.count_nonzero(~np.isfinite(picked[name])))
-            if bad:
-                raise DimensionError(
-                    f"the dimension {name} is not finite at some points",
-                    where=where,
-                    found=f"{bad:,} points",
-                    cure=f"Remove them before this stage. {_MAKERS.get(name, '')}",
-                )
+        values = values if rows is None else values[rows]
+        bad = np.count_nonzero(~np.isfinite(values)) if values.dtype.kind == "f" else 0
+        if bad:
+            raise DimensionError(
+                f"the dimension {name} is not finite at some points",
+                where=where,
+                found=f"{bad:,} points",
+                cure=f"Remove them before this stage. {_MAKERS.get(name, '')}",
+            )
+        return values
+
     notes: dict[str, int] = {}
     out = {}
     for name in names:
         if name in COORDINATES:
             continue
-        if returns.parse(name) is not None:
-            out[name] = np.asarray(dimensions[name] if rows is None else np.asarray(dimensions[name])[rows])
-            continue
-        if name != RETURN_RATIO:
-            out[name] = picked[name]
-            continue
-        number, total = picked["ReturnNumber"], picked["NumberOfReturns"]
-        known = (number > 0) & (total > 0)
-        if len(total) and not known.any():
-            raise DimensionError(
-                "ReturnNumber or NumberOfReturns is 0 everywhere, so there is no ReturnRatio",
-                where=where,
-                cure="Use a model trained without ReturnRatio",
-            )
-        notes["points_without_return_numbers"] = int(np.count_nonzero(~known))
-        out[name] = np.where(known, number / np.maximum(total, 1), 1.0)
+        if returns.parse(name) is not None:  # made by with_returns
+            values = np.asarray(dimensions[name])
+            out[name] = values if rows is None else values[rows]
+        elif name != RETURN_RATIO:
+            out[name] = picked(name)
+        else:
+            number, total = picked("ReturnNumber"), picked("NumberOfReturns")
+            there = (number > 0) & (total > 0)
+            if len(total) and not there.any():
+                raise DimensionError(
+                    "ReturnNumber or NumberOfReturns is 0 everywhere, so there is no ReturnRatio",
+                    where=where,
+                    cure="Use a model trained without ReturnRatio",
+                )
+            notes["points_without_return_numbers"] = int(np.count_nonzero(~there))
+            out[name] = np.where(there, number / np.maximum(total, 1), 1.0)
     return out, notes

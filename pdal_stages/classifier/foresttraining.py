@@ -23,11 +23,10 @@ from .clouds import Labelled, TrainingCloud, label_classes
 from .context import Context
 from .dimensions import gather, required
 from .featureforest import FeatureForest, Features
-from .folds import Folds
+from .folds import FoldForests, Folds, sample_context
 from .forest import Forest
 from .growing import TreeOptions, grow
 from .model import Model
-from .outoffold import FoldForests, sample_context
 from .samplefeatures import must_fit, percentiles, sample_features
 from .sampling import Samples, draw_samples
 from .thinning import density_range

@@ -13,11 +13,10 @@ import numpy.typing as npt
 
 from ..base.errors import OptionError
 from .algorithms import trainer
-from .clouds import Source, TrainingCloud, prepared
+from .clouds import Source, TrainingCloud, prepared, spooled
 from .dimensions import required
 from .heights import ALWAYS, WHERE_THERE, heights, preparation_of
 from .model import Model
-from .spool import spooled
 from .trainoptions import TrainingOptions
 
 
