@@ -11,7 +11,7 @@ The bounds are measured here, on one core, by loops that do nothing else:
 - *nodes*: walking one tree that fits the first cache, eight rows at a time.
 
 What a part needs is counted on the cloud: neighbors by SciPy's kd-tree round a sample of the points, visited nodes in the
-forest's own trees, bytes from the sizes of what must be read and written once. A part's bound is the larger of the two times.
+forest's own trees, bytes from the sizes of what must be read and written once. Its bound is the larger of the two times.
 """
 
 from __future__ import annotations
