@@ -21,19 +21,11 @@ BINS = 1000
 
 @dataclass(frozen=True, eq=False)
 class Grading:
-    """A histogram of a confidence, with the points whose class is right.
+    """A histogram of a confidence, with the points whose class is right: 1000 bins of width 0.001."""
 
-    Attributes
-    ----------
-    count, right : (1000,) int64
-        Points, and points with the right class, for each bin of width 0.001.
-    total : (1000,) float64
-        The sum of the confidence of the bin's points.
-    """
-
-    count: npt.NDArray[np.int64]
-    right: npt.NDArray[np.int64]
-    total: npt.NDArray[np.float64]
+    count: npt.NDArray[np.int64]  #: (1000,) points of each bin
+    right: npt.NDArray[np.int64]  #: (1000,) those with the right class
+    total: npt.NDArray[np.float64]  #: (1000,) the sum of their confidence
 
     @classmethod
     def empty(cls) -> Grading:

@@ -81,18 +81,10 @@ def class_names(codes: Iterable[int], given: Mapping[Any, str] | None) -> dict[i
 
 @dataclass(frozen=True)
 class Merge:
-    """Classes taken as one, on both sides of a comparison.
+    """Classes taken as one, on both sides of a comparison."""
 
-    Attributes
-    ----------
-    target_of : (65536,) int64
-        The class that every code becomes.
-    names : dict of int to str
-        Names of the classes made of several.
-    """
-
-    target_of: npt.NDArray[np.int64]
-    names: dict[int, str]
+    target_of: npt.NDArray[np.int64]  #: (65536,) the class that every code becomes
+    names: dict[int, str]  #: of the classes made of several
 
     @classmethod
     def parse(cls, mapping: Mapping[Any, Any] | None) -> Merge:

@@ -35,27 +35,14 @@ METRES = 10.0
 
 @dataclass(frozen=True, eq=False)
 class AlsNet:
-    """A trained network.
-
-    Parameters
-    ----------
-    weights : dict of str to float32 array
-    configuration : Configuration
-    inputs : tuple of str
-        Names of the inputs.
-    mean, scale : tuple of float
-        An input is (value - mean) / scale.
-    spacing : float
-        Of the batches' grid, metres.
-    n_classes : int
-    """
+    """A trained network."""
 
     weights: Weights
     configuration: Configuration
-    inputs: tuple[str, ...]
-    mean: tuple[float, ...]
+    inputs: tuple[str, ...]  #: their names
+    mean: tuple[float, ...]  #: an input is (value - mean) / scale
     scale: tuple[float, ...]
-    spacing: float
+    spacing: float  #: of the batches' grid, metres
     n_classes: int
 
     name: ClassVar[str] = "alsnet"

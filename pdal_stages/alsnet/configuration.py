@@ -21,27 +21,14 @@ MAX_LAYERS = 60
 
 @dataclass(frozen=True)
 class Level:
-    """One level of set abstraction and the feature propagation back from it.
+    """One level of set abstraction and the feature propagation back from it."""
 
-    Attributes
-    ----------
-    centres : int
-        Points kept, by farthest point sampling; all where there are fewer.
-    radius : float
-        Of the ball around each centre, metres.
-    samples : int
-        Points taken from a ball.
-    mlp : tuple of int
-        Widths of the shared perceptron over a ball's points; the maximum over the points follows.
-    up : tuple of int
-        Widths of the shared perceptron after interpolation to the level above.
-    """
-
-    centres: int
-    radius: float
-    samples: int
+    centres: int  #: points kept, by farthest point sampling; all where there are fewer
+    radius: float  #: of the ball around each centre, metres
+    samples: int  #: points taken from a ball
+    #: widths of the shared perceptron over a ball's points; the maximum over the points follows
     mlp: tuple[int, ...]
-    up: tuple[int, ...]
+    up: tuple[int, ...]  #: widths of the shared perceptron after interpolation to the level above
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
@@ -54,25 +41,14 @@ class Level:
 
 @dataclass(frozen=True)
 class Configuration:
-    """A whole network, but for the number of inputs and classes.
-
-    Attributes
-    ----------
-    name : str
-    points : int
-        Points of a batch: the nearest around a grid point.
-    levels : tuple of Level
-    head : tuple of int
-        Widths after the last propagation; dropout follows, then one linear layer to the classes.
-    dropout : float
-        Share of the head's outputs left out in training.
-    """
+    """A whole network, but for the number of inputs and classes."""
 
     name: str
-    points: int
+    points: int  #: of a batch: the nearest around a grid point
     levels: tuple[Level, ...]
+    #: widths after the last propagation; dropout follows, then one linear layer to the classes
     head: tuple[int, ...] = (128,)
-    dropout: float = 0.5
+    dropout: float = 0.5  #: share of the head's outputs left out in training
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__

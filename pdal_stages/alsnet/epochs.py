@@ -30,38 +30,20 @@ from .weights import Weights, check, fresh
 
 @dataclass(frozen=True, eq=False)
 class LabelledCloud:
-    """A cloud to train on.
+    """A cloud to train on."""
 
-    Attributes
-    ----------
-    xyz : (n, 3) float64
-    position : (n,) int
-        Place of each point's class; -1 is not trained on, but is a neighbor.
-    dimensions : dict
-        Name to (n,) values of the inputs that are dimensions.
-    """
-
-    xyz: npt.NDArray[np.float64]
-    position: npt.NDArray[Any]
-    dimensions: dict[str, npt.NDArray[Any]]
+    xyz: npt.NDArray[np.float64]  #: (n, 3) metres
+    position: npt.NDArray[Any]  #: (n,) place of each point's class; -1 is not trained on, but is a neighbor
+    dimensions: dict[str, npt.NDArray[Any]]  #: name to (n,) values of the inputs that are dimensions
 
 
 @dataclass(eq=False)
 class Trained:
-    """What training gives.
-
-    Attributes
-    ----------
-    net : AlsNet
-    notes : dict
-        For the manifest: batches, epochs, curve, validation.
-    seconds : dict
-        Where the time went.
-    """
+    """What training gives."""
 
     net: AlsNet
-    notes: dict[str, Any]
-    seconds: dict[str, float] = field(default_factory=dict)
+    notes: dict[str, Any]  #: for the manifest: batches, epochs, curve, validation
+    seconds: dict[str, float] = field(default_factory=dict)  #: where the time went
 
 
 def train_network(

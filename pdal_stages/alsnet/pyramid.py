@@ -19,40 +19,21 @@ from .farthest import ball_query, farthest_points, three_nearest
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """From one level to the next coarser one, and back.
+    """From one level to the next coarser one, and back."""
 
-    Attributes
-    ----------
-    groups : (m, samples) int32
-        Points of each ball, as rows of the finer level.
-    offsets : (m, samples, 3) float32
-        Their coordinates from the ball's centre, divided by the radius.
-    near : (n, 3) int32
-        For each point of the finer level, three rows of the coarser one.
-    weights : (n, 3) float32
-        Of those; they sum to 1.
-    """
-
-    groups: npt.NDArray[np.int32]
+    groups: npt.NDArray[np.int32]  #: (m, samples) points of each ball, as rows of the finer level
+    #: (m, samples, 3) their coordinates from the ball's centre, divided by the radius
     offsets: npt.NDArray[np.float32]
-    near: npt.NDArray[np.int32]
-    weights: npt.NDArray[np.float32]
+    near: npt.NDArray[np.int32]  #: (n, 3) for each point of the finer level, three rows of the coarser one
+    weights: npt.NDArray[np.float32]  #: (n, 3) of those; they sum to 1
 
 
 @dataclass(frozen=True, eq=False)
 class Pyramid:
-    """A batch ready for the network.
+    """A batch ready for the network."""
 
-    Attributes
-    ----------
-    inputs : (n, inputs) float32
-        Of each point, in the batch's own order.
-    steps : tuple of Step
-        From fine to coarse.
-    """
-
-    inputs: npt.NDArray[np.float32]
-    steps: tuple[Step, ...]
+    inputs: npt.NDArray[np.float32]  #: (n, inputs) of each point, in the batch's own order
+    steps: tuple[Step, ...]  #: from fine to coarse
 
 
 def scramble(xyz: npt.NDArray[np.float64], seed: int = 0) -> npt.NDArray[np.int64]:

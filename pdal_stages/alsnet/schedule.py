@@ -29,20 +29,11 @@ def spread(histogram: npt.NDArray[Any]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """Batches chosen for training.
-
-    Attributes
-    ----------
-    batches : list of (cloud, circle)
-    all : int
-        How many there were.
-    added : int
-        How many were taken in spite of their spread, for a class that had no other.
-    """
+    """Batches chosen for training."""
 
     batches: list[Batch]
-    all: int
-    added: int
+    all: int  #: how many there were
+    added: int  #: how many were taken in spite of their spread, for a class that had no other
 
 
 def choose(

@@ -26,23 +26,12 @@ KINDS = {
 
 @dataclass(frozen=True)
 class InputPlan:
-    """What a classifier looks at, where a :class:`FeaturePlan` does not say it.
+    """What a classifier looks at, where a :class:`FeaturePlan` does not say it."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Its inputs, in order.
-    dimensions : tuple of str
-        Which of them are dimensions of the points.
-    halo : float
-        Metres around a tile whose points the tile's results depend on.
-    most_neighbors : int
-        The most neighbors a point is asked for, where their number decides how far away they are.
-    """
-
-    names: tuple[str, ...]
-    dimensions: tuple[str, ...]
-    halo: float
+    names: tuple[str, ...]  #: its inputs, in order
+    dimensions: tuple[str, ...]  #: which of them are dimensions of the points
+    halo: float  #: metres around a tile whose points the tile's results depend on
+    #: the most a point is asked for, where their number decides how far away they are
     most_neighbors: int = 0
 
 
@@ -57,28 +46,15 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """A cloud, and the points of it that are to be classified.
+    """A cloud, and the points of it that are to be classified."""
 
-    Attributes
-    ----------
-    xyz : (n, 3) float64
-        Coordinates in metres.
-    dimensions : mapping
-        Name to (n,) values.
-    rows : (m,) int64, ascending, or None
-        Points wanted, None for all. The others are neighbors.
-    threads, memory_mb
-        Cores to use, and memory for work under way.
-    progress : object or None
-        Its ``update`` is called with the points done.
-    """
-
-    xyz: npt.NDArray[np.float64]
-    dimensions: Mapping[str, npt.ArrayLike]
+    xyz: npt.NDArray[np.float64]  #: (n, 3) metres
+    dimensions: Mapping[str, npt.ArrayLike]  #: name to (n,) values
+    #: (m,) points wanted, ascending; None for all; the others are neighbors
     rows: npt.NDArray[np.int64] | None = None
     threads: int | None = None
-    memory_mb: float = 512.0
-    progress: Any = None
+    memory_mb: float = 512.0  #: for work under way
+    progress: Any = None  #: its ``update`` is called with the points done
 
     @property
     def count(self) -> int:
@@ -107,22 +83,12 @@ class Answer:
 
 
 class Algorithm(Protocol):
-    """A trained classifier of clouds.
+    """A trained classifier of clouds."""
 
-    Attributes
-    ----------
-    name : str
-        The word in the manifest.
-    rules : mapping
-        Array of a model file to what it must be; a name that ends in ``*`` stands for many.
-    gives_variance : bool
-        Whether its blocks have a variance.
-    plan : FeaturePlan or InputPlan
-    """
-
-    name: ClassVar[str]
+    name: ClassVar[str]  #: the word in the manifest
+    #: of a model file's arrays; a name that ends in ``*`` stands for many
     rules: ClassVar[Mapping[str, ArrayRule]]
-    gives_variance: ClassVar[bool]
+    gives_variance: ClassVar[bool]  #: whether its blocks have a variance
 
     @property
     def plan(self) -> FeaturePlan | InputPlan: ...

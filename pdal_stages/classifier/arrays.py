@@ -21,18 +21,10 @@ _MAGIC = b"\x93NUMPY\x01\x00"
 
 @dataclass(frozen=True)
 class ArrayRule:
-    """What an algorithm expects of one of its arrays.
+    """What an algorithm expects of one of its arrays."""
 
-    Attributes
-    ----------
-    dtypes : tuple of str
-        Allowed types, as NumPy writes them: ``<f4``.
-    ndim : int or None
-        Number of axes; None where any will do.
-    """
-
-    dtypes: tuple[str, ...]
-    ndim: int | None = None
+    dtypes: tuple[str, ...]  #: allowed types, as NumPy writes them: ``<f4``
+    ndim: int | None = None  #: number of axes; None where any will do
 
 
 def to_bytes(array: npt.NDArray[Any]) -> bytes:

@@ -48,20 +48,11 @@ _CURE = (
 
 @dataclass(frozen=True)
 class ClassMap:
-    """Classes a model tells apart, and the labels each is made of.
+    """Classes a model tells apart, and the labels each is made of."""
 
-    Attributes
-    ----------
-    codes : tuple of int
-        ASPRS codes written to points, ascending.
-    names : tuple of str
-    labels : tuple of tuple of int
-        Labels in the training clouds that become the class.
-    """
-
-    codes: tuple[int, ...]
+    codes: tuple[int, ...]  #: ASPRS codes written to points, ascending
     names: tuple[str, ...]
-    labels: tuple[tuple[int, ...], ...]
+    labels: tuple[tuple[int, ...], ...]  #: labels in the training clouds that become the class
 
     @classmethod
     def parse(cls, spec: Any, found: Iterable[int] = ()) -> ClassMap:

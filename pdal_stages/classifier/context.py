@@ -55,20 +55,9 @@ class Scale:
 
 @dataclass(frozen=True)
 class Context:
-    """Which features of the surroundings a pass reads.
+    """Which features of the surroundings a pass reads; OptionError for a token that is not one."""
 
-    Attributes
-    ----------
-    tokens : tuple of str
-        ``own``, or a word of :data:`KINDS` and a side: ``box1``, ``column2``, ``columnvotes8``.
-
-    Raises
-    ------
-    OptionError
-        For a token that is not one.
-    """
-
-    tokens: tuple[str, ...]
+    tokens: tuple[str, ...]  #: ``own``, or a word of :data:`KINDS` and a side: ``box1``, ``columnvotes8``
 
     def __post_init__(self) -> None:
         self.scales  # noqa: B018  refused when it is made

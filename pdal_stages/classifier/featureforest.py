@@ -23,28 +23,12 @@ from .forest import Forest
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Features and what training fitted to compute them.
-
-    Attributes
-    ----------
-    plan : FeaturePlan
-    bins : ShapeBins or None
-        Thresholds of the shape distributions' histograms.
-    copt_threshold : float or None
-        Curvature threshold of ``copt``.
-    seed : int
-        Of the shape distributions' random pulls.
-
-    Raises
-    ------
-    ModelError
-        Where something is missing that the features need.
-    """
+    """Features and what training fitted to compute them; ModelError where something is missing that they need."""
 
     plan: FeaturePlan
-    bins: ShapeBins | None = None
-    copt_threshold: float | None = None
-    seed: int = 0
+    bins: ShapeBins | None = None  #: thresholds of the shape distributions' histograms
+    copt_threshold: float | None = None  #: curvature threshold of ``copt``
+    seed: int = 0  #: of the shape distributions' random pulls
 
     def __post_init__(self) -> None:
         there = {} if self.bins is None else self.bins.to_dict()
@@ -97,19 +81,11 @@ def shared_features(text: str) -> Features:
 
 @dataclass(frozen=True, eq=False)
 class FeatureForest:
-    """A forest and what it reads.
-
-    Attributes
-    ----------
-    features : Features
-    forest : Forest
-    context : Context or None
-        What it reads of the pass before, after the features.
-    """
+    """A forest and what it reads."""
 
     features: Features
     forest: Forest
-    context: Context | None = None
+    context: Context | None = None  #: what it reads of the pass before, after the features
 
     name: ClassVar[str] = "random_forest"
     rules: ClassVar[Mapping[str, ArrayRule]] = Forest.rules

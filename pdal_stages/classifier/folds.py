@@ -29,19 +29,11 @@ WIDTH, NARROWEST = 10.0, 0.01
 
 @dataclass(frozen=True)
 class Folds:
-    """Which part of the training ground a point belongs to.
-
-    Attributes
-    ----------
-    count : int
-    surveys : dict of str to int, or None
-        Fold of each survey, where whole surveys are folds.
-    width : float
-        Metres of a strip along the diagonal otherwise; every `count`-th strip is of the same fold.
-    """
+    """Which part of the training ground a point belongs to."""
 
     count: int
-    surveys: dict[str, int] | None = None
+    surveys: dict[str, int] | None = None  #: fold of each survey, where whole surveys are folds
+    #: metres of a strip along the diagonal otherwise; every `count`-th strip is of the same fold
     width: float = WIDTH
 
     @classmethod
@@ -108,21 +100,12 @@ def _strip(xyz: npt.NDArray[np.float64], width: float) -> npt.NDArray[np.int64]:
 
 @dataclass(frozen=True, eq=False)
 class FoldForests:
-    """A forest per fold, each grown without it, as one pass over one cloud.
-
-    Attributes
-    ----------
-    features : Features
-    context : Context or None
-    forests : sequence of Forest
-    fold : (n,) int16
-        Of every point of the cloud: the forest that judges it.
-    """
+    """A forest per fold, each grown without it, as one pass over one cloud."""
 
     features: Features
     context: Context | None
     forests: Sequence[Forest]
-    fold: npt.NDArray[np.int16]
+    fold: npt.NDArray[np.int16]  #: (n,) of every point of the cloud: the forest that judges it
 
     def probabilities(
         self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64]

@@ -22,16 +22,9 @@ _KEPT = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Passes:
-    """Two or more passes.
+    """Two or more passes."""
 
-    Attributes
-    ----------
-    members : tuple
-        Any :class:`Algorithm`, then such as read context: with ``features``, ``context`` and
-        ``probabilities(values, rows)``, as a :class:`FeatureForest` has them.
-    classes : int
-    """
-
+    #: any :class:`Algorithm`, then such with ``features``, ``context`` and ``probabilities(values, rows)``
     members: tuple[Any, ...]
     classes: int
 

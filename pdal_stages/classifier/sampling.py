@@ -30,25 +30,14 @@ Clouds = Any
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Points drawn for training; each once, with the number of times it counts.
+    """Points drawn for training; each once, with the number of times it counts."""
 
-    Attributes
-    ----------
-    cloud, row : (m,) int64
-        Which cloud, and which of its points.
-    label : (m,) int16
-        Position of the class.
-    weight : (m,) int64
-        Times the sample counts; above 1 where a class has fewer points than samples asked for.
-    available : tuple of int
-        Points each class has in all clouds.
-    """
-
-    cloud: npt.NDArray[np.int64]
-    row: npt.NDArray[np.int64]
-    label: npt.NDArray[np.int16]
+    cloud: npt.NDArray[np.int64]  #: (m,) which cloud
+    row: npt.NDArray[np.int64]  #: (m,) which of its points
+    label: npt.NDArray[np.int16]  #: (m,) position of the class
+    #: (m,) times the sample counts; above 1 where a class has fewer points than samples asked for
     weight: npt.NDArray[np.int64]
-    available: tuple[int, ...]
+    available: tuple[int, ...]  #: points each class has in all clouds
 
     def __len__(self) -> int:
         return len(self.row)

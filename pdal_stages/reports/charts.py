@@ -13,41 +13,23 @@ Tick = tuple[float, str]
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart.
+    """A chart."""
 
-    Attributes
-    ----------
-    heading, caption : str
-        Above and below it.
-    alt : str
-        What it shows, in words.
-    x_label, y_label : str
-        The axes' titles.
-    x, y : (low, high)
-        The axes' ranges.
-    x_ticks, y_ticks : sequence of (position, text)
-    bars : sequence of (left, right, top, kind, title)
-        `kind` is "faint" or "bad"; the title shows on hovering.
-    lines : sequence of (points, kind)
-        `kind` is "line" or "ideal" (dashed).
-    dots : sequence of (x, y, title)
-    values : sequence of (x, y, text)
-        Text centred above a place.
-    """
-
-    heading: str
-    alt: str
-    x_label: str
+    heading: str  #: above it
+    alt: str  #: what it shows, in words
+    x_label: str  #: the axes' titles
     y_label: str
-    caption: str = ""
-    x: tuple[float, float] = (0.0, 1.0)
+    caption: str = ""  #: below it
+    x: tuple[float, float] = (0.0, 1.0)  #: the axes' ranges
     y: tuple[float, float] = (0.0, 1.0)
     x_ticks: Sequence[Tick] = ()
     y_ticks: Sequence[Tick] = ()
+    #: left, right, top, kind ("faint" or "bad"), and a title that shows on hovering
     bars: Sequence[tuple[float, float, float, str, str]] = ()
+    #: points, and a kind: "line" or "ideal" (dashed)
     lines: Sequence[tuple[Sequence[tuple[float, float]], str]] = ()
-    dots: Sequence[tuple[float, float, str]] = ()
-    values: Sequence[tuple[float, float, str]] = ()
+    dots: Sequence[tuple[float, float, str]] = ()  #: x, y, title
+    values: Sequence[tuple[float, float, str]] = ()  #: x, y, and text centred above that place
 
     #: Size of the drawing, and what is left for the axes' texts.
     WIDE: ClassVar = 520

@@ -34,28 +34,15 @@ Key = tuple[tuple[int, int, int], str]
 
 @dataclass(frozen=True)
 class Picture:
-    """An image of the page, ready for the template.
-
-    Attributes
-    ----------
-    heading, alt : str
-    base64 : str
-        The PNG.
-    wide, tall : int
-        Pixels.
-    scale : (float, str), optional
-        A bar's share of the width in percent, and its length in words.
-    line : str
-        An SVG path drawn over it, in percent of width and height.
-    """
+    """An image of the page, ready for the template."""
 
     heading: str
     alt: str
-    base64: str
-    wide: int
+    base64: str  #: the PNG
+    wide: int  #: pixels
     tall: int
-    scale: tuple[float, str] | None = None
-    line: str = ""
+    scale: tuple[float, str] | None = None  #: a bar's share of the width in percent, and its length in words
+    line: str = ""  #: an SVG path drawn over it, in percent of width and height
 
     @classmethod
     def of(cls, view: npt.NDArray[np.uint8], heading: str, alt: str, **more: Any) -> Picture:
@@ -88,20 +75,13 @@ class DrawnScene:
 
 @dataclass(frozen=True)
 class Scene:
-    """Points with merged classes, and which of them are compared and wrong.
+    """Points with merged classes, and which of them are compared and wrong."""
 
-    Attributes
-    ----------
-    xyz : (n, 3) float64
-    reference, predicted : (n,) int
-    compared, wrong : (n,) bool
-    """
-
-    xyz: npt.NDArray[np.float64]
-    reference: npt.NDArray[Any]
-    predicted: npt.NDArray[Any]
-    compared: npt.NDArray[np.bool_]
-    wrong: npt.NDArray[np.bool_]
+    xyz: npt.NDArray[np.float64]  #: (n, 3)
+    reference: npt.NDArray[Any]  #: (n,)
+    predicted: npt.NDArray[Any]  #: (n,)
+    compared: npt.NDArray[np.bool_]  #: (n,)
+    wrong: npt.NDArray[np.bool_]  #: (n,)
 
     @classmethod
     def of(cls, a: Accuracy, xyz: Any, reference: Any, predicted: Any) -> Scene:
