@@ -18,7 +18,7 @@ from typing import Any
 from .base import kinds
 from .base.errors import StageError, suggest
 from .base.outputs import Output, check_outputs
-from .base.plain import PlainStream
+from .base.plain import PlainStream, tell
 from .base.runlog import LoggedStream, RunLog
 from .base.version import __version__
 from .pipeline.overrides import parse_overrides
@@ -78,14 +78,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except KeyboardInterrupt:
         code = 130
-        print("pdal-stages: interrupted; nothing half-written was left", file=sys.stderr)
+        tell("interrupted; nothing half-written was left")
         return code
     except Exception as error:
         code = 1
         if debug:
             raise
-        message = error if isinstance(error, StageError) else _unforeseen(error)
-        print(f"pdal-stages: {message}", file=sys.stderr)
+        tell(str(error if isinstance(error, StageError) else _unforeseen(error)))
         return code
     finally:
         if log is not None:
@@ -329,13 +328,8 @@ def _pipeline(options: argparse.Namespace) -> int | None:
 def _run(options: argparse.Namespace, pipeline) -> int:
     """Run a pipeline and tell what it has to say; the number of points."""
     count, said = _ran(options, pipeline)
-    _tell(said)
+    tell(*said)
     return count
-
-
-def _tell(said: Sequence[str]) -> None:
-    for line in said:
-        print(f"pdal-stages: {line}", file=sys.stderr)
 
 
 def _ran(options: argparse.Namespace, pipeline) -> tuple[int, list[str]]:
@@ -376,7 +370,7 @@ def _validate(options: argparse.Namespace) -> int:
     except StageError as error:
         verdict = {"valid": False, "error_detail": str(error), "streamable": False}
         print(json.dumps(verdict, indent=2))
-        print(f"pdal-stages: {error}", file=sys.stderr)
+        tell(str(error))
         return 1
     return 0
 
@@ -407,7 +401,7 @@ def _classify(options: argparse.Namespace) -> int:
     work = [(source, target, options) for source, target in zip(inputs, outputs, strict=True)]
     if len(work) == 1:
         result, said = _classify_one(*work[0])
-        _tell(said)
+        tell(*said)
         _print_classes([result], options.model)
         return 0
     done, failed, told = [], 0, _ToldOnce()
@@ -429,7 +423,7 @@ def _classify(options: argparse.Namespace) -> int:
         )
     _print_classes(done, options.model)
     if failed:
-        print(f"pdal-stages: {failed} of {len(work)} files failed", file=sys.stderr)
+        tell(f"{failed} of {len(work)} files failed")
     return 1 if failed else 0
 
 
@@ -442,14 +436,14 @@ class _ToldOnce:
     def tell(self, file: str, text: str) -> None:
         text = text.removeprefix(f"{file}: ")
         if text not in self._files:
-            print(f"pdal-stages: {file}: {text}", file=sys.stderr)
+            tell(f"{file}: {text}")
         self._files.setdefault(text, []).append(file)
 
     def end(self) -> None:
         for text, (_, *others) in self._files.items():
             if others:
                 more = f" and {len(others) - 3:,} more" if len(others) > 3 else ""
-                print(f"pdal-stages: also {', '.join(others[:3])}{more}: {text}", file=sys.stderr)
+                tell(f"also {', '.join(others[:3])}{more}: {text}")
 
 
 def _classify_one(

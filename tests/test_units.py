@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pdal_stages.base.errors import OptionError, StageError
-from pdal_stages.base.units import parse_wkt, units_of_wkt
+from pdal_stages.base.units import Units, parse_wkt, units_of_wkt
 
 GEOGCS = (
     'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.25]],UNIT["degree",0.0174532925199433]]'
@@ -25,7 +25,7 @@ WKT2 = (
 
 
 def test_metres_and_feet():
-    assert units_of_wkt(METRES).metric
+    assert units_of_wkt(METRES) == Units()
     feet = units_of_wkt(FEET)
     assert feet.horizontal == pytest.approx(1200 / 3937)
     assert feet.vertical == feet.horizontal  # no vertical part: as x and y

@@ -206,15 +206,7 @@ def whole_files(
 
 
 class _Place:
-    """A hidden folder in which one output is written.
-
-    Attributes
-    ----------
-    path : Path
-        The output's name as it was given.
-    folder, partial : Path
-        The hidden folder, and the file in it.
-    """
+    """A hidden folder in which one output is written: `partial`, until it gets its name, `path`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from typing import Any
 
 _COMMANDS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
@@ -11,6 +12,12 @@ _COMMANDS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2
 def plain(text: str) -> str:
     """Text with such characters written as their codes; only line breaks and tabs stay."""
     return _COMMANDS.sub(lambda match: ascii(match.group())[1:-1], text)
+
+
+def tell(*lines: str) -> None:
+    """Say lines on standard error, as the command does."""
+    for line in lines:
+        print(f"pdal-stages: {line}", file=sys.stderr)
 
 
 class PlainStream:

@@ -9,9 +9,6 @@ from typing import Any
 #: Bytes looked at: at the beginning and the end, and at some places between.
 _ENDS, _BETWEEN, _PLACES = 1 << 16, 1 << 12, 8
 
-#: The stamp of what is not there, or is not a file.
-NONE = [-1, -1, ""]
-
 
 def stamp(path: str | os.PathLike) -> list[Any]:
     """Size, time of change, and a digest of samples: a copy, link or change of mode leaves it as it is.
@@ -26,5 +23,5 @@ def stamp(path: str | os.PathLike) -> list[Any]:
                 file.seek(at)
                 digest.update(file.read(_ENDS if at in (0, max(0, size - _ENDS)) else _BETWEEN))
     except OSError:
-        return NONE
+        return [-1, -1, ""]  # not there, or not a file
     return [size, status.st_mtime_ns, digest.hexdigest()[:16]]

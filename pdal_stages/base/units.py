@@ -32,11 +32,6 @@ class Units:
     vertical: float = 1.0
     assumed: bool = False
 
-    @property
-    def metric(self) -> bool:
-        """True where coordinates are metres already."""
-        return self.horizontal == 1.0 and self.vertical == 1.0
-
 
 def named_unit(name: str, option: str) -> float:
     """Metres per unit of a unit's name; :class:`OptionError` where it is not known."""

@@ -32,15 +32,7 @@ _CONVERT = (
 def splitter(stages: list[dict[str, Any]]) -> tuple[dict[str, Any], int] | None:
     """A filter that parts classes from flags, and the number of the last reader, after which it belongs.
 
-    Parameters
-    ----------
-    stages : list of dict
-        A pipeline.
-
-    Returns
-    -------
-    (dict, int) or None
-        None where flags come through as they are.
+    None where flags come through as they are.
 
     Raises
     ------

@@ -19,8 +19,7 @@ _NO_FILES = ("type", "tag", "inputs", "user_data", "pdalargs")
 
 def readers_files(stages: list[dict[str, Any]], *, las: bool = False) -> list[str]:
     """Local files that PDAL's readers read, patterns filled in; only LAS and LAZ files with `las`."""
-    last = len(stages) - 1
-    reading = [s for n, s in enumerate(stages) if s.get("type") or not 0 < n == last]
+    reading = [stage for stage in stages if not is_writer(stage, stages)]
     return [name for stage in reading for name in reader_files(stage, las=las)]
 
 

@@ -51,13 +51,7 @@ def classify_job(
 ) -> Pipeline:
     """Read, give heights if the model wants them, classify, write with everything else kept.
 
-    Parameters
-    ----------
-    source, target, model : str
-    overrides : sequence of Override
-    where : str, optional
-    dimensions : sequence of str
-        Which of the dimensions made on the way are written beside the input's own, or ``all``.
+    `dimensions` says which of those made on the way are written beside the input's own, or ``all``.
     """
     from ..stages.modelclassifier import loaded_model
 
@@ -170,15 +164,7 @@ def compare_files(
 ) -> None:
     """Compare files with others that hold the same points in the same order, in pairs of the same name.
 
-    Parameters
-    ----------
-    sources, references : sequence of str
-        Files, folders or patterns.
-    dimension, reference_dimension : str
-        The classes to judge in `sources`, and the true ones in `references`.
-    overrides : iterable of Override
-    **outputs
-        Options of ``filters.accuracy``.
+    Both are files, folders or patterns; `outputs` are options of ``filters.accuracy``.
 
     Raises
     ------

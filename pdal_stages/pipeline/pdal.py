@@ -77,9 +77,13 @@ def program() -> str:
     return found
 
 
+def _run_program(*arguments: str, **how: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([program(), *arguments], capture_output=True, text=True, check=False, **how)
+
+
 def ask_program(*arguments: str) -> str:
     """What `pdal` prints for some arguments."""
-    done = subprocess.run([program(), *arguments], capture_output=True, text=True, check=False, timeout=120)
+    done = _run_program(*arguments, timeout=120)
     if done.returncode:
         raise PipelineError(
             f"pdal {' '.join(arguments)} failed", found=(done.stderr or done.stdout).strip()[-500:]
@@ -219,14 +223,8 @@ def validate(stages: list[dict[str, Any]]) -> None:
     PipelineError, DependencyError
         As :func:`execute`.
     """
-    done = subprocess.run(
-        [program(), "pipeline", "--validate", "--stdin"],
-        input=json.dumps({"pipeline": adapted(stages)}),
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
+    text = json.dumps({"pipeline": adapted(stages)})
+    done = _run_program("pipeline", "--validate", "--stdin", input=text, timeout=300)
     try:
         verdict = json.loads(done.stdout)
     except ValueError:

@@ -43,12 +43,8 @@ class Processes(contextlib.AbstractContextManager):
     def run(self, waiting: deque, task_of: Callable[[Any], Task]) -> Iterator[tuple[Any, Answer]]:
         """Yield (item, answer) for every item, as they finish.
 
-        Parameters
-        ----------
-        waiting : deque
-            Items to do, from the left; more may be put in after every answer.
-        task_of : callable
-            Gives an item's task, just before it is sent.
+        They are taken from the left; more may be put in after every answer. `task_of` is asked for an item's task just
+        before that is sent.
         """
         busy: dict[_Worker, Any] = {}
         while waiting or busy:
@@ -76,16 +72,10 @@ class Processes(contextlib.AbstractContextManager):
 
 
 class _Worker:
-    """A process, and a thread here that waits for its answers.
-
-    Attributes
-    ----------
-    began : bool
-        Whether it got so far as to take tasks.
-    """
+    """A process, and a thread here that waits for its answers."""
 
     def __init__(self, threads: int, answers: queue.SimpleQueue) -> None:
-        self.began = False
+        self.began = False  #: whether it got so far as to take tasks
         self._answers = answers
         self.process = subprocess.Popen(
             _command(),
@@ -158,16 +148,9 @@ def _environment(threads: int) -> dict[str, str]:
 def each_file(
     function: Callable[..., Any], work: Sequence[tuple], workers: int = 1
 ) -> Iterator[tuple[tuple, Answer]]:
-    """Each item of work with what became of it, as they finish; one that fails does not stop the others.
+    """Each item of work, the function's arguments, with what became of it, as they finish; failures do not stop the rest.
 
-    Parameters
-    ----------
-    function : callable
-        Of a module's own, so that other processes find it.
-    work : sequence of tuple
-        Arguments.
-    workers : int
-        Processes; they share the cores.
+    The function is a module's own, so that other processes find it. They share the cores.
     """
     workers = min(checks.whole("--workers", workers, 1, 1024), len(work))
     if workers == 1:

@@ -40,14 +40,9 @@ class Reference:
 
 
 def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
-    """The reference of what a reader reads, as PDAL says.
+    """The reference of what a reader reads, as PDAL says; `horizontal`: the unit of x and y, where it is known better.
 
-    Parameters
-    ----------
-    reader : mapping
-        A stage with a type, restricted to as few points as it can be.
-    horizontal : str
-        Name of the unit of x and y, where it is known better.
+    The reader has a type, and is restricted to as few points as it can be.
 
     Raises
     ------
@@ -74,14 +69,7 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
 def check_one_reference(found: Mapping[str, Reference]) -> None:
     """Refuse inputs of different units or reference systems; where one names none, only units are compared.
 
-    Parameters
-    ----------
-    found : mapping of str to Reference
-        Of one input of each kind.
-
-    Raises
-    ------
-    StageError
+    `found` has one input of each kind, by path.
     """
     units: dict[object, str] = {}
     planes: dict[object, str] = {}

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import sys
-import threading
 from collections.abc import Mapping
 from typing import Any
 from weakref import WeakValueDictionary
@@ -40,7 +39,6 @@ def stage(ins, outs):
 #: Around a stage's message in the name of the array that PDAL refuses.
 _OPENING, _CLOSING = "of a stage that failed:\n\n", "\n\n"
 
-_lock = threading.Lock()
 _reports: dict[str, list[dict[str, Any]]] = {}
 _failures: dict[str, StageError] = {}
 _usual_stdout: Any = sys.__stdout__
@@ -88,12 +86,10 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
         module["out_metadata"] = _metadata_node(arguments["stage"], report)
     except BaseException as error:
         failure = as_stage_error(error, place(arguments["stage"], arguments.get("tag")))
-        with _lock:
-            _failures[label] = failure
+        _failures[label] = failure
         hand_over(failure, outs)
     else:
-        with _lock:
-            _reports.setdefault(label, []).append(report)
+        _reports.setdefault(label, []).append(report)
     return True
 
 
@@ -230,8 +226,7 @@ def message_of(text: str) -> str | None:
 
 def collect(label: str) -> tuple[list[dict[str, Any]], StageError | None]:
     """Reports (one per point view) and the failure of a lowered stage, which are then forgotten."""
-    with _lock:
-        return _reports.pop(label, []), _failures.pop(label, None)
+    return _reports.pop(label, []), _failures.pop(label, None)
 
 
 remember_stdout()

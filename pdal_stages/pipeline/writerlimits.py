@@ -20,12 +20,7 @@ _MOST_EXTRA = 65_535 // 192
 def check_writers(stages: list[dict[str, Any]], ours: list[tuple[Stage, str, int]]) -> None:
     """Class codes must fit the LAS files written later, and extra dimensions one LAS record.
 
-    Parameters
-    ----------
-    stages : list of dict
-        The lowered pipeline.
-    ours : list of (Stage, str, int)
-        Stages of ours, what messages call them, and where they are.
+    `ours` are our stages in the lowered pipeline, what messages call them, and where they are.
 
     Raises
     ------

@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import signal
-import sys
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 
 from ..base.errors import OptionError, StageError
 from ..base.files import check_writable, write_whole
+from ..base.plain import tell
 from ..pipeline.run import Pipeline
 from .outcome import InterruptedRun, TiledRun
 from .settings import PER, TilingOptions
@@ -100,10 +100,9 @@ def run_command(options: argparse.Namespace, source: str | Path) -> int:
     for name in [*options.report, *([options.metadata] if options.metadata else [])]:
         _write_report(name, run)
     if interrupted:
-        print(
-            f"pdal-stages: interrupted; nothing half-written was left. Run it again with --resume for the rest of the "
-            f"{_counted(len(run.tiles), 'tile')}",
-            file=sys.stderr,
+        tell(
+            "interrupted; nothing half-written was left. Run it again with --resume for the rest of the "
+            f"{_counted(len(run.tiles), 'tile')}"
         )
         return 130
     return 1 if run.failures else 0
@@ -134,15 +133,12 @@ def _print(run: TiledRun) -> None:
     print(f"{line}; {s['points']:,} points in {s['seconds']:.1f} s ({s['points_per_second']:,.0f} points/s)")
     if s["dropped"]:
         print(f"{s['dropped']:,} points were dropped by filters of the pipeline")
-    for note in run.notes:
-        print(f"pdal-stages: {note}", file=sys.stderr)
     failures = run.failures
-    for what, reason in failures[:20]:
-        print(f"pdal-stages: {what}: {reason}", file=sys.stderr)
+    tell(*run.notes, *(f"{what}: {reason}" for what, reason in failures[:20]))
     if len(failures) > 20:
-        print(f"pdal-stages: and {len(failures) - 20} more; see --report", file=sys.stderr)
+        tell(f"and {len(failures) - 20} more; see --report")
     if failures:
-        print("pdal-stages: run it again with --resume to try only what failed", file=sys.stderr)
+        tell("run it again with --resume to try only what failed")
 
 
 def _print_dry(run: TiledRun) -> None:
@@ -163,10 +159,7 @@ def _print_dry(run: TiledRun) -> None:
         print(f"  {job.name:24s} {job.points:>14,} points  {_counted(len(job.sources), 'input')}")
     if len(run.tiles) > 50:
         print(f"  and {len(run.tiles) - 50} more")
-    for note in run.notes:
-        print(f"pdal-stages: {note}", file=sys.stderr)
-    for what, reason in run.failures:
-        print(f"pdal-stages: {what}: {reason}", file=sys.stderr)
+    tell(*run.notes, *(f"{what}: {reason}" for what, reason in run.failures))
 
 
 def _counted(count: int, word: str) -> str:

@@ -17,7 +17,6 @@ def fetch(source: Source, grid: Grid, tile: tuple[int, int], margin: float, targ
     dimensions become extra dimensions.
     """
     described = read_ept(source.path)
-    x0, y0, x1, y1 = grid.box(tile, margin)
     writer: dict[str, Any] = {
         "type": "writers.las",
         "filename": target,
@@ -30,5 +29,5 @@ def fetch(source: Source, grid: Grid, tile: tuple[int, int], margin: float, targ
             axis = dimension["name"].lower()
             writer[f"scale_{axis}"] = dimension.get("scale", 0.001)
             writer[f"offset_{axis}"] = dimension.get("offset", 0.0)
-    run = pdal_env.execute([source.within((x0, y0, x1, y1)), writer], arrays=False)
+    run = pdal_env.execute([source.within(grid.box(tile, margin)), writer], arrays=False)
     return index_las(target, grid) if run.count and las_header(target).count else None

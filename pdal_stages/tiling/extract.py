@@ -80,27 +80,10 @@ def cut(
     target: str,
     core: str = "",
 ) -> Piece | None:
-    """Cut a tile and its surroundings out of a file.
+    """Cut a tile and its surroundings out of a LAS or LAZ file; None where the file has no point there.
 
-    Parameters
-    ----------
-    path : str
-        A LAS or LAZ file.
-    index : CloudIndex
-        Of that file.
-    grid, tile
-        Which tile.
-    margin : float
-        Surroundings, in the unit of the coordinates.
-    target : str
-        The LAS file to write.
-    core : str, optional
-        A second file, for the tile's own points alone.
-
-    Returns
-    -------
-    Piece or None
-        None where the file has no point there.
+    `margin` is in the unit of the coordinates. A LAS file `target` is written, and a second one, `core`, for the tile's
+    own points alone, where it is given.
     """
     box = grid.box(tile, margin)
     blocks = touching(index.boxes, box)

@@ -101,26 +101,16 @@ class _Mark:
 
     Old PDAL reads the flags of LAS 1.0 to 1.3 as bits of the class. Beside a file of LAS 1.4, whose flags it reads apart,
     stages could not tell: the bits then go where those are, and back into the results.
-
-    Attributes
-    ----------
-    old_format : bool
-        Whether the file's point format is one of LAS 1.0 to 1.3.
-    mixed : bool
-        Whether there are others beside it.
-    holds_flags : bool
-        Whether class codes of the results hold flags.
-    original : dict of str to ndarray
-        Dimensions of the tile's own points.
     """
 
     def __init__(self, number: int, piece: Piece, recipe: Recipe) -> None:
         self.number, self.piece, self.keep = number, piece, recipe.plan.creates is None
         self.margin = np.where(piece.margin < 0, -1.0, piece.margin * recipe.unit)
         header = read_header(piece.path)
-        self.old_format = header is not None and header.point_format <= 5
-        self.mixed = self.holds_flags = False
-        self.original: dict[str, NDArray] = {}
+        self.old_format = header is not None and header.point_format <= 5  # one of LAS 1.0 to 1.3
+        self.mixed = False  # whether there are others beside it
+        self.holds_flags = False  # whether class codes of the results hold flags
+        self.original: dict[str, NDArray] = {}  # dimensions of the tile's own points
         self._flags: NDArray[np.uint8] | None = None
 
     def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:

@@ -12,7 +12,6 @@ from typing import Any
 
 from ..base import las, strictjson
 from ..base.errors import PipelineError, StageError
-from ..base.stamps import NONE, stamp
 from .grid import Box
 from .tindex import locations
 
@@ -45,10 +44,6 @@ class Source:
             if name.lower().endswith(suffix):
                 return name[: -len(suffix)]
         return Path(name).stem
-
-    def stamp(self) -> list[Any]:
-        """What tells whether an input is still the same; see :func:`pdal_stages.base.stamps.stamp`."""
-        return NONE if "://" in self.path else stamp(self.path)
 
     def within(self, box: Box) -> dict[str, Any]:
         """The reader of an EPT source for a box alone."""

@@ -28,40 +28,19 @@ from .tileplan import TilePlan
 
 
 class Survey:
-    """The inputs of a run.
-
-    Attributes
-    ----------
-    sources, placed : list of Source
-        All of them, and those that are known to have points somewhere.
-    headers : dict of str to Header
-        Of sources by path, where the header can be read.
-    unreadable : dict of str to str
-        Paths of inputs that cannot be read, and why.
-    indexes : dict of str to CloudIndex
-        Of LAS and LAZ files, once they were read.
-    stamps : dict of str to list
-        What inputs, and other files that stages read, were like when the run began.
-    notes : list of str
-    grid : Grid
-    per : str
-        ``file`` or ``tile``: what one output is made of.
-    unit : float
-        Metres per unit of the coordinates.
-    margin : float
-        Surroundings of a tile, in the unit of the coordinates.
-    """
+    """The inputs of a run."""
 
     def __init__(self, plan: TilePlan, options: TilingOptions) -> None:
         self.started = time.strftime("%Y-%m-%d %H:%M")
         self.grid = Grid(options.tile)
         self.notes = list(plan.notes)
-        self.unreadable: dict[str, str] = {}
-        self.headers: dict[str, Header] = {}
-        self.indexes: dict[str, CloudIndex] = {}
+        self.unreadable: dict[str, str] = {}  #: inputs by path that cannot be read, and why
+        self.headers: dict[str, Header] = {}  #: of inputs by path, where the header can be read
+        self.indexes: dict[str, CloudIndex] = {}  #: of LAS and LAZ files by path, once they were read
         self.sources = find_sources(plan.readers)
-        self.stamps = {source.path: source.stamp() for source in self.sources}
-        self.stamps |= {path: stamp(path) for path in named_files([*plan.head, *plan.tail])}
+        others = named_files([*plan.head, *plan.tail])
+        #: What inputs, and other files that stages read, were like when the run began.
+        self.stamps = {path: stamp(path) for path in [*self.paths, *others]}
         if any("t_srs" in reader for reader in plan.readers):
             self.notes.append(
                 "readers.tindex: in tiles points keep the reference of their file, t_srs is left out"
@@ -70,9 +49,10 @@ class Survey:
         files = all(source.kind == "las" for source in self.sources)
         if options.per == "file" and not files:
             raise OptionError("--per file needs LAS or LAZ inputs", cure="Use --per tile")
+        #: ``file`` or ``tile``: what one output is made of.
         self.per = options.per if options.per != "auto" else "file" if files else "tile"
-        self.unit = self._unit(plan)
-        self.margin = plan.halo / self.unit
+        self.unit = self._unit(plan)  #: metres per unit of the coordinates
+        self.margin = plan.halo / self.unit  #: surroundings of a tile, in the unit of the coordinates
         self._place()
 
     def _read_headers(self) -> None:
@@ -156,10 +136,7 @@ class Survey:
 
     def changed(self) -> list[str]:
         """Inputs and other files that are not what they were when the run began."""
-        now = {source.path: source.stamp for source in self.sources}
-        return [
-            path for path, then in self.stamps.items() if now.get(path, lambda p=path: stamp(p))() != then
-        ]
+        return [path for path, then in self.stamps.items() if stamp(path) != then]
 
     def near(self, tile: tuple[int, int], margin: float) -> list[Source]:
         """Inputs that may hold points of a tile or its surroundings."""

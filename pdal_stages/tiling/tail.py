@@ -25,24 +25,10 @@ _FLOATS = {"float64": "double", "float32": "float"}
 def run_tail(
     readers: list[dict[str, Any]], new: list[NewValues], tail: list[dict[str, Any]], outputs: Sequence[str]
 ) -> dict[str, Any]:
-    """Run readers, results and tail; files appear under their names when all are whole.
+    """Run readers, the new values of each, and the tail with its writers; what they have :func:`written`.
 
-    Parameters
-    ----------
-    readers : list of dict
-    new : list of NewValues
-        For each reader.
-    tail : list of dict
-        Stages of the pipeline, with its writers.
-    outputs : sequence of str
-        What each of the writers writes.
-
-    Returns
-    -------
-    dict
-        ``outputs`` with size and time of change, ``written`` points.
+    The files, `outputs`, appear under their names when all are whole.
     """
-
     writers = [stage for stage in tail if stage["type"].startswith("writers.")]
 
     def finish(made: Path, final: Path, number: int) -> None:

@@ -91,13 +91,7 @@ class _Step:
 
 
 def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
-    """Check that a pipeline can be run in tiles, and cut it.
-
-    Parameters
-    ----------
-    pipeline : Pipeline
-    buffer : float, optional
-        How far PDAL's filters look, metres.
+    """Check that a pipeline can be run in tiles, and cut it; `buffer`: how far PDAL's filters look, metres.
 
     Raises
     ------

@@ -36,14 +36,7 @@ class TileTask:
     outputs: list[str] | None  #: otherwise: what each of the writers writes
 
     def run(self) -> dict[str, Any]:
-        """Run the head; write its results, or the outputs.
-
-        Returns
-        -------
-        dict
-            ``points`` of the tile, ``read`` with surroundings, ``classes``, ``buffer`` used, ``short`` (True where
-            the surroundings did not suffice), ``widened``, ``dropped``.
-        """
+        """Run the head; write its results, or the outputs. The report says which."""
         with TemporaryDirectory(
             prefix="tile-", dir=self.recipe.scratch, ignore_cleanup_errors=True
         ) as folder:
@@ -55,7 +48,11 @@ class TileTask:
 
 
 def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, Any]]:
-    """Run the head with surroundings that suffice; results, and the report."""
+    """Run the head with surroundings that suffice; results, and the report.
+
+    It has the ``points`` of the tile, those ``read`` with surroundings, the ``buffer`` used, and whether that did not
+    suffice (``short``).
+    """
     recipe, tile, halo = task.recipe, task.tile, task.recipe.plan.halo
     side, buffer, short = recipe.grid.size * recipe.unit, halo, False
     head: HeadRun | None = None

@@ -21,15 +21,7 @@ from .tilework import TileTask
 
 
 class Worklist:
-    """What a run has to do.
-
-    Attributes
-    ----------
-    jobs : list of Job
-        Tiles with points of their own, row by row.
-    outputs : list of Output
-        One for each input file; empty where each tile is an output.
-    """
+    """What a run has to do."""
 
     def __init__(self, plan: TilePlan, survey: Survey, options: TilingOptions) -> None:
         self.plan, self.survey, self.options = plan, survey, options
@@ -44,7 +36,8 @@ class Worklist:
             options.most_points,
             self._tail if survey.per == "tile" else [],
         )
-        self.jobs = self._jobs()
+        self.jobs = self._jobs()  #: tiles with points of their own, row by row
+        #: One for each input file; empty where each tile is an output.
         self.outputs = self._outputs() if survey.per == "file" else []
 
     def _jobs(self) -> list[Job]:
