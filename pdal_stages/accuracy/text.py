@@ -20,17 +20,7 @@ def percent(share: float | None, digits: int = 2) -> str:
 
 
 def table(figures: Mapping[str, Any], confusion: str, name: Callable[[int], str]) -> str:
-    """The figures as aligned text, in percent.
-
-    Parameters
-    ----------
-    figures : mapping
-        What ``accuracy-1.json`` describes.
-    confusion : str
-        One of :data:`CONFUSIONS`.
-    name : callable
-        A class code's name.
-    """
+    """What ``accuracy-1.json`` describes as aligned text, in percent; `confusion` is one of :data:`CONFUSIONS`."""
     blocks = [_headline(figures, name), _classes(figures)]
     if confusion != "none":
         blocks.append(_confusion(figures["confusion"], confusion))

@@ -14,13 +14,7 @@ LEAST = 16
 
 
 class Augmentation:
-    """Rotation about z, noise and thinning of one batch, drawn anew for each.
-
-    Parameters
-    ----------
-    options : NetworkOptions
-    random : numpy Generator
-    """
+    """Rotation about z, noise and thinning of one batch, drawn anew for each."""
 
     def __init__(self, options: NetworkOptions, random: np.random.Generator) -> None:
         self.options, self.random = options, random

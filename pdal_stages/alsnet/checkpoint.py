@@ -30,16 +30,7 @@ _CURE = "Delete the checkpoint to begin anew, or name another file"
 
 
 def save(path: str | os.PathLike, state: dict[str, Any], arrays: dict[str, npt.NDArray[np.float32]]) -> None:
-    """Write a checkpoint, whole or not at all.
-
-    Parameters
-    ----------
-    path : path
-    state : dict
-        JSON-able; must have ``identity``.
-    arrays : dict
-        Name to float32 array.
-    """
+    """Write a checkpoint, whole or not at all; `state` can be written as JSON and has an ``identity``."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         members = {STATE: json.dumps({"format": FORMAT, **state}, allow_nan=False).encode()}

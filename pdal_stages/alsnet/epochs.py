@@ -56,19 +56,7 @@ def train_network(
     threads: int | None = None,
     progress: bool = True,
 ) -> Trained:
-    """Train a network.
-
-    Parameters
-    ----------
-    clouds : sequence of LabelledCloud
-    inputs : sequence of str
-        Names of the inputs: X, Y, Z or dimensions.
-    classes : ClassMap
-    options : NetworkOptions
-    seed : int
-    threads : int, optional
-        For PyTorch, and for batches prepared ahead.
-    progress : bool
+    """Train a network; `inputs` are X, Y, Z or dimensions, `threads` for PyTorch and for batches prepared ahead.
 
     Raises
     ------

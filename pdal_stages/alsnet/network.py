@@ -39,13 +39,7 @@ class Shared(nn.Module):
 
 
 class Network(nn.Module):
-    """PointNet++ with the levels of a configuration [WM19; Qi et al. 2017].
-
-    Parameters
-    ----------
-    configuration : Configuration
-    inputs, classes : int
-    """
+    """PointNet++ with the levels of a configuration [WM19; Qi et al. 2017]."""
 
     def __init__(self, configuration: Configuration, inputs: int, classes: int) -> None:
         super().__init__()

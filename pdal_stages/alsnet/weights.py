@@ -67,14 +67,7 @@ def check(
 
 
 class Folded:
-    """A network for applying: batch normalisation folded into the linear layers.
-
-    Parameters
-    ----------
-    weights : mapping
-        As :func:`check` accepts them.
-    configuration : Configuration
-    """
+    """A network for applying: weights that :func:`check` accepts, batch normalisation folded into the linear layers."""
 
     def __init__(self, weights: Mapping[str, npt.NDArray[np.float32]], configuration: Configuration) -> None:
         self.configuration = configuration

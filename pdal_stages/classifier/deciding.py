@@ -108,16 +108,7 @@ def decide(p: npt.NDArray[np.floating], codes: npt.NDArray[np.uint8], options: P
 
 
 class Outcome:
-    """The arrays of a :class:`Prediction` while blocks are written into them.
-
-    Parameters
-    ----------
-    n, classes : int
-        Points of the cloud, and classes.
-    current : (n,) uint8 or None
-        Classes the points have now.
-    options : PredictionOptions
-    """
+    """The arrays of a :class:`Prediction` while blocks are written into them; `current`: (n,) classes of the points now."""
 
     def __init__(
         self, n: int, classes: int, current: npt.NDArray[np.uint8] | None, options: PredictionOptions

@@ -155,13 +155,7 @@ class FeatureForest:
 
 
 class Computing:
-    """Features of a question's points, block by block.
-
-    Attributes
-    ----------
-    report : dict
-        What was counted.
-    """
+    """Features of a question's points, block by block; `report` has what was counted."""
 
     def __init__(self, features: Features, question: Question) -> None:
         self.features, self._question = features, question

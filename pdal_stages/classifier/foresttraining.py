@@ -156,16 +156,13 @@ def _validate(
     quick = options.folds is None and not options.searches
     if quick:
         counts = [max(1, math.ceil(counts[-1] * FOLD_TREES))]
+    ways: list[tuple[str, int, npt.NDArray[np.int16] | None]] = [("blocks", options.folds or 5, None)]
     names, index = np.unique(group, return_inverse=True)
-    by_group = len(names) > 1 and (quick or bool(options.groups))
-    ways = ["groups" if options.groups else "surveys"] if by_group else []
+    if len(names) > 1 and (quick or options.groups):
+        folds = min(options.folds or 5, len(names))
+        ways.insert(0, ("groups" if options.groups else "surveys", folds, (index % folds).astype(np.int16)))
     asked = {"groups": options.groups} if options.groups else {}
-    for by in [*ways, "blocks"]:
-        folds = options.folds or 5
-        fold = None
-        if by != "blocks":
-            folds = min(folds, len(names))
-            fold = (index.reshape(-1) % folds).astype(np.int16)
+    for by, folds, fold in ways:
         try:
             rows = crossval.search(
                 values,

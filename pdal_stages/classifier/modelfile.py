@@ -13,6 +13,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
@@ -57,15 +58,8 @@ def write(
 ) -> None:
     """Write a model file; an existing one stays as it was until the new one is complete.
 
-    The same model always gives the same bytes: no date, no path and no host is stored.
-
-    Parameters
-    ----------
-    path : path
-    manifest : mapping
-        Everything but ``arrays``, which is added here.
-    passes : sequence of mapping
-        Of each pass, name to array of numbers.
+    The same model always gives the same bytes: no date, no path and no host is stored. The manifest is whole but for
+    ``arrays``; `passes` has the arrays of each pass by their names.
     """
     path = Path(path)
     arrays = {
@@ -218,10 +212,8 @@ def _read(archive: zipfile.ZipFile, size: int, rules_of) -> tuple[dict[str, Any]
 
 
 def _rule(rules: Mapping[str, ArrayRule], name: str) -> ArrayRule:
-    if name in rules:
-        return rules[name]
     for pattern, rule in rules.items():
-        if pattern.endswith("*") and name.startswith(pattern[:-1]):
+        if fnmatchcase(name, pattern):
             return rule
     raise ModelError("the model file has an array its algorithm does not know", found=repr(name))
 

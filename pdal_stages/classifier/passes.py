@@ -60,19 +60,9 @@ class Passes:
 
 
 class PassRun:
-    """Passes at work on one cloud.
+    """Passes at work on one cloud. Of the last only `features` and `context` are looked at here.
 
-    Parameters
-    ----------
-    members : sequence
-        The passes. Of the last only `features` and `context` are looked at here.
-    classes : int
-    question : Question
-
-    Attributes
-    ----------
-    report : dict
-        What was counted, complete when all blocks are read.
+    `report` has what was counted, complete when all blocks are read.
     """
 
     def __init__(self, members: Sequence[Any], classes: int, question: Question) -> None:

@@ -132,17 +132,9 @@ class Scene:
 
 
 def draw_scene(a: Accuracy, scene: Scene, unit: str = "m", section: Line | None = None) -> DrawnScene:
-    """Maps of reference, prediction and errors, and a vertical section.
+    """Maps of reference, prediction and errors, and a vertical section, by default where the errors are densest.
 
-    Parameters
-    ----------
-    a : Accuracy
-        Says which classes are compared, and names them.
-    scene : Scene
-    unit : str
-        Unit of the coordinates.
-    section : ((x, y), (x, y)), optional
-        Ends of the vertical section; by default where the errors are densest.
+    The accuracy names the classes; `unit` is that of the coordinates.
     """
     size = np.ptp(scene.xyz[:, :2], axis=0)
     n, wrong = int(scene.compared.sum()), int(scene.wrong.sum())

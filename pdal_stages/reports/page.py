@@ -16,15 +16,9 @@ from ..base.version import __version__
 
 
 def render(template: str, *, date: str | None = None, **context: Any) -> str:
-    """A page from a template of ``templates/``; every value is escaped.
+    """A page from a template of ``templates/``, whose every value is escaped: a `title`, maybe a `subtitle`, and its own.
 
-    Parameters
-    ----------
-    template : str
-    date : str, optional
-        The date to print; by default today, or ``SOURCE_DATE_EPOCH`` where the environment sets it.
-    **context
-        What the template is given: `title`, `subtitle` and its own.
+    The date is today's by default, or ``SOURCE_DATE_EPOCH`` where the environment sets it.
     """
     context = {"subtitle": "", "version": __version__, "date": date or _today(), **context}
     page = _templates().get_template(template).render(context)

@@ -32,20 +32,7 @@ Entry = tuple[str, tuple[int, int, int]]
 
 
 def legend(codes: Sequence[int], width: int, extra: Sequence[Entry] = ()) -> np.ndarray:
-    """A band of colour patches with class names, in as many lines as the width needs.
-
-    Parameters
-    ----------
-    codes : sequence of int
-    width : int
-        Pixels.
-    extra : sequence of (text, (r, g, b))
-        More patches, after the classes.
-
-    Returns
-    -------
-    (height, width, 3) uint8
-    """
+    """A band of colour patches with class names, then with `extra` texts: (height, width, 3) uint8, as high as it needs."""
     entries = [(f"{c} {class_name(c)}", tuple(CLASS_COLORS[c].tolist())) for c in codes]
     spots, left, line = [], 16, 0
     for text, color in [*entries, *extra]:

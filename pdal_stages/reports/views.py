@@ -165,18 +165,8 @@ def error_view(
 ) -> np.ndarray:
     """The cloud from above: grey where points are right, red where they are `wrong`, pale where they are `left_out`.
 
-    A wrong point is drawn over right ones of the same pixel, so that no error hides under a roof or a crown.
-
-    Parameters
-    ----------
-    x, y, z : (n,) float
-    wrong, left_out : (n,) bool
-    width : int
-        Pixels across.
-
-    Returns
-    -------
-    (height, width, 3) uint8
+    A wrong point is drawn over right ones of the same pixel, so that no error hides under a roof or a crown. Arrays are as
+    for :func:`top_view`.
     """
     x, y, z, wrong, left_out = checked_columns(x=x, y=y, z=z, wrong=wrong, left_out=left_out)
     s = window(x, y, z, width)
