@@ -484,10 +484,7 @@ class Accuracy:
                 "by_class": {str(c): n for c, n in self.left_out.items()},
             },
             "merged": {str(c): t for c, t in sorted(self.merged.items())},
-            "predicted_outside_reference": {
-                "points": self.extra_points,
-                "classes": described(self.extra),
-            },
+            "predicted_outside_reference": {"points": self.extra_points, "classes": described(self.extra)},
             "overall_accuracy": self.overall_accuracy,
             "overall_accuracy_interval": list(self.overall_accuracy_interval),
             "kappa": self.kappa,

@@ -201,10 +201,7 @@ class AlsNet:
         variance = np.where(count > 1, np.maximum(variance / self.n_classes, 0.0), 0.0)
         report = {
             "batches": len(numbers),
-            "batches_per_point": {
-                "mean": round(float(count.mean()), 2),
-                "least": int(count.min()),
-            },
+            "batches_per_point": {"mean": round(float(count.mean()), 2), "least": int(count.min())},
             "device": device,
         }
         return mean, variance, report

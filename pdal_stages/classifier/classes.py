@@ -84,7 +84,8 @@ class ClassMap:
             pairs = [((_code(item, "label"),), _code(item, "code")) for item in spec]
         else:
             raise OptionError("'classes' must be a list or a mapping", found=repr(spec), cure=_CURE)
-        made: dict[int, tuple[str | None, list[int]]] = {}
+        names: dict[int, str | None] = {}
+        members: dict[int, list[int]] = {}
         taken: set[int] = set()
         for labels, value in pairs:
             repeated = taken & set(labels)
@@ -95,15 +96,11 @@ class ClassMap:
             if target is None:
                 continue
             code, name = target
-            known, members = made.setdefault(code, (name, []))
-            made[code] = (known or name, members)
-            members.extend(labels)
-        codes = tuple(sorted(made))
-        return cls(
-            codes,
-            tuple(made[code][0] or class_name(code) for code in codes),
-            tuple(tuple(sorted(made[code][1])) for code in codes),
-        )
+            names[code] = names.get(code) or name
+            members.setdefault(code, []).extend(labels)
+        codes = tuple(sorted(members))
+        named = tuple(names[code] or class_name(code) for code in codes)
+        return cls(codes, named, tuple(tuple(sorted(members[code])) for code in codes))
 
     def binary(self, target: int, background: int) -> ClassMap:
         """One class against all the others, which become `background`."""

@@ -122,12 +122,8 @@ def search(
         for c in range(len(candidates))
         for t in tree_counts
     }
-    with Progress(
-        folds * len(candidates) * tree_counts[-1],
-        "cross-validation",
-        "trees",
-        enabled=progress,
-    ) as bar:
+    total = folds * len(candidates) * tree_counts[-1]
+    with Progress(total, "cross-validation", "trees", enabled=progress) as bar:
         for number in range(folds):
             train, rows = split(xy, fold, number, gap)
             missing = [codes[k] for k in range(len(codes)) if not (weight * train)[label == k].any()]

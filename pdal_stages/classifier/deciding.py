@@ -144,10 +144,7 @@ class Outcome:
         self.classification[rows] = np.where(low, instead, decided.code)
 
     def prediction(
-        self,
-        rows: npt.NDArray[np.int64] | None,
-        there: npt.NDArray[np.int64] | None,
-        counted: dict[str, Any],
+        self, rows: npt.NDArray[np.int64] | None, there: npt.NDArray[np.int64] | None, counted: dict[str, Any]
     ) -> Prediction:
         """The result once all blocks are written.
 

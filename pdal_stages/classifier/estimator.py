@@ -82,10 +82,7 @@ class PointClassifier(ClassifierMixin, BaseEstimator):
         self.options = options
 
     def fit(
-        self,
-        X: npt.ArrayLike,
-        y: npt.ArrayLike,
-        dimensions: Mapping[str, npt.ArrayLike] | None = None,
+        self, X: npt.ArrayLike, y: npt.ArrayLike, dimensions: Mapping[str, npt.ArrayLike] | None = None
     ) -> PointClassifier:
         """Train on a labelled cloud.
 

@@ -50,9 +50,10 @@ def describe(manifest: Mapping[str, Any], columns: Sequence[Sequence[Column]]) -
 
 def text(info: Mapping[str, Any]) -> str:
     """What :func:`describe` gives as a page of text."""
-    lines = scores(info, info.get("training", {}).get("held_out"))
+    training, several = info["training"], len(info["passes"]) > 1
+    lines = scores(info, training.get("held_out"))
     for number, one in enumerate(info["passes"], 1):
-        if len(info["passes"]) > 1:
+        if several:
             lines.append(f"pass {number}")
         numbers = [f"{v:,} {k}" for k, v in one["parameters"].items() if isinstance(v, int)]
         lines += [
@@ -65,24 +66,19 @@ def text(info: Mapping[str, Any]) -> str:
         f"needs          {', '.join(info['required_dimensions']) or 'coordinates only'}",
         f"halo           {info['halo']:g} m",
     ]
-    training = info.get("training", {})
     if info.get("priors"):
         lines.append(f"prior weight   {info['priors']['weight']:g}")
-    if info.get("strategy") == "binary":
-        lines.append(
-            f"strategy       binary, target {info.get('target')}, background {info.get('background')}"
-        )
-    if info.get("densities"):
-        lines.append(
-            f"densities      {info['densities']['low']:.3g} to {info['densities']['high']:.3g} points/m2"
-        )
+    if info["strategy"] == "binary":
+        lines.append(f"strategy       binary, target {info['target']}, background {info['background']}")
+    if densities := info.get("densities"):
+        lines.append(f"densities      {densities['low']:.3g} to {densities['high']:.3g} points/m2")
     if info.get("voxel"):
         lines.append(f"voxel          {info['voxel']:g} m, which one point stands for")
-    for cloud in training.get("clouds", []):
+    for cloud in training["clouds"]:
         lines.append(f"trained on     {cloud['name']}, {cloud['points']:,} points")
     lines += ["", f"{'class':<34}{'available':>12}{'samples':>10}{'duplicates':>12}{'F1 out of bag':>15}"]
     bag = info["passes"][-1]["out_of_bag"] or {}
-    for entry in info.get("classes", []):
+    for entry in info["classes"]:
         f1 = (bag.get("f1") or {}).get(str(entry["code"]))
         lines.append(
             f"{entry['code']:>3} {entry['name'][:29]:<30}{entry['available']:>12,}{entry['samples']:>10,}"
@@ -90,7 +86,7 @@ def text(info: Mapping[str, Any]) -> str:
         )
     lines.append("")
     for number, one in enumerate(info["passes"], 1):
-        if "importances" in one and len(info["passes"]) > 1:
+        if "importances" in one and several:
             lines.append(f"pass {number}")
         for by in ("neighborhood", "group", "feature") if "importances" in one else ():
             top = list(one["importances"][by].items())[:10]
@@ -103,8 +99,7 @@ def scores(info: Mapping[str, Any], held_out: dict[str, Any] | None = None) -> l
     names = ("overall_accuracy", "kappa", "mean_f1")
     if isinstance(held_out, dict) and all(isinstance(held_out.get(n), float | None) for n in names):
         return [
-            f"{'ground held out':<17}overall accuracy {_percent(held_out.get('overall_accuracy'))}, "
-            f"kappa {_percent(held_out.get('kappa'))}, mean F1 {_percent(held_out.get('mean_f1'))}",
+            _scored("ground held out", held_out),
             "(it chose the best epoch, so it flatters a little)",
             "",
         ]
@@ -121,16 +116,16 @@ def scores(info: Mapping[str, Any], held_out: dict[str, Any] | None = None) -> l
     rows = [(held_out_by(crossed), crossed and crossed["chosen"])]
     for number, one in enumerate(info["passes"], 1):
         rows.append((f"out of bag{f' {number}' if len(info['passes']) > 1 else ''}", one["out_of_bag"]))
-    for label, row in rows:
-        if row:
-            lines.append(
-                f"{label:<17}overall accuracy {_percent(row['overall_accuracy'])}, "
-                f"kappa {_percent(row['kappa'])}, mean F1 {_percent(row['mean_f1'])}"
-            )
+    lines += [_scored(label, row) for label, row in rows if row]
     if lines:
         lines.append("(classes weigh the same; out of bag is flattered by neighboring samples)")
         lines.append("")
     return lines
+
+
+def _scored(label: str, row: Mapping[str, Any]) -> str:
+    values = [_percent(row.get(name)) for name in ("overall_accuracy", "kappa", "mean_f1")]
+    return "{:<17}overall accuracy {}, kappa {}, mean F1 {}".format(label, *values)
 
 
 def held_out_by(crossed: Mapping[str, Any] | None) -> str:
