@@ -156,7 +156,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"pdal-stages {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def add(name: str, run: Callable, help: str, overrides: bool = False) -> argparse.ArgumentParser:
+    def add(name: str, run: Callable, help: str, overrides: bool = False) -> Callable:
         command = commands.add_parser(
             name, help=help, description=help + ".", epilog=_OVERRIDES if overrides else None
         )
@@ -168,20 +168,18 @@ def _parser() -> argparse.ArgumentParser:
             command.add_argument(
                 "--progress", action=argparse.BooleanOptionalAction, default=None, help="Show progress"
             )
-        return command
+        return command.add_argument
 
-    command = add("pipeline", _pipeline, "Run a pipeline that may contain our stages", overrides=True)
-    _pipeline_input(command)
-    command.add_argument("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
-    command.add_argument(
-        "--validate", action="store_true", help="Check the pipeline without reading points, then stop"
-    )
-    command.add_argument(
+    takes = add("pipeline", _pipeline, "Run a pipeline that may contain our stages", overrides=True)
+    _pipeline_input(takes)
+    takes("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
+    takes("--validate", action="store_true", help="Check the pipeline without reading points, then stop")
+    takes(
         "--nostream",
         action="store_true",
         help="Accepted for compatibility with PDAL; our stages never stream",
     )
-    command.add_argument(
+    takes(
         "-v",
         "--verbose",
         type=int,
@@ -191,106 +189,94 @@ def _parser() -> argparse.ArgumentParser:
     )
     from .tiling.command import add_arguments
 
-    add_arguments(command)
+    add_arguments(commands.choices["pipeline"])
 
-    command = add(
+    takes = add(
         "expand", _expand, "Print the plain PDAL JSON, which stock 'pdal pipeline' runs", overrides=True
     )
-    _pipeline_input(command)
-    command.add_argument("-o", "--output", metavar="FILE", help="Write it to a file instead")
+    _pipeline_input(takes)
+    takes("-o", "--output", metavar="FILE", help="Write it to a file instead")
 
-    command = add("validate", _validate, "Check a pipeline without reading points", overrides=True)
-    _pipeline_input(command)
+    takes = add("validate", _validate, "Check a pipeline without reading points", overrides=True)
+    _pipeline_input(takes)
 
-    command = add("drivers", _drivers, "List stages: ours, then PDAL's")
-    command.add_argument("--ours", action="store_true", help="Only ours")
-    command.add_argument("--showjson", action="store_true", help="As JSON, like pdal --drivers --showjson")
+    takes = add("drivers", _drivers, "List stages: ours, then PDAL's")
+    takes("--ours", action="store_true", help="Only ours")
+    takes("--showjson", action="store_true", help="As JSON, like pdal --drivers --showjson")
 
-    command = add("options", _options, "List the options of a stage")
-    command.add_argument("stage", help="e.g. filters.hag_minima; for PDAL's stages pdal --options is asked")
-    command.add_argument("--showjson", action="store_true", help="As JSON Schema")
+    takes = add("options", _options, "List the options of a stage")
+    takes("stage", help="e.g. filters.hag_minima; for PDAL's stages pdal --options is asked")
+    takes("--showjson", action="store_true", help="As JSON Schema")
 
-    command = add("classify", _classify, "Classify a cloud with a model file", overrides=True)
-    command.add_argument("inputs", nargs="+", metavar="input", help="Files PDAL can read, folders, patterns")
-    command.add_argument(
+    takes = add("classify", _classify, "Classify a cloud with a model file", overrides=True)
+    takes("inputs", nargs="+", metavar="input", help="Files PDAL can read, folders, patterns")
+    takes(
         "output",
         help="A file PDAL can write; of several inputs a folder, or a name with # where the input's goes. Other dimensions "
         "and the header are kept",
     )
-    command.add_argument(
+    takes(
         "--model",
         default="standard",
         help="A model file, or a shipped model's name (pdal-stages models); default standard",
     )
-    command.add_argument(
+    takes(
         "--dimensions",
         metavar="LIST",
         help="Extra dimensions to write beside the input's own: e.g. Reliability,Margin,Probability_6, all, or none; "
         "default HeightAboveGround,Reliability",
     )
-    command.add_argument(
-        "--workers", type=int, default=1, metavar="N", help="Files classified at the same time (1)"
-    )
-    command.add_argument(
-        "--where", help="Classify only the points for which this holds; the others serve as neighbors"
-    )
-    command.add_argument("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
+    takes("--workers", type=int, default=1, metavar="N", help="Files classified at the same time (1)")
+    takes("--where", help="Classify only the points for which this holds; the others serve as neighbors")
+    takes("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
 
     add("models", _models, "List the models that come with the package")
 
-    command = add("train", _train, "Train a model on labelled clouds", overrides=True)
-    command.add_argument(
-        "inputs", nargs="+", metavar="input", help="Labelled files PDAL can read, folders, patterns"
-    )
-    command.add_argument("--model", required=True, help="The model file to write")
-    command.add_argument("--classes", help="Codes (2,5,6) or a JSON mapping of labels to classes")
-    command.add_argument("--neighborhoods", help="Preset or tokens, e.g. s5,k10,k50")
-    command.add_argument("--feature-set", help="Groups or single features, e.g. covariance,geometric")
-    command.add_argument("--count", type=int, help="Samples of each class")
-    command.add_argument("--trees", help="Number of trees; of several the best is found")
+    takes = add("train", _train, "Train a model on labelled clouds", overrides=True)
+    takes("inputs", nargs="+", metavar="input", help="Labelled files PDAL can read, folders, patterns")
+    takes("--model", required=True, help="The model file to write")
+    takes("--classes", help="Codes (2,5,6) or a JSON mapping of labels to classes")
+    takes("--neighborhoods", help="Preset or tokens, e.g. s5,k10,k50")
+    takes("--feature-set", help="Groups or single features, e.g. covariance,geometric")
+    takes("--count", type=int, help="Samples of each class")
+    takes("--trees", help="Number of trees; of several the best is found")
 
-    command = add("accuracy", _accuracy, "Compare two class dimensions, or two files", overrides=True)
-    command.add_argument("inputs", nargs="+", metavar="input", help="Classified files, folders or patterns")
-    command.add_argument(
+    takes = add("accuracy", _accuracy, "Compare two class dimensions, or two files", overrides=True)
+    takes("inputs", nargs="+", metavar="input", help="Classified files, folders or patterns")
+    takes(
         "--reference",
         action="append",
         metavar="FILE",
         help="The same points, in the same order, with true classes: a file, a folder or a pattern, paired by name; "
         "may be repeated",
     )
-    command.add_argument("--dimension", default="Classification", help="Classes to judge")
-    command.add_argument("--reference-dimension", help="Dimension with the true classes")
-    command.add_argument("--json", help="Write figures to this file")
-    command.add_argument("--html", help="Write a report to this file")
+    takes("--dimension", default="Classification", help="Classes to judge")
+    takes("--reference-dimension", help="Dimension with the true classes")
+    takes("--json", help="Write figures to this file")
+    takes("--html", help="Write a report to this file")
 
-    command = add("model", _model, "Describe a model file")
-    command.add_argument("file")
-    command.add_argument("--showjson", action="store_true", help="Everything, as JSON")
-    command.add_argument(
-        "--html", help="Write a page with its scores, training curve and importances to this file"
-    )
+    takes = add("model", _model, "Describe a model file")
+    takes("file")
+    takes("--showjson", action="store_true", help="Everything, as JSON")
+    takes("--html", help="Write a page with its scores, training curve and importances to this file")
 
-    command = add("demo", _demo, "Generate a town, train on one half, classify the other")
-    command.add_argument("folder", nargs="?", default="pdal-stages-demo", help="Where results go")
-    command.add_argument("--size", type=float, default=200.0, help="Side of the town in metres")
-    command.add_argument("--density", type=float, default=7.0, help="Points per square metre")
-    command.add_argument("--seed", type=int, default=1)
+    takes = add("demo", _demo, "Generate a town, train on one half, classify the other")
+    takes("folder", nargs="?", default="pdal-stages-demo", help="Where results go")
+    takes("--size", type=float, default=200.0, help="Side of the town in metres")
+    takes("--density", type=float, default=7.0, help="Points per square metre")
+    takes("--seed", type=int, default=1)
 
-    command = add(
+    takes = add(
         "warmup", _warmup, "Compile the kernels for this machine once, so that later runs start without delay"
     )
-    command.add_argument(
-        "--all", action="store_true", help="Those of kopt, ropt, copt and shape distributions too"
-    )
+    takes("--all", action="store_true", help="Those of kopt, ropt, copt and shape distributions too")
     return parser
 
 
-def _pipeline_input(command: argparse.ArgumentParser) -> None:
-    command.add_argument("file", nargs="?", help="Pipeline JSON file")
-    command.add_argument(
-        "-i", "--input", dest="file_option", metavar="FILE", help="The same, as PDAL's --input"
-    )
-    command.add_argument("-s", "--stdin", action="store_true", help="Read the pipeline from standard input")
+def _pipeline_input(takes: Callable) -> None:
+    takes("file", nargs="?", help="Pipeline JSON file")
+    takes("-i", "--input", dest="file_option", metavar="FILE", help="The same, as PDAL's --input")
+    takes("-s", "--stdin", action="store_true", help="Read the pipeline from standard input")
 
 
 def _source(options: argparse.Namespace) -> str | Path:

@@ -5,57 +5,32 @@ Source: ASPRS LAS specification 1.4-R15, tables 9 and 17.
 
 from __future__ import annotations
 
-NAMES: dict[int, str] = {
-    0: "Created, never classified",
-    1: "Unclassified",
-    2: "Ground",
-    3: "Low vegetation",
-    4: "Medium vegetation",
-    5: "High vegetation",
-    6: "Building",
-    7: "Low point (noise)",
-    8: "Model key-point",
-    9: "Water",
-    10: "Rail",
-    11: "Road surface",
-    12: "Overlap",
-    13: "Wire - guard (shield)",
-    14: "Wire - conductor (phase)",
-    15: "Transmission tower",
-    16: "Wire-structure connector",
-    17: "Bridge deck",
-    18: "High noise",
-    19: "Overhead structure",
-    20: "Ignored ground",
-    21: "Snow",
-    22: "Temporal exclusion",
+_CLASSES: dict[int, tuple[str, tuple[int, int, int]]] = {
+    0: ("Created, never classified", (150, 150, 150)),
+    1: ("Unclassified", (170, 170, 170)),
+    2: ("Ground", (176, 137, 84)),
+    3: ("Low vegetation", (186, 219, 110)),
+    4: ("Medium vegetation", (113, 184, 72)),
+    5: ("High vegetation", (34, 122, 52)),
+    6: ("Building", (214, 78, 60)),
+    7: ("Low point (noise)", (196, 45, 196)),
+    8: ("Model key-point", (120, 90, 50)),
+    9: ("Water", (60, 132, 214)),
+    10: ("Rail", (110, 90, 140)),
+    11: ("Road surface", (90, 90, 98)),
+    12: ("Overlap", (230, 200, 120)),
+    13: ("Wire - guard (shield)", (240, 170, 60)),
+    14: ("Wire - conductor (phase)", (250, 190, 20)),
+    15: ("Transmission tower", (120, 70, 190)),
+    16: ("Wire-structure connector", (220, 130, 30)),
+    17: ("Bridge deck", (90, 170, 180)),
+    18: ("High noise", (240, 80, 240)),
+    19: ("Overhead structure", (60, 110, 130)),
+    20: ("Ignored ground", (150, 120, 90)),
+    21: ("Snow", (225, 238, 250)),
+    22: ("Temporal exclusion", (130, 130, 150)),
 }
-
-_COLORS: dict[int, tuple[int, int, int]] = {
-    0: (150, 150, 150),
-    1: (170, 170, 170),
-    2: (176, 137, 84),
-    3: (186, 219, 110),
-    4: (113, 184, 72),
-    5: (34, 122, 52),
-    6: (214, 78, 60),
-    7: (196, 45, 196),
-    8: (120, 90, 50),
-    9: (60, 132, 214),
-    10: (110, 90, 140),
-    11: (90, 90, 98),
-    12: (230, 200, 120),
-    13: (240, 170, 60),
-    14: (250, 190, 20),
-    15: (120, 70, 190),
-    16: (220, 130, 30),
-    17: (90, 170, 180),
-    18: (240, 80, 240),
-    19: (60, 110, 130),
-    20: (150, 120, 90),
-    21: (225, 238, 250),
-    22: (130, 130, 150),
-}
+NAMES = {code: name for code, (name, _) in _CLASSES.items()}
 
 #: Codes of noise points: below ground (7) and in the air (18).
 NOISE = (7, 18)
@@ -80,7 +55,7 @@ def class_name(code: int) -> str:
 def class_color(code: int) -> tuple[int, int, int]:
     """An sRGB colour (0-255) for maps; other codes get a stable one of their own."""
     code = int(code)
-    if code in _COLORS:
-        return _COLORS[code]
+    if code in _CLASSES:
+        return _CLASSES[code][1]
     mixed = (code * 2654435761) & 0xFFFFFFFF
     return (70 + (mixed & 127), 70 + ((mixed >> 8) & 127), 70 + ((mixed >> 16) & 127))

@@ -224,24 +224,16 @@ _PLY_BYTES = {
     **dict.fromkeys((b"int64", b"uint64", b"double", b"float64"), 8),
 }
 _Judge = Callable[[BinaryIO, int, "int | None", Mapping[str, Any]], bool]
-_JUDGES: dict[str, _Judge] = {
-    "writers.las": _las,
-    "writers.copc": _las,
-    "writers.text": _text,
-    "writers.ply": _ply,
-    "writers.pcd": _pcd,
-    "writers.bpf": _bpf,
-    "writers.sbet": _sbet,
-    "writers.gltf": _gltf,
+#: Of PDAL's writers: what judges their files, and by which suffixes PDAL chooses them.
+_FORMATS: dict[str, tuple[_Judge, tuple[str, ...]]] = {
+    "las": (_las, (".las", ".laz")),
+    "copc": (_las, ()),
+    "text": (_text, ("", ".csv", ".txt", ".json", ".xyz")),
+    "ply": (_ply, (".ply",)),
+    "pcd": (_pcd, (".pcd",)),
+    "bpf": (_bpf, (".bpf",)),
+    "sbet": (_sbet, (".sbet",)),
+    "gltf": (_gltf, (".glb",)),
 }
-#: Of stages that PDAL chooses by the file's name.
-_BY_SUFFIX: dict[str, _Judge] = {
-    ".las": _las,
-    ".laz": _las,
-    ".ply": _ply,
-    ".pcd": _pcd,
-    ".bpf": _bpf,
-    ".glb": _gltf,
-    ".sbet": _sbet,
-    **dict.fromkeys(("", ".csv", ".txt", ".json", ".xyz"), _text),
-}
+_JUDGES = {f"writers.{name}": judge for name, (judge, _) in _FORMATS.items()}
+_BY_SUFFIX = {suffix: judge for judge, suffixes in _FORMATS.values() for suffix in suffixes}

@@ -16,13 +16,7 @@ from .lowering import Lowered, LoweredStage
 #: How dimensions begin that no reader has of itself, but a stage or a file's extra bytes.
 _MADE = ("HeightAbove", "Ground", "Slope", "Reference")
 #: Stages that make dimensions of any name, or say so in options.
-_MAKES_ANY = (
-    "filters.python",
-    "filters.matlab",
-    "filters.colorization",
-    "filters.overlay",
-    "filters.hag_dem",
-)
+_MAKES_ANY = {f"filters.{name}" for name in ("python", "matlab", "colorization", "overlay", "hag_dem")}
 _DEGREES = re.compile(
     r"^\s*EPSG:\s*4\d{3}\s*$|longlat|latlong|^\s*(OGC:)?CRS:?84|^\s*(GEOGCS|GEOGCRS|GEODCRS)", re.IGNORECASE
 )

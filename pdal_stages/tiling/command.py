@@ -22,32 +22,23 @@ from .tileplan import make_plan
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """Add the flags to the parser of ``pipeline``."""
     group = command.add_argument_group("large areas", "Run the pipeline in tiles; see docs/large-areas.md.")
-    group.add_argument(
-        "--tile", type=float, metavar="SIZE", help="Side of the tiles, in the unit of the coordinates"
-    )
-    group.add_argument(
+    takes = group.add_argument
+    takes("--tile", type=float, metavar="SIZE", help="Side of the tiles, in the unit of the coordinates")
+    takes(
         "--workers",
         type=int,
         metavar="N",
         help="Worker processes; 0 runs everything in this process (default: half the cores)",
     )
-    group.add_argument(
-        "--scheduler", default="", metavar="ADDRESS", help="A running Dask scheduler, tcp://HOST:8786"
-    )
-    group.add_argument(
-        "--per", choices=PER, default="auto", help="One output per input file or per tile (auto: per file)"
-    )
-    group.add_argument(
+    takes("--scheduler", default="", metavar="ADDRESS", help="A running Dask scheduler, tcp://HOST:8786")
+    takes("--per", choices=PER, default="auto", help="One output per input file or per tile (auto: per file)")
+    takes(
         "--buffer", type=float, metavar="METRES", help="Surroundings for PDAL filters that look at neighbors"
     )
-    group.add_argument(
-        "--resume", action="store_true", help="Keep what an earlier run in this folder finished"
-    )
-    group.add_argument(
-        "--retries", type=int, default=2, metavar="N", help="How often a failed tile is tried again (2)"
-    )
-    group.add_argument("--dry-run", action="store_true", help="Show the tiles and an estimate, then stop")
-    group.add_argument(
+    takes("--resume", action="store_true", help="Keep what an earlier run in this folder finished")
+    takes("--retries", type=int, default=2, metavar="N", help="How often a failed tile is tried again (2)")
+    takes("--dry-run", action="store_true", help="Show the tiles and an estimate, then stop")
+    takes(
         "--report",
         action="append",
         default=[],
