@@ -447,7 +447,7 @@ def test_without_a_writable_folder(tmp_path):
         def twice(x):
             return 2 * x
         assert twice(3) == 6
-        print(type(twice._cache).__name__, jit.private_cache_folder())
+        print(type(twice.dispatcher._cache).__name__, jit.private_cache_folder())
     """
     file = tmp_path / "pdal-stages-cache-test.py"
     for broken in (False, True):
@@ -475,7 +475,7 @@ def test_cached_code_follows_the_kernels_it_calls(tmp_path):
         (tmp_path / "inner.py").write_text(
             f"from pdal_stages.base.jit import njit\n@njit\ndef value():\n    return {number}\n"
         )
-        code = "from outer import f; print(f(), sum(f.stats.cache_hits.values()))"
+        code = "from outer import f; print(f(), sum(f.dispatcher.stats.cache_hits.values()))"
         found.append(run_python(code, PYTHONPATH=str(tmp_path), PYTHONDONTWRITEBYTECODE="1").split())
     assert found == [["1", "0"], ["1", "1"], ["2", "0"]]
 
@@ -490,7 +490,7 @@ def test_cached_code_follows_device_functions_too(tmp_path):
         (tmp_path / "inner.py").write_text(
             f"from pdal_stages.base.jit import device\n@device\ndef value():\n    return {number}\n"
         )
-        code = "from outer import f, value; print(f(), value(), sum(f.stats.cache_hits.values()))"
+        code = "from outer import f, value; print(f(), value(), sum(f.dispatcher.stats.cache_hits.values()))"
         found.append(run_python(code, PYTHONPATH=str(tmp_path), PYTHONDONTWRITEBYTECODE="1").split())
     assert found == [["1", "1", "0"], ["1", "1", "1"], ["2", "2", "0"]]
 

@@ -1,6 +1,7 @@
 """How kernels are compiled: without the GIL, cached where the user can write, never in the way.
 
-``njit`` here is numba's with the package's defaults and three repairs of numba's cache:
+``njit`` here is numba's with the package's defaults, and numba itself is imported when a kernel is first called, so that
+commands that need none, and errors, come at once. Three repairs of numba's cache:
 
 * numba keys cached code by its own source file only, so a changed *device function* in another module
   leaves stale code behind. The key here is a digest of the source of the kernel and of every kernel it
@@ -24,23 +25,11 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, update_wrapper
 from pathlib import Path
 from typing import Any
 
 from .errors import DependencyError
-
-try:
-    import numba
-    from numba.core import config
-    from numba.core.compiler_lock import global_compiler_lock
-    from numba.extending import register_jitable
-except ValueError as error:  # of an environment variable of its own
-    raise DependencyError(
-        "numba cannot be started",
-        found=str(error),
-        cure="Look for environment variables that begin with NUMBA_",
-    ) from None
 
 #: Flags that allow sums to be reordered and contracted, but keep NaN and infinity meaningful.
 FAST = frozenset({"reassoc", "contract", "nsz", "arcp"})
@@ -51,20 +40,47 @@ _ERRORS = {"error_model": "numpy"}
 _stamps: dict[Any, frozenset[str]] = {}
 
 
+#: Device functions that numba has not heard of yet, with their options.
+_unregistered: list[tuple[Callable, dict[str, Any]]] = []
+_lock = threading.RLock()
+
+
+class Kernel:
+    """A function that numba compiles when it is first called; make it with :func:`njit`."""
+
+    def __init__(self, function: Callable, options: dict[str, Any]) -> None:
+        update_wrapper(self, function)
+        self._function, self._options = function, options
+        self._dispatcher: Any = None
+        _stamp(self, function)
+
+    def __call__(self, *arguments: Any) -> Any:
+        return (self._dispatcher or self.dispatcher)(*arguments)
+
+    @property
+    def dispatcher(self) -> Any:
+        """What numba makes of it."""
+        with _lock:
+            if self._dispatcher is None:
+                _register_devices()
+                made = _dispatcher(self._function, self._options)
+                file: Any = getattr(getattr(made, "_cache", None), "_cache_file", None)
+                if hasattr(file, "_source_stamp"):
+                    file._source_stamp = "-".join(sorted(_stamps[self]))
+                self._dispatcher = made
+            return self._dispatcher
+
+    @property
+    def _numba_type_(self) -> Any:
+        """By which numba knows what a kernel calls."""
+        return self.dispatcher._numba_type_
+
+
 def njit(function: Callable | None = None, **options):
     """``numba.njit`` with the package's defaults; see the module's text. Use as ``@njit`` or ``@njit(...)``."""
     if function is None:
         return lambda f: njit(f, **options)
-    options = {"nogil": True, "cache": True, "no_cfunc_wrapper": True, **_ERRORS, **options}
-    try:
-        dispatcher = numba.njit(**options)(function)
-    except RuntimeError:  # "cannot cache function ...: no locator available"
-        dispatcher = _elsewhere(function, options)
-    _stamp(dispatcher, function)
-    file: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-    if hasattr(file, "_source_stamp"):
-        file._source_stamp = "-".join(sorted(_stamps[dispatcher]))
-    return dispatcher
+    return Kernel(function, {"nogil": True, "cache": True, "no_cfunc_wrapper": True, **_ERRORS, **options})
 
 
 def device(function: Callable | None = None, **options):
@@ -75,10 +91,38 @@ def device(function: Callable | None = None, **options):
     if function is None:
         return lambda f: device(f, **options)
     _stamp(function, function)
-    return register_jitable(**_ERRORS, **options)(function)
+    _unregistered.append((function, {**_ERRORS, **options}))
+    return function
 
 
-def _elsewhere(function: Callable, options: dict):
+def _register_devices() -> None:
+    if _unregistered:
+        from numba.extending import register_jitable
+
+        while _unregistered:
+            function, options = _unregistered.pop()
+            register_jitable(**options)(function)
+
+
+def _dispatcher(function: Callable, options: dict[str, Any]) -> Any:
+    try:
+        import numba
+    except ValueError as error:  # of an environment variable of its own
+        raise DependencyError(
+            "numba cannot be started",
+            found=str(error),
+            cure="Look for environment variables that begin with NUMBA_",
+        ) from None
+    try:
+        return numba.njit(**options)(function)
+    except RuntimeError:  # "cannot cache function ...: no locator available"
+        return _elsewhere(function, options)
+
+
+def _elsewhere(function: Callable, options: dict[str, Any]) -> Any:
+    import numba
+    from numba.core import config
+
     folder = private_cache_folder()
     if folder is not None:
         settings: Any = config
@@ -181,6 +225,8 @@ class CompilationNote:
 
 def _is_compiling() -> bool:
     """Whether another thread holds numba's compiler lock."""
+    from numba.core.compiler_lock import global_compiler_lock
+
     lock = getattr(global_compiler_lock, "_lock", None)
     if lock is None:
         return True

@@ -24,15 +24,6 @@ MAX_DEPTH = 10_000
 #: from whatever memory, so many of them make a tree's nodes pay; wide ones, read here and there, had better fit the cache.
 _GROUP_BYTES, _NARROW, _WIDE_GROUP_BYTES = 1 << 22, 512, 1 << 20
 
-_FAULTS = {
-    kernels.TOO_FEW: "a tree ends before all its branches do",
-    kernels.TOO_MANY: "a tree has nodes that are nobody's children",
-    kernels.BAD_FEATURE: "a node asks for a feature that does not exist",
-    kernels.BAD_THRESHOLD: "a threshold is not a finite number",
-    kernels.BAD_LEAVES: "the number of leaves and the leaf table differ",
-    kernels.TOO_DEEP: f"a tree is deeper than {MAX_DEPTH} levels",
-}
-
 
 @dataclass(frozen=True, eq=False)
 class Forest:
@@ -76,20 +67,13 @@ class Forest:
             raise ModelError("the forest's arrays do not fit each other", found=self._shapes())
         if int(sizes.min()) < 1 or int(sizes.sum(dtype=np.int64)) != nodes:
             raise ModelError("the trees' sizes do not add up to the nodes", found=self._shapes())
-        left = np.empty(nodes, np.uint32)
-        depths = np.empty(len(sizes), np.int32)
-        fault, tree, node = kernels.lay_out(
-            sizes.astype(np.int64),
-            self.feature,
-            self.threshold,
-            self.n_features,
-            len(self.leaf_counts),
-            MAX_DEPTH,
-            left,
-            depths,
-        )
-        if fault:
-            raise ModelError(_FAULTS[fault], found=f"tree {tree}, node {node}")
+        left, depths = _laid_out(sizes, self.feature, self.threshold, self.n_features)
+        leaves = int(np.count_nonzero(self.feature < 0))
+        if leaves != len(self.leaf_counts):
+            raise ModelError(
+                "the number of leaves and the leaf table differ",
+                found=f"{leaves} and {len(self.leaf_counts)} rows",
+            )
         totals = self.leaf_counts.sum(axis=1, dtype=np.uint64)
         if not totals.all():
             raise ModelError("a leaf holds no samples", found=f"leaf {int(np.argmin(totals))}")
@@ -188,6 +172,43 @@ class Forest:
         kernels.walk(values.reshape(-1), *self._walked, rows, out)  # type: ignore[attr-defined]
         out /= self.n_trees
         return out
+
+
+def _laid_out(
+    sizes, feature, threshold, n_features: int
+) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.int32]]:
+    """(each node's left child within its tree, of a leaf itself; each tree's depth); a ModelError where it is no tree.
+
+    Trees are stored level by level, so the children of a tree's k-th split node are its nodes 2k+1 and 2k+2: no child
+    pointers are stored, and no file can hold a cycle or a shared child.
+    """
+    end = np.cumsum(sizes, dtype=np.int64)
+    start = end - sizes
+    tree = np.repeat(np.arange(len(sizes)), sizes)
+    node = np.arange(len(feature)) - start[tree]
+
+    def refuse(bad: npt.NDArray[np.bool_], what: str) -> None:
+        if bad.any():
+            first = int(np.argmax(bad))
+            raise ModelError(what, found=f"tree {tree[first]}, node {node[first]}")
+
+    split = feature >= 0
+    refuse((feature < -1) | (feature >= n_features), "a node asks for a feature that does not exist")
+    refuse(split & ~np.isfinite(threshold), "a threshold is not a finite number")
+    splits = np.concatenate(([0], np.cumsum(split)))  # before each node, in all trees
+    before = splits[:-1] - splits[start][tree]
+    refuse(node > 2 * before, "a tree has nodes that are nobody's children")
+    short = sizes != 2 * (splits[end] - splits[start]) + 1
+    refuse(short[tree] & (node == sizes[tree] - 1), "a tree ends before all its branches do")
+    depths = np.zeros(len(sizes), np.int32)
+    level = np.minimum(start + 1, end)  # where the next one begins
+    while (deeper := level < end).any():
+        depths += deeper
+        if depths.max() > MAX_DEPTH:
+            deep = int(np.argmax(depths))
+            raise ModelError(f"a tree is deeper than {MAX_DEPTH} levels", found=f"tree {deep}")
+        level = start + 2 * (splits[level] - splits[start]) + 1
+    return np.where(split, 2 * before + 1, node).astype(np.uint32), depths
 
 
 def _walkable(sizes, feature, threshold, left, leaf_value, n_features: int) -> tuple[Any, ...]:

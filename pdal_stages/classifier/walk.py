@@ -1,4 +1,4 @@
-"""Compiled kernels of the forest: laying out level-ordered trees, and walking many rows at once.
+"""The compiled kernel of the forest: many rows walk its trees at once.
 
 A tree is walked by eight rows in lock step. One step loads a node, which is two numbers side by side (its threshold; its
 feature and left child packed into one), compares, and moves to the left child or the one after it. A leaf points at
@@ -20,59 +20,6 @@ from ..base.jit import njit
 LANES = 8
 #: Of 32 and 64 bits: the type of a node's two numbers, that of its threshold, and the bits of NaN that are free.
 WORDS: tuple[tuple[Any, Any, int], ...] = ((np.uint32, np.float32, 22), (np.uint64, np.float64, 51))
-
-# What `lay_out` found; 0 is good.
-TOO_FEW, TOO_MANY, BAD_FEATURE, BAD_THRESHOLD, BAD_LEAVES, TOO_DEEP = 1, 2, 3, 4, 5, 6
-
-
-@njit
-def lay_out(sizes, feature, threshold, n_features, n_leaves, max_depth, left, depths):
-    """Fill `left` with each node's left child (a leaf: itself), within its tree, and check everything.
-
-    Trees are stored level by level, so the children of a tree's k-th split node are its nodes 2k+1 and
-    2k+2: no child pointers are stored, and no file can hold a cycle or a shared child.
-
-    Returns (code, tree, node): code 0, or what is wrong and where.
-    """
-    start = 0
-    leaves = 0
-    for tree in range(len(sizes)):
-        size = sizes[tree]
-        if size < 1 or start + size > len(feature):
-            return TOO_FEW, tree, 0
-        splits = 0
-        depth = 0
-        level_end = 1  # first node of the next level
-        for i in range(size):
-            if i > 2 * splits:  # nobody's child
-                return TOO_MANY, tree, i
-            if i == level_end:
-                depth += 1
-                level_end = 2 * splits + 1
-                if depth > max_depth:
-                    return TOO_DEEP, tree, i
-            f = feature[start + i]
-            if f < 0:
-                if f != -1:
-                    return BAD_FEATURE, tree, i
-                left[start + i] = i
-                leaves += 1
-            else:
-                if f >= n_features:
-                    return BAD_FEATURE, tree, i
-                if not np.isfinite(threshold[start + i]):
-                    return BAD_THRESHOLD, tree, i
-                left[start + i] = 2 * splits + 1
-                splits += 1
-        if 2 * splits + 1 != size:
-            return TOO_FEW, tree, size
-        depths[tree] = depth
-        start += size
-    if start != len(feature):
-        return TOO_MANY, len(sizes) - 1, 0
-    if leaves != n_leaves:
-        return BAD_LEAVES, 0, leaves
-    return 0, 0, 0
 
 
 @njit

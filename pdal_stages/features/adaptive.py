@@ -17,13 +17,11 @@ from .index import Grid
 from .kdtree import KdTree, build_tree
 from .moments import BATCH, FEATURES, MOMENTS, WIDTH, finish
 from .names import MOMENT_FEATURES, SHAPE_FEATURES
+from .neighborhoods import LEAST_RADIUS
 from .optimal import kopt_block, nearest_block
 from .plan import Columns, FeaturePlan
 from .ropt import COPT_RADII, copt_block, curvature_block, radii_of, ropt_block
 from .shapes import Shapes, count_shapes, list_shapes, no_shapes, point_seeds
-
-#: Density takes smaller radii as this, metres: copies of one point lie at a distance of 0.
-LEAST_RADIUS = 0.001
 
 #: Queries computed at a time when curvatures of a whole cloud are.
 CHUNK = 16_384

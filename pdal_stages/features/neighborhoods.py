@@ -32,6 +32,8 @@ ROPT_DEFAULT = (0.25, 2.0, 0.05)  # r_min, r_max, step in metres [H17]
 LEAST_MEMBERS = 10
 COPT_REACH = 3.0  # metres: the cap of the scattered branch, the largest radius copt looks at [H17]
 MAX_K = 10_000
+#: Density takes smaller radii as this, metres: copies of one point lie at a distance of 0.
+LEAST_RADIUS = 0.001
 MIN_RADIUS, MAX_RADIUS = 0.001, 100_000.0  # metres
 #: Neighborhoods of one plan: a model file of a few kB must not ask for hours of work.
 MOST = 64

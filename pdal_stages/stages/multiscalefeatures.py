@@ -14,8 +14,7 @@ from ..base.errors import OptionError, StageError
 from ..base.outputs import Output
 from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
-from ..features.adaptive import LEAST_RADIUS
-from ..features.neighborhoods import Neighborhood, parse_neighborhoods
+from ..features.neighborhoods import LEAST_RADIUS, Neighborhood, parse_neighborhoods
 from ..features.plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS
 from ..features.voxels import LARGEST, represent
 from .base import Stage
