@@ -14,13 +14,13 @@ from ..base import checks
 from ..base.errors import DimensionError, OptionError, StageError
 from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
+from .index import Grid, build_grid, check_xyz, cut_blocks
 from .plan import FeaturePlan
 
 if TYPE_CHECKING:
     from .adaptive import AdaptiveNeighborhoods
     from .bins import ShapeBins
     from .fixed import FixedRadius
-    from .index import Grid
 
 #: Estimated nanoseconds a block may take on one core: Ctrl-C waits for the blocks in work.
 BLOCK_NS = 1.5e8
@@ -82,8 +82,6 @@ class Run:
         self.dimensions = _dimensions(plan, dimensions, count)
         self.grid = grid
         if coordinates is not None:
-            from .index import build_grid
-
             self.grid = build_grid(coordinates, plan.cell)
         checks.number("'memory_mb'", memory_mb, 16)
         self.threads = resolve_threads(threads)
@@ -100,8 +98,6 @@ class Run:
 
     def _cut(self, budget: float) -> None:
         """Cut the queries into blocks of bounded rows and time; use fewer threads where scratch is large."""
-        from .index import cut_blocks
-
         fixed, adaptive = self.fitted.fixed, self.fitted.adaptive
         cost = fixed.cost(self.candidates) if len(fixed) else np.zeros(len(self.candidates))
         scratch = float(fixed.scratch_bytes(int(self.candidates.max())))
@@ -199,8 +195,6 @@ def _queries(queries, cloud: np.ndarray) -> tuple[np.ndarray | None, np.ndarray 
         return None, None
     array = np.asarray(queries)
     if array.ndim == 2:
-        from .index import check_xyz
-
         return None, check_xyz(array, "queries")
     if array.ndim != 1 or array.dtype.kind not in "iu":
         if array.size == 0 and array.ndim == 1:
@@ -263,15 +257,12 @@ def compile_once(what: str) -> None:
 
 
 def _compile_index() -> None:
-    from .index import build_grid
-
     build_grid(np.zeros((2, 3)), 1.0)
 
 
 def _compile_fixed(feature: str) -> None:
     from .bins import ShapeBins
     from .fixed import FixedRadius
-    from .index import build_grid, cut_blocks
 
     grid = build_grid(np.zeros((1, 3)), 1.0)
     none = np.zeros(0)

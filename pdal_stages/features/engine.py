@@ -15,6 +15,7 @@ from ..base.errors import OptionError, StageError, optional_import
 from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
 from .blocks import Fitted, Run, Tally, compile_once
+from .index import Grid, build_grid, check_xyz
 from .plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS, FeaturePlan
 from .samples import smallest_hashes
 
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from .adaptive import AdaptiveNeighborhoods
     from .bins import ShapeBins
     from .fixed import FixedRadius
-    from .index import Grid
 
 
 class FeatureEngine:
@@ -76,8 +76,6 @@ class FeatureEngine:
         seed: int = 0,
         threads: int | None = None,
     ) -> None:
-        from .index import build_grid, check_xyz  # numba is loaded here, not when the package is
-
         if not isinstance(plan, FeaturePlan):
             raise OptionError(
                 "'plan' must be a FeaturePlan", found=type(plan).__name__, cure="Use FeaturePlan.parse"

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from ..base.errors import OptionError
 from ..base.threads import map_blocks
+from .cells import WHOLE, cell_means, take_means
 from .neighborhoods import SIDES
 
 #: What they are made of.
@@ -106,8 +107,6 @@ def return_features(
     dict of name to (n,) float32
         0 to 1.
     """
-    from .cells import WHOLE, cell_means, take_means  # numba, which a plan does without
-
     wanted = {name: one for name in names if (one := parse(name)) is not None}
     if not wanted:
         return {}

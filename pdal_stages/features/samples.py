@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from .shapes import point_seeds
+
 #: Sample neighborhoods [B16 3.2.2].
 SAMPLES = 500
 
@@ -26,8 +28,6 @@ def smallest_hashes(xyz: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]
     rows : (m,) int64
         Of the points.
     """
-    from .shapes import point_seeds  # numba is loaded here, not when the package is
-
     hashes, rows = np.zeros(0, np.uint64), np.zeros(0, np.int64)
     for start in range(0, len(xyz), CHUNK):
         part = np.asarray(xyz[start : start + CHUNK])
