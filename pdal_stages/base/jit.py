@@ -95,37 +95,43 @@ def device(function: Callable | None = None, **options):
     return function
 
 
+def intrinsic(function: Callable) -> Any:
+    """numba's, for instructions that it has no word for; it is imported here."""
+    made = _numba().extending.intrinsic(function)
+    _stamp(made, function)
+    return made
+
+
 def _register_devices() -> None:
-    if _unregistered:
-        from numba.extending import register_jitable
-
-        while _unregistered:
-            function, options = _unregistered.pop()
-            register_jitable(**options)(function)
+    while _unregistered:
+        function, options = _unregistered.pop()
+        _numba().extending.register_jitable(**options)(function)
 
 
-def _dispatcher(function: Callable, options: dict[str, Any]) -> Any:
+def _numba() -> Any:
     try:
-        import numba
+        import numba.extending
     except ValueError as error:  # of an environment variable of its own
         raise DependencyError(
             "numba cannot be started",
             found=str(error),
             cure="Look for environment variables that begin with NUMBA_",
         ) from None
+    return numba
+
+
+def _dispatcher(function: Callable, options: dict[str, Any]) -> Any:
+    numba = _numba()
     try:
         return numba.njit(**options)(function)
     except RuntimeError:  # "cannot cache function ...: no locator available"
-        return _elsewhere(function, options)
+        return _elsewhere(numba, function, options)
 
 
-def _elsewhere(function: Callable, options: dict[str, Any]) -> Any:
-    import numba
-    from numba.core import config
-
+def _elsewhere(numba: Any, function: Callable, options: dict[str, Any]) -> Any:
     folder = private_cache_folder()
     if folder is not None:
-        settings: Any = config
+        settings = numba.core.config
         before, settings.CACHE_DIR = settings.CACHE_DIR, folder
         try:
             return numba.njit(**options)(function)

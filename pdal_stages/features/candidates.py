@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
 
-from ..base.jit import device
+from ..base.jit import device, intrinsic
 from .index import SPARE
 
 #: Coordinates of padding points: the square is still finite, and larger than any squared radius.
@@ -34,6 +32,8 @@ def order_bits(typingctx, value):
         sign = builder.ashr(bits, ir.Constant(i64, 63))
         return builder.xor(bits, builder.and_(sign, ir.Constant(i64, 2**63 - 1)))
 
+    from numba import types
+
     return types.int64(types.float64), codegen
 
 
@@ -46,6 +46,8 @@ def from_order_bits(typingctx, value):
         sign = builder.ashr(args[0], ir.Constant(i64, 63))
         bits = builder.xor(args[0], builder.and_(sign, ir.Constant(i64, 2**63 - 1)))
         return builder.bitcast(bits, ir.DoubleType())
+
+    from numba import types
 
     return types.float64(types.int64), codegen
 
@@ -123,6 +125,8 @@ def fill_strip(cell_ix, cell_start, row_iy, row_start, iy, left, reach, columns,
 @intrinsic
 def _copy8(typingctx, target, i, source, j):
     """Eight float64 at once, as one or a few vector registers."""
+    from numba import types
+
     signature = types.void(target, types.int64, source, types.int64)
 
     def codegen(context, builder, signature, args):

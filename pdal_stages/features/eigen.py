@@ -15,10 +15,8 @@ from __future__ import annotations
 import math
 
 from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
 
-from ..base.jit import device
+from ..base.jit import device, intrinsic
 
 LN2_HI = 6.93147180369123816490e-01
 LN2_LO = 1.90821492927058770002e-10
@@ -34,6 +32,8 @@ def _bits(typingctx, value):
     def codegen(context, builder, signature, args):
         return builder.bitcast(args[0], ir.IntType(64))
 
+    from numba import types
+
     return types.int64(types.float64), codegen
 
 
@@ -43,6 +43,8 @@ def _from_bits(typingctx, value):
 
     def codegen(context, builder, signature, args):
         return builder.bitcast(args[0], ir.DoubleType())
+
+    from numba import types
 
     return types.float64(types.int64), codegen
 

@@ -12,10 +12,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import types
-from numba.extending import intrinsic
 
-from ..base.jit import device
+from ..base.jit import device, intrinsic
 from .candidates import from_order_bits, order_bits
 from .eigen import covariance_features, eigen3
 
@@ -47,6 +45,8 @@ def _add(typingctx, a, b):
     def codegen(context, builder, signature, args):
         return builder.fadd(args[0], args[1], flags=("reassoc", "contract", "nsz"))
 
+    from numba import types
+
     return types.float64(types.float64, types.float64), codegen
 
 
@@ -56,6 +56,8 @@ def _mul(typingctx, a, b):
 
     def codegen(context, builder, signature, args):
         return builder.fmul(args[0], args[1], flags=("contract",))
+
+    from numba import types
 
     return types.float64(types.float64, types.float64), codegen
 
