@@ -13,7 +13,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from .base import kinds
 from .base.errors import StageError, suggest
@@ -22,6 +22,9 @@ from .base.plain import PlainStream, tell
 from .base.runlog import LoggedStream, RunLog
 from .base.version import __version__
 from .pipeline.overrides import parse_overrides
+
+if TYPE_CHECKING:
+    from .pipeline.read import PipelineSource
 
 _OVERRIDES = (
     "Options of stages are set as in PDAL: --stage.TAG.option=VALUE for stages with a tag, "
@@ -279,12 +282,14 @@ def _pipeline_input(takes: Callable) -> None:
     takes("-s", "--stdin", action="store_true", help="Read the pipeline from standard input")
 
 
-def _source(options: argparse.Namespace) -> str | Path:
+def _source(options: argparse.Namespace) -> Path | PipelineSource:
+    """A file's path, or what was read from standard input."""
     if options.stdin:
-        from .pipeline.read import decode
+        from .pipeline.read import decode, parse_pipeline
 
         raw = getattr(sys.stdin, "buffer", None)
-        return (decode(raw.read(), "standard input") if raw is not None else sys.stdin.read()) or " "
+        text = decode(raw.read(), "standard input") if raw is not None else sys.stdin.read()
+        return parse_pipeline(text or " ", "standard input")
     name = options.file or options.file_option
     if not name:
         raise StageError("no pipeline file was given", cure=f"Usage: pdal-stages {options.command} job.json")
@@ -292,12 +297,9 @@ def _source(options: argparse.Namespace) -> str | Path:
 
 
 def _build(options: argparse.Namespace):
-    from .pipeline.read import parse_pipeline
     from .pipeline.run import Pipeline
 
-    source = _source(options)
-    read = parse_pipeline(source, "standard input") if isinstance(source, str) else source
-    return Pipeline(read, options.overrides)
+    return Pipeline(_source(options), options.overrides)
 
 
 def _pipeline(options: argparse.Namespace) -> int | None:

@@ -114,6 +114,15 @@ def test_stdin_and_expand(job, capsys, monkeypatch, tmp_path):
     assert json.loads((tmp_path / "plain.json").read_text())["pipeline"][1]["function"] == "stage"
 
 
+def test_standard_input_is_named_in_tiles_too(capsys, monkeypatch):
+    import io
+
+    for words in ([], ["--tile", "50"]):
+        monkeypatch.setattr(sys, "stdin", io.StringIO('["in.las", {"type": ]'))
+        code, _, err = run(capsys, "pipeline", "--stdin", *words)
+        assert code == 1 and "standard input, line 1" in err
+
+
 def test_validate(job, capsys, tmp_path):
     assert run(capsys, "validate", job)[0] == 0
     code, out, _ = run(capsys, "pipeline", "--validate", job)

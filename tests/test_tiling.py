@@ -589,7 +589,8 @@ def test_reports(tmp_path, town_file, model_file):
     assert not list(tmp_path.glob("c_*"))
     dry = json.loads((tmp_path / "r.json").read_text())
     assert abs(sum(tile["points"] for tile in dry["tiles"]) - dry["points"]) <= len(dry["tiles"])  # rounding
-    assert main([*words, *names]) == 1
+    assert main([*words, *names, "--metadata", str(tmp_path / "run.metadata")]) == 1
+    assert json.loads((tmp_path / "run.metadata").read_text())["failures"]
     told = json.loads((tmp_path / "r.json").read_text())
     assert told["states"]["failed"] == 0 and told["failures"][0]["what"] == str(broken)
     assert sum(told["classes"].values()) == told["points"] == len(laspy.read(tmp_path / "c_town.laz"))

@@ -12,6 +12,7 @@ from pathlib import Path
 from ..base.errors import OptionError, StageError
 from ..base.files import check_writable, write_whole
 from ..base.plain import tell
+from ..pipeline.read import PipelineSource
 from ..pipeline.run import Pipeline
 from .outcome import InterruptedRun, TiledRun
 from .settings import PER, TilingOptions
@@ -66,7 +67,7 @@ def wants_tiles(options: argparse.Namespace) -> bool:
     return False
 
 
-def run_command(options: argparse.Namespace, source: str | Path) -> int:
+def run_command(options: argparse.Namespace, source: Path | PipelineSource) -> int:
     """Run ``pdal-stages pipeline --tile``; the exit code, 1 where anything failed."""
     for name in options.report:
         if Path(name).suffix.lower() not in (".html", ".htm", ".json"):
@@ -88,7 +89,9 @@ def run_command(options: argparse.Namespace, source: str | Path) -> int:
         except InterruptedRun as stopped:
             run, interrupted = stopped.run, True
     _print_dry(run) if options.dry_run else _print(run)
-    for name in [*options.report, *([options.metadata] if options.metadata else [])]:
+    if options.metadata:
+        _write_json(options.metadata, run, "--metadata")
+    for name in options.report:
         _write_report(name, run)
     if interrupted:
         tell(
@@ -159,11 +162,15 @@ def _counted(count: int, word: str) -> str:
 
 def _write_report(name: str, run: TiledRun) -> None:
     if Path(name).suffix.lower() == ".json":
-        try:
-            write_whole(name, (json.dumps(run.to_dict(), indent=1) + "\n").encode())
-        except StageError as error:
-            raise error.at("--report") from None
+        _write_json(name, run, "--report")
         return
     from ..reports.runpage import write_run_report
 
     write_run_report(name, run.to_dict())
+
+
+def _write_json(name: str, run: TiledRun, flag: str) -> None:
+    try:
+        write_whole(name, (json.dumps(run.to_dict(), indent=1) + "\n").encode())
+    except StageError as error:
+        raise error.at(flag) from None
