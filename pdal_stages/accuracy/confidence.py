@@ -33,21 +33,9 @@ class Grading:
 
     @classmethod
     def from_values(cls, values: npt.ArrayLike, right: npt.ArrayLike, name: str = "reliability") -> Grading:
-        """Grade one confidence per point.
+        """Grade (n,) confidences by whether the class is right, (n,) bool.
 
-        Parameters
-        ----------
-        values : (n,) array
-            Confidence between 0 and 1.
-        right : (n,) bool array
-            Whether the point's class is right.
-        name : str
-            What the values are called, for the error message.
-
-        Raises
-        ------
-        StageError
-            Where a value is not a number between 0 and 1.
+        StageError, which calls them `name`, where one is not a number between 0 and 1.
         """
         v = np.asarray(values, dtype=np.float64)
         ok = np.asarray(right, dtype=bool)

@@ -90,10 +90,7 @@ class Merge:
     def parse(cls, mapping: Mapping[Any, Any] | None) -> Merge:
         """Read ``{5: [3, 4]}`` or ``{3: 5, 4: 5}``; keys and codes may be text.
 
-        Raises
-        ------
-        StageError
-            For something that is not a class code, or a class sent to two others.
+        StageError for something that is not a class code, or a class sent to two others.
         """
         to = np.arange(MAX_CODE + 1)
         members: dict[int, set[int]] = {}

@@ -43,15 +43,7 @@ def save(path: str | os.PathLike, state: dict[str, Any], arrays: dict[str, npt.N
 def load(
     path: str | os.PathLike, identity: dict[str, Any], shapes: dict[str, tuple[int, ...]]
 ) -> tuple[dict[str, Any], dict[str, npt.NDArray[np.float32]]]:
-    """Read a checkpoint of this very training.
-
-    Parameters
-    ----------
-    path : path
-    identity : dict
-        What must be equal for a training to go on: options, classes, data.
-    shapes : dict
-        Arrays it must hold.
+    """Read a checkpoint of this very training: of the same options, classes and data, with arrays of these shapes.
 
     Raises
     ------

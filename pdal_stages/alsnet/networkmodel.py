@@ -32,13 +32,7 @@ def own_options(given: Any) -> NetworkOptions:
 
 
 def inputs(options: TrainingOptions) -> tuple[str, ...]:
-    """The network's inputs: coordinates from the batch's centre, then dimensions.
-
-    Raises
-    ------
-    OptionError
-        There are none.
-    """
+    """The network's inputs: coordinates from the batch's centre, then dimensions; OptionError where there are none."""
     names = tuple(dict.fromkeys([*options.alsnet.coordinates, *options.dimensions]))
     if not names:
         raise OptionError(

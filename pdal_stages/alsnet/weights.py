@@ -41,13 +41,7 @@ def fresh(configuration: Configuration, inputs: int, classes: int, seed: int) ->
 def check(
     weights: Mapping[str, npt.NDArray[Any]], configuration: Configuration, inputs: int, classes: int
 ) -> None:
-    """Refuse arrays that are not this network's weights.
-
-    Raises
-    ------
-    ModelError
-        An array is missing, unknown, of another shape, not finite, or has a negative variance.
-    """
+    """Refuse, as a ModelError, arrays that are missing, unknown, of other shapes, not finite, or of negative variance."""
     shapes = configuration.shapes(inputs, classes)
     odd = sorted(set(weights) - set(shapes))
     if odd:

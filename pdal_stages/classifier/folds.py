@@ -131,12 +131,7 @@ class ContextOnly:
 def sample_context(
     question: Question, passes: Sequence[FoldForests], context: Context, classes: int
 ) -> npt.NDArray[np.float32]:
-    """The context of the points that are asked for, as passes say, one after the other, that have not seen them.
-
-    Returns
-    -------
-    (points asked for, columns of the context) float32
-    """
+    """(m, columns): the context of the m points asked for, as passes say, one after the other, that have not seen them."""
     asked: Any = question.rows
     out = np.empty((len(asked), len(context.tokens) * classes), np.float32)
     run = PassRun([*passes, ContextOnly(context)], classes, question)

@@ -239,13 +239,7 @@ class _Passes:
             self.scores.append({"percentiles": percentiles, "importances": importances, "out_of_bag": bag})
 
     def without_each_survey(self) -> dict[str, Any]:
-        """Scores of each survey's samples by passes grown without that survey.
-
-        Raises
-        ------
-        OptionError
-            There is only one survey.
-        """
+        """Scores of each survey's samples by passes grown without that survey; OptionError where there is only one."""
         names = sorted(set(self.flights))
         if len(names) < 2:
             raise OptionError(

@@ -85,13 +85,7 @@ class Scene:
 
     @classmethod
     def of(cls, a: Accuracy, xyz: Any, reference: Any, predicted: Any) -> Scene:
-        """Check arrays that fit together, and merge classes as the accuracy did.
-
-        Raises
-        ------
-        StageError
-            Where one is missing, empty, of another length, or a coordinate is not finite.
-        """
+        """Arrays that fit together and are finite, or a StageError, with classes merged as the accuracy did."""
         given = {"xyz": xyz, "reference": reference, "predicted": predicted}
         missing = [name for name, values in given.items() if values is None]
         if missing:
@@ -281,14 +275,7 @@ def heights_to_draw(z: npt.NDArray[np.float64], length: float) -> tuple[float, f
     """The heights that a section shows: birds, multipath and other strays would press the scene flat.
 
     The narrowest band with 98 % of the points, widened by half its height, but by 0.3 of the section's length at
-    least and by that length at most; no farther than the points reach.
-
-    Parameters
-    ----------
-    z : (n,) float
-        Heights in the section, one at least.
-    length : float
-        Length of the section.
+    least and by that length at most; no farther than the points reach. One height at least is given.
     """
     z = np.sort(z)
     held = math.ceil(0.98 * len(z))

@@ -33,13 +33,7 @@ _SETTINGS = {
 
 
 def write_run_report(path: str | os.PathLike[str], run: Mapping[str, Any]) -> Path:
-    """Write the page of :func:`run_page`, whole or not at all.
-
-    Raises
-    ------
-    StageError
-        If it cannot be written.
-    """
+    """Write the page of :func:`run_page`, whole or not at all; StageError if it cannot be written."""
     return write_whole(path, run_page(run).encode())
 
 
