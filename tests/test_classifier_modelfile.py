@@ -337,9 +337,11 @@ def test_hostile_arrays_are_refused(data, good):
 @pytest.mark.parametrize("kind", ["<f4", "<i2", "|u1", "<u8", "<f8"])
 def test_arrays_come_back(shape, kind):
     array = np.arange(np.prod(shape)).reshape(shape).astype(kind)
-    again = from_bytes(to_bytes(array), ArrayRule((kind,)), "a")
+    again = from_bytes(to_bytes(array), ArrayRule((kind,), len(shape)), "a")
     assert again.dtype == array.dtype and np.array_equal(again, array) and not again.flags.writeable
-    assert np.array_equal(from_bytes(to_bytes(np.asfortranarray(array)), ArrayRule((kind,)), "a"), array)
+    assert np.array_equal(
+        from_bytes(to_bytes(np.asfortranarray(array)), ArrayRule((kind,), len(shape)), "a"), array
+    )
 
 
 def test_zip_bomb(good):

@@ -94,7 +94,7 @@ class Circles:
         keys = [xyz[:, 2], xyz[:, 1], xyz[:, 0]]
         if inputs is not None:
             keys = [*(inputs[:, k] for k in range(inputs.shape[1])), *keys]
-        canonical = np.lexsort(keys).astype(np.int64) if len(xyz) else np.zeros(0, np.int64)
+        canonical = np.lexsort(keys)
         self._side = self.spacing / 2.0
         cell = np.floor(xyz[canonical, :2] / self._side).astype(np.int64)
         self._first = cell.min(axis=0) if len(cell) else np.zeros(2, np.int64)

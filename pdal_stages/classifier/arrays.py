@@ -24,7 +24,7 @@ class ArrayRule:
     """What an algorithm expects of one of its arrays."""
 
     dtypes: tuple[str, ...]  #: allowed types, as NumPy writes them: ``<f4``
-    ndim: int | None = None  #: number of axes; None where any will do
+    ndim: int  #: number of axes
 
 
 def to_bytes(array: npt.NDArray[Any]) -> bytes:
@@ -46,10 +46,9 @@ def from_bytes(data: bytes, rule: ArrayRule, name: str) -> npt.NDArray[Any]:
         shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
     except (ValueError, RecursionError, MemoryError) as error:
         raise ModelError(f"the header of the array '{name}' cannot be read", found=str(error)[:80]) from None
-    if fortran or dtype.str not in rule.dtypes or (rule.ndim is not None and len(shape) != rule.ndim):
-        axes = "" if rule.ndim is None else f" with {rule.ndim} axes"
+    if fortran or dtype.str not in rule.dtypes or len(shape) != rule.ndim:
         raise ModelError(
-            f"the array '{name}' must be {' or '.join(rule.dtypes)}{axes}, in C order",
+            f"the array '{name}' must be {' or '.join(rule.dtypes)} with {rule.ndim} axes, in C order",
             found=f"{dtype.str} {shape}",
         )
     start = stream.tell()
