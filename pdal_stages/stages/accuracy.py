@@ -145,9 +145,7 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
                 cure="Check the reader's file and the filters before this stage",
             )
         chosen = Selection.parse(["withheld"], "ignore") if self.ignore is None else self.ignore
-        inside = ~points.ignored(replace(chosen, codes=()))  # codes are of the reference
-        if points.mask is not None:
-            inside &= points.mask
+        inside = points.usable(replace(chosen, codes=()))  # codes are of the reference
         reference = points.codes_of(self.reference)[inside]
         predicted = points.codes_of(self.dimension)[inside]
         confidence: dict[str, Any] = {

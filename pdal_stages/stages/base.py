@@ -161,32 +161,14 @@ class Stage(ABC):
     def reach_of(self, points: Points, wanted: NDArray[np.bool_], box: Sequence[float]) -> float:
         """How far around a box lie the points that decide the results of the wanted ones, for an open-ended stage.
 
-        Parameters
-        ----------
-        points : Points
-            What was read: the box and some surroundings.
-        wanted : (n,) bool
-        box : (min x, min y, max x, max y)
-            In metres.
-
-        Returns
-        -------
-        float
-            Metres; more than was read, where that was not enough.
+        `points` are what was read: the box (min x, min y, max x, max y) and some surroundings. All in metres; more than
+        was read, where that was not enough.
         """
         return 0.0
 
     @classmethod
     def from_pipeline(cls, given: Mapping[str, Any], before: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        """Options that the stage takes from the pipeline where they are not given.
-
-        Parameters
-        ----------
-        given : mapping
-            The stage's own options, as given.
-        before : sequence of mapping
-            The stages before it.
-        """
+        """Options that the stage takes from the stages before it in the pipeline, where its own do not give them."""
         return {}
 
     def points(self, arrays: Mapping[str, NDArray], *, wkt: str = "", legacy_flags: bool = False) -> Points:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -27,25 +27,10 @@ from .options import option
 from .points import Points
 from .selection import UNWANTED, Selection
 
-#: Options of this stage that are not the trainer's.
-_OWN = {
-    "filename",
-    "files",
-    "label",
-    "survey",
-    "where",
-    "threads",
-    "memory",
-    "horizontal_unit",
-    "vertical_unit",
-}
-
-
-def _default(name: str) -> Any:
-    """The trainer's own default."""
-    return TrainingOptions.__dataclass_fields__[name].default
-
-
+#: The trainer's own options.
+_TRAINERS = {field.name: field.default for field in fields(TrainingOptions)}
+#: The part of a model's description that fits in a pipeline's metadata.
+_TOLD = ("strategy", "classes", "accuracy", "parameters")
 #: Most files that a model names.
 _NAMED = 20
 #: The word for the dimensions that follow from what the points have.
@@ -73,12 +58,12 @@ class ClassifierModel(Stage):
     )
     neighborhoods: list = option(
         "list",
-        _default("neighborhoods"),
+        _TRAINERS["neighborhoods"],
         "Neighborhoods: tokens (c2, s1, k50, kopt, ropt, copt) or a preset (blomley2016, weinmann2018, he2017)",
     )
     feature_set: list = option(
         "list",
-        _default("feature_set"),
+        _TRAINERS["feature_set"],
         "Groups (covariance, geometric, shapes, all) or single features. 'all' is the papers' set",
     )
     dimensions: list = option(
@@ -109,7 +94,7 @@ class ClassifierModel(Stage):
     )
     count: int = option(
         "integer",
-        _default("count"),
+        _TRAINERS["count"],
         "Samples per class; smaller classes are filled up with duplicates",
         minimum=1,
     )
@@ -118,7 +103,7 @@ class ClassifierModel(Stage):
     )
     trees: list = option(
         "list",
-        (_default("trees"),),
+        (_TRAINERS["trees"],),
         "Number of trees; of several values the best is found by cross-validation",
     )
     max_depth: list = option(
@@ -126,12 +111,12 @@ class ClassifierModel(Stage):
     )
     min_samples_leaf: list = option(
         "list",
-        (_default("min_samples_leaf"),),
+        (_TRAINERS["min_samples_leaf"],),
         "Minimum number of samples in a leaf; of several values the best is found",
     )
     max_samples: float = option(
         "number",
-        _default("max_samples"),
+        _TRAINERS["max_samples"],
         "Share of the samples that each tree draws",
         minimum=0,
         exclusive=True,
@@ -139,12 +124,12 @@ class ClassifierModel(Stage):
     )
     max_features: str = option(
         "string",
-        _default("max_features"),
+        _TRAINERS["max_features"],
         "Features tried at each split: auto (a tenth, at least the square root), sqrt, log2, a number or a share",
     )
     prior_weight: float = option(
         "number",
-        _default("prior_weight"),
+        _TRAINERS["prior_weight"],
         "0: all classes count as equally frequent, as they are sampled; 1: each as frequent as in the training points",
         minimum=0,
         maximum=1,
@@ -169,18 +154,18 @@ class ClassifierModel(Stage):
     )
     balance: bool = option(
         "boolean",
-        _default("balance"),
+        _TRAINERS["balance"],
         "Take as many samples of a class from each survey and each thinned copy; false: as many as their share",
     )
     thin: list = option(
         "list",
-        _default("thin"),
+        _TRAINERS["thin"],
         "Points per square metre of sparser copies to train on as well, so that the model bears sparse clouds",
         may_be_empty=True,
     )
     voxel: float = option(
         "number",
-        _default("voxel"),
+        _TRAINERS["voxel"],
         "Side of voxels: in training and in classifying one point represents each, and the others get its class; 0 for none",
         minimum=0,
         maximum=LARGEST,
@@ -198,19 +183,19 @@ class ClassifierModel(Stage):
     )
     passes: int = option(
         "integer",
-        _default("passes"),
+        _TRAINERS["passes"],
         "Forests one after the other, each reading what the one before says of a point's surroundings",
         minimum=1,
         maximum=MOST_PASSES,
     )
     context: list = option(
         "list",
-        _default("context"),
+        _TRAINERS["context"],
         "What passes after the first read: own, or box, boxvotes, column, columnvotes and a cell's side (box0.5)",
     )
     pass_folds: int = option(
         "integer",
-        _default("pass_folds"),
+        _TRAINERS["pass_folds"],
         "Parts of the training ground held out in turn to train the passes after the first",
         minimum=2,
         maximum=100,
@@ -249,7 +234,7 @@ holds the classes.
             codes = (
                 classes if isinstance(classes, list) else [c.strip() for c in classes.split(",") if c.strip()]
             )
-            given["classes"] = {str(c): _code(c) for c in codes}
+            given["classes"] = {str(c): _number(c) for c in codes}
         if isinstance(share, int | float) and not isinstance(share, bool):
             given["max_features"] = str(share)
         self._preparation: list[dict[str, Any]] = []
@@ -266,7 +251,7 @@ holds the classes.
     @cached_property
     def training(self) -> TrainingOptions:
         """The trainer's options."""
-        values = {name: value for name, value in self.options.items() if name not in _OWN}
+        values = {name: value for name, value in self.options.items() if name in _TRAINERS}
         for name in ("trees", "max_depth", "min_samples_leaf"):
             numbers = [int(v) if str(v).strip().lstrip("-").isdigit() else v for v in values[name]]
             values[name] = numbers[0] if len(numbers) == 1 else numbers
@@ -275,7 +260,7 @@ holds the classes.
             values["dimensions"] = ALWAYS
         values["ignore"] = self.ignore.codes
         values["thin"] = [_number(v) if isinstance(v, str) else v for v in values["thin"]]
-        return TrainingOptions(**values, threads=self.threads, memory_mb=self.memory)
+        return TrainingOptions(**values, memory_mb=self.memory)
 
     @property
     def automatic(self) -> bool:
@@ -339,7 +324,8 @@ holds the classes.
         model = train(self._surveys(cloud, points), training)
         model.info["preparation"] = self._preparation
         model.save(self.filename)
-        points.report.update({"model": self.filename, **_brief(model.info), "seconds": model.seconds})
+        told = {key: model.info[key] for key in _TOLD if key in model.info}
+        points.report.update({"model": self.filename, **told, "seconds": model.seconds})
         if scores := summary.scores(model.info):
             points.report["score"] = scores[0]
         crossed = model.info["accuracy"]["cross_validation"] or {}
@@ -348,7 +334,7 @@ holds the classes.
                 f"blocks are held out, not {summary.groups_word(self.groups)}: {crossed['instead']}"
             )
         if self.algorithm == "alsnet":  # with the curve
-            points.report["training"] = _plain(model.info["training"])
+            points.report["training"] = model.info["training"]
         return {}
 
     def _surveys(self, cloud: TrainingCloud, points: Points) -> list[TrainingCloud]:
@@ -360,34 +346,11 @@ holds the classes.
         return [replace(part, name=f"{self.survey} {one:g}", survey=None) for one, part in parts]
 
 
-def _code(label: Any) -> Any:
-    try:
-        return int(label)
-    except (TypeError, ValueError):
-        return label
-
-
-def _number(text: str) -> Any:
-    """``0.1`` as a share, ``24`` as a number of features, words as they are."""
+def _number(text: Any) -> Any:
+    """``0.1`` as a share, ``24`` as a number of features or a class, all else as it is."""
     for kind in (int, float):
         try:
             return kind(text)
-        except ValueError:
+        except (TypeError, ValueError):
             continue
     return text
-
-
-def _brief(info: dict[str, Any]) -> dict[str, Any]:
-    """The part of a model's description that fits in a pipeline's metadata."""
-    keep = ("strategy", "classes", "accuracy", "parameters")
-    return {key: _plain(info[key]) for key in keep if key in info}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, np.generic):
-        return value.item()
-    return value

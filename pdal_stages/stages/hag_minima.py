@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import OptionError
-from ..terrain.minima import MinimaTerrain, terrain_reach
+from ..terrain.minima import MinimaTerrain, check_sizes, terrain_reach
 from .base import HEIGHTS_OUTSIDE, Stage
 from .options import option
 from .points import Points
@@ -63,12 +63,11 @@ the unit of Z.
     example = {"type": "filters.hag_minima", "cell": 20, "resolution": 0.5}
 
     def check(self) -> None:
-        if self.resolution > self.cell:
-            raise OptionError(
-                "option 'resolution' must not be larger than 'cell'",
-                found=f"resolution {self.resolution:g}, cell {self.cell:g}",
-                cure="Swap them, or lower 'resolution'",
-            )
+        try:
+            check_sizes(self.cell, self.resolution)
+        except OptionError as error:
+            error.what = f"option {error.what}"
+            raise
 
     def creates(self) -> dict[str, str]:
         return {"HeightAboveGround": "float"}
@@ -80,18 +79,13 @@ the unit of Z.
 
     def reach_of(self, points: Points, wanted: NDArray[np.bool_], box: Sequence[float]) -> float:
         x, y, _ = points.xyz.T
-        return terrain_reach(x, y, self.forms_terrain(points), wanted, box, self.cell, self.resolution)
-
-    def forms_terrain(self, points: Points) -> NDArray[np.bool_]:
-        """Which points form the terrain; those left out are counted."""
-        forms = ~points.ignored(self.ignore)
-        return forms if points.mask is None else forms & points.mask
+        return terrain_reach(x, y, points.usable(self.ignore), wanted, box, self.cell, self.resolution)
 
     def run(self, points: Points) -> dict[str, NDArray]:
         if points.count == 0:
             return {"HeightAboveGround": np.empty(0)}
         x, y, z = points.xyz.T
-        forms = self.forms_terrain(points)
+        forms = points.usable(self.ignore)
         if points.mask is not None and not points.mask.any():  # which the report says
             return {}
         terrain = MinimaTerrain.fit(x, y, z, cell=self.cell, resolution=self.resolution, mask=forms)

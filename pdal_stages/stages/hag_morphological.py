@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import OptionError, StageError
+from ..base.errors import OptionError
 from ..terrain.morphological import check_sizes, filtered_ground, reach
 from ..terrain.profile import opening_names
 from .base import HEIGHTS_OUTSIDE, Stage
@@ -102,8 +102,9 @@ of Z.
             ) from None
         try:
             check_sizes(self.cell, self.slope, self.window, self.threshold, self.scalar, self.windows)
-        except StageError as error:
-            raise OptionError(f"option {error.what}", found=error.found, cure=error.cure) from None
+        except OptionError as error:
+            error.what = f"option {error.what}"
+            raise
 
     def creates(self) -> dict[str, str]:
         return {
@@ -118,9 +119,7 @@ of Z.
 
     def run(self, points: Points) -> dict[str, NDArray]:
         x, y, z = points.xyz.T
-        usable = ~points.ignored(self.ignore)
-        if points.mask is not None:
-            usable &= points.mask
+        usable = points.usable(self.ignore)
         wanted = points.wanting("HeightAboveGround", self.makes_again)
         found = filtered_ground(
             x[wanted],

@@ -211,10 +211,9 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         if points.count == 0:
             return {}
         ignored, kept = points.ignored(self.ignore), points.chosen(self.keep)
-        inside = np.ones(points.count, bool) if points.mask is None else points.mask
-        stay = ignored | kept
+        inside = points.inside
         points.report["kept"] = int(np.count_nonzero(inside & kept & ~ignored))
-        wanted = inside & ~stay
+        wanted = inside & ~ignored & ~kept
         self._refuse_codes_that_stay(points, wanted)
         with Progress(int(np.count_nonzero(wanted)), self.type) as progress:
             found = self.model.predict(

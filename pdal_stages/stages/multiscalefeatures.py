@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..base import kinds, strictjson
 from ..base.errors import OptionError, StageError
+from ..base.files import write_whole
 from ..base.outputs import Output
 from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
@@ -240,8 +241,6 @@ def _read_bins(path: str | None) -> tuple[ShapeBins | None, float | None]:
 
 
 def _write_bins(path: str, engine: FeatureEngine) -> None:
-    from ..base.files import write_whole
-
     content = {
         "format": "pdal_stages thresholds 1",
         "bins": engine.bins.to_dict() if engine.bins is not None else None,

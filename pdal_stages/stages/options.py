@@ -12,72 +12,46 @@ from ..base import checks
 from ..base.errors import OptionError, suggest
 from .selection import Selection
 
-_JSON_TYPES = {
-    "number": "number",
-    "integer": "integer",
-    "string": "string",
-    "boolean": "boolean",
-    "filename": "string",
-    "expression": "string",
-    "list": "array",
-    "codes": "array",
-    "selection": "array",
-    "mapping": "object",
-}
-_READABLE = {
-    "number": "a number",
-    "integer": "a whole number",
-    "string": "text",
-    "boolean": "true or false",
-    "filename": "a file name",
-    "expression": 'a condition such as "Classification == 2"',
-    "list": "a list, or text separated by commas",
-    "codes": "a list, or text separated by commas",
-    "selection": "a list, or text separated by commas",
-    "mapping": 'a mapping such as {"2": "Ground"}',
+_LISTED = ["array", "string"], "a list, or text separated by commas"
+#: Kind of option -> its JSON type (PDAL takes numbers as text too), and what errors call it.
+_KINDS: dict[str, tuple[str | list[str], str]] = {
+    "number": (["number", "string"], "a number"),
+    "integer": (["integer", "string"], "a whole number"),
+    "string": ("string", "text"),
+    "boolean": (["boolean", "string"], "true or false"),
+    "filename": ("string", "a file name"),
+    "expression": ("string", 'a condition such as "Classification == 2"'),
+    "list": _LISTED,
+    "codes": _LISTED,
+    "selection": _LISTED,
+    "mapping": (["object", "string"], 'a mapping such as {"2": "Ground"}'),
 }
 
 
 @dataclass(frozen=True)
 class Option:
-    """One option of a stage; see :func:`option`. Read from a stage object it gives the parsed value.
+    """One option of a stage; see :func:`option`. Read from a stage object it gives the parsed value."""
 
-    Attributes
-    ----------
-    kind : str
-        ``number``, ``integer``, ``string``, ``boolean``, ``filename``, ``expression``,
-        ``list`` (a JSON list or comma-separated text), ``codes`` (a list of class codes, or of ranges as PDAL
-        writes them, ``Classification[7:7]``), ``selection`` (the same, of other dimensions too) or ``mapping``
-        (a JSON object).
-    default : object
-        The value where the option is absent; None means "decided by the stage".
-    help : str
-        One sentence that ends without a full stop.
-    minimum, maximum : float, optional
-        Bounds of a number; `exclusive` leaves the lower one out.
-    choices : tuple, optional
-        The values allowed.
-    unit : str
-        Shown beside the default.
-    may_be_empty : bool
-        Whether an empty list means "none".
-    name : str
-        As the user types it; by default the attribute's name.
-    also : str
-        Another name it goes by, PDAL's.
-    """
-
+    #: A key of ``_KINDS``. ``list`` is a JSON list or comma-separated text; ``codes`` a list of class codes, or of
+    #: ranges as PDAL writes them, ``Classification[7:7]``; ``selection`` the same, of other dimensions too.
     kind: str
+    #: The value where the option is absent; None means "decided by the stage".
     default: Any
+    #: One sentence that ends without a full stop.
     help: str
+    #: Bounds of a number; `exclusive` leaves the lower one out.
     minimum: float | None = None
     maximum: float | None = None
     exclusive: bool = False
     choices: tuple = ()
+    #: Shown beside the default.
     unit: str = ""
     required: bool = False
+    #: Whether an empty list means "none".
     may_be_empty: bool = False
+    #: As the user types it; by default the attribute's name.
     name: str = ""
+    #: Another name it goes by, PDAL's.
     also: str = ""
 
     def __set_name__(self, owner: type, name: str) -> None:
@@ -89,11 +63,7 @@ class Option:
 
     def schema(self) -> dict:
         """The option's JSON Schema."""
-        out: dict[str, Any] = {"description": self.help, "type": _JSON_TYPES[self.kind]}
-        if self.kind in ("list", "codes", "selection"):
-            out["type"] = ["array", "string"]
-        if self.kind in ("number", "integer", "boolean", "mapping"):
-            out["type"] = [out["type"], "string"]  # PDAL takes numbers as text too
+        out: dict[str, Any] = {"description": self.help, "type": _KINDS[self.kind][0]}
         if self.minimum is not None:
             out["exclusiveMinimum" if self.exclusive else "minimum"] = self.minimum
         if self.maximum is not None:
@@ -105,15 +75,9 @@ class Option:
         return out
 
     def parse(self, value: Any) -> Any:
-        """The value as the stage wants it, from JSON or from command-line text.
-
-        Raises
-        ------
-        OptionError
-            If it is of the wrong type, out of range or not among the choices.
-        """
-        parsed = getattr(self, f"_parse_{self.kind}", self._parse_string)(value)
-        if isinstance(parsed, int | float) and self.kind in ("number", "integer"):
+        """The value as the stage wants it, from JSON or from command-line text; OptionError where it does not fit."""
+        parsed: Any = getattr(self, f"_parse_{self.kind}", self._parse_string)(value)
+        if self.kind in ("number", "integer"):
             self._check_range(parsed)
         if self.choices and parsed not in self.choices:
             raise OptionError(
@@ -125,7 +89,7 @@ class Option:
 
     def _wrong(self, value: Any) -> OptionError:
         return OptionError(
-            f"option '{self.name}' must be {_READABLE[self.kind]}", found=json.dumps(value, default=str)
+            f"option '{self.name}' must be {_KINDS[self.kind][1]}", found=json.dumps(value, default=str)
         )
 
     def _parse_number(self, value: Any) -> float:
@@ -146,18 +110,17 @@ class Option:
         return int(number)
 
     def _parse_boolean(self, value: Any) -> bool:
-        if isinstance(value, bool):
-            return value
-        if isinstance(value, str) and value.strip().lower() in ("true", "false"):
-            return value.strip().lower() == "true"
-        raise self._wrong(value)
+        word = str(value).strip().lower()
+        if not isinstance(value, bool | str) or word not in ("true", "false"):
+            raise self._wrong(value)
+        return word == "true"
 
     def _parse_string(self, value: Any) -> str:
         if not isinstance(value, str):
             raise self._wrong(value)
         if self.kind in ("filename", "expression") and not value.strip():
             raise OptionError(
-                f"option '{self.name}' is empty", cure=f"Give {_READABLE[self.kind]}, or leave it out"
+                f"option '{self.name}' is empty", cure=f"Give {_KINDS[self.kind][1]}, or leave it out"
             )
         return value
 
@@ -208,7 +171,7 @@ class Option:
         ):
             limits = checks.bounds(low, high, self.exclusive, self.unit)
             raise OptionError(
-                f"option '{self.name}' must be {_READABLE[self.kind]}{limits}", found=f"{value:g}"
+                f"option '{self.name}' must be {_KINDS[self.kind][1]}{limits}", found=f"{value:g}"
             )
 
 
@@ -235,14 +198,7 @@ def _split(text: str) -> list[str]:
 
 
 def parse_options(declared: Iterable[Option], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Every declared option with its value, given or default.
-
-    Raises
-    ------
-    OptionError
-        For an unknown option (with the nearest known one), a missing required one, or a
-        value that does not fit.
-    """
+    """Every declared option with its value, given or default; OptionError where what is given does not fit."""
     known = {option.name: option for option in declared}
     for option in known.values():
         if option.also in given:
@@ -264,7 +220,7 @@ def parse_options(declared: Iterable[Option], given: Mapping[str, Any]) -> dict[
             values[name] = option.parse(given[name])
         elif option.required:
             raise OptionError(
-                f"option '{name}' is required", cure=f"It is {_READABLE[option.kind]}: {option.help}"
+                f"option '{name}' is required", cure=f"It is {_KINDS[option.kind][1]}: {option.help}"
             )
         elif option.kind == "selection" and option.default is not None:
             values[name] = option.parse(option.default)

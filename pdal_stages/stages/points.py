@@ -71,6 +71,11 @@ class Points:
             if self.count and not self.report["where"]:
                 self.report["warning"] = f"'where' holds for none of the {self.count:,} points: {where.text}"
 
+    @property
+    def inside(self) -> NDArray[np.bool_]:
+        """The points inside `where`; all, where there is none."""
+        return np.ones(self.count, bool) if self.mask is None else self.mask
+
     @cached_property
     def units(self) -> Units:
         """Metres per unit; refuses degrees. An assumption is put in the report."""
@@ -132,8 +137,6 @@ class Points:
     @cached_property
     def class_codes(self) -> NDArray[np.uint8]:
         """`Classification` without the flag bits LAS 1.0-1.3 keeps in the same byte."""
-        if "Classification" not in self.arrays:
-            raise DimensionError("the dimension 'Classification' is missing", found=", ".join(self.arrays))
         return self.codes_of("Classification")
 
     def codes_of(self, name: str) -> NDArray[np.uint8]:
@@ -190,10 +193,13 @@ class Points:
         self.report["ignored"] = int(np.count_nonzero(found if self.mask is None else found & self.mask))
         return found
 
+    def usable(self, ignored: Selection) -> NDArray[np.bool_]:
+        """The points inside `where` that are not ignored; those that are, are counted."""
+        return self.inside & ~self.ignored(ignored)
+
     def wanting(self, name: str, made_before: bool) -> NDArray[np.bool_]:
         """The points that get a height: those inside `where`, and others that have none yet (0)."""
-        inside = np.ones(self.count, bool) if self.mask is None else self.mask
-        return inside if made_before else inside | (self.arrays[name] == 0)
+        return self.inside if made_before else self.inside | (self.arrays[name] == 0)
 
     def with_codes(self, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """New class codes for `Classification`, with the flag bits of each point kept."""

@@ -9,8 +9,6 @@ from functools import cache
 from ..base.errors import PipelineError, suggest
 from .base import Stage
 
-_SUPPORT = {"base", "options", "points", "registry", "where", "preparation"}
-
 
 @cache
 def stages() -> dict[str, type[Stage]]:
@@ -19,11 +17,9 @@ def stages() -> dict[str, type[Stage]]:
     path = importlib.import_module(package).__path__
     found: dict[str, type[Stage]] = {}
     for info in pkgutil.iter_modules(path):
-        if info.name in _SUPPORT:
-            continue
         module = importlib.import_module(f"{package}.{info.name}")
         for value in vars(module).values():
-            if isinstance(value, type) and issubclass(value, Stage) and value.__module__ == module.__name__:
+            if isinstance(value, type) and issubclass(value, Stage) and value is not Stage:
                 found[value.type] = value
     return dict(sorted(found.items()))
 

@@ -41,13 +41,7 @@ class Span:
 
 @dataclass(frozen=True)
 class Selection:
-    """Points of some classes, and points in ranges of other dimensions; any of them suffices.
-
-    Attributes
-    ----------
-    codes : tuple of int
-    spans : tuple of Span
-    """
+    """Points of some classes, and points in ranges of other dimensions; any of them suffices."""
 
     codes: tuple[int, ...] = ()
     spans: tuple[Span, ...] = ()
@@ -57,13 +51,7 @@ class Selection:
 
     @classmethod
     def parse(cls, items: Iterable[Any], option: str) -> Selection:
-        """From class codes, ranges and the word ``withheld``.
-
-        Raises
-        ------
-        OptionError
-            Naming the option.
-        """
+        """From class codes, ranges and the word ``withheld``; errors name the option."""
         codes: list[int] = []
         spans: list[Span] = []
         for item in (str(item).strip() for item in items):

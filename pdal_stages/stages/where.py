@@ -13,6 +13,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,10 +84,10 @@ _ALIASES = {
 
 @dataclass(frozen=True)
 class _Node:
-    """An operator with its operands, a dimension name, or a number; `truth` marks booleans."""
+    """A function with its operands, a dimension name, or a number; `truth` marks booleans."""
 
     kind: str
-    value: object = None
+    value: Any
     parts: tuple[_Node, ...] = ()
     truth: bool = False
 
@@ -120,13 +121,14 @@ class Expression:
             position = match.end()
         self._at = 0
         self._depth = 0
+        self._names: set[str] = set()
         self._root = self._level(0)
         if self._at < len(self._tokens):
             kind, word, place = self._tokens[self._at]
             raise self._error(f"'{word}' is not expected here", place)
         if not self._root.truth:
             raise self._error("it gives a number, not true or false", 0)
-        self.dimensions = tuple(sorted(_names(self._root)))
+        self.dimensions = tuple(sorted(self._names))
 
     def evaluate(self, arrays: Mapping[str, NDArray]) -> NDArray[np.bool_]:
         """The mask of points for which the expression holds.
@@ -162,7 +164,7 @@ class Expression:
             right = self._level(level + 1)
             if (left.truth, right.truth) != (mark in _BOOLEAN,) * 2:
                 raise self._error(f"'{mark}' does not fit its two sides", place)
-            left = _Node("op", mark, (left, right), truth=level < 3)
+            left = _Node("operation", _OPERATIONS[mark], (left, right), truth=level < 3)
         return left
 
     def _unary(self) -> _Node:
@@ -173,6 +175,7 @@ class Expression:
         if kind == "number":
             return _Node("number", float(word))
         if kind == "name" and self._peek() != "(":
+            self._names.add(word)
             return _Node("name", word)
         self._depth += 1
         if self._depth > _DEEPEST:
@@ -187,12 +190,12 @@ class Expression:
                 operand = self._unary() if self._peek() in ("(", "!") else self._level(2)
                 if not operand.truth:
                     raise self._error("'!' needs a condition after it, in parentheses", place)
-                return _Node("not", None, (operand,), truth=True)
+                return _Node("call", np.logical_not, (operand,), truth=True)
             if word == "-":
                 operand = self._unary()
                 if operand.truth:
                     raise self._error("'-' needs a number after it", place)
-                return _Node("minus", None, (operand,))
+                return _Node("call", np.negative, (operand,))
         finally:
             self._depth -= 1
         raise self._error(f"'{word}' is not expected here", place)
@@ -208,13 +211,14 @@ class Expression:
         self._at += 1  # the parenthesis
         if name in _CONSTANTS:
             return self._closed(_Node("number", _CONSTANTS[name]), place)
-        if name not in _FUNCTIONS and name not in _CONDITIONS:
+        called = _FUNCTIONS.get(name) or _CONDITIONS.get(name)
+        if called is None:
             known = [*_FUNCTIONS, *_CONDITIONS, *_CONSTANTS]
             raise self._error(f"'{name}' is not a function; known are {', '.join(known)}", place)
         argument = self._level(0)
         if argument.truth:
             raise self._error(f"'{name}' needs a number", place)
-        return self._closed(_Node("call", name, (argument,), truth=name in _CONDITIONS), place)
+        return self._closed(_Node("call", called, (argument,), truth=name in _CONDITIONS), place)
 
 
 def _find(name: str, arrays: Mapping[str, NDArray]) -> str:
@@ -232,24 +236,14 @@ def _find(name: str, arrays: Mapping[str, NDArray]) -> str:
     )
 
 
-def _names(node: _Node) -> set[str]:
-    found, waiting = set(), [node]
-    while waiting:
-        node = waiting.pop()
-        waiting += node.parts
-        if node.kind == "name":
-            found.add(str(node.value))
-    return found
-
-
 def _value(node: _Node, arrays: Mapping[str, NDArray]):
     chain = []  # a row of terms, as long as it may be, is nested to the left
-    while node.kind == "op":
+    while node.kind == "operation":
         chain.append(node)
         node = node.parts[0]
     value = _operand(node, arrays)
     for operation in reversed(chain):
-        value = _OPERATIONS[str(operation.value)](value, _value(operation.parts[1], arrays))
+        value = operation.value(value, _value(operation.parts[1], arrays))
     return value
 
 
@@ -257,13 +251,5 @@ def _operand(node: _Node, arrays: Mapping[str, NDArray]):
     if node.kind == "number":
         return node.value
     if node.kind == "name":
-        return np.asarray(arrays[str(node.value)], np.float64)
-    parts = [_value(part, arrays) for part in node.parts]
-    if node.kind == "not":
-        return np.logical_not(parts[0])
-    if node.kind == "minus":
-        return np.negative(parts[0])
-    if node.kind == "call":
-        name = str(node.value)
-        return (_FUNCTIONS[name] if name in _FUNCTIONS else _CONDITIONS[name])(parts[0])
-    raise AssertionError(node.kind)
+        return np.asarray(arrays[node.value], np.float64)
+    return node.value(_value(node.parts[0], arrays))

@@ -69,7 +69,7 @@ class MinimaTerrain:
         mask : array_like of bool, shape (n,), optional
             Points that may form the terrain; the others only receive heights.
         """
-        _check_sizes(cell, resolution)
+        check_sizes(cell, resolution)
         x, y, z = (np.asarray(a, np.float64) for a in (x, y, z))
         usable = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
         if mask is not None:
@@ -198,7 +198,7 @@ def hag_minima(
     """
     x, y, z = columns(x, y, z)
     if x.size == 0:
-        _check_sizes(cell, resolution)
+        check_sizes(cell, resolution)
         return np.empty(0)
     terrain = MinimaTerrain.fit(x, y, z, cell=cell, resolution=resolution, mask=mask)
     return z - terrain.at(x, y)
@@ -253,7 +253,7 @@ def terrain_reach(
     return float(max(0.0, below.max(), above.max()))
 
 
-def _check_sizes(cell: float, resolution: float) -> None:
+def check_sizes(cell: float, resolution: float) -> None:
     for name, value in (("cell", cell), ("resolution", resolution)):
         checks.number(f"'{name}'", value, 0, above=True)
     if resolution > cell:
