@@ -53,16 +53,8 @@ class Fitted:
 class Run:
     """One pass over queries: sorted like the cloud, cut into blocks.
 
-    Parameters
-    ----------
-    plan : FeaturePlan
-    cloud : (n, 3) float64
-    grid : Grid
-        The index of the cloud.
-    fit : callable
-        Gives what was fitted; called once the queries are found to be right.
-    queries, dimensions, threads, memory_mb
-        As for ``FeatureEngine.blocks``.
+    `grid` is the index of the `cloud`; `fit` gives what was fitted, and is called once the queries are found to be right;
+    all else is as for ``FeatureEngine.blocks``.
     """
 
     def __init__(
@@ -80,9 +72,7 @@ class Run:
         self.indices, coordinates = _queries(queries, cloud)
         count = len(grid) if coordinates is None else len(coordinates)
         self.dimensions = _dimensions(plan, dimensions, count)
-        self.grid = grid
-        if coordinates is not None:
-            self.grid = build_grid(coordinates, plan.cell)
+        self.grid = grid if coordinates is None else build_grid(coordinates, plan.cell)
         checks.number("'memory_mb'", memory_mb, 16)
         self.threads = resolve_threads(threads)
         self.starts = np.zeros(1, np.int64)

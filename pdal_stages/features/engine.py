@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base import checks
-from ..base.errors import OptionError, StageError, optional_import
+from ..base.errors import OptionError, StageError, optional_import, suggest
 from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
 from .blocks import Fitted, Run, Tally, compile_once
@@ -86,7 +86,7 @@ class FeatureEngine:
         self._cloud = check_xyz(xyz)
         compile_once("index")
         self._grid: Grid = build_grid(self._cloud, plan.cell)
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._parts: tuple[FixedRadius, AdaptiveNeighborhoods | None] | None = None
         self.report: dict[str, Any] = {"points": len(self._grid), "queries": 0, "fewer_than_three": {}}
         if plan.unbounded:
@@ -109,19 +109,16 @@ class FeatureEngine:
         StageError
             Where the cloud is empty, so that there is nothing to fit to.
         """
-        needs_copt = self.copt_threshold is None and self.plan.copt
-        needs_bins = self.bins is None and self.plan.shapes
-        if not (needs_copt or needs_bins):
-            return self
-        if not len(self):
-            raise StageError("the cloud has no points to fit shape thresholds or copt to")
-        self._prepared()
         with self._lock:
-            if needs_copt and self.copt_threshold is None:
+            needs_copt = self.copt_threshold is None and self.plan.copt
+            needs_bins = self.bins is None and self.plan.shapes
+            if (needs_copt or needs_bins) and not len(self):
+                raise StageError("the cloud has no points to fit shape thresholds or copt to")
+            if needs_copt:
                 from .ropt import curvature_threshold
 
                 self.copt_threshold = curvature_threshold(self.curvatures())
-            if needs_bins and self.bins is None:
+            if needs_bins:
                 from .bins import ShapeBins
 
                 self.bins = ShapeBins.fit(self.shape_values(smallest_hashes(self._cloud, self.seed)[1]))
@@ -129,13 +126,13 @@ class FeatureEngine:
 
     def curvatures(self) -> np.ndarray:
         """The curvature of every point, in the order of the index, (n,) float64 [H17 eq. 1]; for plans with copt."""
-        _, adaptive = self._parts or self._prepared()
+        _, adaptive = self._prepared()
         assert adaptive is not None
         return adaptive.curvatures(self.threads)
 
     def shape_values(self, rows: np.ndarray) -> dict[str, np.ndarray]:
         """Neighborhood token -> metrics of all pulls round some points of the cloud, (m, 5, 255) float32, comparable."""
-        fixed, adaptive = self._parts or self._prepared()
+        fixed, adaptive = self._prepared()
         x, y, z = np.ascontiguousarray(self._cloud[rows].T)
         tokens = [c.neighborhood.token for c in self.plan.layout if c.shapes]
 
@@ -304,8 +301,6 @@ class FeatureTable:
         if isinstance(name, list):
             return np.stack([self[one] for one in name], axis=1)
         if name not in self.names:
-            from ..base.errors import suggest
-
             raise KeyError(f"no feature '{name}' in this table. {suggest(name, self.names)}".strip())
         return self.values[:, self.names.index(name)]
 

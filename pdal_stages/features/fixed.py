@@ -27,14 +27,7 @@ class _Spec:
 
 
 class FixedRadius:
-    """Kernels' tables for the fixed-radius neighborhoods of `plan` on `grid`.
-
-    Parameters
-    ----------
-    grid : Grid
-        The sorted cloud.
-    plan : FeaturePlan
-    """
+    """Kernels' tables for the fixed-radius neighborhoods of `plan` on `grid`, the sorted cloud."""
 
     def __init__(self, grid: Grid, plan: FeaturePlan) -> None:
         self.grid = grid
@@ -69,14 +62,12 @@ class FixedRadius:
         )
 
     def cost(self, candidates: np.ndarray) -> np.ndarray:
-        """Estimated nanoseconds of one query in cells with so many candidates."""
-        area = (self.radii / self.radii[-1]) ** 2 if self.specs else np.zeros(0)
+        """Estimated nanoseconds of one query in cells with so many candidates; for plans with such neighborhoods."""
+        area = (self.radii / self.radii[-1]) ** 2
         each = NS_NEIGHBORHOOD + NS_CANDIDATE * np.multiply.outer(candidates, area)
         listed = NS_SHAPES + NS_MEMBER * np.multiply.outer(candidates, area)
         number = (self.wanted >= 0).sum(axis=1)
-        shaped = (
-            np.where(self.wanted >= 0, self.shaped[self.wanted], False).sum(axis=1) if self.specs else number
-        )
+        shaped = np.where(self.wanted >= 0, self.shaped[self.wanted], False).sum(axis=1)
         return each @ number.astype(float) + listed @ shaped.astype(float)
 
     def scratch_bytes(self, room: int) -> int:
@@ -139,8 +130,6 @@ class FixedRadius:
 
 
 def _columns(chosen, features) -> np.ndarray:
-    table = np.full((len(chosen), len(features)), -1, np.int64)
-    for number, columns in enumerate(chosen):
-        for k, feature in enumerate(features):
-            table[number, k] = columns.at.get(feature, -1)
-    return table
+    """Where each feature (column) of each neighborhood (row) goes; -1: nowhere."""
+    table = [[columns.at.get(feature, -1) for feature in features] for columns in chosen]
+    return np.array(table, np.int64).reshape(len(chosen), len(features))

@@ -113,10 +113,8 @@ def parse_feature_set(spec: str | Iterable[str]) -> tuple[str, ...]:
         if name is None:  # a feature of one neighborhood keeps its suffix
             head = _longest_feature(word)
             if word.lower() in OF_PDAL:
-                raise OptionError(
-                    f"'{OF_PDAL[word.lower()][0]}' is PDAL's word, not a feature",
-                    cure=OF_PDAL[word.lower()][1],
-                )
+                theirs, cure = OF_PDAL[word.lower()]
+                raise OptionError(f"'{theirs}' is PDAL's word, not a feature", cure=cure)
             if head is None:
                 cure = suggest(word, (*GROUPS, *ALL_FEATURES))
                 raise OptionError(
@@ -133,7 +131,5 @@ def parse_feature_set(spec: str | Iterable[str]) -> tuple[str, ...]:
 
 
 def _longest_feature(word: str) -> str | None:
-    for name in sorted(ALL_FEATURES, key=len, reverse=True):
-        if word.lower().startswith(name.lower() + "_"):
-            return name
-    return None
+    found = (name for name in ALL_FEATURES if word.lower().startswith(name.lower() + "_"))
+    return max(found, key=len, default=None)

@@ -17,10 +17,7 @@ from ..base.errors import OptionError, suggest
 #: Preset name -> (neighborhood tokens, the points' own dimensions it uses as features).
 PRESETS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "blomley2016": (("c1", "c2", "c3", "c5", "kopt"), ("Z",)),
-    "weinmann2018": (
-        ("c1", "c2", "c3", "c5", "s1", "s2", "s3", "s5", "kopt"),
-        ("HeightAboveGround",),
-    ),
+    "weinmann2018": (("c1", "c2", "c3", "c5", "s1", "s2", "s3", "s5", "kopt"), ("HeightAboveGround",)),
     "he2017": (("copt",), ()),
 }
 
@@ -53,18 +50,12 @@ _CURE = (
 
 @dataclass(frozen=True)
 class Neighborhood:
-    """One neighborhood definition. Make it with :func:`parse_neighborhoods`.
+    """One neighborhood definition. Make it with :func:`parse_neighborhoods`."""
 
-    Attributes
-    ----------
-    kind : str
-        ``cylinder``, ``sphere``, ``knn``, ``kopt``, ``ropt`` or ``copt``.
-    parameters : tuple of float
-        Cylinder and sphere: (radius in metres,); knn: (k,); kopt: (k_min, k_max);
-        ropt: (r_min, r_max, step) in metres; copt: ().
-    """
-
+    #: ``cylinder``, ``sphere``, ``knn``, ``kopt``, ``ropt`` or ``copt``.
     kind: str
+    #: Cylinder and sphere: (radius in metres,); knn: (k,); kopt: (k_min, k_max); ropt: (r_min, r_max, step) in metres;
+    #: copt: ().
     parameters: tuple[float, ...] = ()
 
     @property
@@ -143,11 +134,8 @@ def parse_neighborhoods(spec: str | Neighborhood | Iterable[str | Neighborhood])
 
 def preset_dimensions(spec: str | Neighborhood | Iterable[str | Neighborhood]) -> tuple[str, ...]:
     """The points' own dimensions that the presets named in `spec` use as features."""
-    names: dict[str, None] = {}
-    for word in _words(spec):
-        if isinstance(word, str) and word in PRESETS:
-            names.update(dict.fromkeys(PRESETS[word][1]))
-    return tuple(names)
+    used = (PRESETS[word][1] for word in _words(spec) if word in PRESETS)
+    return tuple(dict.fromkeys(name for names in used for name in names))
 
 
 def _words(spec) -> list:

@@ -23,16 +23,10 @@ POINTS_HALO = 15.0
 
 @dataclass(frozen=True)
 class Columns:
-    """The features wanted of one neighborhood.
-
-    Attributes
-    ----------
-    neighborhood : Neighborhood
-    at : dict of str to int
-        Feature (without suffix) -> column in the matrix.
-    """
+    """The features wanted of one neighborhood."""
 
     neighborhood: Neighborhood
+    #: Feature (without suffix) -> column in the matrix.
     at: dict[str, int] = field(hash=False)
 
     @property
@@ -43,22 +37,14 @@ class Columns:
 
 @dataclass(frozen=True)
 class FeaturePlan:
-    """An ordered set of features; make it with :meth:`parse`.
-
-    Attributes
-    ----------
-    neighborhoods : tuple of Neighborhood
-    features : tuple of str
-        The words of the feature set: groups, features, or features of one neighborhood.
-    dimensions : tuple of str
-        The points' own dimensions used as features, after all others.
-    least_members : int
-        Points a radius of ``ropt`` and ``copt`` must hold, and the sphere of a curvature [H17].
-    """
+    """An ordered set of features; make it with :meth:`parse`."""
 
     neighborhoods: tuple[Neighborhood, ...]
+    #: The words of the feature set: groups, features, or features of one neighborhood.
     features: tuple[str, ...] = ("all",)
+    #: The points' own dimensions used as features, after all others.
     dimensions: tuple[str, ...] = ()
+    #: Points a radius of ``ropt`` and ``copt`` must hold, and the sphere of a curvature [H17].
     least_members: int = LEAST_MEMBERS
 
     def __post_init__(self) -> None:
@@ -104,55 +90,36 @@ class FeaturePlan:
     @cached_property
     def layout(self) -> tuple[Columns, ...]:
         """The columns of each neighborhood, in the order of the neighborhoods."""
-        everywhere: set[str] = set()
-        single: dict[str, bool] = {}
-        for word in self.features:
-            if word in GROUPS or word in ALL_FEATURES:
-                everywhere.update(GROUPS.get(word, (word,)))
-            else:
-                single[word] = False
-        result, column = [], 0
+        wanted = {name for word in self.features for name in GROUPS.get(word, (word,))}
+        result, names = [], list[str]()
         for one in self.neighborhoods:
             at = {}
             for feature in ALL_FEATURES:
-                if feature == "Radius" and not one.adaptive:
-                    continue
                 name = f"{feature}_{one.suffix}"
-                if name in single:
-                    single[name] = True
-                elif feature not in everywhere:
-                    continue
-                at[feature] = column
-                column += 1
+                if (one.adaptive or feature != "Radius") and (feature in wanted or name in wanted):
+                    at[feature] = len(names)
+                    names.append(name)
             result.append(Columns(one, at))
-        lost = [name for name, used in single.items() if not used]
-        if lost:
+        if lost := [word for word in self.features if word not in {*GROUPS, *ALL_FEATURES, *names}]:
             raise OptionError(
                 f"the feature '{lost[0]}' belongs to none of the neighborhoods",
                 found=", ".join(n.token for n in self.neighborhoods),
             )
-        if not column:
+        if not names:
             raise OptionError(
                 f"none of the neighborhoods has the feature '{', '.join(self.features)}'",
                 found=", ".join(n.token for n in self.neighborhoods),
                 cure="Radius exists for kopt, ropt and copt only" if "Radius" in self.features else None,
             )
-        clash = {f"{f}_{c.neighborhood.suffix}" for c in result for f in c.at} & set(self.dimensions)
-        if clash:
+        if clash := {*names} & {*self.dimensions}:
             raise OptionError(f"the dimension '{min(clash)}' is also a computed feature")
         return tuple(result)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of all columns: ``Linearity_c1``, ..., then the dimensions."""
-        return (
-            *(
-                f"{feature}_{columns.neighborhood.suffix}"
-                for columns in self.layout
-                for feature in columns.at
-            ),
-            *self.dimensions,
-        )
+        computed = (f"{feature}_{c.neighborhood.suffix}" for c in self.layout for feature in c.at)
+        return (*computed, *self.dimensions)
 
     @property
     def shapes(self) -> bool:
@@ -225,12 +192,7 @@ class FeaturePlan:
         # A model that does not say was trained when three members were enough.
         given = data.get("least_members", 3 if _by_radius(parsed) else LEAST_MEMBERS)
         least = checks.whole("'least_members' of a feature plan", given, 3, 100)
-        return cls(
-            parsed,
-            parse_feature_set(words),
-            tuple(dict.fromkeys(dimensions)),
-            least,
-        )
+        return cls(parsed, parse_feature_set(words), tuple(dict.fromkeys(dimensions)), least)
 
 
 def _by_radius(neighborhoods: Iterable[Neighborhood]) -> bool:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from ..base.errors import StageError
@@ -36,10 +38,8 @@ def run_demo(folder: str | Path, *, size: float = 200.0, density: float = 7.0, s
         raise StageError("the demo's folder cannot be made", found=str(folder))
     settings = {"version": __version__, "size": size, "density": density, "seed": seed}
     stamp = folder / "demo.json"
-    outputs = [
-        folder / n
-        for n in ("classified.laz", "classified.png", "accuracy.html", "accuracy.json", "table.txt")
-    ]
+    names = "classified.laz", "classified.png", "accuracy.html", "accuracy.json", "table.txt"
+    outputs = [folder / name for name in names]
     if _same(stamp, settings) and all(path.is_file() for path in outputs):
         print(
             f"{folder} holds the results of this very demo; delete the folder to run it again.",
@@ -78,12 +78,21 @@ def _work(folder: Path, size: float, density: float, seed: int) -> None:
     from . import TownOptions, write_town
 
     town = folder / "town.laz"
-    with _Step(f"a town of {size:g} x {size:g} m at {density:g} points/m2 under a simulated flight"):
+    with _step(f"a town of {size:g} x {size:g} m at {density:g} points/m2 under a simulated flight"):
         write_town(TownOptions(size=size, density=density, seed=seed), town)
     bounds = Pipeline([str(town)])
     bounds.execute()
     x = bounds.arrays[0]["X"]
     middle = float(np.floor((x.min() + x.max()) / 2))
+
+    def las(name: str) -> dict:
+        return {
+            "type": "writers.las",
+            "filename": str(folder / name),
+            "forward": "all",
+            "extra_dims": "all",
+        }
+
     train = [
         {"type": "readers.las", "filename": str(town)},
         {"type": "filters.range", "limits": f"X[:{middle})"},
@@ -111,31 +120,18 @@ def _work(folder: Path, size: float, density: float, seed: int) -> None:
             "title": "Classification of the generated town",
             "print": False,
         },
-        {
-            "type": "writers.las",
-            "filename": str(folder / "classified.laz"),
-            "forward": "all",
-            "extra_dims": "all",
-        },
+        las("classified.laz"),
     ]
-    unlabelled = [
-        *classify[:4],
-        {"type": "filters.modelclassifier", "model": STANDARD},
-        {
-            "type": "writers.las",
-            "filename": str(folder / "standard.laz"),
-            "forward": "all",
-            "extra_dims": "all",
-        },
-    ]
+    standard = {"type": "filters.modelclassifier", "model": STANDARD}
+    unlabelled = [*classify[:4], standard, las("standard.laz")]
     for name, stages in (("train", train), ("classify", classify), ("standard", unlabelled)):
         write_whole(folder / f"{name}.json", (json.dumps(stages, indent=4) + "\n").encode())
-    with _Step("training on the western half"):
+    with _step("training on the western half"):
         Pipeline(train).execute(arrays=False)
-    with _Step("classifying the eastern half"):
+    with _step("classifying the eastern half"):
         job = Pipeline(classify)
         job.execute()
-    with _Step("classifying it with the model that comes with the package, which has never seen such a town"):
+    with _step("classifying it with the model that comes with the package, which has never seen such a town"):
         general = Pipeline(unlabelled)
         general.execute()
     _results(folder, job.arrays[0], general.arrays[0])
@@ -160,20 +156,14 @@ def _results(folder: Path, points, general) -> None:
     table = f"Trained on the western half:\n\n{own}\n\nThe model that comes with the package ({STANDARD}):\n\n{shipped}\n"
     write_whole(folder / "table.txt", table.encode())
     x, y, z = (points[axis][keep] for axis in "XYZ")
-    with _Step("drawing the picture"):
+    with _step("drawing the picture"):
         write_png(folder / "classified.png", triptych(x, y, z, predicted, reference))
 
 
-class _Step:
+@contextlib.contextmanager
+def _step(text: str) -> Iterator[None]:
     """Says what is being done, and how long it took."""
-
-    def __init__(self, text: str) -> None:
-        self.text = text
-
-    def __enter__(self) -> None:
-        self.started = time.monotonic()
-        print(f"{self.text} ...", file=sys.stderr, flush=True)
-
-    def __exit__(self, kind, *_) -> None:
-        if kind is None:
-            print(f"  done in {time.monotonic() - self.started:.1f} s", file=sys.stderr, flush=True)
+    started = time.monotonic()
+    print(f"{text} ...", file=sys.stderr, flush=True)
+    yield
+    print(f"  done in {time.monotonic() - started:.1f} s", file=sys.stderr, flush=True)

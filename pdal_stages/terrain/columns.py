@@ -9,13 +9,7 @@ from ..base.errors import StageError
 
 
 def columns(x: ArrayLike, y: ArrayLike | None, z: ArrayLike | None) -> list[NDArray[np.float64]]:
-    """Three arrays of one length, from three or from one of shape (n, 3).
-
-    Raises
-    ------
-    StageError
-        Shapes differ.
-    """
+    """Three arrays of one length, from three or from one of shape (n, 3); StageError where shapes differ."""
     if y is None and z is None:
         xyz = np.asarray(x, np.float64)
         if xyz.ndim != 2 or xyz.shape[1] != 3:

@@ -128,19 +128,7 @@ def _below_smooth(raster, out):
 
 
 def pits(raster: np.ndarray, cell: float) -> np.ndarray:
-    """Cells of a minimum grid (holes ``inf``) whose lowest point is a low outlier.
-
-    Parameters
-    ----------
-    raster : ndarray of float32, shape (h, w)
-        Lowest heights, metres.
-    cell : float
-        Side of a cell, metres.
-
-    Returns
-    -------
-    ndarray of bool, shape (h, w)
-    """
+    """Cells (h, w) of a minimum grid whose lowest point is a low outlier, from float32 heights, holes ``inf``; in metres."""
     out = np.zeros(raster.shape, np.uint8)
     offsets, distances = _by_distance(COMPANY)
     _lonely(raster, offsets, distances, cell, out)

@@ -29,20 +29,13 @@ _INDEX_LIMIT = 2**31 - 2
 
 @dataclass
 class MinimaTerrain:
-    """The coarse terrain of a cloud: build with :meth:`fit`, read with :meth:`at`.
+    """The coarse terrain of a cloud: build with :meth:`fit`, read with :meth:`at`."""
 
-    Attributes
-    ----------
-    cell, resolution : float
-        Side of a coarse and of a fine cell, in the unit of the coordinates.
-    report : dict
-        Counts: ``cells`` (with points), ``interpolated_cells`` (empty ones that were
-        needed), ``farthest_fill`` (distance to the nearest filled cell, the worst case),
-        ``unused_points`` (not finite, or excluded by the mask).
-    """
-
+    #: Sides of a coarse and of a fine cell, in the unit of the coordinates.
     cell: float
     resolution: float
+    #: Counts: ``cells`` (with points), ``interpolated_cells`` (empty ones that were needed), ``farthest_fill`` (distance
+    #: to the nearest filled cell, the worst case), ``unused_points`` (not finite, or excluded by the mask).
     report: dict = field(default_factory=dict)
     _keys: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64), repr=False)
     _minima: NDArray[np.float64] = field(default_factory=lambda: np.empty(0), repr=False)
@@ -58,17 +51,7 @@ class MinimaTerrain:
         resolution: float = 0.5,
         mask: ArrayLike | None = None,
     ) -> MinimaTerrain:
-        """Take the lowest point of each coarse cell.
-
-        Parameters
-        ----------
-        x, y, z : array_like, shape (n,)
-            Coordinates, all three in one unit or z in its own.
-        cell, resolution : float
-            Sides of the coarse and the fine cells, in the unit of x and y.
-        mask : array_like of bool, shape (n,), optional
-            Points that may form the terrain; the others only receive heights.
-        """
+        """Take the lowest point of each coarse cell; parameters as for :func:`hag_minima`."""
         check_sizes(cell, resolution)
         x, y, z = (np.asarray(a, np.float64) for a in (x, y, z))
         usable = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
@@ -78,10 +61,8 @@ class MinimaTerrain:
         column, row = cell_numbers(x[usable], cell), cell_numbers(y[usable], cell)
         key = _key(column, row)
         order = np.argsort(key, kind="stable")
-        key = key[order]
-        if key.size:
-            starts = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
-            terrain._keys = key[starts]
+        terrain._keys, starts = np.unique(key[order], return_index=True)
+        if starts.size:
             terrain._minima = np.minimum.reduceat(z[usable][order], starts)
         terrain.report = {
             "cells": int(terrain._keys.size),
@@ -92,14 +73,9 @@ class MinimaTerrain:
         return terrain
 
     def at(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-        """Terrain height where points fall: bilinear, at the centre of their fine cell.
+        """Terrain height where points fall: bilinear, at the centre of their fine cell; NaN for those not finite.
 
-        Points that are not finite get NaN.
-
-        Raises
-        ------
-        StageError
-            If no point formed a terrain.
+        NoTerrainError if no point formed a terrain.
         """
         x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
         out = np.full(x.shape, np.nan)
@@ -121,14 +97,15 @@ class MinimaTerrain:
         wu, wv = u - i, v - j
         i, j = _bounded(i), _bounded(j)
         corners = [_key(i + a, j + b) for b in (0, 1) for a in (0, 1)]
-        keys, values = self._filled(np.unique(np.concatenate([np.unique(k) for k in corners])))
+        keys = np.unique(np.concatenate([np.unique(k) for k in corners]))
+        values = self._filled(keys)
         z00, z10, z01, z11 = (values[np.searchsorted(keys, k)] for k in corners)
         lower = z00 + (z10 - z00) * wu
         upper = z01 + (z11 - z01) * wu
         out[finite] = lower + (upper - lower) * wv
         return out
 
-    def _filled(self, keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def _filled(self, keys: NDArray[np.int64]) -> NDArray[np.float64]:
         """Values of the cells `keys`; empty ones from the filled ones about as near as the nearest.
 
         Weights are one over the fourth power of the distance between cell centres. [W18] does not say what becomes
@@ -142,19 +119,18 @@ class MinimaTerrain:
 
             filled_at = np.column_stack(_unkey(self._keys)).astype(np.float64)
             wanted_at = np.column_stack(_unkey(keys[empty])).astype(np.float64)
-            nearest = cKDTree(filled_at).query(wanted_at, k=1)[0]
+            tree = cKDTree(filled_at)
+            nearest = tree.query(wanted_at, k=1)[0]
             # All filled cells within reach of the nearest one: a set, so the outcome
             # does not depend on how a search tree orders equal distances.
-            reach = nearest + 1.5
-            tree = cKDTree(filled_at)
-            for at, (centre, radius) in enumerate(zip(wanted_at, reach, strict=True)):
+            for at, centre, radius in zip(empty, wanted_at, nearest + 1.5, strict=True):
                 near = np.sort(tree.query_ball_point(centre, radius))
                 squared = ((filled_at[near] - centre) ** 2).sum(axis=1)
                 weight = 1.0 / squared**2  # distance to the fourth power
-                values[empty[at]] = np.dot(weight, self._minima[near]) / weight.sum()
+                values[at] = np.dot(weight, self._minima[near]) / weight.sum()
             self.report["interpolated_cells"] = int(empty.size)
             self.report["farthest_fill"] = float(nearest.max() * self.cell)
-        return keys, values
+        return values
 
 
 def hag_minima(
@@ -217,20 +193,8 @@ def terrain_reach(
 
     A height takes the four coarse cells around a point; an empty one is filled from all cells within its
     nearest filled one's distance and 1.5 cells. All of these must be known whole. What is found with too few
-    points bounds the true reach from above.
-
-    Parameters
-    ----------
-    x, y : (n,) float64
-    forms, wanted : (n,) bool
-        Points that form the terrain, and those whose heights matter.
-    box : (min x, min y, max x, max y)
-    cell, resolution : float
-
-    Returns
-    -------
-    float
-        In the unit of x and y; 0 where the box suffices.
+    points bounds the true reach from above. `forms` and `wanted` (n,) are the points that form the terrain, and those
+    whose heights matter; the box is (min x, min y, max x, max y). In the unit of x and y; 0 where the box suffices.
     """
     from scipy.spatial import cKDTree
 
@@ -276,13 +240,7 @@ def _bounded(index: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def cell_numbers(coordinate: NDArray[np.float64], cell: float) -> NDArray[np.int64]:
-    """Which cell coordinates fall in, counted from the origin.
-
-    Raises
-    ------
-    StageError
-        Where coordinates are beyond what any survey has.
-    """
+    """Which cell coordinates fall in, counted from the origin; StageError beyond what any survey has."""
     return _bounded(np.floor(coordinate / cell))
 
 

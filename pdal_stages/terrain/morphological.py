@@ -121,38 +121,26 @@ def filtered_ground(
     out: dict[str, NDArray] = {
         "HeightAboveGround": np.zeros(len(x)),
         "Ground": np.zeros(len(x), np.uint8),
-        "Slope": np.zeros(len(x)),
+        **({"Slope": np.zeros(len(x))} if slope_too else {}),
         **{name: np.zeros(len(x), np.float32) for name in opening_names(openings)},
     }
-    if not slope_too:
-        del out["Slope"]
     if len(x):
         column, row = cell_numbers(x, cell), cell_numbers(y, cell)
         around = math.ceil(reach(cell=cell, window=window, openings=openings) / cell)
-
-        def work(piece):
-            points, own = piece
+        for points, own in patches(column, row, around):
             found = _filter(
                 x[points], y[points], z[points], use[points], column[points], row[points], own,
                 cell=cell, slope=slope, window=window, threshold=threshold, scalar=scalar, openings=openings,
-                wanted=set(out), threads=threads, counts=counts,
+                slope_too=slope_too, threads=threads, counts=counts,
             )  # fmt: skip
             for name, values in found.items():
-                if isinstance(points, slice):
-                    out[name][:] = values
-                else:
-                    out[name][points[own]] = values[own]
-
-        for piece in patches(column, row, around):
-            work(piece)
+                out[name][points if isinstance(points, slice) else points[own]] = values[own]
     if report is not None:
         report["ground_points"] = int(np.count_nonzero(out["Ground"]))
         report.update(counts, unused_points=int(len(finite) - np.count_nonzero(use)))
     if not all_finite:
         for name, values in out.items():
-            whole = np.zeros(len(finite), values.dtype)
-            if name != "Ground":
-                whole[:] = np.nan
+            whole = np.full(len(finite), 0 if name == "Ground" else np.nan, values.dtype)
             whole[finite] = values
             out[name] = whole
     return out
@@ -201,7 +189,7 @@ def _levels(block: float, cell: float) -> int:
 
 def _filter(
     x, y, z, use, column, row, own, *,
-    cell, slope, window, threshold, scalar, openings, wanted, threads, counts,
+    cell, slope, window, threshold, scalar, openings, slope_too, threads, counts,
 ):  # fmt: skip
     """All of it on one raster round the points."""
     # One empty cell on every side: points blend the four cells round them.
@@ -241,7 +229,7 @@ def _filter(
     counts["without_terrain"] += int(np.count_nonzero(nowhere[own]))
     height[nowhere] = gradient[nowhere] = 0.0
     found = {"HeightAboveGround": height, "Ground": is_ground.view(np.uint8)}
-    if "Slope" in wanted:
+    if slope_too:
         found["Slope"] = np.degrees(np.arctan(gradient))
     for name, radius in zip(opening_names(openings), radii, strict=True):
         values = found[name] = np.empty(len(x), np.float32)

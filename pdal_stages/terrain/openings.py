@@ -25,12 +25,7 @@ def square_steps(radius: int) -> int:
 
 def opening_radii(largest: int) -> list[int]:
     """Radii in cells: each one up to 16, then every other one."""
-    radii = []
-    radius = 0
-    while radius < largest:
-        radius = min(radius + (1 if radius < 16 else 2), largest)
-        radii.append(radius)
-    return radii
+    return sorted({*range(1, min(largest, 16) + 1), *range(18, largest, 2), largest})
 
 
 @device

@@ -189,27 +189,12 @@ def surface(
     bottom: int,
     levels: int,
 ) -> np.ndarray:
-    """Planes at the centres of all cells.
+    """Planes at the centres of all cells (h, w, 3): height, gradient per cell; NaN beyond the reach of all measured cells.
 
-    Parameters
-    ----------
-    ground : ndarray of bool, shape (h, w)
-        Cells that hold ground.
-    place : ndarray, shape (h, w, 3)
-        Where it is: from the cell's centre, in cells, and height.
-    floor : ndarray, shape (h, w)
-        Level to take where no ground is near, at measured cells.
-    raster : ndarray, shape (h, w)
-        Not finite where nothing was measured.
-    left, bottom : int
-        Number of the first column and row, counted from the origin of the coordinates.
-    levels : int
-        Number of coarser levels, at least 1.
-
-    Returns
-    -------
-    ndarray, shape (h, w, 3)
-        Height at the centre and gradient per cell; NaN beyond the reach of all measured cells.
+    `ground` (h, w) says which cells hold ground, `place` (h, w, 3) where it is: from the cell's centre, in cells, and its
+    height; `floor` (h, w) is the level to take where no ground is near, `raster` (h, w) is not finite where nothing was
+    measured. `left` and `bottom` number the first column and row from the origin of the coordinates. There are
+    `levels` coarser levels, at least 1.
     """
     h, w = ground.shape
     spans = [(left, bottom, w, h)]

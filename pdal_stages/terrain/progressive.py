@@ -28,25 +28,9 @@ def objects_of(
 ) -> tuple[np.ndarray, np.ndarray, Mapping[int, np.ndarray]]:
     """Cells that an opening lowers by more than `slope` times its radius, or than `LARGEST_DROP`.
 
-    Parameters
-    ----------
-    raster : ndarray of float32, shape (h, w)
-        Minimum grid in metres, with holes.
-    cell : float
-        Side of a cell, metres.
-    slope : float
-    window : int
-        Largest radius, in cells.
-    keep : collection of int
-        Radii, in cells, whose openings are wanted.
-
-    Returns
-    -------
-    objects : ndarray of bool, shape (h, w)
-    floor : ndarray of float32, shape (h, w)
-        What the opening that showed an object left there; the cell's own height elsewhere.
-    openings : mapping of int to ndarray of float32
-        The openings of `keep`.
+    `raster` is the minimum grid (h, w), float32, with holes; it and `cell`, a cell's side, are in metres. `window` is the
+    largest radius and `keep` lists radii whose openings are wanted, in cells. Returned are the objects (h, w), what the
+    opening that showed an object left there (elsewhere the cell's own height), and the openings of `keep`.
     """
     h, w = raster.shape
     radii = set(opening_radii(window))
