@@ -45,29 +45,15 @@ class _Spec:
 
 
 class AdaptiveNeighborhoods:
-    """A tree over a grid's cloud, and the adaptive neighborhoods of a plan.
-
-    Parameters
-    ----------
-    grid : Grid
-        The sorted cloud, not empty.
-    plan : FeaturePlan
-    threads : int, optional
-        For building the tree.
-
-    Attributes
-    ----------
-    tokens : list of str
-        The neighborhoods, in the plan's order: what `few` and `far` of :meth:`fill` count for.
-    query_ns, scratch_bytes : float, int
-        Estimated cost of one query; memory of one call of :meth:`fill` besides its rows.
-    """
+    """A tree over a grid's cloud, built by `threads`, and the adaptive neighborhoods of a plan."""
 
     def __init__(self, grid: Grid, plan: FeaturePlan, threads: int | None = None) -> None:
         self.grid, self.halo, self.least = grid, plan.halo, plan.least_members
         fixed = ("cylinder", "sphere")
         self.specs = [_spec(c) for c in plan.layout if c.at and c.neighborhood.kind not in fixed]
+        #: In the plan's order: what `few` and `far` of :meth:`fill` count for.
         self.tokens = [spec.token for spec in self.specs]
+        #: Estimated cost of one query, and memory of one call of :meth:`fill` besides its rows.
         self.query_ns = sum(NS_QUERY[s.kind] * _load(s) + NS_SHAPES * s.shaped for s in self.specs)
         largest = max((s.parameters[-1] for s in self.specs if s.parameters), default=0.0)
         self.scratch_bytes = 2_000_000 + int(500 * largest)
@@ -129,24 +115,11 @@ class AdaptiveNeighborhoods:
         far: np.ndarray,
         out: np.ndarray,
     ) -> None:
-        """Compute the columns of these neighborhoods for a block of queries.
+        """Compute the columns of these neighborhoods in `out` (m, F) for a block of queries, neighbors at best.
 
-        Parameters
-        ----------
-        qx, qy, qz : (m,) float64 arrays
-            Queries; blocks of neighbors are the fastest.
-        copies : (m,) int64 array
-            How many queries of the user's each stands for.
-        bins : ShapeBins
-            Needed where shapes are wanted.
-        seed : int
-        copt_threshold : float
-            Needed for copt.
-        few : (k,) int64 array
-            Raised by the number of queries whose neighborhood has fewer than three points.
-        far : (k,) int64 array
-            Raised by the number of queries whose result depends on points farther than the plan's halo.
-        out : (m, F) float32 array
+        Each query stands for so many `copies` of the user's. `bins` are needed where shapes are wanted, the threshold for
+        copt. For each neighborhood, `few` is raised by the number of queries with fewer than three points, and `far` by
+        that of queries whose result depends on points farther than the plan's halo.
         """
         together = self._compute_nearest(qx, qy, qz) if self._nearest else {}
         for number, spec in enumerate(self.specs):
@@ -198,21 +171,10 @@ class AdaptiveNeighborhoods:
             ropt_block(self._tree, qx, qy, qz, radii, self.least, table, radius, seeds, shapes)
         else:
             assert threshold is not None
-            radii = radii_of(*COPT_RADII)
             copt_block(
-                self._tree,
-                qx,
-                qy,
-                qz,
-                threshold,
-                radii,
-                self.least,
-                table,
-                radius,
-                seeds,
-                shapes,
+                self._tree, qx, qy, qz, threshold, radii_of(*COPT_RADII), self.least, table, radius, seeds, shapes,
                 no_shapes(),
-            )
+            )  # fmt: skip
         return table, radius, reach
 
 
@@ -258,15 +220,8 @@ def _spec(columns: Columns) -> _Spec:
     def at(names) -> np.ndarray:
         return np.array([columns.at.get(name, -1) for name in names], np.int64)
 
-    return _Spec(
-        one.token,
-        one.kind,
-        one.parameters,
-        at((*MOMENT_FEATURES, "Radius")),
-        at(SHAPE_FEATURES),
-        columns.shapes,
-        one.reach is None,
-    )
+    moments, shapes = at((*MOMENT_FEATURES, "Radius")), at(SHAPE_FEATURES)
+    return _Spec(one.token, one.kind, one.parameters, moments, shapes, columns.shapes, one.reach is None)
 
 
 def _load(spec: _Spec) -> float:

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import OptionError
+from .names import SHAPE_BINS, SHAPES
 
 #: The metrics, in the order of the rows of all threshold arrays.
-METRICS = ("A3", "D1", "D2", "D3", "D4")
-
-#: Inner thresholds of ten bins.
-INNER = 9
+METRICS = tuple(SHAPES)
+#: Inner thresholds of the bins.
+INNER = SHAPE_BINS - 1
 
 _CURE = "Fit the thresholds again, or take them from the model file as it was written"
 
@@ -44,14 +44,9 @@ class ShapeBins:
         """Thresholds at the 10 %, 20 %, ... 90 % quantiles of sample values.
 
         A threshold is one of the values, so values that often repeat (areas of 0 on a line) make equal
-        thresholds and empty bins, and nothing else does.
-
-        Parameters
-        ----------
-        values : mapping of str to (m, 5, 255) float array
-            Neighborhood token -> values of the pulls of m sample neighborhoods, in the comparable form of
-            :func:`shapes.shape_values`. NaN (neighborhoods without points) is left out; where nothing is
-            left, the thresholds are 0.
+        thresholds and empty bins, and nothing else does. `values` are the pulls (m, 5, 255) of m sample neighborhoods by
+        neighborhood token, in the comparable form of :func:`shapes.shape_values`. NaN (neighborhoods without points) is
+        left out; where nothing is left, the thresholds are 0.
         """
         result = {}
         for token, sample in values.items():
@@ -96,13 +91,7 @@ class ShapeBins:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> ShapeBins:
-        """The bins that :meth:`to_dict` described.
-
-        Raises
-        ------
-        OptionError
-            Where it is not such a description.
-        """
+        """The bins that :meth:`to_dict` described; OptionError where it is not such a description."""
         if not isinstance(data, Mapping):
             raise OptionError("shape thresholds must be an object", found=type(data).__name__, cure=_CURE)
         result = {}

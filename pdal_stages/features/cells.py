@@ -22,16 +22,8 @@ def cell_means(
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
     """(cell of each point, means (cells, columns) over each cell and those around it).
 
-    Parameters
-    ----------
-    coordinates : (n, 2 or 3) float64
-        Metres; two for columns of any height.
-    shares : (n, columns) uint16
-        In 65535ths.
-    side : float
-        Of a cell, metres; one of :data:`SIDES`.
-    votes : bool
-        Count the largest column of each point alone, as a whole.
+    Two coordinates make columns of any height; they and `side`, one of :data:`SIDES`, are in metres. `shares` (n, columns)
+    are in 65535ths; with `votes` the largest column of each point counts alone, as a whole.
     """
     keys, offsets = cell_keys(coordinates, side)
     order = np.argsort(keys)
@@ -53,11 +45,7 @@ def cell_keys(
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """A number for each point's cell, such that cells beside each other along the last axis follow each other.
 
-    Returns
-    -------
-    keys : (n,) int64
-    offsets : (3 or 9,) int64
-        Added to a key, the middle cells of the rows of three around it.
+    And offsets (3 or 9,): added to a number, they give the middle cells of the rows of three around it.
     """
     numbers = [cell_numbers(coordinates[:, k], side) for k in _ORDER[coordinates.shape[1]]]
     lengths = []

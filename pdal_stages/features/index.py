@@ -25,29 +25,18 @@ SPARE = 8
 
 @dataclass(frozen=True)
 class Grid:
-    """A sorted cloud and its occupied cells.
+    """A sorted cloud and its occupied cells."""
 
-    Attributes
-    ----------
-    cell : float
-        Edge of a cell in metres, a power of two (so that cell corners are exact).
-    order : (n,) int32 or int64 array
-        ``order[i]`` is the index, in the cloud as it was given, of the i-th sorted point.
-    xyz : (3, n + SPARE) float64 array
-        The sorted coordinates; kernels that copy whole vectors may read (and ignore) what lies behind the last.
-    x, y, z : (n,) float64 arrays
-        Views of them.
-    cell_ix, cell_start : (m,) and (m + 1,) int64 arrays
-        Column number of each occupied cell and its first point; cells ascend by row, then column.
-    row_iy, row_start : (r,) and (r + 1,) int64 arrays
-        Row number of each occupied row and its first cell.
-    """
-
+    #: Edge of a cell in metres, a power of two (so that cell corners are exact).
     cell: float
+    #: (n,) int32 or int64: ``order[i]`` is the index, in the cloud as it was given, of the i-th sorted point.
     order: np.ndarray
+    #: (3, n + SPARE): sorted coordinates; kernels that copy whole vectors may read (and ignore) what lies behind the last.
     xyz: np.ndarray
+    #: Column number of each occupied cell (m,) and its first point (m + 1,); cells ascend by row, then column.
     cell_ix: np.ndarray
     cell_start: np.ndarray
+    #: Row number of each occupied row (r,) and its first cell (r + 1,).
     row_iy: np.ndarray
     row_start: np.ndarray
 
@@ -258,19 +247,8 @@ def _take(values, rows):
 def cut_blocks(cell_start, cost, most_cost, most_rows):
     """Cut sorted queries into blocks, inside cells where one cell is too much for a block.
 
-    Parameters
-    ----------
-    cell_start : (m + 1,) int64 array
-        First query of each cell.
-    cost : (m,) float64 array
-        Cost of one query in each cell.
-    most_cost, most_rows : float, int
-        Bounds of a block; a block has at least one query.
-
-    Returns
-    -------
-    (b + 1,) int64 array
-        First query of each block, and the number of queries.
+    `cell_start` (m + 1,) is the first query of each cell, `cost` (m,) that of one query in each; a block has at least one
+    query. The first query of each block, and the number of queries: (b + 1,).
     """
     starts = [np.int64(0)]
     spent, rows = 0.0, 0

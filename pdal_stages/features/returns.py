@@ -39,30 +39,17 @@ _NAME = re.compile(rf"({'|'.join(FLAGS)})(?:_(box|column)(\d+(?:_\d+)?))?")
 
 @dataclass(frozen=True)
 class ReturnFeature:
-    """One of them; make it with :func:`parse`.
-
-    Attributes
-    ----------
-    flag : str
-    axes : int
-        3 for boxes, 2 for columns, 0 for the point itself.
-    side : float
-        Of a cell, metres.
-    """
+    """One of them; make it with :func:`parse`."""
 
     flag: str
+    #: 3 for boxes, 2 for columns, 0 for the point itself.
     axes: int = 0
+    #: Of a cell, metres.
     side: float = 0.0
 
 
 def parse(name: str) -> ReturnFeature | None:
-    """The feature of a name such as ``EarlierReturn_box0_5``; None for another name.
-
-    Raises
-    ------
-    OptionError
-        For a side that is not a power of two from 0.125 to 64 m.
-    """
+    """The feature of a name such as ``EarlierReturn_box0_5``; None for another name, OptionError for another side."""
     match = _NAME.fullmatch(name)
     if match is None:
         return None
@@ -89,23 +76,9 @@ def return_features(
     dimensions: Mapping[str, npt.ArrayLike],
     threads: int | None = None,
 ) -> dict[str, npt.NDArray[np.float32]]:
-    """Those of `names` that are return features, for every point of a cloud.
+    """Those of `names` that are return features, for every point of a cloud: (n,) float32 each, 0 to 1.
 
-    Parameters
-    ----------
-    names : iterable of str
-        Others are passed over.
-    xyz : (n, 3) float64
-        Metres.
-    dimensions : mapping
-        ``ReturnNumber`` and ``NumberOfReturns``, (n,) each; without them all is 0.
-    threads : int, optional
-        ``None`` or 0: every core.
-
-    Returns
-    -------
-    dict of name to (n,) float32
-        0 to 1.
+    Of `dimensions`, ``ReturnNumber`` and ``NumberOfReturns`` are read, (n,) each; without them all is 0.
     """
     wanted = {name: one for name in names if (one := parse(name)) is not None}
     if not wanted:

@@ -16,17 +16,7 @@ CHUNK = 1_000_000
 def smallest_hashes(xyz: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """The SAMPLES points with the smallest hash of (seed, coordinates); copies of a point count once.
 
-    Parameters
-    ----------
-    xyz : (n, 3) float64
-    seed : int
-
-    Returns
-    -------
-    hashes : (m,) uint64
-        Ascending.
-    rows : (m,) int64
-        Of the points.
+    Hashes (m,), ascending, and rows (m,) of the points.
     """
     hashes, rows = np.zeros(0, np.uint64), np.zeros(0, np.int64)
     for start in range(0, len(xyz), CHUNK):

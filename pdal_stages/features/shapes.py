@@ -38,7 +38,6 @@ PULLS = 255
 #: Arrays are padded to whole vectors.
 ROOM = 256
 
-METRICS = ("A3", "D1", "D2", "D3", "D4")
 BINS = 10
 
 #: Product of two squared lengths (m^4) below which an angle is not defined, and 0.

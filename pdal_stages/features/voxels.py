@@ -23,17 +23,11 @@ LARGEST = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Representatives:
-    """Points that stand for others.
+    """Points that stand for others."""
 
-    Attributes
-    ----------
-    rows : (m,) int64, ascending
-        The representatives' rows in the cloud.
-    wanted : (w,) int64, ascending, or None
-        Those of them, by their place in `rows`, that stand for a point that was asked for; None: all.
-    """
-
+    #: The representatives' rows in the cloud, ascending.
     rows: npt.NDArray[np.int64]
+    #: Those of them, by their place in `rows`, ascending, that stand for a point that was asked for; None: all.
     wanted: npt.NDArray[np.int64] | None
     _members: npt.NDArray[np.int64]  # points asked for, by representative
     _start: npt.NDArray[np.int64]

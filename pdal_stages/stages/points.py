@@ -22,9 +22,10 @@ MAKERS = {
     "Reference": 'Keep the labels before classifying: {"type": "filters.ferry", "dimensions": "Classification=>Reference"}',
     "Ground": 'Add {"type": "filters.hag_morphological", "ground": true} before this stage',
     "Slope": 'Add {"type": "filters.hag_morphological", "terrain_slope": true} before this stage',
-    "Intensity": "The reader does not give it; leave it out of the model's dimensions",
-    "ReturnNumber": "The reader does not give it; leave it out of the model's dimensions",
-    "NumberOfReturns": "The reader does not give it; leave it out of the model's dimensions",
+    **dict.fromkeys(
+        ("Intensity", "ReturnNumber", "NumberOfReturns"),
+        "The reader does not give it; leave it out of the model's dimensions",
+    ),
 }
 #: Flags of a point, in the order of their bits.
 _FLAGS = ("Synthetic", "KeyPoint", "Withheld", "Overlap")
