@@ -106,24 +106,17 @@ class Run:
     def _distinct_share(self) -> np.ndarray:
         """Of each cell's queries the share that is computed: copies of a query lie side by side and cost nothing."""
         grid = self.grid
-        copy = np.zeros(len(grid), np.bool_)
-        copy[1:] = grid.x[1:] == grid.x[:-1]
-        for axis in (grid.y, grid.z):
-            copy[1:] &= axis[1:] == axis[:-1]
-        if not copy.any():
+        new = _differ(grid.x, grid.y, grid.z)
+        if new.all():
             return np.ones(1)
-        copies = np.add.reduceat(copy, grid.cell_start[:-1], dtype=np.int64)
-        return 1.0 - copies / np.diff(grid.cell_start)
+        return np.add.reduceat(new, grid.cell_start[:-1], dtype=np.int64) / np.diff(grid.cell_start)
 
     def compute(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, Tally]:
         """Positions (in the user's order) and values of the sorted queries first..last, and what to report."""
         plan, grid, fitted = self.plan, self.grid, self.fitted
         fixed, adaptive = fitted.fixed, fitted.adaptive
         qx, qy, qz = grid.x[first:last], grid.y[first:last], grid.z[first:last]
-        new = np.empty(last - first, np.bool_)
-        new[:1] = True
-        new[1:] = (qx[1:] != qx[:-1]) | (qy[1:] != qy[:-1]) | (qz[1:] != qz[:-1])
-        at = np.flatnonzero(new)
+        at = np.flatnonzero(_differ(qx, qy, qz))
         copies = np.diff(at, append=last - first)
         if len(at) < last - first:
             qx, qy, qz = qx[at], qy[at], qz[at]
@@ -177,6 +170,13 @@ class Run:
         finally:
             if own is not None:
                 own.close()
+
+
+def _differ(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Which of sorted queries are no copies of the one before."""
+    new = np.ones(len(x), np.bool_)
+    new[1:] = (x[1:] != x[:-1]) | (y[1:] != y[:-1]) | (z[1:] != z[:-1])
+    return new
 
 
 def _queries(queries, cloud: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:

@@ -20,22 +20,8 @@ def fit_clouds(
 
     Curvatures of all points of all clouds are parted together [H17 eq. 3], and the 500 sample neighborhoods
     [B16 3.2.2] are those round the points with the smallest hashes of all. A neighborhood lies within its own cloud. Of
-    one cloud the result is :meth:`FeatureEngine.fit`'s; the order of the clouds does not matter.
-
-    Parameters
-    ----------
-    clouds : sequence of (n, 3) arrays
-        Metres; one at a time has an index.
-    plan : FeaturePlan
-    seed : int
-    threads : int, optional
-
-    Returns
-    -------
-    bins : ShapeBins or None
-        None where the plan has no shapes.
-    copt_threshold : float or None
-        None where the plan has no copt.
+    one cloud the result is :meth:`FeatureEngine.fit`'s; the order of the clouds (n, 3), in metres, does not matter. None
+    where the plan has no shapes, or no copt.
     """
     if not (plan.shapes or plan.copt):
         return None, None

@@ -52,18 +52,10 @@ def represent(
 ) -> Representatives | None:
     """Representatives of a cloud's points, or None where each stands for itself.
 
-    Parameters
-    ----------
-    xyz : (n, 3) float64
-        Coordinates in metres.
-    side : float
-        Of a voxel, metres; 0 for none.
-    values : iterable of (k,) arrays
-        What else is known of the points that are there; decides between points of the same coordinates.
-    rows : (m,) int64, ascending, optional
-        Points asked for; the others are represented too, but are nobody's members.
-    there : (k,) int64, ascending, optional
-        Points that are there at all, `rows` among them; all n by default.
+    `side` is a voxel's, in metres as `xyz`; 0 for none. `values` (k,) are what else is known of the points that are there,
+    and decide between points of the same coordinates. `rows` (m,) are the points asked for; the others are represented
+    too, but are nobody's members. `there` (k,) are the points that are there at all, `rows` among them; all n by default.
+    Both ascend.
     """
     found = _one_each(xyz if there is None else xyz[there], side, values)
     if there is None:
