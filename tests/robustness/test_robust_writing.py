@@ -52,7 +52,7 @@ SITES = {
     "synthetic/demo:_work": _WHOLE,
     "synthetic/demo:run_demo": _WHOLE,
     "synthetic/townfile:write_town": "town",
-    "tiling/command:_write_report": "tiles: report .json",
+    "tiling/command:_write_json": "tiles: report .json",
     "tiling/extract:cut": "tiles: what a run keeps",
     "tiling/inparts:_Joined.add": "tiles: output of a file",
     "tiling/inparts:_copy": "tiles: output of a file",
