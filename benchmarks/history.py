@@ -67,7 +67,7 @@ def table(lines: list[dict]) -> str:
     text = [
         "# Benchmark history",
         "",
-        "Written by `python benchmarks/history.py` from `benchmarks/history.jsonl`. Features: generated town of 498,792",
+        "Written by `python benchmarks/history.py` from `benchmarks/history.jsonl`. Features: generated town of half a million",
         "points. Real clouds: test parts, all defaults of that commit.",
         "",
         "| " + " | ".join(head) + " |",
