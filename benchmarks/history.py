@@ -67,8 +67,8 @@ def table(lines: list[dict]) -> str:
     text = [
         "# Benchmark history",
         "",
-        "Written by `python benchmarks/history.py` from `benchmarks/history.jsonl`. Features: generated town of half a million",
-        "points. Real clouds: test parts, all defaults of that commit.",
+        "Written by `python benchmarks/history.py` from `benchmarks/history.jsonl`. Features: a generated town of half a",
+        "million points. Real clouds: test parts, all defaults of that commit.",
         "",
         "| " + " | ".join(head) + " |",
         "|" + "---|" * len(head),
