@@ -39,7 +39,6 @@ _ERRORS = {"error_model": "numpy"}
 
 _stamps: dict[Any, frozenset[str]] = {}
 
-
 #: Device functions that numba has not heard of yet, with their options.
 _unregistered: list[tuple[Callable, dict[str, Any]]] = []
 _lock = threading.RLock()
@@ -96,8 +95,10 @@ def device(function: Callable | None = None, **options):
 
 
 def intrinsic(function: Callable) -> Any:
-    """numba's, for instructions that it has no word for; it is imported here."""
-    made = _numba().extending.intrinsic(function)
+    """numba's, for instructions that it has no word for; the function gets numba's types before those of its arguments."""
+    numba = _numba()
+    typed = update_wrapper(lambda context, *given: function(numba.types, *given), function)
+    made = numba.extending.intrinsic(typed)
     _stamp(made, function)
     return made
 

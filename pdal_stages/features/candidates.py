@@ -23,7 +23,7 @@ INNER_FROM = 2
 
 
 @intrinsic
-def order_bits(typingctx, value):
+def order_bits(types, value):
     """The bits of a float64 as an int64 that orders like the float (integer minima vectorise, float ones do not)."""
 
     def codegen(context, builder, signature, args):
@@ -32,13 +32,11 @@ def order_bits(typingctx, value):
         sign = builder.ashr(bits, ir.Constant(i64, 63))
         return builder.xor(bits, builder.and_(sign, ir.Constant(i64, 2**63 - 1)))
 
-    from numba import types
-
     return types.int64(types.float64), codegen
 
 
 @intrinsic
-def from_order_bits(typingctx, value):
+def from_order_bits(types, value):
     """The float64 whose :func:`order_bits` are given."""
 
     def codegen(context, builder, signature, args):
@@ -46,8 +44,6 @@ def from_order_bits(typingctx, value):
         sign = builder.ashr(args[0], ir.Constant(i64, 63))
         bits = builder.xor(args[0], builder.and_(sign, ir.Constant(i64, 2**63 - 1)))
         return builder.bitcast(bits, ir.DoubleType())
-
-    from numba import types
 
     return types.float64(types.int64), codegen
 
@@ -123,10 +119,8 @@ def fill_strip(cell_ix, cell_start, row_iy, row_start, iy, left, reach, columns,
 
 
 @intrinsic
-def _copy8(typingctx, target, i, source, j):
+def _copy8(types, target, i, source, j):
     """Eight float64 at once, as one or a few vector registers."""
-    from numba import types
-
     signature = types.void(target, types.int64, source, types.int64)
 
     def codegen(context, builder, signature, args):

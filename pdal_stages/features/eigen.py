@@ -26,25 +26,21 @@ LINE = 1e-12
 
 
 @intrinsic
-def _bits(typingctx, value):
+def _bits(types, value):
     """The 64 bits of a float64 as int64 (a register move; a view through memory would not vectorise)."""
 
     def codegen(context, builder, signature, args):
         return builder.bitcast(args[0], ir.IntType(64))
 
-    from numba import types
-
     return types.int64(types.float64), codegen
 
 
 @intrinsic
-def _from_bits(typingctx, value):
+def _from_bits(types, value):
     """The float64 of 64 bits."""
 
     def codegen(context, builder, signature, args):
         return builder.bitcast(args[0], ir.DoubleType())
-
-    from numba import types
 
     return types.float64(types.int64), codegen
 

@@ -39,25 +39,21 @@ COINCIDENT = 1e-13
 
 
 @intrinsic
-def _add(typingctx, a, b):
+def _add(types, a, b):
     """a + b that may be reordered in a sum and contracted with a product: what lets LLVM vectorise it."""
 
     def codegen(context, builder, signature, args):
         return builder.fadd(args[0], args[1], flags=("reassoc", "contract", "nsz"))
 
-    from numba import types
-
     return types.float64(types.float64, types.float64), codegen
 
 
 @intrinsic
-def _mul(typingctx, a, b):
+def _mul(types, a, b):
     """a * b that may be contracted with the sum it goes into."""
 
     def codegen(context, builder, signature, args):
         return builder.fmul(args[0], args[1], flags=("contract",))
-
-    from numba import types
 
     return types.float64(types.float64, types.float64), codegen
 
