@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError
 from ..base.hashing import hash_of
+from ..base.runs import begins_run
 from . import walk as kernels
 from .arrays import ArrayRule
 
@@ -232,7 +233,7 @@ def _distinct(values: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.int64], n
     """(row of the table for each row, table of the different rows): a forest's leaves are much alike."""
     hashes = hash_of(values.T, 0)
     order = np.argsort(hashes)
-    new = np.append(True, hashes[order[1:]] != hashes[order[:-1]])
+    new = begins_run(hashes[order])
     rows = np.empty(len(values), np.int64)
     rows[order] = np.cumsum(new) - 1
     table = values[order[new]]

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.hashing import coordinate_hash
+from ..base.runs import begins_run
 from ..features.cells import cell_keys
 
 #: Side in metres of the cells that density is measured in.
@@ -27,7 +28,7 @@ def density(xyz: npt.NDArray[np.float64]) -> float:
         return 0.0
     keys, _ = cell_keys(xyz[:, :2], CELL)
     keys.sort()
-    starts = np.flatnonzero(np.append(True, keys[1:] != keys[:-1]))
+    starts = np.flatnonzero(begins_run(keys))
     return float(np.median(np.diff(np.append(starts, len(keys))))) / CELL**2
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.jit import njit
+from ..base.runs import begins_run
 from .index import cell_numbers
 
 #: A share of 1.
@@ -28,9 +29,7 @@ def cell_means(
     keys, offsets = cell_keys(coordinates, side)
     order = np.argsort(keys)
     ascending = keys[order]
-    new = np.ones(len(keys), np.bool_)
-    np.not_equal(ascending[1:], ascending[:-1], out=new[1:])
-    start = np.append(np.flatnonzero(new), len(keys))
+    start = np.append(np.flatnonzero(begins_run(ascending)), len(keys))
     occupied = ascending[start[:-1]]
     cell = np.empty(len(keys), np.int32)
     sums = np.zeros((len(occupied), shares.shape[1] + 1), np.int64)

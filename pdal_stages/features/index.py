@@ -15,6 +15,7 @@ import numpy as np
 
 from ..base.errors import StageError
 from ..base.jit import device, njit
+from ..base.runs import begins_run
 
 #: Coordinates beyond this many metres are no point cloud (and would overflow cell numbers).
 LIMIT = 1e12
@@ -137,7 +138,7 @@ def build_grid(xyz: np.ndarray, cell: float) -> Grid:
     if n < 2**31:
         order = order.astype(np.int32)
     key = key[order]
-    starts = np.flatnonzero(np.concatenate(([True], key[1:] != key[:-1]))) if n else np.zeros(0, np.int64)
+    starts = np.flatnonzero(begins_run(key))
     cells = key[starts]
     del key
     iy, ix = (cells // width).astype(np.int64), (cells % width).astype(np.int64)
@@ -152,7 +153,7 @@ def build_grid(xyz: np.ndarray, cell: float) -> Grid:
     x, y, z = spare[:, :n]
     cell_start = np.concatenate((starts, [n])).astype(np.int64)
     sort_cells(x, y, z, order, cell_start)
-    rows = np.flatnonzero(np.concatenate(([True], iy[1:] != iy[:-1]))) if n else np.zeros(0, np.int64)
+    rows = np.flatnonzero(begins_run(iy))
     return Grid(
         cell=float(cell),
         order=order,

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.hashing import hash_of
+from ..base.runs import begins_run
 from .cells import cell_keys
 
 #: Largest side in metres.
@@ -85,8 +86,7 @@ def _one_each(
         return None
     keys, _ = cell_keys(xyz, side)
     order = np.argsort(keys)
-    ascending = keys[order]
-    first = np.append(True, ascending[1:] != ascending[:-1])
+    first = begins_run(keys[order])
     if first.all():
         return None
     start = np.flatnonzero(first)

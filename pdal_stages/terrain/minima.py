@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base import checks
 from ..base.errors import NoTerrainError, OptionError, StageError
+from ..base.runs import begins_run
 from .columns import columns
 
 #: Largest cell index either side of zero; beyond it coordinates cannot be terrain.
@@ -61,7 +62,9 @@ class MinimaTerrain:
         column, row = cell_numbers(x[usable], cell), cell_numbers(y[usable], cell)
         key = _key(column, row)
         order = np.argsort(key, kind="stable")
-        terrain._keys, starts = np.unique(key[order], return_index=True)
+        key = key[order]
+        starts = np.flatnonzero(begins_run(key))
+        terrain._keys = key[starts]
         if starts.size:
             terrain._minima = np.minimum.reduceat(z[usable][order], starts)
         terrain.report = {
