@@ -405,7 +405,7 @@ def test_axis_holds_its_values(most):
 def tiled(**changes):
     """What a run after --resume reports: one tile done, one kept, one failed."""
     nasty = "<x>\"'&"
-    done = {"points": 2000, "read": 2500, "buffer": 12.3456789, "seconds": 81.23456, "tries": 1}
+    done = {"points": 2000, "read": 2500, "halo_m": 12.3456789, "seconds": 81.23456, "tries": 1}
     return {
         "pipeline": f"/jobs/{nasty}.json",
         "models": [f"{nasty}.model"],
@@ -413,7 +413,7 @@ def tiled(**changes):
         "inputs": 2,
         "tile": 500.0,
         "bounds": [770500.004999, 6277000.0, 772000.0, 6277500.0],
-        "buffer_metres": 12.3456789012,
+        "halo_m": 12.3456789012,
         "workers": 2,
         "cpu_seconds": 3723.4567891,
         "points": 2000,

@@ -20,8 +20,8 @@ from pdal_stages.terrain.minima import terrain_reach
 from pdal_stages.tiling import TilingOptions, run_tiled
 from pdal_stages.tiling.cloudindex import index_las
 from pdal_stages.tiling.extract import cut, plain_header
-from pdal_stages.tiling.grid import Grid, inside, touching
-from pdal_stages.tiling.sources import find_sources, las_header
+from pdal_stages.tiling.grid import TileGrid, inside, touching
+from pdal_stages.tiling.sources import find_sources, las_extent
 from pdal_stages.tiling.tileplan import make_plan
 from pdal_stages.tiling.tindex import locations
 
@@ -68,7 +68,7 @@ def whole(tmp_path_factory, town_file, model_file):
     st.integers(-1000, 1000),
 )
 def test_every_point_has_one_tile(size, values, edge):
-    grid = Grid(size)
+    grid = TileGrid(size)
     x = np.array([*values, edge * size])
     at = grid.index(x)
     for value, i in zip(x.tolist(), at.tolist(), strict=True):
@@ -77,12 +77,12 @@ def test_every_point_has_one_tile(size, values, edge):
 
 
 def test_boxes_touch_on_their_edges():
-    grid = Grid(10)
+    grid = TileGrid(10)
     boxes = [grid.box((1, 1)), grid.box((2, 0)), grid.box((0, -1))]
     assert touching(boxes, grid.box((0, 0))) == [0, 2]
     assert inside(grid.box((0, 0)), grid.box((0, 0), 1)) and not inside(grid.box((0, 0), 1), grid.box((0, 0)))
     assert grid.covering((0, 0, 10, 5)) == [(0, 0), (1, 0)]
-    assert Grid(500).name((1000, -1)) == "500000_-500"
+    assert TileGrid(500).name((1000, -1)) == "500000_-500"
 
 
 # ---- reading parts of files ------------------------------------------------------------------------------
@@ -100,11 +100,11 @@ def test_a_cut_is_the_files_own_bytes(tmp_path, random_cloud, write_las, suffix,
     path = write_las(
         tmp_path / f"cloud{suffix}", arrays, point_format=point_format, wkt=WKT if point_format == 6 else None
     )
-    index = index_las(str(path), Grid(25.0))
+    index = index_las(str(path), TileGrid(25.0))
     assert index.count == len(xyz) and sum(n for _, _, n in index.tiles) == len(xyz)
     assert touching(index.boxes, (0, 0, 10, 100)) == [0]
     target = tmp_path / "piece.las"
-    piece = cut(str(path), index, Grid(25.0), (1, 2), 3.0, str(target), str(tmp_path / "core.las"))
+    piece = cut(str(path), index, TileGrid(25.0), (1, 2), 3.0, str(target), str(tmp_path / "core.las"))
     las, all_ = laspy.read(target), laspy.read(path)
     expected = np.flatnonzero((xyz[:, 0] >= 22) & (xyz[:, 0] <= 53) & (xyz[:, 1] >= 47) & (xyz[:, 1] <= 78))
     assert np.array_equal(piece.index, expected)
@@ -129,10 +129,10 @@ def test_index_refuses_what_is_cut_short(tmp_path, random_cloud, write_las):
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(StageError, match=r"damaged|cut short|cannot be read"):
-        index_las(str(path), Grid(10.0))
+        index_las(str(path), TileGrid(10.0))
     path.write_bytes(b"not a cloud")
     with pytest.raises(StageError, match="not a LAS"):
-        las_header(str(path))
+        las_extent(str(path))
 
 
 # ---- the same as untiled ---------------------------------------------------------------------------------
@@ -185,9 +185,9 @@ def test_two_worker_processes_give_the_same(tmp_path, town_file, model_file, who
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
 def test_large_files_are_written_in_parts(tmp_path, town_file, model_file, whole, suffix, monkeypatch):
-    from pdal_stages.tiling import assemble
+    from pdal_stages.tiling import file_task
 
-    monkeypatch.setattr(assemble, "MOST_AT_ONCE", 11_000)
+    monkeypatch.setattr(file_task, "MOST_AT_ONCE", 11_000)
     out = tmp_path / f"out.{suffix}"
     assert not run_tiled(clouds.stages([town_file], out, model_file), 60, workers=0).failures
     clouds.same_points(whole, out)
@@ -611,7 +611,7 @@ def test_a_failed_tile_is_crossed_out():
     from pdal_stages.reports.runpage import run_page
     from pdal_stages.tiling.outcome import Job, TiledRun
 
-    report = {"points": 5, "read": 9, "buffer": 1.0, "seconds": 2.0}
+    report = {"points": 5, "read": 9, "halo_m": 1.0, "seconds": 2.0}
     jobs = [Job((0, 0), "0_0", 5, [], state="done", report=report)]
     jobs.append(Job((1, 0), "10_0", 5, [], state="failed", reason="<odd> & broken"))
     summary = {"tile": 10.0, "points": 5, "states": {"done": 1, "kept": 0, "failed": 1}, "classes": {}}

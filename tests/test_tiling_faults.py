@@ -570,7 +570,7 @@ def test_a_far_input_that_a_widened_tile_read(tmp_path, write_las):
     writer = {"type": "writers.las", "filename": str(tmp_path / "o_#.las"), "extra_dims": "all"}
     stages = [{"type": "readers.las", "filename": str(tmp_path / "?.las")}, features, writer]
     first = run_tiled(stages, 60, workers=0)
-    wide = {job.name: job.report["buffer"] for job in first.tiles}
+    wide = {job.name: job.report["halo_m"] for job in first.tiles}
     assert wide["0_0"] > 60, wide  # which reaches c
     xyz = rng.uniform(0, 1, (60, 3)) * (59.9, 60, 5) + (120, 0, 0)
     write_las(tmp_path / "c.las", dict(zip("XYZ", xyz.T, strict=True)))
@@ -735,7 +735,7 @@ def test_a_failure_on_another_host_names_it(tmp_path):
 
     task = pickle.dumps(Failing())
     answer = scheduler.perform_for(scheduler.versions(), str(tmp_path), "another host", task)
-    assert answer.reason == f"on {socket.gethostname()}: it failed." and isinstance(answer, work.Answer)
+    assert answer.reason == f"on {socket.gethostname()}: it failed." and isinstance(answer, work.TaskResult)
     answer = scheduler.perform_for(scheduler.versions(), str(tmp_path), socket.gethostname(), task)
     assert answer.reason == "it failed."
 

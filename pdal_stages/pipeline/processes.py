@@ -18,7 +18,7 @@ from ..base import checks
 from ..base.errors import StageError
 from ..base.runlog import LoggedStream
 from ..base.threads import available_threads
-from .work import Answer, Call, Task, perform
+from .work import Call, Task, TaskResult, perform
 
 _KILLED = "it killed its worker each time it was tried: too little memory, or a crash in a library"
 
@@ -33,14 +33,14 @@ class Processes(contextlib.AbstractContextManager):
     def __init__(self, slots: int, threads: int) -> None:
         self.slots, self.threads = slots, threads
         self._workers: list[_Worker] = []
-        self._answers: queue.SimpleQueue[tuple[_Worker, Answer | None]] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[tuple[_Worker, TaskResult | None]] = queue.SimpleQueue()
 
     def __exit__(self, *exc: object) -> None:
         for worker in self._workers:
             worker.stop()
         self._workers.clear()
 
-    def run(self, waiting: deque, task_of: Callable[[Any], Task]) -> Iterator[tuple[Any, Answer]]:
+    def run(self, waiting: deque, task_of: Callable[[Any], Task]) -> Iterator[tuple[Any, TaskResult]]:
         """Yield (item, answer) for every item, as they finish.
 
         They are taken from the left; more may be put in after every answer. `task_of` is asked for an item's task just
@@ -67,7 +67,7 @@ class Processes(contextlib.AbstractContextManager):
                     )
                 if worker not in busy:
                     continue
-                answer = Answer(reason=_KILLED, again=True)
+                answer = TaskResult(reason=_KILLED, again=True)
             yield busy.pop(worker), answer
 
 
@@ -147,7 +147,7 @@ def _environment(threads: int) -> dict[str, str]:
 
 def each_file(
     function: Callable[..., Any], work: Sequence[tuple], workers: int = 1
-) -> Iterator[tuple[tuple, Answer]]:
+) -> Iterator[tuple[tuple, TaskResult]]:
     """Each item of work, the function's arguments, with what became of it, as they finish; failures do not stop the rest.
 
     The function is a module's own, so that other processes find it. They share the cores.

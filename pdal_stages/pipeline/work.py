@@ -42,7 +42,7 @@ class Call:
 
 
 @dataclass
-class Answer:
+class TaskResult:
     """What became of a task."""
 
     result: Any = None
@@ -52,25 +52,25 @@ class Answer:
     cost: dict[str, float] = field(default_factory=dict)
 
 
-def perform(task: Task) -> Answer:
+def perform(task: Task) -> TaskResult:
     """Do a task; what goes wrong is in the answer, except Ctrl-C."""
     with _one:
         started, cpu = time.perf_counter(), time.process_time()
         try:
-            answer = Answer(task.run())
+            answer = TaskResult(task.run())
         except InterruptedStage:
             raise KeyboardInterrupt from None
         except StageError as error:
             wrong = isinstance(error, OptionError | ModelError | DimensionError | DependencyError)
-            answer = Answer(
+            answer = TaskResult(
                 reason=str(error), again=not wrong
             )  # nothing helps where the request itself is wrong
         except MemoryError:
-            answer = Answer(reason="memory ran out. Take smaller tiles or fewer workers", again=True)
+            answer = TaskResult(reason="memory ran out. Take smaller tiles or fewer workers", again=True)
         except Exception as error:
             last = traceback.extract_tb(error.__traceback__)[-1]
             reason = f"{type(error).__name__}: {error} ({last.name}, line {last.lineno})"
-            answer = Answer(reason=reason, again=True)
+            answer = TaskResult(reason=reason, again=True)
         answer.cost = {
             "seconds": time.perf_counter() - started,
             "cpu_seconds": time.process_time() - cpu,

@@ -21,7 +21,7 @@ _SETTINGS = {
     "inputs": "input files",
     "bounds": "extent of the inputs",
     "tile": "side of the tiles",
-    "buffer_metres": "surroundings, m",
+    "halo_m": "surroundings, m",
     "metres_per_unit": "metres per unit",
     "per": "one output for each",
     "workers": "workers",

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import StageError
-from .grid import Box, Grid, check_number
+from .grid import Box, TileGrid, check_number
 
 #: Points of a block: LAZ is compressed in pieces of so many.
 BLOCK = 50_000
@@ -54,7 +54,7 @@ def read_block(reader: Any, path: str, start: int, end: int):
     return points
 
 
-def index_las(path: str, grid: Grid) -> CloudIndex:
+def index_las(path: str, grid: TileGrid) -> CloudIndex:
     """Read a file once and say where its points lie.
 
     Raises

@@ -138,7 +138,7 @@ def _print(run: TiledRun) -> None:
 def _print_dry(run: TiledRun) -> None:
     s = run.summary
     print(
-        f"{_counted(len(run.tiles), 'tile')} of {s['tile']:g}, each read with {s['buffer_metres']:g} m of surroundings"
+        f"{_counted(len(run.tiles), 'tile')} of {s['tile']:g}, each read with {s['halo_m']:g} m of surroundings"
     )
     print(f"{_counted(s['inputs'], 'input')}, {s['points']:,} points; one output for each {s['per']}")
     print(

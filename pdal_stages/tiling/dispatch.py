@@ -7,7 +7,7 @@ from collections import deque
 
 from ..base.errors import StageError
 from ..base.progress import Progress
-from .outcome import Job, Output
+from .outcome import FileJob, TileJob
 from .pool import Pool, last_tries
 from .store import Store
 from .worklist import Worklist
@@ -25,15 +25,15 @@ def run_all(work: Worklist, store: Store, pool: Pool, retries: int, show: bool |
         If the first tiles all fail for one reason.
     """
     jobs = work.jobs
-    waiting: deque[Job | Output] = deque(job for job in jobs if job.state == "waiting")
+    waiting: deque[TileJob | FileJob] = deque(job for job in jobs if job.state == "waiting")
     done = good = sum(job.state == "kept" for job in jobs)
     failures: list[str] = []
-    users: dict[tuple[int, int], list[Output]] = {}
+    users: dict[tuple[int, int], list[FileJob]] = {}
     for out in work.outputs:
         for job in out.jobs:
             users.setdefault(job.tile, []).append(out)
         _make_ready(out, waiting)
-    total = sum(item.points for item in waiting if isinstance(item, Job))
+    total = sum(item.points for item in waiting if isinstance(item, TileJob))
     with Progress(total, f"{done} of {len(jobs)} tiles", enabled=show) as progress:
         for item, answer in last_tries(pool, waiting, work.tasks(store, pool.threads), retries):
             if answer.reason:
@@ -42,7 +42,7 @@ def run_all(work: Worklist, store: Store, pool: Pool, retries: int, show: bool |
                 item.state, item.report = "done", answer.result | answer.cost
                 with contextlib.suppress(StageError, OSError):  # no room: a later run does it again
                     work.keep(store, item)
-            if isinstance(item, Output):
+            if isinstance(item, FileJob):
                 continue
             done += 1
             progress.label = f"{done} of {len(jobs)} tiles"
@@ -60,7 +60,7 @@ def run_all(work: Worklist, store: Store, pool: Pool, retries: int, show: bool |
                 )
 
 
-def _make_ready(out: Output, waiting: deque) -> None:
+def _make_ready(out: FileJob, waiting: deque) -> None:
     """Put an output to work when the last of its tiles is there."""
     if out.state != "waiting" or any(job.state == "waiting" for job in out.jobs):
         return

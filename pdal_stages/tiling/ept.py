@@ -6,11 +6,13 @@ from typing import Any
 
 from ..pipeline import pdal as pdal_env
 from .cloudindex import CloudIndex, index_las
-from .grid import Grid
-from .sources import Source, las_header, read_ept
+from .grid import TileGrid
+from .sources import InputSource, las_extent, read_ept
 
 
-def fetch(source: Source, grid: Grid, tile: tuple[int, int], margin: float, target: str) -> CloudIndex | None:
+def fetch(
+    source: InputSource, grid: TileGrid, tile: tuple[int, int], halo: float, target: str
+) -> CloudIndex | None:
     """Read a tile and its surroundings into a LAS file; its index, None where it is empty.
 
     Scales and offsets are the source's, so coordinates stay what they are; other
@@ -29,5 +31,5 @@ def fetch(source: Source, grid: Grid, tile: tuple[int, int], margin: float, targ
             axis = dimension["name"].lower()
             writer[f"scale_{axis}"] = dimension.get("scale", 0.001)
             writer[f"offset_{axis}"] = dimension.get("offset", 0.0)
-    run = pdal_env.execute([source.within(grid.box(tile, margin)), writer], arrays=False)
-    return index_las(target, grid) if run.count and las_header(target).count else None
+    run = pdal_env.execute([source.within(grid.box(tile, halo)), writer], arrays=False)
+    return index_las(target, grid) if run.count and las_extent(target).count else None

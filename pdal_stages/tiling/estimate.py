@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from .assemble import MOST_AT_ONCE
-from .outcome import Job, TiledRun
+from .file_task import MOST_AT_ONCE
+from .outcome import TiledRun, TileJob
 from .settings import TilingOptions
 from .survey import Survey
 from .tileplan import TilePlan, outputs_for
@@ -18,9 +18,9 @@ _RATE = 5_000
 def estimate(plan: TilePlan, survey: Survey, options: TilingOptions) -> TiledRun:
     """Tiles and points as the headers tell."""
     grid, area = survey.grid, 0.0
-    jobs = {tile: Job(tile, grid.name(tile), 0, []) for tile in survey.tiles()}
+    jobs = {tile: TileJob(tile, grid.name(tile), 0, []) for tile in survey.tiles()}
     for source in survey.sources:
-        header = survey.headers.get(source.path)
+        header = survey.extents.get(source.path)
         if header is None or not header.count:
             continue
         x0, y0, x1, y1 = header.box
@@ -35,10 +35,10 @@ def estimate(plan: TilePlan, survey: Survey, options: TilingOptions) -> TiledRun
     listed = list(jobs.values())
     names = [s.stem for s in survey.sources] if survey.per == "file" else [job.name for job in listed]
     outputs_for(plan, names, survey.paths)
-    count = sum(header.count for header in survey.headers.values())
-    side = grid.size + 2 * survey.margin
+    count = sum(header.count for header in survey.extents.values())
+    side = grid.size + 2 * survey.halo
     read = min(count, round(count / area * side * side if area else 0.0))
-    a_file = count / max(len(survey.headers), 1) if survey.per == "file" else 0
+    a_file = count / max(len(survey.extents), 1) if survey.per == "file" else 0
     held = max(read * _TILE_BYTES + _BLOCKS_MB * 2**20, min(a_file, MOST_AT_ONCE) * _FILE_BYTES)
     summary = survey.figures(plan) | {
         "workers": options.local_workers,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..base import las
 from ..base.errors import StageError
 from .cloudindex import BLOCK, CloudIndex, open_las, read_block
-from .grid import Grid, touching
+from .grid import TileGrid, touching
 
 _COMPRESSOR = b"laszip encoded"
 
@@ -27,12 +27,12 @@ class Piece:
     core: str  #: another file, with the tile's own points alone; empty where none was asked for
     index: NDArray[np.int64]  #: (n,) number of each point in the input file
     #: (n,) how far it lies outside the tile, in the unit of the coordinates; -1 inside
-    margin: NDArray[np.float64]
+    away: NDArray[np.float64]
 
     @cached_property
     def own(self) -> NDArray[np.int64]:
         """Rows of the tile's own points."""
-        return np.flatnonzero(self.margin < 0)
+        return np.flatnonzero(self.away < 0)
 
 
 def plain_header(path: str) -> tuple[bytearray, bytes]:
@@ -74,23 +74,23 @@ def finish(file: Any, head: bytearray, tail: bytes, count: int) -> None:
 def cut(
     path: str,
     index: CloudIndex,
-    grid: Grid,
+    grid: TileGrid,
     tile: tuple[int, int],
-    margin: float,
+    halo: float,
     target: str,
     core: str = "",
 ) -> Piece | None:
     """Cut a tile and its surroundings out of a LAS or LAZ file; None where the file has no point there.
 
-    `margin` is in the unit of the coordinates. A LAS file `target` is written, and a second one, `core`, for the tile's
+    `halo` is in the unit of the coordinates. A LAS file `target` is written, and a second one, `core`, for the tile's
     own points alone, where it is given.
     """
-    box = grid.box(tile, margin)
+    box = grid.box(tile, halo)
     blocks = touching(index.boxes, box)
     if not blocks:
         return None
     rows_cut: list[NDArray[np.int64]] = []
-    margins: list[NDArray[np.float64]] = []
+    aways: list[NDArray[np.float64]] = []
     cores = 0
     head, tail = plain_header(path)
     try:
@@ -114,7 +114,7 @@ def cut(
                     core_out.write(raw[mine].tobytes())
                     cores += int(np.count_nonzero(mine))
                 rows_cut.append(rows + start)
-                margins.append(away)
+                aways.append(away)
             found = sum(map(len, rows_cut))
             finish(out, bytearray(head), tail, found)
             if core:
@@ -126,10 +126,10 @@ def cut(
         if core:
             os.unlink(core)
         return None
-    return Piece(target, core, np.concatenate(rows_cut), np.concatenate(margins))
+    return Piece(target, core, np.concatenate(rows_cut), np.concatenate(aways))
 
 
-def outside(x: NDArray, y: NDArray, grid: Grid, tile: tuple[int, int]) -> NDArray[np.float64]:
+def outside(x: NDArray, y: NDArray, grid: TileGrid, tile: tuple[int, int]) -> NDArray[np.float64]:
     """Distance of points from a tile along the farther axis; -1 for its own points."""
     x0, y0, x1, y1 = grid.box(tile)
     away = np.maximum(np.maximum(x0 - x, x - x1), np.maximum(y0 - y, y - y1))

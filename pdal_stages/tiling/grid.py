@@ -19,7 +19,7 @@ Box = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
-class Grid:
+class TileGrid:
     """Square tiles of one size; tile (i, j) holds ``i*size <= x < (i+1)*size``, likewise y."""
 
     size: float  #: side of a tile, in the unit of the coordinates
@@ -46,14 +46,14 @@ class Grid:
         where += coordinate >= (where + 1.0) * self.size
         return where.astype(np.int64)
 
-    def box(self, tile: tuple[int, int], margin: float = 0.0) -> Box:
-        """(min x, min y, max x, max y) of a tile, grown by a margin."""
+    def box(self, tile: tuple[int, int], halo: float = 0.0) -> Box:
+        """(min x, min y, max x, max y) of a tile, grown by as much on each side."""
         i, j = tile
         return (
-            i * self.size - margin,
-            j * self.size - margin,
-            (i + 1) * self.size + margin,
-            (j + 1) * self.size + margin,
+            i * self.size - halo,
+            j * self.size - halo,
+            (i + 1) * self.size + halo,
+            (j + 1) * self.size + halo,
         )
 
     def name(self, tile: tuple[int, int]) -> str:

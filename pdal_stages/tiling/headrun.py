@@ -19,20 +19,20 @@ from ..pipeline.writerlimits import check_writers
 from ..stages import registry
 from ..stages.base import Stage
 from .extract import Piece
-from .grid import Box, Grid
+from .grid import Box, TileGrid
 from .results import PieceResults
-from .sources import Source
-from .tileplan import MARGIN, ROW, SOURCE, TilePlan
+from .sources import InputSource
+from .tileplan import INPUT, OUTSIDE, ROW, TilePlan
 
-_MARK_TYPES = {ROW: "uint32_t", SOURCE: "uint32_t", MARGIN: "double"}
+_MARK_TYPES = {ROW: "uint32_t", INPUT: "uint32_t", OUTSIDE: "double"}
 
 
 @dataclass(frozen=True)
-class Recipe:
+class RunContext:
     """What all tiles of a run have in common."""
 
     plan: TilePlan
-    grid: Grid
+    grid: TileGrid
     unit: float  #: metres per unit of the coordinates
     bounds: Box  #: of all inputs
     threads: int
@@ -50,13 +50,13 @@ class HeadRun:
 
 
 def run_head(
-    recipe: Recipe, tile: tuple[int, int], cuts: list[tuple[Source, Piece]], everything: bool
+    context: RunContext, tile: tuple[int, int], cuts: list[tuple[InputSource, Piece]], everything: bool
 ) -> HeadRun:
     """Run the head once; `everything`: all inputs were read, so nothing can lie farther away."""
-    plan = recipe.plan
+    plan = context.plan
     if not plan.head:
         return HeadRun([PieceResults(source, piece, piece.own, {}) for source, piece in cuts], 0.0)
-    marks = [_Mark(number, piece, recipe) for number, (_, piece) in enumerate(cuts)]
+    marks = [_Mark(number, piece, context) for number, (_, piece) in enumerate(cuts)]
     old = [mark.old_format for mark in marks]
     for mark in marks:
         mark.mixed = any(old) and not all(old)
@@ -74,10 +74,10 @@ def run_head(
             kind = registry.stages().get(stage["type"])
             if kind is not None:
                 asked = int(stage.get("threads") or 0)
-                stage["threads"] = min(asked, recipe.threads) if asked else recipe.threads
+                stage["threads"] = min(asked, context.threads) if asked else context.threads
             stages.append(stage)
             if kind is not None and kind.open_ended and not everything:
-                reach = reaches[len(stages) - 1] = _Reach(recipe.grid.box(tile), later)
+                reach = reaches[len(stages) - 1] = _Reach(context.grid.box(tile), later)
                 stages.append(callbacks.filter(reach))
         pipeline = Pipeline(stages)
         ours_there = [(ours.stage, ours.place, ours.index) for ours in pipeline.lowered.ours]
@@ -91,7 +91,7 @@ def run_head(
     beyond = [report.get("beyond_halo") or {} for _, reports in pipeline.reports for report in reports]
     if not everything and any(number for one in beyond for number in one.values()):
         most = max(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
-        need = max(need, _far_neighbors(pipeline.arrays, most, recipe, tile))
+        need = max(need, _far_neighbors(pipeline.arrays, most, context, tile))
     said = [*(f"PDAL says: {line}" for line in pipeline.said), *pipeline.told]
     return HeadRun(results, need, said)
 
@@ -103,9 +103,9 @@ class _Mark:
     stages could not tell: the bits then go where those are, and back into the results.
     """
 
-    def __init__(self, number: int, piece: Piece, recipe: Recipe) -> None:
-        self.number, self.piece, self.keep = number, piece, recipe.plan.creates is None
-        self.margin = np.where(piece.margin < 0, -1.0, piece.margin * recipe.unit)
+    def __init__(self, number: int, piece: Piece, context: RunContext) -> None:
+        self.number, self.piece, self.keep = number, piece, context.plan.creates is None
+        self.away = np.where(piece.away < 0, -1.0, piece.away * context.unit)
         header = read_header(piece.path)
         self.old_format = header is not None and header.point_format <= 5  # one of LAS 1.0 to 1.3
         self.mixed = False  # whether there are others beside it
@@ -115,11 +115,11 @@ class _Mark:
 
     def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
         count = len(ins["X"])
-        if count != len(self.margin):
-            raise StageError(f"the reader gave {count:,} points of {len(self.margin):,}")
+        if count != len(self.away):
+            raise StageError(f"the reader gave {count:,} points of {len(self.away):,}")
         outs[ROW] = np.arange(count, dtype=np.uint32)
-        outs[SOURCE] = np.full(count, self.number, np.uint32)
-        outs[MARGIN] = self.margin
+        outs[INPUT] = np.full(count, self.number, np.uint32)
+        outs[OUTSIDE] = self.away
         if self.keep:
             self.original = {name: v[self.piece.own] for name, v in ins.items() if name not in _MARK_TYPES}
         self.holds_flags = self.old_format and not {"Synthetic", "Withheld"} & set(ins)
@@ -148,13 +148,16 @@ class _Reach:
     def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
         assert self.stage is not None
         points = points_of(self.stage, module, ins)
-        wanted = ins[MARGIN] <= self.later if self.later > 0 else ins[MARGIN] < 0
+        wanted = ins[OUTSIDE] <= self.later if self.later > 0 else ins[OUTSIDE] < 0
         box = [side * points.units.horizontal for side in self.box]
         self.need = max(self.need, self.stage.reach_of(points, wanted, box))
 
 
 def _collect(
-    arrays: list[NDArray], cuts: list[tuple[Source, Piece]], creates: list[str] | None, marks: list[_Mark]
+    arrays: list[NDArray],
+    cuts: list[tuple[InputSource, Piece]],
+    creates: list[str] | None,
+    marks: list[_Mark],
 ) -> list[PieceResults]:
     """Results of the tile's own points, sorted as their pieces are."""
     names = [n for a in arrays[:1] for n in a.dtype.names or ()]
@@ -164,7 +167,7 @@ def _collect(
         names = [n for n in creates if n in names]
     results = []
     for number, (source, piece) in enumerate(cuts):
-        mine = [(a, np.flatnonzero((a[MARGIN] < 0) & (a[SOURCE] == number))) for a in arrays]
+        mine = [(a, np.flatnonzero((a[OUTSIDE] < 0) & (a[INPUT] == number))) for a in arrays]
         rows = np.concatenate([a[ROW][at].astype(np.int64) for a, at in mine] or [np.empty(0, np.int64)])
         order = np.argsort(rows, kind="stable")
         rows = rows[order]
@@ -194,16 +197,16 @@ def _changed(result: PieceResults, name: str, original: Mapping[str, NDArray]) -
     return name not in original or not np.array_equal(original[name][before], result.values[name])
 
 
-def _far_neighbors(arrays: list[NDArray], most: int, recipe: Recipe, tile: tuple[int, int]) -> float:
+def _far_neighbors(arrays: list[NDArray], most: int, context: RunContext, tile: tuple[int, int]) -> float:
     """Metres around the tile within which the `most` nearest neighbors of all its points lie."""
     from scipy.spatial import cKDTree
 
-    x0, y0, x1, y1 = (side * recipe.unit for side in recipe.grid.box(tile))
-    array = np.concatenate([a[["X", "Y", "Z", MARGIN]] for a in arrays])
-    xyz = np.column_stack([array[c] for c in "XYZ"]) * recipe.unit
-    mine = xyz[array[MARGIN] < 0]
+    x0, y0, x1, y1 = (side * context.unit for side in context.grid.box(tile))
+    array = np.concatenate([a[["X", "Y", "Z", OUTSIDE]] for a in arrays])
+    xyz = np.column_stack([array[c] for c in "XYZ"]) * context.unit
+    mine = xyz[array[OUTSIDE] < 0]
     if len(xyz) <= most:
         return 2 * (x1 - x0)
     inward = np.min([mine[:, 0] - x0, x1 - mine[:, 0], mine[:, 1] - y0, y1 - mine[:, 1]], axis=0)
-    far = cKDTree(xyz).query(mine, k=[most + 1], workers=recipe.threads)[0][:, 0]
+    far = cKDTree(xyz).query(mine, k=[most + 1], workers=context.threads)[0][:, 0]
     return float(max(0.0, (far - inward).max()))

@@ -14,7 +14,7 @@ from ..base.files import whole_files
 from .cloudindex import BLOCK, open_las, read_block
 from .extract import finish, plain_header
 from .results import NewValues
-from .sources import Source
+from .sources import InputSource
 from .tail import run_tail, written
 
 
@@ -23,7 +23,7 @@ class HeadersDifferError(Exception):
 
 
 def write_in_parts(
-    source: Source,
+    source: InputSource,
     count: int,
     most: int,
     new_values: Callable[[int, int], NewValues],

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.version import __version__
-from .sources import Source
+from .sources import InputSource
 
 
 @dataclass(kw_only=True)
@@ -23,23 +23,23 @@ class _Work:
 
 
 @dataclass
-class Job(_Work):
+class TileJob(_Work):
     """A tile to run."""
 
     tile: tuple[int, int]
     name: str
     points: int  #: its own; 0 where not known before it is read
-    sources: list[Source]  #: inputs that may hold points of it or its surroundings
+    sources: list[InputSource]  #: inputs that may hold points of it or its surroundings
     outputs: list[str] | None = None  #: what the writers write, where each tile is an output
 
 
 @dataclass
-class Output(_Work):
+class FileJob(_Work):
     """An input file whose output is put together from tiles."""
 
-    source: Source
+    source: InputSource
     paths: list[str]
-    jobs: list[Job] = field(default_factory=list)
+    jobs: list[TileJob] = field(default_factory=list)
 
 
 _CHANGED = (
@@ -62,8 +62,8 @@ class TiledRun:
 
     Attributes
     ----------
-    tiles : list of Job
-    outputs : list of Output
+    tiles : list of TileJob
+    outputs : list of FileJob
         Empty where each tile is an output.
     unreadable : dict of str to str
         Inputs that could not be read, and why.
@@ -75,8 +75,8 @@ class TiledRun:
         Figures for people; see :meth:`to_dict`.
     """
 
-    tiles: list[Job]
-    outputs: list[Output]
+    tiles: list[TileJob]
+    outputs: list[FileJob]
     unreadable: dict[str, str]
     changed: list[str]
     notes: list[str]
@@ -125,7 +125,7 @@ class TiledRun:
         }
 
 
-def summarize(tiles: list[Job], outputs: list[Output], seconds: float) -> dict[str, Any]:
+def summarize(tiles: list[TileJob], outputs: list[FileJob], seconds: float) -> dict[str, Any]:
     """Figures of all tiles and outputs together, for :attr:`TiledRun.summary`."""
     worked = [job for job in tiles if job.state == "done"]
     classes: dict[str, int] = {}

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..pipeline.interrupts import gentle
 from ..pipeline.processes import Processes
-from ..pipeline.work import Answer, Task, perform
+from ..pipeline.work import Task, TaskResult, perform
 from .scheduler import OnDask
 from .settings import TilingOptions
 
@@ -22,7 +22,7 @@ class Here(AbstractContextManager):
 
     def __exit__(self, *exc: object) -> None: ...
 
-    def run(self, waiting: deque, task_of: Callable[[Any], Task]) -> Iterator[tuple[Any, Answer]]:
+    def run(self, waiting: deque, task_of: Callable[[Any], Task]) -> Iterator[tuple[Any, TaskResult]]:
         """Yield (item, answer) for every item; see :meth:`pdal_stages.pipeline.processes.Processes.run`."""
         with gentle() as interrupts:
             while waiting:
@@ -34,7 +34,7 @@ class Here(AbstractContextManager):
 
 def last_tries(
     pool: Pool, waiting: deque, task_of: Callable[[Any], Task], retries: int
-) -> Iterator[tuple[Any, Answer]]:
+) -> Iterator[tuple[Any, TaskResult]]:
     """Items and the answers of their last tries; failed ones wait again behind the others, up to `retries` times."""
     for item, answer in pool.run(waiting, task_of):
         item.tries += 1

@@ -15,14 +15,14 @@ from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import StageError
 from ..base.files import whole_files
 from .extract import Piece
-from .sources import Source
+from .sources import InputSource
 
 
 @dataclass
 class PieceResults:
     """Results of a tile's own points of one source."""
 
-    source: Source
+    source: InputSource
     piece: Piece
     rows: NDArray[np.int64]  #: (n,) rows of the piece that came out, ascending
     values: dict[str, NDArray]  #: (n,) new values of dimensions
@@ -89,7 +89,7 @@ def _opened(name: str) -> Iterator[Any]:
         ) from error
 
 
-def read_range(tiles: Iterable[str], source: Source, count: int, start: int, end: int) -> NewValues:
+def read_range(tiles: Iterable[str], source: InputSource, count: int, start: int, end: int) -> NewValues:
     """Results of points `start` to `end` of a file with `count` points, out of the files of its tiles.
 
     Raises

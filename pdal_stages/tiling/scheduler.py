@@ -15,7 +15,7 @@ from typing import Any
 from ..base.errors import StageError, optional_import
 from ..base.version import build
 from ..pipeline import pdal as pdal_env
-from ..pipeline.work import Answer, Task, perform
+from ..pipeline.work import Task, TaskResult, perform
 from .settings import TilingOptions
 
 #: Seconds to wait for a worker: at the beginning, and when all are gone.
@@ -76,7 +76,7 @@ class OnDask:
             if not sees:
                 raise StageError(_APART, found=f"no {self.folder} on {host}", cure=_SHARE)
 
-    def run(self, waiting: deque, task_of: Callable[[Any], Task]) -> Iterator[tuple[Any, Answer]]:
+    def run(self, waiting: deque, task_of: Callable[[Any], Task]) -> Iterator[tuple[Any, TaskResult]]:
         """Yield (item, answer) for every item; see :meth:`pdal_stages.pipeline.processes.Processes.run`.
 
         Notes
@@ -101,7 +101,7 @@ class OnDask:
                     out.clear()
                     suspects.clear()
                     while waiting:  # more may come while these are looked at
-                        yield waiting.popleft(), Answer(reason=str(lost))
+                        yield waiting.popleft(), TaskResult(reason=str(lost))
                     return
                 for future in done:
                     item, error = out.pop(future), future.exception()
@@ -179,13 +179,13 @@ def _sees(folder: str) -> bool:
     return False
 
 
-def perform_for(wanted: tuple[str, str], folder: str, host: str, task: bytes) -> Answer:
+def perform_for(wanted: tuple[str, str], folder: str, host: str, task: bytes) -> TaskResult:
     """Do a task on a worker, if it has the versions of the program that sent it, from `host`, and sees its folder."""
     here = socket.gethostname()
     if versions() != wanted:
-        return Answer(reason=f"{_OTHER} ({_difference('it', versions(), wanted)}). {_SAME}", again=True)
+        return TaskResult(reason=f"{_OTHER} ({_difference('it', versions(), wanted)}). {_SAME}", again=True)
     if not _sees(folder):
-        return Answer(reason=f"{_APART} (found no {folder} on {here}). {_SHARE}", again=True)
+        return TaskResult(reason=f"{_APART} (found no {folder} on {here}). {_SHARE}", again=True)
     answer = perform(pickle.loads(task))
     if answer.reason and here != host:
         answer.reason = f"on {here}: {answer.reason}"
@@ -196,9 +196,9 @@ def _difference(worker: str, theirs: tuple[str, str], ours: tuple[str, str]) -> 
     return f"{worker} has pdal-stages {theirs[0]} and PDAL {theirs[1]}, this program {ours[0]} and {ours[1]}"
 
 
-def _failed(error: BaseException, killed: bool) -> Answer:
+def _failed(error: BaseException, killed: bool) -> TaskResult:
     """The answer of a task that gave none."""
     if killed:
         reason = "it killed its worker each time it was tried: too little memory, or a crash in a library"
-        return Answer(reason=reason)
-    return Answer(reason=f"{type(error).__name__}: {error}", again=True)
+        return TaskResult(reason=reason)
+    return TaskResult(reason=f"{type(error).__name__}: {error}", again=True)

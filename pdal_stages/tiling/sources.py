@@ -24,7 +24,7 @@ _TINDEX_QUERIES = ("bounds", "polygon", "where", "sql", "count", "srs_column")
 
 
 @dataclass(frozen=True)
-class Source:
+class InputSource:
     """One input."""
 
     path: str  #: absolute, or an address
@@ -51,7 +51,7 @@ class Source:
         return {**self.reader, "filename": self.path, "bounds": f"([{x0!r}, {x1!r}], [{y0!r}, {y1!r}])"}
 
 
-def find_sources(readers: list[dict[str, Any]]) -> list[Source]:
+def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
     """The inputs behind readers: names, patterns, EPT addresses, tile indexes.
 
     Raises
@@ -59,7 +59,7 @@ def find_sources(readers: list[dict[str, Any]]) -> list[Source]:
     PipelineError
         Where nothing is found, or a reader cannot be cut into tiles.
     """
-    found: dict[str, Source] = {}
+    found: dict[str, InputSource] = {}
     for reader in readers:
         name = str(reader.get("filename", ""))
         kind = reader["type"]
@@ -79,7 +79,7 @@ def find_sources(readers: list[dict[str, Any]]) -> list[Source]:
             path = name.removeprefix("ept://")
             path = path if path.endswith("ept.json") else path.rstrip("/") + "/ept.json"
             path = path if "://" in path else str(Path(path).absolute())
-            found.setdefault(path, Source(path, _bare(reader), "ept"))
+            found.setdefault(path, InputSource(path, _bare(reader), "ept"))
             continue
         elif kind in _LAS:
             patterned = any(c in name for c in "*?[") and not os.path.exists(name)
@@ -94,7 +94,7 @@ def find_sources(readers: list[dict[str, Any]]) -> list[Source]:
             )
         for path in paths:
             full = str(Path(path).absolute())
-            found.setdefault(full, Source(full, {**_bare(reader), "type": "readers.las"}, "las"))
+            found.setdefault(full, InputSource(full, {**_bare(reader), "type": "readers.las"}, "las"))
     return list(found.values())
 
 
@@ -103,14 +103,14 @@ def _bare(reader: dict[str, Any]) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Header:
+class Extent:
     """What an input says of itself."""
 
     count: int  #: points
     box: Box
 
 
-def read_header(source: Source) -> Header:
+def read_extent(source: InputSource) -> Extent:
     """Number of points and bounding box, from the first bytes.
 
     Raises
@@ -119,13 +119,13 @@ def read_header(source: Source) -> Header:
         If the input cannot be read.
     """
     if source.kind != "ept":
-        return las_header(source.path)
+        return las_extent(source.path)
     described = read_ept(source.path)
     x0, y0, _, x1, y1, _ = map(float, described["boundsConforming"])
-    return Header(int(described["points"]), (x0, y0, x1, y1))
+    return Extent(int(described["points"]), (x0, y0, x1, y1))
 
 
-def check_source(source: Source) -> None:
+def check_source(source: InputSource) -> None:
     """Refuse an input whose header does not fit its file, or whose name is not text. Where it lies is known all the same.
 
     Raises
@@ -139,7 +139,7 @@ def check_source(source: Source) -> None:
         las.check_readable(source.path)
 
 
-def las_header(path: str) -> Header:
+def las_extent(path: str) -> Extent:
     """Number of points and bounding box in the header of a LAS or LAZ file."""
     try:
         found = las.read_header(path)
@@ -152,7 +152,7 @@ def las_header(path: str) -> Header:
         raise StageError(
             "the header has no bounding box", where=path, found=f"x {x0} to {x1}, y {y0} to {y1}"
         )
-    return Header(found.count, found.box)
+    return Extent(found.count, found.box)
 
 
 def read_ept(path: str) -> dict[str, Any]:

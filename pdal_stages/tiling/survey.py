@@ -19,10 +19,10 @@ from ..pipeline.filenames import named_files
 from ..pipeline.references import Reference, check_one_reference, reference_of
 from ..pipeline.work import Call
 from .cloudindex import CloudIndex, index_las
-from .grid import Box, Grid, check_number, touching, union
+from .grid import Box, TileGrid, check_number, touching, union
 from .pool import Pool, last_tries
 from .settings import TilingOptions
-from .sources import Header, Source, check_source, find_sources, read_ept, read_header
+from .sources import Extent, InputSource, check_source, find_sources, read_ept, read_extent
 from .store import Store, fingerprint
 from .tileplan import TilePlan
 
@@ -32,10 +32,10 @@ class Survey:
 
     def __init__(self, plan: TilePlan, options: TilingOptions) -> None:
         self.started = time.strftime("%Y-%m-%d %H:%M")
-        self.grid = Grid(options.tile)
+        self.grid = TileGrid(options.tile)
         self.notes = list(plan.notes)
         self.unreadable: dict[str, str] = {}  #: inputs by path that cannot be read, and why
-        self.headers: dict[str, Header] = {}  #: of inputs by path, where the header can be read
+        self.extents: dict[str, Extent] = {}  #: of inputs by path, where the header can be read
         self.indexes: dict[str, CloudIndex] = {}  #: of LAS and LAZ files by path, once they were read
         self.sources = find_sources(plan.readers)
         others = named_files([*plan.head, *plan.tail])
@@ -52,19 +52,19 @@ class Survey:
         #: ``file`` or ``tile``: what one output is made of.
         self.per = options.per if options.per != "auto" else "file" if files else "tile"
         self.unit = self._unit(plan)  #: metres per unit of the coordinates
-        self.margin = plan.halo / self.unit  #: surroundings of a tile, in the unit of the coordinates
+        self.halo = plan.halo_m / self.unit  #: surroundings of a tile, in the unit of the coordinates
         self._place()
 
     def _read_headers(self) -> None:
         for source in self.sources:
             try:
-                self.headers[source.path] = read_header(source)
+                self.extents[source.path] = read_extent(source)
                 check_source(source)
             except StageError as error:
                 self.unreadable[source.path] = str(error)
         if len(self.unreadable) == len(self.sources):
             raise self._none_readable()
-        lost = len(self.sources) - len(self.headers)
+        lost = len(self.sources) - len(self.extents)
         if lost:
             which = "1 input has" if lost == 1 else f"{lost} inputs have"
             self.notes.append(
@@ -79,8 +79,8 @@ class Survey:
 
     def _unit(self, plan: TilePlan) -> float:
         """Metres per unit of the coordinates, whose reference must be one for all inputs that stages see together."""
-        needed = bool(plan.head and plan.halo)
-        groups: dict[str, list[Source]] = {}
+        needed = bool(plan.head and plan.halo_m)
+        groups: dict[str, list[InputSource]] = {}
         for source in self.sources:
             if source.path not in self.unreadable:
                 groups.setdefault(self._tells(source), []).append(source)
@@ -103,25 +103,25 @@ class Survey:
             check_one_reference(found)
         return next(iter(found.values())).units.horizontal
 
-    def _tells(self, source: Source) -> str:
+    def _tells(self, source: InputSource) -> str:
         """What tells apart inputs of different spatial references."""
         own = read_ept(source.path).get("srs") if source.kind == "ept" else las.projection(source.path)
         return fingerprint(source.reader, own)
 
-    def _reference_of(self, source: Source, horizontal: str) -> Reference:
+    def _reference_of(self, source: InputSource, horizontal: str) -> Reference:
         """What PDAL's reader says of an input, with as few points read as it can."""
         if source.kind == "las":
             return reference_of({**source.reader, "filename": source.path, "count": 1}, horizontal)
-        x, y, _, _ = self.headers[source.path].box
+        x, y, _, _ = self.extents[source.path].box
         return reference_of(source.within((x, y, x + 1, y + 1)), horizontal)
 
     def _place(self) -> None:
         """Note where inputs lie, as headers or indexes say; thousands of them are compared at once."""
-        self.placed = [s for s in self.sources if s.path in self.headers and self.headers[s.path].count]
+        self.placed = [s for s in self.sources if s.path in self.extents and self.extents[s.path].count]
         boxes = []
         for source in self.placed:
             index = self.indexes.get(source.path)
-            boxes.append(union(index.boxes) if index else self.headers[source.path].box)
+            boxes.append(union(index.boxes) if index else self.extents[source.path].box)
         self._boxes = np.array(boxes, np.float64)
         self.bounds: Box = union(boxes)
 
@@ -138,14 +138,14 @@ class Survey:
         """Inputs and other files that are not what they were when the run began."""
         return [path for path, then in self.stamps.items() if stamp(path) != then]
 
-    def near(self, tile: tuple[int, int], margin: float) -> list[Source]:
+    def near(self, tile: tuple[int, int], halo: float) -> list[InputSource]:
         """Inputs that may hold points of a tile or its surroundings."""
-        return [self.placed[n] for n in touching(self._boxes, self.grid.box(tile, margin))]
+        return [self.placed[n] for n in touching(self._boxes, self.grid.box(tile, halo))]
 
     def tiles(self) -> dict[tuple[int, int], int]:
         """Every tile that may have points of its own, row by row, and how many where that is known (else 0)."""
         counts: dict[tuple[int, int], int] = {}
-        for path, header in self.headers.items():
+        for path, header in self.extents.items():
             if path in self.indexes:
                 for i, j, n in self.indexes[path].tiles:
                     counts[i, j] = counts.get((i, j), 0) + n
@@ -162,7 +162,7 @@ class Survey:
             "models": [str(stage["model"]) for stage in plan.head if "model" in stage],
             "started": self.started,
             "tile": self.grid.size,
-            "buffer_metres": plan.halo,
+            "halo_m": plan.halo_m,
             "metres_per_unit": self.unit,
             "per": self.per,
             "inputs": len(self.sources),
@@ -180,7 +180,7 @@ class Survey:
                 self.indexes[source.path] = known
             else:
                 waiting.append(_Reading(source.path, mark))
-        total = sum(self.headers[reading.path].count for reading in waiting)
+        total = sum(self.extents[reading.path].count for reading in waiting)
         with Progress(total, "reading the inputs", enabled=show) as progress:
             for reading, answer in last_tries(
                 pool, waiting, lambda reading: Call(index_las, (reading.path, self.grid)), retries

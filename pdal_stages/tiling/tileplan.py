@@ -16,7 +16,7 @@ from ..pipeline.run import Pipeline
 from ..stages.base import Stage
 
 #: Dimensions that follow a point through a tile's pipeline.
-ROW, SOURCE, MARGIN = "PdalStagesRow", "PdalStagesSource", "PdalStagesMargin"
+ROW, INPUT, OUTSIDE = "PdalStagesRow", "PdalStagesInput", "PdalStagesOutside"
 
 
 def _filters(words: str) -> set[str]:
@@ -50,7 +50,7 @@ class TilePlan:
     later: list[float]  #: metres outside the tile within which the results of each of them are still used
     #: Stages that look at single points, and the writers: run on the points of one output.
     tail: list[dict[str, Any]]
-    halo: float  #: metres of surroundings
+    halo_m: float  #: metres of surroundings
     #: Dimensions the head changes; None where PDAL's filters in it make that unknown.
     creates: list[str] | None
     unit: str  #: `horizontal_unit` of our stages, empty for the spatial reference's
@@ -134,7 +134,7 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
         head=[_narrowed(step, reach) for step, reach in zip(head, later, strict=True)],
         later=later,
         tail=[step.given for step in [*tail, *writers]],
-        halo=sum(reaches),
+        halo_m=sum(reaches),
         creates=None
         if foreign
         else list(dict.fromkeys(name for stage in stages for name in stage.creates())),
@@ -237,7 +237,7 @@ def _narrowed(step: _Step, later: float) -> dict[str, Any]:
                 stage[option.name] = str(Path(stage[option.name]).absolute())
         if ours.where_chooses:
             seen_to = later + ours.inner_reach()
-            seen = f"{MARGIN} <= {seen_to!r}" if seen_to > 0 else f"{MARGIN} < 0"
+            seen = f"{OUTSIDE} <= {seen_to!r}" if seen_to > 0 else f"{OUTSIDE} < 0"
             stage["where"] = f"({ours.where}) && ({seen})" if ours.where else seen
     return stage
 

@@ -8,16 +8,16 @@ from dataclasses import replace
 from typing import Any
 
 from ..base.version import build
-from .assemble import FileTask
 from .cloudindex import CloudIndex
-from .headrun import Recipe
-from .outcome import Job, Output
+from .file_task import FileTask
+from .headrun import RunContext
+from .outcome import FileJob, TileJob
 from .settings import TilingOptions
-from .sources import Source
+from .sources import InputSource
 from .store import Store, fingerprint
 from .survey import Survey
+from .tile_task import TileTask
 from .tileplan import TilePlan, outputs_for
-from .tilework import TileTask
 
 
 class Worklist:
@@ -31,7 +31,7 @@ class Worklist:
             plan.head,
             survey.stamps_of(plan.head),
             plan.creates,
-            plan.halo,
+            plan.halo_m,
             survey.grid.size,
             options.most_points,
             self._tail if survey.per == "tile" else [],
@@ -40,12 +40,12 @@ class Worklist:
         #: One for each input file; empty where each tile is an output.
         self.outputs = self._outputs() if survey.per == "file" else []
 
-    def _jobs(self) -> list[Job]:
+    def _jobs(self) -> list[TileJob]:
         plan, survey = self.plan, self.survey
         jobs = []
         for tile, points in survey.tiles().items():
-            near = survey.near(tile, survey.margin)
-            job = Job(tile, survey.grid.name(tile), points, near)
+            near = survey.near(tile, survey.halo)
+            job = TileJob(tile, survey.grid.name(tile), points, near)
             bad = [s.path for s in near if s.path in survey.unreadable]
             if bad:
                 job.state, job.blocked_by = "failed", bad[0]
@@ -57,29 +57,29 @@ class Worklist:
                 job.outputs = paths
         return jobs
 
-    def mark_of(self, job: Job, report: dict[str, Any]) -> str:
+    def mark_of(self, job: TileJob, report: dict[str, Any]) -> str:
         """Fingerprint of all that decides a tile's result: of every input that was read for it too.
 
         That is known from the report alone, as a tile may be read with wider surroundings.
         """
         survey = self.survey
-        margin = max(float(report.get("buffer", 0.0)) / survey.unit, survey.margin)
-        read = survey.near(job.tile, margin)
+        halo = max(float(report.get("halo_m", 0.0)) / survey.unit, survey.halo)
+        read = survey.near(job.tile, halo)
         return fingerprint(self._common, job.tile, [[s.path, survey.stamps[s.path], s.reader] for s in read])
 
-    def output_mark(self, out: Output, marks: Mapping[tuple[int, int], str]) -> str:
+    def output_mark(self, out: FileJob, marks: Mapping[tuple[int, int], str]) -> str:
         """Fingerprint of all that decides an output, given those of its tiles."""
         source = out.source
         mine = [marks[job.tile] for job in out.jobs]
         return fingerprint(source.path, self.survey.stamps[source.path], source.reader, self._tail, mine)
 
-    def _outputs(self) -> list[Output]:
+    def _outputs(self) -> list[FileJob]:
         survey = self.survey
         by_tile = {job.tile: job for job in self.jobs}
         named = outputs_for(self.plan, [source.stem for source in survey.sources], survey.paths)
         outputs = []
         for source, paths in zip(survey.sources, named, strict=True):
-            out = Output(source, paths)
+            out = FileJob(source, paths)
             if source.path in survey.indexes:
                 out.jobs = [by_tile[i, j] for i, j, _ in survey.indexes[source.path].tiles]
             if source.path in survey.unreadable:
@@ -120,9 +120,9 @@ class Worklist:
             if job.tile not in needed:
                 store.result(job.name).unlink(missing_ok=True)
 
-    def keep(self, store: Store, item: Job | Output) -> None:
+    def keep(self, store: Store, item: TileJob | FileJob) -> None:
         """Remember what was finished, for runs to come."""
-        if isinstance(item, Output):
+        if isinstance(item, FileJob):
             marks = {job.tile: self.mark_of(job, job.report) for job in item.jobs}
             store.wrote(item.source.key, self.output_mark(item, marks), item.report)
         elif item.outputs is not None:
@@ -135,18 +135,18 @@ class Worklist:
         plan, survey = self.plan, self.survey
         most, scratch = self.options.most_points, str(store.scratch)
         run = replace(plan, readers=[])  # tasks travel, and there may be thousands
-        recipe = Recipe(run, survey.grid, survey.unit, survey.bounds, threads, most, scratch)
+        context = RunContext(run, survey.grid, survey.unit, survey.bounds, threads, most, scratch)
         # Farther inputs too: a tile may have to be read with wider surroundings.
-        far = max(4 * survey.margin, survey.margin + survey.grid.size)
+        far = max(4 * survey.halo, survey.halo + survey.grid.size)
 
-        def task_of(item: Job | Output) -> TileTask | FileTask:
-            if isinstance(item, Output):
+        def task_of(item: TileJob | FileJob) -> TileTask | FileTask:
+            if isinstance(item, FileJob):
                 count = survey.indexes[item.source.path].count
                 results = [str(store.result(job.name)) for job in item.jobs]
                 return FileTask(item.source, count, results, plan.tail, item.paths, scratch)
             sources = survey.near(item.tile, far)
             return TileTask(
-                recipe,
+                context,
                 item.tile,
                 [self._with_index(s) for s in sources if s.path not in survey.unreadable],
                 math.inf if len(sources) == len(survey.placed) else far * survey.unit,
@@ -156,7 +156,7 @@ class Worklist:
 
         return task_of
 
-    def _with_index(self, source: Source) -> tuple[Source, CloudIndex | None]:
+    def _with_index(self, source: InputSource) -> tuple[InputSource, CloudIndex | None]:
         """A source and its index, of which the blocks are all that a worker needs."""
         index = self.survey.indexes.get(source.path)
         return source, index and replace(index, tiles=[])

@@ -28,7 +28,7 @@ from pdal_stages.pipeline.pdal import version
 from pdal_stages.stages.where import Expression
 from pdal_stages.tiling import results, sources, tindex
 from pdal_stages.tiling.cloudindex import index_las
-from pdal_stages.tiling.grid import Grid
+from pdal_stages.tiling.grid import TileGrid
 from pdal_stages.tiling.store import Store
 
 PATIENCE = 10.0
@@ -107,8 +107,8 @@ def cloud(data: bytes) -> str:
         las.check_readable(path)
         las.projection(path)
         las.odd_text(path)
-        found = sources.las_header(str(path))
-        index = index_las(str(path), Grid(10.0))
+        found = sources.las_extent(str(path))
+        index = index_las(str(path), TileGrid(10.0))
         assert index.count == found.count == sum(n for _, _, n in index.tiles)
         las.supersede_copc(path)
         return "read"
@@ -141,10 +141,10 @@ def ept(data: bytes) -> str:
     """The description of an EPT source."""
     path = put("ept.json", data)
     try:
-        source = sources.Source(str(path), {"type": "readers.ept"}, "ept")
-        found = sources.read_header(source)
+        source = sources.InputSource(str(path), {"type": "readers.ept"}, "ept")
+        found = sources.read_extent(source)
         assert found.count >= 0 and np.isfinite(found.box).all()
-        Grid(10.0).covering(found.box)
+        TileGrid(10.0).covering(found.box)
         return "read"
     except StageError as error:
         assert "Traceback" not in str(error)
@@ -180,8 +180,8 @@ def store(data: bytes) -> str:
 
 
 @cache
-def _result() -> tuple[bytes, sources.Source]:
-    source = sources.Source("/a.las", {"type": "readers.las"}, "las")
+def _result() -> tuple[bytes, sources.InputSource]:
+    source = sources.InputSource("/a.las", {"type": "readers.las"}, "las")
     path = folder() / "result.npz"
     index = np.arange(40, dtype=np.int64)
     content = {

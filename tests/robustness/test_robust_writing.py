@@ -61,7 +61,7 @@ SITES = {
     "tiling/store:_keep": "tiles: what a run keeps",
     "tiling/store:_open_own": "tiles: what a run keeps",
     "tiling/tail:run_tail": "tiles: output of a tile",
-    "tiling/tilework:TileTask.run": "tiles: what a run keeps",
+    "tiling/tile_task:TileTask.run": "tiles: what a run keeps",
     "pipeline/worker:serve": "opens pipes",
 }
 #: PDAL's writers without a case.

@@ -8,7 +8,7 @@ from typing import Any
 
 from .inparts import HeadersDifferError, write_in_parts
 from .results import PieceResults, of_own_points, read_range
-from .sources import Source
+from .sources import InputSource
 from .tail import run_tail
 
 #: A larger file is written in parts of so many points.
@@ -19,7 +19,7 @@ MOST_AT_ONCE = 4_000_000
 class FileTask:
     """An input file's output, to be put together from tiles."""
 
-    source: Source
+    source: InputSource
     count: int  #: points of the input
     results: list[str]  #: files of tiles
     tail: list[dict[str, Any]]  #: stages to run, with the writers

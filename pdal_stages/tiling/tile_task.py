@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import NoTerrainError
-from .assemble import write_tile
 from .cloudindex import CloudIndex
 from .ept import fetch
 from .extract import Piece, cut
+from .file_task import write_tile
 from .grid import inside
-from .headrun import HeadRun, Recipe, run_head
+from .headrun import HeadRun, RunContext, run_head
 from .results import PieceResults, class_counts, save
-from .sources import Source
+from .sources import InputSource
 
 #: How often a tile is read again with wider surroundings.
 _WIDENINGS = 3
@@ -27,10 +27,10 @@ _WIDENINGS = 3
 class TileTask:
     """A tile to be worked on."""
 
-    recipe: Recipe
+    context: RunContext
     tile: tuple[int, int]
     #: Inputs that may hold points of it or its surroundings; EPT sources have no index.
-    sources: list[tuple[Source, CloudIndex | None]]
+    sources: list[tuple[InputSource, CloudIndex | None]]
     complete: float  #: metres around the tile up to which these are all the inputs there are
     result: str  #: file for the results, where outputs are put together from tiles
     outputs: list[str] | None  #: otherwise: what each of the writers writes
@@ -38,11 +38,11 @@ class TileTask:
     def run(self) -> dict[str, Any]:
         """Run the head; write its results, or the outputs. The report says which."""
         with TemporaryDirectory(
-            prefix="tile-", dir=self.recipe.scratch, ignore_cleanup_errors=True
+            prefix="tile-", dir=self.context.scratch, ignore_cleanup_errors=True
         ) as folder:
             results, report = _settle(self, folder)
             if self.outputs is not None:
-                return report | write_tile(results, self.recipe.plan.tail, self.outputs)
+                return report | write_tile(results, self.context.plan.tail, self.outputs)
             save(self.result, results)
         return report | {"result_bytes": os.path.getsize(self.result)}
 
@@ -50,46 +50,46 @@ class TileTask:
 def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, Any]]:
     """Run the head with surroundings that suffice; results, and the report.
 
-    It has the ``points`` of the tile, those ``read`` with surroundings, the ``buffer`` used, and whether that did not
+    It has the ``points`` of the tile, those ``read`` with surroundings, the ``halo_m`` used, and whether that did not
     suffice (``short``).
     """
-    recipe, tile, halo = task.recipe, task.tile, task.recipe.plan.halo
-    side, buffer, short = recipe.grid.size * recipe.unit, halo, False
+    context, tile, least_m = task.context, task.tile, task.context.plan.halo_m
+    side, halo_m, short = context.grid.size * context.unit, least_m, False
     head: HeadRun | None = None
     for attempt in range(_WIDENINGS + 1):
-        cuts = _cut_all(task, buffer / recipe.unit, folder)
+        cuts = _cut_all(task, halo_m / context.unit, folder)
         read = sum(len(piece.index) for _, piece in cuts)
         own = sum(len(piece.own) for _, piece in cuts)
         if not own:
             break
-        everything = inside(recipe.bounds, recipe.grid.box(tile, buffer / recipe.unit))
+        everything = inside(context.bounds, context.grid.box(tile, halo_m / context.unit))
         try:
-            head = run_head(recipe, tile, cuts, everything)
+            head = run_head(context, tile, cuts, everything)
             need = head.need
         except NoTerrainError:
             if everything:
                 raise
-            head, need = None, side + 2 * halo  # look farther away
-        if everything or need <= buffer:
+            head, need = None, side + 2 * least_m  # look farther away
+        if everything or need <= halo_m:
             break
         short = True
-        estimate = read * ((side + 2 * need) / (side + 2 * buffer)) ** 2
-        if attempt == _WIDENINGS or estimate > recipe.most_points or need > task.complete:
+        estimate = read * ((side + 2 * need) / (side + 2 * halo_m)) ** 2
+        if attempt == _WIDENINGS or estimate > context.most_points or need > task.complete:
             if head is None:
                 raise NoTerrainError(
-                    "no terrain: no point near the tile may form one", found=f"within {buffer:.0f} m"
+                    "no terrain: no point near the tile may form one", found=f"within {halo_m:.0f} m"
                 )
             break
-        buffer, short = need + 1e-6, False
+        halo_m, short = need + 1e-6, False
     if head is None:
         empty = np.empty(0, np.int64)
         head = HeadRun([PieceResults(source, piece, empty, {}) for source, piece in cuts], 0.0)
     report = {
         "points": own,
         "read": read,
-        "buffer": buffer,
+        "halo_m": halo_m,
         "short": short,
-        "widened": buffer > halo,
+        "widened": halo_m > least_m,
         "dropped": own - sum(len(result.rows) for result in head.results),
         "classes": class_counts(head.results),
         "said": head.said,
@@ -97,19 +97,19 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
     return head.results, report
 
 
-def _cut_all(task: TileTask, margin: float, folder: str) -> list[tuple[Source, Piece]]:
+def _cut_all(task: TileTask, halo: float, folder: str) -> list[tuple[InputSource, Piece]]:
     """The tile's points and their surroundings, out of every input."""
-    grid, cuts = task.recipe.grid, []
+    grid, cuts = task.context.grid, []
     for number, (source, index) in enumerate(task.sources):
         path = source.path
         if source.kind == "ept":
             path = os.path.join(folder, f"fetched{number}.las")
-            index = fetch(source, grid, task.tile, margin, path)
+            index = fetch(source, grid, task.tile, halo, path)
         if index is None:
             continue
         target = os.path.join(folder, f"piece{number}.las")
         core = "" if task.outputs is None else os.path.join(folder, f"core{number}.las")
-        piece = cut(path, index, grid, task.tile, margin, target, core)
+        piece = cut(path, index, grid, task.tile, halo, target, core)
         if piece is not None:
             cuts.append((source, piece))
     return cuts
