@@ -244,6 +244,7 @@ def changed(path, edit, rehash=True):
     [
         ("format", "something else", "not a model"),
         ("version", 3, "version"),
+        ("version", 1, "version"),
         ("version", 0, "version"),
         ("version", True, "version"),
         ("version", 1.5, "version"),
@@ -280,7 +281,7 @@ def test_manifests_that_are_no_manifest(good):
         (b'{"a": NaN}', "NaN"),
         (b'{"a": 1, "a": 2}', "twice"),
         (b"[" * 200_000 + b"]" * 200_000, "deep"),
-        (b'{"format": "pdal-stages model", "version": 1, "x": ' + b"[" * 900 + b"]" * 900 + b"}", "manifest"),
+        (b'{"format": "pdal-stages model", "version": 2, "x": ' + b"[" * 900 + b"]" * 900 + b"}", "manifest"),
         (b"1" * 100_000, "JSON|something else"),
         (b" " * (modelfile.MANIFEST_LIMIT + 1), "too large"),
     ):

@@ -9,10 +9,11 @@ import sys
 
 import numpy as np
 import pytest
+from stage_message import message_of
 
 import pdal_stages as ps
 from pdal_stages.pipeline import runtime
-from pdal_stages.pipeline.runtime import TRAMPOLINE, message_of, run_stage
+from pdal_stages.pipeline.runtime import TRAMPOLINE, run_stage
 
 pytestmark = pytest.mark.pdal
 

@@ -8,15 +8,52 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pdal_stages.base.jit import njit
 from pdal_stages.features import compute_features
 from pdal_stages.features.engine import FeatureEngine
 from pdal_stages.features.index import build_grid
 from pdal_stages.features.kdtree import build_tree
-from pdal_stages.features.knn import nearest_block
+from pdal_stages.features.knn import CROWD, ROOM, make_rows, make_scratch, next_rows, start_search
 from pdal_stages.features.optimal import kopt_block
 from pdal_stages.features.plan import FeaturePlan
 from pdal_stages.features.ropt import curvature_block, curvature_threshold, radii_of, ropt_block
 from pdal_stages.features.shapes import no_shapes
+
+
+@njit
+def neighbors_of(tree, qx, qy, qz, need, cap2, index, d2, found):
+    """The neighbors of a block of queries, sorted by (squared distance, x, y, z).
+
+    Parameters
+    ----------
+    tree : KdTree
+    qx, qy, qz : ndarray of float64, shape (m,)
+    need : int
+        Neighbors wanted, the query's own point included.
+    cap2 : float
+        Neighbors lie within this squared distance; infinity for no bound.
+    index : ndarray of uint32, shape (m, need)
+        Out: positions in the cloud.
+    d2 : ndarray of float64, shape (m, need)
+        Out: squared distances.
+    found : ndarray of int64, shape (m,)
+        Out: how many there are; what lies behind them is not written.
+    """
+    search = start_search(qx, qy, qz)
+    scratch = make_scratch(CROWD * need + ROOM)
+    rows = make_rows(need)
+    while True:
+        lo, hi, count, scratch = next_rows(tree, search, need, cap2, scratch, rows)
+        if lo < 0:
+            return
+        for j in range(lo, hi):
+            q = search.order[j]
+            r = min(j - lo, count - 1)
+            found[q] = rows.found[r]
+            for i in range(rows.found[r]):
+                index[q, i] = rows.at[r, i]
+                d2[q, i] = rows.d2[r, i]
+
 
 CHECKED = [*oracle.COVARIANCE, *oracle.GEOMETRIC]
 NO_SEEDS = np.zeros(0, np.uint64)
@@ -87,7 +124,7 @@ def check_nearest(xyz, queries, need, cap=math.inf):
     tree = tree_of(xyz)
     m = len(queries)
     index, d2, found = np.zeros((m, need), np.uint32), np.zeros((m, need)), np.zeros(m, np.int64)
-    nearest_block(tree, *columns(queries), need, cap * cap, index, d2, found)
+    neighbors_of(tree, *columns(queries), need, cap * cap, index, d2, found)
     for i, q in enumerate(queries):
         points, _ = oracle.by_distance(xyz, q)
         expected = oracle.squared_distance(points, q)
@@ -185,7 +222,7 @@ def test_a_dense_facade_and_a_dense_ball_are_not_quadratic():
     tree = tree_of(xyz)
     m, need = len(xyz), 21
     index, d2, found = np.zeros((m, need), np.uint32), np.zeros((m, need)), np.zeros(m, np.int64)
-    nearest_block(tree, *columns(xyz), need, math.inf, index, d2, found)
+    neighbors_of(tree, *columns(xyz), need, math.inf, index, d2, found)
     for i in range(0, m, 7001):
         _, distance = oracle.by_distance(xyz, xyz[i])
         assert np.sqrt(d2[i]) == pytest.approx(distance[:need], rel=1e-12)

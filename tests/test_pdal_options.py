@@ -132,7 +132,6 @@ def test_where_as_pdal_merges(tmp_path, write_las, merge):
     ],
 )
 def test_ranges(given, codes):
-    assert list(HagMinima({"ignore_classes": given}).ignore.codes) == codes
     assert list(HagMinima({"ignore": given}).ignore.codes) == codes
 
 
@@ -141,12 +140,7 @@ def test_ranges(given, codes):
 )
 def test_what_is_not_a_range(given):
     with pytest.raises(OptionError, match="class codes of 0 to 255"):
-        HagMinima({"ignore_classes": given})
-
-
-def test_one_option_by_two_names():
-    with pytest.raises(OptionError, match="one and the same"):
-        HagMinima({"ignore_classes": [7], "ignore": [18]})
+        HagMinima({"ignore": given})
 
 
 @pytest.mark.pdal

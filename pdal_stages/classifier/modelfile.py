@@ -30,7 +30,7 @@ from .arrays import ArrayRule, from_bytes, to_bytes
 Arrays = list[dict[str, npt.NDArray[Any]]]
 
 FORMAT = "pdal-stages model"
-#: Written; every one before is read.
+#: Of the format; a file of another is refused.
 VERSION = 2
 MANIFEST = "manifest.json"
 
@@ -115,7 +115,6 @@ def read(path: str | os.PathLike, rules_of) -> tuple[dict[str, Any], Arrays]:
     Returns
     -------
     manifest : dict
-        As the newest version has it, whatever the file's.
     arrays : list of dict
         Of each pass.
 
@@ -230,7 +229,7 @@ def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
 
 
 def parse(data: bytes) -> dict[str, Any]:
-    """The manifest in `data`, valid by its version's schema, as the newest version has it."""
+    """The manifest in `data`, valid by its schema."""
     try:
         manifest = strictjson.loads(data.decode("utf-8"))
     except RecursionError:
@@ -240,41 +239,20 @@ def parse(data: bytes) -> dict[str, Any]:
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ModelError("this is not a model file", found="a manifest of something else")
     version = manifest.get("version")
-    if type(version) is not int or not 1 <= version <= VERSION:
+    if type(version) is not int or version != VERSION:
         raise ModelError(
-            f"the model file has a version this release does not know (it knows 1 to {VERSION})",
+            f"the model file has a version this release does not know (it knows {VERSION})",
             found=f"version {str(version)[:20]}",
             cure="Update pdal-stages",
         )
     validate(manifest)
-    return _from_version_1(manifest) if version == 1 else manifest
-
-
-def _from_version_1(old: Mapping[str, Any]) -> dict[str, Any]:
-    """Version 1 had one pass, whose entries stood among the others."""
-    only = {key: old[key] for key in _PASS}
-    only |= {"context": [], "out_of_bag": old["accuracy"]["out_of_bag"]}
-    rest = {key: value for key, value in old.items() if key not in _PASS}
-    return {
-        **rest,
-        "version": VERSION,
-        "accuracy": {"cross_validation": old["accuracy"]["cross_validation"]},
-        "passes": [only],
-        "arrays": {f"1.{name}": entry for name, entry in old["arrays"].items()},
-    }
-
-
-#: What version 1 said of its one pass.
-_PASS = (
-    "algorithm", "parameters", "features", "feature_names", "dimensions", "shape_bins", "copt_threshold",
-    "feature_seed", "percentiles", "importances",
-)  # fmt: skip
+    return manifest
 
 
 def validate(manifest: Mapping[str, Any]) -> None:
     """Hold a manifest against its JSON Schema."""
     try:
-        error = next(_validator(manifest["version"]).iter_errors(manifest), None)
+        error = next(_validator().iter_errors(manifest), None)
     except RecursionError:
         raise ModelError("the manifest is nested too deeply", cure=CURE) from None
     if error is not None:
@@ -283,8 +261,8 @@ def validate(manifest: Mapping[str, Any]) -> None:
 
 
 @lru_cache
-def _validator(version: int):
+def _validator():
     import jsonschema
 
-    text = resources.files(__package__).joinpath(f"model-{version}.json").read_text("utf-8")
+    text = resources.files(__package__).joinpath("model.json").read_text("utf-8")
     return jsonschema.Draft202012Validator(json.loads(text))

@@ -59,12 +59,6 @@ class Grid:
         """Sorted z, metres."""
         return self.xyz[2, : len(self)]
 
-    @property
-    def nbytes(self) -> int:
-        """Memory held, in bytes."""
-        arrays = (self.order, self.xyz, self.cell_ix, self.cell_start, self.row_iy, self.row_start)
-        return sum(array.nbytes for array in arrays)
-
     def tables(self) -> tuple[np.ndarray, ...]:
         """The arrays kernels take: x, y, z (with spare values behind), cell_ix, cell_start, row_iy, row_start."""
         x, y, z = self.xyz

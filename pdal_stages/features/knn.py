@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.jit import device, njit
+from ..base.jit import device
 from .kdtree import STACK, bounding_box, farthest2, gather, halve
 
 #: Queries that share one set of candidates.
@@ -401,38 +401,3 @@ def _search_group(tree, search, lo, hi, need, cap2, reach2, scratch, rows):
             low, high = reach2, np.inf
             reach2 = more2
     return count, max(SPARE * kth2, TINY), scratch
-
-
-@njit
-def nearest_block(tree, qx, qy, qz, need, cap2, index, d2, found):
-    """The neighbors of a block of queries, sorted by (squared distance, x, y, z).
-
-    Parameters
-    ----------
-    tree : KdTree
-    qx, qy, qz : ndarray of float64, shape (m,)
-    need : int
-        Neighbors wanted, the query's own point included.
-    cap2 : float
-        Neighbors lie within this squared distance; infinity for no bound.
-    index : ndarray of uint32, shape (m, need)
-        Out: positions in the cloud.
-    d2 : ndarray of float64, shape (m, need)
-        Out: squared distances.
-    found : ndarray of int64, shape (m,)
-        Out: how many there are; what lies behind them is not written.
-    """
-    search = start_search(qx, qy, qz)
-    scratch = make_scratch(CROWD * need + ROOM)
-    rows = make_rows(need)
-    while True:
-        lo, hi, count, scratch = next_rows(tree, search, need, cap2, scratch, rows)
-        if lo < 0:
-            return
-        for j in range(lo, hi):
-            q = search.order[j]
-            r = min(j - lo, count - 1)
-            found[q] = rows.found[r]
-            for i in range(rows.found[r]):
-                index[q, i] = rows.at[r, i]
-                d2[q, i] = rows.d2[r, i]

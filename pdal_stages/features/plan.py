@@ -189,8 +189,7 @@ class FeaturePlan:
             if not isinstance(value, list | tuple) or not all(isinstance(item, str) for item in value):
                 raise OptionError("a feature plan holds lists of text", found=repr(value)[:80])
         parsed = tuple(parse_neighborhoods(tokens))
-        # A model that does not say was trained when three members were enough.
-        given = data.get("least_members", 3 if _by_radius(parsed) else LEAST_MEMBERS)
+        given = data.get("least_members", LEAST_MEMBERS)
         least = checks.whole("'least_members' of a feature plan", given, 3, 100)
         return cls(parsed, parse_feature_set(words), tuple(dict.fromkeys(dimensions)), least)
 

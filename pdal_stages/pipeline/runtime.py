@@ -218,12 +218,6 @@ def _redirected() -> bool:
     return type(sys.stdout).__module__ == "redirector"  # PDAL's own type
 
 
-def message_of(text: str) -> str | None:
-    """A stage's own message in PDAL's error text, or None."""
-    start, end = text.find(_OPENING), text.rfind(_CLOSING)
-    return text[start + len(_OPENING) : end] if 0 <= start < end else None
-
-
 def collect(label: str) -> tuple[list[dict[str, Any]], StageError | None]:
     """Reports (one per point view) and the failure of a lowered stage, which are then forgotten."""
     return _reports.pop(label, []), _failures.pop(label, None)

@@ -9,8 +9,7 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw
 
 from ..base.asprs import class_name
-from ..base.errors import StageError
-from .pictures import LARGE, fit_text, font, text_width
+from .pictures import fit_text, font, text_width
 from .raster import BACKGROUND, paint, shading
 from .views import (
     CLASS_COLORS,
@@ -58,8 +57,6 @@ def triptych(
     truth: npt.ArrayLike | None = None,
     *,
     width: int = 1500,
-    captions: Sequence[str] | None = None,
-    title: str | None = None,
 ) -> np.ndarray:
     """Heights, classes and errors side by side, with captions, a scale and a legend.
 
@@ -71,9 +68,6 @@ def triptych(
         Reference classes; without them there is no panel of errors.
     width : int
         Pixels across all panels.
-    captions : sequence of str, optional
-        One for each panel.
-    title : str, optional
 
     Returns
     -------
@@ -98,20 +92,12 @@ def triptych(
         images.append(paint(s, verdict(s, x, y, z, wrong, np.zeros_like(wrong)), light))
         texts.append(f"Errors: {100 * wrong.sum() / len(x):.1f} % of {len(x):,} points")
         extra = [("right", RIGHT), ("wrong", WRONG)]
-    if captions is not None:
-        if len(captions) != panels:
-            raise StageError(
-                f"there are {panels} panels, so {panels} captions", where="triptych", found=len(captions)
-            )
-        texts = list(captions)
 
     band = legend(np.unique(predicted).tolist(), int(width), extra)
-    top = (38 if title else 6) + 30
+    top = 36
     below = top + images[0].shape[0]
     sheet = Image.new("RGB", (int(width), below + 36 + band.shape[0]), BACKGROUND)
     pen = ImageDraw.Draw(sheet)
-    if title:
-        pen.text((_GAP, 8), fit_text(title, int(width) - 2 * _GAP, LARGE), INK, font(LARGE))
     for n, (image, text) in enumerate(zip(images, texts, strict=True)):
         left = _GAP + n * (each + _GAP)
         pen.text((left + 2, top - 14), fit_text(text, each), INK, font(), anchor="lm")

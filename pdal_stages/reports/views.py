@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from ..base.asprs import class_color
 from ..base.errors import StageError
-from .pictures import fit_text, font
+from .pictures import font
 from .raster import BACKGROUND, Frame, Surface, paint, shading, surface
 
 INK, FAINT, GRIDLINE = (34, 38, 44), (110, 114, 120), (226, 226, 222)
@@ -29,7 +29,6 @@ _RAMPS = {
         (233, 204, 186),
     ),
     "value": ((68, 1, 84), (65, 68, 135), (42, 120, 142), (34, 168, 132), (122, 209, 81), (253, 231, 37)),
-    "grey": ((40, 42, 46), (244, 244, 242)),
 }
 
 
@@ -100,8 +99,6 @@ def top_view(
     values: npt.ArrayLike | None = None,
     width: int = 900,
     limits: tuple[float, float] | None = None,
-    colors: str | None = None,
-    shade: bool = True,
 ) -> np.ndarray:
     """The cloud from above, coloured by ASPRS class, by a value or by height; the highest point of a pixel wins.
 
@@ -116,10 +113,6 @@ def top_view(
         Pixels across; the height follows from the extent.
     limits : (low, high), optional
         Values at the ends of the ramp; by default the 1st and 99th percentile.
-    colors : str, optional
-        Ramp: 'value', 'height' or 'grey'; by default 'height' for heights and 'value' for other values.
-    shade : bool
-        Whether to shade the relief.
 
     Returns
     -------
@@ -139,10 +132,10 @@ def top_view(
         shown = CLASS_COLORS[s.spread(class_codes(by[0]), 0)]
     elif values is not None:
         numbers = by[0].astype(np.float64)
-        shown = ramp(s.spread(numbers, np.nan), *(limits or span(numbers)), colors or "value")
+        shown = ramp(s.spread(numbers, np.nan), *(limits or span(numbers)), "value")
     else:
-        shown = ramp(s.z, *(limits or span(s.z)), colors or "height")
-    return paint(s, shown, shading(s) if shade else None)
+        shown = ramp(s.z, *(limits or span(s.z)), "height")
+    return paint(s, shown, shading(s))
 
 
 def span(values: np.ndarray) -> tuple[float, float]:
@@ -201,8 +194,6 @@ def section_view(
     end: tuple[float, float] | None = None,
     thickness: float = 3.0,
     width: int = 1400,
-    exaggeration: float = 1.0,
-    caption: str | None = None,
 ) -> np.ndarray:
     """A vertical slice through the cloud, with a scale.
 
@@ -217,8 +208,6 @@ def section_view(
         Depth of the slice in the cloud's unit, half on each side of the line.
     width : int
         Pixels across.
-    exaggeration : float
-        Vertical scale over horizontal scale.
     """
     x, y, z = checked_columns(x=x, y=y, z=z)
     frame = Frame.around(x, y, 1000)
@@ -227,11 +216,11 @@ def section_view(
     end = (frame.x0 + frame.pixel * frame.width, middle) if end is None else end
     run = (end[0] - start[0], end[1] - start[1])
     length = math.hypot(*run)
-    if not (length > 0 and thickness > 0 and exaggeration > 0):
+    if not (length > 0 and thickness > 0):
         raise StageError(
-            "a section needs two different ends, a thickness and an exaggeration above 0",
+            "a section needs two different ends and a thickness above 0",
             where="section_view",
-            found=(start, end, thickness, exaggeration),
+            found=(start, end, thickness),
         )
     s = ((x - start[0]) * run[0] + (y - start[1]) * run[1]) / length
     off = ((y - start[1]) * run[0] - (x - start[0]) * run[1]) / length
@@ -245,9 +234,9 @@ def section_view(
         )
     keep = keep[np.argsort(off[keep], kind="stable")[::-1]]  # far ones first
     low, high = float(z[keep].min()), float(z[keep].max())
-    left, bottom, above = 64, 46, 40 if caption else 16
+    left, bottom, above = 64, 46, 16
     scale = (width - left - 16) / length
-    tall = max(24, math.ceil((high - low) * scale * exaggeration) + 8)
+    tall = max(24, math.ceil((high - low) * scale) + 8)
     if tall > 4 * width:
         raise StageError(
             "the section is much higher than wide",
@@ -265,11 +254,9 @@ def section_view(
         pen.text((at, above + tall + 8), f"{n * step:g}", FAINT, font(), anchor="ma")
     step = nice_step(max((high - low) / 5, 1e-6))
     for n in range(math.ceil(low / step), math.floor(high / step) + 1):
-        at = base - round((n * step - low) * scale * exaggeration)
+        at = base - round((n * step - low) * scale)
         pen.line((left, at, width - 16, at), GRIDLINE)
         pen.text((left - 8, at), f"{n * step:g}", FAINT, font(), anchor="rm")
-    if caption:
-        pen.text((left, 10), fit_text(caption, width - left - 16), INK, font())
     if classes is not None:
         color = CLASS_COLORS[class_codes(np.asarray(classes))[keep]]
     else:
@@ -277,7 +264,7 @@ def section_view(
     # The nearest point of each pixel, then the nearest of each disc around a pixel.
     nearest = np.full((canvas.height, canvas.width), -1)
     column = left + np.round(s[keep] * scale).astype(np.int64)
-    row = base - np.round((z[keep] - low) * scale * exaggeration).astype(np.int64)
+    row = base - np.round((z[keep] - low) * scale).astype(np.int64)
     nearest[row, column] = np.arange(keep.size)
     spacing = math.sqrt(length * (high - low + 1) / keep.size) * scale
     nearest = ndimage.maximum_filter(nearest, footprint=_SMALL_DOT if spacing < 5 else _DOT)

@@ -45,7 +45,6 @@ class HagMinima(Stage):
         "Points that do not form the terrain but still receive heights: class codes, ranges such as "
         "Classification[7:7], or the word withheld",
         may_be_empty=True,
-        also="ignore_classes",
     )
     details = """
 The terrain is the lowest point of each cell of a coarse grid, interpolated bilinearly between cell centres and

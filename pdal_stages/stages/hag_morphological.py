@@ -56,7 +56,6 @@ class HagMorphological(Stage):
         "Points that cannot be ground but still receive heights: class codes, ranges such as Classification[7:7], or the "
         "word withheld",
         may_be_empty=True,
-        also="ignore_classes",
     )
     ground: bool = option(
         "boolean", False, "Also write Ground: 1 where the filter calls the point ground, else 0"

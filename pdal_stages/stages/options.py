@@ -51,8 +51,6 @@ class Option:
     may_be_empty: bool = False
     #: As the user types it; by default the attribute's name.
     name: str = ""
-    #: Another name it goes by, PDAL's.
-    also: str = ""
 
     def __set_name__(self, owner: type, name: str) -> None:
         if not self.name:
@@ -200,13 +198,6 @@ def _split(text: str) -> list[str]:
 def parse_options(declared: Iterable[Option], given: Mapping[str, Any]) -> dict[str, Any]:
     """Every declared option with its value, given or default; OptionError where what is given does not fit."""
     known = {option.name: option for option in declared}
-    for option in known.values():
-        if option.also in given:
-            if option.name in given:
-                raise OptionError(
-                    f"options '{option.name}' and '{option.also}' are one and the same", cure="Give one"
-                )
-            given = {(option.name if name == option.also else name): value for name, value in given.items()}
     for name in given:
         if name not in known:
             raise OptionError(

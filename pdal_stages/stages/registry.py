@@ -33,22 +33,3 @@ def get(type_name: str) -> type[Stage]:
             f"there is no stage '{type_name}' in pdal_stages",
             cure=f"{suggest(type_name, stages())}Stages: {', '.join(stages())}",
         ) from None
-
-
-def pipeline_schema() -> dict:
-    """JSON Schema of a pipeline: our stages exactly, PDAL's by their type alone."""
-    ours = [stage.schema() for stage in stages().values()]
-    theirs = {"type": "object", "properties": {"type": {"type": "string", "not": {"enum": list(stages())}}}}
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": "PDAL pipeline with pdal_stages",
-        "type": "object",
-        "required": ["pipeline"],
-        "properties": {
-            "pipeline": {
-                "type": "array",
-                "minItems": 1,
-                "items": {"anyOf": [{"type": "string"}, theirs, *ours]},
-            }
-        },
-    }

@@ -7,9 +7,9 @@ import subprocess
 
 import numpy as np
 import pytest
+from stage_message import message_of
 
 import pdal_stages as ps
-from pdal_stages.pipeline.runtime import message_of
 
 pytestmark = pytest.mark.pdal
 HAG = {"type": "filters.hag_minima"}
