@@ -30,6 +30,8 @@ CASES = {
     "n.pcd": {"type": "writers.pcd", "compression": "binary"},
     "o.sbet": {"type": "writers.sbet"},
     "p.glb": {"type": "writers.gltf"},
+    "q.geojson": {"type": "writers.ogr", "measure_dim": "Z"},
+    "r.shp": {"type": "writers.ogr", "measure_dim": "Z"},
 }
 
 

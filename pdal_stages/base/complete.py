@@ -49,7 +49,8 @@ def check_complete(
     path = Path(path)
     beside = path.suffix != Path(str(writer["filename"])).suffix  # a file the writer made with its own
     judge = _JUDGES.get(str(writer.get("type", ""))) or _BY_SUFFIX.get(path.suffix.lower())
-    judge = None if beside else judge
+    if beside:
+        judge = _vectors if judge is _vectors else None
     try:
         size = path.stat().st_size
         with open(path, "rb+") as file:
@@ -193,6 +194,45 @@ def _gltf(file: BinaryIO, size: int, count: int | None, writer: Mapping[str, Any
     return magic == b"glTF" and length == size == at and kinds == [b"JSON", b"BIN\0"]
 
 
+def _vectors(file: BinaryIO, size: int, count: int | None, writer: Mapping[str, Any]) -> bool | None:
+    """Of the formats that GDAL writes, those of which the length is known; None for others that hold something."""
+    features = None if count is None else -(-count // int(writer.get("multicount", 1)))
+    suffix = Path(file.name).suffix.lower()
+    if suffix in (".geojson", ".json"):
+        return _geojson_of_gdal(file, size, features)
+    if suffix in (".shp", ".shx"):  # ESRI Shapefile Technical Description (1998), the main file's header
+        long, kind = struct.unpack(">24xi4x", file.read(32))[0], file.read(4)[0]
+        each = 8 if suffix == ".shx" else {1: 28, 11: 44}.get(kind)
+        return 2 * long == size and (features is None or each is None or size == 100 + each * features)
+    if suffix == ".dbf":
+        rows, header, width = struct.unpack("<4xIHH", file.read(12))
+        return size - header - rows * width in (0, 1) and features in (None, rows)
+    if suffix in (".gpkg", ".sqlite"):
+        (page,) = struct.unpack(">16xH", file.read(18))
+        file.seek(28)
+        return size == (65536 if page == 1 else page) * struct.unpack(">I", file.read(4))[0]
+    return None if size else False
+
+
+def _geojson_of_gdal(file: BinaryIO, size: int, features: int | None) -> bool:
+    file.seek(max(0, size - 4))
+    if not file.read().endswith(b"]\n}\n"):
+        return False
+    file.seek(0)
+    if (file.readline(), file.readline()) != (b"{\n", b'"type": "FeatureCollection",\n'):
+        return False
+    found = -1  # what stands before the first feature is none
+    for line in file:
+        if line == b'"features": [\n':
+            found = 0
+        elif line.startswith(_FEATURE_OF_GDAL):
+            json.loads(line.rstrip(b",\n"))
+            found += 1
+        elif found >= 0 and line not in (b"]\n", b"}\n"):
+            return False
+    return found >= 0 if features is None else found == features
+
+
 def _header(file: BinaryIO, end: bytes) -> list[list[bytes]]:
     """Words of a header's lines, the last of which begins with `end`; the file stands after it."""
     words = []
@@ -217,13 +257,15 @@ def _lines(file: BinaryIO, count: int, alike: int) -> bool:
 
 #: How PDAL begins a feature, and what may follow the last brace.
 _FEATURE, _AFTER_JSON = b'{ "type":"Feature",', b" \n;)"
+#: How GDAL does.
+_FEATURE_OF_GDAL = b'{ "type": "Feature",'
 _PLY_BYTES = {
     **dict.fromkeys((b"int8", b"uint8", b"char", b"uchar"), 1),
     **dict.fromkeys((b"int16", b"uint16", b"short", b"ushort"), 2),
     **dict.fromkeys((b"int32", b"uint32", b"int", b"uint", b"float", b"float32"), 4),
     **dict.fromkeys((b"int64", b"uint64", b"double", b"float64"), 8),
 }
-_Judge = Callable[[BinaryIO, int, "int | None", Mapping[str, Any]], bool]
+_Judge = Callable[[BinaryIO, int, "int | None", Mapping[str, Any]], "bool | None"]
 #: Of PDAL's writers: what judges their files, and by which suffixes PDAL chooses them.
 _FORMATS: dict[str, tuple[_Judge, tuple[str, ...]]] = {
     "las": (_las, (".las", ".laz")),
@@ -234,6 +276,7 @@ _FORMATS: dict[str, tuple[_Judge, tuple[str, ...]]] = {
     "bpf": (_bpf, (".bpf",)),
     "sbet": (_sbet, (".sbet",)),
     "gltf": (_gltf, (".glb",)),
+    "ogr": (_vectors, (".shp", ".geojson")),
 }
 _JUDGES = {f"writers.{name}": judge for name, (judge, _) in _FORMATS.items()}
 _BY_SUFFIX = {suffix: judge for judge, suffixes in _FORMATS.values() for suffix in suffixes}

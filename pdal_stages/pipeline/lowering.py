@@ -20,7 +20,7 @@ from . import classflags
 from .optionfile import settled
 from .read import PipelineSource
 from .runtime import TRAMPOLINE, made, place, python_filter
-from .writerlimits import check_copc, check_writers
+from .writerlimits import check_copc, check_vectors, check_writers
 
 #: Options of every PDAL stage that a lowered stage hands on.
 PDAL_OWN = ("tag", "inputs", "user_data", "log")
@@ -66,6 +66,7 @@ def lower(source: PipelineSource, whole: bool = True) -> Lowered:
     views = _Views()
     out = Lowered([])
     check_copc(stages)
+    check_vectors(stages)
     parted = classflags.splitter(stages) if whole else None
     tags = {str(s["tag"]) for s in stages if "tag" in s}
     for index, stage in enumerate(stages):

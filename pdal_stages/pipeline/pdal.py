@@ -278,7 +278,8 @@ def _metadata(pipeline) -> dict[str, Any]:
 def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Stages that this PDAL knows: before 2.4 a COPC file is read as the LAZ file that it is too.
 
-    Where nothing says otherwise, writers are told the file source identifier, 0: old PDAL writes what its memory held.
+    Where nothing says otherwise, writers are told what old PDAL takes from memory that it never set: `writers.las` the
+    file source identifier, 0, and `writers.ogr`, which crashes of it, the dimension of its measure, Z.
 
     Raises
     ------
@@ -289,8 +290,11 @@ def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
         return stages
     out = []
     for stage in stages:
+        last = stage is stages[-1] and len(stages) > 1
         if isinstance(stage, dict) and stage.get("type") == "writers.las" and "forward" not in stage:
             stage = {"filesource_id": 0, **stage}
+        elif isinstance(stage, dict) and _writes_ogr(stage, last):
+            stage = {"measure_dim": "Z", **stage}
         elif isinstance(stage, dict) and stage.get("type") == "readers.copc":
             beyond = [name for name in stage if name in _COPC_OPTIONS]
             if beyond:
@@ -303,6 +307,11 @@ def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
             stage = {**{k: v for k, v in stage.items() if k not in _COPC_TUNING}, "type": "readers.las"}
         out.append(stage)
     return out
+
+
+def _writes_ogr(stage: dict[str, Any], last: bool) -> bool:
+    by_name = last and str(stage.get("filename", "")).lower().endswith((".shp", ".geojson"))
+    return stage.get("type") == "writers.ogr" or (by_name and not stage.get("type"))
 
 
 #: Options of readers.copc that choose points, and those that only make it faster.
@@ -327,6 +336,11 @@ def writes_extended_classes_to_laz() -> bool:
 def writes_copc() -> bool:
     """Whether this PDAL has writers.copc."""
     return version() >= (2, 4, 0)
+
+
+def writes_numbered_features() -> bool:
+    """Whether writers.ogr makes a new feature of each point, as formats need that number their features."""
+    return version() >= (2, 5, 0)
 
 
 #: Dimensions of newer PDAL for the flags of a point.

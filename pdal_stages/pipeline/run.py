@@ -211,7 +211,7 @@ class Pipeline:
         given = [s.get("type") if isinstance(s, dict) else None for s in self.source.stages]
         if given.count(named.group()) == 1:
             error.where = self.source.where(given.index(named.group()))
-        if error.cure is None and "Couldn't create" in str(error.found):
+        if error.cure is None and _NO_STAGE.search(str(error.found)):
             from . import describe
 
             error.found = str(error.found).splitlines()[0]
@@ -227,6 +227,9 @@ def run_pipeline(source: str | Path | list | dict, overrides: Iterable[Override]
 
 
 _STAGE_TYPE = re.compile(r"\b(?:readers|filters|writers)\.\w+")
+
+
+_NO_STAGE = re.compile(r"Couldn't create (?:reader|filter|writer) stage")
 
 
 _NOT_UTF8 = re.compile(r"returned a result with an exception set|UnicodeDecodeError|codec can't decode")

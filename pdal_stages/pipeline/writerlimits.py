@@ -67,6 +67,25 @@ def check_copc(stages: list[dict[str, Any]]) -> None:
             )
 
 
+#: Drivers that number features themselves: PDAL before 2.5 gives them the same feature again.
+_NUMBERED = ("gpkg", "sqlite")
+
+
+def check_vectors(stages: list[dict[str, Any]]) -> None:
+    """Refuse vector formats that an old PDAL can write no second point to, which it says at the end of its work."""
+    for stage in stages:
+        driver = str(stage.get("ogrdriver", ""))
+        if stage.get("type") != "writers.ogr" or driver.lower() not in _NUMBERED:
+            continue
+        if not pdal_env.writes_numbered_features():
+            raise PipelineError(
+                f"PDAL {pdal_env.dotted_version()} cannot write points as {driver}: it gives all of them one number",
+                where="writers.ogr",
+                found=str(stage.get("filename", "")),
+                cure="Write a Shapefile or GeoJSON and convert it with ogr2ogr, or use PDAL 2.5 or later",
+            )
+
+
 def _code_limit(writer: dict[str, Any], before: list[dict[str, Any]]) -> CodeLimit | None:
     """The largest class code that a LAS writer can hold; None where that is any."""
     if writer.get("type") == "writers.copc":

@@ -68,7 +68,6 @@ SITES = {
 LEFT_OUT = {
     "writers.null": "writes nothing",
     "writers.ept_addon": "writes into an EPT source, in place",
-    "writers.ogr": "PDAL 2.2 of Debian crashes in it",
     "writers.raster": "writes what other stages made; as writers.gdal",
 }
 _WRITING = {"write_whole", "whole_files"}

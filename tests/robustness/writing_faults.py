@@ -105,6 +105,8 @@ CASES = {
     "writers.pcd binary": pdal("o.pcd", {"type": "writers.pcd", "compression": "binary"}),
     "writers.sbet": pdal("o.sbet", {"type": "writers.sbet"}),
     "writers.gltf": pdal("o.glb", {"type": "writers.gltf"}, {"type": "filters.delaunay"}),
+    "writers.ogr": pdal("o.geojson", {"type": "writers.ogr"}),
+    "writers.ogr shapefile": pdal("o.shp", {"type": "writers.ogr"}),
     "writers.gdal": pdal("o.tif", {"type": "writers.gdal", "resolution": 1, "output_type": "mean"}),
     "model": ours("o.model", {"type": "writers.classifiermodel", **FOREST}, "filename", exact=False),
     "thresholds": ours("bins.json", {"type": "filters.multiscalefeatures", "neighborhoods": "c1", "feature_set": "D1"}, "bins"),
