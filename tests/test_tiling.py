@@ -496,9 +496,9 @@ def test_outputs_need_names(tmp_path, town_file):
 
 def test_only_seen_points_are_computed(tmp_path, town_file, model_file):
     plan = make_plan(ps.Pipeline(clouds.stages([town_file], tmp_path / "o.las", model_file)))
-    assert plan.head[1]["where"] == "PdalStagesMargin < 0"
+    assert plan.head[1]["where"] == "PdalStagesOutside < 0"
     assert [s["type"] for s in plan.tail] == ["writers.las"]
-    assert plan.halo == pytest.approx(4 * clouds.CELL + ps.load_model(model_file).halo)
+    assert plan.halo_m == pytest.approx(4 * clouds.CELL + ps.load_model(model_file).halo)
 
 
 # ---- tile indexes and EPT --------------------------------------------------------------------------------
@@ -609,11 +609,11 @@ def test_reports(tmp_path, town_file, model_file):
 
 def test_a_failed_tile_is_crossed_out():
     from pdal_stages.reports.runpage import run_page
-    from pdal_stages.tiling.outcome import Job, TiledRun
+    from pdal_stages.tiling.outcome import TiledRun, TileJob
 
     report = {"points": 5, "read": 9, "halo_m": 1.0, "seconds": 2.0}
-    jobs = [Job((0, 0), "0_0", 5, [], state="done", report=report)]
-    jobs.append(Job((1, 0), "10_0", 5, [], state="failed", reason="<odd> & broken"))
+    jobs = [TileJob((0, 0), "0_0", 5, [], state="done", report=report)]
+    jobs.append(TileJob((1, 0), "10_0", 5, [], state="failed", reason="<odd> & broken"))
     summary = {"tile": 10.0, "points": 5, "states": {"done": 1, "kept": 0, "failed": 1}, "classes": {}}
     text = run_page(TiledRun(jobs, [], {}, [], [], summary).to_dict())
     assert text.count("<rect") == 2 and text.count('d="M1.2') == 1
