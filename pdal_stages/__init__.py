@@ -25,7 +25,7 @@ _WHERE = {
     "compute_features": "features",
     "filtered_ground": "terrain",
     "hag_minima": "terrain",
-    "load_model": "classifier",
+    "load_model": "stages.loading",
     "make_town": "synthetic",
     "parse_neighborhoods": "features.neighborhoods",
     "run_pipeline": "pipeline",
@@ -41,13 +41,14 @@ __all__ = [*_WHERE, "__version__"]
 if TYPE_CHECKING:
     from .accuracy.measures import Accuracy
     from .base.errors import StageError
-    from .classifier import Model, TrainingCloud, TrainingOptions, load_model, train
+    from .classifier import Model, TrainingCloud, TrainingOptions, train
     from .classifier.estimator import PointClassifier
     from .features import FeatureTable, compute_features
     from .features.neighborhoods import parse_neighborhoods
     from .pipeline import Pipeline, run_pipeline
     from .pipeline.native import Filter, Writer
     from .reports.accuracypage import write_accuracy_report
+    from .stages.loading import load_model
     from .synthetic import make_town
     from .terrain import filtered_ground, hag_minima
     from .tiling import run_tiled

@@ -452,7 +452,7 @@ def _classify_one(
 def _print_classes(done: Sequence[tuple[str, int, dict[str, Any]]], model: str) -> None:
     """The files that were written, and the points of each class in all of them."""
     from .base.asprs import class_name
-    from .stages.modelclassifier import loaded_model
+    from .stages.loading import loaded_model
 
     for target, count, _ in done:
         print(f"{count:,} points written to {target}")
@@ -471,8 +471,8 @@ def _print_classes(done: Sequence[tuple[str, int, dict[str, Any]]], model: str) 
 
 def _models(options: argparse.Namespace) -> None:
     from .base.asprs import class_name
-    from .classifier import load_model
     from .models import shipped
+    from .stages.loading import load_model
 
     for name, path in shipped().items():
         model = load_model(path)
@@ -481,9 +481,9 @@ def _models(options: argparse.Namespace) -> None:
 
 
 def _train(options: argparse.Namespace) -> None:
-    from .classifier import load_model
     from .pipeline.jobs import las_files, train_pipeline
     from .pipeline.run import Pipeline
+    from .stages.loading import load_model
 
     named = ("classes", "neighborhoods", "feature_set", "count", "trees")
     extra = {name: value for name in named if (value := getattr(options, name)) is not None}
@@ -516,10 +516,9 @@ def _accuracy(options: argparse.Namespace) -> None:
 
 
 def _model(options: argparse.Namespace) -> None:
-    from .classifier import load_model
-    from .models import find
+    from .stages.loading import load_model
 
-    model = load_model(find(options.file))
+    model = load_model(options.file)
     if options.html:
         from .reports.modelpage import write_model_report
 

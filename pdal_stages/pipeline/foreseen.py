@@ -42,13 +42,10 @@ def check_dimensions(lowered: Lowered) -> None:
         wanted = [name for name in ours.stage.reads() if name.startswith(_MADE)]
         missing = [name for name in wanted if not _may_be_there(name, ours, lowered)]
         if missing:
-            made = getattr(ours.stage, "preparation", None)
             raise DimensionError(
                 f"the dimension '{missing[0]}' is missing: no stage before makes it, and no input has it",
                 where=ours.place,
-                cure=f"Put before this stage: {preparation.as_json(made)}"
-                if made
-                else MAKERS.get(missing[0]),
+                cure=getattr(ours.stage, "hint", None) or MAKERS.get(missing[0]),
             )
 
 

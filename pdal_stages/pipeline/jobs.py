@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import DimensionError, OptionError, StageError, suggest
+from ..base.errors import DimensionError, ModelError, OptionError, StageError, suggest
 from ..base.las import extra_dimensions
 from ..base.outputs import check_outputs
 from ..classifier.heights import preparation_of
@@ -53,7 +53,7 @@ def classify_job(
 
     `dimensions` says which of those made on the way are written beside the input's own, or ``all``.
     """
-    from ..stages.modelclassifier import loaded_model
+    from ..stages.loading import loaded_model
 
     classifier: dict[str, Any] = {
         "type": "filters.modelclassifier",
@@ -64,6 +64,14 @@ def classify_job(
         if any(one.startswith(name) for one in dimensions):
             classifier[option] = True
     loaded = loaded_model(_overridden(classifier, overrides)["model"])
+    if by_hand := loaded.info.get("by_hand"):
+        raise ModelError(
+            "what the model reads was made by stages that a model file does not carry",
+            where=model,
+            found=", ".join(by_hand),
+            cure="Write a pipeline: the reader, these stages with their options of training, filters.modelclassifier, and "
+            "the writer",
+        )
     prepared = loaded.info.get("preparation") or preparation_of(loaded.required_dimensions)
     pipeline = Pipeline([_reader(source, "input"), *prepared, classifier, _writer(target)], overrides)
     of_pdal = any(stage["type"] in preparation.OF_PDAL for stage in prepared)

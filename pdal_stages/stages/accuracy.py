@@ -21,7 +21,8 @@ from ..base.outputs import Output
 from ..base.plain import plain
 from ..base.units import name_of_wkt
 from .base import Stage, files_read
-from .modelclassifier import ModelClassifier, loaded_model
+from .loading import loaded_model
+from .modelclassifier import ModelClassifier
 from .options import option
 from .points import Points
 from .selection import Selection

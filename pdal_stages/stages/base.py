@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..base.errors import StageError
 from ..base.outputs import Output
 from ..base.units import named_unit
+from .carried import Rule
 from .options import Option, option, parse_options
 from .points import Points
 from .where import Expression
@@ -79,6 +80,9 @@ class Stage(ABC):
     where_chooses: ClassVar[bool] = False
     #: For a stage that needs all points at once: what to do instead of running it in tiles.
     instead_of_tiles: ClassVar[str] = ""
+    #: For a stage that a model may carry with it, to be run by whoever applies it: the options that the file may give, each
+    #: with what it may say (see ``carried``). None: a model file cannot name the stage.
+    in_models: ClassVar[Mapping[str, Rule] | None] = None
     #: Whether points beyond the halo may matter; tiles then ask :meth:`reach_of`, and are read wider.
     open_ended: ClassVar[bool] = False
 

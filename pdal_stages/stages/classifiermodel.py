@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base import kinds
-from ..base.errors import StageError
+from ..base.errors import ModelError, StageError
 from ..base.files import check_writable
 from ..base.outputs import Output
 from ..classifier import TrainingCloud, TrainingOptions, summary, train
@@ -25,6 +25,7 @@ from ..features.voxels import LARGEST
 from .base import Stage, files_read
 from .options import option
 from .points import Points
+from .preparation import check
 from .selection import UNWANTED, Selection
 
 #: The trainer's own options.
@@ -238,6 +239,7 @@ holds the classes.
         if isinstance(share, int | float) and not isinstance(share, bool):
             given["max_features"] = str(share)
         self._preparation: list[dict[str, Any]] = []
+        self._by_hand: list[str] = []
         super().__init__(given, place)
 
     @classmethod
@@ -245,7 +247,16 @@ holds the classes.
         return {"files": files_read(before)}
 
     def follows(self, preparation: list[dict[str, Any]]) -> str | None:
-        self._preparation = preparation
+        self._preparation, self._by_hand = [], []
+        try:
+            self._preparation = check(preparation)
+        except ModelError as error:
+            self._by_hand = [str(stage["type"]) for stage in preparation]
+            return (
+                f"{self.type}: the model will not hold the stages before it, so `classify` cannot run them by itself: "
+                f"{error.what}{f' (found {error.found})' if error.found is not None else ''}. Write a pipeline with "
+                f"the same stages, {', '.join(self._by_hand)}, before filters.modelclassifier"
+            )
         return None
 
     @cached_property
@@ -323,6 +334,8 @@ holds the classes.
             cloud = cloud.part(np.flatnonzero(~gone))
         model = train(self._surveys(cloud, points), training)
         model.info["preparation"] = self._preparation
+        if self._by_hand:
+            model.info["by_hand"] = self._by_hand
         model.save(self.filename)
         told = {key: model.info[key] for key in _TOLD if key in model.info}
         points.report.update({"model": self.filename, **told, "seconds": model.seconds})

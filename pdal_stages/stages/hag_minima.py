@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ..base.errors import OptionError
 from ..terrain.minima import MinimaTerrain, check_sizes, terrain_reach
+from . import carried
 from .base import HEIGHTS_OUTSIDE, Stage
 from .options import option
 from .points import Points
@@ -21,6 +22,13 @@ class HagMinima(Stage):
     source = "[W18] section 3.2"
     open_ended = True  # an empty cell is filled from the nearest ones, however far away
     where_help = HEIGHTS_OUTSIDE
+    in_models = {
+        "cell": carried.number(1, 1000),
+        "resolution": carried.number(0.05, 1000),
+        "ignore": carried.selection,
+        "ignore_classes": carried.selection,
+        "where": carried.condition,
+    }
     cell: float = option(
         "number",
         20.0,

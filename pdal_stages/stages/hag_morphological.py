@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from ..base.errors import OptionError
 from ..terrain.morphological import check_sizes, filtered_ground, reach
 from ..terrain.profile import opening_names
+from . import carried
 from .base import HEIGHTS_OUTSIDE, Stage
 from .options import option
 from .points import Points
@@ -19,6 +20,19 @@ class HagMorphological(Stage):
     summary = "Height above ground found by a progressive morphological filter"
     source = "after Pingel, Clarke, McBride 2013 (SMRF), ISPRS Journal of Photogrammetry and Remote Sensing 77, 21-30"
     where_help = HEIGHTS_OUTSIDE
+    in_models = {
+        "cell": carried.number(0.2, 100),
+        "slope": carried.number(0, 100),
+        "window": carried.number(1, 1000),
+        "threshold": carried.number(0, 1000),
+        "scalar": carried.number(0, 1000),
+        "ignore": carried.selection,
+        "ignore_classes": carried.selection,
+        "ground": carried.flag,
+        "terrain_slope": carried.flag,
+        "openings": carried.numbers(1, 1000),
+        "where": carried.condition,
+    }
     cell: float = option(
         "number", 1.0, "Side of the grid's cells", minimum=0, exclusive=True, maximum=1000, unit="m"
     )

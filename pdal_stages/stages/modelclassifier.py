@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property, lru_cache
-from pathlib import Path
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,10 +11,10 @@ from numpy.typing import NDArray
 from ..base.asprs import OVERLAP
 from ..base.errors import DimensionError, OptionError
 from ..base.progress import Progress
-from ..classifier import Model, Prediction, load_model
+from ..classifier import Model, Prediction
 from ..classifier.smoothing import FARTHEST
-from ..models import find
 from .base import Stage
+from .loading import loaded_model
 from .options import option
 from .points import Points
 from .preparation import as_json, same
@@ -161,6 +160,16 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         """The stages that made what the model was trained on; empty where the model does not say."""
         return self.model.info.get("preparation") or []
 
+    @property
+    def hint(self) -> str | None:
+        """Where what the model reads comes from, if its file says."""
+        if self.preparation:
+            return f"Put before this stage: {as_json(self.preparation)}"
+        by_hand = self.model.info.get("by_hand")
+        return (
+            f"Put before this stage what stood there in training: {', '.join(by_hand)}" if by_hand else None
+        )
+
     def follows(self, preparation: list[dict[str, Any]]) -> str | None:
         if not self.preparation or not preparation or same(preparation, self.preparation):
             return None
@@ -203,8 +212,7 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         try:
             return points.dimension(name)
         except DimensionError as error:
-            if self.preparation:
-                error.cure = f"Put before this stage: {as_json(self.preparation)}"
+            error.cure = self.hint or error.cure
             raise
 
     def run(self, points: Points) -> dict[str, NDArray]:
@@ -279,19 +287,3 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
             raise OptionError(
                 self.code_limit.what, found=f"codes that points keep, {listed}", cure=self.code_limit.cure
             )
-
-
-def loaded_model(path: str) -> Model:
-    """A model file's model, read once per process as long as the file stays the same."""
-    path = find(path)
-    try:
-        stat = Path(path).stat()
-        stamp = (stat.st_mtime_ns, stat.st_size)
-    except (OSError, ValueError):  # the latter for a name that holds a null
-        return load_model(path)  # says what is wrong
-    return _load(path, stamp)
-
-
-@lru_cache(maxsize=4)
-def _load(path: str, stamp: tuple[int, int]) -> Model:
-    return load_model(path)

@@ -17,7 +17,8 @@ from ..base.errors import OptionError
 #: Noise, and points that their supplier withheld: neither neighbors nor overwritten, unless told.
 UNWANTED = (*NOISE, "withheld")
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)"
-_RANGE = re.compile(rf"([A-Za-z]\w*)\s*(!?)\s*([\[(])\s*({_NUMBER})?\s*:\s*({_NUMBER})?\s*([\])])")
+#: One range as PDAL writes it.
+RANGE = re.compile(rf"([A-Za-z]\w*)\s*(!?)\s*([\[(])\s*({_NUMBER})?\s*:\s*({_NUMBER})?\s*([\])])")
 _CURE = "Write 7,18 or, as PDAL has it, Classification[7:7]; withheld is short for Withheld[1:1]"
 
 
@@ -57,7 +58,7 @@ class Selection:
         for item in (str(item).strip() for item in items):
             if not item:
                 continue
-            found = _RANGE.fullmatch("Withheld[1:1]" if item.lower() == "withheld" else item)
+            found = RANGE.fullmatch("Withheld[1:1]" if item.lower() == "withheld" else item)
             if item in map(str, range(256)):
                 codes.append(int(item))
             elif found is None:

@@ -1,0 +1,130 @@
+"""What a model file may ask to be run before it: stages of a short list, options in bounds, never a path."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdal_stages.base.errors import ModelError
+from pdal_stages.stages import carried, registry
+from pdal_stages.stages.preparation import check, same
+
+HAG = {"type": "filters.hag_morphological"}
+#: Kinds of options that hold a path, or more than a model may say.
+_PATHS = ("filename", "mapping", "string")
+
+
+def test_no_option_that_holds_a_path_is_carried():
+    for kind in registry.stages().values():
+        declared = {name: one for one in kind.all_options() for name in (one.name, one.also)}
+        for name in kind.in_models or {}:
+            assert declared[name].kind not in _PATHS, (kind.type, name)
+            assert name not in ("threads", "horizontal_unit", "vertical_unit")
+
+
+def test_stages_with_files_are_not_carried():
+    for kind in registry.stages().values():
+        if any(one.kind == "filename" for one in kind.all_options()):
+            assert kind.in_models is None, kind.type
+
+
+def test_one_spelling():
+    given = {**HAG, "cell": "2.0", "ground": "TRUE", "openings": "5, 17", "ignore": "7,Withheld[1:1]"}
+    assert check([given]) == [
+        {**HAG, "cell": 2, "ground": True, "openings": [5, 17], "ignore": ["7", "Withheld[1:1]"]}
+    ]
+    assert same(
+        [given], [{**HAG, "cell": 2, "ground": True, "openings": [5, 17], "ignore": [7, "Withheld[1:1]"]}]
+    )
+    assert check(check([given])) == check([given])
+    both = [
+        {"type": "filters.smrf", "ignore": "Classification[7:7]", "returns": "last,only"},
+        {"type": "filters.hag_nn"},
+    ]
+    assert check(both)[0]["returns"] == ["last", "only"]
+
+
+@pytest.mark.parametrize(
+    ("stage", "says"),
+    [
+        ({"type": "filters.python", "source": "x"}, "filters.python"),
+        ({"type": "readers.las", "filename": "x"}, "readers.las"),
+        ({"type": "filters.multiscalefeatures"}, "filters.multiscalefeatures"),
+        ({"type": "filters.accuracy"}, "filters.accuracy"),
+        ({"type": "filters.modelclassifier", "model": "x"}, "filters.modelclassifier"),
+        ({"type": "filters.smrf", "dir": "/tmp"}, "'dir'"),
+        ({"type": "filters.smrf", "log": "/tmp/x"}, "'log'"),
+        ({"type": "filters.smrf", "where": "Z > 1"}, "'where'"),
+        ({"type": "filters.smrf", "ignore": "/etc/passwd"}, "'ignore'"),
+        ({"type": "filters.smrf", "cell": 1e-9}, "0.2 to 100"),
+        ({"type": "filters.smrf", "cell": True}, "0.2 to 100"),
+        ({"type": "filters.smrf", "returns": "last,/etc"}, "'returns'"),
+        ({"type": "filters.hag_nn", "count": 1.5}, "whole number"),
+        ({"type": "filters.hag_nn", "count": 10**400}, "whole number"),
+        ({**HAG, "option_file": "/etc/passwd"}, "'option_file'"),
+        ({**HAG, "threads": 999}, "'threads'"),
+        ({**HAG, "user_data": "x"}, "'user_data'"),
+        ({**HAG, "inputs": ["x"]}, "'inputs'"),
+        ({**HAG, "horizontal_unit": "foot"}, "'horizontal_unit'"),
+        ({**HAG, "cell": "1;2"}, "'cell'"),
+        ({**HAG, "cell": {}}, "'cell'"),
+        ({**HAG, "openings": [5] * 1000}, "at most 32"),
+        ({**HAG, "openings": [[5]]}, "'openings'"),
+        ({**HAG, "where": "__import__('os')"}, "'where'"),
+        ({**HAG, "where": "Z > 1" + " && Z > 1" * 1000}, "'where'"),
+        ({**HAG, "cell": 0.2, "window": 1000}, "cells"),
+        ({"type": "filters.hag_minima", "cell": 5, "resolution": 10}, "resolution"),
+    ],
+)
+def test_what_is_not_carried_is_refused_by_name(stage, says):
+    with pytest.raises(ModelError) as caught:
+        check([HAG, stage])
+    assert says in str(caught.value)
+
+
+def test_only_a_few_stages():
+    with pytest.raises(ModelError, match="at most 8"):
+        check([HAG] * 9)
+
+
+_JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=True) | st.text(max_size=20),
+    lambda inside: st.lists(inside, max_size=4) | st.dictionaries(st.text(max_size=8), inside, max_size=3),
+    max_leaves=8,
+)
+_KINDS = [*registry.stages(), *carried.OF_PDAL, "filters.python", "filters.stats", "filters.head"]
+_NAMES = [
+    name
+    for rules in (*carried.OF_PDAL.values(), *(k.in_models or {} for k in registry.stages().values()))
+    for name in rules
+] + ["log", "dir", "option_file", "source", "json", "user_data", "tag"]
+
+
+@settings(max_examples=400, deadline=None)
+@given(
+    st.lists(
+        st.builds(
+            lambda kind, options: {**options, "type": kind},
+            st.sampled_from(_KINDS),
+            st.dictionaries(st.sampled_from(_NAMES), _JSON, max_size=4),
+        ),
+        max_size=9,
+    )
+)
+def test_whatever_passes_is_harmless(stages):
+    """Random preparations are refused, or hold known stages, rules' options, and no text that could be a path."""
+    try:
+        passed = check(stages)
+    except ModelError as error:
+        assert len(str(error)) < 1000
+        return
+    assert check(passed) == passed
+    for stage in passed:
+        kind = registry.stages().get(stage["type"])
+        rules = carried.OF_PDAL[stage["type"]] if kind is None else kind.in_models
+        assert set(stage) - {"type"} <= set(rules)
+        text = json.dumps({k: v for k, v in stage.items() if k not in ("type", "where")})
+        assert "/" not in text and "\\" not in text
