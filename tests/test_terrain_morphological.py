@@ -11,7 +11,7 @@ from scipy import ndimage
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.stages.hag_morphological import HagMorphological
-from pdal_stages.terrain import filtered_ground, patches
+from pdal_stages.terrain import filtered_ground, morphological, patches
 from pdal_stages.terrain.lowest import pits
 from pdal_stages.terrain.morphological import reach
 from pdal_stages.terrain.openings import opening_radii, square_steps
@@ -288,6 +288,52 @@ def test_pieces_and_threads_change_nothing(monkeypatch):
     again = {}
     same(filtered_ground(x, y, z, mask=~noise, threads=2, report=again, **SMALL), whole)
     assert again == report
+
+
+@pytest.mark.parametrize("spacing", [40, 110, 160, 400])
+def test_land_without_points_costs_nothing_and_changes_nothing(monkeypatch, spacing):
+    """Groups of points that no step of the filter sees across are worked on apart: as on one raster."""
+    rng = np.random.default_rng(spacing)
+    n = 3000
+    cluster = rng.uniform(0, 15 * spacing, (2, 60))[:, rng.integers(0, 60, n)]
+    x, y = np.round(cluster + rng.normal(0, 4, (2, n)) - 700.0, 2)
+    z = np.round(0.1 * x + rng.choice([0.0, 6.0, -20.0], n, p=[0.7, 0.29, 0.01]) + rng.normal(0, 0.1, n), 2)
+    mask = rng.random(n) < 0.95
+    options = {"openings": (5, 120), "slope_too": True, "window": 40.0, "mask": mask}
+    shapes, real = [], morphological.pits
+
+    def looked_at(raster, cell):
+        shapes.append(raster.size)
+        return real(raster, cell)
+
+    monkeypatch.setattr(morphological, "pits", looked_at)
+    monkeypatch.setattr(patches, "_FEW", 1 << 40)
+    monkeypatch.setattr(patches, "LARGEST", 1 << 40)
+    report, again = {}, {}
+    whole = filtered_ground(x, y, z, report=report, **options)
+    assert len(shapes) == 1
+    for few, largest, side in ((0, 1 << 40, 1024), (0, 20_000, 256)):
+        shapes.clear()
+        monkeypatch.setattr(patches, "_FEW", few)
+        monkeypatch.setattr(patches, "_EMPTY", 1)
+        monkeypatch.setattr(patches, "LARGEST", largest)
+        monkeypatch.setattr(patches, "SIDE", side)
+        same(filtered_ground(x, y, z, report=again, **options), whole)
+        assert again == report
+        if spacing == 400:
+            assert len(shapes) > 30
+            assert sum(shapes) < 0.1 * 15**2 * spacing**2
+
+
+def test_cost_of_strays_follows_their_number():
+    rng = np.random.default_rng(0)
+    x, y = np.concatenate([rng.uniform(0, 200, (2, 2000)), rng.uniform(-1e6, 1e6, (2, 300))], axis=1)
+    column, row = (np.floor(v).astype(np.int64) for v in (x, y))
+    pieces = list(patches.patches(column, row, 400, 100))
+    own = np.concatenate([points[mine] for points, mine in pieces])
+    assert np.array_equal(np.sort(own), np.arange(len(x)))
+    cells = sum(patches._cells(column[points], row[points]) for points, _ in pieces)
+    assert cells < 201 * 201 + 300 * 100
 
 
 def test_one_stray_point_costs_little_memory():

@@ -127,7 +127,7 @@ def filtered_ground(
     if len(x):
         column, row = cell_numbers(x, cell), cell_numbers(y, cell)
         around = math.ceil(reach(cell=cell, window=window, openings=openings) / cell)
-        for points, own in patches(column, row, around):
+        for points, own in patches(column, row, around, _link(cell, window, openings)):
             found = _filter(
                 x[points], y[points], z[points], use[points], column[points], row[points], own,
                 cell=cell, slope=slope, window=window, threshold=threshold, scalar=scalar, openings=openings,
@@ -151,9 +151,18 @@ def reach(*, cell: float = 1.0, window: float = 75.0, openings: Sequence[float] 
 
     An opening looks twice its radius away; low outliers are judged before, and surfaces led through ground after it.
     """
-    radius = max([_radius(window, cell), *(opening_radius(size, cell) for size in openings)])
+    radius = _largest_radius(cell, window, openings)
     near, far = (planes_reach(_levels(block, cell)) for block in (_NEAR, _FAR))
     return (COMPANY + SURROUNDINGS + 2 * radius + (_ROUNDS + 1) * near + far + 2) * cell
+
+
+def _link(cell: float, window: float, openings: Sequence[float]) -> int:
+    """How far one step looks, in cells: no step of the filter sees from a point to another across more empty land."""
+    return max(COMPANY, _largest_radius(cell, window, openings), planes_reach(_levels(_FAR, cell))) + 2
+
+
+def _largest_radius(cell: float, window: float, openings: Sequence[float]) -> int:
+    return max([_radius(window, cell), *(opening_radius(size, cell) for size in openings)])
 
 
 def check_sizes(

@@ -34,7 +34,11 @@ def objects_of(
     """
     h, w = raster.shape
     radii = set(opening_radii(window))
-    largest = max(radii.union(keep))
+    wanted = {
+        radius: min(radius, h + w) for radius in keep
+    }  # a window of that radius holds all of the raster
+    keep = set(wanted.values())
+    largest = min(max(radii.union(keep)), h + w)
     eroded, other = raster.copy(), np.empty_like(raster)
     before, after = raster.copy(), np.empty_like(raster)
     objects, floor = np.zeros((h, w), bool), raster.copy()
@@ -52,4 +56,4 @@ def objects_of(
         if radius in radii:
             _mark(before, after, raster, np.float32(min(slope * radius * cell, LARGEST_DROP)), objects, floor)
             before, after = after, before
-    return objects, floor, openings
+    return objects, floor, {radius: openings[held] for radius, held in wanted.items()}
