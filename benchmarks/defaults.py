@@ -24,7 +24,7 @@ import numpy as np
 
 from pdal_stages.accuracy import Accuracy
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
-from pdal_stages.classifier.heights import ALWAYS, WHERE_THERE
+from pdal_stages.classifier.dimensions import ALWAYS, WHERE_THERE
 from pdal_stages.terrain import filtered_ground
 
 #: What ``pdal-stages train`` takes where points have it.

@@ -16,7 +16,7 @@ from pdal_stages.alsnet.pyramid import build, scramble
 from pdal_stages.alsnet.weights import Folded, check
 from pdal_stages.base.errors import DimensionError, ModelError, OptionError
 from pdal_stages.classifier import load_model, modelfile
-from pdal_stages.classifier.algorithms import Question
+from pdal_stages.classifier.algorithms import PredictRequest
 
 INPUTS = ("Z", "HeightAboveGround", "Intensity")
 
@@ -90,8 +90,8 @@ def test_probabilities_belong_to_points_not_to_their_order(seed, n):
 def test_averages_equal_a_hand_computation():
     xyz, _, dimensions = scene(1500, 20.0)
     net = net_with()
-    answer = net.predict(Question(xyz, dimensions), lambda p: p)
-    (found,) = answer.blocks
+    predicted = net.predict(PredictRequest(xyz, dimensions), lambda p: p)
+    (found,) = predicted.blocks
     columns = net.inputs_of(xyz, dimensions)
     np.testing.assert_allclose(columns[:, 1], (dimensions["HeightAboveGround"] - 1.0) / 2.0, rtol=1e-5)
     circles = Circles(xyz, TINY.points, net.spacing, columns)
@@ -105,8 +105,8 @@ def test_averages_equal_a_hand_computation():
     for i, part in enumerate(each):
         np.testing.assert_allclose(found.result[i], np.mean(part, axis=0), rtol=1e-9)
         np.testing.assert_allclose(found.variance[i], np.var(part, axis=0).mean(), rtol=1e-6, atol=1e-12)
-    assert answer.report["batches"] == len(circles)
-    assert answer.report["batches_per_point"]["least"] == coverage(circles).min()
+    assert predicted.report["batches"] == len(circles)
+    assert predicted.report["batches_per_point"]["least"] == coverage(circles).min()
     assert found.variance[coverage(circles) > 1].max() > 0
 
 
@@ -176,7 +176,7 @@ def test_absurd_weights_give_an_error_not_nan():
     weights = {name: array * np.float32(1e30) for name, array in net.weights.items()}
     xyz, _, dimensions = scene(300, 8.0)
     with np.errstate(all="ignore"), pytest.raises(ModelError, match="not numbers"):
-        dataclasses.replace(net, weights=weights).predict(Question(xyz, dimensions), lambda p: p)
+        dataclasses.replace(net, weights=weights).predict(PredictRequest(xyz, dimensions), lambda p: p)
 
 
 # ---- files ------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier.context import KINDS, OWN, Context, around
+from pdal_stages.classifier.context import CELLS, OWN, Context, around
 from pdal_stages.classifier.smoothing import WHOLE, count_shares
 from pdal_stages.classifier.sweep import Passed, Sweep
 
@@ -134,7 +134,7 @@ def test_names_and_reach():
         "Probability_2_own", "Probability_6_own", "Probability_2_box0_5", "Probability_6_box0_5",
         "Probability_2_columnvotes8", "Probability_6_columnvotes8",
     )  # fmt: skip
-    assert all(kind.text for kind in KINDS.values())
+    assert all(kind.text for kind in CELLS.values())
 
 
 @pytest.mark.parametrize(

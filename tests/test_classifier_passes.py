@@ -192,19 +192,20 @@ def test_hostile_passes_are_refused(two, tmp_path, edit):
 
 def test_a_pass_may_come_from_elsewhere(two, other):
     """The first pass may be any classifier of clouds: here one that hands over all points at once, like a network."""
-    from pdal_stages.classifier.algorithms import Answer, Block
+    from pdal_stages.classifier.algorithms import Block, PredictResult
     from pdal_stages.classifier.passes import Passes
 
     class Whole:
         plan = two.passes[0].plan
+        features = context = None
 
-        def predict(self, question, finish):
-            answer = two.passes[0].predict(question, lambda p: p)
-            p = np.zeros((len(question.xyz), 3))
-            for block in answer.blocks:
+        def predict(self, request, finish):
+            predicted = two.passes[0].predict(request, lambda p: p)
+            p = np.zeros((len(request.xyz), 3))
+            for block in predicted.blocks:
                 p[block.rows] = block.result
-            rows = slice(None) if question.rows is None else question.rows
-            return Answer([Block(rows, finish(p[rows]))], {"batches": 1})
+            rows = slice(None) if request.rows is None else request.rows
+            return PredictResult([Block(rows, finish(p[rows]))], {"batches": 1})
 
     xyz, _, dimensions = other
     model = type(two)((two.passes[0],), two.classes, two.info)

@@ -10,10 +10,10 @@ import pytest
 from pdal_stages import Filter
 from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.classifier import load_model
-from pdal_stages.classifier.heights import preparation_of
 from pdal_stages.cli import main
 from pdal_stages.models import STANDARD, find, shipped
 from pdal_stages.pipeline import Pipeline
+from pdal_stages.stages.heights import preparation_of
 from pdal_stages.synthetic import TownOptions, write_town
 
 

@@ -10,8 +10,8 @@ from clouds import SURVEYS, Cloud, load, on_slopes, thinned, without_returns
 
 from pdal_stages.base.hashing import coordinate_hash
 from pdal_stages.classifier import Model, TrainingCloud, TrainingOptions, train
-from pdal_stages.classifier.heights import PREPARATION
 from pdal_stages.features.voxels import represent
+from pdal_stages.stages.heights import PREPARATION
 
 #: Points per square metre of thinned copies.
 DENSITIES = (8.0, 2.0, 0.6)
@@ -54,9 +54,9 @@ def copies(cloud: Cloud) -> Iterator[Cloud]:
 
 def training_cloud(cloud: Cloud) -> TrainingCloud:
     """As dense as it is trained on, with a mask of :data:`SAMPLES` points of each class, chosen by their coordinates."""
-    few = represent(cloud.xyz, OPTIONS.voxel, cloud.dimensions.values())
-    if few is not None:
-        cloud = cloud.taken(few.rows)
+    representatives = represent(cloud.xyz, OPTIONS.voxel, cloud.dimensions.values())
+    if representatives is not None:
+        cloud = cloud.taken(representatives.rows)
     order = np.argsort(coordinate_hash(cloud.xyz, 1), kind="stable")
     mask = np.zeros(len(order), np.bool_)
     for code in (2, 5, 6):

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from ..base import checks
 from ..base.errors import ModelError, OptionError, StageError
 from ..base.threads import map_blocks, resolve_threads
-from ..classifier.algorithms import Answer, Block, Column, InputPlan, Question
+from ..classifier.algorithms import Block, Column, InputPlan, PredictRequest, PredictResult
 from ..classifier.arrays import ArrayRule
 from ..classifier.dimensions import gather, with_returns
 from ..features.index import check_xyz
@@ -47,6 +47,8 @@ class AlsNet:
 
     name: ClassVar[str] = "alsnet"
     gives_variance: ClassVar[bool] = True
+    features: ClassVar[None] = None
+    context: ClassVar[None] = None
     rules: ClassVar[Mapping[str, ArrayRule]] = {
         "sa*": ArrayRule(("<f4",), 2),
         "fp*": ArrayRule(("<f4",), 2),
@@ -133,31 +135,33 @@ class AlsNet:
         """The inputs that do not depend on the batch, scaled; columns of X, Y and Z are left 0."""
         return scaled(xyz, dimensions, self.inputs, self.mean, self.scale)
 
-    def predict(self, question: Question, finish: Callable[[npt.NDArray[np.float64]], Any]) -> Answer:
+    def predict(
+        self, request: PredictRequest, finish: Callable[[npt.NDArray[np.float64]], Any]
+    ) -> PredictResult:
         """Mean probabilities over all batches a point is in [WM19]; see ``Algorithm.predict``.
 
         Batches are computed side by side, as many as fit into the memory, at least one.
         """
         values, notes = gather(
             self.inputs,
-            with_returns(self.inputs, question.xyz, question.dimensions, question.threads),
-            len(question.xyz),
+            with_returns(self.inputs, request.xyz, request.dimensions, request.threads),
+            len(request.xyz),
         )
         report: dict[str, Any] = {name: number for name, number in notes.items() if number}
-        if not question.count:
-            return Answer((), report)
-        mean, variance, counted = self._means(question, values)
-        rows = slice(None) if question.rows is None else question.rows
-        return Answer([Block(rows, finish(mean), variance)], {**report, **counted})
+        if not request.count:
+            return PredictResult((), report)
+        mean, variance, counted = self._means(request, values)
+        rows = slice(None) if request.rows is None else request.rows
+        return PredictResult([Block(rows, finish(mean), variance)], {**report, **counted})
 
     def _means(
-        self, question: Question, dimensions: Mapping[str, npt.ArrayLike]
+        self, request: PredictRequest, dimensions: Mapping[str, npt.ArrayLike]
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], dict[str, Any]]:
         """Mean probabilities over the batches, a class's variance over them (mean over the classes), counts."""
         from threadpoolctl import threadpool_limits
 
-        rows, progress = question.rows, question.progress
-        xyz = check_xyz(question.xyz)
+        rows, progress = request.rows, request.progress
+        xyz = check_xyz(request.xyz)
         columns = self.inputs_of(xyz, dimensions)
         circles = Circles(xyz, self.configuration.points, self.spacing, columns)
         numbers = circles.needed(rows)
@@ -165,12 +169,12 @@ class AlsNet:
         place = np.arange(n) if rows is None else np.full(n, -1, np.int64)
         if rows is not None:
             place[rows] = np.arange(len(rows))
-        m = question.count
+        m = request.count
         total = np.zeros((m, self.n_classes))
         squares = np.zeros(m)
         count = np.zeros(m, np.int64)
         each = self.configuration.memory_mb(len(self.inputs))
-        side_by_side = max(1, min(resolve_threads(question.threads), int(question.memory_mb / each)))
+        side_by_side = max(1, min(resolve_threads(request.threads), int(request.memory_mb / each)))
         apply, device = _applied(self)
 
         def one(number: int):

@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from ..base import kinds
 from ..base.errors import OptionError
+from ..base.outputs import Output
 from ..base.version import __version__
 from ..classifier.clouds import TrainingCloud, label_classes
 from ..classifier.dimensions import gather, with_returns
@@ -20,6 +22,15 @@ from ..classifier.trainoptions import TrainingOptions
 from ..features.index import check_xyz
 from .epochs import LabelledCloud, train_network
 from .networkoptions import NetworkOptions
+
+optional_inputs: dict[str, tuple[str, ...]] = {}
+reports_training = True
+
+
+def outputs(options: TrainingOptions) -> list[Output]:
+    """The checkpoint, if one is wanted."""
+    path = options.alsnet.checkpoint
+    return [Output(path, "checkpoint", kinds.CHECKPOINT)] if path else []
 
 
 def own_options(given: Any) -> NetworkOptions:

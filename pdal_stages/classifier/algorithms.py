@@ -11,11 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError
+from ..base.outputs import Output
 from ..features import FeaturePlan
 from .arrays import ArrayRule
 
 #: Each kind by its word in manifests and options: its Algorithm and its Trainer, imported when asked for.
-KINDS = {
+ALGORITHMS = {
     "random_forest": (
         "pdal_stages.classifier.featureforest:FeatureForest",
         "pdal_stages.classifier.foresttraining",
@@ -45,7 +46,7 @@ class Column(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Question:
+class PredictRequest:
     """A cloud, and the points of it that are to be classified."""
 
     xyz: npt.NDArray[np.float64]  #: (n, 3) metres
@@ -75,7 +76,7 @@ class Block(NamedTuple):
 
 
 @dataclass(eq=False)
-class Answer:
+class PredictResult:
     """Blocks that hold every point wanted once, and what was counted, complete when all blocks are read."""
 
     blocks: Iterable[Block]
@@ -89,6 +90,8 @@ class Algorithm(Protocol):
     #: of a model file's arrays; a name that ends in ``*`` stands for many
     rules: ClassVar[Mapping[str, ArrayRule]]
     gives_variance: ClassVar[bool]  #: whether its blocks have a variance
+    #: what it computes of the points, which a next pass may share; None where it has its own way
+    features: Any
 
     @property
     def plan(self) -> FeaturePlan | InputPlan: ...
@@ -108,12 +111,14 @@ class Algorithm(Protocol):
     def columns(self, codes: Sequence[int]) -> Sequence[Column]:
         """Its inputs, for people."""
 
-    def predict(self, question: Question, finish: Callable[[npt.NDArray[np.float64]], Any]) -> Answer:
+    def predict(
+        self, request: PredictRequest, finish: Callable[[npt.NDArray[np.float64]], Any]
+    ) -> PredictResult:
         """Classify.
 
         Parameters
         ----------
-        question : Question
+        request : PredictRequest
         finish : function
             Called with the (b, classes) float64 probabilities of a block, which it may change, in a worker's
             thread where there are any; its result stands in the block.
@@ -123,9 +128,16 @@ class Algorithm(Protocol):
 class Trainer(Protocol):
     """How a kind is trained: a module with these functions.
 
+    It says itself what it needs and gives: the rooms above ask it, and know no kind by its name.
+
     `options` are ``TrainingOptions``, `clouds` ``TrainingCloud``s, and what comes out is a ``Model``: all of them rooms
     that stand on this one.
     """
+
+    #: inputs used too where the user names none, and the dimensions that the points must have for each
+    optional_inputs: Mapping[str, tuple[str, ...]]
+    #: whether the record of its training, such as a curve, belongs into a run's report
+    reports_training: bool
 
     def own_options(self, given: Any) -> Any:
         """The kind's own options, checked; None where it has none."""
@@ -133,20 +145,23 @@ class Trainer(Protocol):
     def inputs(self, options: Any) -> tuple[str, ...]:
         """Dimensions it uses as inputs, X, Y and Z among them."""
 
+    def outputs(self, options: Any) -> list[Output]:
+        """Files it writes beside the model."""
+
     def train(self, clouds: Sequence[Any], options: Any, progress: bool) -> Any: ...
 
 
 def algorithm(name: str) -> type[Algorithm]:
     """The class of a kind by its name; ModelError where there is none."""
-    if name not in KINDS:
+    if name not in ALGORITHMS:
         raise ModelError(
             "the model uses an algorithm this release does not know",
             found=repr(name)[:60],
             cure="Update pdal-stages",
         )
-    return pkgutil.resolve_name(KINDS[name][0])
+    return pkgutil.resolve_name(ALGORITHMS[name][0])
 
 
 def trainer(name: str) -> Trainer:
-    """What trains a kind, one of :data:`KINDS`."""
-    return pkgutil.resolve_name(KINDS[name][1])
+    """What trains a kind, one of :data:`ALGORITHMS`."""
+    return pkgutil.resolve_name(ALGORITHMS[name][1])

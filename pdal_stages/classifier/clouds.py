@@ -70,10 +70,10 @@ class TrainingCloud:
 
 
 #: A training cloud, or a function that makes it when it is its turn.
-Source = TrainingCloud | Callable[[], TrainingCloud]
+CloudSource = TrainingCloud | Callable[[], TrainingCloud]
 
 
-def prepared(sources: Iterable[Source], options: TrainingOptions) -> Iterator[TrainingCloud]:
+def prepared(sources: Iterable[CloudSource], options: TrainingOptions) -> Iterator[TrainingCloud]:
     """The clouds without ignored points and with one point per voxel, each followed by its thinned copies."""
     named: set[int] = set()
     if options.classes is not None:
@@ -85,9 +85,9 @@ def prepared(sources: Iterable[Source], options: TrainingOptions) -> Iterator[Tr
         if ignored and (gone := np.isin(labels, ignored)).any():
             cloud = cloud.part(np.flatnonzero(~gone))
         values = known(options.inputs, cloud.dimensions, len(cloud.xyz), where=cloud.name)
-        few = represent(cloud.xyz, options.voxel, values)
-        if few is not None:
-            cloud = cloud.part(few.rows)
+        representatives = represent(cloud.xyz, options.voxel, values)
+        if representatives is not None:
+            cloud = cloud.part(representatives.rows)
         yield cloud
         for wanted in options.thin:
             rows = thinned(cloud.xyz, wanted, options.seed)

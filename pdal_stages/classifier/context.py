@@ -33,7 +33,7 @@ class Kind:
 
 
 #: Word of a token, which the side of a cell in metres follows.
-KINDS = {
+CELLS = {
     "box": Kind(3, False, "mean probabilities of the points in 3 x 3 x 3 cells around the point's"),
     "column": Kind(2, False, "mean probabilities of the points in 3 x 3 columns, of any height, around the point's"),
     "boxvotes": Kind(3, True, "share of the points in 3 x 3 x 3 cells whose most probable class it is"),
@@ -57,7 +57,7 @@ class Scale:
 class Context:
     """Which features of the surroundings a pass reads; OptionError for a token that is not one."""
 
-    tokens: tuple[str, ...]  #: ``own``, or a word of :data:`KINDS` and a side: ``box1``, ``columnvotes8``
+    tokens: tuple[str, ...]  #: ``own``, or a word of :data:`CELLS` and a side: ``box1``, ``columnvotes8``
 
     def __post_init__(self) -> None:
         self.scales  # noqa: B018  refused when it is made
@@ -73,16 +73,16 @@ class Context:
         """The tokens that have cells."""
         found = []
         for token in self.tokens:
-            match = re.fullmatch(rf"({'|'.join(KINDS)})(\d+(?:\.\d+)?)", token)
+            match = re.fullmatch(rf"({'|'.join(CELLS)})(\d+(?:\.\d+)?)", token)
             if token != OWN and (match is None or float(match[2]) not in SIDES):
                 raise OptionError(
                     "a token of 'context' is not known",
                     found=repr(token)[:60],
-                    cure=f"Write {OWN}, or {', '.join(KINDS)} and a side in metres that is a power of two "
+                    cure=f"Write {OWN}, or {', '.join(CELLS)} and a side in metres that is a power of two "
                     f"from {SIDES[0]:g} to {SIDES[-1]:g}: box1, column8",
                 )
             if match:
-                found.append(Scale(token, float(match[2]), KINDS[match[1]]))
+                found.append(Scale(token, float(match[2]), CELLS[match[1]]))
         return tuple(found)
 
     @property

@@ -13,6 +13,9 @@ from ..features import returns
 
 #: What every point has: the feature engine takes these from the coordinates.
 COORDINATES = ("X", "Y", "Z")
+#: What a model is trained on by default: always this, and these where points have them.
+ALWAYS = ("HeightAboveGround",)
+WHERE_THERE = ("Ground", "HeightAboveOpening_5", "HeightAboveOpening_17")
 #: Derived here: ReturnNumber / NumberOfReturns, 1 for a last or only return.
 RETURN_RATIO = "ReturnRatio"
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from ..base.errors import ModelError
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.names import GROUPS, RELATIVE
-from .algorithms import Answer, Block, Column, Question
+from .algorithms import Block, Column, PredictRequest, PredictResult
 from .arrays import ArrayRule
 from .context import Context
 from .dimensions import gather, with_returns
@@ -147,23 +147,25 @@ class FeatureForest:
         """Probabilities (b, classes) of points by their features and context; `rows`, which they are, plays no part."""
         return self.forest.predict_proba(values)
 
-    def predict(self, question: Question, finish: Callable[[npt.NDArray[np.float64]], Any]) -> Answer:
+    def predict(
+        self, request: PredictRequest, finish: Callable[[npt.NDArray[np.float64]], Any]
+    ) -> PredictResult:
         """Classify; see ``Algorithm.predict``. Not for one that reads context, which :class:`Passes` gives it."""
-        computing = Computing(self.features, question)
-        blocks = computing.blocks(question.rows, lambda values, rows: finish(self.probabilities(values)))
-        return Answer((Block(rows, result) for rows, result in blocks), computing.report)
+        features_here = CloudFeatures(self.features, request)
+        blocks = features_here.blocks(request.rows, lambda values, rows: finish(self.probabilities(values)))
+        return PredictResult((Block(rows, result) for rows, result in blocks), features_here.report)
 
 
-class Computing:
-    """Features of a question's points, block by block; `report` has what was counted."""
+class CloudFeatures:
+    """Features of a request's points, block by block; `report` has what was counted."""
 
-    def __init__(self, features: Features, question: Question) -> None:
-        self.features, self._question = features, question
+    def __init__(self, features: Features, request: PredictRequest) -> None:
+        self.features, self._request = features, request
         self.report: dict[str, Any] = {}
         self._engine: FeatureEngine | None = None
         names = features.plan.dimensions
-        self._dimensions = with_returns(names, question.xyz, question.dimensions, question.threads)
-        _, notes = gather(names, self._dimensions, len(question.xyz), question.rows)
+        self._dimensions = with_returns(names, request.xyz, request.dimensions, request.threads)
+        _, notes = gather(names, self._dimensions, len(request.xyz), request.rows)
         self.report.update({name: number for name, number in notes.items() if number})
 
     def blocks(
@@ -179,7 +181,7 @@ class Computing:
         `apply` runs in workers' threads. Where not `counted`, the report does not change; the progress does where
         `counted` and `shown`.
         """
-        asked = self._question
+        asked = self._request
         if not (len(asked.xyz) if rows is None else len(rows)):
             return
         if self._engine is None:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OptionError
-from .algorithms import Question
+from .algorithms import PredictRequest
 from .context import Context
 from .featureforest import Features
 from .forest import Forest
@@ -127,14 +127,20 @@ class ContextOnly:
     context: Context
     features: None = None
 
+    def probabilities(
+        self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.float64]:
+        """Nobody asks."""
+        raise NotImplementedError
+
 
 def sample_context(
-    question: Question, passes: Sequence[FoldForests], context: Context, classes: int
+    request: PredictRequest, passes: Sequence[FoldForests], context: Context, classes: int
 ) -> npt.NDArray[np.float32]:
     """(m, columns): the context of the m points asked for, as passes say, one after the other, that have not seen them."""
-    asked: Any = question.rows
+    asked: Any = request.rows
     out = np.empty((len(asked), len(context.tokens) * classes), np.float32)
-    run = PassRun([*passes, ContextOnly(context)], classes, question)
+    run = PassRun([*passes, ContextOnly(context)], classes, request)
     for part, columns in run.blocks(lambda _, rows, columns: columns):
         out[np.searchsorted(asked, part)] = columns
     return out

@@ -13,15 +13,17 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OptionError
+from ..base.outputs import Output
 from ..base.progress import Progress
 from ..base.version import __version__
 from ..features import FeaturePlan
 from ..features.fitting import fit_clouds
+from ..features.returns import SOURCES
 from . import crossval
-from .algorithms import Question
+from .algorithms import PredictRequest
 from .clouds import Labelled, TrainingCloud, label_classes
 from .context import Context
-from .dimensions import gather, required
+from .dimensions import WHERE_THERE, gather, required
 from .featureforest import FeatureForest, Features
 from .folds import FoldForests, Folds, sample_context
 from .forest import Forest
@@ -34,6 +36,15 @@ from .trainoptions import TrainingOptions
 
 #: Trees of a forest that judges a fold, as a share of the final one's.
 FOLD_TREES = 0.25
+
+
+optional_inputs = {**{name: (name,) for name in WHERE_THERE}, "returns": SOURCES}
+reports_training = False
+
+
+def outputs(options: TrainingOptions) -> list[Output]:
+    """The model alone."""
+    return []
 
 
 def own_options(given: Any) -> None:
@@ -309,8 +320,8 @@ class _Passes:
                     FoldForests(self.features, self.context if k else None, forests, fold)
                     for k, forests in enumerate(held_out)
                 ]
-                question = Question(cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb, bar)
-                out[at] = sample_context(question, passes, self.context, classes)
+                request = PredictRequest(cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb, bar)
+                out[at] = sample_context(request, passes, self.context, classes)
         return out
 
     def _grown(

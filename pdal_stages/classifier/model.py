@@ -15,11 +15,11 @@ from ..base.errors import ModelError, OptionError
 from ..features import FeaturePlan
 from ..features.voxels import represent
 from . import modelfile, summary
-from .algorithms import InputPlan, Question, algorithm
+from .algorithms import InputPlan, PredictRequest, algorithm
 from .deciding import Outcome, Prediction, PredictionOptions, decide
 from .dimensions import known, required, welcome
-from .heights import heights
 from .passes import Passes
+from .preparing import preparing
 from .smoothing import count_shares, smooth
 from .thinning import density, out_of_range
 
@@ -179,7 +179,9 @@ class Model:
         xyz = np.asarray(xyz, dtype=np.float64)
         if dimensions is None and self.required_dimensions:
             usable = None if ignore is None else ~np.asarray(ignore, bool)
-            dimensions = heights(self.info.get("preparation") or [], xyz, usable, how.threads)
+            dimensions = preparing().made_of_coordinates(
+                self.info.get("preparation") or [], xyz, usable, how.threads
+            )
         if how.variance and not self.gives_variance:
             raise OptionError(
                 "only a network gives a variance",
@@ -215,39 +217,39 @@ class Model:
 
         outcome = Outcome(len(xyz), len(codes), old, how)
         values = known(self.plan.dimensions, dimensions, len(xyz), there)
-        few = represent(xyz, self.voxel, values, rows, there)
+        representatives = represent(xyz, self.voxel, values, rows, there)
         asked, count = rows, len(xyz if there is None else there)
-        if few is not None:
-            xyz, asked = xyz[few.rows], few.wanted
-            dimensions = {name: np.asarray(dimensions[name])[few.rows] for name in dimensions}
+        if representatives is not None:
+            xyz, asked = xyz[representatives.rows], representatives.wanted
+            dimensions = {name: np.asarray(dimensions[name])[representatives.rows] for name in dimensions}
 
         def write(at, decided, variance=None):
-            if few is not None:
-                at, place = few.members(at)
+            if representatives is not None:
+                at, place = representatives.members(at)
                 decided = None if decided is None else decided.taken(place)
                 variance = None if variance is None else variance[place]
             outcome.write(at, decided, variance)
             return at
 
-        question = Question(
-            xyz, dimensions, asked, how.threads, how.memory_mb, progress if few is None else None
+        request = PredictRequest(
+            xyz, dimensions, asked, how.threads, how.memory_mb, progress if representatives is None else None
         )
-        answer = self.algorithm.predict(question, finish)
+        predicted = self.algorithm.predict(request, finish)
         shares = np.zeros((len(xyz), len(codes)), np.uint16) if how.smooth else None
-        for block in answer.blocks:
+        for block in predicted.blocks:
             if shares is not None:
                 shares[block.rows] = block.result
             written = write(block.rows, None if how.smooth else block.result, block.variance)
-            if few is not None and progress is not None:
+            if representatives is not None and progress is not None:
                 progress.update(len(written))
-        if shares is not None and question.count:
+        if shares is not None and request.count:
             for part, p in _smoothed(xyz, asked, shares, how):
                 write(part, decide(p, codes, how))
-            answer.report["smooth"] = how.smooth
+            predicted.report["smooth"] = how.smooth
         if len(xyz) < count:
-            answer.report["representatives"] = len(xyz)
-        answer.report.update(self._density_report(xyz, question.count, answer.report))
-        return outcome.prediction(rows, there, answer.report)
+            predicted.report["representatives"] = len(xyz)
+        predicted.report.update(self._density_report(xyz, request.count, predicted.report))
+        return outcome.prediction(rows, there, predicted.report)
 
     def _density_report(
         self, xyz: npt.NDArray[np.float64], count: int, report: Mapping[str, Any]
@@ -260,11 +262,11 @@ class Model:
         out: dict[str, Any] = {"density": round(found, 3)}
         if out_of_range(found, trained):
             low, high = f"{trained['low']:.3g}", f"{trained['high']:.3g}"
-            few = report.get("fewer_than_three", {})
-            token = max(few, key=lambda one: few[one], default="")
+            lonely_in = report.get("fewer_than_three", {})
+            token = max(lonely_in, key=lambda one: lonely_in[one], default="")
             lonely = (
-                f"; {100 * few[token] / count:.2g} % have fewer than three neighbors in {token}"
-                if few
+                f"; {100 * lonely_in[token] / count:.2g} % have fewer than three neighbors in {token}"
+                if lonely_in
                 else ""
             )
             out["warning"] = (

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from .algorithms import Answer, Block, InputPlan, Question
-from .context import around
-from .featureforest import Computing, Features
+from .algorithms import Algorithm, Block, InputPlan, PredictRequest, PredictResult
+from .context import Context, around
+from .featureforest import CloudFeatures, Features
 from .smoothing import count_shares
 from .sweep import Passed, Sweep
 
@@ -20,11 +20,28 @@ from .sweep import Passed, Sweep
 _KEPT = 0.5
 
 
+class Pass(Protocol):
+    """One of several passes, as it reads the points of a block."""
+
+    @property
+    def features(self) -> Features | None:
+        """What it computes of the points; None where it reads context alone, or is a whole algorithm that comes first."""
+
+    @property
+    def context(self) -> Context | None:
+        """What it reads of the pass before; None for the first."""
+
+    def probabilities(
+        self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.float64]:
+        """(b, classes) of the points `rows`, by their features and then their context, side by side."""
+
+
 @dataclass(frozen=True, eq=False)
 class Passes:
     """Two or more passes."""
 
-    #: any :class:`Algorithm`, then such with ``features``, ``context`` and ``probabilities(values, rows)``
+    #: of a model file: the first any :class:`Algorithm`, then forests
     members: tuple[Any, ...]
     classes: int
 
@@ -49,73 +66,75 @@ class Passes:
             max(plan.most_neighbors for plan in plans),
         )
 
-    def predict(self, question: Question, finish: Callable[[npt.NDArray[np.float64]], Any]) -> Answer:
+    def predict(
+        self, request: PredictRequest, finish: Callable[[npt.NDArray[np.float64]], Any]
+    ) -> PredictResult:
         """Classify; see ``Algorithm.predict``."""
-        run = PassRun(self.members, self.classes, question)
+        run = PassRun(self.members, self.classes, request)
 
         def last(values, rows, context):
             return finish(self.members[-1].probabilities(joined(values, context), rows))
 
-        return Answer((Block(rows, result) for rows, result in run.blocks(last)), run.report)
+        return PredictResult((Block(rows, result) for rows, result in run.blocks(last)), run.report)
 
 
 class PassRun:
-    """Passes at work on one cloud. Of the last only `features` and `context` are looked at here.
+    """Passes at work on one cloud. Of the last only `features` and `context` are looked at here; a first one without
+    features is asked for its probabilities as the algorithm it is.
 
     `report` has what was counted, complete when all blocks are read.
     """
 
-    def __init__(self, members: Sequence[Any], classes: int, question: Question) -> None:
-        self._members, self._classes, self._question = members, classes, question
+    def __init__(self, members: Sequence[Pass], classes: int, request: PredictRequest) -> None:
+        self._members, self._classes, self._request = members, classes, request
         self.report: dict[str, Any] = {}
-        rows = [question.rows]  # wanted of each pass
+        rows = [request.rows]  # wanted of each pass
         for one in members[:0:-1]:
-            rows.insert(0, around(question.xyz, rows[0], one.context))
+            rows.insert(0, around(request.xyz, rows[0], _context_of(one)))
         self._rows = rows
-        self._computings: list[Computing] = []
+        self._of_clouds: list[CloudFeatures] = []
         for one in members:
-            if getattr(one, "features", None) is not None:
-                self._computing(one.features)
+            if one.features is not None:
+                self._features_of(one.features)
 
-    def _computing(self, features: Features) -> Computing:
+    def _features_of(self, features: Features) -> CloudFeatures:
         """One for passes that read the same features, so that these are computed once."""
-        for one in self._computings:
+        for one in self._of_clouds:
             if one.features is features or one.features.to_dict() == features.to_dict():
                 return one
-        self._computings.append(Computing(features, self._question))
-        self.report.update(self._computings[-1].report)
-        return self._computings[-1]
+        self._of_clouds.append(CloudFeatures(features, self._request))
+        self.report.update(self._of_clouds[-1].report)
+        return self._of_clouds[-1]
 
     def blocks(
         self, last: Callable[[Any, npt.NDArray[np.int64], npt.NDArray[np.float32]], Any]
     ) -> Iterator[tuple[npt.NDArray[np.int64], Any]]:
         """Yield (rows, ``last(values, rows, context)``) for all points asked for; called in workers' threads."""
-        if not self._question.count:
+        if not self._request.count:
             return
         stream = self._first()
         for number in range(1, len(self._members) - 1):
             stream = _passed(self._swept(number, stream, self._handing_on(number)))
-        progress = self._question.progress
+        progress = self._request.progress
         for rows, result in self._swept(len(self._members) - 1, stream, last):
             if progress is not None:
                 progress.update(len(rows))
             yield rows, result
-        for one in self._computings:
+        for one in self._of_clouds:
             self.report.update(one.report)
 
     def _first(self) -> Iterator[Passed]:
         first = self._members[0]
-        features = getattr(first, "features", None)
-        if features is None:
-            asked = self._question
-            inner = Question(asked.xyz, asked.dimensions, self._rows[0], asked.threads, asked.memory_mb)
-            answer = first.predict(inner, count_shares)
+        if first.features is None:
+            asked = self._request
+            inner = PredictRequest(asked.xyz, asked.dimensions, self._rows[0], asked.threads, asked.memory_mb)
+            predicted = cast(Algorithm, first).predict(inner, count_shares)
             every = np.arange(len(asked.xyz))
-            for block in answer.blocks:
+            for block in predicted.blocks:
                 yield Passed(every[block.rows], block.result, None)
-            self.report.update(answer.report)
+            self.report.update(predicted.report)
             return
-        blocks = self._computing(features).blocks(
+        blocks = self._features_of(first.features).blocks(
             self._rows[0], self._handing_on(0), 1.0 - _KEPT, shown=False
         )
         yield from _passed(blocks)
@@ -123,7 +142,11 @@ class PassRun:
     def _handing_on(self, number: int) -> Callable[..., tuple[npt.NDArray[np.uint16], Any]]:
         """What a pass makes of a block: its shares, and the features where the next pass reads the same ones."""
         one, after = self._members[number : number + 2]
-        same = after.features is not None and self._computing(one.features) is self._computing(after.features)
+        same = (
+            one.features is not None
+            and after.features is not None
+            and self._features_of(one.features) is self._features_of(after.features)
+        )
 
         def apply(values, rows, context=None):
             read = values if context is None else joined(values, context)
@@ -132,19 +155,19 @@ class PassRun:
         return apply
 
     def _swept(self, number: int, stream: Iterator[Passed], apply) -> Iterator[tuple[Any, Any]]:
-        one, asked = self._members[number], self._question
+        one, asked = self._members[number], self._request
         again = None
         if one.features is not None:
-            computing = self._computing(one.features)
+            features_here = self._features_of(one.features)
 
             def again(rows, apply_again):
-                return computing.blocks(rows, apply_again, 1.0 - _KEPT, counted=False)
+                return features_here.blocks(rows, apply_again, 1.0 - _KEPT, counted=False)
 
         sweep = Sweep(
             asked.xyz,
             self._rows[number - 1],
             self._rows[number],
-            one.context,
+            _context_of(one),
             self._classes,
             threads=asked.threads,
             keep_bytes=asked.memory_mb * 2**20 * _KEPT / (len(self._members) - 1),
@@ -155,6 +178,12 @@ class PassRun:
 
 def _passed(blocks: Iterable[tuple[npt.NDArray[np.int64], Any]]) -> Iterator[Passed]:
     return (Passed(rows, shares, values) for rows, (shares, values) in blocks)
+
+
+def _context_of(one: Pass) -> Context:
+    """Of a pass after the first, which has one."""
+    assert one.context is not None
+    return one.context
 
 
 def joined(values: npt.NDArray[np.float32], context: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

@@ -13,15 +13,15 @@ import numpy.typing as npt
 
 from ..base.errors import OptionError
 from .algorithms import trainer
-from .clouds import Source, TrainingCloud, prepared, spooled
-from .dimensions import required
-from .heights import ALWAYS, WHERE_THERE, heights, preparation_of
+from .clouds import CloudSource, TrainingCloud, prepared, spooled
+from .dimensions import ALWAYS, WHERE_THERE, required
 from .model import Model
+from .preparing import preparing
 from .trainoptions import TrainingOptions
 
 
 def train(
-    clouds: TrainingCloud | Iterable[Source] | npt.ArrayLike,
+    clouds: TrainingCloud | Iterable[CloudSource] | npt.ArrayLike,
     labels: npt.ArrayLike | TrainingOptions | None = None,
     options: TrainingOptions | None = None,
     *,
@@ -75,8 +75,10 @@ def _prepared(
     xyz: npt.NDArray[np.float64], labels: npt.ArrayLike, options: TrainingOptions
 ) -> tuple[dict[str, npt.NDArray[Any]], TrainingOptions, list[dict[str, Any]]]:
     """Heights of bare points, the options that use them, and the stage that makes them."""
-    if tuple(options.dimensions) == ALWAYS and options.algorithm == "random_forest":
-        options = replace(options, dimensions=(*ALWAYS, *WHERE_THERE))
-    preparation = preparation_of(required(options.inputs))
+    if tuple(options.dimensions) == ALWAYS:
+        more = trainer(options.algorithm).optional_inputs
+        options = replace(options, dimensions=(*ALWAYS, *(name for name in WHERE_THERE if name in more)))
+    preparation = preparing().preparation_of(required(options.inputs))
     usable = ~np.isin(np.asarray(labels), options.ignore)
-    return heights(preparation, xyz, usable, options.threads), options, preparation
+    made = preparing().made_of_coordinates(preparation, xyz, usable, options.threads)
+    return made, options, preparation

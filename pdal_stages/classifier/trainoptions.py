@@ -13,7 +13,7 @@ from ..base.asprs import NOISE
 from ..base.errors import OptionError, suggest
 from ..base.threads import resolve_threads
 from ..features.voxels import LARGEST
-from .algorithms import KINDS, trainer
+from .algorithms import ALGORITHMS, trainer
 from .classes import MAX_LABEL
 from .context import Context
 
@@ -201,8 +201,8 @@ class TrainingOptions:
         resolve_threads(self.threads)
 
     def _check_algorithm(self) -> None:
-        checks.one_of("'algorithm'", self.algorithm, KINDS)
-        for name in KINDS:  # an algorithm's own options stand under its name
+        checks.one_of("'algorithm'", self.algorithm, ALGORITHMS)
+        for name in ALGORITHMS:  # an algorithm's own options stand under its name
             if name != self.algorithm and getattr(self, name, None):
                 raise OptionError(
                     f"'{name}' means something only with algorithm '{name}'", found=self.algorithm

@@ -13,7 +13,7 @@ import numpy as np
 from ..base.jit import CompilationNote, njit
 from ..base.threads import map_blocks
 from .bins import ShapeBins
-from .index import Grid
+from .index import CellGrid
 from .kdtree import KdTree, build_tree
 from .moments import BATCH, FEATURES, MOMENTS, WIDTH, finish
 from .names import MOMENT_FEATURES, SHAPE_FEATURES
@@ -47,7 +47,7 @@ class _Spec:
 class AdaptiveNeighborhoods:
     """A tree over a grid's cloud, built by `threads`, and the adaptive neighborhoods of a plan."""
 
-    def __init__(self, grid: Grid, plan: FeaturePlan, threads: int | None = None) -> None:
+    def __init__(self, grid: CellGrid, plan: FeaturePlan, threads: int | None = None) -> None:
         self.grid, self.halo, self.least = grid, plan.halo, plan.least_members
         fixed = ("cylinder", "sphere")
         self.specs = [_spec(c) for c in plan.layout if c.at and c.neighborhood.kind not in fixed]

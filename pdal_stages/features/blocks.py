@@ -14,7 +14,7 @@ from ..base import checks
 from ..base.errors import DimensionError, OptionError, StageError
 from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
-from .index import Grid, build_grid, check_xyz, cut_blocks
+from .index import CellGrid, build_grid, check_xyz, cut_blocks
 from .plan import FeaturePlan
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class Run:
         self,
         plan: FeaturePlan,
         cloud: np.ndarray,
-        grid: Grid,
+        grid: CellGrid,
         fit: Callable[[], Fitted],
         queries: npt.ArrayLike | None,
         dimensions: Mapping[str, npt.ArrayLike] | None,

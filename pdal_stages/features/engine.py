@@ -15,7 +15,7 @@ from ..base.errors import OptionError, StageError, optional_import, suggest
 from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
 from .blocks import Fitted, Run, Tally, compile_once
-from .index import Grid, build_grid, check_xyz
+from .index import CellGrid, build_grid, check_xyz
 from .plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS, FeaturePlan
 from .samples import smallest_hashes
 
@@ -85,7 +85,7 @@ class FeatureEngine:
         self.bins, self.copt_threshold = bins, copt_threshold
         self._cloud = check_xyz(xyz)
         compile_once("index")
-        self._grid: Grid = build_grid(self._cloud, plan.cell)
+        self._grid: CellGrid = build_grid(self._cloud, plan.cell)
         self._lock = threading.RLock()
         self._parts: tuple[FixedRadius, AdaptiveNeighborhoods | None] | None = None
         self.report: dict[str, Any] = {"points": len(self._grid), "queries": 0, "fewer_than_three": {}}

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from .candidates import LANES
-from .index import Grid
+from .index import CellGrid
 from .names import MOMENT_FEATURES, SHAPE_FEATURES
 from .plan import FeaturePlan
 from .radius import ShapeColumns, count_block, radius_block, radius_values, width_table
@@ -29,7 +29,7 @@ class _Spec:
 class FixedRadius:
     """Kernels' tables for the fixed-radius neighborhoods of `plan` on `grid`, the sorted cloud."""
 
-    def __init__(self, grid: Grid, plan: FeaturePlan) -> None:
+    def __init__(self, grid: CellGrid, plan: FeaturePlan) -> None:
         self.grid = grid
         chosen = [c for c in plan.layout if c.neighborhood.kind in ("cylinder", "sphere") and c.at]
         self.specs = [

@@ -79,7 +79,7 @@ def radius_block(
     Parameters
     ----------
     grid : tuple
-        ``Grid.tables()`` of the cloud.
+        ``CellGrid.tables()`` of the cloud.
     cell : float
         Edge of a grid cell, metres.
     qx, qy, qz : (m,) float64 arrays

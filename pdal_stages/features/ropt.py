@@ -9,7 +9,7 @@ A radius is a candidate where it holds at least ``neighborhoods.LEAST_MEMBERS`` 
 where no radius does, the largest is taken. The curvature of a sphere with fewer is 1/3. Radii that hold the same
 points are equal, and the smallest wins.
 
-The tree must be built over a cloud in canonical order (``index.Grid``): sums run over the members in the
+The tree must be built over a cloud in canonical order (``index.CellGrid``): sums run over the members in the
 order of their shell, then of the cloud.
 """
 

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from ..base.errors import DimensionError, ModelError, OptionError, StageError, suggest
 from ..base.las import extra_dimensions
 from ..base.outputs import check_outputs
-from ..classifier.heights import preparation_of
 from ..classifier.summary import FILE_NUMBER
 from ..stages import preparation
 from ..stages.accuracy import AccuracyStage
+from ..stages.heights import preparation_of
 from ..stages.points import Points
 from . import pdal as pdal_env
 from .filenames import LAS_WRITERS, stage_files

@@ -16,11 +16,10 @@ from ..base.errors import ModelError, StageError
 from ..base.files import check_writable
 from ..base.outputs import Output
 from ..classifier import TrainingCloud, TrainingOptions, summary, train
+from ..classifier.algorithms import ALGORITHMS, Trainer, trainer
 from ..classifier.classes import ClassMap
-from ..classifier.dimensions import required, welcome
-from ..classifier.heights import ALWAYS, WHERE_THERE
+from ..classifier.dimensions import ALWAYS, required, welcome
 from ..classifier.trainoptions import MOST_PASSES
-from ..features.returns import SOURCES
 from ..features.voxels import LARGEST
 from .base import Stage, files_read
 from .options import option
@@ -50,7 +49,7 @@ class ClassifierModel(Stage):
         "string",
         "random_forest",
         "A forest on computed features, or a network on the points themselves (needs PyTorch)",
-        choices=("random_forest", "alsnet"),
+        choices=tuple(ALGORITHMS),
     )
     alsnet: dict | None = option(
         "mapping",
@@ -274,6 +273,10 @@ holds the classes.
         return TrainingOptions(**values, memory_mb=self.memory)
 
     @property
+    def _trainer(self) -> Trainer:
+        return trainer(self.algorithm)
+
+    @property
     def automatic(self) -> bool:
         """Whether the dimensions follow from what the points have."""
         return list(self.dimensions) == [AUTO]
@@ -281,15 +284,16 @@ holds the classes.
     @property
     def wished(self) -> tuple[str, ...]:
         """Dimensions worth making for the training, whether asked for or not."""
-        forest = self.algorithm == "random_forest"
-        return (*ALWAYS, *WHERE_THERE) if self.automatic and forest else tuple(required(self.training.inputs))
+        names = required(self.training.inputs)
+        return (*names, *self._trainer.optional_inputs) if self.automatic else names
 
     def _training_on(self, points: Points) -> TrainingOptions:
         """The trainer's options, with the dimensions that the points have."""
-        if not self.automatic or self.algorithm != "random_forest":
+        if not self.automatic:
             return self.training
-        there = [name for name in WHERE_THERE if name in points.arrays]
-        there += ["returns"] if all(name in points.arrays for name in SOURCES) else []
+
+        optional = self._trainer.optional_inputs
+        there = [name for name, needs in optional.items() if all(one in points.arrays for one in needs)]
         return replace(self.training, dimensions=(*ALWAYS, *there))
 
     def check(self) -> None:
@@ -300,10 +304,7 @@ holds the classes.
             check_writable(output.path, output.what, output.kind)
 
     def outputs(self) -> list[Output]:
-        found = [Output(self.filename, "model", kinds.MODEL)]
-        if self.training.alsnet is not None and self.training.alsnet.checkpoint:
-            found.append(Output(self.training.alsnet.checkpoint, "checkpoint", kinds.CHECKPOINT))
-        return found
+        return [Output(self.filename, "model", kinds.MODEL), *self._trainer.outputs(self.training)]
 
     def reads(self) -> list[str]:
         own = [name for name in (self.survey, self.groups) if name]
@@ -346,7 +347,7 @@ holds the classes.
             points.report["note"] = (
                 f"blocks are held out, not {summary.groups_word(self.groups)}: {crossed['instead']}"
             )
-        if self.algorithm == "alsnet":  # with the curve
+        if self._trainer.reports_training:
             points.report["training"] = model.info["training"]
         return {}
 

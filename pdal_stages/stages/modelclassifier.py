@@ -47,7 +47,7 @@ class ModelClassifier(Stage):
     variance: bool = option(
         "boolean",
         False,
-        "Also write Variance: how much the probabilities vary over a network's batches (alsnet only)",
+        "Also write Variance: how much the probabilities vary over a network's batches (networks only)",
     )
     reject_below: float | None = option(
         "number",

@@ -173,10 +173,10 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
         queries = None if points.mask is None else np.flatnonzero(points.mask[there])
         total = len(there) if queries is None else len(queries)
         own = {name: points.dimension(name)[there] for name in plan.dimensions}
-        few = represent(xyz, self.voxel, own.values(), queries)
-        if few is not None:
-            xyz, queries = xyz[few.rows], few.wanted
-            own = {name: values[few.rows] for name, values in own.items()}
+        representatives = represent(xyz, self.voxel, own.values(), queries)
+        if representatives is not None:
+            xyz, queries = xyz[representatives.rows], representatives.wanted
+            own = {name: values[representatives.rows] for name, values in own.items()}
         engine = FeatureEngine(
             xyz, plan, bins=bins, copt_threshold=threshold, seed=self.seed, threads=self.threads
         )
@@ -193,10 +193,10 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
                 dimensions=own,
                 threads=self.threads,
                 memory_mb=self.memory,
-                progress=progress if few is None else None,
+                progress=progress if representatives is None else None,
             ):  # rows are indices into the engine's cloud, with queries too
-                if few is not None:
-                    rows, place = few.members(rows)
+                if representatives is not None:
+                    rows, place = representatives.members(rows)
                     values = values[place]
                     progress.update(len(rows))
                 rows = there[rows]
@@ -213,7 +213,7 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
             {
                 "neighborhoods": len(plan.neighborhoods),
                 "features": len(names),
-                **({} if few is None else {"representatives": len(few.rows)}),
+                **({} if representatives is None else {"representatives": len(representatives.rows)}),
                 **engine.report,
             }
         )

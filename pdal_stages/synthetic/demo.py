@@ -12,8 +12,8 @@ from pathlib import Path
 from ..base.errors import StageError
 from ..base.files import write_whole
 from ..base.version import __version__
-from ..classifier.heights import PREPARATION
 from ..models import STANDARD
+from ..stages.heights import PREPARATION
 
 #: Classes of the town that the demo tells apart; small ones are left to the reader.
 CLASSES = {

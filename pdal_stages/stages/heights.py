@@ -1,4 +1,4 @@
-"""Heights that a model reads, made of coordinates alone, as the stage before it in a pipeline makes them."""
+"""Heights that a model reads, as stages write them, and made of coordinates alone as those stages make them."""
 
 from __future__ import annotations
 
@@ -10,16 +10,13 @@ import numpy.typing as npt
 
 from ..terrain import filtered_ground, hag_minima
 
-#: What a model is trained on by default: always this, and these where points have them.
-ALWAYS = ("HeightAboveGround",)
-WHERE_THERE = ("Ground", "HeightAboveOpening_5", "HeightAboveOpening_17")
-#: The stage that makes them.
+#: The stage that makes the dimensions a model is trained on by default.
 PREPARATION = ({"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]},)
 #: Its options by the arguments of the function.
 _MORPHOLOGICAL = ("cell", "slope", "window", "threshold", "scalar")
 
 
-def heights(
+def made_of_coordinates(
     preparation: Sequence[Mapping[str, Any]],
     xyz: npt.NDArray[np.float64],
     usable: npt.NDArray[np.bool_] | None = None,

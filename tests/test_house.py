@@ -1,0 +1,30 @@
+"""The house: imports go down only, and private names stay in their room."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent / "pdal_stages"
+FLOORS = (
+    "base models", "features terrain accuracy", "classifier", "alsnet objects", "review reports", "stages", "pipeline",
+    "synthetic tiling", "cli",
+)  # fmt: skip
+FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms.split()}
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.rglob("*.py")), ids=lambda path: str(path.relative_to(ROOT)))
+def test_house(path):
+    own, *rest = path.relative_to(ROOT).with_suffix("").parts
+    for node in ast.walk(ast.parse(path.read_text())) if own != "__init__" else ():
+        if not isinstance(node, ast.ImportFrom) or not node.level:
+            continue
+        module = (*[own, *rest][: -node.level], *(node.module or "").split("."))
+        for room in [module[0]] if module[0] else [alias.name for alias in node.names]:
+            assert room == own or FLOOR[room] < FLOOR[own], f"line {node.lineno}: {own} imports {room}"
+            private = [
+                one.name for one in node.names if one.name.startswith("_") and one.name != "__version__"
+            ]
+            assert room == own or not private, f"line {node.lineno}: {private} of {room}"
