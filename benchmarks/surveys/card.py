@@ -18,7 +18,8 @@ from leave_one_out import tables
 from recipe import DENSITIES, OPTIONS, SAMPLES, SLOPES
 
 from pdal_stages.classifier import load_model
-from pdal_stages.stages.preparation import PREPARATION, as_json
+from pdal_stages.stages.heights import PREPARATION
+from pdal_stages.stages.preparation import as_json
 
 
 def main() -> None:
