@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 
+import laspy
 import numpy as np
 import pytest
 
 from pdal_stages import Filter
 from pdal_stages.base.errors import OptionError, StageError
-from pdal_stages.classifier import load_model
 from pdal_stages.cli import main
 from pdal_stages.models import STANDARD, find, shipped
 from pdal_stages.pipeline import Pipeline
 from pdal_stages.stages.heights import preparation_of
+from pdal_stages.stages.loading import load_model
 from pdal_stages.synthetic import TownOptions, write_town
+from pdal_stages.tiling import run_tiled
 
 
 @pytest.fixture(scope="module")
@@ -40,11 +42,11 @@ def _creates(stage):
     return registry.get(stage["type"])({k: v for k, v in stage.items() if k != "type"}).creates()
 
 
-def test_a_file_of_that_name_comes_first(tmp_path, monkeypatch):
+def test_a_file_of_that_name_does_not_stand_in_for_it(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert find(STANDARD) == str(shipped()[STANDARD]) and find("other.model") == "other.model"
     (tmp_path / STANDARD).write_text("mine")
-    assert find(STANDARD) == STANDARD
+    assert find(STANDARD) == str(shipped()[STANDARD]) and find(f"./{STANDARD}") == f"./{STANDARD}"
 
 
 @pytest.mark.pdal
@@ -142,3 +144,29 @@ def classified(town, **options):
 def test_vegetation_heights_that_mean_nothing(wrong):
     with pytest.raises(OptionError, match="vegetation_heights"):
         Filter.modelclassifier(model=STANDARD, vegetation_heights=wrong)
+
+
+@pytest.mark.pdal
+def test_a_shipped_model_by_name_in_tiles(town, tmp_path, monkeypatch):
+    """In processes of their own as well, and whatever the current folder holds."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / STANDARD).write_text("mine")
+    preparation = load_model(STANDARD).info["preparation"]
+
+    def job(target):
+        return [str(town), *preparation, {"type": "filters.modelclassifier", "model": STANDARD}, target]
+
+    Pipeline(job("whole.laz")).execute(arrays=False)
+    for workers in (0, 2):
+        run = run_tiled(job(f"tiles{workers}.laz"), 60, workers=workers, progress=False)
+        assert not run.failures
+        whole, tiles = laspy.read("whole.laz"), laspy.read(f"tiles{workers}.laz")
+        assert np.array_equal(whole.classification, tiles.classification)
+    (path,) = tmp_path.glob("tiles2.laz")
+    assert main(["pipeline", str(write(tmp_path, job(str(path)))), "--tile", "60", "--workers", "0"]) == 0
+
+
+def write(folder, stages):
+    path = folder / "job.json"
+    path.write_text(json.dumps(stages))
+    return path

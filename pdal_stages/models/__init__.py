@@ -14,6 +14,9 @@ def shipped() -> dict[str, Path]:
 
 
 def find(name: str) -> str:
-    """The file of a model: of a shipped one by its name, unless a file of that name is there."""
+    """The file of a model: of a shipped one by its name; a file in the current folder that is called so is ``./name``.
+
+    So what is run does not depend on what lies in the folder, which others may write to.
+    """
     path = shipped().get(name)
-    return name if path is None or Path(name).exists() else str(path)
+    return name if path is None else str(path)

@@ -9,6 +9,7 @@ from typing import Any
 
 from ..base import kinds
 from ..base.outputs import Output
+from ..models import find
 from ..stages.base import Stage
 
 #: Writers of LAS and what is made of it.
@@ -71,8 +72,9 @@ def _is_file(text: str) -> bool:
 def stage_files(stage: Stage) -> list[str]:
     """Files that a stage of ours reads."""
     written = {output.path for output in stage.outputs()}
-    given = [stage.options[o.name] for o in stage.all_options() if o.kind == "filename"]
-    return [name for name in given if name and name not in written]
+    given = [(o.kind, stage.options[o.name]) for o in stage.all_options() if o.kind in ("filename", "model")]
+    found = [find(name) if kind == "model" else name for kind, name in given if name]
+    return [name for name in found if name not in written]
 
 
 def is_writer(stage: dict[str, Any], stages: list[dict[str, Any]]) -> bool:

@@ -59,7 +59,7 @@ class AccuracyStage(Stage):
     html: str | None = option("filename", None, "Write a report with maps to this HTML file")
     title: str = option("string", "Classification accuracy", "Heading of the report")
     model_file: str | None = option(
-        "filename",
+        "model",
         None,
         "Model file whose classes are scored and whose importances the report shows; default: that of the "
         "filters.modelclassifier before",

@@ -32,7 +32,7 @@ class ModelClassifier(Stage):
     where_chooses = True
     where_help = "Points outside keep their class but still serve as neighbors."
     model_file: str = option(
-        "filename",
+        "model",
         None,
         "The model file to apply, or the name of a shipped one (standard)",
         required=True,

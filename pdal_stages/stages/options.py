@@ -20,6 +20,7 @@ _KINDS: dict[str, tuple[str | list[str], str]] = {
     "string": ("string", "text"),
     "boolean": (["boolean", "string"], "true or false"),
     "filename": ("string", "a file name"),
+    "model": ("string", "a model file, or the name of a shipped model"),
     "expression": ("string", 'a condition such as "Classification == 2"'),
     "list": _LISTED,
     "codes": _LISTED,
@@ -116,7 +117,7 @@ class Option:
     def _parse_string(self, value: Any) -> str:
         if not isinstance(value, str):
             raise self._wrong(value)
-        if self.kind in ("filename", "expression") and not value.strip():
+        if self.kind in ("filename", "model", "expression") and not value.strip():
             raise OptionError(
                 f"option '{self.name}' is empty", cure=f"Give {_KINDS[self.kind][1]}, or leave it out"
             )

@@ -11,6 +11,7 @@ from typing import Any
 from ..base import kinds
 from ..base.errors import PipelineError, StageError
 from ..base.outputs import Output, check_outputs
+from ..models import shipped
 from ..pipeline.filenames import writes_las
 from ..pipeline.run import Pipeline
 from ..stages.base import Stage
@@ -229,11 +230,15 @@ def _check_local(step: _Step, buffer: float | None) -> None:
 
 
 def _narrowed(step: _Step, later: float) -> dict[str, Any]:
-    """A stage of the head for a tile: absolute paths, and only points computed that someone will see."""
+    """A stage of the head for a tile: absolute paths, and only points computed that someone will see.
+
+    A shipped model keeps its name: on another host it lies elsewhere.
+    """
     stage, ours = dict(step.given), step.ours
     if ours is not None:
         for option in ours.all_options():
-            if option.kind == "filename" and stage.get(option.name):
+            name = stage.get(option.name)
+            if name and (option.kind == "filename" or (option.kind == "model" and name not in shipped())):
                 stage[option.name] = str(Path(stage[option.name]).absolute())
         if ours.where_chooses:
             seen_to = later + ours.inner_reach()
