@@ -111,7 +111,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--data", default=os.environ.get("PDAL_STAGES_DATA"))
-    parser.add_argument("--work", default="real-clouds", help="folder for models, clouds and reports")
+    parser.add_argument("--work", default=".real-clouds", help="folder for models, clouds and reports")
     parser.add_argument("--only", choices=list(CLOUDS))
     parser.add_argument("--json", help="write the figures here")
     parser.add_argument("--pictures", type=Path, help="folder for pictures")
