@@ -8,6 +8,7 @@ from sphinx.errors import ConfigError
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 try:
+    import robustness_cases
     import stage_pages
 
     from pdal_stages import __version__
@@ -18,6 +19,7 @@ except ModuleNotFoundError as error:
     ) from None
 
 stage_pages.write()
+robustness_cases.write()
 
 project = "pdal_stages"
 author = "the pdal_stages authors"
@@ -37,4 +39,3 @@ html_static_path = ["static"]
 html_css_files = ["custom.css"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # docstrings say shapes and units; NumPy's own names of types fill ten lines
-suppress_warnings = ["myst.xref_missing"]

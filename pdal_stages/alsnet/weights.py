@@ -78,8 +78,9 @@ class Folded:
     def _shared(self, prefix: str, values: npt.NDArray[np.float32], depth: int) -> npt.NDArray[np.float32]:
         for step in range(1, depth + 1):
             matrix, bias = self._layers[f"{prefix}_{step}"]
-            values = values @ matrix
-            values += bias
+            with np.errstate(all="ignore"):  # scores that are not finite are an error in the end
+                values = values @ matrix
+                values += bias
             np.maximum(values, 0.0, out=values)
         return values
 

@@ -69,8 +69,3 @@ def model(shared, cloud) -> Path:
         ]
     )
     return path
-
-
-def pytest_sessionfinish(session):
-    if kit.WRITE_TO and kit.SEEN:
-        kit.write_table(Path(kit.WRITE_TO))
