@@ -118,7 +118,7 @@ if first or (ins['X'].min() > 60 and ins['Y'].max() < 20):
 def test_failing_tiles_are_tried_again_a_bounded_number_of_times(tmp_path, folder):
     count = tmp_path / "count"
     body = "if ins['X'].min() < 1 and ins['Y'].min() < 1:\n"
-    body += f"    open({str(count)!r}, 'a').write('x')\n    raise ValueError('odd')"
+    body += f"    with open({str(count)!r}, 'a') as file: file.write('x')\n    raise ValueError('odd')"
     run = run_tiled(
         pipeline(folder, tmp_path / "o_#.laz", python_filter(body)), 20, workers=0, retries=3, buffer=0.0
     )
@@ -151,7 +151,8 @@ def test_full_disk_leaves_nothing_half_written(tmp_path, folder, expected):
     assert run.returncode == 1, err
     assert not list(tmp_path.glob("o_*")) and not clouds.hidden(tmp_path)
     run = command(tmp_path / "job.json", stages, "--workers", "0", "--resume")
-    assert run.wait(300) == 0
+    run.communicate(timeout=300)
+    assert run.returncode == 0
     check_same(tmp_path, expected)
 
 
