@@ -87,28 +87,135 @@ def test_flags_of_old_files_stay_flags_in_new_ones(tmp_path, capsys, write_las, 
     same_flags(before, after)
 
 
-def test_flags_beside_files_without_room_for_them_are_refused_before_work(tmp_path, capsys, write_las, model):
+NEWER = {"minor_version": 4, "dataformat_id": 6}
+
+
+def all_flags(las):
+    return np.array([np.asarray(las[name]) for name in ("synthetic", "key_point", "withheld")])
+
+
+@pytest.mark.parametrize("wiring", ["plain", "tags", "pattern", "filters before"])
+def test_old_and_new_files_together(tmp_path, capsys, write_las, wiring):
+    """Old PDAL reads the flags of one as bits of the class, of the other apart."""
+    old = write_las(tmp_path / "a_old.las", flagged(), point_format=1)
+    new = write_las(tmp_path / "b_new.las", flagged(2), point_format=6)
+    out = {"type": "writers.las", "filename": str(tmp_path / "o.las"), **NEWER}
+    heights = {"type": "filters.hag_minima", "ignore": "withheld"}
+    readers = {
+        "plain": [str(new), str(old)],
+        "tags": [{"filename": str(new), "tag": "n"}, {"filename": str(old), "tag": "o"}],
+        "pattern": [str(tmp_path / "*_*.las")],
+        "filters before": [str(new), {"type": "filters.range", "limits": "Z[-100:]"}, str(old)],
+    }[wiring]
+    if wiring == "tags":
+        heights["inputs"] = ["n", "o"]
+    (tmp_path / "job.json").write_text(json.dumps([*readers, heights, out]))
+    code, _, err = run(capsys, "pipeline", tmp_path / "job.json")
+    assert code == 0, err
+    made, parts = laspy.read(tmp_path / "o.las"), [laspy.read(new), laspy.read(old)]
+    if wiring == "pattern":
+        parts.reverse()
+    for name in ("x", "y", "classification"):
+        assert np.array_equal(made[name], np.concatenate([np.asarray(part[name]) for part in parts])), name
+    assert np.array_equal(all_flags(made), np.hstack([all_flags(part) for part in parts]))
+    assert not list(made.point_format.extra_dimension_names)
+
+
+def test_training_on_old_and_new_files(tmp_path, capsys, write_las):
+    """Withheld points teach nothing, of either kind."""
+    models = []
+    for point_formats in ((1, 6), (6, 6)):
+        files = [
+            write_las(tmp_path / f"{n}.las", flagged(n), point_format=f) for n, f in enumerate(point_formats)
+        ]
+        words = ["train", *files, "--model", tmp_path / "m.model", "--neighborhoods", "k8", "--count", 50]
+        more = ["--writers.classifiermodel.trees=2", "--writers.classifiermodel.passes=1"]
+        code, _, err = run(capsys, *words, *more, "--writers.classifiermodel.threads=1")
+        assert code == 0, err
+        models.append(ps.load_model(tmp_path / "m.model").passes[0].arrays())
+    assert all(np.array_equal(models[0][key], models[1][key]) for key in models[0])
+
+
+@pytest.mark.parametrize("tiles", [False, True])
+@pytest.mark.parametrize("order", ["las first", "las last", "tagged"])
+def test_an_old_file_and_its_text_or_raster(tmp_path, capsys, write_las, model, order, tiles):
+    """A second writer that is none of LAS gets classes, the first flags and classes as they were read."""
+    arrays = flagged()
+    source = write_las(tmp_path / "in.las", arrays, point_format=1)
+    las = {"type": "writers.las", "filename": str(tmp_path / "o.las"), "forward": "all", "extra_dims": "all"}
+    text = {"type": "writers.text", "filename": str(tmp_path / "o.txt"), "order": "X,Y,Z,Classification"}
+    text["keep_unspecified"] = False
+    raster = {
+        "type": "writers.gdal",
+        "filename": str(tmp_path / "o.tif"),
+        "resolution": 2,
+        "dimension": "Classification",
+    }
+    raster["output_type"] = "max"
+    if order == "tagged":
+        las["inputs"], raster["tag"], raster["inputs"], text["inputs"] = "r", "r", "t", "m"
+        writers = [{**text, "tag": "t"}, raster, las]
+    else:
+        writers = [las, raster, text] if order == "las first" else [raster, text, las]
+    classify = {"type": "filters.modelclassifier", "model": str(model), "ignore": "", "tag": "m"}
+    (tmp_path / "job.json").write_text(
+        json.dumps([str(source), {"type": "filters.hag_minima"}, classify, *writers])
+    )
+    if tiles and order == "tagged":
+        pytest.skip("tiles take no inputs there")
+    words = ["--tile", 1000, "--workers", 0, "--per", "tile"] if tiles else []
+    code, _, err = run(capsys, "pipeline", tmp_path / "job.json", *words)
+    assert code == 0, err
+    made = laspy.read(tmp_path / "o.las")
+    assert made.header.point_format.id == 1 and "ClassFlags" not in made.point_format.extra_dimension_names
+    same_flags(laspy.read(source), made)
+    assert set(np.unique(made.classification)) == {2, 6}
+    listed = np.loadtxt(tmp_path / "o.txt", delimiter=",", skiprows=1)
+    assert np.array_equal(listed[:, 3], np.asarray(made.classification))
+
+
+def test_writers_of_both_are_refused_before_work(tmp_path, capsys, write_las, model):
     if pdal_env.splits_class_flags():
         pytest.skip("PDAL 2.6 and newer read flags as dimensions of their own")
     old = write_las(tmp_path / "old.las", flagged(), point_format=1)
-    new = write_las(tmp_path / "new.las", scene(2), point_format=6)
+    new = {"type": "writers.las", "filename": str(tmp_path / "o4.las"), **NEWER}
     stages = [
         str(old),
-        str(new),
-        {"type": "filters.hag_minima"},
-        {"type": "writers.las", "filename": str(tmp_path / "o.las"), "minor_version": 4, "dataformat_id": 6},
+        {**new, "filename": str(tmp_path / "o2.las"), "minor_version": 2, "dataformat_id": 1},
+        new,
     ]
     (tmp_path / "job.json").write_text(json.dumps(stages))
     code, _, err = run(capsys, "pipeline", tmp_path / "job.json")
     assert code == 1 and "flags" in err and "pdal-stages pipeline" in err
-    # The cure works.
-    convert = [str(old), {**stages[-1], "filename": str(tmp_path / "converted.las"), "forward": "all"}]
+    # The cure works, and leaves no dimension that was not there.
+    convert = [str(old), {**new, "filename": str(tmp_path / "c.las"), "forward": "all", "extra_dims": "all"}]
     (tmp_path / "convert.json").write_text(json.dumps(convert))
     assert run(capsys, "pipeline", tmp_path / "convert.json")[0] == 0
-    same_flags(laspy.read(old), laspy.read(tmp_path / "converted.las"))
-    stages[0] = str(tmp_path / "converted.las")
+    made = laspy.read(tmp_path / "c.las")
+    same_flags(laspy.read(old), made)
+    assert not list(made.point_format.extra_dimension_names)
+
+
+@pytest.mark.parametrize("tiles", [False, True])
+def test_all_extra_dimensions_of_a_new_file(tmp_path, capsys, write_las, tiles):
+    """Old PDAL counted flags among them."""
+    arrays = flagged() | {"Amplitude": np.arange(900, dtype="f4"), "Linearity": np.arange(900, dtype="f8")}
+    source = write_las(tmp_path / "in.laz", arrays, point_format=7)
+    stages = [
+        str(source),
+        {"type": "filters.ferry", "dimensions": "Classification=>Reference"},
+        {"type": "filters.hag_minima"},
+        {"type": "writers.las", "filename": str(tmp_path / "o.las"), "extra_dims": "all", **NEWER},
+    ]
     (tmp_path / "job.json").write_text(json.dumps(stages))
-    assert run(capsys, "pipeline", tmp_path / "job.json")[0] == 0
+    words = ["--tile", 20, "--workers", 0] if tiles else []
+    code, _, err = run(capsys, "pipeline", tmp_path / "job.json", *words)
+    assert code == 0, err
+    made = laspy.read(tmp_path / "o.las")
+    names = list(made.point_format.extra_dimension_names)
+    assert names == ["Red", "Green", "Blue", "Amplitude", "Linearity", "Reference", "HeightAboveGround"]
+    assert np.array_equal(made.Amplitude, arrays["Amplitude"])
+    same_flags(laspy.read(source), made)
 
 
 def test_kept_codes_that_do_not_fit_are_refused_before_work(tmp_path, capsys, write_las, model):

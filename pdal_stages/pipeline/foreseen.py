@@ -10,6 +10,7 @@ from ..base.errors import DimensionError, PipelineError
 from ..base.las import extra_dimensions, read_header
 from ..stages import preparation
 from ..stages.points import MAKERS
+from . import classflags
 from .filenames import reader_files
 from .lowering import Lowered, LoweredStage
 
@@ -55,9 +56,7 @@ def _may_be_there(name: str, ours: LoweredStage, lowered: Lowered) -> bool:
     made_by_ours = {one.index for one in lowered.ours}
     for index, stage in enumerate(lowered.stages[: ours.index]):
         kind = str(stage.get("type") or "readers.")
-        if index in made_by_ours or (
-            kind == "filters.python" and "ClassFlags=uint8_t" in stage.get("add_dimension", [])
-        ):
+        if index in made_by_ours or classflags.is_ours(stage):
             continue
         if kind.startswith("readers."):
             if _reader_may_have(name, stage):

@@ -10,13 +10,14 @@ import copy
 import difflib
 import itertools
 import uuid
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
 from ..base.errors import PipelineError, StageError, suggest
 from ..stages import preparation, registry
 from ..stages.base import Stage
-from . import classflags
+from . import classflags, extradims
 from .optionfile import settled
 from .read import PipelineSource
 from .runtime import TRAMPOLINE, made, place, python_filter
@@ -59,25 +60,23 @@ def lower(source: PipelineSource, whole: bool = True) -> Lowered:
         Where a stage type or option of ours is wrong; PDAL's own stages are left to PDAL.
     """
     stages: list[dict[str, Any]] = []
-    for index, given in enumerate(source.stages):
+    for place_of, given in enumerate(source.stages):
         # File names stand for readers and writers; PDAL tells which, so they stay without a type.
         stages.append(copy.deepcopy(given) if isinstance(given, dict) else {"filename": given})
-        _refuse_near_miss(stages[-1], source.where(index))
+        _refuse_near_miss(stages[-1], source.where(place_of))
     views = _Views()
     out = Lowered([])
     check_copc(stages)
     check_vectors(stages)
-    parted = classflags.splitter(stages) if whole else None
     tags = {str(s["tag"]) for s in stages if "tag" in s}
-    for index, stage in enumerate(stages):
+    numbered: Iterable[tuple[dict[str, Any], int | None]] = zip(stages, itertools.count(), strict=False)
+    for stage, index in classflags.wired(stages) if whole else numbered:
         type_name = stage.get("type", "")
-        where = source.where(index)
-        if type_name not in registry.stages():
-            views.add(stage, last=0 < index == len(stages) - 1)
+        if index is None or type_name not in registry.stages():
+            views.add(stage, last=index is not None and 0 < index == len(stages) - 1)
             out.stages.append(stage)
-            if parted is not None and index == parted[1]:
-                out.stages.append(parted[0])
             continue
+        where = source.where(index)
         try:
             if views.reaching(stage) > 1:  # points of several readers
                 merge: dict[str, Any] = {"type": "filters.merge"}
@@ -96,6 +95,7 @@ def lower(source: PipelineSource, whole: bool = True) -> Lowered:
         views.add(stage)
         out.ours.append(lowered)
         out.stages.append(lowered.plain)
+    out.stages = extradims.settle(out.stages)
     _tell_preparations(out)
     check_writers(out.stages, [(ours.stage, ours.place, ours.index) for ours in out.ours])
     return out

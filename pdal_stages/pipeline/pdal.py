@@ -343,6 +343,11 @@ def writes_numbered_features() -> bool:
     return version() >= (2, 5, 0)
 
 
+def knows_class_flags() -> bool:
+    """Whether writers know that `ClassFlags` is no extra dimension of LAS 1.4 (PDAL 2.2 does not)."""
+    return version() >= (2, 3, 0)
+
+
 #: Dimensions of newer PDAL for the flags of a point.
 FLAGS = ("Synthetic", "KeyPoint", "Withheld", "Overlap")
 

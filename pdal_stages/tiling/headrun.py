@@ -79,7 +79,7 @@ def run_head(
             if kind is not None and kind.open_ended and not everything:
                 reach = reaches[len(stages) - 1] = _Reach(context.grid.box(tile), later)
                 stages.append(callbacks.filter(reach))
-        pipeline = Pipeline(stages)
+        pipeline = Pipeline(stages, whole=False)
         ours_there = [(ours.stage, ours.place, ours.index) for ours in pipeline.lowered.ours]
         check_writers([*pipeline.lowered.stages, *plan.tail], ours_there)
         for ours in pipeline.lowered.ours:

@@ -13,7 +13,7 @@ from ..base.complete import check_complete
 from ..base.errors import StageError
 from ..base.files import whole_files
 from ..base.las import supersede_copc
-from ..pipeline import classflags
+from ..pipeline import classflags, extradims
 from ..pipeline import pdal as pdal_env
 from ..pipeline.callbacks import Callbacks
 from .results import NewValues
@@ -35,24 +35,30 @@ def run_tail(
         check_complete(made, final, writers[number], None if "where" in writers[number] else run.count)
         supersede_copc(made)
 
+    flags = classflags.parting([*readers, *tail])
     with Callbacks() as callbacks:
         stages: list[dict[str, Any]] = []
+        inputs = []
         for number, (reader, values) in enumerate(zip(readers, new, strict=True)):
             stages.append({**reader, "tag": f"in{number}"})
             stages += _put(callbacks, values, f"in{number}", f"put{number}")
-        inputs = [f"put{number}" for number in range(len(readers))]
+            inputs.append(f"put{number}")
+            if flags.way == "split" and flags.old[number]:
+                stages.append(classflags.splitter(inputs=[f"put{number}"], tag=f"split{number}"))
+                inputs[-1] = f"split{number}"
         stages.append({"type": "filters.merge", "inputs": inputs})
-        parted = classflags.splitter([*readers, *tail])
-        if parted is not None:
-            stages.append(parted[0])
+        tail = [{k: v for k, v in stage.items() if k != "inputs"} for stage in tail]
+        if flags.way == "around":
+            tail = [stage for stage, _ in classflags.around(tail)]
         with whole_files(*outputs, check=finish) as partials:
             waiting = iter(partials)
             for stage in tail:
-                stage = {k: v for k, v in stage.items() if k != "inputs"}
-                if stage["type"].startswith("writers."):
-                    stage["filename"] = str(next(waiting))
-                stages.append(stage)
-            run = pdal_env.execute(stages, arrays=False)
+                stages.append(
+                    {**stage, "filename": str(next(waiting))}
+                    if stage["type"].startswith("writers.")
+                    else stage
+                )
+            run = pdal_env.execute(extradims.settle(stages), arrays=False)
     return written(outputs, run.count)
 
 

@@ -75,7 +75,7 @@ def run_tiled(
     plan = make_plan(pipeline, chosen.buffer)
     survey = Survey(plan, chosen)
     if survey.per == "tile":  # whose outputs have points of all readers
-        classflags.splitter([*plan.readers, *plan.tail])
+        classflags.parting([*plan.readers, *plan.tail])
     if dry_run:
         return estimate(plan, survey, chosen)
     folder = _folder(plan)
