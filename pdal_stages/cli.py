@@ -138,7 +138,7 @@ def _unforeseen(error: Exception) -> StageError:
 
 
 def _end_at_once(options: argparse.Namespace) -> None:
-    """Ctrl-C ends the program although PDAL works: Python hears nothing meanwhile. The next run sweeps up."""
+    """Ctrl-C ends the program although PDAL works: Python cannot handle signals meanwhile. The next run sweeps up."""
     if options.is_program and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 

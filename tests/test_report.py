@@ -39,7 +39,7 @@ class Page(HTMLParser):
         self.text = re.sub(r"\s+", " ", " ".join(self.words))
 
     def handle_starttag(self, tag, attrs):
-        assert len(dict(attrs)) == len(attrs), f"an attribute of <{tag}> stands twice"
+        assert len(dict(attrs)) == len(attrs), f"duplicate attribute of <{tag}>"
         self.tags.append((tag, dict(attrs)))
         if tag not in VOID:
             self.open.append(tag)

@@ -216,7 +216,7 @@ class Accuracy:
                 cure="Give one row per class, and one column per class and extra class",
             )
         if len(set(rows + more)) != len(rows) + len(more):
-            raise StageError("a class stands twice in the confusion matrix", found=rows + more)
+            raise StageError("duplicate class in the confusion matrix", found=rows + more)
         whole = np.array(counts, dtype=np.int64)
         if (whole != counts).any() or (whole < 0).any():
             raise StageError("a confusion matrix holds counts: whole numbers of 0 or more")

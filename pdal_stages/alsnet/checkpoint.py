@@ -90,7 +90,7 @@ def load(
 
 def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
     if info.compress_type != zipfile.ZIP_STORED:
-        raise ModelError("a member is packed in a way not used here", found=repr(info.filename)[:60])
+        raise ModelError("a member has an unsupported compression", found=repr(info.filename)[:60])
     return archive.read(info)
 
 

@@ -88,7 +88,7 @@ def _las(file: BinaryIO, size: int, count: int | None, writer: Mapping[str, Any]
         check_readable(file.name)
     except StageError:
         return False
-    # The count is written last: none of it, but points and no records after them, is a header left behind.
+    # The count is written last: none of it, but points and no records after them, means the header was never updated.
     if not header.count and not header.records_after and size >= header.offset + header.point_bytes:
         return header.compressed
     if count is not None and header.count != count:

@@ -39,7 +39,9 @@ def what_is_wrong(
         return "its record of the octree is cut short", f"{len(data)} bytes"
     box = struct.unpack_from("<5d", data)
     if not all(map(math.isfinite, box)) or box[3] <= 0 or box[4] <= 0:
-        return "its octree has no place", "center, half size and spacing " + ", ".join(f"{v:g}" for v in box)
+        return "its octree has an invalid extent", "center, half size and spacing " + ", ".join(
+            f"{v:g}" for v in box
+        )
     pages, seen = [struct.unpack_from("<2Q", data, 40)], set()
     nodes: dict[tuple[int, ...], tuple[int, int, int]] = {}
     while pages:

@@ -95,7 +95,7 @@ def device(function: Callable | None = None, **options):
 
 
 def intrinsic(function: Callable) -> Any:
-    """numba's, for instructions that it has no word for; the function gets numba's types before those of its arguments."""
+    """numba's, for instructions that it has no equivalent of; the function gets numba's types first."""
     numba = _numba()
     typed = update_wrapper(lambda context, *given: function(numba.types, *given), function)
     made = numba.extending.intrinsic(typed)

@@ -92,7 +92,7 @@ def check_readable(path: str | os.PathLike) -> str | None:
         raise StageError("the file cannot be read", where=str(path), found=error) from None
     if header is None:
         raise StageError(
-            "this is no LAS file", where=str(path), found=f"{size:,} bytes without a LAS header", cure=_CURE
+            "not a LAS file", where=str(path), found=f"{size:,} bytes without a LAS header", cure=_CURE
         )
     if wrong:
         raise StageError(f"the LAS file is damaged: {wrong[0]}", where=str(path), found=wrong[1], cure=_CURE)
@@ -129,7 +129,10 @@ def _what_is_wrong(header: LasHeader, size: int, table: int) -> tuple[str, str] 
     if not all(math.isfinite(v) and v != 0 for v in header.scales) or not all(
         map(math.isfinite, header.offsets)
     ):
-        return "its scales or offsets are no numbers", f"scales {header.scales}, offsets {header.offsets}"
+        return (
+            "its scales or offsets are not valid numbers",
+            f"scales {header.scales}, offsets {header.offsets}",
+        )
     if header.count and header.offset > size:
         return "it is cut short", f"{size:,} bytes, points begin at {header.offset:,}"
     if header.compressed:
@@ -251,7 +254,7 @@ _EXTRA_TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64",
 def extra_dimensions(path: str | os.PathLike) -> dict[str, str]:
     """Extra dimensions that a LAS file describes, by name: the types PDAL holds them in. Empty where there are none.
 
-    Scaled ones are ``double``; those that are no numbers are left out.
+    Scaled ones are ``double``; those that are not valid numbers are left out.
     """
     found: dict[str, str] = {}
     try:

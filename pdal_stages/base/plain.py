@@ -1,4 +1,4 @@
-"""Text for terminals: names and texts from files may hold characters that command one, or turn its lines round."""
+"""Text for terminals: names and texts from files may hold control characters, or turn its lines round."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""JSON without what JSON has not: NaN, infinities (also written as 1e999), keys that stand twice."""
+"""Strict JSON: no NaN, no infinities (also written as 1e999), no duplicate keys."""
 
 from __future__ import annotations
 
@@ -34,5 +34,5 @@ def _finite(word: str) -> float:
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     out = dict(pairs)
     if len(out) != len(pairs):
-        raise ValueError("a key stands twice in one object")
+        raise ValueError("duplicate key in one object")
     return out

@@ -39,7 +39,7 @@ def named_unit(name: str, option: str) -> float:
         return NAMED[name.strip().lower()]
     except KeyError:
         raise OptionError(
-            f"'{option}' is no unit of length that is known here",
+            f"'{option}' is not a known length unit",
             found=repr(name),
             cure=f"{suggest(name, NAMED)}Known units: {', '.join(NAMED)}",
         ) from None

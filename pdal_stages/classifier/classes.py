@@ -168,7 +168,7 @@ def _labels(text: Any) -> tuple[int, ...]:
             raise OptionError("'classes' has a key that is no list of labels", found=repr(text), cure=_CURE)
         first, last = int(span[1]), int(span[2] or span[1])
         if last < first or last > MAX_LABEL:
-            raise OptionError("'classes' has a range of labels that is none", found=part.strip(), cure=_CURE)
+            raise OptionError("'classes' has an invalid label range", found=part.strip(), cure=_CURE)
         labels.extend(range(first, last + 1))
     return tuple(dict.fromkeys(labels))
 

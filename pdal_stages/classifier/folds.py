@@ -1,6 +1,6 @@
 """Parts of the training ground that are held out in turn, and what a pass says of those it has not seen.
 
-Parts are whole surveys where there are several, else strips. A forest knows the labels of its own samples by heart.
+Parts are whole surveys where there are several, else strips. A forest has memorized the labels of its own samples.
 Probabilities it gave them would teach the next pass to trust labels that nobody knows elsewhere: so the context that
 the next pass is trained on comes from forests that have not seen it.
 """
@@ -47,7 +47,7 @@ class Folds:
 
         Parameters
         ----------
-        clouds : iterable, again and again, of ((n, 3) float64 coordinates in metres, (n,) class positions)
+        clouds : re-iterable of ((n, 3) float64 coordinates in metres, (n,) class positions)
             A position of -1 is not trained on.
         surveys : sequence of str
             The survey of each cloud.

@@ -271,7 +271,7 @@ class Model:
             )
             out["warning"] = (
                 f"the cloud has {found:.3g} points/m2, the model was trained on "
-                f"{low if low == high else f'{low} to {high}'}{lonely}. Expect worse classes, or train with 'thin'"
+                f"{low if low == high else f'{low} to {high}'}{lonely}. Expect lower accuracy, or train with 'thin'"
             )
         return out
 

@@ -159,7 +159,7 @@ def _check_end(stream) -> int:
     if disk or first or here != total or not 1 <= total <= MEMBER_LIMIT or length > MEMBER_LIMIT * 512:
         raise ModelError("the model file's list of members is not right", found=f"{total} members")
     if offset + length + _END.size != size:
-        raise ModelError("the model file has bytes that belong to nothing")
+        raise ModelError("the model file has bytes outside any member")
     stream.seek(0)
     return size
 
@@ -170,7 +170,7 @@ def _read(archive: zipfile.ZipFile, size: int, rules_of) -> tuple[dict[str, Any]
         if info.filename in members:
             raise ModelError("the model file has a member twice", found=repr(info.filename))
         if info.flag_bits & 0x1 or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise ModelError("a member is packed in a way not used here", found=repr(info.filename))
+            raise ModelError("a member has an unsupported compression", found=repr(info.filename))
         members[info.filename] = info
     declared = sum(info.file_size for info in members.values())
     if declared > RATIO_LIMIT * size + ALLOWANCE:

@@ -91,7 +91,7 @@ def _extra_dims(source: str, made: dict[str, str], wanted: Sequence[str]) -> str
     for name in wanted:
         if name not in ("all", "none", *names) and list(wanted) != list(WRITTEN):
             raise OptionError(
-                "--dimensions names what is not made",
+                "--dimensions names a dimension no stage creates",
                 found=name,
                 cure=f"{suggest(name, names)}There are {', '.join(names)}; or all, or none",
             )

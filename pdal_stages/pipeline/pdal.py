@@ -109,7 +109,7 @@ def execute(
     try:
         text = json.dumps(adapted(stages))
     except (TypeError, ValueError) as error:  # a pipeline of Python objects that are not JSON
-        raise PipelineError("the pipeline holds what JSON cannot say", found=str(error)) from None
+        raise PipelineError("the pipeline contains values JSON cannot represent", found=str(error)) from None
     pipeline = None
     try:
         pipeline = pdal.Pipeline(text, loglevel=loglevel)

@@ -85,7 +85,7 @@ class HagMorphological(Stage):
     details = """
 The lowest point of every cell of a grid is taken, pits (low outliers) left out, and the grid opened with windows of
 growing radius: a cell that a window lowers by more than `slope` times its radius, or by 3.5 m, belongs to an object.
-A surface is led through what is left, ground that was taken from ridges and dams is regained where it continues the
+A surface is fitted through what is left, ground that was taken from ridges and dams is regained where it continues the
 surface, and points within `threshold` plus `scalar` times the terrain's slope of it are ground. A point's height is its
 Z minus the surface through the ground points. `Classification` is read for `ignore` alone and not changed;
 return numbers are not looked at.

@@ -99,7 +99,7 @@ class ModelClassifier(Stage):
 Computes the features the model needs block by block and classifies them at once, so memory does not grow with their
 number. A model asked for a dimension that the points lack names the dimension and the stage that makes it.
 `Reliability` is the probability of the winning class. `smooth` (1 m, say)
-makes classes calmer: a point's probabilities become half its own and half the mean over its neighbors, as far as
+reduces speckle: a point's probabilities become half its own and half the mean over its neighbors, as far as
 these are classified too; class, reliability and margin follow.
 Noise and withheld points would spoil the features of all around them, so by default these are as good as not there
 (`ignore`), and keep their class. `keep` names what is a neighbor but is not overwritten. Both are counted in the
@@ -175,7 +175,7 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
             return None
         return (
             f"{self.type}: the model was trained on other heights than this pipeline makes. Trained on: "
-            f"{as_json(self.preparation)}. Here: {as_json(preparation)}. Expect worse classes, or use the former"
+            f"{as_json(self.preparation)}. Here: {as_json(preparation)}. Expect lower accuracy, or use the former"
         )
 
     def most_neighbors(self) -> int:

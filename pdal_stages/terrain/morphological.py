@@ -1,7 +1,7 @@
-"""Height above filtered ground: a progressive morphological filter that tiles cannot tell from the whole.
+"""Height above filtered ground: a progressive morphological filter with identical results in tiles.
 
 After SMRF [P13]: the grid of lowest points is opened with growing windows; a cell that an opening lowers by more
-than `slope` times the window's radius is an object; what is left is ground, a surface is led through it, and a
+than `slope` times the window's radius is an object; what is left is ground, a surface is fitted through it, and a
 point is ground if it lies within `threshold` plus `scalar` times the terrain's slope of the surface. Unlike there:
 
 * the grid is anchored to absolute coordinates and every step reaches a bounded way (:func:`reach`), so that a tile

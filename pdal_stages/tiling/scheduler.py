@@ -81,7 +81,7 @@ class OnDask:
 
         Notes
         -----
-        As many tasks are out as there are workers. While a killed worker starts anew, two may sit on one; so a task
+        As many tasks are out as there are workers. While a killed worker restarts, two tasks may share a worker; so a task
         whose worker was killed is tried once more with nothing beside it before it is blamed.
         """
         out: dict[Any, Any] = {}  # items by their future

@@ -155,7 +155,7 @@ def _object(stage: Any, index: int, count: int) -> dict[str, Any]:
             driver = "ept"
         if driver is None:
             raise PipelineError(
-                f"the {kind[:-1]} of '{name}' is not known by its name",
+                f"the {kind[:-1]} of '{name}' cannot be inferred from the file name",
                 cure=f'Give the stage a type: "{kind}.las"',
             )
         out["type"] = f"{kind}.{driver}"

@@ -218,7 +218,7 @@ def test_damaged_las(cell, tmp_path, model, good, case, edit):
         damaged(good, edit)
     it = cell("LAS files", case)
     says = (
-        "no LAS file"
+        "not a LAS file"
         if case.rpartition(" ")[2] in ("file", "header", "signature", ".las") and "points" not in case
         else "damaged"
     )

@@ -154,7 +154,7 @@ def _put(at, form: str, *values):
 
 COPCS = [
     ("COPC: no octree record first", _put(377, "<4s", b"none"), ["does not describe an octree"]),
-    ("COPC: half size of NaN", _put(429 + 24, "<d", float("nan")), ["its octree has no place"]),
+    ("COPC: half size of NaN", _put(429 + 24, "<d", float("nan")), ["its octree has an invalid extent"]),
     ("COPC: octree beyond the file", _put(429 + 40, "<Q", 2**62), ["outside the file"]),
     ("COPC: octree of 2^62 bytes", _put(429 + 48, "<Q", 2**62), ["outside the file"]),
     ("COPC: octree that leads back to itself", lambda d: _put(lambda d: _root(d) + 16, "<Qii", _root(d), 32, -1)(d), ["leads back to itself"]),
