@@ -55,7 +55,7 @@ def represent(
 
     `side` is a voxel's, in metres as `xyz`; 0 for none. `values` (k,) are what else is known of the points that are there,
     and decide between points of the same coordinates. `rows` (m,) are the points asked for; the others are represented
-    too, but are not listed as members. `there` (k,) are the points that are there at all, `rows` among them (default: all n).
+    too, but are not listed. `there` (k,) are the points that are there at all, `rows` among them (default: all n).
     Both ascend.
     """
     found = _one_each(xyz if there is None else xyz[there], side, values)
