@@ -2,6 +2,7 @@
 
 import json
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -447,3 +448,38 @@ def test_manifests_that_do_not_fit_themselves(trained, tmp_path, edit, other):
 
 def test_any_model_error_is_a_stage_error():
     assert issubclass(ModelError, StageError)
+
+
+def test_labels_that_their_height_contradicts_are_left_out():
+    """Of 4, 5 and 6 alone, where Ground and lower than asked; counted, and kept as neighbors."""
+    rng = np.random.default_rng(5)
+    n = 4000
+    xyz = rng.uniform(0, 60, (n, 3)) * (1, 1, 0)
+    labels = rng.choice([2, 3, 5, 6], n)
+    height = np.where(labels > 3, 4.0, 0.0)
+    wrong = (labels > 3) & (rng.random(n) < 0.2)
+    height[wrong] = rng.uniform(0, 0.5, wrong.sum())
+    ground = ((height < 0.5) & (rng.random(n) < 0.8)).astype(np.uint8)
+    xyz[:, 2] = height
+    dimensions = {"HeightAboveGround": height, "Ground": ground}
+    mask = rng.random(n) < 0.9
+    cloud = TrainingCloud(xyz, labels, dimensions, mask=mask)
+    gone = mask & np.isin(labels, (5, 6)) & (ground > 0) & (height < 0.3)
+    expected = {str(code): int(np.count_nonzero(gone & (labels == code))) for code in (5, 6)}
+    assert all(expected.values())
+    options = TrainingOptions(
+        neighborhoods="k10", dimensions=tuple(dimensions), count=50, trees=3, passes=1, voxel=0
+    )
+    plain = train([cloud], options, progress=False)
+    told = train([cloud], replace(options, contradicted_below=0.3), progress=False)
+    assert "contradicted" not in plain.info["training"] and told.info["training"]["contradicted"] == expected
+    available = [
+        {entry["code"]: entry["available"] for entry in model.info["classes"]} for model in (plain, told)
+    ]
+    left = {code: before - available[1][code] for code, before in available[0].items()}
+    assert left == {2: 0, 3: 0, 5: expected["5"], 6: expected["6"]}
+    assert "their height contradicts" in str(told) and "contradicts" not in str(plain)
+    # no ground, nothing to contradict
+    bare = TrainingCloud(xyz, labels, {"HeightAboveGround": height}, mask=mask)
+    options = replace(options, dimensions=("HeightAboveGround",), contradicted_below=0.3)
+    assert "contradicted" not in train([bare], options, progress=False).info["training"]

@@ -53,6 +53,7 @@ class Survey:
 
 
 _LIDARHD = "IGN, LiDAR HD, Licence Ouverte Etalab 2.0"
+_ARRANGED = ", as arranged for IGNF's open tools"
 _AHN = "AHN, open data of the Dutch government"
 CLASSES = {2: GROUND, 4: VEGETATION, 5: VEGETATION, 6: BUILDING}
 SURVEYS = {
@@ -99,6 +100,41 @@ SURVEYS = {
         _AHN + ", arranged by github hankersyan/AHN_transmission_corridor",
         dropped=(7, 18, 26, 1),
         returns=False,
+    ),
+    "bank": Survey(
+        ("rural/lidarhd_bank.laz",),
+        CLASSES,
+        "French steep wooded bank and a house",
+        _LIDARHD,
+        dropped=(7, 18, 65),
+    ),
+    "town's edge": Survey(
+        ("rural/ign_0p3ppm2.laz",),
+        CLASSES,
+        "French town's edge with large halls, at 0.3 points/m²",
+        _LIDARHD + _ARRANGED,
+        dropped=(7, 18, 64, 65, 66, 67),
+    ),
+    "bridges": Survey(
+        ("bridge/ign_0299_6802.laz",),
+        CLASSES,
+        "French river, fields and bridges, at 0.3 points/m²",
+        _LIDARHD + _ARRANGED,
+        dropped=(7, 18, 66, 67),
+    ),
+    "meadows": Survey(
+        ("rural/ahn3_achterhoek.laz",),
+        {2: GROUND, 6: BUILDING, 9: GROUND},
+        "Dutch meadows, rows of trees and farms (AHN3)",
+        _AHN + ", arranged by eEcoLiDAR/Laserfarm",
+        tall={1: 2.0},
+        tall_scored=True,
+    ),
+    "pines": Survey(
+        ("forest/neon_osbs.laz",),
+        {2: GROUND, 5: VEGETATION},
+        "Open pine forest in Florida (NEON)",
+        "NEON open data, arranged by brycefrank/pyfor",
     ),
 }
 

@@ -132,6 +132,8 @@ class Labelled:
 
     clouds: Sequence[TrainingCloud]
     classes: ClassMap
+    contradicted_below: float = 0.0  #: metres; see ``TrainingOptions``
+    left_out: Mapping[str, int] = field(default_factory=dict)  #: points of each label that are so left out
 
     def __len__(self) -> int:
         return len(self.clouds)
@@ -141,10 +143,17 @@ class Labelled:
         position = self.classes.index(as_labels(cloud.labels, cloud.name))
         if cloud.mask is not None:
             position[~np.asarray(cloud.mask)] = -1
+        gone = contradicted(cloud, self.contradicted_below)
+        if gone is not None:
+            position[gone] = -1
         return cloud.xyz, position
 
     def __iter__(self) -> Iterator[tuple[npt.NDArray[np.float64], npt.NDArray[np.int16]]]:
         return (self[number] for number in range(len(self)))
+
+    def training_notes(self) -> dict[str, Any]:
+        """What was counted, for a manifest."""
+        return {"contradicted": dict(self.left_out)} if self.left_out else {}
 
     def described(self, options: TrainingOptions, counts: Iterable[Mapping[str, int]]) -> dict[str, Any]:
         """What a manifest says of the task and of each class, whose samples `counts` tells."""
@@ -160,13 +169,33 @@ class Labelled:
         }
 
 
+#: Labels of what stands above the ground: vegetation from medium height on, buildings.
+STANDING = (4, 5, 6)
+
+
+def contradicted(cloud: TrainingCloud, below: float) -> npt.NDArray[np.bool_] | None:
+    """(n,) points whose label their height contradicts: of :data:`STANDING`, but Ground and lower than `below` metres.
+
+    None where nothing can be said.
+    """
+    if below == 0 or not {"Ground", "HeightAboveGround"} <= set(cloud.dimensions):
+        return None
+    low = np.asarray(cloud.dimensions["HeightAboveGround"]) < below
+    ground = np.asarray(cloud.dimensions["Ground"]) > 0
+    return np.isin(as_labels(cloud.labels, cloud.name), STANDING) & ground & low
+
+
 def label_classes(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> Labelled:
     """The classes that the clouds' labels make."""
-    number = np.zeros(MAX_LABEL + 1, np.int64)
+    number, left_out = np.zeros((2, MAX_LABEL + 1), np.int64)
     for cloud in clouds:
         labels = as_labels(cloud.labels, cloud.name)
-        used = labels if cloud.mask is None else labels[np.asarray(cloud.mask)]
-        number += np.bincount(used, minlength=len(number))
+        used = np.ones(len(labels), np.bool_) if cloud.mask is None else np.asarray(cloud.mask)
+        gone = contradicted(cloud, options.contradicted_below)
+        if gone is not None:
+            left_out += np.bincount(labels[used & gone], minlength=len(number))
+            used = used & ~gone
+        number += np.bincount(labels[used], minlength=len(number))
     found = {int(label): int(number[label]) for label in np.flatnonzero(number)}
     listing = ", ".join(f"{label}: {n:,}" for label, n in sorted(found.items())[:20]) or "no points"
     classes = ClassMap.parse(options.classes, found)
@@ -185,7 +214,8 @@ def label_classes(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> 
             found=f"labels {listing}",
             cure=f"Labels {', '.join(map(str, UNINFORMATIVE))} are left out unless 'classes' names them",
         )
-    return Labelled(clouds, classes)
+    counted = {str(label): int(left_out[label]) for label in np.flatnonzero(left_out)}
+    return Labelled(clouds, classes, options.contradicted_below, counted)
 
 
 def _checked_labels(cloud: TrainingCloud) -> npt.NDArray[Any]:

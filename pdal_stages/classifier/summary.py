@@ -76,6 +76,8 @@ def text(info: Mapping[str, Any]) -> str:
         lines.append(f"voxel          {info['voxel']:g} m, which one point stands for")
     for cloud in training["clouds"]:
         lines.append(f"trained on     {cloud['name']}, {cloud['points']:,} points")
+    if gone := training.get("contradicted"):
+        lines.append(f"left out       labels that their height contradicts: {_counts(gone)}")
     lines += ["", f"{'class':<34}{'available':>12}{'samples':>10}{'duplicates':>12}{'F1 out of bag':>15}"]
     bag = info["passes"][-1]["out_of_bag"] or {}
     for entry in info["classes"]:
@@ -137,6 +139,10 @@ def held_out_by(crossed: Mapping[str, Any] | None) -> str:
 def groups_word(dimension: str) -> str:
     """What the values of a dimension of groups stand for."""
     return "files" if dimension == FILE_NUMBER else dimension
+
+
+def _counts(labels: Mapping[str, int]) -> str:
+    return ", ".join(f"{number:,} of {label}" for label, number in labels.items())
 
 
 def _percent(value: float | None) -> str:

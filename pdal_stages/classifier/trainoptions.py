@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+# ruff: noqa: RUF009  options are declared, nothing is shared
+import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -17,147 +19,246 @@ from .algorithms import ALGORITHMS, trainer
 from .classes import MAX_LABEL
 from .context import Context
 
-STRATEGIES = ("multiclass", "binary")
 #: Most passes a model can have.
 MOST_PASSES = 3
 #: What passes after the first read of the surroundings.
 DEFAULT_CONTEXT = ("own", "box1", "columnvotes2", "columnvotes8")
 
 
+def setting(default: Any, kind: str, what: str, more: str = "", **rule: Any) -> Any:
+    """Declare an option: what it is in a sentence, for help texts too, and `more` for who reads the documentation.
+
+    `kind` is that of an option of a stage. `rule`: `low` and `high` bound a number, `above` leaves `low` out, `unit` is
+    that of both, `choices` are the words there are.
+    """
+    return field(default=default, metadata={"kind": kind, "what": what, "more": more, **rule})
+
+
 @dataclass(frozen=True)
 class TrainingOptions:
-    """How a model is trained.
+    """How a model is trained."""
 
-    Attributes
-    ----------
-    neighborhoods : str or sequence of str
-        Preset or tokens, as for features. The default has one sphere and three numbers of neighbors: on surveys a
-        model has not seen these four beat the papers' nine, at a fraction of the time.
-    feature_set : str or sequence of str
-        Which features, as for features. The default leaves out density, which belongs to the sensor, and shape
-        distributions, and adds the height above the lowest point of each neighborhood [HWS16], which tells low
-        vegetation from sloping ground.
-    dimensions : sequence of str
-        Dimensions of the points used as features beside the geometric ones. HeightAboveGround alone by
-        default: Intensity depends on sensor, flying height and calibration, and return numbers
-        on the sensor, so a model that uses them seldom fits another flight. ``ReturnRatio`` is
-        ReturnNumber / NumberOfReturns.
-    classes : None, str, sequence of int or mapping
-        Labels and what they become; see ``ClassMap.parse``.
-    strategy : {"multiclass", "binary"}
-        All classes, or `target` against all the others, which become `background`.
-    target, background : int
-        Codes of the binary strategy.
-    count : int
-        Samples of each class. A class with fewer points has them counted several times.
-    seed : int
-        Seed of everything random: sampling, bootstrap, splits, shape distributions.
-    trees, max_depth, min_samples_leaf : int, or a list of values to search (grid search)
-        `max_depth` None or 0: unlimited.
-    max_samples : float
-        Size of each tree's bootstrap sample, as a share of all samples.
-    max_features : "auto", "sqrt", "log2", int or float
-        Features tried at a split; a float is a share of them. Auto: a tenth, but at least the square root.
-    prior_weight : float
-        0: classes are taken as equally frequent, as they are sampled; rare ones are then called too often.
-        1: as frequent as in the training clouds; rare ones are then hardly called at all. Between: each class's
-        probability is multiplied by its frequency to this power. The default lies between what suits new ground
-        (held-out tiles gain up to 0.3 and more) and held-out blocks amid the training points (0 to 0.1).
-    balance : bool
-        Whether every survey, and every thinned copy of one, gives as many samples of a class as the others, as far as
-        it has them. Without, each gives as many as its share of the class's points.
-    thin : sequence of float
-        Points per square metre of sparser copies that each cloud is also trained in. Features are computed on the
-        copies; dimensions keep the values they have in the whole cloud.
-    voxel : float
-        Side in metres, 0 for none: one point represents each voxel, in training and in classifying, and the others get its
-        class. Bounds the cost of a point in a drone's cloud, and keeps a model near the densities it knows.
-    ignore : sequence of int
-        Labels whose points are not even neighbors, unless `classes` names them: noise.
-    scale : bool
-        Limit features to the 1st and 99th percentile of the samples, from 0 where the smallest value is 0
-        [B16 3.3].
-    folds : int, optional
-        Folds of the spatial cross-validation; 0: none (5 where there is a grid to search). None: 5 with a quarter of the
-        trees, by survey where there are several, so that every model has an honest score; it chooses nothing then.
-    groups : str
-        Dimension whose points of one value are held out together in cross-validation: a tile, a file. Where that takes all
-        samples of a class away, blocks of ground are held out instead. It changes the score alone, unless there is a grid
-        to search.
-    block_size : float
-        Side of the cross-validation's blocks in metres.
-    gap : float or None
-        Training samples nearer than this (metres, in plan) to a validation sample are left out of that fold.
-        None: the largest radius of the neighborhoods.
-    leave_one_survey_out : bool
-        Whether to score each survey with forests grown without it, all passes.
-    passes : int
-        1 to 3. Every pass after the first reads, beside the features, what the one before says all around
-        (`context`), and is trained on what it says of ground it has not seen.
-    context : sequence of str
-        What of the surroundings is read; see :class:`pdal_stages.classifier.context.Context`.
-    pass_folds : int
-        Parts of the training ground that are held out in turn for that: whole surveys where there are three or
-        more, else every so many-th strip of 10 m.
-    algorithm : {"random_forest", "alsnet"}
-        A forest on features, or a network on the points themselves [WM19], which uses `dimensions`, `classes`,
-        `strategy`, `seed` and `threads` of these options and all of `alsnet`.
-    alsnet : mapping or NetworkOptions, optional
-        How the network is trained; see :class:`pdal_stages.alsnet.NetworkOptions`.
-    threads : int or None
-    memory_mb : float
-        For blocks of features under way; the matrix of all samples comes on top.
-    """
-
-    neighborhoods: Any = ("s5", "k10", "k20", "k50")
-    feature_set: Any = ("covariance", "Verticality", "HeightRange", "HeightStd", "HeightAboveLowest")
-    dimensions: Sequence[str] = ("HeightAboveGround",)
-    classes: Any = None
-    strategy: str = "multiclass"
-    target: int | None = None
-    background: int = 1
-    count: int = 10_000
-    seed: int = 0
-    trees: int | Sequence[int] = 50
-    max_depth: int | Sequence[int | None] | None = None
-    min_samples_leaf: int | Sequence[int] = 3
-    max_samples: float = 1.0
-    max_features: str | int | float = "auto"
-    prior_weight: float = 0.2
-    balance: bool = True
-    thin: Sequence[float] = ()
-    voxel: float = 0.125
-    ignore: Sequence[int] = NOISE
-    scale: bool = True
-    folds: int | None = None
-    groups: str = ""
-    block_size: float = 25.0
-    gap: float | None = None
-    leave_one_survey_out: bool = False
-    passes: int = 2
-    context: Sequence[str] = DEFAULT_CONTEXT
-    pass_folds: int = 5
-    algorithm: str = "random_forest"
-    alsnet: Any = None
-    threads: int | None = None
-    memory_mb: float = 512.0
+    neighborhoods: Any = setting(
+        ("s5", "k10", "k20", "k50"),
+        "list",
+        "Neighborhoods: tokens (c2, s1, k50, kopt, ropt, copt) or a preset (blomley2016, weinmann2018, he2017)",
+        "The default has one sphere and three numbers of neighbors: on surveys a model has not seen these four beat the "
+        "papers' nine, at a fraction of the time.",
+    )
+    feature_set: Any = setting(
+        ("covariance", "Verticality", "HeightRange", "HeightStd", "HeightAboveLowest"),
+        "list",
+        "Groups (covariance, geometric, shapes, all) or single features. 'all' is the papers' set",
+        "The default leaves out density, which belongs to the sensor, and shape distributions, and adds the height above "
+        "the lowest point of each neighborhood [HWS16], which tells low vegetation from sloping ground.",
+    )
+    dimensions: Sequence[str] = setting(
+        ("HeightAboveGround",),
+        "list",
+        "Dimensions of the points that are used as features too, e.g. HeightAboveGround, Intensity, ReturnRatio, or returns "
+        "for all return features",
+        "Intensity depends on sensor, flying height and calibration, and return numbers on the sensor, so a model that uses "
+        "them seldom fits another flight. ``ReturnRatio`` is ReturnNumber / NumberOfReturns.",
+    )
+    classes: Any = setting(
+        None,
+        "mapping",
+        'Labels and what they become: {"2": "Ground", "3,4,5": "5 Vegetation", "6": 6}, or a list of codes; '
+        "default: every label met except 0, 1, 7, 12 and 18",
+        "See ``ClassMap.parse``.",
+    )
+    strategy: str = setting(
+        "multiclass",
+        "string",
+        "All classes at once, or 'target' against all the others",
+        choices=("multiclass", "binary"),
+    )
+    target: int | None = setting(None, "integer", "Class to find with the binary strategy", low=0, high=255)
+    background: int = setting(
+        1, "integer", "Code given to all other classes with the binary strategy", low=0, high=255
+    )
+    count: int = setting(
+        10_000,
+        "integer",
+        "Samples per class; smaller classes are filled up with duplicates",
+        low=1,
+        high=10**8,
+    )
+    contradicted_below: float = setting(
+        0.0,
+        "number",
+        "Labels 4, 5 and 6 (vegetation from medium height on, buildings) of points that are Ground and not this high above "
+        "it are left out of training: their height contradicts them; 0 for none",
+        "Such labels are the feet of walls, courtyards inside a roof's outline, and what lies under a crown. A model that "
+        "learns them calls steep ground building. They are counted, and serve as neighbors. Without the dimensions Ground "
+        "and HeightAboveGround nothing is left out.",
+        low=0,
+        high=10,
+        unit="m",
+    )
+    seed: int = setting(
+        0,
+        "integer",
+        "Seed for sampling, trees and shape distributions",
+        low=0,
+        high=2**31 - 1,
+    )
+    trees: int | Sequence[int] = setting(
+        50, "list", "Number of trees; of several values the best is found by cross-validation"
+    )
+    max_depth: int | Sequence[int | None] | None = setting(
+        None, "list", "Maximum depth of the trees, 0 for no limit; of several values the best is found"
+    )
+    min_samples_leaf: int | Sequence[int] = setting(
+        3, "list", "Minimum number of samples in a leaf; of several values the best is found"
+    )
+    max_samples: float = setting(
+        1.0, "number", "Share of the samples that each tree draws", low=0, high=1, above=True
+    )
+    max_features: str | int | float = setting(
+        "auto",
+        "string",
+        "Features tried at each split: auto (a tenth, at least the square root), sqrt, log2, a number or a share",
+    )
+    prior_weight: float = setting(
+        0.2,
+        "number",
+        "0: all classes count as equally frequent, as they are sampled; 1: each as frequent as in the training points",
+        "At 0 rare ones are called too often, at 1 hardly at all. Between: each class's probability is multiplied by its "
+        "frequency to this power. The default lies between what suits new ground (held-out tiles gain up to 0.3 and more) "
+        "and held-out blocks amid the training points (0 to 0.1).",
+        low=0,
+        high=1,
+    )
+    balance: bool = setting(
+        True,
+        "boolean",
+        "Take as many samples of a class from each survey and each thinned copy; false: as many as their share",
+    )
+    thin: Sequence[float] = setting(
+        (),
+        "list",
+        "Points per square metre of sparser copies to train on as well, so that the model bears sparse clouds",
+        "Features are computed on the copies; dimensions keep the values they have in the whole cloud.",
+    )
+    voxel: float = setting(
+        0.125,
+        "number",
+        "Side of voxels: in training and in classifying one point represents each, and the others get its class; 0 for none",
+        "Bounds the cost of a point in a drone's cloud, and keeps a model near the densities it knows.",
+        low=0,
+        high=LARGEST,
+        unit="m",
+    )
+    ignore: Sequence[int] = setting(
+        NOISE, "list", "Labels whose points are not even neighbors, unless `classes` names them: noise"
+    )
+    scale: bool = setting(
+        True,
+        "boolean",
+        "Limit features to the 1st and 99th percentile of the samples, from 0 where the smallest value is 0 [B16 3.3]",
+    )
+    folds: int | None = setting(
+        None,
+        "integer",
+        "Folds of cross-validation over groups or spatial blocks; 0 for none; default: 5, with a quarter of the trees",
+        "The default is by survey where there are several, so that every model has an honest score; it chooses nothing "
+        "then. Where there is a grid to search, there are always some.",
+        low=0,
+        high=1000,
+    )
+    groups: str = setting(
+        "",
+        "string",
+        "Dimension whose points of one value are held out together, such as the number of a tile or flight, so that the "
+        "score is of tiles or flights that the model has not seen",
+        "Where that takes all samples of a class away, blocks of ground are held out instead. It changes the score alone, "
+        "unless there is a grid to search.",
+    )
+    block_size: float = setting(
+        25.0, "number", "Side of these blocks", low=0, high=10**6, above=True, unit="m"
+    )
+    gap: float | None = setting(
+        None,
+        "number",
+        "Training samples nearer than this, in plan, to a validation sample are left out of that fold; by default the "
+        "largest radius of the neighborhoods",
+        low=0,
+        high=10**6,
+        unit="m",
+    )
+    leave_one_survey_out: bool = setting(
+        False,
+        "boolean",
+        "Score each survey with forests grown without it; takes a training per survey",
+    )
+    passes: int = setting(
+        2,
+        "integer",
+        "Forests one after the other, each reading what the one before says of a point's surroundings",
+        "Each is trained on what the one before says of ground it has not seen.",
+        low=1,
+        high=MOST_PASSES,
+    )
+    context: Sequence[str] = setting(
+        DEFAULT_CONTEXT,
+        "list",
+        "What passes after the first read: own, or box, boxvotes, column, columnvotes and a cell's side (box0.5)",
+        "See :class:`pdal_stages.classifier.context.Context`.",
+    )
+    pass_folds: int = setting(
+        5,
+        "integer",
+        "Parts of the training ground held out in turn to train the passes after the first",
+        "Whole surveys where there are three or more, else every so many-th strip of 10 m.",
+        low=2,
+        high=100,
+    )
+    algorithm: str = setting(
+        "random_forest",
+        "string",
+        "A forest on computed features, or a network on the points themselves (needs PyTorch)",
+        "A network [WM19] uses `dimensions`, `classes`, `strategy`, `seed` and `threads` of these options and "
+        "all of its own.",
+    )
+    alsnet: Any = setting(
+        None,
+        "mapping",
+        'Options of the network: {"configuration": "small", "epochs": 60, ...}; see the page on alsNet',
+        "See :class:`pdal_stages.alsnet.NetworkOptions`.",
+    )
+    threads: int | None = setting(None, "integer", "Threads to use; by default every available core")
+    memory_mb: float = setting(
+        512.0,
+        "number",
+        "Memory for blocks of points, in addition to the samples",
+        low=0,
+        high=10**9,
+        above=True,
+        unit="MB",
+    )
 
     def __post_init__(self) -> None:
         def put(name: str, check: Any, *bounds: float, **more: Any) -> None:
             object.__setattr__(self, name, check(f"'{name}'", getattr(self, name), *bounds, **more))
 
-        put("count", checks.whole, 1, 10**8)
-        put("seed", checks.whole, 0, 2**63 - 1)
-        put("passes", checks.whole, 1, MOST_PASSES)
-        put("pass_folds", checks.whole, 2, 100)
         self.searches  # noqa: B018  wrong values to search are refused here
-        if self.folds is not None:
-            put("folds", checks.whole, 0, 1000)
+        for one in fields(self):
+            rule = dict(one.metadata)
+            words = [rule.pop(key) for key in ("what", "more", "kind")]
+            value, kind = getattr(self, one.name), words[-1]
+            if value is None and one.default is None:
+                continue
+            if "choices" in rule:
+                checks.one_of(f"'{one.name}'", value, rule["choices"])
+            elif rule:
+                put(one.name, checks.whole if kind == "integer" else checks.number, **rule)
+            elif kind == "boolean":
+                put(one.name, checks.flag)
         if not isinstance(self.groups, str):
             raise OptionError("'groups' must be the name of a dimension", found=repr(self.groups)[:60])
         if self.folds == 1:
             raise OptionError("'folds' must be 0 or at least 2", found=1)
-        checks.one_of("'strategy'", self.strategy, STRATEGIES)
         self._check_algorithm()
         put("context", lambda _, tokens: Context.parse(tokens).tokens)
         if self.passes > 1 and not self.context:
@@ -168,16 +269,6 @@ class TrainingOptions:
             raise OptionError("the binary strategy needs 'target', the code of the class to find")
         if self.strategy == "multiclass" and self.target is not None:
             raise OptionError("'target' means something only with strategy 'binary'", found=self.target)
-        if self.target is not None:
-            put("target", checks.whole, 0, 255)
-        put("background", checks.whole, 0, 255)
-        put("max_samples", checks.number, 0, 1, above=True)
-        put("block_size", checks.number, 0, 10**6, above=True, unit="m")
-        put("memory_mb", checks.number, 0, 10**9, above=True)
-        put("prior_weight", checks.number, 0, 1)
-        put("voxel", checks.number, 0, LARGEST, unit="m")
-        if self.gap is not None:
-            put("gap", checks.number, 0, 10**6, unit="m")
         m = self.max_features
         if isinstance(m, str):
             good = m in ("auto", "sqrt", "log2")
@@ -191,10 +282,8 @@ class TrainingOptions:
                 found=repr(m),
             )
         put("dimensions", checks.names)
-        for name in ("scale", "balance", "leave_one_survey_out"):
-            put(name, checks.flag)
         thin = [self.thin] if isinstance(self.thin, int | float) else self.thin
-        rule: Any = {"low": 0, "high": 10**6, "above": True, "unit": "points/m2"}
+        rule = {"low": 0, "high": 10**6, "above": True, "unit": "points/m2"}
         put("thin", lambda what, _: tuple(checks.number(what, one, **rule) for one in thin))
         ignore = [self.ignore] if isinstance(self.ignore, int) else self.ignore
         put("ignore", lambda what, _: tuple(checks.whole(what, one, 0, MAX_LABEL) for one in ignore))
@@ -249,3 +338,15 @@ def _values(name: str, value: Any, low: int, high: int, none: bool = False) -> l
     if not many:
         raise OptionError(f"'{name}' is an empty list", cure="Give a number")
     return [None if none and (v is None or v == 0) else checks.whole(f"'{name}'", v, low, high) for v in many]
+
+
+def _documented() -> str:
+    lines = ["How a model is trained.", "", "Attributes", "----------"]
+    for one in fields(TrainingOptions):
+        what = f"{one.metadata['what']}. {one.metadata['more']}".strip()
+        unit = f", {one.metadata['unit']}" if one.metadata.get("unit") else ""
+        lines += [f"{one.name} : {one.type}{unit}", textwrap.indent(textwrap.fill(what, 110), "    ")]
+    return "\n".join([*lines, ""])
+
+
+TrainingOptions.__doc__ = _documented()

@@ -19,8 +19,6 @@ from ..classifier import TrainingCloud, TrainingOptions, summary, train
 from ..classifier.algorithms import ALGORITHMS, Trainer, trainer
 from ..classifier.classes import ClassMap
 from ..classifier.dimensions import ALWAYS, required, welcome
-from ..classifier.trainoptions import MOST_PASSES
-from ..features.voxels import LARGEST
 from .base import Stage, files_read
 from .options import option
 from .points import Points
@@ -28,13 +26,35 @@ from .preparation import check
 from .selection import UNWANTED, Selection
 
 #: The trainer's own options.
-_TRAINERS = {field.name: field.default for field in fields(TrainingOptions)}
+_TRAINING = {field.name: field for field in fields(TrainingOptions)}
 #: The part of a model's description that fits in a pipeline's metadata.
 _TOLD = ("strategy", "classes", "accuracy", "parameters")
 #: Most files that a model names.
 _NAMED = 20
 #: The word for the dimensions that follow from what the points have.
 AUTO = "auto"
+
+
+def trained(name: str, /, **other: Any) -> Any:
+    """An option of training, as it is declared there; `other` is what is different here, as for :class:`Option`."""
+    field = _TRAINING[name]
+    rule = field.metadata
+    kind: str = rule["kind"]
+    default: Any = field.default
+    if kind == "list" and not isinstance(default, tuple):
+        default = (default,)
+    more: dict[str, Any] = {
+        "default": float(default) if kind == "number" and default is not None else default
+    }
+    if "low" in rule:
+        more |= {"minimum": rule["low"], "maximum": rule["high"], "exclusive": rule.get("above", False)}
+    more |= {
+        "kind": kind,
+        "help": rule["what"],
+        "unit": rule.get("unit", ""),
+        "choices": rule.get("choices", ()),
+    }
+    return option(**{**more, **other})
 
 
 class ClassifierModel(Stage):
@@ -45,132 +65,41 @@ class ClassifierModel(Stage):
     where_help = "Samples are drawn from the points inside; all points are neighbors."
     filename: str = option("filename", None, "The model file to write", required=True)
     label: str = option("string", "Classification", "Dimension that holds the labels")
-    algorithm: str = option(
-        "string",
-        "random_forest",
-        "A forest on computed features, or a network on the points themselves (needs PyTorch)",
-        choices=tuple(ALGORITHMS),
-    )
-    alsnet: dict | None = option(
-        "mapping",
-        None,
-        'Options of the network: {"configuration": "small", "epochs": 60, ...}; see the page on alsNet',
-    )
-    neighborhoods: list = option(
-        "list",
-        _TRAINERS["neighborhoods"],
-        "Neighborhoods: tokens (c2, s1, k50, kopt, ropt, copt) or a preset (blomley2016, weinmann2018, he2017)",
-    )
-    feature_set: list = option(
-        "list",
-        _TRAINERS["feature_set"],
-        "Groups (covariance, geometric, shapes, all) or single features. 'all' is the papers' set",
-    )
-    dimensions: list = option(
-        "list",
-        (AUTO,),
-        "Dimensions of the points that are used as features too, e.g. HeightAboveGround, Intensity, ReturnRatio, or returns "
-        "for all return features; auto: HeightAboveGround and, where the points have them, Ground, HeightAboveOpening_5, "
-        "HeightAboveOpening_17 and returns",
+    algorithm: str = trained("algorithm", choices=tuple(ALGORITHMS))
+    alsnet: dict | None = trained("alsnet")
+    neighborhoods: list = trained("neighborhoods")
+    feature_set: list = trained("feature_set")
+    dimensions: list = trained(
+        "dimensions",
+        default=(AUTO,),
+        help=f"{_TRAINING['dimensions'].metadata['what']}; auto: HeightAboveGround and, where the points have them, Ground, "
+        "HeightAboveOpening_5, HeightAboveOpening_17 and returns",
         may_be_empty=True,
     )
-    classes: dict | None = option(
-        "mapping",
-        None,
-        'Labels and what they become: {"2": "Ground", "3,4,5": "5 Vegetation", "6": 6}, or a list of codes; '
-        "default: every label met except 0, 1, 7, 12 and 18",
-    )
-    strategy: str = option(
-        "string",
-        "multiclass",
-        "All classes at once, or 'target' against all the others",
-        choices=("multiclass", "binary"),
-    )
-    target: int | None = option(
-        "integer", None, "Class to find with the binary strategy", minimum=0, maximum=255
-    )
-    background: int = option(
-        "integer", 1, "Code given to all other classes with the binary strategy", minimum=0, maximum=255
-    )
-    count: int = option(
-        "integer",
-        _TRAINERS["count"],
-        "Samples per class; smaller classes are filled up with duplicates",
-        minimum=1,
-    )
-    seed: int = option(
-        "integer", 0, "Seed for sampling, trees and shape distributions", minimum=0, maximum=2**31 - 1
-    )
-    trees: list = option(
-        "list",
-        (_TRAINERS["trees"],),
-        "Number of trees; of several values the best is found by cross-validation",
-    )
-    max_depth: list = option(
-        "list", (0,), "Maximum depth of the trees, 0 for no limit; of several values the best is found"
-    )
-    min_samples_leaf: list = option(
-        "list",
-        (_TRAINERS["min_samples_leaf"],),
-        "Minimum number of samples in a leaf; of several values the best is found",
-    )
-    max_samples: float = option(
-        "number",
-        _TRAINERS["max_samples"],
-        "Share of the samples that each tree draws",
-        minimum=0,
-        exclusive=True,
-        maximum=1,
-    )
-    max_features: str = option(
-        "string",
-        _TRAINERS["max_features"],
-        "Features tried at each split: auto (a tenth, at least the square root), sqrt, log2, a number or a share",
-    )
-    prior_weight: float = option(
-        "number",
-        _TRAINERS["prior_weight"],
-        "0: all classes count as equally frequent, as they are sampled; 1: each as frequent as in the training points",
-        minimum=0,
-        maximum=1,
-    )
-    folds: int | None = option(
-        "integer",
-        None,
-        "Folds of cross-validation over groups or spatial blocks; 0 for none; default: 5, with a quarter of the trees",
-        minimum=0,
-    )
-    groups: str = option(
-        "string",
-        "",
-        "Dimension whose points of one value are held out together, such as the number of a tile or flight, so that the "
-        "score is of tiles or flights that the model has not seen",
-    )
-    block_size: float = option("number", 25.0, "Side of these blocks", minimum=0, exclusive=True, unit="m")
+    classes: dict | None = trained("classes")
+    strategy: str = trained("strategy")
+    target: int | None = trained("target")
+    background: int = trained("background")
+    count: int = trained("count")
+    contradicted_below: float = trained("contradicted_below")
+    seed: int = trained("seed")
+    trees: list = trained("trees")
+    max_depth: list = trained("max_depth", default=(0,))
+    min_samples_leaf: list = trained("min_samples_leaf")
+    max_samples: float = trained("max_samples")
+    max_features: str = trained("max_features")
+    prior_weight: float = trained("prior_weight")
+    folds: int | None = trained("folds")
+    groups: str = trained("groups")
+    block_size: float = trained("block_size")
     survey: str = option(
         "string",
         "",
         "Dimension that tells surveys apart: points of another value are not neighbors, and surveys weigh alike",
     )
-    balance: bool = option(
-        "boolean",
-        _TRAINERS["balance"],
-        "Take as many samples of a class from each survey and each thinned copy; false: as many as their share",
-    )
-    thin: list = option(
-        "list",
-        _TRAINERS["thin"],
-        "Points per square metre of sparser copies to train on as well, so that the model bears sparse clouds",
-        may_be_empty=True,
-    )
-    voxel: float = option(
-        "number",
-        _TRAINERS["voxel"],
-        "Side of voxels: in training and in classifying one point represents each, and the others get its class; 0 for none",
-        minimum=0,
-        maximum=LARGEST,
-        unit="m",
-    )
+    balance: bool = trained("balance")
+    thin: list = trained("thin", may_be_empty=True)
+    voxel: float = trained("voxel")
     ignore: Selection = option(
         "selection",
         UNWANTED,
@@ -178,31 +107,13 @@ class ClassifierModel(Stage):
         "ReturnNumber[0:0], or the word withheld",
         may_be_empty=True,
     )
-    leave_one_survey_out: bool = option(
-        "boolean", False, "Score each survey with forests grown without it; takes a training per survey"
-    )
-    passes: int = option(
-        "integer",
-        _TRAINERS["passes"],
-        "Forests one after the other, each reading what the one before says of a point's surroundings",
-        minimum=1,
-        maximum=MOST_PASSES,
-    )
-    context: list = option(
-        "list",
-        _TRAINERS["context"],
-        "What passes after the first read: own, or box, boxvotes, column, columnvotes and a cell's side (box0.5)",
-    )
-    pass_folds: int = option(
-        "integer",
-        _TRAINERS["pass_folds"],
-        "Parts of the training ground held out in turn to train the passes after the first",
-        minimum=2,
-        maximum=100,
-    )
+    leave_one_survey_out: bool = trained("leave_one_survey_out")
+    passes: int = trained("passes")
+    context: list = trained("context")
+    pass_folds: int = trained("pass_folds")
     files: list = option("list", (), "Files that the model names; default: those of the readers")
-    memory: int = option(
-        "integer", 512, "Memory for blocks of points, in addition to the samples", minimum=16, unit="MB"
+    memory: int = trained(
+        "memory_mb", kind="integer", default=512, name="memory", minimum=16, exclusive=False, maximum=None
     )
     details = """
 Samples `count` points of each class, spread over space; computes features for the samples only; fits the
@@ -261,7 +172,7 @@ holds the classes.
     @cached_property
     def training(self) -> TrainingOptions:
         """The trainer's options."""
-        values = {name: value for name, value in self.options.items() if name in _TRAINERS}
+        values = {name: value for name, value in self.options.items() if name in _TRAINING}
         for name in ("trees", "max_depth", "min_samples_leaf"):
             numbers = [int(v) if str(v).strip().lstrip("-").isdigit() else v for v in values[name]]
             values[name] = numbers[0] if len(numbers) == 1 else numbers
@@ -342,6 +253,8 @@ holds the classes.
         points.report.update({"model": self.filename, **told, "seconds": model.seconds})
         if scores := summary.scores(model.info):
             points.report["score"] = scores[0]
+        if gone := model.info["training"].get("contradicted"):
+            points.report["contradicted"] = gone
         crossed = model.info["accuracy"]["cross_validation"] or {}
         if "instead" in crossed:
             points.report["note"] = (
