@@ -4,7 +4,8 @@ The hidden folder has a random name, only its owner may enter it, and it is lock
 writer left is therefore known to be dead, and goes when the next file is written to the same place.
 
 * An existing file is replaced; the new one takes over its mode, and its owner where that may be given.
-* A link is followed: the file it leads to is replaced, the link stays.
+* A link is followed: the file it leads to is replaced, the link stays; not so another user's in a folder that others may
+  write to (:mod:`.links`).
 * A device, pipe or terminal (``/dev/stdout``) is written into, once all is there.
 * A write-protected file, a file of another kind, a folder, a socket and a block device are refused.
 """
@@ -25,6 +26,7 @@ from typing import Any
 
 from .errors import StageError
 from .kinds import kind_of
+from .links import followed
 
 #: How the hidden folders' names begin, and what the file in them is called that their writer holds locked.
 PREFIX, _LOCK = ".pdal-stages-partial-", ".lock"
@@ -56,6 +58,7 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
         write-protected file, a file that is known to be of another kind.
     """
     name = Path(path)
+    real = _real(name, what)
     if is_stream(name):
         if not os.access(name, os.W_OK) or stat.S_IFMT(os.stat(name).st_mode) in (
             stat.S_IFBLK,
@@ -63,7 +66,6 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
         ):
             raise StageError(f"the {what} file is a device that cannot be written to", found=str(path))
         return
-    real = _real(name)
     if len(real.name.encode(errors="surrogateescape")) > _LONGEST_NAME:
         raise StageError(f"the name of the {what} file is longer than {_LONGEST_NAME} bytes", found=str(path))
     if not real.parent.is_dir():
@@ -114,12 +116,27 @@ def _is_open(path: str | os.PathLike) -> bool:
     return False
 
 
-def _real(path: Path) -> Path:
-    """The file that a name leads to."""
-    try:
+def _real(path: Path, what: str = "output") -> Path:
+    """The file that a name leads to; StageError where a stranger's link is on the way."""
+    if not hasattr(os, "geteuid"):  # Windows
         return Path(os.path.realpath(path))
-    except (OSError, ValueError):
-        return path.absolute()
+    return followed(path, what)
+
+
+def open_to_append(path: str | os.PathLike, what: str) -> Any:
+    """A text file at whose end lines go, made where it is not there; a device or pipe is written into.
+
+    Raises
+    ------
+    StageError
+        If a stranger's link is on the way.
+    OSError
+    """
+    real = _real(Path(path), what)
+    if is_stream(path):
+        return open(path, "a", encoding="utf-8", errors="backslashreplace")
+    flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+    return open(os.open(real, flags, 0o666), "a", encoding="utf-8", errors="backslashreplace")
 
 
 # ---- writing -----------------------------------------------------------------------------------------------
@@ -233,11 +250,11 @@ class _Place:
 
 def _give_name(made: Path, target: Path) -> None:
     """Move a file to its place, or write it into what is there."""
+    real = _real(target)
     if is_stream(target):
         with open(made, "rb") as file:
             _pour(file, target)
         return
-    real = _real(target)
     with contextlib.suppress(FileNotFoundError):
         older = real.stat()
         if hasattr(os, "chown") and (older.st_uid, older.st_gid) != (os.geteuid(), os.getegid()):

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from .errors import StageError
+from .files import open_to_append
 from .kinds import kind_of
 from .version import __version__
 
@@ -36,7 +37,9 @@ class RunLog:
         if kind := kind_of(path):
             raise StageError(f"the log would be added to {kind}", where="--log", found=path)
         try:
-            self._file: Any = open(path, "a", encoding="utf-8", errors="backslashreplace")  # noqa: SIM115
+            self._file: Any = open_to_append(path, "log")
+        except StageError as error:
+            raise error.at("--log") from None
         except OSError as error:
             raise StageError(
                 "the log cannot be written", where="--log", found=f"{path}: {error.strerror}"

@@ -200,9 +200,17 @@ def _remove(folder: Path) -> None:
 
 
 def _open_own(path: Path) -> TextIO:
-    """Open a file to append to, unless it is a link."""
+    """Open a file to append to, unless it is a link; who may not write to it may not read it either.
+
+    A lock can be held by whoever can open the file, so readers could keep every run out.
+    """
     flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0)
-    return os.fdopen(os.open(path, flags, 0o666), "a+", encoding="utf-8")
+    file = os.fdopen(os.open(path, flags, 0o622), "a+", encoding="utf-8")
+    if hasattr(os, "fchmod"):
+        there = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
+        with contextlib.suppress(OSError):  # of another user, whose folder this is
+            os.fchmod(file.fileno(), 0o600 | (there & 0o022) | (there & 0o022) << 1)
+    return file
 
 
 def _sealed(path: Path, value: dict[str, Any]) -> str:

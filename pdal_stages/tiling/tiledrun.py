@@ -79,11 +79,11 @@ def run_tiled(
     if dry_run:
         return estimate(plan, survey, chosen)
     folder = _folder(plan)
+    if survey.per == "file":  # refused now, not after reading all inputs
+        outputs_for(plan, [source.stem for source in survey.sources], survey.paths)
     with Store(folder) as store:
         if not chosen.resume:
             store.clear()
-        if survey.per == "file":  # refused now, not after reading all inputs
-            outputs_for(plan, [source.stem for source in survey.sources], survey.paths)
         try:
             with open_pool(chosen, str(store.folder)) as pool:
                 survey.read_indexes(store, pool, chosen.retries, progress)
