@@ -10,6 +10,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 try:
     import robustness_cases
     import stage_pages
+    import survey_table
 
     from pdal_stages import __version__
 except ModuleNotFoundError as error:
@@ -20,21 +21,27 @@ except ModuleNotFoundError as error:
 
 stage_pages.write()
 robustness_cases.write()
+survey_table.write()
 
 project = "pdal_stages"
 author = "the pdal_stages authors"
 copyright = "2026, the pdal_stages authors"
 release = version = __version__
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_parser", "sphinx_design", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
 exclude_patterns = ["_build"]
-html_theme = "alabaster"
+html_theme = "pydata_sphinx_theme"
+html_title = "pdal_stages"
 html_theme_options = {
-    "description": "PDAL stages that classify airborne laser scans",
-    "page_width": "1100px",
-    "sidebar_width": "240px",
+    "show_prev_next": False,
+    "secondary_sidebar_items": ["page-toc"],
+    "navigation_with_keys": False,
+    "footer_start": ["copyright"],
+    "footer_end": [],
 }
+html_sidebars = {"index": []}
+html_show_sourcelink = False
 html_static_path = ["static"]
 html_css_files = ["custom.css"]
 autodoc_member_order = "bysource"
