@@ -12,6 +12,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -215,8 +216,8 @@ def _parser() -> argparse.ArgumentParser:
     takes("inputs", nargs="+", metavar="input", help="Files PDAL can read, folders, patterns")
     takes(
         "output",
-        help="A file PDAL can write; of several inputs a folder, or a name with # where the input's goes. Other dimensions "
-        "and the header are kept",
+        help="A file PDAL can write; of several inputs a folder, which is made, or a name with # where the input's goes. "
+        "Other dimensions and the header are kept",
     )
     takes(
         "--model",
@@ -376,43 +377,74 @@ def _options(options: argparse.Namespace) -> None:
 
 
 def _classify(options: argparse.Namespace) -> int:
-    from .pipeline.jobs import las_files, outputs_of
-    from .pipeline.processes import each_file
+    from .pipeline.jobs import las_files, make_folder, outputs_of
 
     inputs = las_files(options.inputs)
     outputs = outputs_of(inputs, options.output)
-    if len(inputs) > 1 and options.metadata:
-        raise StageError(
-            "--metadata is of one run", found=f"{len(inputs)} inputs", cure="Classify one at a time"
-        )
-    check_outputs([Output(name) for name in outputs], inputs)
-    work = [(source, target, options) for source, target in zip(inputs, outputs, strict=True)]
-    if len(work) == 1:
-        result, said = _classify_one(*work[0])
-        tell(*said)
-        _print_classes([result], options.model)
-        return 0
-    done, failed, told = [], 0, _ToldOnce()
-    for (source, *_), answer in each_file(_classify_one, work, options.workers):
-        if answer.reason:
-            failed += 1
-            told.tell(source, answer.reason)
-        else:
-            result, said = answer.result
-            done.append(result)
-            for line in said:
+    make_folder(options.output, outputs)
+    more = [Output(options.metadata, "metadata", kinds.JSON)] if options.metadata else []
+    more += [Output(options.log, "log")] if options.log else []
+    check_outputs([*map(Output, outputs), *more], inputs)
+    if len(inputs) > 1:
+        return _classify_each(inputs, outputs, options)
+    done = _classify_one(inputs[0], outputs[0], options)
+    tell(*done.said)
+    print(f"{done.count:,} points written to {done.target}")
+    _print_classes([done.report], options.model)
+    return 0
+
+
+def _classify_each(inputs: Sequence[str], outputs: Sequence[str], options: argparse.Namespace) -> int:
+    """Classify files one by one, saying of each that it is finished as soon as it is."""
+    from .base.files import write_whole
+    from .pipeline.processes import each_file
+
+    one = argparse.Namespace(**{**vars(options), "metadata": None, "log": None})
+    work = [(source, target, one) for source, target in zip(inputs, outputs, strict=True)]
+    done: dict[str, _Classified] = {}
+    failed: dict[str, str] = {}
+    told, code = _ToldOnce(), 0
+    try:
+        # A process of their own, so that one may crash, and Ctrl-C is heard here.
+        for (source, *_), answer in each_file(_classify_one, work, options.workers, apart=options.is_program):
+            number = f"{len(done) + len(failed) + 1} of {len(work)}"
+            if answer.reason:
+                failed[source] = answer.reason
+                told.tell(source, answer.reason)
+                continue
+            done[source] = answer.result
+            print(f"{number}: {answer.result.count:,} points written to {answer.result.target}", flush=True)
+            for line in answer.result.said:
                 told.tell(source, line)
+    except KeyboardInterrupt:
+        code = 130
     told.end()
-    done.sort(key=lambda one: one[0])
     if done:
         print(
             "Each file was classified by itself; --tile of 'pipeline' lets them see each other's points",
             file=sys.stderr,
         )
-    _print_classes(done, options.model)
+    _print_classes([done[source].report for source in inputs if source in done], options.model)
+    if options.metadata:
+        listed = [
+            {"input": source, "output": target}
+            | (
+                {"metadata": done[source].metadata}
+                if source in done
+                else {"error": failed.get(source, "not done")}
+            )
+            for source, target in zip(inputs, outputs, strict=True)
+        ]
+        write_whole(options.metadata, (json.dumps({"files": listed}, indent=2, default=str) + "\n").encode())
     if failed:
-        tell(f"{failed} of {len(work)} files failed")
-    return 1 if failed else 0
+        tell(f"{len(failed)} of {len(work)} files failed")
+    if code:
+        left = [source for source in inputs if source not in done and source not in failed]
+        tell(
+            f"interrupted; {len(done)} of {len(work)} files are finished and whole, of the others nothing was left. Still "
+            f"to be done: {', '.join(left[:5])}{f' and {len(left) - 5:,} more' * (len(left) > 5)}"
+        )
+    return code or (1 if failed else 0)
 
 
 class _ToldOnce:
@@ -434,10 +466,19 @@ class _ToldOnce:
                 tell(f"also {', '.join(others[:3])}{more}: {text}")
 
 
-def _classify_one(
-    source: str, target: str, options: argparse.Namespace
-) -> tuple[tuple[str, int, dict[str, Any]], list[str]]:
-    """Classify a file: the output, its points and the classifier's report; and what is to be told."""
+@dataclass
+class _Classified:
+    """What became of a file: where it was written, its points, the classifier's report, and what is to be told."""
+
+    target: str
+    count: int
+    report: dict[str, Any]
+    said: list[str]
+    metadata: dict[str, Any]
+
+
+def _classify_one(source: str, target: str, options: argparse.Namespace) -> _Classified:
+    """Classify a file."""
     from .pipeline.jobs import WRITTEN, classify_job
 
     listed = options.dimensions
@@ -446,25 +487,23 @@ def _classify_one(
         source, target, options.model, options.overrides, where=options.where, dimensions=named
     )
     count, said = _ran(options, pipeline)
-    return (target, count, pipeline.reports[-1][1][-1]), said
+    return _Classified(target, count, pipeline.reports[-1][1][-1], said, pipeline.metadata)
 
 
-def _print_classes(done: Sequence[tuple[str, int, dict[str, Any]]], model: str) -> None:
-    """The files that were written, and the points of each class in all of them."""
+def _print_classes(reports: Sequence[dict[str, Any]], model: str) -> None:
+    """The points of each class in all files."""
     from .base.asprs import class_name
     from .stages.loading import loaded_model
 
-    for target, count, _ in done:
-        print(f"{count:,} points written to {target}")
     names = dict(loaded_model(model).classes)
     classes: dict[int, int] = {}
-    for _, _, report in done:
+    for report in reports:
         for code, points in report.get("classes", {}).items():
             classes[int(code)] = classes.get(int(code), 0) + points
     for code, points in sorted(classes.items()):
         print(f"  {code:3d} {names.get(code, class_name(code)):28s} {points:>12,}")
     for key, what in _LEFT_ALONE.items():
-        number = sum(report.get(key) or 0 for _, _, report in done)
+        number = sum(report.get(key) or 0 for report in reports)
         if number:
             print(f"  {what:32s} {number:>12,}")
 

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
 import laspy
 import numpy as np
 import pytest
@@ -78,6 +84,68 @@ def test_an_output_for_each_input(folder, classify, tmp_path, given, output, wor
 def test_several_inputs_are_not_merged_into_one(folder, classify, tmp_path):
     code, _, err = classify(folder / "in", tmp_path / "all.laz")
     assert code == 1 and "#" in err and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("given", "output"), [("in", "a/b"), ("in", "new.d/"), ("in/t0.laz", "one/")])
+def test_the_output_folder_is_made(folder, classify, tmp_path, given, output):
+    code, _, err = classify(folder / given, f"{tmp_path}/{output}")
+    assert code == 0, err
+    assert {path.name for path in (tmp_path / output).iterdir()} <= {"t0.laz", "t1.laz", "t2.laz"}
+
+
+def test_a_file_where_the_folder_should_be(folder, classify, tmp_path):
+    (tmp_path / "a").write_text("a file")
+    for output in ("a/b", "a/"):
+        code, _, err = classify(folder / "in", f"{tmp_path}/{output}")
+        assert code == 1 and "folder" in err and "t0.laz written" not in err
+
+
+def test_inputs_of_one_name(folder, classify, tmp_path):
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "t0.laz").write_bytes((folder / "in" / "t0.laz").read_bytes())
+    code, _, err = classify(folder / "in", tmp_path / "other" / "t0.laz", tmp_path / "out")
+    assert code == 1 and "two inputs have one name" in err and str(tmp_path / "other" / "t0.laz") in err
+    code, _, err = classify(folder / "in", folder / "in" / "t0.laz", tmp_path / "out")
+    assert code == 1 and "an input is given twice" in err and not (tmp_path / "out").exists()
+
+
+def test_metadata_of_many(folder, classify, tmp_path):
+    (tmp_path / "bad.laz").write_bytes(b"LASF")
+    code, _, err = classify(
+        folder / "in", tmp_path / "bad.laz", tmp_path / "out", "--metadata", tmp_path / "m.json"
+    )
+    assert code == 1, err
+    files = json.loads((tmp_path / "m.json").read_text())["files"]
+    assert [Path(one["input"]).name for one in files] == ["t0.laz", "t1.laz", "t2.laz", "bad.laz"]
+    for one in files[:3]:
+        assert one["metadata"]["metadata"]["filters.modelclassifier"]["points"] == 500
+    assert "damaged" in files[3]["error"] or "no LAS file" in files[3]["error"]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_interrupt_says_what_is_finished(folder, tmp_path, write_las, workers):
+    """Each file is told of, and logged, as soon as it is there; the one under work when Ctrl-C comes leaves nothing."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, 400, (2, 300_000))
+    slow = write_las(
+        tmp_path / "z_slow.laz", {"X": x, "Y": y, "Z": rng.normal(0, 0.1, len(x))}, point_format=1
+    )
+    words = ["classify", folder / "in", slow, slow, tmp_path / "out_#.laz", "--model", "standard"]
+    words[3] = tmp_path / "zz_slow.laz"
+    words[3].write_bytes(slow.read_bytes())
+    command = [sys.executable, "-m", "pdal_stages.cli", *map(str, words), "--workers", str(workers)]
+    command += ["--log", str(tmp_path / "log"), "--metadata", str(tmp_path / "m.json")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run:
+        seen = [run.stdout.readline() for _ in range(3)]
+        logged = (tmp_path / "log").read_text()
+        run.send_signal(signal.SIGINT)
+        _, err = run.communicate(timeout=60)
+    assert run.returncode == 130, err
+    assert all(f"{n} of 5: 500 points written to" in line for n, line in enumerate(seen, 1)), seen
+    assert all(line.strip() in logged for line in seen)
+    assert "3 of 5 files are finished and whole" in err and "zz_slow.laz" in err, err
+    assert sorted(p.name for p in tmp_path.glob("*out_*")) == ["out_t0.laz", "out_t1.laz", "out_t2.laz"]
+    assert "not done" in (tmp_path / "m.json").read_text() and not list(tmp_path.glob(".pdal-stages*"))
 
 
 def test_a_file_that_fails_does_not_stop_the_others(folder, classify, tmp_path):

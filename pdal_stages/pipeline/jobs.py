@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -106,26 +107,59 @@ def _extra_dims(source: str, made: dict[str, str], wanted: Sequence[str]) -> str
 def outputs_of(sources: Sequence[str], target: str) -> list[str]:
     """An output for each input: in a folder under the input's name, or with the input's name for ``#``.
 
+    A name without a suffix is that of a folder where there are several inputs, one that ends with a slash in any case.
+
     Raises
     ------
     StageError
         Where several inputs would be written to one file.
     """
     path = Path(target)
-    if path.is_dir():
+    if _is_folder(target, sources):
         outputs = [str(path / Path(source).name) for source in sources]
     elif "#" in path.name:
         outputs = [str(path.with_name(path.name.replace("#", Path(source).stem))) for source in sources]
-    else:
-        outputs = [target]
-    if len(set(outputs)) < len(sources):
+    elif len(sources) > 1:
         raise StageError(
             "several inputs would be written to one file",
             found=f"{len(sources)} inputs, {target}",
-            cure="Name a folder that exists, or put '#' where the input's name should be, e.g. classified_#.laz. To merge "
-            "them into one file, use a pipeline",
+            cure="Name a folder (with a slash at its end), or put '#' where the input's name should be, e.g. "
+            "classified_#.laz. To merge them into one file, use a pipeline",
         )
+    else:
+        return [target]
+    first: dict[str, str] = {}
+    for source, output in zip(sources, outputs, strict=True):
+        other = first.setdefault(output, source)
+        if other is not source:
+            same = os.path.realpath(other) == os.path.realpath(source)
+            raise StageError(
+                "an input is given twice"
+                if same
+                else "two inputs have one name and would be written to one file",
+                found=f"{source}: {output}" if same else f"{other} and {source}: {output}",
+                cure="Give it once" if same else "Classify them into different folders, or rename one",
+            )
     return outputs
+
+
+def make_folder(target: str, outputs: Sequence[str]) -> None:
+    """Make the folder that `outputs_of` found in a name, where it is not there."""
+    folder = Path(target)
+    if outputs and Path(outputs[0]) != folder and Path(outputs[0]).parent == folder:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StageError("the output's folder cannot be made", where=target, found=error) from None
+
+
+def _is_folder(target: str, sources: Sequence[str]) -> bool:
+    path = Path(target)
+    return (
+        path.is_dir()
+        or target.endswith(("/", os.sep))
+        or (len(sources) > 1 and not path.suffix and "#" not in path.name and not path.exists())
+    )
 
 
 def train_pipeline(

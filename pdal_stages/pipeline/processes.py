@@ -146,14 +146,15 @@ def _environment(threads: int) -> dict[str, str]:
 
 
 def each_file(
-    function: Callable[..., Any], work: Sequence[tuple], workers: int = 1
+    function: Callable[..., Any], work: Sequence[tuple], workers: int = 1, *, apart: bool = False
 ) -> Iterator[tuple[tuple, TaskResult]]:
     """Each item of work, the function's arguments, with what became of it, as they finish; failures do not stop the rest.
 
     The function is a module's own, so that other processes find it. They share the cores.
+    A single worker is this process, unless the work is to be `apart`.
     """
     workers = min(checks.whole("--workers", workers, 1, 1024), len(work))
-    if workers == 1:
+    if workers == 1 and not apart:
         for item in work:
             yield item, perform(Call(function, item))
         return
