@@ -1,0 +1,180 @@
+"""Where a native stage arrives in Python: the two questions that ``native/stage.cpp`` asks through ``filters.python``.
+
+`prepare` is asked before any point is read: what is wrong with the options comes up here, and which dimensions they ask
+for. `run` does the work on one point view. An answer is metadata of the script, a list of named texts; a failure is the
+one named ``pdal_stages_error``, which the plugin throws as PDAL's own error. No exception leaves this module.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+from collections import OrderedDict
+from collections.abc import Mapping
+from typing import Any
+
+from ..base.errors import StageError
+from ..base.version import __version__
+from ..pipeline import lowering, runtime
+from ..pipeline.optionfile import settled
+from ..stages import registry
+from ..stages.base import Stage
+from ..stages.options import Option
+from ..stages.options import split_list as split
+from . import declarations
+
+#: Stages made when a pipeline was prepared, until it has run; of pipelines that never run, so many are kept.
+_KEPT = 16
+_prepared: OrderedDict[str, Stage] = OrderedDict()
+_Leaf = dict[str, Any]
+
+
+def arrive(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
+    """Answer one question; True, whatever happened.
+
+    Parameters
+    ----------
+    module : dict
+        Globals of the script: PDAL's `pdalargs` (the question), `metadata` and `spatialreference`. `out_metadata` is
+        set in it.
+    ins, outs : dict
+        PDAL's dimensions, and the ones to write back.
+    """
+    question = module["pdalargs"]
+    where = runtime.place(question["stage"], question.get("tag"))
+    _end_on_interrupt()
+    # PDAL's module object stays alive; the register need not grow.
+    sys.modules.pop(question["label"], None)
+    try:
+        answer = _prepare(question) if question["step"] == "prepare" else _run(question, module, ins, outs)
+    except BaseException as error:
+        outs.clear()
+        _prepared.pop(question["label"], None)
+        answer = [runtime.leaf("pdal_stages_error", str(runtime.as_stage_error(error, where)))]
+    module["out_metadata"] = runtime.node("pdal_stages", answer)
+    return True
+
+
+def _prepare(question: Mapping[str, Any]) -> list[_Leaf]:
+    stage, remark = _made(question)
+    _prepared[question["label"]] = stage
+    while len(_prepared) > _KEPT:
+        _prepared.popitem(last=False)
+    answer = [runtime.leaf("dimension", f"{name}={kind}") for name, kind in stage.creates().items()]
+    if remark is not None:
+        answer.append(runtime.leaf("pdal_stages_warning", remark))
+    return answer
+
+
+def _run(
+    question: Mapping[str, Any], module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]
+) -> list[_Leaf]:
+    label = question["label"]
+    stage = _prepared.get(label) or _made(question)[0]
+    report = runtime.run_on_view(stage, module, ins, outs)
+    if question.get("last"):
+        _prepared.pop(label, None)
+    return runtime.leaves(report)
+
+
+def _made(question: Mapping[str, Any]) -> tuple[Stage, str | None]:
+    """The stage of a question, and what its user should know of the stages before it."""
+    _check_version(question)
+    kind = registry.get(question["stage"])
+    texts: dict[str, list[str]] = {}
+    for name, value in question["options"]:
+        texts.setdefault(name, []).append(value)
+    before = [_typed(stage) for stage in _stages(question["pipeline"])][:-1]
+    given = settled({**kind.from_pipeline(texts, before), **_parsed(kind, texts)})
+    where = runtime.place(kind.type, question.get("tag"))
+    stage = kind({name: value for name, value in given.items() if name not in lowering.PDAL_OWN}, where)
+    remark = lowering.tell(stage, [(one, _creates(one)) for one in before]).remark
+    return stage, remark
+
+
+def _check_version(question: Mapping[str, Any]) -> None:
+    if question["version"] != __version__ or question["digest"] != declarations.digest():
+        raise StageError(
+            "PDAL's plugin of this stage was built for another version of pdal_stages",
+            found=f"plugin {question['version']} ({question['digest']}), package {__version__} "
+            f"({declarations.digest()}) in {sys.prefix}",
+            cure="Build it again: pdal-stages plugin --install",
+        )
+
+
+def _stages(text: str) -> list[dict[str, Any]]:
+    """The pipeline up to the stage itself, as PDAL writes it: every value is text."""
+    try:
+        found = json.loads(text)["pipeline"]
+    except (ValueError, KeyError):  # `user_data` that is not JSON
+        return [{}]
+    return found if isinstance(found, list) else [found]
+
+
+def _typed(stage: Mapping[str, Any]) -> dict[str, Any]:
+    """A stage of PDAL's serialized pipeline, its values as one writes them in JSON."""
+    if stage.get("type") in registry.stages():
+        kind = registry.get(stage["type"])
+        own = {name: [value] for name, value in stage.items() if name not in ("type", "inputs")}
+        return {"type": kind.type, **settled(_parsed(kind, own))}
+    return {name: _number(value) if isinstance(value, str) else value for name, value in stage.items()}
+
+
+def _creates(stage: Mapping[str, Any]) -> Mapping[str, str]:
+    """What a stage before makes, as far as it matters: of ours, what it says; of PDAL's, heights."""
+    if stage.get("type") not in registry.stages():
+        return lowering.heights_of(stage)
+    kind = registry.get(stage["type"])
+    options = {k: v for k, v in stage.items() if k not in ("type", *lowering.PDAL_OWN)}
+    try:
+        return kind(options).creates()
+    except StageError:  # its own preparation has said so
+        return {}
+
+
+def _parsed(kind: type[Stage], texts: Mapping[str, list[str]]) -> dict[str, Any]:
+    """Options as text, one for each time they were given, as one writes them in JSON."""
+    known = {option.name: option for option in kind.all_options()}
+    known |= {option.also: option for option in kind.all_options() if option.also}
+    return {name: _value(known.get(name), values) for name, values in texts.items()}
+
+
+def _value(option: Option | None, texts: list[str]) -> Any:
+    if option is None:
+        return texts[-1]
+    if declarations.is_list(option):
+        return [_number(part) for text in texts for part in split(text)]
+    text = texts[-1]
+    if option.kind == "boolean" and text in ("true", "false", "invert"):
+        return text == "true" if text != "invert" else not option.default
+    if option.kind == "mapping":
+        try:
+            return json.loads(text)
+        except ValueError:
+            return text
+    return _number(text) if option.kind in ("number", "integer") else text
+
+
+def _number(text: str) -> Any:
+    """A number or truth where the text is one."""
+    if text in ("true", "false"):
+        return text == "true"
+    for kind in (int, float):
+        try:
+            return kind(text) if "_" not in text else text
+        except ValueError:
+            continue
+    return text
+
+
+def _end_on_interrupt() -> None:
+    """Within a program that is not Python, such as `pdal`, let Ctrl-C end it at once, as PDAL's own stages do.
+
+    There filters.python starts an interpreter, which takes the signal and keeps it while PDAL works.
+    """
+    if not sys.orig_argv and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        try:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+        except ValueError:  # of another thread
+            pass
