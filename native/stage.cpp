@@ -237,8 +237,6 @@ private:
             try
             {
                 add(args, *o, m_bound.back());
-                if (*o->also)
-                    args.addSynonym(o->name, o->also);
             }
             catch (const arg_error&)
             {} // writers of newer PDAL have `filename` and `where` already

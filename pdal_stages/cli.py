@@ -212,6 +212,11 @@ def _parser() -> argparse.ArgumentParser:
     takes("stage", help="e.g. filters.hag_minima; for PDAL's stages pdal --options is asked")
     takes("--showjson", action="store_true", help="As JSON Schema")
 
+    add("plugin", _plugin, "Build our stages into PDAL itself, so that all that runs PDAL has them")
+    from .plugin.command import add_arguments as add_plugin_arguments
+
+    add_plugin_arguments(commands.choices["plugin"])
+
     takes = add("classify", _classify, "Classify a cloud with a model file", overrides=True)
     takes("inputs", nargs="+", metavar="input", help="Files PDAL can read, folders, patterns")
     takes(
@@ -368,6 +373,12 @@ def _drivers(options: argparse.Namespace) -> None:
     from .pipeline import describe
 
     print(describe.drivers(ours_only=options.ours, as_json=options.showjson), end="")
+
+
+def _plugin(options: argparse.Namespace) -> int:
+    from .plugin.command import run
+
+    return run(options)
 
 
 def _options(options: argparse.Namespace) -> None:

@@ -19,7 +19,9 @@ def drivers(*, ours_only: bool = False, as_json: bool = False) -> str:
     if as_json:
         listed = [{"name": name, "description": text, "link": "", "extensions": []} for name, text in ours]
         if not ours_only:
-            listed += json.loads(pdal_env.ask_program("--drivers", "--showjson"))
+            # Where our plugin is built, PDAL names ours too.
+            theirs = json.loads(pdal_env.ask_program("--drivers", "--showjson"))
+            listed += [entry for entry in theirs if entry["name"] not in registry.stages()]
         return json.dumps(listed, indent=2) + "\n"
     width = max(len(name) for name, _ in ours) + 2
     lines = ["=" * 80, "pdal_stages", "=" * 80]

@@ -10,9 +10,9 @@ import copy
 import difflib
 import itertools
 import uuid
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..base.errors import PipelineError, StageError, suggest
 from ..stages import preparation, registry
@@ -101,26 +101,48 @@ def lower(source: PipelineSource, whole: bool = True) -> Lowered:
     return out
 
 
+class Told(NamedTuple):
+    """What a stage was told of the stages before it."""
+
+    preparation: list[dict[str, Any]]  #: those that made what it reads
+    makes_again: bool  #: whether one makes what it makes too
+    remark: str | None  #: what the user should know
+
+
+def tell(stage: Stage, before: Sequence[tuple[Mapping[str, Any], Mapping[str, str]]]) -> Told:
+    """Tell a stage which stages before it made what it reads.
+
+    `before` are the stages before it in their order, as they are written, each with what :meth:`Stage.creates` says of it;
+    for PDAL's own, :func:`heights_of`.
+    """
+    wanted = set(stage.reads())
+    made = [preparation.entry(given) for given, creates in before if wanted & set(creates)]
+    stage.makes_again = bool({name for _, creates in before for name in creates} & set(stage.creates()))
+    return Told(made, stage.makes_again, stage.follows(made))
+
+
+def heights_of(stage: Mapping[str, Any]) -> dict[str, str]:
+    """What a stage of PDAL's own makes that ours may read."""
+    return {"HeightAboveGround": "double"} if stage.get("type") in preparation.OF_PDAL else {}
+
+
 def _tell_preparations(lowered: Lowered) -> None:
     """Each stage of ours hears which stages before it made what it reads."""
-    for ours in lowered.ours:
-        wanted = set(ours.stage.reads())
-        makers = {one.index: one for one in lowered.ours if wanted & set(one.stage.creates())}
-        made = []
-        for index, stage in enumerate(lowered.stages[: ours.index]):
-            if index in makers:
-                made.append(preparation.entry({"type": makers[index].stage.type, **makers[index].given}))
-            elif "HeightAboveGround" in wanted and stage.get("type") in preparation.OF_PDAL:
-                made.append(preparation.entry(stage))
-        before = {name for one in lowered.ours if one.index < ours.index for name in one.stage.creates()}
-        if any(s.get("type") in preparation.OF_PDAL for s in lowered.stages[: ours.index]):
-            before.add("HeightAboveGround")
-        if before & set(ours.stage.creates()):
-            ours.stage.makes_again = ours.plain["pdalargs"]["makes_again"] = True
-        if made:
-            ours.plain["pdalargs"]["preparation"] = made
-        if (remark := ours.stage.follows(made)) is not None:
-            lowered.remarks.append(remark)
+    numbered = {ours.index: ours for ours in lowered.ours}
+    before: list[tuple[Mapping[str, Any], Mapping[str, str]]] = []
+    for index, plain in enumerate(lowered.stages):
+        ours = numbered.get(index)
+        if ours is None:
+            before.append((plain, heights_of(plain)))
+            continue
+        told = tell(ours.stage, before)
+        if told.makes_again:
+            ours.plain["pdalargs"]["makes_again"] = True
+        if told.preparation:
+            ours.plain["pdalargs"]["preparation"] = told.preparation
+        if told.remark is not None:
+            lowered.remarks.append(told.remark)
+        before.append(({"type": ours.stage.type, **ours.given}, ours.stage.creates()))
 
 
 def _refuse_near_miss(stage: dict[str, Any], where: str) -> None:

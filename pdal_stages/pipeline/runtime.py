@@ -82,8 +82,9 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
     label = str(arguments.get("label", ""))
     sys.modules.pop(label, None)  # PDAL's module object stays alive; the register need not grow
     try:
-        report = run_on_view(module, arguments, ins, outs)
-        module["out_metadata"] = _metadata_node(arguments["stage"], report)
+        stage = made.get(label) or _made_again(arguments)
+        report = run_on_view(stage, module, ins, outs)
+        module["out_metadata"] = node(arguments["stage"], leaves(report))
     except BaseException as error:
         failure = as_stage_error(error, place(arguments["stage"], arguments.get("tag")))
         _failures[label] = failure
@@ -109,16 +110,21 @@ def points_of(stage: Stage, module: Mapping[str, Any], ins: Mapping[str, Any]) -
     )
 
 
+def _made_again(arguments: Mapping[str, Any]) -> Stage:
+    """The stage of a lowered pipeline that runs in another process than the one that lowered it."""
+    kind = registry.get(arguments["stage"])
+    stage = kind(arguments.get("options", {}), place(kind.type, arguments.get("tag")))
+    stage.makes_again = arguments.get("makes_again", False)
+    stage.follows(arguments.get("preparation", []))
+    return stage
+
+
 @interrupts.catches
-def run_on_view(module, arguments, ins, outs) -> dict[str, Any]:
+def run_on_view(
+    stage: Stage, module: Mapping[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]
+) -> dict[str, Any]:
     """Run a stage on one view; its report. What it raises may be anything, Ctrl-C too."""
     interrupts.check()
-    stage = made.get(arguments.get("label", ""))
-    if stage is None:
-        kind = registry.get(arguments["stage"])
-        stage = kind(arguments.get("options", {}), place(kind.type, arguments.get("tag")))
-        stage.makes_again = arguments.get("makes_again", False)
-        stage.follows(arguments.get("preparation", []))
     points = points_of(stage, module, ins)
     for name in stage.reads():
         if name not in ins:
@@ -177,13 +183,18 @@ def wkt_of(reference: Any) -> str:
     return ""
 
 
-def _metadata_node(name: str, report: Mapping[str, Any]) -> dict[str, Any]:
-    """A report in the form PDAL takes metadata: every value as text, with its type."""
-    children = [_leaf(key, value) for key, value in report.items() if value is not None]
+def node(name: str, children: list[dict[str, Any]]) -> dict[str, Any]:
+    """A node of PDAL's metadata, as a script gives it."""
     return {"name": name, "value": "", "type": "", "description": "", "children": children}
 
 
-def _leaf(name: str, value: Any) -> dict[str, Any]:
+def leaves(report: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """A report as nodes of PDAL's metadata: every value as text, with its type."""
+    return [leaf(key, value) for key, value in report.items() if value is not None]
+
+
+def leaf(name: str, value: Any) -> dict[str, Any]:
+    """One value as a node of PDAL's metadata."""
     if isinstance(value, bool):
         text, kind = str(value).lower(), "boolean"
     elif isinstance(value, int | np.integer):

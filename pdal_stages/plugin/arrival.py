@@ -20,8 +20,7 @@ from ..pipeline import lowering, runtime
 from ..pipeline.optionfile import settled
 from ..stages import registry
 from ..stages.base import Stage
-from ..stages.options import Option
-from ..stages.options import split_list as split
+from ..stages.options import Option, split_list
 from . import declarations
 
 #: Stages made when a pipeline was prepared, until it has run; of pipelines that never run, so many are kept.
@@ -136,7 +135,6 @@ def _creates(stage: Mapping[str, Any]) -> Mapping[str, str]:
 def _parsed(kind: type[Stage], texts: Mapping[str, list[str]]) -> dict[str, Any]:
     """Options as text, one for each time they were given, as one writes them in JSON."""
     known = {option.name: option for option in kind.all_options()}
-    known |= {option.also: option for option in kind.all_options() if option.also}
     return {name: _value(known.get(name), values) for name, values in texts.items()}
 
 
@@ -144,7 +142,7 @@ def _value(option: Option | None, texts: list[str]) -> Any:
     if option is None:
         return texts[-1]
     if declarations.is_list(option):
-        return [_number(part) for text in texts for part in split(text)]
+        return [_number(part) for text in texts for part in split_list(text)]
     text = texts[-1]
     if option.kind == "boolean" and text in ("true", "false", "invert"):
         return text == "true" if text != "invert" else not option.default

@@ -39,7 +39,6 @@ struct Option
     bool hasDefault;
     double number;
     const char *text;
-    const char *also;
     const char *help;
 }};
 
@@ -107,7 +106,6 @@ def _options(number: int, kind: type[Stage]) -> str:
             str(bool(given)).lower(),
             repr(value),
             _text(text),
-            _text(option.also),
             _text(_help(kind, option)),
         ]
         lines.append(f"    {{ {', '.join(fields)} }},")

@@ -125,7 +125,7 @@ class Option:
 
     def _parse_list(self, value: Any) -> list:
         if isinstance(value, str):
-            value = _split(value)
+            value = split_list(value)
         elif isinstance(value, int | float) and not isinstance(value, bool):
             value = [value]
         if not isinstance(value, list | tuple) or not all(
@@ -182,7 +182,7 @@ def option(kind: str, default: Any, help: str, **more: Any) -> Any:
     return Option(kind, default, help, **more)
 
 
-def _split(text: str) -> list[str]:
+def split_list(text: str) -> list[str]:
     """Split at commas outside parentheses: ``c1,kopt(10,50)`` is two tokens."""
     parts, depth, current = [], 0, ""
     for character in text:

@@ -1,0 +1,141 @@
+"""What the plugin is compiled with and where PDAL looks for it, on this machine."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import os
+import re
+import shutil
+import sys
+import sysconfig
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..base.errors import DependencyError
+from ..pipeline import pdal as pdal_env
+
+#: Suffix of a shared library, by which PDAL knows its plugins.
+SUFFIX = ".dylib" if sys.platform == "darwin" else ".so"
+_PYTHON_FILTER = f"libpdal_plugin_filter_python{SUFFIX}"
+#: A function of PDAL's library, in every version: its address tells which file the library is.
+_OF_PDAL = "_ZN4pdal12StageFactoryC1Eb"
+_FILTER_CURE = (
+    "It comes with pdal-plugins: conda install -c conda-forge pdal-plugins, or pip install pdal-plugins; where it is "
+    "there already, set PDAL_DRIVER_PATH to the folder that holds it"
+)
+
+
+@dataclass(frozen=True)
+class Pdal:
+    """The PDAL that python-pdal uses."""
+
+    library: Path  #: the folder of its library
+    headers: Path  #: the folder that holds ``pdal/``
+    version: str
+
+
+def sources() -> Path:
+    """The folder of the C++ sources: in an installed package, or in a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "native", package.parent / "native"):
+        if (folder / "stage.cpp").is_file():
+            return folder
+    raise DependencyError(
+        "the C++ sources of the plugin are missing", found=package / "native", cure="Install pdal-stages again"
+    )
+
+
+def compiler() -> list[str]:
+    """The C++ compiler, $CXX first."""
+    named = os.environ.get("CXX", "").split()
+    for words in ([named] if named else [["c++"], ["g++"], ["clang++"]]):
+        if shutil.which(words[0]):
+            return words
+    raise DependencyError(
+        "there is no C++ compiler",
+        found=f"CXX={' '.join(named)}" if named else "neither c++, g++ nor clang++ on PATH",
+        cure="Debian, Ubuntu: apt-get install g++. Fedora: dnf install gcc-c++. macOS: xcode-select --install. conda: "
+        "conda install -c conda-forge cxx-compiler. Without one every other door works: pdal-stages pipeline, "
+        "pdal-stages expand",
+    )
+
+
+def pdal() -> Pdal:
+    """PDAL's library and headers; :class:`DependencyError` with the cure where they are missing or do not fit."""
+    library = _library_folder()
+    version = pdal_env.dotted_version()
+    for prefix in dict.fromkeys([*library.parents, Path(sys.prefix)]):
+        headers = prefix / "include"
+        if not (headers / "pdal" / "Filter.hpp").is_file():
+            continue
+        found = _headers_version(headers)
+        if found not in (version, ""):
+            raise DependencyError(
+                "PDAL's headers are of another version than its library",
+                found=f"{headers / 'pdal'}: {found}, {library}: {version}",
+                cure="Install both from one place",
+            )
+        return Pdal(library, headers, version)
+    raise DependencyError(
+        "PDAL's headers are missing",
+        found=f"no include/pdal beside {library}",
+        cure="Debian, Ubuntu: apt-get install libpdal-dev. conda-forge: conda install -c conda-forge libpdal-core. "
+        "Without them every other door works: pdal-stages pipeline, pdal-stages expand",
+    )
+
+
+def plugin_folder() -> Path:
+    """The folder of ``filters.python``, where PDAL will find our plugin too."""
+    named = [Path(part) for part in os.environ.get("PDAL_DRIVER_PATH", "").split(os.pathsep) if part]
+    usual = [Path(sysconfig.get_path(key)) / "pdal" for key in ("platlib", "purelib")]
+    tried = list(dict.fromkeys([*named, *usual, Path(sys.prefix) / "lib"]))
+    for folder in tried:
+        if (folder / _PYTHON_FILTER).is_file():
+            return folder
+    raise DependencyError(
+        "PDAL's plugin filters.python is missing, which runs our stages",
+        found=f"{_PYTHON_FILTER} in none of {', '.join(map(str, tried))}",
+        cure=_FILTER_CURE,
+    )
+
+
+def _library_folder() -> Path:
+    """The folder of the library that python-pdal is linked to."""
+    extension = importlib.import_module(f"{pdal_env.bindings().__name__}.libpdalpython").__file__ or ""
+    try:
+        address = ctypes.cast(getattr(ctypes.CDLL(extension), _OF_PDAL), ctypes.c_void_p)
+        found = _Found()
+        if ctypes.CDLL(None).dladdr(address, ctypes.byref(found)) and found.file:
+            return Path(os.fsdecode(found.file)).resolve().parent
+    except (OSError, AttributeError):
+        pass
+    raise DependencyError(
+        "the library that python-pdal uses is not found",
+        found=extension,
+        cure="On this system compile the plugin with CMake, from native/ of the sources",
+    )
+
+
+class _Found(ctypes.Structure):
+    """``Dl_info`` of dladdr(3)."""
+
+    _fields_ = [
+        ("file", ctypes.c_char_p),
+        ("base", ctypes.c_void_p),
+        ("name", ctypes.c_char_p),
+        ("address", ctypes.c_void_p),
+    ]
+
+
+def _headers_version(headers: Path) -> str:
+    """The version that PDAL's headers say, empty where they do not."""
+    for name in ("pdal_features.hpp", "pdal_config.hpp"):
+        path = headers / "pdal" / name
+        text = path.read_text(errors="replace") if path.is_file() else ""
+        numbers = [
+            re.search(rf"#define\s+PDAL_VERSION_{part}\s+(\d+)", text) for part in ("MAJOR", "MINOR", "PATCH")
+        ]
+        if all(numbers):
+            return ".".join(number.group(1) for number in numbers if number)
+    return ""
