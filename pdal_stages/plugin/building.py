@@ -133,7 +133,9 @@ def check(folder: Path | None = None) -> tuple[list[str], list[str]]:
     if kept is None:
         bad.append(f"the plugin is not in {folder}. {cure}")
         return good, bad
-    missing = [library_name(name) for name in registry.stages() if not (folder / library_name(name)).is_file()]
+    missing = [
+        library_name(name) for name in registry.stages() if not (folder / library_name(name)).is_file()
+    ]
     if missing:
         bad.append(f"libraries are missing in {folder} (found {', '.join(missing)}). {cure}")
     if kept.get("digest") != declarations.digest() or kept.get("pdal_stages") != __version__:
@@ -150,7 +152,9 @@ def check(folder: Path | None = None) -> tuple[list[str], list[str]]:
 def _run(command: Sequence[str]) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        errors = [line for line in done.stderr.splitlines() if "error" in line] or done.stderr.splitlines()[-1:]
+        errors = [line for line in done.stderr.splitlines() if "error" in line] or done.stderr.splitlines()[
+            -1:
+        ]
         raise StageError(
             "the plugin does not compile",
             found=f"{' '.join(command[:1])}: {'; '.join(errors[:3])}",

@@ -42,14 +42,16 @@ def sources() -> Path:
         if (folder / "stage.cpp").is_file():
             return folder
     raise DependencyError(
-        "the C++ sources of the plugin are missing", found=package / "native", cure="Install pdal-stages again"
+        "the C++ sources of the plugin are missing",
+        found=package / "native",
+        cure="Install pdal-stages again",
     )
 
 
 def compiler() -> list[str]:
     """The C++ compiler, $CXX first."""
     named = os.environ.get("CXX", "").split()
-    for words in ([named] if named else [["c++"], ["g++"], ["clang++"]]):
+    for words in [named] if named else [["c++"], ["g++"], ["clang++"]]:
         if shutil.which(words[0]):
             return words
     raise DependencyError(
