@@ -95,3 +95,12 @@ def test_hash_is_of_the_coordinates_alone():
 def test_a_class_without_points_is_an_error(random_cloud):
     with pytest.raises(OptionError, match="no samples"):
         draw_samples([(random_cloud(10), np.zeros(10, np.int16))], 2, 5, 0)
+
+
+def test_no_more_samples_than_the_largest_class_has(random_cloud):
+    """Weights, and with them the work of training, stay those of the points that are there."""
+    xyz = random_cloud(1000, seed=4)
+    position = np.zeros(1000, np.int16)
+    position[:100] = 1
+    samples = draw_samples([(xyz, position)], 2, 99_999_999, seed=0)
+    assert samples.weight.sum() == 1800 and samples.weight.max() == 9

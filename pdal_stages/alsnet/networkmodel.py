@@ -91,7 +91,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
             "count": int(count.sum()),
             "seed": options.seed,
             "samples": int(count.sum()),
-            **known.training_notes(),
+            **known.training_notes(options),
             **trained.notes,
             **{name: number for name, number in notes.items() if number},
         },

@@ -14,7 +14,8 @@ from ..base.asprs import UNINFORMATIVE
 from ..base.errors import OptionError, StageError
 from ..features.voxels import represent
 from .classes import MAX_LABEL, ClassMap, as_labels
-from .dimensions import known
+from .dimensions import known, required, welcome
+from .telltale import telltale
 from .thinning import thinned
 from .trainoptions import TrainingOptions
 
@@ -151,9 +152,15 @@ class Labelled:
     def __iter__(self) -> Iterator[tuple[npt.NDArray[np.float64], npt.NDArray[np.int16]]]:
         return (self[number] for number in range(len(self)))
 
-    def training_notes(self) -> dict[str, Any]:
+    def training_notes(self, options: TrainingOptions) -> dict[str, Any]:
         """What was counted, for a manifest."""
-        return {"contradicted": dict(self.left_out)} if self.left_out else {}
+        notes: dict[str, Any] = {"contradicted": dict(self.left_out)} if self.left_out else {}
+        read = {*required(options.inputs), *welcome(options.inputs)}
+        telling = telltale(
+            ({name: np.asarray(v) for name, v in cloud.dimensions.items() if name in read}, self[number][1])
+            for number, cloud in enumerate(self.clouds)
+        )
+        return notes | ({"telltale": telling} if telling else {})
 
     def described(self, options: TrainingOptions, counts: Iterable[Mapping[str, int]]) -> dict[str, Any]:
         """What a manifest says of the task and of each class, whose samples `counts` tells."""

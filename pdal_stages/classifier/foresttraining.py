@@ -97,7 +97,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
             "count": options.count,
             "seed": options.seed,
             "samples": len(samples),
-            **labelled.training_notes(),
+            **labelled.training_notes(options),
             "max_samples": options.max_samples,
             "max_features": options.max_features,
             "min_samples_leaf": chosen["min_samples_leaf"],

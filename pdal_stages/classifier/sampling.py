@@ -77,7 +77,8 @@ def draw_samples(
         A position of -1 leaves the point out.
     n_classes : int
     count : int
-        Samples per class. A class with fewer points gives each of them count/n times, rounded down or up.
+        Samples per class; no more than the largest class has points. A class with fewer points gives each of them
+        count/n times, rounded down or up.
     seed : int
     groups : sequence of str, optional
         The group of each cloud: each gives as many samples of a class as the others, as far as it has them. Without,
@@ -98,6 +99,7 @@ def draw_samples(
     available = there.sum(axis=0)
     if not available.all():
         raise OptionError("a class has no samples", found=f"class position {int(np.argmin(available))}")
+    count = min(count, int(available.max()))
     alone = np.count_nonzero(there.any(axis=1)) == 1
     parts = []
     for position in range(n_classes):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base import kinds
-from ..base.errors import ModelError, StageError
+from ..base.errors import ModelError, OptionError, StageError
 from ..base.files import check_writable
 from ..base.outputs import Output
 from ..classifier import TrainingCloud, TrainingOptions, summary, train
@@ -209,6 +209,12 @@ holds the classes.
 
     def check(self) -> None:
         self.training.inputs  # noqa: B018  words that mean nothing are refused
+        if self.label in required(self.training.inputs):
+            raise OptionError(
+                f"option 'dimensions' names the label itself, '{self.label}'",
+                found=", ".join(map(str, self.dimensions)),
+                cure="Leave it out: the points to classify do not have it",
+            )
         if self.training.classes is not None:
             ClassMap.parse(self.training.classes)
         for output in self.outputs():
@@ -255,6 +261,13 @@ holds the classes.
             points.report["score"] = scores[0]
         if gone := model.info["training"].get("contradicted"):
             points.report["contradicted"] = gone
+        if telling := model.info["training"].get("telltale"):
+            listed = ", ".join(f"{name} ({100 * share:.3g} %)" for name, share in telling.items())
+            said = (
+                f"the classes follow from one dimension almost alone: {listed}. If it was made of the labels, or of what "
+                "unlabelled points do not have, leave it out of 'dimensions': the score is worth nothing"
+            )
+            points.report["warning"] = ". ".join(filter(None, [points.report.get("warning"), said]))
         crossed = model.info["accuracy"]["cross_validation"] or {}
         if "instead" in crossed:
             points.report["note"] = (

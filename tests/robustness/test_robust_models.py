@@ -93,7 +93,7 @@ BROKEN = [
     ("model of version 2.0", lambda h, m: h.update(version=2.0), ["version 2.0"]),
     ("model with a number of 1e999", with_text(rb'"max_samples": [\d.]+', b'"max_samples": 1e999'), ["1e999 is too large"]),
     ("model with NaN in its manifest", with_text(rb'"max_samples": [\d.]+', b'"max_samples": NaN'), ["NaN is not a number"]),
-    ("model with a key twice", with_text(rb'"max_samples"', b'"max_samples": 1, "max_samples"'), ["twice"]),
+    ("model with a key twice", with_text(rb'"max_samples"', b'"max_samples": 1, "max_samples"'), ["duplicate key"]),
     ("model with 997 neighborhoods", lambda h, m: h["passes"][0]["features"].update(neighborhoods=[f"ropt(0.25,{k / 100},0.05)" for k in range(30, 1027)]),
      ["at most 64 neighborhoods"]),
     ("model with features in another order", swap_names, ["features"]),
@@ -269,3 +269,57 @@ def test_figures_of_any_size(cell, tmp_path, model):
         else:
             it.runs(done, "printed, and drawn as far as it can be")
             assert (tmp_path / "page.html").read_text().rstrip().endswith("</html>")
+
+
+# ---- labels among what is trained on ---------------------------------------------------------------------------
+
+
+def test_the_label_as_a_dimension(cell, tmp_path, write_las):
+    data = scene(2000)
+    data["Copy"] = data["Classification"].astype("f4")
+    source = write_las(tmp_path / "in.las", data, point_format=6)
+    words = [
+        "train",
+        source,
+        "--model",
+        tmp_path / "m.model",
+        "--neighborhoods",
+        "c1",
+        "--count",
+        "100",
+        "--trees",
+        "3",
+    ]
+    it = cell("Models", "training on the label itself")
+    it.refused(
+        [*words, "--writers.classifiermodel.dimensions=Classification"], "the label itself", "Leave it out"
+    )
+    it = cell("Models", "training on a dimension that is a copy of the label")
+    done = it.runs(
+        [*words, "--writers.classifiermodel.dimensions=Copy"], "trained, with a warning that names it"
+    )
+    assert "almost alone: Copy (100 %)" in done.err
+
+
+def test_more_samples_than_points(cell, tmp_path, cloud):
+    """The largest class bounds what is drawn, so a figure that means 'all' costs what all cost."""
+    it = cell("Models", "training with 99,999,999 samples of each class, on 600 points")
+    it.runs(
+        [
+            "train",
+            cloud,
+            "--model",
+            tmp_path / "m.model",
+            "--neighborhoods",
+            "c1",
+            "--count",
+            "99999999",
+            "--trees",
+            "3",
+        ],
+        "trained on all points",
+    )
+    (large, small) = sorted(
+        ps.load_model(tmp_path / "m.model").info["classes"], key=lambda c: -c["available"]
+    )
+    assert large["duplicates"] == 0 and small["samples"] + small["duplicates"] == large["samples"]
