@@ -156,7 +156,9 @@ def limits(values: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.nda
     Trees need no scaling, but values beyond are cut off.
     """
     low, high = np.percentile(values, [1, 99], axis=0).astype(np.float32)
-    low = np.where(np.abs(values).min(axis=0) == 0, np.float32(0), low)
+    low = np.where(
+        values.min(axis=0) == 0, np.float32(0), low
+    )  # the absolute minimum, not the least absolute value
     histogram = np.array([name.startswith(("A3_", "D1_", "D2_", "D3_", "D4_")) for name in names])
     low[histogram], high[histogram] = -np.inf, np.inf
     return low, high

@@ -7,8 +7,8 @@ coordinates (``floor(x / cell)``), so every tile of a survey sees the same cells
 is held: the fine value is computed where a point falls, and only cells with points and
 their neighbors are stored, so one stray coordinate costs one cell.
 
-[W18] Weinmann, Blomley, Weinmann, Jutzi (2018), DGPF: binary and multi-class
-classification of ALS point clouds.
+[W18] Weinmann, Blomley, Weinmann, Jutzi (2018), Investigations on the potential of binary and
+multi-class classification for object extraction from airborne laser scanning point clouds, DGPF.
 """
 
 from __future__ import annotations
