@@ -631,7 +631,9 @@ def test_install_check_uninstall(tmp_path, plugin, monkeypatch, capsys):
     record["files"].append("libpdal_plugin_filter_former.so")
     (folder / building.RECORD).write_text(json.dumps(record))
     (folder / "libpdal_plugin_filter_other.so").write_text("of somebody else")
-    building.uninstall(folder)
+    monkeypatch.setenv("PDAL_DRIVER_PATH", f"{tmp_path}{os.pathsep}{folder}")
+    assert building.usual_folder() == folder
+    building.uninstall()
     assert [path.name for path in folder.iterdir()] == ["libpdal_plugin_filter_other.so"]
     assert building.uninstall(folder) == []
 

@@ -28,6 +28,12 @@ def library_name(type_name: str) -> str:
     return f"libpdal_plugin_{family.removesuffix('s')}_{name}{places.SUFFIX}"
 
 
+def usual_folder() -> Path:
+    """Where PDAL looks and the plugin is already; otherwise the folder of ``filters.python``."""
+    named = [Path(part) for part in os.environ.get("PDAL_DRIVER_PATH", "").split(os.pathsep) if part]
+    return next((path for path in named if record(path) is not None), None) or places.plugin_folder()
+
+
 def install(folder: Path | None = None) -> list[Path]:
     """Compile the plugin and put it into a folder, by default beside ``filters.python``; the files.
 
@@ -38,7 +44,7 @@ def install(folder: Path | None = None) -> list[Path]:
     StageError
         If it does not compile, or the folder cannot be written.
     """
-    target = folder or places.plugin_folder()
+    target = folder or usual_folder()
     found = places.pdal()
     if not target.is_dir() or not os.access(target, os.W_OK):
         raise StageError(
@@ -87,7 +93,7 @@ def compile_into(work: Path, pdal: places.Pdal) -> list[Path]:
 
 def uninstall(folder: Path | None = None) -> list[Path]:
     """Take the plugin away; the files that were there."""
-    target = folder or places.plugin_folder()
+    target = folder or usual_folder()
     names = [*(record(target) or {}).get("files", []), *map(library_name, registry.stages()), RECORD]
     gone = [target / name for name in dict.fromkeys(names) if (target / Path(name).name).is_file()]
     for path in gone:
@@ -125,7 +131,7 @@ def check(folder: Path | None = None) -> tuple[list[str], list[str]]:
             good.append(f"compiler: {shutil.which(found[0])}")
         else:
             good.append(f"filters.python: {found}")
-            folder = folder or found
+            folder = folder or usual_folder()
     if folder is None:
         return good, bad
     kept = record(folder)
