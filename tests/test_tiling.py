@@ -185,9 +185,9 @@ def test_two_worker_processes_give_the_same(tmp_path, town_file, model_file, who
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
 def test_large_files_are_written_in_parts(tmp_path, town_file, model_file, whole, suffix, monkeypatch):
-    from pdal_stages.tiling import file_task
+    from pdal_stages.tiling import sizing
 
-    monkeypatch.setattr(file_task, "MOST_AT_ONCE", 11_000)
+    monkeypatch.setattr(sizing, "MOST_AT_ONCE", 11_000)
     out = tmp_path / f"out.{suffix}"
     assert not run_tiled(clouds.stages([town_file], out, model_file), 60, workers=0).failures
     clouds.same_points(whole, out)

@@ -71,6 +71,12 @@ def read_header(path: str | os.PathLike) -> LasHeader | None:
     )  # fmt: skip
 
 
+def holds_flags(path: str | os.PathLike) -> bool:
+    """Whether a file is of LAS 1.0 to 1.3, whose flags (synthetic, key-point, withheld) share a byte with the class."""
+    header = read_header(path)
+    return header is not None and header.point_format <= 5
+
+
 def check_readable(path: str | os.PathLike) -> str | None:
     """Refuse a LAS or LAZ file whose header cannot be right; a remark where it only looks odd.
 

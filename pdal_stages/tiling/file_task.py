@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from ..base import las
+from ..base.asprs import LEGACY_LIMIT
+from ..pipeline.beside import extra_dims_option
+from ..pipeline.filenames import LAS_WRITERS
+from . import sizing
 from .inparts import HeadersDifferError, write_in_parts
-from .results import PieceResults, of_own_points, read_range
+from .results import NewValues, PieceResults, of_own_points, read_range
 from .sources import InputSource
 from .tail import run_tail
-
-#: A larger file is written in parts of so many points.
-MOST_AT_ONCE = 4_000_000
+from .tileplan import TilePlan
 
 
 @dataclass(frozen=True)
@@ -23,32 +29,61 @@ class FileTask:
     count: int  #: points of the input
     results: list[str]  #: files of tiles
     tail: list[dict[str, Any]]  #: stages to run, with the writers
+    beside: dict[str, str] | None  #: see TilePlan
     outputs: list[str]  #: what each of the writers writes
     scratch: str  #: folder for temporary files
 
     def run(self) -> dict[str, Any]:
-        """Write the outputs; see :func:`~pdal_stages.tiling.tail.run_tail`."""
+        """Write the outputs; see :func:`~pdal_stages.tiling.tail.run_tail`. The report counts the points of each class, too."""
+        classes = np.zeros(256, np.int64)
+        holds_flags = las.holds_flags(self.source.path)
 
-        def new_values(start: int, end: int):
-            return read_range(self.results, self.source, self.count, start, end)
+        def new_values(start: int, end: int) -> NewValues:
+            values = read_range(self.results, self.source, self.count, start, end)
+            if start == 0:  # begun, or begun anew
+                classes[:] = 0
+            if "Classification" in values.values:
+                codes = np.asarray(values.values["Classification"][1], np.uint8)
+                codes = codes & LEGACY_LIMIT if holds_flags else codes
+                np.add(classes, np.bincount(codes, minlength=256), out=classes)
+            return values
 
-        writers = [stage for stage in self.tail if stage["type"].startswith("writers.")]
-        kinds = {(writer["type"], Path(writer["filename"]).suffix.lower()) for writer in writers}
-        if self.count > MOST_AT_ONCE and kinds <= {("writers.las", ".las"), ("writers.las", ".laz")}:
+        report = self._write(new_values)
+        return report | {"classes": {str(code): int(classes[code]) for code in np.flatnonzero(classes)}}
+
+    def _write(self, new_values: Callable[[int, int], NewValues]) -> dict[str, Any]:
+        tail = with_beside(self.tail, self.beside, [self.source.path])
+        writers = [stage["type"] for stage in self.tail if stage["type"].startswith("writers.")]
+        kinds = {(kind, Path(path).suffix.lower()) for kind, path in zip(writers, self.outputs, strict=True)}
+        if self.count > sizing.MOST_AT_ONCE and kinds <= {("writers.las", ".las"), ("writers.las", ".laz")}:
             try:
                 return write_in_parts(
-                    self.source, self.count, MOST_AT_ONCE, new_values, self.tail, self.outputs, self.scratch
+                    self.source, self.count, sizing.MOST_AT_ONCE, new_values, tail, self.outputs, self.scratch
                 )
             except HeadersDifferError:  # such as automatic offsets: written at once
                 pass
         reader = {**self.source.reader, "filename": self.source.path}
-        return run_tail([reader], [new_values(0, self.count)], self.tail, self.outputs)
+        return run_tail([reader], [new_values(0, self.count)], tail, self.outputs)
 
 
-def write_tile(results: list[PieceResults], tail: list[dict[str, Any]], outputs: list[str]) -> dict[str, Any]:
+def write_tile(results: list[PieceResults], plan: TilePlan, outputs: list[str]) -> dict[str, Any]:
     """Write one tile's own points, from the files that were cut for it."""
     mine = [result for result in results if result.piece.own.size]
+    tail = with_beside(plan.tail, plan.beside, [result.source.path for result in mine])
     if not mine:
         return {"outputs": []}
     readers = [{**r.source.reader, "type": "readers.las", "filename": r.piece.core} for r in mine]
     return run_tail(readers, [of_own_points(result) for result in mine], tail, outputs)
+
+
+def with_beside(
+    tail: list[dict[str, Any]], beside: dict[str, str] | None, paths: list[str]
+) -> list[dict[str, Any]]:
+    """The tail with LAS writers told which extra dimensions to write: the inputs' own, and those beside them."""
+    if beside is None:
+        return tail
+    listed = extra_dims_option(paths, beside)
+    return [
+        {"extra_dims": listed, **stage} if listed and stage["type"] in LAS_WRITERS else stage
+        for stage in tail
+    ]

@@ -46,7 +46,7 @@ class HeadRun:
 
     results: list[PieceResults]
     need: float  #: the metres of surroundings that it took
-    said: list[str] = field(default_factory=list)  #: warnings and notes
+    notes: list[str] = field(default_factory=list)  #: warnings and notes
 
 
 def run_head(
@@ -92,8 +92,8 @@ def run_head(
     if not everything and any(number for one in beyond for number in one.values()):
         most = max(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
         need = max(need, _far_neighbors(pipeline.arrays, most, context, tile))
-    said = [*(f"PDAL says: {line}" for line in pipeline.said), *pipeline.told]
-    return HeadRun(results, need, said)
+    notes = [*(f"PDAL says: {line}" for line in pipeline.said), *pipeline.told]
+    return HeadRun(results, need, notes)
 
 
 class _Mark:

@@ -18,8 +18,8 @@ class TilingOptions:
 
     Attributes
     ----------
-    tile : float
-        Side of a tile, in the unit of the coordinates.
+    tile : float, optional
+        Side of a tile, in the unit of the coordinates. By default as large as the memory allows.
     workers : int, optional
         Worker processes; 0 works in this process. Default: one for every two cores.
     scheduler : str
@@ -30,6 +30,9 @@ class TilingOptions:
     buffer : float, optional
         Metres of surroundings each tile is read with, for PDAL filters that look at neighbors; it is added
         to what our stages ask for.
+    memory : int, optional
+        Bytes that all processes of this machine together may hold; of a run on a scheduler, each worker. Default: half of
+        what is free.
     resume : bool
         Keep what an earlier run finished.
     retries : int
@@ -39,18 +42,22 @@ class TilingOptions:
         ones, up to so many points.
     """
 
-    tile: float
+    tile: float | None = None
     workers: int | None = None
     scheduler: str = ""
     per: str = "auto"
     buffer: float | None = None
+    memory: int | None = None
     resume: bool = False
     retries: int = 2
     most_points: int = 5_000_000
 
     def __post_init__(self) -> None:
         # 20 and 20.0 are one run
-        object.__setattr__(self, "tile", checks.number("--tile", self.tile, 0, above=True))
+        if self.tile is not None:
+            object.__setattr__(self, "tile", checks.number("--tile", self.tile, 0, above=True))
+        if self.memory is not None:
+            checks.whole("--memory", self.memory, 1, unit="bytes")
         if self.workers is not None:
             checks.whole("--workers", self.workers, 0)
         if self.workers is not None and self.scheduler:

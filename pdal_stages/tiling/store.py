@@ -109,6 +109,15 @@ class Store:
         self.files.unlink(missing_ok=True)
         self._written = {}
 
+    def keep_side(self, side: float) -> None:
+        """Remember the side of the tiles, for :meth:`side`."""
+        _keep(self.folder / "run.json", {"tile": side}, "result")
+
+    def side(self) -> float | None:
+        """The side of the last run's tiles, where it is known."""
+        known = _read(self.folder / "run.json")
+        return known["tile"] if known else None
+
     def result(self, name: str) -> Path:
         """The file of a tile's results."""
         return self.tiles / f"{name}.npz"

@@ -6,6 +6,7 @@ import math
 import time
 from collections import deque
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from .cloudindex import CloudIndex, index_las
 from .grid import Box, TileGrid, check_number, touching, union
 from .pool import Pool, last_tries
 from .settings import TilingOptions
+from .sizing import Density, settled
 from .sources import Extent, InputSource, check_source, find_sources, read_ept, read_extent
 from .store import Store, fingerprint
 from .tileplan import TilePlan
@@ -32,8 +34,8 @@ class Survey:
 
     def __init__(self, plan: TilePlan, options: TilingOptions) -> None:
         self.started = time.strftime("%Y-%m-%d %H:%M")
-        self.grid = TileGrid(options.tile)
         self.notes = list(plan.notes)
+        self._whole_names = plan.whole_names
         self.unreadable: dict[str, str] = {}  #: inputs by path that cannot be read, and why
         self.extents: dict[str, Extent] = {}  #: of inputs by path, where the header can be read
         self.indexes: dict[str, CloudIndex] = {}  #: of LAS and LAZ files by path, once they were read
@@ -54,6 +56,10 @@ class Survey:
         self.unit = self._unit(plan)  #: metres per unit of the coordinates
         self.halo = plan.halo_m / self.unit  #: surroundings of a tile, in the unit of the coordinates
         self._place()
+        #: With the tiles' side and the workers settled.
+        self.options = settled(options, Density.of(self.extents.values()), self.halo, self.per == "file")
+        assert self.options.tile is not None
+        self.grid = TileGrid(self.options.tile)
 
     def _read_headers(self) -> None:
         for source in self.sources:
@@ -129,6 +135,11 @@ class Survey:
     def paths(self) -> list[str]:
         """Of all inputs."""
         return [source.path for source in self.sources]
+
+    @property
+    def names(self) -> list[str]:
+        """What outputs of files are called, in place of '#'."""
+        return [Path(s.path).name if self._whole_names else s.stem for s in self.sources]
 
     def stamps_of(self, stages: list[dict[str, Any]]) -> list[Any]:
         """Names and stamps of the files that stages read."""

@@ -42,7 +42,7 @@ class TileTask:
         ) as folder:
             results, report = _settle(self, folder)
             if self.outputs is not None:
-                return report | write_tile(results, self.context.plan.tail, self.outputs)
+                return report | write_tile(results, self.context.plan, self.outputs)
             save(self.result, results)
         return report | {"result_bytes": os.path.getsize(self.result)}
 
@@ -92,7 +92,7 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
         "widened": halo_m > least_m,
         "dropped": own - sum(len(result.rows) for result in head.results),
         "classes": class_counts(head.results),
-        "said": head.said,
+        "notes": head.notes,
     }
     return head.results, report
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from ..pipeline.overrides import Override
 from ..pipeline.run import Pipeline
 from .dispatch import run_all
 from .estimate import estimate
-from .outcome import InterruptedRun, TiledRun, summarize
+from .outcome import FileJob, InterruptedRun, TiledRun, TileJob, summarize
 from .pool import open_pool
 from .settings import TilingOptions
 from .store import Store
@@ -69,37 +70,54 @@ def run_tiled(
     >>> run.failures                                                 # doctest: +SKIP
     []
     """
-    started = time.monotonic()
     chosen = tile if isinstance(tile, TilingOptions) else TilingOptions(tile, **options)
     pipeline = source if isinstance(source, Pipeline) else Pipeline(source, overrides, whole=False)
-    plan = make_plan(pipeline, chosen.buffer)
+    return run_plan(make_plan(pipeline, chosen.buffer), chosen, dry_run=dry_run, progress=progress)
+
+
+def run_plan(
+    plan: TilePlan,
+    chosen: TilingOptions,
+    *,
+    dry_run: bool = False,
+    progress: bool | None = None,
+    finished: Callable[[TileJob | FileJob], None] | None = None,
+) -> TiledRun:
+    """Run what was planned; see :func:`run_tiled`. `finished` hears of every output that was written."""
+    started = time.monotonic()
+    folder = Path(plan.writers[0]["filename"]).absolute().parent
+    if chosen.resume and chosen.tile is None:  # the free memory may be another today
+        chosen = replace(chosen, tile=Store(folder).side())
     survey = Survey(plan, chosen)
+    chosen = survey.options
     if survey.per == "tile":  # whose outputs have points of all readers
         classflags.parting([*plan.readers, *plan.tail])
     if dry_run:
-        return estimate(plan, survey, chosen)
-    folder = _folder(plan)
+        return estimate(plan, survey)
+    if not folder.is_dir():
+        raise StageError("the folder of the output does not exist", found=str(folder), cure="Create it first")
     if survey.per == "file":  # refused now, not after reading all inputs
-        outputs_for(plan, [source.stem for source in survey.sources], survey.paths)
+        outputs_for(plan, survey.names, survey.paths)
     with Store(folder) as store:
         if not chosen.resume:
             store.clear()
+        store.keep_side(survey.grid.size)
         try:
             with open_pool(chosen, str(store.folder)) as pool:
                 survey.read_indexes(store, pool, chosen.retries, progress)
-                work = Worklist(plan, survey, chosen)
+                work = Worklist(plan, survey)
                 if chosen.resume:
                     work.take_over(store)
                 with contextlib.suppress(KeyboardInterrupt):
                     interrupted = True
-                    run_all(work, store, pool, chosen.retries, progress)
+                    run_all(work, store, pool, chosen.retries, progress, finished)
                     interrupted = False
                     work.forget_results(store)
         finally:
             sweep(folder)  # what workers left that were killed
     summary = survey.figures(plan) | {"workers": pool.slots, "threads_per_worker": pool.threads}
     summary |= summarize(work.jobs, work.outputs, time.monotonic() - started)
-    survey.notes += _said(work)
+    survey.notes += _notes_of_tiles(work)
     short = [job.name for job in work.jobs if job.state == "done" and job.report.get("short")]
     if short:
         survey.notes.append(
@@ -113,21 +131,13 @@ def run_tiled(
 
 
 #: Most different warnings of tiles that a run repeats.
-_MOST_SAID = 20
+_MOST_NOTES = 20
 
 
-def _said(work: Worklist) -> list[str]:
+def _notes_of_tiles(work: Worklist) -> list[str]:
     """Warnings and notes of tiles, once each, the most frequent first."""
     told = Counter(
-        text for job in work.jobs if job.state == "done" for text in set(job.report.get("said", ()))
+        text for job in work.jobs if job.state == "done" for text in set(job.report.get("notes", ()))
     )
-    notes = [f"{text} ({n} tile{'s' * (n != 1)})" for text, n in told.most_common(_MOST_SAID)]
-    return notes + ([f"and {len(told) - _MOST_SAID} more; see --report"] if len(told) > _MOST_SAID else [])
-
-
-def _folder(plan: TilePlan) -> Path:
-    """The folder of the outputs, where the run keeps what it needs too."""
-    folder = Path(plan.writers[0]["filename"]).absolute().parent
-    if not folder.is_dir():
-        raise StageError("the folder of the output does not exist", found=str(folder), cure="Create it first")
-    return folder
+    notes = [f"{text} ({n} tile{'s' * (n != 1)})" for text, n in told.most_common(_MOST_NOTES)]
+    return notes + ([f"and {len(told) - _MOST_NOTES} more; see --report"] if len(told) > _MOST_NOTES else [])

@@ -57,6 +57,9 @@ class TilePlan:
     unit: str  #: `horizontal_unit` of our stages, empty for the spatial reference's
     notes: list[str]  #: what the user should know
     name: str  #: the pipeline's file, or what else its source is called
+    #: Of the dimensions that stages make, those that LAS files get beside the input's own; None leaves it to the writer.
+    beside: dict[str, str] | None = None
+    whole_names: bool = False  #: '#' in an output's name is the whole name of the input file, with its suffix
 
     @property
     def writers(self) -> list[dict[str, Any]]:

@@ -12,7 +12,6 @@ from .cloudindex import CloudIndex
 from .file_task import FileTask
 from .headrun import RunContext
 from .outcome import FileJob, TileJob
-from .settings import TilingOptions
 from .sources import InputSource
 from .store import Store, fingerprint
 from .survey import Survey
@@ -23,9 +22,9 @@ from .tileplan import TilePlan, outputs_for
 class Worklist:
     """What a run has to do."""
 
-    def __init__(self, plan: TilePlan, survey: Survey, options: TilingOptions) -> None:
-        self.plan, self.survey, self.options = plan, survey, options
-        self._tail = [plan.tail, survey.stamps_of(plan.tail)]
+    def __init__(self, plan: TilePlan, survey: Survey) -> None:
+        self.plan, self.survey, self.options = plan, survey, survey.options
+        self._tail = [plan.tail, plan.beside, survey.stamps_of(plan.tail)]
         self._common = fingerprint(
             build(),
             plan.head,
@@ -33,7 +32,7 @@ class Worklist:
             plan.creates,
             plan.halo_m,
             survey.grid.size,
-            options.most_points,
+            self.options.most_points,
             self._tail if survey.per == "tile" else [],
         )
         self.jobs = self._jobs()  #: tiles with points of their own, row by row
@@ -76,7 +75,7 @@ class Worklist:
     def _outputs(self) -> list[FileJob]:
         survey = self.survey
         by_tile = {job.tile: job for job in self.jobs}
-        named = outputs_for(self.plan, [source.stem for source in survey.sources], survey.paths)
+        named = outputs_for(self.plan, survey.names, survey.paths)
         outputs = []
         for source, paths in zip(survey.sources, named, strict=True):
             out = FileJob(source, paths)
@@ -143,7 +142,7 @@ class Worklist:
             if isinstance(item, FileJob):
                 count = survey.indexes[item.source.path].count
                 results = [str(store.result(job.name)) for job in item.jobs]
-                return FileTask(item.source, count, results, plan.tail, item.paths, scratch)
+                return FileTask(item.source, count, results, plan.tail, plan.beside, item.paths, scratch)
             sources = survey.near(item.tile, far)
             return TileTask(
                 context,

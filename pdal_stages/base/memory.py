@@ -1,0 +1,66 @@
+"""How much memory there is, and sizes of memory as people write them."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+from .errors import OptionError
+
+#: Bytes of each unit, by its first letter.
+_UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
+#: Taken where the system does not say what is free.
+_UNKNOWN = 4 * 10**9
+
+
+def parse_size(text: str) -> int:
+    """Bytes of ``4GB``, ``500 MB``, ``4GiB`` or a plain number.
+
+    Raises
+    ------
+    OptionError
+        For anything else.
+    """
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(i?)B?\s*", text, re.IGNORECASE)
+    if match is None or float(match[1]) <= 0:
+        raise OptionError("an amount of memory is a number and a unit", found=text, cure="For example 4GB")
+    letter = match[2].upper()
+    unit = 1024 ** "KMGT".index(letter) * 1024 if match[3] and letter else _UNITS[letter]
+    return int(float(match[1]) * unit)
+
+
+def free_memory() -> int:
+    """Bytes that can be had without swapping: what the system has left, within what a container allows."""
+    found = [_available(), _left_in_container()]
+    known = [size for size in found if size]
+    return min(known) if known else _UNKNOWN
+
+
+def _available() -> int:
+    try:
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    except (OSError, ValueError):
+        pass
+    try:  # other systems than Linux: half of what there is
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+    except (OSError, ValueError, AttributeError):
+        return 0
+
+
+def _left_in_container() -> int:
+    """Of control groups, of either version; 0 where there is no limit."""
+    folder = Path("/sys/fs/cgroup")
+    for limit, used in (
+        (folder / "memory.max", folder / "memory.current"),
+        (folder / "memory/memory.limit_in_bytes", folder / "memory/memory.usage_in_bytes"),
+    ):
+        try:
+            most = int(limit.read_text())
+            if most < 2**60:
+                return max(1, most - int(used.read_text()))
+        except (OSError, ValueError):
+            continue
+    return 0
