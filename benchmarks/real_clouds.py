@@ -24,9 +24,11 @@ import numpy as np
 from pdal_stages import __version__
 from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.pipeline import pdal as pdal_env
-from pdal_stages.pipeline.jobs import classify_job, las_files, train_pipeline
+from pdal_stages.pipeline.classifying import ClassifyRequest
+from pdal_stages.pipeline.ends import input_files
 from pdal_stages.pipeline.overrides import parse_overrides
 from pdal_stages.pipeline.run import Pipeline
+from pdal_stages.pipeline.trainjob import train_pipeline
 from pdal_stages.reports.panels import triptych
 from pdal_stages.reports.pictures import write_png
 
@@ -46,7 +48,7 @@ PEER = {"montpellier": (85.1, 79.2, 75.6, 90.7), "delft": (94.4, None, 93.5, Non
 def train(sources: str, model: Path, classes: str, more: list[str]) -> None:
     """A model of these files."""
     overrides, _ = parse_overrides(f"--writers.classifiermodel.{option}" for option in more)
-    stages = train_pipeline(las_files([sources]), str(model), overrides, classes=classes)
+    stages = train_pipeline(input_files([sources]), str(model), overrides, classes=classes)
     Pipeline(stages, overrides).execute(arrays=False)
 
 
@@ -63,7 +65,7 @@ def job(name: str, options: argparse.Namespace, work: Path) -> dict:
     drawn = []
     for source in sorted(data.glob(str(spec["test"]))):
         target = work / f"classified_{source.name}"
-        classify_job(str(source), str(target), str(model)).execute(arrays=False)
+        ClassifyRequest(str(model)).pipeline(str(source), str(target)).execute(arrays=False)
         points += unchanged(source, target)
         before, after = laspy.read(source), laspy.read(target)
         codes = [int(c) for c in str(spec["classes"]).split(",")]

@@ -8,13 +8,10 @@ import json
 import logging
 import os
 import re
-import signal
 import sys
-import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from .base import kinds
 from .base.errors import StageError, suggest
@@ -32,13 +29,7 @@ _OVERRIDES = (
     "--filters.name.option=VALUE for all stages of a type."
 )
 
-#: Points that a classifier did not give a class, by their name in its report.
-_LEFT_ALONE = {
-    "rejected": "rejected as unreliable",
-    "ignored": "left out: noise, withheld (ignore)",
-    "kept": "class kept (keep)",
-    "outside_where": "outside where",
-}
+_INPUTS = "Files that PDAL reads, folders, patterns, tile indexes, EPT sources"
 #: Lines of PDAL's log that are shown without -v.
 _SAID = 10
 _VERBOSE = ("-v", "--verbose")
@@ -138,12 +129,6 @@ def _unforeseen(error: Exception) -> StageError:
     )
 
 
-def _end_at_once(options: argparse.Namespace) -> None:
-    """Ctrl-C ends the program although PDAL works: Python cannot handle signals meanwhile. The next run sweeps up."""
-    if options.is_program and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
 def _refuse_words(command: argparse.ArgumentParser, unknown: list[str]) -> None:
     """Leave with the command's usage and the flag that may have been meant."""
     flags = re.findall(r"(?<!\S)--[\w-]+", command.format_help())
@@ -218,11 +203,11 @@ def _parser() -> argparse.ArgumentParser:
     add_plugin_arguments(commands.choices["plugin"])
 
     takes = add("classify", _classify, "Classify a cloud with a model file", overrides=True)
-    takes("inputs", nargs="+", metavar="input", help="Files PDAL can read, folders, patterns")
+    takes("inputs", nargs="+", metavar="input", help=_INPUTS)
     takes(
         "output",
-        help="A file PDAL can write; of several inputs a folder, which is made, or a name with # where the input's goes. "
-        "Other dimensions and the header are kept",
+        help="A file; of several inputs a folder, which is made, or a name with # where the input's goes. Other dimensions "
+        "and the header are kept",
     )
     takes(
         "--model",
@@ -235,14 +220,14 @@ def _parser() -> argparse.ArgumentParser:
         help="Extra dimensions to write beside the input's own: e.g. Reliability,Margin,Probability_6, all, or none; "
         "default HeightAboveGround,Reliability",
     )
-    takes("--workers", type=int, default=1, metavar="N", help="Files classified at the same time (1)")
     takes("--where", help="Classify only the points for which this holds; the others serve as neighbors")
     takes("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
+    add_arguments(commands.choices["classify"], survey=True)
 
     add("models", _models, "List the models that come with the package")
 
     takes = add("train", _train, "Train a model on labelled clouds", overrides=True)
-    takes("inputs", nargs="+", metavar="input", help="Labelled files PDAL can read, folders, patterns")
+    takes("inputs", nargs="+", metavar="input", help=f"Labelled: {_INPUTS[0].lower()}{_INPUTS[1:]}")
     takes("--model", required=True, help="The model file to write")
     takes("--classes", help="Codes (2,5,6) or a JSON mapping of labels to classes")
     takes("--neighborhoods", help="Preset or tokens, e.g. s5,k10,k50")
@@ -251,7 +236,7 @@ def _parser() -> argparse.ArgumentParser:
     takes("--trees", help="Number of trees; of several the best is found")
 
     takes = add("accuracy", _accuracy, "Compare two class dimensions, or two files", overrides=True)
-    takes("inputs", nargs="+", metavar="input", help="Classified files, folders or patterns")
+    takes("inputs", nargs="+", metavar="input", help=f"Classified: {_INPUTS[0].lower()}{_INPUTS[1:]}")
     takes(
         "--reference",
         action="append",
@@ -329,11 +314,12 @@ def _run(options: argparse.Namespace, pipeline) -> int:
 def _ran(options: argparse.Namespace, pipeline) -> tuple[int, list[str]]:
     """Run a pipeline: the number of points, and what is to be told."""
     from .base.files import write_whole
+    from .tiling.command import end_at_once
 
     metadata, verbose = getattr(options, "metadata", None), getattr(options, "verbose", 1)
     more = [Output(options.log, "log")] if getattr(options, "log", None) else []
     pipeline.check_outputs(*more, *([Output(metadata, "metadata", kinds.JSON)] if metadata else []))
-    _end_at_once(options)
+    end_at_once(options)
     count = pipeline.execute(arrays=False, loglevel=_LEVELS.get(verbose, logging.DEBUG))
     # Warnings, and what PDAL calls an error although it goes on: a reader that sets what it cannot read to 0, say.
     lines = pipeline.said
@@ -388,135 +374,17 @@ def _options(options: argparse.Namespace) -> None:
 
 
 def _classify(options: argparse.Namespace) -> int:
-    from .pipeline.jobs import las_files, make_folder, outputs_of
-
-    inputs = las_files(options.inputs)
-    outputs = outputs_of(inputs, options.output)
-    make_folder(options.output, outputs)
-    more = [Output(options.metadata, "metadata", kinds.JSON)] if options.metadata else []
-    more += [Output(options.log, "log")] if options.log else []
-    check_outputs([*map(Output, outputs), *more], inputs)
-    if len(inputs) > 1:
-        return _classify_each(inputs, outputs, options)
-    done = _classify_one(inputs[0], outputs[0], options)
-    tell(*done.said)
-    print(f"{done.count:,} points written to {done.target}")
-    _print_classes([done.report], options.model)
-    return 0
-
-
-def _classify_each(inputs: Sequence[str], outputs: Sequence[str], options: argparse.Namespace) -> int:
-    """Classify files one by one, saying of each that it is finished as soon as it is."""
-    from .base.files import write_whole
-    from .pipeline.processes import each_file
-
-    one = argparse.Namespace(**{**vars(options), "metadata": None, "log": None})
-    work = [(source, target, one) for source, target in zip(inputs, outputs, strict=True)]
-    done: dict[str, _Classified] = {}
-    failed: dict[str, str] = {}
-    told, code = _ToldOnce(), 0
-    try:
-        # A process of their own, so that one may crash, and Ctrl-C is heard here.
-        for (source, *_), answer in each_file(_classify_one, work, options.workers, apart=options.is_program):
-            number = f"{len(done) + len(failed) + 1} of {len(work)}"
-            if answer.reason:
-                failed[source] = answer.reason
-                told.tell(source, answer.reason)
-                continue
-            done[source] = answer.result
-            print(f"{number}: {answer.result.count:,} points written to {answer.result.target}", flush=True)
-            for line in answer.result.said:
-                told.tell(source, line)
-    except KeyboardInterrupt:
-        code = 130
-    told.end()
-    if done:
-        print(
-            "Each file was classified by itself; --tile of 'pipeline' lets them see each other's points",
-            file=sys.stderr,
-        )
-    _print_classes([done[source].report for source in inputs if source in done], options.model)
-    if options.metadata:
-        listed = [
-            {"input": source, "output": target}
-            | (
-                {"metadata": done[source].metadata}
-                if source in done
-                else {"error": failed.get(source, "not done")}
-            )
-            for source, target in zip(inputs, outputs, strict=True)
-        ]
-        write_whole(options.metadata, (json.dumps({"files": listed}, indent=2, default=str) + "\n").encode())
-    if failed:
-        tell(f"{len(failed)} of {len(work)} files failed")
-    if code:
-        left = [source for source in inputs if source not in done and source not in failed]
-        tell(
-            f"interrupted; {len(done)} of {len(work)} files are finished and whole, of the others nothing was left. Still "
-            f"to be done: {', '.join(left[:5])}{f' and {len(left) - 5:,} more' * (len(left) > 5)}"
-        )
-    return code or (1 if failed else 0)
-
-
-class _ToldOnce:
-    """What is said of many files: at once for the first, and in the end which others it holds for."""
-
-    def __init__(self) -> None:
-        self._files: dict[str, list[str]] = {}
-
-    def tell(self, file: str, text: str) -> None:
-        text = text.removeprefix(f"{file}: ")
-        if text not in self._files:
-            tell(f"{file}: {text}")
-        self._files.setdefault(text, []).append(file)
-
-    def end(self) -> None:
-        for text, (_, *others) in self._files.items():
-            if others:
-                more = f" and {len(others) - 3:,} more" if len(others) > 3 else ""
-                tell(f"also {', '.join(others[:3])}{more}: {text}")
-
-
-@dataclass
-class _Classified:
-    """What became of a file: where it was written, its points, the classifier's report, and what is to be told."""
-
-    target: str
-    count: int
-    report: dict[str, Any]
-    said: list[str]
-    metadata: dict[str, Any]
-
-
-def _classify_one(source: str, target: str, options: argparse.Namespace) -> _Classified:
-    """Classify a file."""
-    from .pipeline.jobs import WRITTEN, classify_job
+    from .pipeline.classifying import WRITTEN, ClassifyRequest
+    from .tiling.classify import ClassifyTask
+    from .tiling.command import classify, options_of
 
     listed = options.dimensions
     named = WRITTEN if listed is None else tuple(name.strip() for name in listed.split(",") if name.strip())
-    pipeline = classify_job(
-        source, target, options.model, options.overrides, where=options.where, dimensions=named
+    request = ClassifyRequest(options.model, tuple(options.overrides), options.where, named)
+    files = {"metadata": options.metadata or "", "log": options.log or ""}
+    return classify(
+        ClassifyTask(tuple(options.inputs), options.output, request, options_of(options), **files), options
     )
-    count, said = _ran(options, pipeline)
-    return _Classified(target, count, pipeline.reports[-1][1][-1], said, pipeline.metadata)
-
-
-def _print_classes(reports: Sequence[dict[str, Any]], model: str) -> None:
-    """The points of each class in all files."""
-    from .base.asprs import class_name
-    from .stages.loading import loaded_model
-
-    names = dict(loaded_model(model).classes)
-    classes: dict[int, int] = {}
-    for report in reports:
-        for code, points in report.get("classes", {}).items():
-            classes[int(code)] = classes.get(int(code), 0) + points
-    for code, points in sorted(classes.items()):
-        print(f"  {code:3d} {names.get(code, class_name(code)):28s} {points:>12,}")
-    for key, what in _LEFT_ALONE.items():
-        number = sum(report.get(key) or 0 for report in reports)
-        if number:
-            print(f"  {what:32s} {number:>12,}")
 
 
 def _models(options: argparse.Namespace) -> None:
@@ -531,20 +399,21 @@ def _models(options: argparse.Namespace) -> None:
 
 
 def _train(options: argparse.Namespace) -> None:
-    from .pipeline.jobs import las_files, train_pipeline
+    from .pipeline.ends import input_files
     from .pipeline.run import Pipeline
+    from .pipeline.trainjob import train_pipeline
     from .stages.loading import load_model
 
     named = ("classes", "neighborhoods", "feature_set", "count", "trees")
     extra = {name: value for name in named if (value := getattr(options, name)) is not None}
-    stages = train_pipeline(las_files(options.inputs), options.model, options.overrides, **extra)
+    stages = train_pipeline(input_files(options.inputs), options.model, options.overrides, **extra)
     _run(options, Pipeline(stages, options.overrides))
     if Path(options.model).is_file():  # not written into a pipe or device
         print(load_model(options.model))
 
 
 def _accuracy(options: argparse.Namespace) -> None:
-    from .pipeline.jobs import accuracy_pipeline, compare_files
+    from .pipeline.comparing import accuracy_pipeline, compare_files
     from .pipeline.run import Pipeline
 
     reference_dimension = options.reference_dimension or (

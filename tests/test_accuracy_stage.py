@@ -12,7 +12,8 @@ import pdal_stages as ps
 from pdal_stages.base.errors import StageError
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 from pdal_stages.cli import main
-from pdal_stages.pipeline.jobs import las_files, paired
+from pdal_stages.pipeline.comparing import paired
+from pdal_stages.pipeline.ends import input_files
 
 pytestmark = pytest.mark.pdal
 WKT = 'PROJCS["RGF93 / Lambert-93",GEOGCS["RGF93",DATUM["x",SPHEROID["GRS 1980",6378137,298.257222101]],'
@@ -151,4 +152,4 @@ def test_files_without_a_partner_are_refused(tmp_path):
     with pytest.raises(StageError, match="the same reference"):
         paired(["c_a.laz", "d_a.laz"], ["a.laz"])
     with pytest.raises(StageError, match="no LAS or LAZ"):
-        las_files([str(tmp_path)])
+        input_files([str(tmp_path)])

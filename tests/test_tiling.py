@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, PipelineError, StageError
+from pdal_stages.pipeline.tindex import locations
 from pdal_stages.synthetic.townfile import wkt
 from pdal_stages.terrain.minima import terrain_reach
 from pdal_stages.tiling import TilingOptions, run_tiled
@@ -23,7 +24,6 @@ from pdal_stages.tiling.extract import cut, plain_header
 from pdal_stages.tiling.grid import TileGrid, inside, touching
 from pdal_stages.tiling.sources import find_sources, las_extent
 from pdal_stages.tiling.tileplan import make_plan
-from pdal_stages.tiling.tindex import locations
 
 pytestmark = pytest.mark.pdal
 WKT = wkt("EPSG:25832")

@@ -8,6 +8,14 @@ import time
 from contextlib import AbstractContextManager
 
 
+def duration(seconds: float) -> str:
+    """Seconds up to two minutes, then minutes, then hours: ``95 s``, ``12 min``, ``3 h 20 min``."""
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
 class Progress(AbstractContextManager):
     """A line of progress: done, rate, time left.
 
@@ -36,6 +44,8 @@ class Progress(AbstractContextManager):
         silenced = enabled is False or os.environ.get("PDAL_STAGES_PROGRESS", "1") == "0"
         self.enabled = self.stream is not None and not silenced
         self.count = 0
+        #: Seconds left, where they are known better than from what was done since the beginning.
+        self.seconds_left: float | None = None
         self.started = time.monotonic()
         self._terminal = self.stream is not None and self.enabled and self.stream.isatty()
         self._every = 0.2 if self._terminal else 15.0
@@ -61,8 +71,10 @@ class Progress(AbstractContextManager):
         text += f", {rate:,.0f} {self.unit}/s" if rate >= 10 else f", {rate:.2g} {self.unit}/s"
         if end:
             text += f", {seconds:.1f} s"
+        elif self.seconds_left is not None:
+            text += f", {duration(self.seconds_left)} left"
         elif self.total and rate > 0:
-            text += f", {max(self.total - self.count, 0) / rate:.0f} s left"
+            text += f", {duration(max(self.total - self.count, 0) / rate)} left"
         if self.stream is None:
             return
         try:
@@ -71,6 +83,12 @@ class Progress(AbstractContextManager):
         except (OSError, ValueError):  # a closed or full stderr must not stop the work
             self.enabled = False
         self._shown = True
+
+    def clear(self) -> None:
+        """Take the line away, for something else to be printed; it comes back when it is due."""
+        if self._terminal and self._shown and self.stream is not None and self.enabled:
+            self.stream.write("\r\x1b[K")
+            self.stream.flush()
 
     def close(self) -> None:
         """Draw the last state, if anything was drawn at all."""

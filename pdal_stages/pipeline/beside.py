@@ -10,7 +10,7 @@ from ..base.las import extra_dimensions
 
 
 def extra_dims_option(sources: Sequence[str], made: Mapping[str, str]) -> str:
-    """The inputs' own extra dimensions and those `made` (name -> PDAL type); ``all`` where the own are not known or named oddly."""
+    """The inputs' own extra dimensions and those `made` (name -> PDAL type); ``all`` where the own are not known."""
     own: dict[str, str] = {}
     for source in sources:
         if Path(source).suffix.lower() not in (".las", ".laz"):

@@ -1,30 +1,48 @@
-"""The flags of ``pdal-stages pipeline --tile``, and what it prints."""
+"""The flags of runs in tiles, of ``pipeline`` and of ``classify``, and what they print."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import signal
+import threading
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 
+from ..base.asprs import class_name
 from ..base.errors import OptionError, StageError
 from ..base.files import check_writable, write_whole
+from ..base.memory import parse_size
 from ..base.plain import tell
+from ..pipeline.ends import is_folder, is_las
 from ..pipeline.read import PipelineSource
 from ..pipeline.run import Pipeline
+from .classify import LEFT_ALONE, ClassifyTask, Written
 from .outcome import InterruptedRun, TiledRun
 from .settings import PER, TilingOptions
 from .tiledrun import run_tiled
 from .tileplan import make_plan
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Add the flags to the parser of ``pipeline``."""
-    group = command.add_argument_group("large areas", "Run the pipeline in tiles; see docs/large-areas.md.")
+def add_arguments(command: argparse.ArgumentParser, survey: bool = False) -> None:
+    """Add the flags to the parser of ``pipeline``, or of ``classify`` (a `survey`)."""
+    when = "Several inputs, and files too large for memory, are cut into tiles" if survey else "Run in tiles"
+    group = command.add_argument_group("large areas", f"{when}; see docs/large-areas.md.")
     takes = group.add_argument
-    takes("--tile", type=float, metavar="SIZE", help="Side of the tiles, in the unit of the coordinates")
+    takes(
+        "--tile",
+        type=_side,
+        metavar="SIZE",
+        help="Side of the tiles, in the unit of the coordinates; auto takes what the memory allows",
+    )
+    takes(
+        "--memory",
+        metavar="SIZE",
+        help="What all processes together may hold, e.g. 4GB (default: half of what is free)",
+    )
     takes(
         "--workers",
         type=int,
@@ -34,7 +52,10 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     takes("--scheduler", default="", metavar="ADDRESS", help="A running Dask scheduler, tcp://HOST:8786")
     takes("--per", choices=PER, default="auto", help="One output per input file or per tile (auto: per file)")
     takes(
-        "--buffer", type=float, metavar="METRES", help="Surroundings for PDAL filters that look at neighbors"
+        "--buffer",
+        type=float,
+        metavar="METERS",
+        help=argparse.SUPPRESS if survey else "Surroundings for PDAL filters that look at neighbors",
     )
     takes("--resume", action="store_true", help="Keep what an earlier run in this folder finished")
     takes("--retries", type=int, default=2, metavar="N", help="How often a failed tile is tried again (2)")
@@ -48,11 +69,25 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     )
 
 
+def _side(text: str) -> float | str:
+    return text if text == "auto" else float(text)
+
+
+def options_of(options: argparse.Namespace) -> TilingOptions:
+    """What the flags say."""
+    names = {field.name for field in fields(TilingOptions)}
+    chosen = {name: value for name, value in vars(options).items() if name in names}
+    chosen["tile"] = None if options.tile == "auto" else options.tile
+    chosen["memory"] = None if options.memory is None else parse_size(options.memory)
+    return TilingOptions(**chosen)
+
+
 def wants_tiles(options: argparse.Namespace) -> bool:
     """Whether a run in tiles is asked for."""
     if options.tile is not None:
         return True
     given = {
+        "--memory": options.memory is not None,
         "--workers": options.workers is not None,
         "--scheduler": options.scheduler,
         "--per": options.per != "auto",
@@ -63,20 +98,16 @@ def wants_tiles(options: argparse.Namespace) -> bool:
     }
     for flag, used in given.items():
         if used:
-            raise OptionError(f"{flag} needs --tile", cure="Give the side of the tiles, e.g. --tile 500")
+            raise OptionError(
+                f"{flag} needs --tile", cure="Give the side of the tiles, e.g. --tile 500, or --tile auto"
+            )
     return False
 
 
 def run_command(options: argparse.Namespace, source: Path | PipelineSource) -> int:
     """Run ``pdal-stages pipeline --tile``; the exit code, 1 where anything failed."""
-    for name in options.report:
-        if Path(name).suffix.lower() not in (".html", ".htm", ".json"):
-            raise OptionError("--report writes .html or .json", found=name)
-        check_writable(name, "report")
-    if options.metadata:
-        check_writable(options.metadata, "metadata")
-    names = {field.name for field in fields(TilingOptions)}
-    chosen = TilingOptions(**{name: value for name, value in vars(options).items() if name in names})
+    _check_reports(options)
+    chosen = options_of(options)
     pipeline = Pipeline(source, options.overrides, whole=False)
     if options.validate:
         make_plan(pipeline, chosen.buffer)
@@ -89,17 +120,156 @@ def run_command(options: argparse.Namespace, source: Path | PipelineSource) -> i
         except InterruptedRun as stopped:
             run, interrupted = stopped.run, True
     _print_dry(run) if options.dry_run else _print(run)
+    return _end(options, run, "run it again with --resume" if interrupted else "")
+
+
+def _check_reports(options: argparse.Namespace) -> None:
+    for name in options.report:
+        if Path(name).suffix.lower() not in (".html", ".htm", ".json"):
+            raise OptionError("--report writes .html or .json", found=name)
+        check_writable(name, "report")
+    if options.metadata:
+        check_writable(options.metadata, "metadata")
+
+
+def _end(options: argparse.Namespace, run: TiledRun, again: str) -> int:
+    """Write reports; the exit code. `again`: of an interrupted run, how to go on."""
     if options.metadata:
         _write_json(options.metadata, run, "--metadata")
     for name in options.report:
         _write_report(name, run)
-    if interrupted:
-        tell(
-            "interrupted; nothing half-written was left. Run it again with --resume for the rest of the "
-            f"{_counted(len(run.tiles), 'tile')}"
+    if not again:
+        return 1 if run.failures else 0
+    states = run.summary["states"]
+    done = states["done"] + states["kept"]
+    files = sum(out.state in ("done", "kept") for out in run.outputs)
+    written = f"{files:,} of {_counted(len(run.outputs), 'file')} written, " if run.outputs else ""
+    tell(
+        f"interrupted; nothing half-written was left. {written}{done:,} of {_counted(len(run.tiles), 'tile')} done. "
+        f"For the rest: {again}"
+    )
+    return 130
+
+
+# ---- classify --------------------------------------------------------------------------------------------
+
+
+def classify(task: ClassifyTask, options: argparse.Namespace) -> int:
+    """Run ``pdal-stages classify``; the exit code, 1 where anything failed."""
+    _check_reports(options)
+    names = dict(task.request.loaded.classes)
+    if options.dry_run and (task.in_one_piece() or not task.can_be_cut):
+        task.request.pipeline(
+            task.files[0], str(Path(task.output) / "dry-run.laz") if is_folder(task.output) else task.output
         )
-        return 130
-    return 1 if run.failures else 0
+        print(f"{_counted(len(task.files), 'input')}, each in one piece")
+        return 0
+    if task.in_one_piece() and not options.report:
+        end_at_once(options)
+        written = task.run_whole()
+        tell(*written.notes)
+        print(f"{written.points:,} points written to {written.path}")
+        _print_classes([written], names)
+        return 0
+    if not task.can_be_cut:
+        return _classify_each(task, options, names)
+    done: list[Written] = []
+
+    def finished(written: Written) -> None:
+        done.append(written)
+        print(f"{written.path}: {written.points:,} points{_shares(written, names)}", flush=True)
+
+    interrupted = False
+    with _terminated_as_interrupted():
+        try:
+            run = task.run_tiles(dry_run=options.dry_run, finished=finished)
+        except InterruptedRun as stopped:
+            run, interrupted = stopped.run, True
+    if options.dry_run:
+        _print_dry(run)
+    else:
+        _print(run, "files" if run.outputs else "")
+        _print_classes(done, names)
+    return _end(options, run, task.again() if interrupted else "")
+
+
+def _classify_each(task: ClassifyTask, options: argparse.Namespace, names: Mapping[int, str]) -> int:
+    """Inputs of which parts cannot be read, one after the other."""
+    for flag in ("resume", "report", "scheduler"):
+        if getattr(options, flag):
+            raise OptionError(
+                f"--{flag} needs inputs that can be cut into tiles: LAS, LAZ, COPC or EPT",
+                found=next(name for name in task.files if not is_las(name)),
+                cure="Convert them first: pdal translate INPUT input.laz",
+            )
+    end_at_once(options)
+    notes = _SaidOnce()
+
+    def said(source: str, what: Written | str) -> None:
+        if isinstance(what, Written):
+            print(f"{what.path}: {what.points:,} points{_shares(what, names)}", flush=True)
+        for line in [what] if isinstance(what, str) else what.notes:
+            notes.say(source, line)
+
+    done, failed = task.run_each(said)
+    notes.end()
+    if len(task.files) > 1:
+        tell(
+            "each file was classified by itself: inputs that are not LAS, LAZ, COPC or EPT cannot be cut into tiles"
+        )
+    _print_classes(done, names)
+    if failed:
+        tell(f"{failed} of {_counted(len(task.files), 'file')} failed")
+    return 1 if failed else 0
+
+
+def end_at_once(options: argparse.Namespace) -> None:
+    """Ctrl-C ends the program although PDAL works: Python cannot handle signals meanwhile. The next run sweeps up."""
+    if options.is_program and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+class _SaidOnce:
+    """What is said of many files: at once for the first, and in the end which others it holds for."""
+
+    def __init__(self) -> None:
+        self._files: dict[str, list[str]] = {}
+
+    def say(self, file: str, text: str) -> None:
+        text = text.removeprefix(f"{file}: ")
+        if text not in self._files:
+            tell(f"{file}: {text}")
+        self._files.setdefault(text, []).append(file)
+
+    def end(self) -> None:
+        for text, (_, *others) in self._files.items():
+            if others:
+                more = f" and {len(others) - 3:,} more" if len(others) > 3 else ""
+                tell(f"also {', '.join(others[:3])}{more}: {text}")
+
+
+def _shares(written: Written, names: Mapping[int, str]) -> str:
+    """``; 2 ground 61.3 %, 6 building 12.0 %``"""
+    total = sum(written.classes.values())
+    shares = [
+        f"{code} {names.get(code, class_name(code))} {100.0 * n / total:.1f} %"
+        for code, n in sorted(written.classes.items())
+    ]
+    return f"; {', '.join(shares)}" if shares else ""
+
+
+def _print_classes(done: Sequence[Written], names: Mapping[int, str]) -> None:
+    """The points of each class in all files together."""
+    classes: Counter[int] = Counter()
+    counts: Counter[str] = Counter()
+    for written in done:
+        classes.update(written.classes)
+        counts.update(written.counts)
+    for code, points in sorted(classes.items()):
+        print(f"  {code:3d} {names.get(code, class_name(code)):28s} {points:>12,}")
+    for key, what in LEFT_ALONE.items():
+        if counts[key]:
+            print(f"  {what:32s} {counts[key]:>12,}")
 
 
 @contextmanager
@@ -116,7 +286,7 @@ def _terminated_as_interrupted():
         signal.signal(signal.SIGTERM, before)
 
 
-def _print(run: TiledRun) -> None:
+def _print(run: TiledRun, unit: str = "") -> None:
     s = run.summary
     states = s["states"]
     line = f"{_counted(states['done'], 'tile')} done"
@@ -124,6 +294,14 @@ def _print(run: TiledRun) -> None:
         line += f", {states['kept']} kept from an earlier run"
     if states["failed"]:
         line += f", {states['failed']} failed"
+    if unit:
+        files = [sum(out.state == state for out in run.outputs) for state in ("done", "kept", "failed")]
+        more = [
+            f"{n:,} {what}"
+            for n, what in zip(files[1:], ("kept from an earlier run", "failed"), strict=True)
+            if n
+        ]
+        line = f"{_counted(files[0], 'file')} written{''.join(f', {words}' for words in more)}; {line}"
     print(f"{line}; {s['points']:,} points in {s['seconds']:.1f} s ({s['points_per_second']:,.0f} points/s)")
     if s["dropped"]:
         print(f"{s['dropped']:,} points were dropped by filters of the pipeline")

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 from collections import deque
+from collections.abc import Callable
 
 from ..base.errors import StageError
 from ..base.progress import Progress
 from .outcome import FileJob, TileJob
+from .pace import Pace
 from .pool import Pool, last_tries
 from .store import Store
 from .worklist import Worklist
@@ -16,8 +18,15 @@ from .worklist import Worklist
 _HOPELESS = 10
 
 
-def run_all(work: Worklist, store: Store, pool: Pool, retries: int, show: bool | None) -> None:
-    """Do all waiting tiles and outputs; their states, reports and reasons are set.
+def run_all(
+    work: Worklist,
+    store: Store,
+    pool: Pool,
+    retries: int,
+    show: bool | None,
+    finished: Callable[[TileJob | FileJob], None] | None = None,
+) -> None:
+    """Do all waiting tiles and outputs; their states, reports and reasons are set. `finished` hears of outputs.
 
     Raises
     ------
@@ -34,6 +43,10 @@ def run_all(work: Worklist, store: Store, pool: Pool, retries: int, show: bool |
             users.setdefault(job.tile, []).append(out)
         _make_ready(out, waiting)
     total = sum(item.points for item in waiting if isinstance(item, TileJob))
+    pace = Pace(
+        total, sum(out.points for out in work.outputs if out.state in ("waiting", "ready")), pool.slots
+    )
+    failed = 0
     with Progress(total, f"{done} of {len(jobs)} tiles", enabled=show) as progress:
         for item, answer in last_tries(pool, waiting, work.tasks(store, pool.threads), retries):
             if answer.reason:
@@ -42,11 +55,22 @@ def run_all(work: Worklist, store: Store, pool: Pool, retries: int, show: bool |
                 item.state, item.report = "done", answer.result | answer.cost
                 with contextlib.suppress(StageError, OSError):  # no room: a later run does it again
                     work.keep(store, item)
+            if finished is not None and item.state == "done" and item.outputs:
+                progress.clear()
+                finished(item)
+            kind = "tile" if isinstance(item, TileJob) else "output"
+            pace.finished(kind, item.points, answer.cost.get("seconds", 0.0))
+            progress.seconds_left = pace.seconds_left()
             if isinstance(item, FileJob):
+                progress.update(0)
                 continue
-            done += 1
-            progress.label = f"{done} of {len(jobs)} tiles"
-            progress.update(item.report.get("points", item.points))
+            if answer.reason:
+                failed += 1
+                progress.total -= item.points
+            else:
+                done += 1
+            progress.label = f"{done} of {len(jobs)} tiles" + (f", {failed} failed" if failed else "")
+            progress.update(0 if answer.reason else item.points)
             for out in users.get(item.tile, ()):
                 _make_ready(out, waiting)
             if answer.reason:

@@ -34,7 +34,7 @@ class FileTask:
     scratch: str  #: folder for temporary files
 
     def run(self) -> dict[str, Any]:
-        """Write the outputs; see :func:`~pdal_stages.tiling.tail.run_tail`. The report counts the points of each class, too."""
+        """Write the outputs; see :func:`~pdal_stages.tiling.tail.run_tail`. The report counts classes, too."""
         classes = np.zeros(256, np.int64)
         holds_flags = las.holds_flags(self.source.path)
 
@@ -44,7 +44,7 @@ class FileTask:
                 classes[:] = 0
             if "Classification" in values.values:
                 codes = np.asarray(values.values["Classification"][1], np.uint8)
-                codes = codes & LEGACY_LIMIT if holds_flags else codes
+                codes = codes & np.uint8(LEGACY_LIMIT if holds_flags else 255)
                 np.add(classes, np.bincount(codes, minlength=256), out=classes)
             return values
 

@@ -38,7 +38,8 @@ class FileJob(_Work):
     """An input file whose output is put together from tiles."""
 
     source: InputSource
-    paths: list[str]
+    outputs: list[str]
+    points: int = 0  #: of the input
     jobs: list[TileJob] = field(default_factory=list)
 
 
@@ -89,7 +90,7 @@ class TiledRun:
             (path, reason.removeprefix(f"{path}: ") + self._blocked_by(path))
             for path, reason in self.unreadable.items()
         ]
-        failed = [(f"tile {job.name}", job) for job in self.tiles] + [(o.paths[0], o) for o in self.outputs]
+        failed = [(f"tile {job.name}", job) for job in self.tiles] + [(o.outputs[0], o) for o in self.outputs]
         found += [(path, _CHANGED) for path in self.changed]
         return found + [
             (what, item.reason) for what, item in failed if item.state == "failed" and not item.blocked_by
@@ -98,7 +99,7 @@ class TiledRun:
     def _blocked_by(self, path: str) -> str:
         """What was not made because an input cannot be read, in words."""
         tiles = sum(job.blocked_by == path for job in self.tiles)
-        outputs = [Path(out.paths[0]).name for out in self.outputs if out.blocked_by == path]
+        outputs = [Path(out.outputs[0]).name for out in self.outputs if out.blocked_by == path]
         parts = [f"{tiles} tile{'s' * (tiles != 1)} there"] if tiles else []
         parts += [*outputs[:5], *([f"{len(outputs) - 5} more outputs"] if len(outputs) > 5 else [])]
         return f" (not made because of it: {', '.join(parts)})" if parts else ""
@@ -117,9 +118,13 @@ class TiledRun:
                 for j in self.tiles
             ],
             "outputs": [
-                {"input": o.source.path, "output": o.paths, "state": o.state}
+                {"input": o.source.path, "output": o.outputs, "state": o.state}
                 | ({"reason": o.reason} if o.reason else {})
-                | {k: o.report[k] for k in ("written", "seconds", "cpu_seconds", "peak_mb") if k in o.report}
+                | {
+                    k: o.report[k]
+                    for k in ("written", "classes", "seconds", "cpu_seconds", "peak_mb")
+                    if k in o.report
+                }
                 for o in self.outputs
             ],
         }

@@ -12,8 +12,8 @@ from typing import Any
 
 from ..base import las, strictjson
 from ..base.errors import PipelineError, StageError
+from ..pipeline.tindex import locations
 from .grid import Box
-from .tindex import locations
 
 #: Readers of files whose points can be fetched by number.
 _LAS = ("readers.las", "readers.copc")
@@ -45,6 +45,14 @@ class InputSource:
                 return name[: -len(suffix)]
         return Path(name).stem
 
+    @property
+    def plain_name(self) -> str:
+        """The file's name, without what says that it is COPC: outputs of tiles are not."""
+        name = Path(self.path).name
+        return (
+            name[: -len(".copc.laz")] + name[-len(".laz") :] if name.lower().endswith(".copc.laz") else name
+        )
+
     def within(self, box: Box) -> dict[str, Any]:
         """The reader of an EPT source for a box alone."""
         x0, y0, x1, y1 = box
@@ -61,7 +69,8 @@ def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
     """
     found: dict[str, InputSource] = {}
     for reader in readers:
-        name = str(reader.get("filename", ""))
+        given = reader.get("filename", "")
+        name = str(given)
         kind = reader["type"]
         if kind == "readers.tindex":
             ignored = [o for o in _TINDEX_QUERIES if o in reader]
@@ -76,11 +85,14 @@ def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
             paths = locations(name, str(reader.get("tindex_name", "location")))
             reader = {"type": "readers.las", **options}
         elif kind == "readers.ept":
-            path = name.removeprefix("ept://")
-            path = path if path.endswith("ept.json") else path.rstrip("/") + "/ept.json"
-            path = path if "://" in path else str(Path(path).absolute())
-            found.setdefault(path, InputSource(path, _bare(reader), "ept"))
+            for one in given if isinstance(given, list) else [name]:
+                path = one.removeprefix("ept://")
+                path = path if path.endswith("ept.json") else path.rstrip("/") + "/ept.json"
+                path = path if "://" in path else str(Path(path).absolute())
+                found.setdefault(path, InputSource(path, _bare(reader), "ept"))
             continue
+        elif isinstance(given, list):  # from a command: all of them are files
+            paths = given
         elif kind in _LAS:
             patterned = any(c in name for c in "*?[") and not os.path.exists(name)
             paths = sorted(glob.glob(name, recursive=True)) if patterned else [name]
@@ -92,9 +104,10 @@ def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
                 found=name,
                 cure="Convert the input first: pdal translate INPUT input.laz",
             )
+        bare = {**_bare(reader), "type": "readers.las"}
         for path in paths:
-            full = str(Path(path).absolute())
-            found.setdefault(full, InputSource(full, {**_bare(reader), "type": "readers.las"}, "las"))
+            full = os.path.abspath(path)
+            found.setdefault(full, InputSource(full, bare, "las"))
     return list(found.values())
 
 

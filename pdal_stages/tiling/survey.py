@@ -6,7 +6,6 @@ import math
 import time
 from collections import deque
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -139,7 +138,7 @@ class Survey:
     @property
     def names(self) -> list[str]:
         """What outputs of files are called, in place of '#'."""
-        return [Path(s.path).name if self._whole_names else s.stem for s in self.sources]
+        return [s.plain_name if self._whole_names else s.stem for s in self.sources]
 
     def stamps_of(self, stages: list[dict[str, Any]]) -> list[Any]:
         """Names and stamps of the files that stages read."""

@@ -80,6 +80,7 @@ class Worklist:
         for source, paths in zip(survey.sources, named, strict=True):
             out = FileJob(source, paths)
             if source.path in survey.indexes:
+                out.points = survey.indexes[source.path].count
                 out.jobs = [by_tile[i, j] for i, j, _ in survey.indexes[source.path].tiles]
             if source.path in survey.unreadable:
                 out.state, out.blocked_by = "failed", source.path
@@ -142,7 +143,7 @@ class Worklist:
             if isinstance(item, FileJob):
                 count = survey.indexes[item.source.path].count
                 results = [str(store.result(job.name)) for job in item.jobs]
-                return FileTask(item.source, count, results, plan.tail, plan.beside, item.paths, scratch)
+                return FileTask(item.source, count, results, plan.tail, plan.beside, item.outputs, scratch)
             sources = survey.near(item.tile, far)
             return TileTask(
                 context,

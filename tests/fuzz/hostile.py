@@ -24,9 +24,10 @@ import numpy as np
 from pdal_stages.base import las
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.strictjson import loads
+from pdal_stages.pipeline import tindex
 from pdal_stages.pipeline.pdal import version
 from pdal_stages.stages.where import Expression
-from pdal_stages.tiling import results, sources, tindex
+from pdal_stages.tiling import results, sources
 from pdal_stages.tiling.cloudindex import index_las
 from pdal_stages.tiling.grid import TileGrid
 from pdal_stages.tiling.store import Store

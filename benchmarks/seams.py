@@ -1,0 +1,115 @@
+"""Whether a survey in files is classified as the whole would be: real clouds cut where houses stand.
+
+    python benchmarks/seams.py --data FOLDER
+
+Each cloud is classified as one file and, cut at two lines through buildings, as four. Classes, heights and reliability of
+every point are compared: of the command as it is (tiles), and of each file by itself, which is what a loop over files
+does. Prints, and with --json writes, how many points differ.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import laspy
+import numpy as np
+
+DIMENSIONS = ("classification", "HeightAboveGround", "Reliability")
+
+
+def busiest(values: np.ndarray, weights: np.ndarray, low: float, high: float) -> float:
+    """The line, of those at whole meters, on both sides of which the most points of buildings lie."""
+    edges = np.arange(np.ceil(low), np.floor(high) + 1)
+    counts = np.histogram(values[weights], edges)[0]
+    return float(edges[np.argmax(counts[:-1] + counts[1:]) + 1])
+
+
+def cut(path: Path, folder: Path) -> tuple[Path, list[Path]]:
+    """The cloud as one file, and as four that meet where buildings are."""
+    las = laspy.read(path)
+    x, y = np.asarray(las.x), np.asarray(las.y)
+    building = np.asarray(las.classification) == 6
+    thirds = [(v.min() + np.ptp(v) / 4, v.max() - np.ptp(v) / 4) for v in (x, y)]
+    at = [busiest(v, building, *third) for v, third in zip((x, y), thirds, strict=True)]
+    parts = []
+    for number in range(4):
+        mine = ((x >= at[0]) == bool(number & 1)) & ((y >= at[1]) == bool(number & 2))
+        part = laspy.LasData(las.header)
+        part.points = las.points[mine]
+        parts.append(folder / f"part{number}.laz")
+        part.write(parts[-1])
+    near = min(np.abs(v - a).min() for v, a in zip((x, y), at, strict=True))
+    close = (np.abs(x - at[0]) < 10) | (np.abs(y - at[1]) < 10)
+    print(
+        f"{path.name}: {len(x):,} points, cut at x {at[0]:g} and y {at[1]:g} (nearest point {near:.2f} m), "
+        f"{np.count_nonzero(close & building):,} points of buildings within 10 m"
+    )
+    return path, parts
+
+
+def classify(*words: object) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "pdal_stages.cli", "classify", *map(str, words), "--no-progress"],
+        capture_output=True,
+        text=True,
+    )
+    if done.returncode:
+        sys.exit(done.stderr)
+
+
+def ordered(paths: list[Path]) -> dict[str, np.ndarray]:
+    """Values of all points, in an order that depends on the points alone."""
+    read = [laspy.read(path) for path in paths]
+    xyz = np.concatenate(
+        [np.column_stack([r.X, r.Y, r.Z, np.asarray(r.gps_time).view(np.int64)]) for r in read]
+    )
+    order = np.lexsort(xyz.T)
+    return {
+        "xyz": xyz[order],
+        **{name: np.concatenate([np.asarray(r[name]) for r in read])[order] for name in DIMENSIONS},
+    }
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("--data", type=Path, required=True, help="The folder with delft/ and montpellier/")
+    p.add_argument("--tile", type=float, default=40.0)
+    p.add_argument("--json", type=Path)
+    o = p.parse_args()
+    found = {}
+    clouds = [o.data / "delft" / "train.laz", *sorted((o.data / "montpellier").glob("train_*_627755.laz"))]
+    for path in clouds:
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            whole, parts = cut(path, folder)
+            classify(whole, folder / "whole.laz")
+            classify(*parts, folder / "tiles/", "--tile", o.tile)
+            for part in parts:
+                classify(part, folder / f"alone_{part.name}")
+            reference = ordered([folder / "whole.laz"])
+            rows = {}
+            for how, files in (
+                ("in tiles", [folder / "tiles" / part.name for part in parts]),
+                ("each file by itself", [folder / f"alone_{part.name}" for part in parts]),
+            ):
+                other = ordered(files)
+                assert np.array_equal(reference["xyz"], other["xyz"])
+                rows[how] = {n: int(np.count_nonzero(reference[n] != other[n])) for n in DIMENSIONS}
+                rows[how]["height differs by over 0.1 m"] = int(
+                    np.count_nonzero(
+                        np.abs(reference["HeightAboveGround"] - other["HeightAboveGround"]) > 0.1
+                    )
+                )
+                print(f"  {how}: " + ", ".join(f"{k} {v:,}" for k, v in rows[how].items()))
+            found[path.name] = {"points": len(reference["xyz"]), **rows}
+    if o.json:
+        o.json.write_text(json.dumps(found, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,127 @@
+"""What ``classify`` is asked for, and the pipeline of one file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from ..base.errors import ModelError, OptionError, suggest
+from ..models import STANDARD
+from ..stages import preparation, registry
+from ..stages.heights import preparation_of
+from ..stages.loading import loaded_model
+from .ends import overridden, reader_of, writer_of
+from .beside import extra_dims_option
+from .filenames import LAS_WRITERS
+from .lowering import lower_stage
+from .overrides import Override
+from .run import Pipeline
+
+#: Dimensions that are written beside the input's own.
+WRITTEN = ("HeightAboveGround", "Reliability")
+
+
+@dataclass(frozen=True)
+class ClassifyRequest:
+    """How points are classified, whichever they are.
+
+    Attributes
+    ----------
+    model : str
+        A model file, or the name of a shipped one.
+    overrides : tuple of Override
+        Options of stages set from outside; they may name another model.
+    where : str, optional
+        Classify only the points for which this holds.
+    dimensions : tuple of str
+        Which of the dimensions made on the way are written beside the input's own; ``all`` and ``none`` are known.
+    """
+
+    model: str = STANDARD
+    overrides: tuple[Override, ...] = ()
+    where: str | None = None
+    dimensions: tuple[str, ...] = WRITTEN
+
+    @cached_property
+    def _classifier(self) -> dict[str, Any]:
+        stage: dict[str, Any] = {"type": "filters.modelclassifier", "model": self.model}
+        if self.where:
+            stage["where"] = self.where
+        for option, name in (
+            ("margin", "Margin"),
+            ("variance", "Variance"),
+            ("probabilities", "Probability_"),
+        ):
+            if any(one.startswith(name) for one in self.dimensions):
+                stage[option] = True
+        return stage
+
+    @cached_property
+    def loaded(self) -> Any:
+        """The model that will be applied, which overrides may have changed."""
+        return loaded_model(overridden(self._classifier, self.overrides)["model"])
+
+    @cached_property
+    def stages(self) -> list[dict[str, Any]]:
+        """Those that make what the model reads, and the classifier.
+
+        Raises
+        ------
+        ModelError
+            If the model was trained on what no stage of its file makes.
+        """
+        if by_hand := self.loaded.info.get("by_hand"):
+            raise ModelError(
+                "what the model reads was made by stages that a model file does not carry",
+                where=self.model,
+                found=", ".join(by_hand),
+                cure="Write a pipeline: the reader, these stages with their options of training, "
+                "filters.modelclassifier, and the writer",
+            )
+        prepared = self.loaded.info.get("preparation") or preparation_of(self.loaded.required_dimensions)
+        return [*prepared, self._classifier]
+
+    @cached_property
+    def beside(self) -> dict[str, str] | None:
+        """What is written beside the input's own dimensions: name -> PDAL type; None for all there is.
+
+        Raises
+        ------
+        OptionError
+            If a dimension is wanted that is not made.
+        """
+        made: dict[str, str] = {}
+        for stage in self.stages:
+            if stage["type"] in preparation.OF_PDAL:
+                made["HeightAboveGround"] = "double"
+            elif stage["type"] in registry.stages():
+                made |= lower_stage(overridden(stage, self.overrides)).stage.creates()
+        made.pop("Classification", None)
+        for name in self.dimensions:
+            if name not in ("all", "none", *made) and self.dimensions != WRITTEN:
+                raise OptionError(
+                    "--dimensions names a dimension no stage creates",
+                    found=name,
+                    cure=f"{suggest(name, list(made))}There are {', '.join(made)}; or all, or none",
+                )
+        if "all" in self.dimensions:
+            return None
+        return {name: kind for name, kind in made.items() if name in self.dimensions}
+
+    def writer(self, target: str) -> dict[str, Any]:
+        """The writer of an output, before it is told which extra dimensions to write."""
+        writer = writer_of(target)
+        return {**writer, "extra_dims": "all"} if self.beside is None and _is_las(writer) else writer
+
+    def pipeline(self, source: str, target: str) -> Pipeline:
+        """Read a file, make heights where the model wants them, classify, write with everything else kept."""
+        writer = self.writer(target)
+        if self.beside is not None and _is_las(writer):
+            listed = extra_dims_option([source], self.beside)
+            writer |= {"extra_dims": listed} if listed else {}
+        return Pipeline([reader_of(source, "input"), *self.stages, writer], self.overrides)
+
+
+def _is_las(writer: dict[str, Any]) -> bool:
+    return writer.get("type") in LAS_WRITERS

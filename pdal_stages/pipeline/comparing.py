@@ -1,0 +1,139 @@
+"""What is behind ``accuracy``: two dimensions of files, or files against others of the same points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import DimensionError, StageError
+from ..base.outputs import check_outputs
+from ..stages.accuracy import AccuracyStage
+from ..stages.points import Points
+from . import pdal as pdal_env
+from .ends import input_files, reader_of
+from .filenames import stage_files
+from .lowering import lower_stage
+from .overrides import Override, apply_overrides
+from .run import Pipeline
+from .runtime import wkt_of
+
+
+def accuracy_pipeline(
+    sources: Sequence[str], dimension: str, reference: str, **outputs: str
+) -> list[dict[str, Any]]:
+    """Read files, folders or patterns, compare two dimensions."""
+    files = input_files(sources)
+    tags = ["input"] if len(files) == 1 else [f"input{i}" for i in range(1, len(files) + 1)]
+    return [
+        *map(reader_of, files, tags),
+        {"type": "filters.accuracy", "dimension": dimension, "reference": reference, **outputs},
+    ]
+
+
+def compare_files(
+    sources: Sequence[str],
+    references: Sequence[str],
+    dimension: str,
+    reference_dimension: str,
+    overrides: Iterable[Override] = (),
+    **outputs: str,
+) -> None:
+    """Compare files with others that hold the same points in the same order, in pairs of the same name.
+
+    Both are files, folders or patterns; `outputs` are options of ``filters.accuracy``.
+
+    Raises
+    ------
+    StageError
+        If a file has no partner, or two do not hold the same points.
+    """
+    pairs = paired(input_files(sources), input_files(references))
+    listed = {"files": [name for pair in pairs for name in pair]}
+    wanted: dict[str, Any] = {"type": "filters.accuracy", **listed, **outputs}
+    (given,) = apply_overrides([wanted], overrides)
+    renamed = {"dimension": "Classification", "reference": "Reference"}
+    stage = cast(AccuracyStage, lower_stage({**given, **renamed}).stage)
+    check_outputs(stage.outputs(), [*listed["files"], *stage_files(stage)])
+    parts, wkt = [], ""
+    for source, reference in pairs:
+        mine, wkt, withheld = _points_of(source, dimension)
+        true, _, _ = _points_of(reference, reference_dimension)
+        _refuse_other_points(mine, true, source, reference)
+        named = [span.dimension for span in stage.ignore.spans] if stage.ignore else []
+        kept = [n for n in ("X", "Y", "Z", "Reliability", "Margin", *named) if n in mine.dtype.names]
+        part = {name: mine[name] for name in kept}
+        codes = {"Classification": mine[dimension], "Reference": true[reference_dimension]}
+        parts.append({"Withheld": withheld, **part, **codes})
+    shared = [name for name in parts[0] if all(name in part for part in parts)]
+    arrays = {name: np.concatenate([part[name] for part in parts]) for name in shared}
+    stage.run(stage.points(arrays, wkt=wkt))
+
+
+def paired(sources: Sequence[str], references: Sequence[str]) -> list[tuple[str, str]]:
+    """Files with their references: of the same name, or the longest name inside theirs (c_town: town).
+
+    Raises
+    ------
+    StageError
+        If a file has no reference, or shares it with another.
+    """
+    if len(sources) == len(references) == 1:
+        return [(sources[0], references[0])]
+    by_name = {Path(name).stem: name for name in references}
+    pairs: dict[str, str] = {}
+    for source in sources:
+        inside = [name for name in by_name if name in Path(source).stem]
+        if not inside:
+            raise StageError(
+                "a file has no reference of its name",
+                found=source,
+                cure=f"Name the references like the files they belong to, not {', '.join(list(by_name)[:5])}",
+            )
+        reference = by_name[max(inside, key=len)]
+        if reference in pairs:
+            raise StageError(
+                "two files have the same reference", found=f"{pairs[reference]} and {source}: {reference}"
+            )
+        pairs[reference] = source
+    return [(source, reference) for reference, source in pairs.items()]
+
+
+def _points_of(name: str, dimension: str) -> tuple[Any, str, NDArray]:
+    """All points of a file with class codes freed of flag bits, its spatial reference, and the withheld flags."""
+    pipeline = Pipeline([reader_of(name, "input")])
+    pipeline.execute()
+    array: Any = np.concatenate(pipeline.arrays) if pipeline.arrays else np.empty(0)
+    names = array.dtype.names or ()
+    if dimension not in names:
+        raise DimensionError(f"the dimension '{dimension}' is missing", where=name, found=", ".join(names))
+    points = Points(
+        {n: array[n] for n in names},
+        legacy_flags=pdal_env.flags_inside_classification(names, pipeline.metadata),
+    )
+    withheld = np.array(points.flag("Withheld"), np.uint8)
+    if "Classification" in names:
+        array["Classification"] = points.class_codes
+    readers = [v for k, v in pipeline.metadata.get("metadata", {}).items() if k.startswith("readers.")]
+    node = readers[0] if readers else None
+    return array, wkt_of(node[0] if isinstance(node, list) else node), withheld
+
+
+def _refuse_other_points(mine: np.ndarray, true: np.ndarray, source: str, reference: str) -> None:
+    if len(mine) != len(true):
+        raise StageError(
+            "the two files do not hold the same points",
+            found=f"{len(mine):,} points in {source}, {len(true):,} in {reference}",
+            cure="Compare files of the same points, or keep the labels with filters.ferry while classifying",
+        )
+    for axis in sorted({"X", "Y", "Z"} & set(mine.dtype.names or ()) & set(true.dtype.names or ())):
+        apart = np.abs(mine[axis] - true[axis])
+        if apart.size and apart.max() > 0.01:
+            raise StageError(
+                "the two files do not hold the same points in the same order",
+                found=f"{int(np.count_nonzero(apart > 0.01)):,} points of {source} and {reference} differ in {axis}",
+                cure="Keep the labels with filters.ferry while classifying instead",
+            )

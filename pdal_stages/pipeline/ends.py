@@ -1,0 +1,133 @@
+"""The ends of the pipelines behind the short commands: files by name, folder or pattern, their readers and writers."""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from ..base.errors import StageError
+from . import pdal as pdal_env
+from .overrides import Override, apply_overrides
+from .tindex import locations
+
+#: What the description of an EPT source is called.
+EPT = "ept.json"
+
+#: Tile indexes, by suffix.
+_INDEXES = (".gpkg", ".sqlite", ".shp", ".geojson")
+
+
+def input_files(names: Sequence[str]) -> list[str]:
+    """The inputs that files, folders, patterns, tile indexes and EPT sources stand for: each once, sorted within each name.
+
+    Raises
+    ------
+    StageError
+        Where a folder or a tile index holds no input.
+    """
+    found: list[str] = []
+    for name in names:
+        path = Path(name)
+        if "://" in name:
+            found.append(name)
+        elif path.is_dir():
+            found += _inside(path)
+        elif path.suffix.lower() in _INDEXES:
+            found += locations(name)
+        elif not path.exists() and (matches := sorted(glob.glob(name, recursive=True))):
+            found += matches
+        else:
+            found.append(name)
+    return list(dict.fromkeys(found))
+
+
+def _inside(folder: Path) -> list[str]:
+    """The LAS and LAZ files of a folder, or the EPT source that it is."""
+    if (folder / EPT).is_file():
+        return [str(folder / EPT)]
+    inside = sorted(str(path) for path in folder.iterdir() if path.suffix.lower() in (".las", ".laz"))
+    if not inside:
+        deeper = next(folder.rglob("*.la[sz]"), None)
+        raise StageError(
+            "the folder holds no LAS or LAZ files",
+            found=str(folder),
+            cure=f"There are some further down: '{folder}/**/*{deeper.suffix}'" if deeper else None,
+        )
+    return inside
+
+
+def is_ept(name: str) -> bool:
+    """Whether an input is an EPT source."""
+    return name.startswith("ept://") or Path(name).name == EPT
+
+
+def is_las(name: str) -> bool:
+    """Whether an input is a LAS, LAZ or COPC file, as its name says."""
+    return Path(name).suffix.lower() in (".las", ".laz") and "://" not in name
+
+
+def is_folder(target: str) -> bool:
+    """Whether an output is a folder: one that is there, or a name that ends with a slash, or has neither suffix nor '#'."""
+    path = Path(target)
+    named = target.endswith(("/", "\\")) or ("#" not in path.name and not path.suffix)
+    return path.is_dir() or (named and not path.exists())
+
+
+def _output_name(source: str) -> str:
+    """The input's name; what this PDAL cannot write as COPC becomes plain LAZ."""
+    name = Path(source).name
+    plain = name.lower().endswith(".copc.laz") and not pdal_env.writes_copc()
+    return name[: -len(".copc.laz")] + ".laz" if plain else name
+
+
+def outputs_of(sources: Sequence[str], target: str) -> list[str]:
+    """An output for each input: in a folder under the input's name, or with the input's name for ``#``.
+
+    Raises
+    ------
+    StageError
+        Where several inputs would be written to one file.
+    """
+    path = Path(target)
+    if is_folder(target):
+        outputs = [str(path / _output_name(source)) for source in sources]
+    elif "#" in path.name:
+        outputs = [str(path.with_name(path.name.replace("#", Path(source).stem))) for source in sources]
+    else:
+        outputs = [target]
+    if len(set(outputs)) < len(sources):
+        raise StageError(
+            "several inputs would be written to one file",
+            found=f"{len(sources)} inputs, {target}",
+            cure="Name a folder, or put '#' where the input's name should be, e.g. classified_#.laz. To merge "
+            "them into one file, use a pipeline",
+        )
+    return outputs
+
+
+def reader_of(source: str, tag: str) -> dict[str, Any]:
+    """A reader; of LAS 1.0-1.3 it takes the extra dimensions too, which PDAL leaves out unless told."""
+    stage: dict[str, Any] = {"filename": str(source), "tag": tag}
+    if is_ept(source):
+        stage["type"] = "readers.ept"
+    if Path(source).suffix.lower() in (".las", ".laz") and not str(source).lower().endswith(".copc.laz"):
+        stage.update({"type": "readers.las", "use_eb_vlr": True})
+    return stage
+
+
+def writer_of(target: str) -> dict[str, Any]:
+    """A writer that keeps the input's header, where it is a LAS file."""
+    stage: dict[str, Any] = {"filename": target, "tag": "output"}
+    if target.lower().endswith(".copc.laz") and pdal_env.writes_copc():
+        stage.update({"type": "writers.copc", "forward": "all"})
+    elif Path(target).suffix.lower() in (".las", ".laz"):
+        stage.update({"type": "writers.las", "forward": "all"})
+    return stage
+
+
+def overridden(stage: dict[str, Any], overrides: Iterable[Override]) -> dict[str, Any]:
+    """A stage with the overrides of its type."""
+    of_type = [o for o in overrides if not o.by_tag and o.selector == stage["type"]]
+    return apply_overrides([stage], of_type)[0]

@@ -1,0 +1,220 @@
+"""A survey, or a file, classified: in one piece where it fits, otherwise in seamless tiles."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shlex
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from ..base import kinds, las
+from ..base.errors import OptionError, StageError
+from ..base.files import write_whole
+from ..base.outputs import Output, check_outputs
+from ..pipeline.classifying import ClassifyRequest
+from ..pipeline.ends import input_files, is_ept, is_folder, is_las, outputs_of
+from ..pipeline.processes import each_file
+from ..pipeline.run import Pipeline
+from .outcome import FileJob, TiledRun, TileJob
+from .settings import TilingOptions
+from .sizing import fits_whole
+from .tiledrun import run_plan
+from .tileplan import TilePlan, make_plan
+
+
+@dataclass
+class Written:
+    """An output that was written."""
+
+    path: str
+    points: int
+    classes: dict[int, int]  #: number of points by code
+    counts: dict[str, int] = field(default_factory=dict)  #: of points that got no class, by reason
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class ClassifyTask:
+    """What is to be classified, how, and where to.
+
+    Attributes
+    ----------
+    inputs : tuple of str
+        Files, folders, patterns, tile indexes, EPT sources.
+    output : str
+        A file; of several inputs a folder, or a name with ``#`` for the input's.
+    request : ClassifyRequest
+    options : TilingOptions
+    metadata, log : str
+        Files that are written beside, empty for none.
+    """
+
+    inputs: tuple[str, ...]
+    output: str
+    request: ClassifyRequest = field(default_factory=ClassifyRequest)
+    options: TilingOptions = field(default_factory=TilingOptions)
+    metadata: str = ""
+    log: str = ""
+
+    @cached_property
+    def files(self) -> list[str]:
+        """All inputs."""
+        return input_files(self.inputs)
+
+    @property
+    def can_be_cut(self) -> bool:
+        """Whether parts of all inputs can be read."""
+        return all(is_las(name) or is_ept(name) for name in self.files)
+
+    def in_one_piece(self) -> bool:
+        """Whether the only input is a file that fits into memory, and nothing asks for tiles."""
+        asked = self.options.tile is not None or self.options.per != "auto" or self.options.scheduler
+        if len(self.files) > 1 or asked or self.options.resume:
+            return False
+        if not is_las(self.files[0]):
+            return not is_ept(self.files[0])
+        try:
+            header = las.read_header(self.files[0])
+        except OSError:
+            header = None  # said when it is read
+        return header is None or fits_whole(header.count, self.options.memory)
+
+    # ---- in one piece ------------------------------------------------------------------------------------
+
+    def outputs(self) -> list[str]:
+        """An output for each input.
+
+        Raises
+        ------
+        StageError
+            If one cannot be written, or is an input.
+        """
+        if self._in_folder:
+            _make_folder(Path(self.output))
+        outputs = outputs_of(self.files, self.output)
+        check_outputs([Output(name) for name in outputs], self.files)
+        return outputs
+
+    def run_whole(self) -> Written:
+        """Classify the only input in one piece."""
+        (source,), (target,) = self.files, self.outputs()
+        return classify_file(replace(self.request), source, target, self.metadata, self.log)
+
+    def run_each(self, said: Callable[[str, Written | str], None]) -> tuple[list[Written], int]:
+        """Classify inputs each by itself; what was written, and how many failed. `said` hears of each."""
+        if self.metadata:
+            raise OptionError(
+                "--metadata is of one run, or of tiles", found=f"{len(self.files)} inputs that are not LAS"
+            )
+        work = [
+            (replace(self.request), s, t, "", "") for s, t in zip(self.files, self.outputs(), strict=True)
+        ]
+        done, failed = [], 0
+        for (_, source, *_), answer in each_file(classify_file, work, max(1, self.options.local_workers)):
+            failed += bool(answer.reason)
+            said(source, answer.reason or answer.result)
+            done += [] if answer.reason else [answer.result]
+        return sorted(done, key=lambda one: one.path), failed
+
+    # ---- in tiles ----------------------------------------------------------------------------------------
+
+    def plan(self) -> TilePlan:
+        """What is done to each tile.
+
+        Raises
+        ------
+        StageError
+            For whatever is wrong with model or options, before any point is read.
+        """
+        readers = {("readers.ept" if is_ept(name) else "readers.las"): name for name in reversed(self.files)}
+        heads: list[dict[str, Any]] = [
+            {"type": kind, "filename": name, "tag": "input"} for kind, name in readers.items()
+        ]
+        for head in heads:
+            if head["type"] == "readers.las":  # of LAS 1.0-1.3 PDAL leaves extra dimensions out unless told
+                head["use_eb_vlr"] = True
+        writer = {**self.request.writer(self._target()), "type": "writers.las"}
+        pipeline = Pipeline([*heads, *self.request.stages, writer], self.request.overrides, whole=False)
+        plan = make_plan(pipeline, self.options.buffer)
+        beside = self.request.beside
+        tail_only = len(plan.tail) == 1 and beside is not None
+        files = {kind: [n for n in self.files if is_ept(n) == (kind == "readers.ept")] for kind in readers}
+        return replace(
+            plan,
+            readers=[{**reader, "filename": files[reader["type"]]} for reader in plan.readers],
+            creates=["Classification", *(beside or {})] if tail_only and plan.creates else plan.creates,
+            beside=beside,
+            whole_names=self._in_folder and self.options.per != "tile",
+            name=self.request.model,
+        )
+
+    @property
+    def _in_folder(self) -> bool:
+        return is_folder(self.output)
+
+    def _target(self) -> str:
+        """The output with '#' where the input's name goes, or the tile's."""
+        if not self._in_folder:
+            return self.output
+        tiles = self.options.per == "tile" or any(map(is_ept, self.files))
+        return str(Path(self.output) / ("#.laz" if tiles else "#"))
+
+    def run_tiles(
+        self, *, dry_run: bool = False, finished: Callable[[Written], None] | None = None
+    ) -> TiledRun:
+        """Classify all inputs in tiles; `finished` hears of every output that was written."""
+        plan = self.plan()
+        if self._in_folder and not dry_run:
+            _make_folder(Path(self.output))
+        more = [("metadata", self.metadata, kinds.JSON), ("log", self.log, "")]
+        check_outputs([Output(name, what, kind) for what, name, kind in more if name], self.files)
+
+        def tell(job: TileJob | FileJob) -> None:
+            if finished is not None:
+                for path in (job.outputs or [])[:1]:
+                    classes = {int(code): n for code, n in job.report.get("classes", {}).items()}
+                    finished(Written(path, job.report.get("written", 0), classes))
+
+        return run_plan(plan, self.options, dry_run=dry_run, finished=tell)
+
+    def again(self) -> str:
+        """The command that goes on where this one stopped."""
+        words = ["pdal-stages", "classify", *self.inputs[:3], *(["..."] if len(self.inputs) > 3 else [])]
+        return f"{shlex.join([*words, self.output])} --resume"
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StageError("the output folder cannot be made", found=f"{folder}: {error.strerror}") from None
+
+
+def classify_file(
+    request: ClassifyRequest, source: str, target: str, metadata: str = "", log: str = ""
+) -> Written:
+    """Classify a file in one piece; `metadata` and `log` are files that are written beside."""
+    pipeline = request.pipeline(source, target)
+    more = [("log", log, ""), ("metadata", metadata, kinds.JSON)]
+    pipeline.check_outputs(*(Output(name, what, kind) for what, name, kind in more if name))
+    count = pipeline.execute(arrays=False, loglevel=logging.WARNING)
+    if metadata:
+        write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
+    report = pipeline.reports[-1][1][-1]
+    classes = {int(code): points for code, points in report.get("classes", {}).items()}
+    counts = {key: report[key] for key in LEFT_ALONE if report.get(key)}
+    notes = [*(f"PDAL says: {line}" for line in pipeline.said), *pipeline.told]
+    return Written(target, count, classes, counts, notes)
+
+
+#: Points that a classifier did not give a class, by their name in its report.
+LEFT_ALONE = {
+    "rejected": "rejected as unreliable",
+    "ignored": "left out: noise, withheld (ignore)",
+    "kept": "class kept (keep)",
+    "outside_where": "outside where",
+}
