@@ -57,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             _refuse_words(command, unknown)
         if overrides and not getattr(options, "takes_overrides", False):
             raise StageError(f"'{options.command}' takes no stage options", found=overrides[0].flag)
-        options.overrides = overrides
+        options.overrides, options.arguments = overrides, arguments
         options.is_program = argv is None
         if getattr(options, "progress", None) is not None:
             os.environ["PDAL_STAGES_PROGRESS"] = "1" if options.progress else "0"

@@ -11,8 +11,8 @@ from ..models import STANDARD
 from ..stages import preparation, registry
 from ..stages.heights import preparation_of
 from ..stages.loading import loaded_model
-from .ends import overridden, reader_of, writer_of
 from .beside import extra_dims_option
+from .ends import overridden, reader_of, writer_of
 from .filenames import LAS_WRITERS
 from .lowering import lower_stage
 from .overrides import Override

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -180,11 +179,6 @@ class ClassifyTask:
                     finished(Written(path, job.report.get("written", 0), classes))
 
         return run_plan(plan, self.options, dry_run=dry_run, finished=tell)
-
-    def again(self) -> str:
-        """The command that goes on where this one stopped."""
-        words = ["pdal-stages", "classify", *self.inputs[:3], *(["..."] if len(self.inputs) > 3 else [])]
-        return f"{shlex.join([*words, self.output])} --resume"
 
 
 def _make_folder(folder: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import signal
 import threading
 from collections import Counter
@@ -190,7 +191,14 @@ def classify(task: ClassifyTask, options: argparse.Namespace) -> int:
     else:
         _print(run, "files" if run.outputs else "")
         _print_classes(done, names)
-    return _end(options, run, task.again() if interrupted else "")
+    return _end(options, run, _again(options) if interrupted else "")
+
+
+def _again(options: argparse.Namespace) -> str:
+    """The command that goes on where this one stopped."""
+    words = [word for word in options.arguments if word != "--resume"]
+    same = shlex.join(["pdal-stages", *words]) if len(words) <= 20 else "the same command with"
+    return f"{same} --resume"
 
 
 def _classify_each(task: ClassifyTask, options: argparse.Namespace, names: Mapping[int, str]) -> int:

@@ -286,5 +286,6 @@ def outputs_for(plan: TilePlan, names: list[str], inputs: Iterable[str]) -> list
             found=twice[0],
             cure="Give input files different names, or use --per tile",
         )
-    check_outputs(flat, inputs)
+    if not flat or Path(flat[0].path).parent.is_dir():  # otherwise it will be made: a dry run looks ahead
+        check_outputs(flat, inputs)
     return [[outputs[n].path for outputs in found] for n in range(len(names))]

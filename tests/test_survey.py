@@ -1,0 +1,232 @@
+"""`classify` of a survey: seamless, resumable, within memory, and said in words."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+import tiling_clouds as clouds
+
+from pdal_stages.base.errors import OptionError
+from pdal_stages.base.memory import free_memory, parse_size
+from pdal_stages.cli import main
+from pdal_stages.synthetic.townfile import wkt
+from pdal_stages.tiling import TilingOptions
+from pdal_stages.tiling.pace import Pace
+from pdal_stages.tiling.sizing import PARENT, Density, settled, worker_bytes
+from pdal_stages.tiling.sources import Extent
+
+pytestmark = pytest.mark.pdal
+OPTIONS = ("--filters.hag_minima.cell=5", "--no-progress")
+
+
+@pytest.fixture(scope="module")
+def survey(tmp_path_factory, write_las):
+    """A town as one file, as four that meet inside it, and a model; one of the four has an extra dimension of its own."""
+    base = tmp_path_factory.mktemp("survey")
+    made, xyz, keep = clouds.town()
+    arrays = {
+        **dict(zip("XYZ", xyz[keep].T, strict=True)),
+        "Classification": np.where(np.arange(keep.sum()) % 97, 1, 7).astype("u1"),
+        "GpsTime": made.gps_time[keep],
+    }
+    how = {
+        "point_format": 6,
+        "wkt": wkt("EPSG:25832"),
+        "scale": 0.001,
+        "offset": (499_000.0, 5_399_000.0, 0.0),
+    }
+    write_las(base / "town.laz", arrays, **how)
+    (base / "in").mkdir()
+    east, north = arrays["X"] >= 500_047.0, arrays["Y"] >= 5_400_041.0
+    for number in range(4):
+        mine = (east == bool(number & 1)) & (north == bool(number & 2))
+        part = {name: values[mine] for name, values in arrays.items()}
+        if number == 0:
+            part["Amplitude"] = np.arange(mine.sum(), dtype="f4")
+        write_las(base / "in" / f"t{number}.{'las' if number == 1 else 'laz'}", part, **how)
+    clouds.model(base / "m.model", "c1,s2", "covariance")
+    return base
+
+
+@pytest.fixture()
+def classify(survey, capsys):
+    def go(*words):
+        code = main(["classify", *map(str, words), "--model", str(survey / "m.model"), *OPTIONS])
+        return code, *capsys.readouterr()
+
+    return go
+
+
+def values(*paths: Path) -> dict[str, np.ndarray]:
+    """What was made of points, in an order of their own."""
+    read = [laspy.read(path) for path in paths]
+    xyz = np.concatenate([np.column_stack([r.X, r.Y, r.Z, np.asarray(r.gps_time) * 1e6]) for r in read])
+    names = ("classification", "Reliability", "HeightAboveGround")
+    order = np.lexsort(xyz.T)
+    return {name: np.concatenate([np.asarray(r[name]) for r in read])[order] for name in names}
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.glob("*.la?"))}
+
+
+def test_a_survey_has_no_seams_and_a_second_run_does_what_is_missing(survey, classify, tmp_path):
+    code, out, err = classify(survey / "town.laz", tmp_path / "whole.laz")
+    assert code == 0, err
+    target = tmp_path / "made" / "classified"
+    code, out, err = classify(
+        survey / "in", target, "--tile", 30, "--workers", 0, "--metadata", tmp_path / "m.json"
+    )
+    assert code == 0, err
+    assert sorted(path.name for path in target.glob("t*")) == ["t0.laz", "t1.las", "t2.laz", "t3.laz"]
+    one = values(tmp_path / "whole.laz")
+    other = values(*target.glob("t*"))
+    for name in one:
+        assert np.array_equal(one[name], other[name]), name
+    extra = {p.name: sorted(laspy.read(p).point_format.extra_dimension_names) for p in target.glob("t*")}
+    assert extra["t0.laz"] == ["Amplitude", "HeightAboveGround", "Reliability"]
+    assert extra["t1.las"] == ["HeightAboveGround", "Reliability"]
+    # Every file is said when it is there, with its classes; the table has them all.
+    said = dict(re.findall(r"(t\d)\.la.: ([\d,]+) points; ", out))
+    assert {name: int(n.replace(",", "")) for name, n in said.items()} == {
+        path.stem: len(laspy.read(path)) for path in target.glob("t*")
+    }
+    codes, counts = np.unique(one["classification"], return_counts=True)
+    table = {
+        int(c): int(n.replace(",", "")) for c, n in re.findall(r"^ +(\d+) .*?([\d,]+)$", out, re.MULTILINE)
+    }
+    assert table == dict(zip(codes.tolist(), counts.tolist(), strict=True))
+    found = json.loads((tmp_path / "m.json").read_text())
+    assert len(found["outputs"]) == 4 and sum(o["written"] for o in found["outputs"]) == len(
+        one["classification"]
+    )
+
+    before = contents(target)
+    (target / "t2.laz").unlink()
+    code, out, err = classify(
+        survey / "in", target, "--workers", 0, "--resume"
+    )  # the tiles stay those of the first run
+    assert code == 0 and "1 file written, 3 kept from an earlier run" in out, out + err
+    assert contents(target) == before
+
+
+def test_a_damaged_file_is_named_and_done_once_it_is_repaired(survey, classify, tmp_path):
+    (tmp_path / "in").mkdir()
+    for path in (survey / "in").iterdir():
+        (tmp_path / "in" / path.name).write_bytes(path.read_bytes())
+    whole = (tmp_path / "in" / "t3.laz").read_bytes()
+    (tmp_path / "in" / "t3.laz").write_bytes(whole[:1000])
+    code, out, err = classify(tmp_path / "in", tmp_path / "out/", "--tile", 20, "--workers", 0)
+    assert code == 1 and "t3.laz" in err and "failed" in out
+    assert not (tmp_path / "out" / "t3.laz").exists()
+    (tmp_path / "in" / "t3.laz").write_bytes(whole)
+    code, out, err = classify(tmp_path / "in", tmp_path / "out/", "--tile", 20, "--workers", 0, "--resume")
+    assert code == 0, err
+    classify(survey / "in", tmp_path / "fresh/", "--tile", 20, "--workers", 0)
+    assert contents(tmp_path / "out") == contents(tmp_path / "fresh")
+
+
+def test_a_dry_run_writes_nothing_and_finds_what_is_wrong(survey, classify, tmp_path):
+    code, out, err = classify(survey / "in", tmp_path / "out", "--dry-run")
+    assert code == 0 and "4 inputs" in out and not list(tmp_path.iterdir()), err
+    code, _, err = classify(survey / "in", tmp_path / "out", "--dry-run", "--where", "Classificaton == 2 &&")
+    assert code == 1 and "where" in err
+    words = ["classify", str(survey / "in"), str(tmp_path / "out"), "--dry-run", "--model", "standart"]
+    assert main(words) == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_one_output_for_each_tile(survey, classify, tmp_path):
+    code, _, err = classify(survey / "in", tmp_path / "out/", "--tile", 45, "--per", "tile", "--workers", 0)
+    assert code == 0, err
+    made = list((tmp_path / "out").glob("*.laz"))
+    assert len(made) == 6 and all(re.fullmatch(r"\d+_\d+\.laz", path.name) for path in made)
+    classify(survey / "town.laz", tmp_path / "whole.laz")
+    for name, array in values(tmp_path / "whole.laz").items():
+        assert np.array_equal(array, values(*made)[name]), name
+
+
+def test_a_cloud_beyond_the_memory_is_cut(survey, classify, tmp_path):
+    code, out, err = classify(survey / "town.laz", tmp_path / "cut.laz", "--memory", "1.3GB", "--tile", 30)
+    assert code == 0 and "tiles done" in out, err
+    classify(survey / "town.laz", tmp_path / "whole.laz")
+    clouds.same_points(tmp_path / "cut.laz", tmp_path / "whole.laz")
+    code, _, err = classify(survey / "town.laz", tmp_path / "cut.laz", "--memory", "0.2GB")
+    assert code == 1 and "the memory does not suffice" in err and "--memory" in err
+
+
+def test_ctrl_c_says_what_is_done_and_how_to_go_on(survey, classify, tmp_path, monkeypatch):
+    from pdal_stages.tiling import tile_task
+
+    run, calls = tile_task.TileTask.run, []
+
+    def some(self):
+        calls.append(self.tile)
+        if len(calls) == 5:
+            raise KeyboardInterrupt
+        return run(self)
+
+    monkeypatch.setattr(tile_task.TileTask, "run", some)
+    code, out, err = classify(survey / "in", tmp_path / "out/", "--tile", 30, "--workers", 0)
+    assert (
+        code == 130 and "4 of 11 tiles done" in err and "--resume" in err and "pdal-stages classify" in err
+    ), err
+    assert re.search(r"\d of 4 files written", err)
+    monkeypatch.undo()
+    code, out, err = classify(survey / "in", tmp_path / "out/", "--workers", 0, "--resume")
+    assert code == 0 and "4 kept from an earlier run" in out, out + err
+    classify(survey / "in", tmp_path / "fresh/", "--tile", 30, "--workers", 0)
+    assert contents(tmp_path / "out") == contents(tmp_path / "fresh")
+
+
+# ---- memory, and time left -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("4GB", 4 * 10**9), ("4 GiB", 4 * 2**30), ("1.5g", 15 * 10**8), ("500M", 5 * 10**8), ("77", 77)],
+)
+def test_amounts_of_memory(text, size):
+    assert parse_size(text) == size
+
+
+@pytest.mark.parametrize("text", ["", "GB", "-1GB", "0", "4 apples", "1e9"])
+def test_what_is_no_amount_of_memory(text):
+    with pytest.raises(OptionError, match="a number and a unit"):
+        parse_size(text)
+
+
+def test_there_is_memory():
+    assert 2**20 < free_memory() < 2**50
+
+
+@pytest.mark.parametrize("density", [0.5, 5.0, 40.0, 400.0])
+@pytest.mark.parametrize("memory", [1.5e9, 4e9, 16e9, 64e9])
+@pytest.mark.parametrize("halo", [0.0, 32.0, 368.0])
+def test_the_side_of_tiles_keeps_to_the_memory(density, memory, halo):
+    extents = [Extent(int(density * 10**6), (i * 1000.0, 0.0, (i + 1) * 1000.0, 1000.0)) for i in range(100)]
+    found = Density.of(extents)
+    options = TilingOptions(memory=int(memory), workers=None)
+    try:
+        chosen = settled(options, found, halo, True)
+    except OptionError:
+        least = worker_bytes(found.read_by(1.0, halo), found.largest) + PARENT
+        assert least > memory  # nothing would have fitted
+        return
+    used = PARENT + chosen.workers * worker_bytes(found.read_by(chosen.tile, halo), found.largest)
+    assert used <= memory and chosen.workers >= 1 and chosen.tile > 0
+
+
+def test_time_left_is_told_from_what_tasks_took():
+    pace = Pace(tiles=100, outputs=0, slots=2)
+    assert pace.seconds_left() is None
+    pace.finished("tile", 10, 60.0)  # loading and compiling
+    pace.finished("tile", 10, 60.0)
+    for _ in range(4):
+        pace.finished("tile", 10, 2.0)
+    assert pace.seconds_left() == pytest.approx(40 * 0.2 / 2)
