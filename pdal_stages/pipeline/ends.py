@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,12 @@ def input_files(names: Sequence[str]) -> list[str]:
             found += matches
         else:
             found.append(name)
-    return list(dict.fromkeys(found))
+    by_place = {name if "://" in name else os.path.realpath(name): name for name in reversed(found)}
+    return [
+        name
+        for name in dict.fromkeys(found)
+        if by_place.get(name if "://" in name else os.path.realpath(name)) == name
+    ]
 
 
 def _inside(folder: Path) -> list[str]:
@@ -71,8 +77,8 @@ def is_las(name: str) -> bool:
 def is_folder(target: str) -> bool:
     """Whether an output is a folder: one that is there, or a name that ends with a slash, or has neither suffix nor '#'."""
     path = Path(target)
-    named = target.endswith(("/", "\\")) or ("#" not in path.name and not path.suffix)
-    return path.is_dir() or (named and not path.exists())
+    named = "#" not in path.name and not path.suffix and not path.exists()
+    return path.is_dir() or target.endswith(("/", os.sep)) or named
 
 
 def _output_name(source: str) -> str:
@@ -95,15 +101,23 @@ def outputs_of(sources: Sequence[str], target: str) -> list[str]:
         outputs = [str(path / _output_name(source)) for source in sources]
     elif "#" in path.name:
         outputs = [str(path.with_name(path.name.replace("#", Path(source).stem))) for source in sources]
-    else:
-        outputs = [target]
-    if len(set(outputs)) < len(sources):
+    elif len(sources) > 1:
         raise StageError(
             "several inputs would be written to one file",
             found=f"{len(sources)} inputs, {target}",
-            cure="Name a folder, or put '#' where the input's name should be, e.g. classified_#.laz. To merge "
-            "them into one file, use a pipeline",
+            cure="Name a folder (with a slash at its end), or put '#' where the input's name should be, e.g. "
+            "classified_#.laz. To merge them into one file, use a pipeline",
         )
+    else:
+        return [target]
+    first: dict[str, str] = {}
+    for source, output in zip(sources, outputs, strict=True):
+        if (other := first.setdefault(output, source)) is not source:
+            raise StageError(
+                "two inputs have one name and would be written to one file",
+                found=f"{other} and {source}: {output}",
+                cure="Classify them into different folders, or rename one",
+            )
     return outputs
 
 

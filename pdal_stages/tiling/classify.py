@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from ..base import kinds, las
-from ..base.errors import OptionError, StageError
+from ..base.errors import StageError
 from ..base.files import write_whole
 from ..base.outputs import Output, check_outputs
 from ..pipeline.classifying import ClassifyRequest
@@ -34,6 +34,7 @@ class Written:
     classes: dict[int, int]  #: number of points by code
     counts: dict[str, int] = field(default_factory=dict)  #: of points that got no class, by reason
     notes: list[str] = field(default_factory=list)
+    metadata: dict[str, Any] = field(default_factory=dict)  #: PDAL's
 
 
 @dataclass(frozen=True)
@@ -103,21 +104,16 @@ class ClassifyTask:
         (source,), (target,) = self.files, self.outputs()
         return classify_file(replace(self.request), source, target, self.metadata, self.log)
 
-    def run_each(self, said: Callable[[str, Written | str], None]) -> tuple[list[Written], int]:
-        """Classify inputs each by itself; what was written, and how many failed. `said` hears of each."""
-        if self.metadata:
-            raise OptionError(
-                "--metadata is of one run, or of tiles", found=f"{len(self.files)} inputs that are not LAS"
-            )
-        work = [
-            (replace(self.request), s, t, "", "") for s, t in zip(self.files, self.outputs(), strict=True)
-        ]
-        done, failed = [], 0
-        for (_, source, *_), answer in each_file(classify_file, work, max(1, self.options.local_workers)):
-            failed += bool(answer.reason)
-            said(source, answer.reason or answer.result)
-            done += [] if answer.reason else [answer.result]
-        return sorted(done, key=lambda one: one.path), failed
+    def run_each(self, apart: bool = False) -> Iterator[tuple[str, Written | str]]:
+        """Classify inputs each by itself: yields an input, and what was written or why it failed, as they finish.
+
+        `apart`: in processes of their own, so that one may crash, and Ctrl-C is heard here.
+        """
+        outputs = self.outputs()
+        work = [(replace(self.request), *pair, "", "") for pair in zip(self.files, outputs, strict=True)]
+        workers = max(1, self.options.local_workers)
+        for (_, source, *_), answer in each_file(classify_file, work, workers, apart=apart):
+            yield source, answer.reason or answer.result
 
     # ---- in tiles ----------------------------------------------------------------------------------------
 
@@ -166,6 +162,8 @@ class ClassifyTask:
         self, *, dry_run: bool = False, finished: Callable[[Written], None] | None = None
     ) -> TiledRun:
         """Classify all inputs in tiles; `finished` hears of every output that was written."""
+        if self.options.per != "tile" and not any(map(is_ept, self.files)):
+            outputs_of(self.files, self.output)  # which says what is wrong with names
         plan = self.plan()
         if self._in_folder and not dry_run:
             _make_folder(Path(self.output))
@@ -202,7 +200,7 @@ def classify_file(
     classes = {int(code): points for code, points in report.get("classes", {}).items()}
     counts = {key: report[key] for key in LEFT_ALONE if report.get(key)}
     notes = [*(f"PDAL says: {line}" for line in pipeline.said), *pipeline.told]
-    return Written(target, count, classes, counts, notes)
+    return Written(target, count, classes, counts, notes, pipeline.metadata)
 
 
 #: Points that a classifier did not give a class, by their name in its report.

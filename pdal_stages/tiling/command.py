@@ -210,24 +210,43 @@ def _classify_each(task: ClassifyTask, options: argparse.Namespace, names: Mappi
                 found=next(name for name in task.files if not is_las(name)),
                 cure="Convert them first: pdal translate INPUT input.laz",
             )
-    end_at_once(options)
     notes = _SaidOnce()
-
-    def said(source: str, what: Written | str) -> None:
-        if isinstance(what, Written):
-            print(f"{what.path}: {what.points:,} points{_shares(what, names)}", flush=True)
-        for line in [what] if isinstance(what, str) else what.notes:
-            notes.say(source, line)
-
-    done, failed = task.run_each(said)
+    done: dict[str, Written] = {}
+    failed: dict[str, str] = {}
+    interrupted = False
+    try:
+        for source, what in task.run_each(apart=options.is_program):
+            if isinstance(what, Written):
+                done[source] = what
+                print(f"{what.path}: {what.points:,} points{_shares(what, names)}", flush=True)
+            else:
+                failed[source] = what
+            for line in [what] if isinstance(what, str) else what.notes:
+                notes.say(source, line)
+    except KeyboardInterrupt:
+        interrupted = True
     notes.end()
     if len(task.files) > 1:
-        tell(
-            "each file was classified by itself: inputs that are not LAS, LAZ, COPC or EPT cannot be cut into tiles"
-        )
-    _print_classes(done, names)
+        tell("each file was classified by itself: only LAS, LAZ, COPC and EPT inputs can be cut into tiles")
+    _print_classes([done[source] for source in task.files if source in done], names)
+    if options.metadata:
+        files = [
+            {"input": source}
+            | ({"output": done[source].path, "metadata": done[source].metadata} if source in done else {})
+            | ({} if source in done else {"error": failed.get(source, "not done")})
+            for source in task.files
+        ]
+        text = json.dumps({"files": files}, indent=2, default=str)
+        write_whole(options.metadata, (text + "\n").encode())
     if failed:
-        tell(f"{failed} of {_counted(len(task.files), 'file')} failed")
+        tell(f"{len(failed)} of {_counted(len(task.files), 'file')} failed")
+    if interrupted:
+        left = [source for source in task.files if source not in done and source not in failed]
+        tell(
+            f"interrupted; {len(done)} of {len(task.files)} files are finished and whole, of the others nothing was left. "
+            f"Still to be done: {', '.join(left[:5])}{f' and {len(left) - 5:,} more' * (len(left) > 5)}"
+        )
+        return 130
     return 1 if failed else 0
 
 
