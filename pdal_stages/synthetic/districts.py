@@ -16,12 +16,18 @@ ACROSS = math.pi / 2
 
 def fill(plan: t.Plan, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
     """The things (n, 12) of block (i, j) and of the streets on its low sides, and their planes (m, 4)."""
+    site = filled(plan, i, j)
+    return np.array(site.things), np.array(site.planes)
+
+
+def filled(plan: t.Plan, i: int, j: int) -> Site:
+    """The site of block (i, j) and of the streets on its low sides, with all that stands there."""
     site = Site(plan, i, j)
     kind = t.block_at(t.FIRST_U + t.PITCH_U * (i + 0.5), t.FIRST_V + t.PITCH_V * (j + 0.5), plan)[2]
     (_row, _court, _villa, _hall, _park)[kind](site)
     _street(site)
     {t.BANK: _bank, t.CANAL: _canal}.get(j % 4, _cross_street)(site)
-    return np.array(site.things), np.array(site.planes)
+    return site
 
 
 def _greenery(s: Site, trees: int, shrubs: int, low=0.0, high=0.0, land=None) -> None:
@@ -150,6 +156,7 @@ def _canal(s: Site) -> None:
         _cars(s, [a], [s.axis + side * 10.3], 0.0)
     for a, half_w, z1 in ((0, 5.0, -t.KERB), (-4.85, 0.15, 0.9), (4.85, 0.15, 0.9)):  # deck and parapets
         s.box(a - MARGIN, s.axis, ACROSS, t.CANAL_HALF + 0.1, half_w, -0.8, z1, BRIDGE, "asphalt", "stone")
+    s.built.append(("deck", -MARGIN, s.axis, ACROSS, t.CANAL_HALF + 0.1, 5.0))
 
 
 def _bank(s: Site) -> None:

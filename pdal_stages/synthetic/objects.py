@@ -29,6 +29,7 @@ def house(s: Site, a, b, turn, half_l, half_w, eave, roof, pitch=0.8, *, plain=F
         s.box(*at, turn, half_p, half_q, z0, z1, BUILDING, top, side, cuts=cuts)
 
     if roof == "flat":
+        s.built.append(("house", a, b, turn, half_l, half_w, 0.0, 0.0, eave, eave, ()))
         put(0, 0, half_l, half_w, foot, eave, "paving")
         rim = eave + s.draw(0.25, 0.8)
         for side in (-1, 1):
@@ -46,6 +47,7 @@ def house(s: Site, a, b, turn, half_l, half_w, eave, roof, pitch=0.8, *, plain=F
         slope = {"hip": pitch, "pyramid": rise / half_l, "halfhip": 1.3 * pitch}[roof]
         start = eave + (0.55 * rise if roof == "halfhip" else 0.0)
         cuts += [(side * slope, 0, start + slope * half_l) for side in (1, -1)]
+    s.built.append(("house", a, b, turn, half_l, half_w, overhang / 2, overhang, eave, top, cuts))
     put(0, 0, half_l, half_w, foot, top, cuts=cuts)
     put(0, 0, half_l + overhang / 2, half_w + overhang, eave - overhang * pitch - 0.18, top, cuts=cuts)
     for n in range(extras):  # dormers on both sides, and a chimney
@@ -90,6 +92,7 @@ def cable(s: Site, start, end, sag: float) -> None:
     places = [[p + n / 6 * (q - p) for p, q in zip(start, end, strict=True)] for n in range(7)]
     for n, place in enumerate(places):
         place[2] -= sag * n * (6 - n) / 9
+    s.built.append(("cable", start, end))
     for p, q in itertools.pairwise(places):
         s.bar(p, q, 0.03, WIRE, "metal")
 
@@ -101,12 +104,14 @@ def tree(s: Site, a, b, low, high, conifers=0.25) -> None:
     if s.chance() < conifers:
         steep, top, foot = s.draw(4.5, 7.0), z + 1.1 * height, z + height * s.draw(0.04, 0.14)
         half, eighths = (top - foot) / steep, [n * math.pi / 4 for n in range(8)]
+        s.built.append(("tree", a, b, 1.1 * height, half))
         sides = [(steep * math.cos(way), steep * math.sin(way), top) for way in eighths]
         s.box(a, b, 0.2, half, half, foot, top, VEGETATION, "leaf", cuts=sides, leafy=s.draw(0.6, 1.0))
         return
     leafy = s.draw(0.5, 0.9) if s.chance() < 0.8 else s.draw(0.15, 0.3)
     radius, bole = height * s.draw(0.26, 0.4), height * s.draw(0.18, 0.3)
     half = 0.5 * (height - bole)
+    s.built.append(("tree", a, b, height, radius))
     s.ball(a, b, z + bole + half, 0.7 * radius, 0.7 * radius, half, leafy)
     for n in range(5):
         at = beside(a, b, 2 * math.pi * (n + s.draw(-0.3, 0.3)) / 5, radius * s.draw(0.4, 0.6), 0)

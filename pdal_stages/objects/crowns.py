@@ -1,0 +1,183 @@
+"""Trees of cells: tops of a smoothed canopy, and the crown that goes with each.
+
+The steps are the field's: a canopy height model without pits, smoothed; its maxima in a window that grows with height
+(Popescu, Wynne 2004); a watershed of which only the tops' basins stay (marker-controlled, Chen, Baldocchi, Gong, Kelly
+2006), the others going to the top they belong to. Here every step reaches a bounded way: a cell climbs to its maximum, and a
+maximum goes to a higher one within its window, over the highest saddle; what leads farther than `REACH` is given up. So
+a tile with that much around it has the crowns of the whole forest.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.jit import device, njit
+
+#: Farthest that a cell lies from the top of its tree, metres.
+REACH = 15.0
+
+
+def canopy(high: NDArray, ground: NDArray) -> NDArray[np.float64]:
+    """Height of the canopy above the ground, 0 where there is none; pits and empty cells inside crowns filled.
+
+    Parameters
+    ----------
+    high : (r, c) float64
+        Height of the highest point of vegetation in each cell, metres; NaN where there is none.
+    ground : (r, c) float64
+    """
+    height = high - ground
+    height = np.where(np.isnan(height), 0.0, np.maximum(height, 0.0))
+    return _without_pits(height)
+
+
+@njit
+def _without_pits(height: NDArray) -> NDArray:
+    """Cells raised to the fourth highest of their eight neighbors where they lie more than half below it."""
+    rows, columns = height.shape
+    out = height.copy()
+    around = np.empty(8)
+    for r in range(1, rows - 1):
+        for c in range(1, columns - 1):
+            n = 0
+            for i in range(-1, 2):
+                for j in range(-1, 2):
+                    if i != 0 or j != 0:
+                        around[n] = height[r + i, c + j]
+                        n += 1
+            around.sort()
+            if height[r, c] < 0.5 * around[4]:
+                out[r, c] = around[4]
+    return out
+
+
+@njit
+def smoothed(height: NDArray, weights: NDArray) -> NDArray:
+    """Heights averaged with weights (2k + 1,) along rows and columns; beyond the array there is no canopy."""
+    rows, columns = height.shape
+    k = weights.size // 2
+    along, out = np.zeros(height.shape), np.zeros(height.shape)
+    for r in range(rows):
+        for c in range(columns):
+            total = 0.0
+            for i in range(-k, k + 1):
+                if 0 <= c + i < columns:
+                    total += weights[i + k] * height[r, c + i]
+            along[r, c] = total
+    for r in range(rows):
+        for c in range(columns):
+            if height[r, c] > 0.0:
+                total = 0.0
+                for i in range(-k, k + 1):
+                    if 0 <= r + i < rows:
+                        total += weights[i + k] * along[r + i, c]
+                out[r, c] = total
+    return out
+
+
+def bell(sigma: float) -> NDArray[np.float64]:
+    """Weights of a Gaussian, of `sigma` cells; one alone where it is 0."""
+    if sigma <= 0:
+        return np.ones(1)
+    k = int(np.ceil(2.5 * sigma))
+    weights = np.exp(-0.5 * (np.arange(-k, k + 1) / sigma) ** 2)
+    return weights / weights.sum()
+
+
+@device
+def _higher(z, a, b):
+    """Whether cell a is higher than b; of equal ones the first."""
+    return z[a] > z[b] or (z[a] == z[b] and a < b)
+
+
+@njit
+def summits(s: NDArray, lowest: float) -> NDArray:
+    """Of each cell the number of the cell beside it (or itself) that is highest; -1 below `lowest`."""
+    rows, columns = s.shape
+    z = s.ravel()
+    up = np.full(rows * columns, -1, np.int64)
+    for r in range(rows):
+        for c in range(columns):
+            n = r * columns + c
+            if z[n] < lowest:
+                continue
+            best = n
+            for i in range(max(r - 1, 0), min(r + 2, rows)):
+                for j in range(max(c - 1, 0), min(c + 2, columns)):
+                    if _higher(z, i * columns + j, best):
+                        best = i * columns + j
+            up[n] = best
+    return up
+
+
+@njit
+def heirs(s: NDArray, up: NDArray, base: float, slope: float, most: float, depth: float) -> NDArray:
+    """Of each maximum (a cell that is its own `up`) the higher one that it goes to, itself where it is a top.
+
+    A window has a radius of `base` cells and `slope` per metre of height, `most` at most. Of the higher maxima inside,
+    the one over the highest saddle (on the line between) takes it, where the saddle lies no more than `depth` times its
+    height below.
+    """
+    rows, columns = s.shape
+    z = s.ravel()
+    out = np.full(rows * columns, -1, np.int64)
+    for n in range(rows * columns):
+        if up[n] != n:
+            continue
+        r, c = n // columns, n % columns
+        radius = min(base + slope * z[n], most)
+        k = int(radius)
+        best, best_saddle, best_away = n, -1.0, 0
+        for i in range(max(r - k, 0), min(r + k + 1, rows)):
+            for j in range(max(c - k, 0), min(c + k + 1, columns)):
+                m = i * columns + j
+                away = (i - r) * (i - r) + (j - c) * (j - c)
+                if up[m] != m or m == n or away > radius * radius or not _higher(z, m, n):
+                    continue
+                saddle = _saddle(s, r, c, i, j)
+                if saddle > best_saddle or (saddle == best_saddle and away < best_away):
+                    best, best_saddle, best_away = m, saddle, away
+        out[n] = best if best_saddle >= z[n] * (1.0 - depth) else n
+    return out
+
+
+@device
+def _saddle(s, r, c, i, j):
+    """The lowest height on the line between two cells; the same either way."""
+    steps = max(abs(i - r), abs(j - c))
+    lowest = s[r, c]
+    for k in range(1, steps):
+        # Whole numbers, rounded alike, whichever cell the line begins at.
+        a = (2 * (r * (steps - k) + i * k) + steps) // (2 * steps)
+        b = (2 * (c * (steps - k) + j * k) + steps) // (2 * steps)
+        lowest = min(lowest, s[a, b])
+    return lowest
+
+
+@njit
+def crown_cells(s: NDArray, up: NDArray, heir: NDArray, least: float, top_least: float, reach: float) -> NDArray:
+    """Of each cell the number of its tree's top cell, -1 where there is none.
+
+    A cell belongs to a crown where it is at least `least` times as high as the top and within `reach` cells of it.
+    """
+    rows, columns = s.shape
+    z = s.ravel()
+    out = np.full(rows * columns, -1, np.int64)
+    for n in range(rows * columns):
+        if up[n] < 0:
+            continue
+        r, c = n // columns, n % columns
+        at = n
+        while at >= 0:
+            following = up[at] if up[at] != at else heir[at]
+            dr, dc = at // columns - r, at % columns - c
+            if dr * dr + dc * dc > reach * reach:
+                at = -1
+            elif following == at:
+                break
+            else:
+                at = following
+        if at >= 0 and z[at] >= top_least and z[n] >= least * z[at]:
+            out[n] = at
+    return out.reshape(s.shape)

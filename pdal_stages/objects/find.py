@@ -1,0 +1,421 @@
+"""Find all objects in records of cells, block by block of the absolute grid.
+
+Memory is that of a block with its surroundings and of what was found. A block is looked at with `MARGIN` around it, within
+which the ground and crowns are what they are in the whole; where a building, span or deck that reaches into the block comes
+near the rim of what is seen, more is looked at. An object belongs to the block that its first cell (a tree: its top) lies in.
+So blocks, and tiles that hold as much, find exactly what one look at everything finds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base import checks
+from ..base.jit import device, njit
+from ..base.progress import Progress
+from . import crowns, measure, roofs
+from .cells import GROUND_CELLS, MM, Cells, Kind, cell_keys, object_id, point_keys, unpack
+from .measure import Body
+from .rasters import GROUND_REACH, Window
+
+#: Metres around a place that decide about it, but for the extent of buildings, spans and decks.
+MARGIN = GROUND_REACH + 2 * crowns.REACH
+#: Side of a block, cells.
+BLOCK = 2048
+#: Kinds that are found.
+FOUND = (Kind.BUILDING, Kind.TREE, Kind.SPAN, Kind.DECK)
+
+
+def _setting(default: float, what: str, low: float, high: float, unit: str = "m"):
+    return field(default=default, metadata={"low": low, "high": high, "what": what, "unit": unit})
+
+
+@dataclass(frozen=True)
+class ObjectSettings:
+    """How objects are told apart; wrong values raise an OptionError."""
+
+    cell: float = _setting(
+        0.5,
+        "Side of the grid's cells: about 1.4 times the distance of points, so that few cells of a roof are empty; 1 for 2 "
+        "points/m2",
+        0.05,
+        100,
+    )
+    building_height: float = _setting(1.5, "A building's cells are at least so high above the ground", 0, 100)
+    building_area: float = _setting(4.0, "Smaller buildings are left out", 0, 10_000, "m2")
+    step: float = _setting(
+        2.5, "Roofs that differ by more along two thirds of their border are two buildings; 0 parts none", 0, 100
+    )
+    roof_part: float = _setting(10.0, "Smaller parts of a roof (dormers) go with their neighbor", 0, 10_000, "m2")
+    tree_height: float = _setting(3.0, "Lower plants are no trees", 0, 100)
+    tree_area: float = _setting(1.5, "Trees with smaller crowns are left out", 0, 1000, "m2")
+    window: float = _setting(
+        1.5, "Radius in which a tree has no second top, for a tree of no height", 0.1, 10
+    )
+    window_slope: float = _setting(0.1, "Added to the radius per metre of height", 0, 1, "")
+    saddle: float = _setting(
+        0.1, "Two tops that near are one tree where the saddle is no deeper than this share of the lower", 0, 1, ""
+    )
+    smoothing: float = _setting(0.35, "Standard deviation of the Gaussian that smooths the canopy", 0, 5)
+    span_gap: float = _setting(2.0, "Wires with larger gaps are two spans", 0.5, 20)
+
+    def __post_init__(self) -> None:
+        for one in fields(self):
+            checks.number(f"'{one.name}'", getattr(self, one.name), one.metadata["low"], one.metadata["high"])
+
+
+@dataclass
+class Table:
+    """Objects of a kind, in the order of their ids."""
+
+    ids: NDArray[np.int64]
+    columns: dict[str, NDArray]
+    #: Cells of object n are those from start[n] on: row, column and height (of a path: see `paths`).
+    start: NDArray[np.int64]
+    row: NDArray[np.int64]
+    column: NDArray[np.int64]
+    z: NDArray[np.float64]
+    #: Of spans: the line (k, 3) along each.
+    paths: list[NDArray[np.float64]]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def cells_of(self, number: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Rows, columns and heights of an object's cells."""
+        part = slice(self.start[number], self.start[number + 1])
+        return self.row[part], self.column[part], self.z[part]
+
+
+@dataclass
+class Objects:
+    """All objects, by kind, and which cells' points are theirs."""
+
+    settings: ObjectSettings
+    tables: dict[Kind, Table]
+    key: NDArray[np.int64]  # sorted keys of cells
+    owner: NDArray[np.int64]  # id of the object that has their points
+
+    def ids_at(self, x: NDArray, y: NDArray, kinds: NDArray) -> NDArray[np.int64]:
+        """The id of each point's object, 0 where it is of none; `kinds` are numbers of :class:`Kind`, or -1."""
+        out = np.zeros(len(x), np.int64)
+        rows = np.flatnonzero(kinds >= 0)
+        if rows.size == 0 or self.key.size == 0:
+            return out
+        key, _ = point_keys(x[rows], y[rows], kinds[rows], self.settings.cell)
+        at = np.minimum(np.searchsorted(self.key, key), len(self.key) - 1)
+        out[rows] = np.where(self.key[at] == key, self.owner[at], 0)
+        return out
+
+
+class _Found:
+    """What blocks found so far."""
+
+    def __init__(self) -> None:
+        self.ids: list[int] = []
+        self.records: list[dict[str, object]] = []
+        self.cells: list[tuple[NDArray, NDArray, NDArray]] = []
+        self.paths: list[NDArray] = []
+        self.keys: list[NDArray] = []
+        self.owners: list[NDArray] = []
+
+    def table(self) -> Table:
+        order = np.argsort(np.array(self.ids, np.int64), kind="stable")
+        cells = [self.cells[n] for n in order]
+        names = list(self.records[0]) if self.records else []
+        columns = {name: np.array([self.records[n][name] for n in order]) for name in names}
+        empty = np.empty(0)
+        return Table(
+            np.array(self.ids, np.int64)[order],
+            columns,
+            np.r_[0, np.cumsum([len(row) for row, _, _ in cells])].astype(np.int64),
+            np.concatenate([row for row, _, _ in cells] or [empty]).astype(np.int64),
+            np.concatenate([column for _, column, _ in cells] or [empty]).astype(np.int64),
+            np.concatenate([z for _, _, z in cells] or [empty]),
+            [self.paths[n] for n in order] if self.paths else [],
+        )
+
+
+def find_objects(
+    cells: Cells, settings: ObjectSettings | None = None, *, block: int = BLOCK, progress: bool | None = None
+) -> Objects:
+    """All objects of an area.
+
+    Parameters
+    ----------
+    cells : Cells
+        Records of all points of the area, by :meth:`Cells.of`; a metre or two of its edge may be cut off objects.
+    settings : ObjectSettings, optional
+    block : int
+        Side of the blocks of work, in cells; even. It changes nothing but memory.
+    progress : bool, optional
+        Whether to show progress on stderr.
+    """
+    chosen = settings or ObjectSettings(cell=cells.size)
+    if chosen.cell != cells.size:
+        raise ValueError(f"cells of {cells.size} m, settings for {chosen.cell} m")
+    found = {kind: _Found() for kind in FOUND}
+    blocks = {kind: _blocks(cells, kind, block) for kind in FOUND}
+    total = sum(map(len, blocks.values()))
+    extent = _extent(cells) if len(cells) else Window(0, 0, 0, 0)
+    with Progress(total, "objects", "blocks", enabled=progress) as line:
+        for kind in FOUND:
+            finder = _FINDERS[kind]
+            for row, column in blocks[kind]:
+                finder(cells, extent, chosen, Window(row, column, block, block), found[kind])
+                line.update()
+    keys = [k for one in found.values() for k in one.keys]
+    owners = [k for one in found.values() for k in one.owners]
+    key = np.concatenate(keys) if keys else np.empty(0, np.int64)
+    order = np.argsort(key, kind="stable")
+    owner = np.concatenate(owners) if owners else np.empty(0, np.int64)
+    return Objects(chosen, {kind: one.table() for kind, one in found.items()}, key[order], owner[order])
+
+
+def _blocks(cells: Cells, kind: Kind, block: int) -> list[tuple[int, int]]:
+    """First row and column of each block that has cells of a kind."""
+    _, row, column = unpack(cells.of_kind(kind).key)
+    pairs = np.unique(np.column_stack([row // block, column // block]), axis=0) * block
+    return [(int(r), int(c)) for r, c in pairs]
+
+
+def _around(core: Window, margin: int) -> Window:
+    margin += margin % GROUND_CELLS
+    return Window(core.row - margin, core.column - margin, core.rows + 2 * margin, core.columns + 2 * margin)
+
+
+def _extent(cells: Cells) -> Window:
+    """The rectangle that holds all cells, and an empty rim."""
+    kind, row, column = unpack(cells.key)
+    wide = np.where(kind == Kind.GROUND, GROUND_CELLS, 1)
+    lows = [int((v * wide).min()) - 8 for v in (row, column)]
+    lows = [v - v % GROUND_CELLS for v in lows]
+    sizes = [int(((v + 1) * wide).max()) + 8 - low for v, low in zip((row, column), lows, strict=True)]
+    return Window(*lows, *(n + n % GROUND_CELLS for n in sizes))
+
+
+def _common(a: Window, b: Window) -> Window:
+    row, column = max(a.row, b.row), max(a.column, b.column)
+    rows = min(a.row + a.rows, b.row + b.rows) - row
+    return Window(row, column, rows, min(a.column + a.columns, b.column + b.columns) - column)
+
+
+class _Layers:
+    """What the cells of a kind hold, as arrays of the part of a window that has any cells."""
+
+    def __init__(self, cells: Cells, kind: Kind, window: Window, extent: Window) -> None:
+        window = _common(window, extent)
+        inside = window.of(cells, kind)
+        self.window = window
+        self.high = window.dense(inside, "high", np.nan) / MM
+        self.low = window.dense(inside, "low", np.nan) / MM
+        self.count = window.dense(inside, "count", 0, np.int64)
+        self.sure = window.dense(inside, "sure", 0.0)
+        self.told = window.dense(inside, "told", 0, np.int64)
+        self.ground = window.ground(cells)
+
+    def body(self, r: NDArray, c: NDArray, z: NDArray) -> Body:
+        return Body(
+            r + self.window.row,
+            c + self.window.column,
+            z[r, c],
+            self.low[r, c],
+            self.ground[r, c],
+            self.count[r, c],
+            self.sure[r, c],
+            self.told[r, c],
+        )
+
+
+def _bodies(number: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.int64]]]:
+    """Every object's number, and the rows and columns of its cells, row by row."""
+    flat = np.flatnonzero(number.ravel() >= 0)
+    order = flat[np.argsort(number.ravel()[flat], kind="stable")]
+    values = number.ravel()[order]
+    first = np.flatnonzero(np.r_[True, values[1:] != values[:-1]]) if values.size else np.empty(0, np.int64)
+    for start, end in zip(first, np.r_[first[1:], values.size], strict=True):
+        yield int(values[start]), order[start:end] // number.shape[1], order[start:end] % number.shape[1]
+
+
+def _part(window: Window, part: Window) -> tuple[slice, slice]:
+    """Where in a window's arrays another lies."""
+    common = _common(window, part)
+    row, column = common.row - window.row, common.column - window.column
+    return slice(row, row + max(common.rows, 0)), slice(column, column + max(common.columns, 0))
+
+
+def _whole(
+    cells: Cells, extent: Window, kind: Kind, core: Window, masked: Callable[[_Layers], NDArray[np.bool_]]
+) -> tuple[_Layers, NDArray[np.bool_]]:
+    """A block's layers with as much around it as it takes for all that reaches into the block to be whole."""
+    margin = round(MARGIN / cells.size)
+    around = margin
+    while True:
+        seen = _around(core, around)
+        layers = _Layers(cells, kind, seen, extent)
+        mask = masked(layers)
+        first = roofs.connected(roofs.dilated(mask), np.zeros(mask.shape), np.inf)
+        inside, sure = (_part(layers.window, part) for part in (core, _around(seen, -margin)))
+        rim = first.copy()
+        rim[sure] = -1
+        near = np.intersect1d(first[inside][first[inside] >= 0], rim[rim >= 0])
+        if near.size == 0 or around > 200 * margin:
+            return layers, mask
+        around += max(margin, around // 2)
+
+
+def _buildings(cells: Cells, extent: Window, chosen: ObjectSettings, core: Window, found: _Found) -> None:
+    heights: list[NDArray] = []
+
+    def masked(layers: _Layers) -> NDArray[np.bool_]:
+        mask, z = roofs.roof_cells(layers.high, layers.ground, chosen.building_height)
+        heights[:] = [z]
+        return mask
+
+    layers, mask = _whole(cells, extent, Kind.BUILDING, core, masked)
+    area = chosen.cell**2
+    number = roofs.building_parts(
+        mask, heights[0], step=chosen.step, smallest=int(np.ceil(chosen.roof_part / area))
+    )
+    number = _without_small(number, chosen.building_area / area)
+    # Points of a wall that stands out, and low ones beside it, belong to the building beside them.
+    theirs = np.where(number < 0, _beside(number), number)
+    _keep(layers, number, theirs, heights[0], core, Kind.BUILDING, chosen, found, measure.building)
+
+
+def _decks(cells: Cells, extent: Window, chosen: ObjectSettings, core: Window, found: _Found) -> None:
+    heights: list[NDArray] = []
+
+    def masked(layers: _Layers) -> NDArray[np.bool_]:
+        mask, z = roofs.roof_cells(layers.high, np.full(layers.high.shape, np.nan), 0.0)
+        heights[:] = [z]
+        return mask
+
+    layers, mask = _whole(cells, extent, Kind.DECK, core, masked)
+    number = roofs.building_parts(mask, heights[0], step=1.0, smallest=int(np.ceil(10.0 / chosen.cell**2)))
+    number = _without_small(number, chosen.building_area / chosen.cell**2)
+    theirs = np.where(number < 0, _beside(number), number)
+    _keep(layers, number, theirs, heights[0], core, Kind.DECK, chosen, found, measure.deck)
+
+
+def _spans(cells: Cells, extent: Window, chosen: ObjectSettings, core: Window, found: _Found) -> None:
+    def masked(layers: _Layers) -> NDArray[np.bool_]:
+        towers = layers.window.of(cells, Kind.TOWER)
+        tower = layers.window.dense(towers, "count", 0.0) > 0
+        for _ in range(round(1.5 / chosen.cell)):
+            tower = roofs.dilated(tower)
+        mask = ~np.isnan(layers.high)
+        for _ in range(round(chosen.span_gap / chosen.cell / 2)):
+            mask = roofs.dilated(mask)
+        return mask & ~tower
+
+    layers, mask = _whole(cells, extent, Kind.SPAN, core, masked)
+    joined = roofs.connected(mask, np.zeros(mask.shape), np.inf)
+    number = roofs.numbered(np.where(np.isnan(layers.high), -1, joined))
+    number = _without_small(number, 4)
+
+    def measured(body: Body, size: float) -> dict[str, object]:
+        found.paths.append(measure.path_of(body, size))
+        return measure.span(body, size)
+
+    _keep(layers, number, number, layers.high, core, Kind.SPAN, chosen, found, measured)
+
+
+def _trees(cells: Cells, extent: Window, chosen: ObjectSettings, core: Window, found: _Found) -> None:
+    size = chosen.cell
+    layers = _Layers(cells, Kind.TREE, _around(core, round(MARGIN / size)), extent)
+    height = crowns.canopy(layers.high, layers.ground)
+    s = crowns.smoothed(height, crowns.bell(chosen.smoothing / size))
+    up = crowns.summits(s, min(1.5, chosen.tree_height / 2))
+    heir = crowns.heirs(
+        s, up, chosen.window / size, chosen.window_slope / size, crowns.REACH / 2 / size, chosen.saddle
+    )
+    top = crowns.crown_cells(s, up, heir, 0.3, 0.8 * chosen.tree_height, crowns.REACH / size)
+    number = np.where(np.isnan(layers.high), -1, top)
+    z = np.where(np.isnan(layers.high), layers.ground + height, layers.high)
+    window = layers.window
+    for n, r, c in _bodies(number):
+        tr, tc = n // window.columns + window.row, n % window.columns + window.column
+        if not _inside(core, tr, tc) or len(r) * size**2 < chosen.tree_area:
+            continue
+        body = layers.body(r, c, z)
+        record = measure.tree(body, tr, tc, size)
+        if not record["height"] >= chosen.tree_height:  # type: ignore[operator]
+            continue
+        identity = int(object_id(Kind.TREE, np.array(tr), np.array(tc)))
+        _add(found, identity, record, body)
+        found.keys.append(cell_keys(Kind.TREE, body.row, body.column))
+        found.owners.append(np.full(len(r), identity))
+
+
+_FINDERS = {Kind.BUILDING: _buildings, Kind.TREE: _trees, Kind.SPAN: _spans, Kind.DECK: _decks}
+
+
+def _keep(
+    layers: _Layers,
+    number: NDArray[np.int64],
+    theirs: NDArray[np.int64],
+    z: NDArray,
+    core: Window,
+    kind: Kind,
+    chosen: ObjectSettings,
+    found: _Found,
+    measured: Callable[[Body, float], Mapping[str, object]],
+) -> None:
+    """Keep the objects whose first cell lies in the block; `theirs` says whose points cells hold."""
+    window, identities = layers.window, {}
+    for n, r, c in _bodies(number):
+        row, column = int(r[0]) + window.row, int(c[0]) + window.column
+        if _inside(core, row, column):
+            identity = int(object_id(kind, np.array(row), np.array(column)))
+            identities[n] = identity
+            body = layers.body(r, c, z)
+            _add(found, identity, dict(measured(body, chosen.cell)), body)
+    for n, r, c in _bodies(np.where(np.isnan(layers.high), -1, theirs)):
+        if n in identities:
+            found.keys.append(cell_keys(kind, r + window.row, c + window.column))
+            found.owners.append(np.full(len(r), identities[n]))
+
+
+def _add(found: _Found, identity: int, record: dict[str, object], body: Body) -> None:
+    found.ids.append(identity)
+    found.records.append(record)
+    found.cells.append((body.row, body.column, body.z))
+
+
+def _inside(core: Window, row: int, column: int) -> bool:
+    return core.row <= row < core.row + core.rows and core.column <= column < core.column + core.columns
+
+
+def _without_small(number: NDArray[np.int64], smallest: float) -> NDArray[np.int64]:
+    inside = number >= 0
+    if not inside.any():
+        return number
+    size = np.bincount(number[inside])
+    return np.where(inside & (size[np.where(inside, number, 0)] >= smallest), number, -1)
+
+
+@njit
+def _beside(number: NDArray) -> NDArray:
+    """The lowest number among the eight neighbors of each cell, -1 where none has one."""
+    rows, columns = number.shape
+    out = np.full(number.shape, -1, np.int64)
+    for r in range(rows):
+        for c in range(columns):
+            out[r, c] = _lowest(number, r, c)
+    return out
+
+
+@device
+def _lowest(number, r, c):
+    best = -1
+    for i in range(max(r - 1, 0), min(r + 2, number.shape[0])):
+        for j in range(max(c - 1, 0), min(c + 2, number.shape[1])):
+            n = number[i, j]
+            if n >= 0 and (best < 0 or n < best):
+                best = n
+    return best

@@ -1,0 +1,192 @@
+"""What is measured of an object, and the verdict: sure, or to be checked and why."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .cells import MM
+from .planes import roof_planes
+
+SURE, CHECK = "sure", "check"
+
+
+class Body(NamedTuple):
+    """An object's cells, row by row, and what was measured in each."""
+
+    row: NDArray[np.int64]
+    column: NDArray[np.int64]
+    z: NDArray[np.float64]  # of the roof, the canopy, the wires: highest point, metres
+    low: NDArray[np.float64]  # lowest point; NaN in cells without points
+    ground: NDArray[np.float64]  # NaN where it is not known
+    count: NDArray[np.int64]  # points
+    sure: NDArray[np.float64]  # sum of reliabilities, thousandths
+    told: NDArray[np.int64]  # points that have one
+
+    def image(self, values: NDArray) -> NDArray:
+        """Values of the cells as an array (rows, columns), NaN outside."""
+        out = np.full((int(np.ptp(self.row)) + 1, int(np.ptp(self.column)) + 1), np.nan)
+        out[self.row - self.row.min(), self.column - self.column.min()] = values
+        return out
+
+    def edge(self) -> NDArray[np.bool_]:
+        """Whether each cell lies at the object's edge."""
+        inside = np.pad(~np.isnan(self.image(np.zeros(len(self.row)))), 1)
+        core = inside[:-2, 1:-1] & inside[2:, 1:-1] & inside[1:-1, :-2] & inside[1:-1, 2:]
+        return ~core[self.row - self.row.min(), self.column - self.column.min()]
+
+    @property
+    def reliability(self) -> float:
+        """Mean reliability of the points, NaN where they have none."""
+        told = int(self.told.sum())
+        return float(self.sure.sum()) / told / MM if told else math.nan
+
+    @property
+    def ground_height(self) -> float:
+        """The middle one of the ground's heights, NaN where there is none."""
+        known = self.ground[~np.isnan(self.ground)]
+        return float(np.median(known)) if known.size else math.nan
+
+
+def _judged(reasons: list[str]) -> dict[str, object]:
+    return {"verdict": CHECK if reasons else SURE, "reason": ", ".join(reasons)}
+
+
+def building(body: Body, size: float) -> dict[str, object]:
+    """Heights, roof and verdict of a building."""
+    area, ground, edge = len(body.row) * size * size, body.ground_height, body.edge()
+    above = body.z - (ground if not math.isnan(ground) else np.nanmin(body.low))
+    planes, slope, planar = roof_planes(body.image(body.z), size)
+    depth = body.z[edge] - body.low[edge]
+    facade = float(np.mean(np.nan_to_num(depth) >= 1.5))
+    ridge = float(np.percentile(above, 98))
+    reasons = []
+    if math.isnan(ground):
+        reasons.append("no ground near")
+    if area < 10:
+        reasons.append("small")
+    if ridge < 2.2:
+        reasons.append("low")
+    if planar < 0.3 and area >= 30:
+        reasons.append("rough roof")
+    if body.reliability < 0.7:
+        reasons.append("unsure points")
+    if facade == 0 and area < 50:
+        reasons.append("no facade")
+    return {
+        "area": area,
+        "h_eave": float(np.percentile(above[edge], 25)),
+        "h_ridge": ridge,
+        "ground": ground,
+        "slope": slope,
+        "planes": planes,
+        "planar": planar,
+        "points": int(body.count.sum()),
+        "reliab": body.reliability,
+        **_judged(reasons),
+    }
+
+
+def tree(body: Body, top_row: int, top_column: int, size: float) -> dict[str, object]:
+    """Place, height and crown of a tree, and the verdict."""
+    area = len(body.row) * size * size
+    above = body.z - body.ground
+    highest = int(np.argmax(np.where(np.isnan(above), -np.inf, above)))
+    height, diameter = float(above[highest]), 2.0 * math.sqrt(area / math.pi)
+    points = int(body.count.sum())
+    reasons = []
+    if points < 10:
+        reasons.append("few points")
+    if diameter < 0.12 * height:
+        reasons.append("thin crown")
+    if diameter > 1.6 * height:
+        reasons.append("wide crown")
+    if body.reliability < 0.7:
+        reasons.append("unsure points")
+    return {
+        "x": (top_column + 0.5) * size,
+        "y": (top_row + 0.5) * size,
+        "height": height,
+        "area": area,
+        "diam": diameter,
+        "ground": float(body.ground[highest]),
+        "points": points,
+        "reliab": body.reliability,
+        **_judged(reasons),
+    }
+
+
+def span(body: Body, size: float) -> dict[str, object]:
+    """Length and clearance of the wires between two masts, and the verdict."""
+    path = path_of(body, size)
+    length = float(np.hypot(*np.diff(path[:, :2], axis=0).T).sum())
+    clearance = body.low - body.ground
+    known = clearance[~np.isnan(clearance)]
+    ends = np.hypot(*(path[-1, :2] - path[0, :2]))
+    reasons = []
+    if length < 8:
+        reasons.append("short")
+    if ends < 0.9 * length:
+        reasons.append("not straight")
+    if body.reliability < 0.7:
+        reasons.append("unsure points")
+    return {
+        "length": length,
+        "h_low": float(known.min()) if known.size else math.nan,
+        "z_high": float(body.z.max()),
+        "sag": float(max(0.0, np.max(_chord(path) - path[:, 2]))),
+        "points": int(body.count.sum()),
+        "reliab": body.reliability,
+        **_judged(reasons),
+    }
+
+
+def _chord(path: NDArray) -> NDArray:
+    """Heights of a straight line between the ends at the places of a path."""
+    along = np.r_[0.0, np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))]
+    share = along / along[-1] if along[-1] > 0 else along
+    return path[0, 2] + share * (path[-1, 2] - path[0, 2])
+
+
+def path_of(body: Body, size: float, every: float = 2.0) -> NDArray[np.float64]:
+    """A line along wires (n, 3), metres: the middle of each piece of `every` metres along their main direction."""
+    x, y = (body.column + 0.5) * size, (body.row + 0.5) * size
+    origin = np.array([x.min(), y.min()])
+    u, v = x - origin[0], y - origin[1]
+    du, dv = u - u.mean(), v - v.mean()
+    angle = 0.5 * math.atan2(2.0 * float(du @ dv), float(du @ du - dv @ dv))
+    along = u * math.cos(angle) + v * math.sin(angle)
+    piece = np.floor((along - along.min()) / every).astype(np.int64)
+    _, piece = np.unique(piece, return_inverse=True)
+    many = np.bincount(piece)
+    middle = [np.bincount(piece, weights=values) / many for values in (u, v, body.z)]
+    path = np.column_stack([middle[0] + origin[0], middle[1] + origin[1], middle[2]])
+    if len(path) == 1:  # a wire seen in one place
+        first, last = np.argmin(along), np.argmax(along)
+        path = np.array([[x[first], y[first], body.z[first]], [x[last], y[last], body.z[last]]])
+    return path
+
+
+def deck(body: Body, size: float) -> dict[str, object]:
+    """Area, height and clearance of a bridge deck, and the verdict."""
+    area, ground = len(body.row) * size * size, body.ground_height
+    height = float(np.median(body.z))
+    reasons = []
+    if area < 20:
+        reasons.append("small")
+    if not math.isnan(ground) and height - ground < 0.5:
+        reasons.append("low")
+    if body.reliability < 0.7:
+        reasons.append("unsure points")
+    return {
+        "area": area,
+        "z": height,
+        "clear": height - ground,
+        "ground": ground,
+        "points": int(body.count.sum()),
+        "reliab": body.reliability,
+        **_judged(reasons),
+    }

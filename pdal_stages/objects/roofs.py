@@ -1,0 +1,225 @@
+"""Buildings of cells: roofs that are connected, parted where they part."""
+
+from __future__ import annotations
+
+import heapq
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.jit import device, njit
+
+
+def roof_cells(high: NDArray, ground: NDArray, lowest: float) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Cells of roofs and the height of each, metres.
+
+    Cells of which the highest point lies `lowest` above the ground; empty ones with at least seven of eight neighbors are
+    filled, twice, and what is one cell wide, a wall or a stray point, is left out.
+
+    Parameters
+    ----------
+    high : (r, c) float64
+        Height of the highest point of a building in each cell, NaN where there is none.
+    ground : (r, c) float64
+        NaN where it is not known: then every height will do.
+    lowest : float
+        Metres.
+    """
+    with np.errstate(invalid="ignore"):
+        taken = ~np.isnan(high) & ~(high - ground < lowest)
+    high = np.where(taken, high, np.nan)
+    for _ in range(2):
+        high = _closed(high)
+    return opened(~np.isnan(high)), high
+
+
+def _closed(high: NDArray) -> NDArray[np.float64]:
+    """Heights with those of empty cells that have at least seven neighbors: the mean of them."""
+    wide = np.pad(high, 1, constant_values=np.nan)
+    total, count = np.zeros(high.shape), np.zeros(high.shape, np.int8)
+    for r in range(3):
+        for c in range(3):
+            beside = wide[r : r + high.shape[0], c : c + high.shape[1]]
+            there = ~np.isnan(beside)
+            total += np.where(there, beside, 0.0)
+            count += there
+    fill = np.isnan(high) & (count >= 7)
+    return np.where(fill, total / np.maximum(count, 1), high)
+
+
+def dilated(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cells in or beside (eight neighbors) the mask."""
+    wide = np.pad(mask, 1)
+    rows = wide[:-2] | wide[1:-1] | wide[2:]
+    return rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]
+
+
+def opened(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cells of the mask that lie in a square of two by two of it."""
+    square = mask[:-1, :-1] & mask[1:, :-1] & mask[:-1, 1:] & mask[1:, 1:]
+    out = np.zeros_like(mask)
+    for r in (0, 1):
+        for c in (0, 1):
+            out[r : mask.shape[0] - 1 + r, c : mask.shape[1] - 1 + c] |= square
+    return out
+
+
+@device
+def _root(parent, n):
+    while parent[n] != n:
+        parent[n] = parent[parent[n]]
+        n = parent[n]
+    return n
+
+
+@device
+def _unite(parent, a, b):
+    a, b = _root(parent, a), _root(parent, b)
+    if a < b:
+        parent[b] = a
+    elif b < a:
+        parent[a] = b
+
+
+@njit
+def connected(mask: NDArray, z: NDArray, step: float) -> NDArray:
+    """The first cell (row by row) of each cell's part, -1 outside the mask.
+
+    Two cells side by side are of one part where their heights differ by at most `step`.
+    """
+    rows, columns = mask.shape
+    parent = np.arange(rows * columns)
+    for r in range(rows):
+        for c in range(columns):
+            if not mask[r, c]:
+                continue
+            n = r * columns + c
+            if c + 1 < columns and mask[r, c + 1] and not abs(z[r, c] - z[r, c + 1]) > step:
+                _unite(parent, n, n + 1)
+            if r + 1 < rows and mask[r + 1, c] and not abs(z[r, c] - z[r + 1, c]) > step:
+                _unite(parent, n, n + columns)
+    out = np.full((rows, columns), -1, np.int64)
+    for r in range(rows):
+        for c in range(columns):
+            if mask[r, c]:
+                out[r, c] = _root(parent, r * columns + c)
+    return out
+
+
+@njit
+def borders(part: NDArray, z: NDArray, step: float) -> NDArray:
+    """Every pair of cells side by side in different parts: (n, 3), the numbers of both, the lower first, and whether
+    they lie within `step`."""
+    rows, columns = part.shape
+    count = 0
+    for turn in range(2):
+        out = np.empty((count, 3), np.int64)
+        count = 0
+        for r in range(rows):
+            for c in range(columns):
+                if part[r, c] < 0:
+                    continue
+                for way in range(2):
+                    rr, cc = r + way, c + 1 - way
+                    if rr >= rows or cc >= columns or part[rr, cc] < 0 or part[rr, cc] == part[r, c]:
+                        continue
+                    if turn == 1:
+                        a, b = part[r, c], part[rr, cc]
+                        out[count, 0], out[count, 1] = min(a, b), max(a, b)
+                        out[count, 2] = 0 if abs(z[r, c] - z[rr, cc]) > step else 1
+                    count += 1
+    return out
+
+
+def building_parts(
+    mask: NDArray[np.bool_], z: NDArray, *, step: float, smallest: int, fine: float = 1.0, share: float = 0.34
+) -> NDArray[np.int64]:
+    """Number of each cell's building, from 0 in the order of their first cells; -1 outside.
+
+    Connected cells whose heights differ by at most `fine` are a roof. Roofs of fewer than `smallest` cells (dormers,
+    chimneys) go with the neighbor that they share the longest border with, the smallest first. Then two roofs are of
+    one building where their heights differ by at most `step` along at least the `share` of their border, the most
+    equal first. A `step` of 0 parts nothing.
+    """
+    if step <= 0:
+        return numbered(connected(mask, z, np.inf))
+    number = absorbed(numbered(connected(mask, z, min(fine, step))), z, smallest)
+    return joined(number, z, step, share)
+
+
+def numbered(first: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Parts numbered from 0 in the order of what they are called; below 0 is nothing."""
+    inside, out = first >= 0, np.full(first.shape, -1, np.int64)
+    if inside.any():
+        _, out[inside] = np.unique(first[inside], return_inverse=True)
+    return out
+
+
+def absorbed(number: NDArray[np.int64], z: NDArray, smallest: int) -> NDArray[np.int64]:
+    """Parts without the small ones that have a neighbor."""
+    size, shared = np.bincount(number[number >= 0]).tolist(), _shared(number, z, np.inf)
+    into = list(range(len(size)))
+    waiting = [(n, part) for part, n in enumerate(size) if n < smallest]
+    heapq.heapify(waiting)
+    while waiting:
+        n, part = heapq.heappop(waiting)
+        if into[part] != part or n != size[part] or not shared[part]:
+            continue
+        # The longest border; of equal ones the part that begins first.
+        other = min(shared[part], key=lambda p: (-shared[part][p][0], p))
+        keep = _merge(part, other, into, size, shared)
+        if size[keep] < smallest:
+            heapq.heappush(waiting, (size[keep], keep))
+    return _renamed(number, into)
+
+
+def joined(number: NDArray[np.int64], z: NDArray, step: float, share: float) -> NDArray[np.int64]:
+    """Parts with those put together whose heights meet along enough of their border."""
+    size, shared = np.bincount(number[number >= 0]).tolist(), _shared(number, z, step)
+    into = list(range(len(size)))
+
+    def entry(a: int, b: int) -> tuple[float, int, int, int, int]:
+        length, near = shared[a][b]
+        return -near / length, min(a, b), max(a, b), length, near
+
+    waiting = [entry(a, b) for a in range(len(size)) for b in shared[a] if a < b]
+    heapq.heapify(waiting)
+    while waiting:
+        near, a, b, *state = heapq.heappop(waiting)
+        if into[a] != a or into[b] != b or shared[a].get(b) != tuple(state) or -near < share:
+            continue
+        keep = _merge(a, b, into, size, shared)
+        for other in shared[keep]:
+            heapq.heappush(waiting, entry(keep, other))
+    return _renamed(number, into)
+
+
+def _shared(number: NDArray[np.int64], z: NDArray, step: float) -> list[dict[int, tuple[int, int]]]:
+    """Of each part its neighbors: how long the border is, in cells, and along how much of it heights are within step."""
+    shared: list[dict[int, tuple[int, int]]] = [{} for _ in range(int(number.max(initial=-1)) + 1)]
+    pairs = borders(number, z, step)
+    if len(pairs):
+        ends, which, length = np.unique(pairs[:, :2], axis=0, return_inverse=True, return_counts=True)
+        near = np.bincount(which.ravel(), weights=pairs[:, 2]).astype(np.int64)
+        for (a, b), n, m in zip(ends.tolist(), length.tolist(), near.tolist(), strict=True):
+            shared[a][b] = shared[b][a] = (n, m)
+    return shared
+
+
+def _merge(a: int, b: int, into: list[int], size: list[int], shared: list[dict[int, tuple[int, int]]]) -> int:
+    """Put two parts together; the one that begins first stays."""
+    keep, gone = min(a, b), max(a, b)
+    into[gone] = keep
+    size[keep] += size[gone]
+    for p, (n, m) in shared[gone].items():
+        del shared[p][gone]
+        if p != keep:
+            before = shared[keep].get(p, (0, 0))
+            shared[keep][p] = shared[p][keep] = before[0] + n, before[1] + m
+    return keep
+
+
+def _renamed(number: NDArray[np.int64], into: list[int]) -> NDArray[np.int64]:
+    for part in range(len(into)):  # a part goes into one that begins before it
+        into[part] = into[into[part]]
+    return numbered(np.where(number >= 0, np.array([*into, -1], np.int64)[number], -1))

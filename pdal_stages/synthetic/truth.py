@@ -1,0 +1,113 @@
+"""What truly stands in a generated town: every building, tree, wire and bridge, as it was built."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .districts import filled
+from .solids import Site
+from .town import SPAN, TownOptions
+from .townplan import block_at, make_plan
+
+
+class House(NamedTuple):
+    """A part of a building under one roof."""
+
+    corners: NDArray  # (4, 2): of the roof, overhang and all, in order; metres, the town's coordinates
+    eave: float  # its height, absolute
+    ridge: float
+    walls: NDArray  # (4, 2): corners of the walls
+    slopes: tuple  # of a sloped roof's planes: fall along the length, fall along the width, height in the middle
+
+    def height(self, places: NDArray) -> NDArray[np.float64]:
+        """Height of the roof at places (n, 2), without dormers, chimneys and the like."""
+        along, across = self.walls[0] - self.walls[1], self.walls[1] - self.walls[2]
+        away = places - self.walls.mean(axis=0)
+        p, q = away @ along / np.hypot(*along), away @ across / np.hypot(*across)
+        planes = [middle - fall_p * p - fall_q * q for fall_p, fall_q, middle in self.slopes]
+        return np.min([np.full(len(places), self.ridge), *planes], axis=0)
+
+
+class Tree(NamedTuple):
+    """A tree as it was planted; from the air its top may lie a little beside its trunk."""
+
+    x: float
+    y: float
+    height: float
+    radius: float  # of the crown
+
+
+class TrueObjects(NamedTuple):
+    """The things of a town whose place (trees) or any corner (others) lies inside its square."""
+
+    houses: list[House]
+    trees: list[Tree]
+    cables: NDArray  # (n, 2, 3): start and end of every conductor between two poles
+    decks: NDArray  # (n, 4, 2): corners
+
+
+def true_objects(options: TownOptions) -> TrueObjects:
+    """The things of a town.
+
+    Parameters
+    ----------
+    options : TownOptions
+
+    Returns
+    -------
+    TrueObjects
+        In the town's coordinates (metres).
+    """
+    plan, half = make_plan(int(options.seed)), options.size / 2
+    square = np.array([(p * half, q * half) for p in (-1, 1) for q in (-1, 1)]) @ plan.turn
+    low, high = square.min(axis=0) - SPAN, square.max(axis=0) + SPAN
+    (i0, j0, _), (i1, j1, _) = block_at(*low, plan), block_at(*high, plan)
+
+    def placed(site: Site, ab: list[tuple[float, float]]) -> NDArray:
+        uv = np.array(ab, float).reshape(-1, 2) + (site.u0, site.v0)
+        return uv @ plan.turn.T + half + options.origin[:2]
+
+    def inside(places: NDArray) -> bool:
+        away = np.abs(places - options.origin[:2] - half)
+        return bool((away <= half).all(axis=1).any())
+
+    houses, trees, cables, decks = [], [], [], []
+    for i, j in itertools.product(range(i0, i1 + 1), range(j0, j1 + 1)):
+        site = filled(plan, i, j)
+        for kind, *what in site.built:
+            if kind == "house":
+                a, b, turn, half_l, half_w, over_l, over_w, eave, top, cuts = what
+                z = options.origin[2]
+                roof, walls = (
+                    placed(site, _corners(a, b, turn, half_l + p, half_w + q))
+                    for p, q in ((over_l, over_w), (0, 0))
+                )
+                if inside(roof):
+                    slopes = tuple((p, q, height + z) for p, q, height in cuts)
+                    houses.append(House(roof, eave + z, top + z, walls, slopes))
+            elif kind == "tree":
+                a, b, height, radius = what
+                place = placed(site, [(a, b)])
+                if inside(place):
+                    trees.append(Tree(*place[0].tolist(), height, radius))
+            elif kind == "cable":
+                ends = placed(site, [what[0][:2], what[1][:2]])
+                if inside(ends):
+                    z = np.array([[what[0][2]], [what[1][2]]]) + options.origin[2]
+                    cables.append(np.hstack([ends, z]))
+            elif kind == "deck":
+                corners = placed(site, _corners(*what))
+                if inside(corners):
+                    decks.append(corners)
+    return TrueObjects(houses, trees, np.array(cables).reshape(-1, 2, 3), np.array(decks).reshape(-1, 4, 2))
+
+
+def _corners(a: float, b: float, turn: float, half_l: float, half_w: float) -> list[tuple[float, float]]:
+    c, s = math.cos(turn), math.sin(turn)
+    around = ((1, 1), (-1, 1), (-1, -1), (1, -1))
+    return [(a + p * half_l * c - q * half_w * s, b + p * half_l * s + q * half_w * c) for p, q in around]
