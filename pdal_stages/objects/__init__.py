@@ -5,6 +5,6 @@ added and compared. They do not depend on the order of points, nor on how these 
 """
 
 from .cells import Cells
-from .find import ObjectSettings, Objects, find_objects
+from .find import Objects, ObjectSettings, find_objects
 
 __all__ = ["Cells", "ObjectSettings", "Objects", "find_objects"]

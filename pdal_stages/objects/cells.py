@@ -180,7 +180,7 @@ class Cells:
         order = np.argsort(self.key, kind="stable")
         key = self.key[order]
         first = np.flatnonzero(np.r_[True, key[1:] != key[:-1]]) if key.size else np.empty(0, np.int64)
-        columns = {}
+        columns: dict[str, NDArray] = {}
         for name, values in self.columns.items():
             kind, join = _COLUMNS[name]
             joined = join.reduceat(values[order], first, dtype=kind) if key.size else values
@@ -206,7 +206,9 @@ class Cells:
 
     def within(self, kind: Kind, row: int, column: int, rows: int, columns: int) -> Cells:
         """Those of a kind in a rectangle of its cells."""
-        first, last = np.searchsorted(self.key, cell_keys(kind, np.array([row, row + rows]), np.array([-_HALF, -_HALF])))
+        first, last = np.searchsorted(
+            self.key, cell_keys(kind, np.array([row, row + rows]), np.array([-_HALF, -_HALF]))
+        )
         part = self._rows(slice(int(first), int(last)))
         _, _, column_of = unpack(part.key)
         return part._rows((column_of >= column) & (column_of < column + columns))
@@ -228,5 +230,7 @@ def point_keys(
             found=f"x {x.min():g} to {x.max():g}, y {y.min():g} to {y.max():g} m",
             cure="Drop stray points first, or give a larger 'cell'",
         )
-    inside = tuple(np.minimum(PARTS * (v - f), PARTS - 1).astype(np.int16) for v, f in ((across, column), (up, row)))
-    return cell_keys(0, row, column) | (kinds.astype(np.int64) << _KIND), inside
+    into_x, into_y = (
+        np.minimum(PARTS * (v - f), PARTS - 1).astype(np.int16) for v, f in ((across, column), (up, row))
+    )
+    return np.asarray(cell_keys(0, row, column) | (kinds.astype(np.int64) << _KIND)), (into_x, into_y)

@@ -156,7 +156,9 @@ def _saddle(s, r, c, i, j):
 
 
 @njit
-def crown_cells(s: NDArray, up: NDArray, heir: NDArray, least: float, top_least: float, reach: float) -> NDArray:
+def crown_cells(
+    s: NDArray, up: NDArray, heir: NDArray, least: float, top_least: float, reach: float
+) -> NDArray:
     """Of each cell the number of its tree's top cell, -1 where there is none.
 
     A cell belongs to a crown where it is at least `least` times as high as the top and within `reach` cells of it.

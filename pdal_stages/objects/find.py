@@ -2,7 +2,7 @@
 
 Memory is that of a block with its surroundings and of what was found. A block is looked at with `MARGIN` around it, within
 which the ground and crowns are what they are in the whole; where a building, span or deck that reaches into the block comes
-near the rim of what is seen, more is looked at. An object belongs to the block that its first cell (a tree: its top) lies in.
+near the rim of what is seen, more is looked at. An object is of the block that its first cell (a tree: its top) lies in.
 So blocks, and tiles that hold as much, find exactly what one look at everything finds.
 """
 
@@ -48,9 +48,14 @@ class ObjectSettings:
     building_height: float = _setting(1.5, "A building's cells are at least so high above the ground", 0, 100)
     building_area: float = _setting(4.0, "Smaller buildings are left out", 0, 10_000, "m2")
     step: float = _setting(
-        2.5, "Roofs that differ by more along two thirds of their border are two buildings; 0 parts none", 0, 100
+        2.5,
+        "Roofs that differ by more along two thirds of their border are two buildings; 0 parts none",
+        0,
+        100,
     )
-    roof_part: float = _setting(10.0, "Smaller parts of a roof (dormers) go with their neighbor", 0, 10_000, "m2")
+    roof_part: float = _setting(
+        10.0, "Smaller parts of a roof (dormers) go with their neighbor", 0, 10_000, "m2"
+    )
     tree_height: float = _setting(3.0, "Lower plants are no trees", 0, 100)
     tree_area: float = _setting(1.5, "Trees with smaller crowns are left out", 0, 1000, "m2")
     window: float = _setting(
@@ -58,7 +63,11 @@ class ObjectSettings:
     )
     window_slope: float = _setting(0.1, "Added to the radius per metre of height", 0, 1, "")
     saddle: float = _setting(
-        0.1, "Two tops that near are one tree where the saddle is no deeper than this share of the lower", 0, 1, ""
+        0.1,
+        "Two tops that near are one tree where the saddle is no deeper than this share of the lower",
+        0,
+        1,
+        "",
     )
     smoothing: float = _setting(0.35, "Standard deviation of the Gaussian that smooths the canopy", 0, 5)
     span_gap: float = _setting(2.0, "Wires with larger gaps are two spans", 0.5, 20)
@@ -236,7 +245,9 @@ def _bodies(number: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64],
     flat = np.flatnonzero(number.ravel() >= 0)
     order = flat[np.argsort(number.ravel()[flat], kind="stable")]
     values = number.ravel()[order]
-    first = np.flatnonzero(np.r_[True, values[1:] != values[:-1]]) if values.size else np.empty(0, np.int64)
+    if not values.size:
+        return
+    first = np.flatnonzero(np.r_[True, values[1:] != values[:-1]])
     for start, end in zip(first, np.r_[first[1:], values.size], strict=True):
         yield int(values[start]), order[start:end] // number.shape[1], order[start:end] % number.shape[1]
 

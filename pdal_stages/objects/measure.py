@@ -12,6 +12,11 @@ from .cells import MM
 from .planes import roof_planes
 
 SURE, CHECK = "sure", "check"
+#: Why an object is to be checked.
+REASONS = (
+    "no ground near", "small", "low", "rough roof", "unsure points", "no facade", "few points", "thin crown", "wide crown",
+    "short", "not straight",
+)  # fmt: skip
 
 
 class Body(NamedTuple):
@@ -22,7 +27,7 @@ class Body(NamedTuple):
     z: NDArray[np.float64]  # of the roof, the canopy, the wires: highest point, metres
     low: NDArray[np.float64]  # lowest point; NaN in cells without points
     ground: NDArray[np.float64]  # NaN where it is not known
-    count: NDArray[np.int64]  # points
+    points: NDArray[np.int64]  # points
     sure: NDArray[np.float64]  # sum of reliabilities, thousandths
     told: NDArray[np.int64]  # points that have one
 
@@ -84,7 +89,7 @@ def building(body: Body, size: float) -> dict[str, object]:
         "slope": slope,
         "planes": planes,
         "planar": planar,
-        "points": int(body.count.sum()),
+        "points": int(body.points.sum()),
         "reliab": body.reliability,
         **_judged(reasons),
     }
@@ -96,7 +101,7 @@ def tree(body: Body, top_row: int, top_column: int, size: float) -> dict[str, ob
     above = body.z - body.ground
     highest = int(np.argmax(np.where(np.isnan(above), -np.inf, above)))
     height, diameter = float(above[highest]), 2.0 * math.sqrt(area / math.pi)
-    points = int(body.count.sum())
+    points = int(body.points.sum())
     reasons = []
     if points < 10:
         reasons.append("few points")
@@ -138,7 +143,7 @@ def span(body: Body, size: float) -> dict[str, object]:
         "h_low": float(known.min()) if known.size else math.nan,
         "z_high": float(body.z.max()),
         "sag": float(max(0.0, np.max(_chord(path) - path[:, 2]))),
-        "points": int(body.count.sum()),
+        "points": int(body.points.sum()),
         "reliab": body.reliability,
         **_judged(reasons),
     }
@@ -186,7 +191,7 @@ def deck(body: Body, size: float) -> dict[str, object]:
         "z": height,
         "clear": height - ground,
         "ground": ground,
-        "points": int(body.count.sum()),
+        "points": int(body.points.sum()),
         "reliab": body.reliability,
         **_judged(reasons),
     }

@@ -59,7 +59,9 @@ def _gradients(z: NDArray, size: float) -> tuple[NDArray, NDArray, NDArray]:
 
 
 @njit
-def _grown(z: NDArray, east: NDArray, north: NDArray, seeds: NDArray, size: float, tilt: float, away: float) -> NDArray:
+def _grown(
+    z: NDArray, east: NDArray, north: NDArray, seeds: NDArray, size: float, tilt: float, away: float
+) -> NDArray:
     """Number of each cell's plane, from 0; -1 outside. Planes grow from the flattest places on."""
     rows, columns = z.shape
     plane = np.full(z.shape, -1, np.int32)

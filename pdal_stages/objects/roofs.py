@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from ..base.jit import device, njit
 
 
-def roof_cells(high: NDArray, ground: NDArray, lowest: float) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+def roof_cells(
+    high: NDArray, ground: NDArray, lowest: float
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Cells of roofs and the height of each, metres.
 
     Cells of which the highest point lies `lowest` above the ground; empty ones with at least seven of eight neighbors are

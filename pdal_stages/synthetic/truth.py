@@ -22,7 +22,9 @@ class House(NamedTuple):
     eave: float  # its height, absolute
     ridge: float
     walls: NDArray  # (4, 2): corners of the walls
-    slopes: tuple  # of a sloped roof's planes: fall along the length, fall along the width, height in the middle
+    slopes: (
+        tuple  # of a sloped roof's planes: fall along the length, fall along the width, height in the middle
+    )
 
     def height(self, places: NDArray) -> NDArray[np.float64]:
         """Height of the roof at places (n, 2), without dormers, chimneys and the like."""
@@ -69,7 +71,7 @@ def true_objects(options: TownOptions) -> TrueObjects:
     (i0, j0, _), (i1, j1, _) = block_at(*low, plan), block_at(*high, plan)
 
     def placed(site: Site, ab: list[tuple[float, float]]) -> NDArray:
-        uv = np.array(ab, float).reshape(-1, 2) + (site.u0, site.v0)
+        uv = np.array(ab, float).reshape(-1, 2) + np.array([site.u0, site.v0])
         return uv @ plan.turn.T + half + options.origin[:2]
 
     def inside(places: NDArray) -> bool:
@@ -94,7 +96,7 @@ def true_objects(options: TownOptions) -> TrueObjects:
                 a, b, height, radius = what
                 place = placed(site, [(a, b)])
                 if inside(place):
-                    trees.append(Tree(*place[0].tolist(), height, radius))
+                    trees.append(Tree(float(place[0, 0]), float(place[0, 1]), height, radius))
             elif kind == "cable":
                 ends = placed(site, [what[0][:2], what[1][:2]])
                 if inside(ends):

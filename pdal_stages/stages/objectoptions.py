@@ -1,0 +1,123 @@
+"""Options that the stages of objects share: those of the search, and which classes are what."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from functools import cached_property
+from typing import Any
+
+from ..base.errors import StageError
+from ..objects import Cells, ObjectSettings
+from ..objects.cells import CLASSES, Kind, kind_of_code
+from .options import option
+from .points import Points
+from .selection import UNWANTED, Selection
+
+_SETTINGS = {one.name: one for one in fields(ObjectSettings)}
+_CODES = {
+    "ground": Kind.GROUND,
+    "buildings": Kind.BUILDING,
+    "trees": Kind.TREE,
+    "wires": Kind.SPAN,
+    "decks": Kind.DECK,
+    "towers": Kind.TOWER,
+}
+
+
+def _setting(name: str) -> Any:
+    one = _SETTINGS[name]
+    rule = one.metadata
+    return option(
+        "number", one.default, rule["what"], minimum=rule["low"], maximum=rule["high"], unit=rule["unit"]
+    )
+
+
+def _codes(name: str, what: str) -> Any:
+    return option("codes", CLASSES[_CODES[name]], f"Class codes of {what}", may_be_empty=True)
+
+
+class ObjectOptions:
+    """Mixed into stages."""
+
+    ground: list[int] = _codes("ground", "the ground, and of water")
+    buildings: list[int] = _codes("buildings", "buildings, roofs and facades")
+    trees: list[int] = _codes("trees", "vegetation that trees are looked for in")
+    wires: list[int] = _codes("wires", "wires")
+    decks: list[int] = _codes("decks", "bridge decks")
+    towers: list[int] = _codes("towers", "towers and poles, where spans of wires end")
+    cell: float = _setting("cell")
+    building_height: float = _setting("building_height")
+    building_area: float = _setting("building_area")
+    step: float = _setting("step")
+    roof_part: float = _setting("roof_part")
+    tree_height: float = _setting("tree_height")
+    tree_area: float = _setting("tree_area")
+    window: float = _setting("window")
+    window_slope: float = _setting("window_slope")
+    saddle: float = _setting("saddle")
+    smoothing: float = _setting("smoothing")
+    span_gap: float = _setting("span_gap")
+    ignore: Selection = option(
+        "selection",
+        UNWANTED,
+        "Points of no object: class codes, ranges such as Classification[7:7], or the word withheld",
+        may_be_empty=True,
+    )
+
+    options: dict[str, Any]
+
+    @cached_property
+    def settings(self) -> ObjectSettings:
+        """How objects are told apart."""
+        return ObjectSettings(**{name: self.options[name] for name in _SETTINGS})
+
+    @cached_property
+    def classes(self) -> dict[Kind, tuple[int, ...]]:
+        """Class codes of each kind."""
+        return {kind: tuple(int(c) for c in self.options[name]) for name, kind in _CODES.items()}
+
+    def check_classes(self) -> None:
+        """Refuse a code of two kinds."""
+        kind_of_code(self.classes)
+
+    def cells(self, points: Points) -> Cells:
+        """Records of the points that may be of objects, or are ground.
+
+        Raises
+        ------
+        StageError
+            Where no point has a class of any kind, or none is ground.
+        """
+        usable = points.usable(self.ignore)
+        codes = points.class_codes[usable]
+        x, y, z = points.xyz[usable].T
+        told = points.arrays.get("Reliability")
+        cells = Cells.of(
+            x,
+            y,
+            z,
+            codes,
+            self.settings.cell,
+            reliability=None if told is None else told[usable],
+            classes=self.classes,
+        )
+        refuse_unclassified(cells, codes)
+        return cells
+
+
+def refuse_unclassified(cells: Cells, codes: Any) -> None:
+    """An error for points without classes, and for points without ground."""
+    if len(codes) == 0:
+        return
+    if len(cells) == 0:
+        raise StageError(
+            "no point has a class that objects are made of, or that is ground",
+            found="classes " + ", ".join(str(c) for c in sorted(set(codes.tolist()))),
+            cure="Classify the points first (pdal-stages classify), or say what is what: 'buildings', 'trees', ...",
+        )
+    if len(cells.of_kind(Kind.GROUND)) == 0:
+        raise StageError(
+            "there is no ground: objects' heights are measured from points of its classes",
+            found="classes " + ", ".join(str(c) for c in sorted(set(codes.tolist()))),
+            cure="Classify the ground first (pdal-stages classify, or filters.smrf), or name its classes in 'ground'",
+        )

@@ -1,0 +1,182 @@
+"""``filters.objects``: group classified points into buildings, trees, spans of wires and bridge decks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import OptionError, suggest
+from ..objects import Objects, find_objects
+from ..objects.cells import Kind, kind_of_code
+from ..objects.find import FOUND, MARGIN
+from ..objects.measure import CHECK, REASONS
+from .base import Stage
+from .objectoptions import ObjectOptions
+from .options import option
+from .points import Points
+
+#: What each kind of object is measured by, as points carry it: height and area or length.
+_HEIGHT = {Kind.BUILDING: "h_ridge", Kind.TREE: "height", Kind.SPAN: "h_low", Kind.DECK: "clear"}
+_EXTENT = {Kind.BUILDING: "area", Kind.TREE: "area", Kind.SPAN: "length", Kind.DECK: "area"}
+
+
+class ObjectsFilter(ObjectOptions, Stage):
+    type = "filters.objects"
+    summary = "Group classified points into buildings, trees, spans of wires and bridge decks"
+    source = (
+        "crowns after Popescu, Wynne 2004 (Photogrammetric Engineering and Remote Sensing 70, 589-604) and Chen, "
+        "Baldocchi, Gong, Kelly 2006 (the same journal 72, 923-932)"
+    )
+    where_help = "Points outside form no object, and keep what they have."
+    open_ended = True  # a building may be larger than the surroundings of a tile
+    judged: bool = option(
+        "boolean",
+        False,
+        "Also write ObjectVerdict (1 sure, 2 to be checked), ObjectHeight and ObjectExtent (area, of spans their length)",
+    )
+    refuse: list[str] = option(
+        "list",
+        (),
+        f"Points of objects with one of these reasons to be checked change their class: {', '.join(REASONS)}",
+        may_be_empty=True,
+    )
+    refused_class: int = option("integer", 1, "The class that they get", minimum=0, maximum=255)
+    details = """
+Writes `ObjectID`, 0 for points of no object. An id is made of the object's kind and of the cell of an absolute grid that
+stands for it (its southernmost, westernmost one; of a tree that of its top). It is not counted, so the same object has
+the same id in every tile, in any order of points, and in the next run; below 2^53, it is exact in JSON and as a double.
+
+**Buildings** are connected cells with points of a building at least `building_height` above the ground, roofs and facades
+together. Roofs whose heights differ by more than `step` along two thirds of their border are two buildings; small parts
+(dormers, chimneys) go with the roof around them. **Trees** are crowns: maxima of the smoothed canopy, none of which has a
+higher one within `window` (which grows with height) that only a shallow `saddle` parts from it, and the cells that climb to
+them. **Spans** are wires between towers or poles, **decks** those of bridges.
+
+Heights are above the ground that the points of its classes show, so `Classification` is all that is read; a mean
+`Reliability`, where points have one, is part of the verdict. Each object is *sure* or *to be checked*, with the reasons:
+small, low, rough roof, no facade, no ground near, unsure points, few points, thin crown, wide crown, short, not straight.
+Metadata counts objects by kind, verdict and reason. The objects of the reasons in `refuse` lose their class (and are
+counted): their points get `refused_class`, and no `ObjectID`.
+
+Tiles see what it takes: crowns and ground end within 150 m, and where a building reaches into a tile from farther away
+the tile is read wider. To write objects as polygons and points use `pdal-stages objects` or `writers.objects`.
+"""
+    before = ({"type": "filters.modelclassifier", "model": "town.model"},)
+    after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)
+    example = {"type": "filters.objects", "judged": True}
+
+    def check(self) -> None:
+        self.check_classes()
+        for reason in self.refuse:
+            if reason not in REASONS:
+                raise OptionError(
+                    "option 'refuse' names no reason",
+                    found=repr(reason),
+                    cure=f"{suggest(str(reason), REASONS)}Reasons: {', '.join(REASONS)}",
+                )
+
+    def reads(self) -> list[str]:
+        return ["Classification"]
+
+    def creates(self) -> dict[str, str]:
+        out = {"ObjectID": "uint64_t"}
+        if self.judged:
+            out |= {"ObjectVerdict": "uint8_t", "ObjectHeight": "float", "ObjectExtent": "float"}
+        if self.refuse:
+            out["Classification"] = "uint8_t"
+        return out
+
+    def largest_class(self) -> int:
+        return self.refused_class if self.refuse else 0
+
+    def halo(self) -> float:
+        return MARGIN + 4 * self.settings.cell
+
+    def reach_of(self, points: Points, wanted: NDArray[np.bool_], box: Sequence[float]) -> float:
+        if not wanted.any():
+            return 0.0
+        unit, size = points.units.horizontal, self.settings.cell
+        west, south, east, north = (value * unit for value in box)
+        found = self._found(points)
+        mine = np.unique(self._ids(found, points)[wanted])
+        away = 0.0
+        for kind in (Kind.BUILDING, Kind.SPAN, Kind.DECK):
+            table = found.tables[kind]
+            for number in np.flatnonzero(np.isin(table.ids, mine)).tolist():
+                row, column, _ = table.cells_of(number)
+                beyond = (
+                    west - column.min() * size,
+                    (column.max() + 1) * size - east,
+                    south - row.min() * size,
+                    (row.max() + 1) * size - north,
+                )
+                away = max(away, *beyond)
+        return float(away) + self.halo()
+
+    def _found(self, points: Points) -> Objects:
+        return find_objects(self.cells(points), self.settings, progress=False)
+
+    def _ids(self, found: Objects, points: Points) -> NDArray[np.int64]:
+        kinds = kind_of_code(self.classes)[points.class_codes]
+        kinds[~points.inside | points.chosen(self.ignore)] = -1
+        return found.ids_at(points.xyz[:, 0], points.xyz[:, 1], kinds)
+
+    def run(self, points: Points) -> dict[str, NDArray]:
+        found = self._found(points)
+        ids = self._ids(found, points)
+        out: dict[str, NDArray] = {"ObjectID": ids}
+        at = {kind: _places(ids, found.tables[kind].ids) for kind in FOUND}
+        if self.judged:
+            for name in ("ObjectVerdict", "ObjectHeight", "ObjectExtent"):
+                out[name] = np.array(points.arrays[name])
+                out[name][points.inside] = 0
+        points.report |= self._report(found)
+        refused = np.zeros(points.count, bool)
+        for kind, (which, rows) in at.items():
+            columns = found.tables[kind].columns
+            if not rows.size:
+                continue
+            if self.judged:
+                out["ObjectVerdict"][rows] = np.where(columns["verdict"][which] == CHECK, 2, 1)
+                out["ObjectHeight"][rows] = (
+                    np.nan_to_num(columns[_HEIGHT[kind]][which]) / points.units.vertical
+                )
+                out["ObjectExtent"][rows] = columns[_EXTENT[kind]][which]
+            bad = np.array(
+                [any(r in self.refuse for r in str(text).split(", ")) for text in columns["reason"]]
+            )
+            refused[rows] = bad[which]
+        if self.refuse:
+            codes = points.class_codes.copy()
+            codes[refused] = self.refused_class
+            ids[refused] = 0
+            out["Classification"] = points.with_codes(codes)
+            points.report["refused_points"] = int(np.count_nonzero(refused))
+        out["ObjectID"] = ids.astype(np.uint64)
+        if points.mask is not None:
+            out["ObjectID"] = np.where(points.mask, out["ObjectID"], points.arrays["ObjectID"])
+        return out
+
+    def _report(self, found: Objects) -> dict[str, Any]:
+        report: dict[str, Any] = {}
+        for kind, table in found.tables.items():
+            if len(table):
+                reasons = [r for text in table.columns["reason"].tolist() for r in text.split(", ") if r]
+                report[kind.name.lower() + "s"] = {
+                    "objects": len(table),
+                    "to_be_checked": int(np.count_nonzero(table.columns["verdict"] == CHECK)),
+                    "reasons": {reason: reasons.count(reason) for reason in sorted(set(reasons))},
+                }
+        return report
+
+
+def _places(ids: NDArray[np.int64], known: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Which of the sorted known ids points have, and the rows of those points."""
+    if known.size == 0:
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    at = np.minimum(np.searchsorted(known, ids), known.size - 1)
+    rows = np.flatnonzero((known[at] == ids) & (ids != 0))
+    return at[rows], rows

@@ -1,0 +1,256 @@
+"""Objects: against a slow twin, in any order, in blocks and tiles, of bad input, and on the generated town."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pdal_stages as ps
+from pdal_stages.base.errors import StageError
+from pdal_stages.objects import Cells, ObjectSettings, find_objects
+from pdal_stages.objects.cells import CLASSES, Kind, cell_keys, kind_of_code, object_id, unpack
+from pdal_stages.objects.rasters import fill_gaps
+from pdal_stages.objects.roofs import connected
+from pdal_stages.synthetic import TownOptions
+from pdal_stages.synthetic.truth import true_objects
+
+
+def house(x0, y0, x1, y1, z, step=0.3, code=6):
+    """Points of a flat roof."""
+    x, y = np.meshgrid(np.arange(x0, x1, step), np.arange(y0, y1, step))
+    return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z)]), np.full(x.size, code, np.uint8)
+
+
+def scene(*parts, size=40.0, origin=(0.0, 0.0)):
+    """Parts on flat ground (not below buildings)."""
+    ground, codes = house(-5, -5, size + 5, size + 5, 0.0, 0.5, 2)
+    free = np.ones(len(ground), bool)
+    for xyz, _ in parts:
+        if len(xyz):
+            low, high = xyz[:, :2].min(0), xyz[:, :2].max(0)
+            free &= ~((ground[:, :2] >= low) & (ground[:, :2] <= high)).all(1)
+    xyz = np.concatenate([ground[free], *(p for p, _ in parts)])
+    xyz[:, :2] += origin
+    return xyz, np.concatenate([codes[free], *(c for _, c in parts)])
+
+
+def found_in(xyz, codes, **options):
+    chosen = ObjectSettings(**options)
+    return find_objects(Cells.of(*xyz.T, codes, chosen.cell), chosen, progress=False)
+
+
+def same(a, b):
+    assert a.tables.keys() == b.tables.keys()
+    for kind, one in a.tables.items():
+        other = b.tables[kind]
+        np.testing.assert_array_equal(one.ids, other.ids)
+        assert list(one.columns) == list(other.columns)
+        for name in one.columns:
+            np.testing.assert_array_equal(one.columns[name], other.columns[name])
+        for name in ("start", "row", "column", "z"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+        for path, twin in zip(one.paths, other.paths, strict=True):
+            np.testing.assert_array_equal(path, twin)
+    np.testing.assert_array_equal(a.key, b.key)
+    np.testing.assert_array_equal(a.owner, b.owner)
+
+
+@pytest.fixture(scope="module")
+def town():
+    return ps.make_town(150.0, 8.0, seed=4, progress=False)
+
+
+def test_records_against_a_plain_twin():
+    rng = np.random.default_rng(3)
+    xyz = np.round(rng.uniform(-4, 4, (500, 3)), 3)
+    codes = rng.choice([1, 2, 5, 6, 14, 17], 500).astype(np.uint8)
+    told = rng.uniform(0, 1, 500)
+    cells = Cells.of(*xyz.T, codes, 0.5, reliability=told)
+    twin: dict[int, list[int]] = {}
+    for n, ((x, y, _), code) in enumerate(zip(xyz, codes, strict=True)):
+        kind = kind_of_code(CLASSES)[code]
+        if kind >= 0:
+            wide = 1.0 if kind == Kind.GROUND else 0.5
+            key = int(cell_keys(int(kind), np.floor(y / wide), np.floor(x / wide)))
+            twin.setdefault(key, []).append(n)
+    assert cells.key.tolist() == sorted(twin)
+    for at, key in enumerate(sorted(twin)):
+        mm = np.rint(xyz[twin[key], 2] * 1000).astype(int)
+        row = {name: int(values[at]) for name, values in cells.columns.items()}
+        assert row["count"] == row["told"] == len(mm)
+        assert (row["low"], row["high"], row["sum"]) == (mm.min(), mm.max(), mm.sum())
+        assert row["sure"] == np.rint(told[twin[key]] * 1000).sum()
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 6))
+def test_records_do_not_depend_on_order_or_parts(seed, parts):
+    rng = np.random.default_rng(seed)
+    xyz, codes = rng.normal(0, 20, (300, 3)), rng.choice([2, 5, 6], 300).astype(np.uint8)
+    whole = Cells.of(*xyz.T, codes, 0.5)
+    order = np.array_split(rng.permutation(300), parts)
+    joined = Cells.join([Cells.of(*xyz[part].T, codes[part], 0.5) for part in order])
+    np.testing.assert_array_equal(joined.key, whole.key)
+    for name in whole.columns:
+        np.testing.assert_array_equal(joined.columns[name], whole.columns[name])
+
+
+def test_keys_and_ids_say_where_they_are():
+    kind, row, column = unpack(cell_keys(2, np.array([-7, 12]), np.array([5, -90_000])))
+    assert (kind.tolist(), row.tolist(), column.tolist()) == ([2, 2], [-7, 12], [5, -90_000])
+    ids = object_id(4, np.array([-(2**24), 2**24 - 1]), np.array([-(2**24), 2**24 - 1]))
+    assert len(set(ids.tolist())) == 2 and ids.min() > 0 and ids.max() < 2**53
+
+
+def test_gaps_of_the_ground_continue_a_slope():
+    r, c = np.mgrid[:40, :60]
+    z = 0.3 * r - 0.2 * c + 5.0
+    holed = z.copy()
+    holed[12:28, 20:41] = np.nan
+    np.testing.assert_allclose(fill_gaps(holed, 60), z, atol=0.35)
+    row = holed.copy()
+    row[:, :] = np.nan
+    row[20, 0], row[20, 59] = 1.0, 60.0
+    np.testing.assert_allclose(fill_gaps(row, 60)[20], np.arange(1.0, 61.0), atol=1e-9)
+    assert np.isnan(fill_gaps(row, 10)[20, 30])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_connected_against_flooding(seed):
+    rng = np.random.default_rng(seed)
+    mask, z = rng.random((9, 11)) < 0.7, rng.uniform(0, 3, (9, 11))
+    part = connected(mask, z, 1.0)
+    twin = np.full(mask.shape, -1)
+    for start in range(mask.size):
+        todo = [divmod(start, 11)]
+        while todo:
+            r, c = todo.pop()
+            if not mask[r, c] or twin[r, c] >= 0:
+                continue
+            twin[r, c] = start
+            for i, j in ((r + 1, c), (r - 1, c), (r, c + 1), (r, c - 1)):
+                if 0 <= i < 9 and 0 <= j < 11 and abs(z[r, c] - z[i, j]) <= 1.0:
+                    todo.append((i, j))
+    np.testing.assert_array_equal(part, twin)
+
+
+def test_a_house_is_measured():
+    got = found_in(*scene(house(10, 10, 22, 18, 6.0)))
+    table = got.tables[Kind.BUILDING]
+    assert len(table) == 1
+    one = {name: values[0] for name, values in table.columns.items()}
+    assert one["area"] == pytest.approx(96, abs=6) and one["h_ridge"] == one["h_eave"] == 6.0
+    assert one["planes"] == 1 and one["slope"] < 0.1 and one["ground"] == 0 and one["verdict"] == "sure"
+    assert int(table.ids[0]) == int(object_id(Kind.BUILDING, np.array(20), np.array(20)))
+
+
+def test_roofs_part_at_a_step_alone():
+    low, near, far = house(10, 10, 20, 18, 4.0), house(20.1, 10, 30, 18, 5.0), house(20.1, 10, 30, 18, 9.0)
+    assert len(found_in(*scene(low, near)).tables[Kind.BUILDING]) == 1
+    assert len(found_in(*scene(low, far)).tables[Kind.BUILDING]) == 2
+    assert len(found_in(*scene(low, far), step=0).tables[Kind.BUILDING]) == 1
+    chimney = house(14, 13, 15.2, 14.2, 8.0)
+    assert len(found_in(*scene(low, chimney)).tables[Kind.BUILDING]) == 1
+
+
+def test_tops_of_two_cones():
+    rng = np.random.default_rng(1)
+    xy = rng.uniform(0, 30, (9000, 2))
+    z = np.maximum(*(h - 1.6 * np.hypot(*(xy - p).T) for h, p in ((9.0, (10, 15)), (7.0, (17, 15)))))
+    leaves = np.column_stack([xy, z])[z > 1]
+    got = found_in(*scene((leaves, np.full(len(leaves), 5, np.uint8))))
+    table = got.tables[Kind.TREE]
+    assert len(table) == 2
+    order = np.argsort(table.columns["height"])
+    np.testing.assert_allclose(table.columns["x"][order], [17, 10], atol=0.6)
+    np.testing.assert_allclose(table.columns["height"][order], [7, 9], atol=0.6)
+
+
+def test_spans_end_at_poles_and_decks_have_room_below():
+    t = np.arange(0, 40, 0.2)
+    wire = np.column_stack([t, np.full(t.size, 10.0), 8 + 0.004 * (t - 20) ** 2])
+    pole = np.array([[20.0, 10.0, 8.0]])
+    bridge = house(5, 20, 30, 26, 5.0, code=17)
+    got = found_in(*scene((wire, np.full(t.size, 14, np.uint8)), (pole, np.array([15], np.uint8)), bridge))
+    spans, decks = got.tables[Kind.SPAN], got.tables[Kind.DECK]
+    assert len(spans) == 2 and 15 < spans.columns["length"].min() <= spans.columns["length"].max() < 21
+    assert (
+        len(decks) == 1
+        and decks.columns["clear"][0] == 5.0
+        and decks.columns["area"][0] == pytest.approx(150, abs=8)
+    )
+
+
+@pytest.mark.parametrize("block", [64, 150])
+def test_blocks_change_nothing(town, block):
+    cells = Cells.of(*town.xyz.T, town.classification, 0.5)
+    same(find_objects(cells, progress=False), find_objects(cells, block=block, progress=False))
+
+
+def test_a_building_larger_than_any_block_and_its_margin():
+    long, _ = house(0, 10, 700, 16, 6.0, 0.4)
+    ground, codes = house(-10, 0, 710, 30, 0.0, 0.9, 2)
+    xyz = np.concatenate([long, ground])
+    codes = np.r_[np.full(len(long), 6, np.uint8), codes]
+    cells = Cells.of(*xyz.T, codes, 0.5)
+    whole = find_objects(cells, progress=False)
+    assert len(whole.tables[Kind.BUILDING]) == 1
+    same(whole, find_objects(cells, block=100, progress=False))
+
+
+def test_a_shift_by_whole_cells_shifts_the_objects(town):
+    one = found_in(town.xyz, town.classification)
+    two = found_in(town.xyz + np.array([1024.0, -512.0, 0.0]), town.classification)
+    for kind in (Kind.BUILDING, Kind.TREE, Kind.DECK):
+        a, b = one.tables[kind], two.tables[kind]
+        assert len(a) == len(b) > 0
+        np.testing.assert_array_equal(a.row - 1024, b.row)
+        np.testing.assert_array_equal(a.columns["area"], b.columns["area"])
+
+
+def test_the_town(town):
+    """What stands in a generated town is found: most buildings at IoU 0.5, most trees within 4 m and 30 % of height."""
+    shapely = pytest.importorskip("shapely")
+    true = true_objects(TownOptions(150.0, 8.0, 4))
+    got = found_in(town.xyz, town.classification, step=0)
+    table = got.tables[Kind.BUILDING]
+    houses = shapely.union_all([shapely.Polygon(h.corners) for h in true.houses]).buffer(0.3).buffer(-0.3)
+    square = shapely.box(500_000, 5_400_000, 500_150, 5_400_150)
+    blocks = [g for g in shapely.get_parts(houses.intersection(square)) if g.area > 4]
+    hit = 0
+    for n in range(len(table)):
+        row, column, _ = table.cells_of(n)
+        shape = shapely.union_all(shapely.box(column / 2, row / 2, column / 2 + 0.5, row / 2 + 0.5))
+        hit += any(shape.intersection(g).area / shape.union(g).area >= 0.5 for g in blocks)
+    assert hit >= 0.93 * max(len(blocks), len(table))
+    trees = [t for t in true.trees if t.height >= 3]
+    found = got.tables[Kind.TREE].columns
+    near = [
+        (np.hypot(found["x"] - t.x, found["y"] - t.y) < 4)
+        & (np.abs(found["height"] - t.height) < 0.3 * t.height)
+        for t in trees
+    ]
+    assert np.mean([n.any() for n in near]) > 0.8
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_next_to_nothing(count):
+    got = found_in(np.zeros((count, 3)), np.full(count, 6, np.uint8))
+    assert all(len(table) == 0 for table in got.tables.values())
+
+
+def test_a_far_point_costs_nothing():
+    xyz, codes = scene(house(10, 10, 22, 18, 6.0))
+    stray, more = np.array([[9e6, -3e6, 5.0]]), np.array([6], np.uint8)
+    got = found_in(np.concatenate([xyz, stray]), np.r_[codes, more])
+    assert len(got.tables[Kind.BUILDING]) == 1
+    with pytest.raises(StageError, match="too far out"):
+        found_in(np.concatenate([xyz, stray * 1e4]), np.r_[codes, more])
+
+
+def test_a_class_of_two_kinds():
+    with pytest.raises(StageError, match="class 6 cannot stand for"):
+        kind_of_code({Kind.BUILDING: (6,), Kind.TREE: (6,)})

@@ -1,0 +1,110 @@
+"""``filters.objects`` in real pipelines: dimensions, tiles, `where`, refusals, errors."""
+
+from __future__ import annotations
+
+import laspy
+import numpy as np
+import pytest
+
+import pdal_stages as ps
+from pdal_stages.base.errors import StageError
+from pdal_stages.pipeline.run import Pipeline
+from pdal_stages.stages import registry
+from pdal_stages.synthetic import write_town
+
+pytestmark = pytest.mark.pdal
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory):
+    path = tmp_path_factory.mktemp("objects") / "town.laz"
+    write_town(ps.make_town(110.0, 5.0, seed=5, progress=False), path)
+    return path
+
+
+def run_stage(arrays, **options):
+    """The stage on arrays, as PDAL's runtime calls it."""
+    stage = registry.get("filters.objects")(options)
+    made = {name: np.zeros(len(arrays["X"]), "u8") for name in stage.creates() if name not in arrays}
+    return stage.run(stage.points({**arrays, **made}))
+
+
+def stages(source, target, **options):
+    writer = {"type": "writers.las", "filename": str(target), "forward": "all", "extra_dims": "all"}
+    return [str(source), {"type": "filters.objects", **options}, writer]
+
+
+def test_ids_and_verdicts_of_points(town, tmp_path):
+    job = Pipeline(stages(town, tmp_path / "out.laz", judged=True))
+    job.execute(arrays=False)
+    las = laspy.read(tmp_path / "out.laz")
+    ids, codes = np.asarray(las["ObjectID"]), np.asarray(las.classification)
+    assert (ids[codes == 6] > 0).mean() > 0.95 and (ids[codes == 5] > 0).mean() > 0.9
+    assert not ids[codes == 2].any()
+    assert set((ids[ids > 0] >> np.uint64(50)).tolist()) <= {1, 2, 3, 4}
+    assert set(np.unique(las["ObjectVerdict"]).tolist()) <= {0, 1, 2}
+    assert ((np.asarray(las["ObjectVerdict"]) > 0) == (ids > 0)).all()
+    one = ids == ids[codes == 6][0]
+    assert len(np.unique(np.asarray(las["ObjectHeight"])[one])) == 1
+    report = job.reports[-1][1][-1]
+    assert report["buildings"]["objects"] == len(np.unique(ids[(ids >> np.uint64(50)) == 1]))
+
+
+def test_tiles_give_the_same(town, tmp_path):
+    Pipeline(stages(town, tmp_path / "whole.laz", judged=True)).execute(arrays=False)
+    run = ps.run_tiled(stages(town, tmp_path / "tiled.laz", judged=True), 50, workers=0, progress=False)
+    assert not run.failures
+    whole, tiled = laspy.read(tmp_path / "whole.laz"), laspy.read(tmp_path / "tiled.laz")
+    for name in ("ObjectID", "ObjectVerdict", "ObjectHeight", "ObjectExtent"):
+        np.testing.assert_array_equal(whole[name], tiled[name])
+
+
+def test_a_building_longer_than_what_a_tile_sees(tmp_path):
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(0, 600, 0.45), np.arange(0, 12, 0.45)))
+    roof = (y > 3) & (y < 9)
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales = np.full(3, 0.001)
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = x, y, np.where(roof, 6.0, 0.0)
+    las.classification = np.where(roof, 6, 2).astype(np.uint8)
+    las.write(tmp_path / "row.las")
+    Pipeline(stages(tmp_path / "row.las", tmp_path / "whole.laz")).execute(arrays=False)
+    ps.run_tiled(stages(tmp_path / "row.las", tmp_path / "tiled.laz"), 100, workers=0, progress=False)
+    whole, tiled = laspy.read(tmp_path / "whole.laz"), laspy.read(tmp_path / "tiled.laz")
+    assert len(np.unique(whole["ObjectID"])) == 2
+    np.testing.assert_array_equal(whole["ObjectID"], tiled["ObjectID"])
+
+
+def test_where_and_refusals(town):
+    las = laspy.read(town)
+    points = {"X": las.x, "Y": las.y, "Z": las.z, "Classification": np.asarray(las.classification)}
+    half = run_stage(points, where="X < 500050 || Classification == 2")
+    ids = half["ObjectID"]
+    assert not ids[(points["X"] >= 500050)].any() and ids[points["X"] < 500050].any()
+    refused = run_stage(points, refuse=["small", "no facade"], refused_class=64)
+    gone = np.asarray(refused["Classification"]) == 64
+    assert gone.any() and not refused["ObjectID"][gone].any()
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"refuse": ["smal"]}, "Did you mean"),
+        ({"buildings": [2]}, "class 2 cannot stand for"),
+        ({"cell": 0}, "cell"),
+    ],
+)
+def test_wrong_options(options, text):
+    with pytest.raises(StageError, match=text):
+        registry.get("filters.objects")(options)
+
+
+def test_points_without_classes_or_ground():
+    rng = np.random.default_rng(1)
+    points = {axis: rng.uniform(0, 9, 50) for axis in "XYZ"}
+    with pytest.raises(StageError, match="no point has a class"):
+        run_stage({**points, "Classification": np.ones(50, np.uint8)})
+    with pytest.raises(StageError, match="there is no ground"):
+        run_stage({**points, "Classification": np.full(50, 6, np.uint8)})
+    with pytest.raises(StageError, match="Classification"):
+        run_stage(points)
