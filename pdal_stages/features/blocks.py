@@ -29,11 +29,6 @@ BLOCK_NS = 1.5e8
 MOST_ROWS = 65_536
 ROW_BYTES = 1_000
 
-#: What makes a dimension that is asked for and missing.
-MAKERS = {
-    "HeightAboveGround": "Put filters.hag_minima before this stage; in Python, hag_minima(x, y, z) makes it"
-}
-
 
 #: What a block counted: by kind, then by neighborhood.
 Tally = dict[str, dict[str, int]]
@@ -216,7 +211,7 @@ def _dimensions(
             raise DimensionError(
                 f"the dimension '{name}' is needed as a feature but missing",
                 found=there,
-                cure=MAKERS.get(name, f"Give dimensions={{'{name}': values}}, or leave it out of the plan"),
+                cure=f"Give dimensions={{'{name}': values}}, or leave it out of the plan",
             )
         values = np.asarray(given[name])
         if values.shape != (count,) or values.dtype.kind not in "fiub":

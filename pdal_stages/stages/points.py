@@ -18,7 +18,9 @@ from .where import Expression
 #: Which stage makes a dimension that a user may lack.
 MAKERS = {
     "Z": "The reader does not give it: check its file and options",
-    "HeightAboveGround": 'Add {"type": "filters.hag_minima"} (or filters.hag_delaunay, filters.hag_nn) before this stage',
+    "HeightAboveGround": (
+        'Add {"type": "filters.hag_morphological"} before this stage, or the stage that the model was trained with'
+    ),
     "Reference": 'Keep the labels before classifying: {"type": "filters.ferry", "dimensions": "Classification=>Reference"}',
     "Ground": 'Add {"type": "filters.hag_morphological", "ground": true} before this stage',
     "Slope": 'Add {"type": "filters.hag_morphological", "terrain_slope": true} before this stage',
