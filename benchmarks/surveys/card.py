@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from clouds import SURVEYS
 from leave_one_out import tables
-from recipe import DENSITIES, OPTIONS, SAMPLES, SLOPES
+from recipe import DENSITIES, MOST, OPTIONS, SAMPLES, SLOPES
 
 from pdal_stages.classifier import load_model
 from pdal_stages.stages.heights import PREPARATION
@@ -28,10 +28,12 @@ def main() -> None:
     options.add_argument("--scores", type=Path, required=True)
     args = options.parse_args()
     model, scores = load_model(args.model), json.loads(args.scores.read_text())
-    surveys = ["| survey | what | points | licence |", "|---|---|---:|---|"]
-    points = {cloud["name"]: cloud["points"] for cloud in model.info["training"]["clouds"]}
+    surveys = ["| survey | what | labelled points | left out | licence |", "|---|---|---:|---:|---|"]
+    runs = {run["cloud"]: run for run in scores["surveys"]}
     for name, survey in SURVEYS.items():
-        surveys.append(f"| {name} | {survey.what} | {points[name]:,} | (c) {survey.licence} |")
+        surveys.append(
+            f"| {name} | {survey.what} | {runs[name]['points']:,} | {runs[name]['contradicted']:,} | (c) {survey.licence} |"
+        )
     worst = min(scores["surveys"], key=lambda run: run["oa"])
     own = [run["oa"] for run in scores["surveys"] if run["cloud"] in SURVEYS]
     print(
@@ -49,6 +51,9 @@ def main() -> None:
             read=f"At their own densities the mean is {np.mean(own):.1f}; the worst of all is {worst['cloud']}, "
             f"{worst['oa']:.1f}.",
             surveys="\n".join(surveys),
+            count=OPTIONS.count,
+            most=MOST,
+            below=OPTIONS.contradicted_below,
             densities=", ".join(f"{density:g}" for density in DENSITIES),
             slopes=f"{100 * max(slope for slope, *_ in SLOPES):.0f}",
             samples=SAMPLES,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from clouds import SURVEYS, Cloud, load, on_slopes, thinned, without_returns
 
 from pdal_stages.base.hashing import coordinate_hash
 from pdal_stages.classifier import Model, TrainingCloud, TrainingOptions, train
+from pdal_stages.classifier.clouds import contradicted
 from pdal_stages.features.voxels import represent
 from pdal_stages.stages.heights import PREPARATION
 
@@ -17,7 +19,11 @@ from pdal_stages.stages.heights import PREPARATION
 DENSITIES = (8.0, 2.0, 0.6)
 #: (slope, points per square metre, whether in terraces) of copies on synthetic terrain.
 SLOPES = ((0.3, 8.0, False), (0.6, 3.0, False), (0.9, 1.0, False), (0.5, 0.3, False), (0.5, 1.0, True))
-#: Samples of each class from each copy.
+#: Points of a copy at most: a strip of it, each copy's somewhere else.
+MOST = 50_000
+#: Steps by this share of a whole, over and over, fall evenly everywhere.
+GOLDEN = 0.5 * (5.0**0.5 - 1.0)
+#: Samples of each class from each copy, at most.
 SAMPLES = 1500
 
 OPTIONS = TrainingOptions(
@@ -25,7 +31,8 @@ OPTIONS = TrainingOptions(
     feature_set="covariance,Verticality,HeightRange,HeightStd,HeightAboveLowest",
     dimensions=("HeightAboveGround", "Ground", "HeightAboveOpening_5", "HeightAboveOpening_17", "returns"),
     classes={"2": 2, "5": 5, "6": 6},
-    count=SAMPLES * 20,
+    count=30_000,
+    contradicted_below=0.3,
     trees=40,
     min_samples_leaf=10,
     prior_weight=0.0,
@@ -52,23 +59,37 @@ def copies(cloud: Cloud) -> Iterator[Cloud]:
             yield without_returns(one)
 
 
-def training_cloud(cloud: Cloud) -> TrainingCloud:
-    """As dense as it is trained on, with a mask of :data:`SAMPLES` points of each class, chosen by their coordinates."""
+def training_cloud(cloud: Cloud, number: int) -> TrainingCloud:
+    """A survey's copy of this number as it is trained on: as dense, a strip of it, with a mask of :data:`SAMPLES` points of
+    each class, chosen by their coordinates."""
     representatives = represent(cloud.xyz, OPTIONS.voxel, cloud.dimensions.values())
     if representatives is not None:
         cloud = cloud.taken(representatives.rows)
+    cloud = cloud.taken(strip(cloud.xyz, MOST, number * GOLDEN % 1.0))
     order = np.argsort(coordinate_hash(cloud.xyz, 1), kind="stable")
     mask = np.zeros(len(order), np.bool_)
+    whole = TrainingCloud(cloud.xyz, cloud.labels, cloud.dimensions, name=cloud.name, survey=cloud.survey)
+    gone = contradicted(whole, OPTIONS.contradicted_below)
+    usable = cloud.labels if gone is None else np.where(gone, 0, cloud.labels)
     for code in (2, 5, 6):
-        mask[order[cloud.labels[order] == code][:SAMPLES]] = True
-    return TrainingCloud(
-        cloud.xyz, cloud.labels, cloud.dimensions, name=cloud.name, mask=mask, survey=cloud.survey
-    )
+        mask[order[usable[order] == code][:SAMPLES]] = True
+    return replace(whole, mask=mask | (gone if gone is not None else False))
+
+
+def strip(xyz: np.ndarray, most: int, where: float) -> np.ndarray:
+    """Rows, ascending, of at most `most` points: a strip across the longer axis, `where` along it from 0 to 1."""
+    along = xyz[:, int(np.argmax(np.ptp(xyz[:, :2], axis=0)))]
+    first = int(max(len(xyz) - most, 0) * where)
+    return np.sort(np.argsort(along, kind="stable")[first : first + most])
+
+
+def training_clouds(data: Path, survey: str) -> list[TrainingCloud]:
+    """What a survey gives to train on."""
+    return [training_cloud(copy, number) for number, copy in enumerate(copies(load(data, survey)))]
 
 
 def train_on(data: Path, surveys: Iterable[str], options: TrainingOptions = OPTIONS) -> Model:
     """The model of these surveys."""
-    made = [training_cloud(copy) for name in surveys for copy in copies(load(data, name))]
-    model = train(made, options)
+    model = train([one for name in surveys for one in training_clouds(data, name)], options)
     model.info["preparation"] = list(PREPARATION)
     return model
