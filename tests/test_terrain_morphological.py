@@ -16,6 +16,7 @@ from pdal_stages.terrain.lowest import pits
 from pdal_stages.terrain.morphological import reach
 from pdal_stages.terrain.openings import opening_radii, square_steps
 from pdal_stages.terrain.planes import surface
+from pdal_stages.terrain.plateaus import remove_plateaus
 from pdal_stages.terrain.progressive import LARGEST_DROP, objects_of
 
 SMALL = {"window": 12.0, "openings": (5, 9), "slope_too": True}
@@ -218,6 +219,93 @@ def test_planes_equal_the_slow_reference():
         assert planes[j, i, 0] == pytest.approx(want, abs=1e-6)
 
 
+def slow_plateaus(ground, raster, cell):
+    """Ground cells of plateaus, and the level around them, by walking."""
+    cells = {(j, i): float(raster[j, i]) for j, i in zip(*np.nonzero(np.isfinite(raster)), strict=True)}
+    taken, seen = {}, set()
+    for start in cells:
+        if start in seen:
+            continue
+        members, todo = {start}, [start]
+        while todo:
+            j, i = todo.pop()
+            for b in range(-4, 5):
+                for a in range(-4, 5):
+                    other = (j + b, i + a)
+                    step = max(0.75, 0.3 * cell * np.hypot(a, b))
+                    if other not in cells or other in members or np.hypot(a, b) > 4:
+                        continue
+                    if abs(cells[other] - cells[j, i]) <= step:
+                        members.add(other)
+                        todo.append(other)
+        seen |= members
+        at = np.array(sorted(members))
+        own = [c for c in members if ground[c]]
+        if len(own) <= 0.05 * len(members) or np.ptp(at, axis=0).max() >= int(200 / cell):
+            continue
+        middle, lower, level, directions = at.mean(axis=0), [], 0, set()
+        for j, i in members:
+            for b in range(-8, 9):
+                for a in range(-8, 9):
+                    other = (j + b, i + a)
+                    if other in cells and ground[other] and other not in members:
+                        drop = cells[j, i] - cells[other]
+                        if drop > max(1.5, 0.75 * cell * np.hypot(a, b)):
+                            lower.append(cells[other])
+                            turn = np.arctan2(other[0] - middle[0], other[1] - middle[1]) / (2 * np.pi)
+                            directions.add(int(np.floor(16 * (turn + 1))) % 16)
+                        elif abs(drop) < 0.75:
+                            level += 1
+        if len(directions) >= 14 and len(lower) >= 0.8 * (len(lower) + level):
+            taken |= dict.fromkeys(own, np.mean(lower))
+    return taken
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_plateaus_equal_the_slow_reference(seed):
+    rng = np.random.default_rng(seed)
+    h, w = 40, 44
+    cell = (1.0, 0.5, 6.0)[seed % 3]
+    j, i = np.mgrid[:h, :w]
+    level = 0.05 * i * cell
+    for _ in range(6):
+        y, x, size, high = rng.integers(0, h), rng.integers(0, w), rng.integers(3, 9), rng.uniform(1, 30)
+        level = np.where((abs(j - y) < size) & (abs(i - x) < size), level.min() + high, level)
+    raster = (level + rng.normal(0, 0.1, (h, w))).astype(np.float32)
+    raster[rng.random((h, w)) < (0.2 + 0.1 * seed)] = np.inf
+    ground = np.isfinite(raster) & (rng.random((h, w)) < 0.7)
+    left, floor = ground.copy(), raster.copy()
+    remove_plateaus(left, floor, raster, cell)
+    want = slow_plateaus(ground, raster, cell)
+    assert {tuple(map(int, at)) for at in np.argwhere(ground & ~left)} == set(want)
+    for at, height in want.items():
+        assert floor[at] == pytest.approx(height, abs=1e-4)
+    assert seed % 3 == 2 or want
+
+
+def test_a_roof_is_no_ground_whatever_its_width_and_steps():
+    """190 m wide, with a storey on it; a terrace with a ramp and a plateau of 260 m stay."""
+    rng = np.random.default_rng(2)
+    x, y = rng.uniform(0, 500, (2, 60_000))
+    far = np.maximum(np.abs(x - 250), np.abs(y - 250))
+
+    def ground_of(height):
+        found = filtered_ground(x, y, 0.02 * x + height + rng.normal(0, 0.03, len(x)))
+        return found["Ground"] == 1, found["HeightAboveGround"]
+
+    for storey in (0.0, 3.0):
+        ground, height = ground_of(np.where(far < 95, 3.0, 0.0) + np.where(far < 50, storey, 0.0))
+        assert not ground[far < 93].any()
+        assert ground[far > 97].mean() > 0.999
+        assert height[far < 90].min() > 1.0
+    ramp = np.clip((x - 320) / 40, 0, 1) * 5.0
+    hill = np.where((far < 95) & (x > 320) & (abs(y - 250) < 10), 5.0 - ramp, np.where(far < 95, 5.0, 0.0))
+    ground, _ = ground_of(hill)
+    assert ground[far < 30].mean() > 0.99
+    ground, _ = ground_of(np.where(far < 130, 6.0, 0.0))
+    assert ground[far < 40].mean() > 0.99
+
+
 # ---- what must hold --------------------------------------------------------------------------------------
 
 
@@ -266,13 +354,13 @@ def test_order_and_shifts_by_whole_cells_change_nothing(seed, n, cells):
 
 @pytest.mark.parametrize("origin", [(0.0, 0.0), (-47.0, -200.0), (770_500.0, 6_277_550.0)])
 def test_a_tile_with_its_halo_gives_the_same_bits(origin):
-    x, y, z, _ = town(2, side=700, density=0.3, origin=origin)
+    x, y, z, _ = town(2, side=1000, density=0.2, origin=origin)
     options = {**SMALL, "window": 6.0}
     halo = reach(window=6.0, openings=(5, 9))
     whole = filtered_ground(x, y, z, **options)
     u, v = x - origin[0], y - origin[1]
-    core = (u >= 330) & (u < 380) & (v >= 340) & (v < 400)
-    near = (u >= 330 - halo) & (u < 380 + halo) & (v >= 340 - halo) & (v < 400 + halo)
+    core = (u >= 480) & (u < 530) & (v >= 490) & (v < 550)
+    near = (u >= 480 - halo) & (u < 530 + halo) & (v >= 490 - halo) & (v < 550 + halo)
     assert near.sum() < 0.9 * len(x)
     tile = filtered_ground(x[near], y[near], z[near], **options)
     same({k: a[core[near]] for k, a in tile.items()}, {k: a[core] for k, a in whole.items()})
@@ -431,8 +519,8 @@ def test_the_stage_declares_what_it_makes_and_how_far_it_looks():
         "HeightAboveOpening_16_5": "float",
     }
     assert HagMorphological({}).creates() == {"HeightAboveGround": "float"}
-    assert 300 < HagMorphological({}).halo() < 400
-    assert HagMorphological({"window": 20}).halo() < 300
+    assert 500 < HagMorphological({}).halo() < 600
+    assert HagMorphological({"window": 20}).halo() < 500
     with pytest.raises(
         StageError, match=r"filters\.hag_morphological.*'window' must not be more than 300 cells"
     ):

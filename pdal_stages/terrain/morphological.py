@@ -9,6 +9,7 @@ point is ground if it lies within `threshold` plus `scalar` times the terrain's 
 * windows grow to the size of large halls, and a drop of a few metres is enough there (:mod:`.progressive`);
 * holes are left open, not painted over; a pyramid of planes carries the surface across them (:mod:`.planes`);
 * ground that openings took from ridges, dams and the upper side of walls is regained where it continues the surface;
+* what is higher than all around it on every side is no ground (:mod:`.plateaus`);
 * low outliers are told from ground under a canopy (:mod:`.lowest`).
 
 [P13] Pingel, Clarke, McBride (2013): An improved simple morphological filter for the terrain classification of
@@ -34,6 +35,8 @@ from .openings import HOLE
 from .patches import patches
 from .planes import blend, surface
 from .planes import reach as planes_reach
+from .plateaus import reach as plateau_reach
+from .plateaus import remove_plateaus
 from .profile import above_opening, opening_names, opening_radius
 from .progressive import objects_of
 
@@ -149,11 +152,13 @@ def filtered_ground(
 def reach(*, cell: float = 1.0, window: float = 75.0, openings: Sequence[float] = ()) -> float:
     """How far away, in metres, points can change a point's results: the halo a tile needs.
 
-    An opening looks twice its radius away; low outliers are judged before, and surfaces led through ground after it.
+    An opening looks twice its radius away, a plateau as far as it is wide; low outliers are judged before, and surfaces
+    led through ground after it.
     """
     radius = _largest_radius(cell, window, openings)
     near, far = (planes_reach(_levels(block, cell)) for block in (_NEAR, _FAR))
-    return (COMPANY + SURROUNDINGS + 2 * radius + (_ROUNDS + 1) * near + far + 2) * cell
+    before = COMPANY + SURROUNDINGS + 2 * radius + plateau_reach(cell)
+    return (before + (_ROUNDS + 1) * near + far + 2) * cell
 
 
 def _link(cell: float, window: float, openings: Sequence[float]) -> int:
@@ -217,6 +222,7 @@ def _filter(
     for _ in range(_ROUNDS):
         planes = surface(ground, place, floor, raster, left, bottom, _levels(_NEAR, cell))
         _regain(ground, raster, place, planes, cell, threshold, scalar)
+    remove_plateaus(ground, floor, raster, cell)
     planes = surface(ground, place, floor, raster, left, bottom, _levels(_NEAR, cell))
     height, gradient = np.empty((2, len(x)))
 
