@@ -298,7 +298,7 @@ def test_a_roof_is_no_ground_whatever_its_width_and_steps():
         assert not ground[far < 93].any()
         assert ground[far > 97].mean() > 0.999
         assert height[far < 90].min() > 1.0
-    ramp = np.clip((x - 320) / 40, 0, 1) * 5.0
+    ramp = np.clip((x - 320) / 25, 0, 1) * 5.0
     hill = np.where((far < 95) & (x > 320) & (abs(y - 250) < 10), 5.0 - ramp, np.where(far < 95, 5.0, 0.0))
     ground, _ = ground_of(hill)
     assert ground[far < 30].mean() > 0.99
