@@ -21,8 +21,8 @@ RETURN_RATIO = "ReturnRatio"
 
 _MAKERS = {
     "HeightAboveGround": (
-        "Put filters.hag_minima before this stage (or PDAL's filters.hag_nn or filters.hag_delaunay after a "
-        "ground filter; classify with the one that was used for training)"
+        "In Python filtered_ground(xyz) makes it; in a pipeline put filters.hag_morphological before this stage, or "
+        "what the model was trained with"
     ),
     "Intensity": "It comes from the reader; this source has none. Use a model trained without it",
     "ReturnNumber": "It comes from the reader; this source has none. Use a model trained without it",
