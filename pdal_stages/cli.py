@@ -319,6 +319,8 @@ def _ran(options: argparse.Namespace, pipeline) -> tuple[int, list[str]]:
     metadata, verbose = getattr(options, "metadata", None), getattr(options, "verbose", 1)
     more = [Output(options.log, "log")] if getattr(options, "log", None) else []
     pipeline.check_outputs(*more, *([Output(metadata, "metadata", kinds.JSON)] if metadata else []))
+    before = list(pipeline.lowered.remarks)
+    tell(*before)
     end_at_once(options)
     count = pipeline.execute(arrays=False, loglevel=_LEVELS.get(verbose, logging.DEBUG))
     # Warnings, and what PDAL calls an error although it goes on: a reader that sets what it cannot read to 0, say.
@@ -328,7 +330,7 @@ def _ran(options: argparse.Namespace, pipeline) -> tuple[int, list[str]]:
         said.append(f"PDAL says {len(lines) - _SAID:,} more lines; -v shows them")
     if metadata:
         write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
-    return count, said + pipeline.told
+    return count, said + [line for line in pipeline.told if line not in before]
 
 
 def _expand(options: argparse.Namespace) -> None:
@@ -346,7 +348,9 @@ def _expand(options: argparse.Namespace) -> None:
 def _validate(options: argparse.Namespace) -> int:
     """Print PDAL's verdict or ours as JSON, on standard output; an error goes to standard error too."""
     try:
-        print(_build(options).validate())
+        pipeline = _build(options)
+        print(pipeline.validate())
+        tell(*pipeline.lowered.remarks)
     except StageError as error:
         verdict = {"valid": False, "error_detail": str(error), "streamable": False}
         print(json.dumps(verdict, indent=2))

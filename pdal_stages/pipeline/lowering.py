@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from ..base.errors import PipelineError, StageError, suggest
 from ..stages import preparation, registry
 from ..stages.base import Stage
-from . import classflags, extradims
+from . import classflags, extradims, wiring
 from .optionfile import settled
 from .read import PipelineSource
 from .runtime import TRAMPOLINE, made, place, python_filter
@@ -66,6 +66,11 @@ def lower(source: PipelineSource, whole: bool = True) -> Lowered:
         _refuse_near_miss(stages[-1], source.where(place_of))
     views = _Views()
     out = Lowered([])
+    run = wiring.run_by_pdal(stages)
+    if len(run) < len(stages):
+        places = [source.where(number) for number in range(len(stages))]
+        out.remarks.append(wiring.remark_on(stages, run, places))
+        stages = [stages[number] for number in run]
     check_copc(stages)
     check_vectors(stages)
     tags = {str(s["tag"]) for s in stages if "tag" in s}
@@ -76,7 +81,7 @@ def lower(source: PipelineSource, whole: bool = True) -> Lowered:
             views.add(stage, last=index is not None and 0 < index == len(stages) - 1)
             out.stages.append(stage)
             continue
-        where = source.where(index)
+        where = source.where(run[index])
         try:
             if views.reaching(stage) > 1:  # points of several readers
                 merge: dict[str, Any] = {"type": "filters.merge"}
@@ -89,7 +94,7 @@ def lower(source: PipelineSource, whole: bool = True) -> Lowered:
                 views.add(merge)
                 out.stages.append(merge)
             taken = registry.get(type_name).from_pipeline(stage, stages[:index])
-            lowered = lower_stage({**taken, **stage}, index, len(out.stages))
+            lowered = lower_stage({**taken, **stage}, run[index], len(out.stages))
         except StageError as error:
             raise error.within(where) from None
         views.add(stage)

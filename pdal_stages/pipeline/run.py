@@ -25,6 +25,7 @@ from .lowering import Lowered, lower
 from .overrides import Override, apply_overrides
 from .read import PipelineSource, read_pipeline
 from .references import check_readers
+from .wiring import check_start
 
 
 class Pipeline:
@@ -183,6 +184,7 @@ class Pipeline:
                     pass
             except OSError as error:
                 raise PipelineError("the file cannot be read", where=path, found=error) from None
+        check_start(self.lowered.stages)
         check_dimensions(self.lowered)
         self.remarks = [*self.lowered.remarks, *unread_extra_dimensions(self.lowered.stages)]
         self.remarks += [
