@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 
 import laspy
 import numpy as np
@@ -172,6 +174,19 @@ def test_an_old_file_and_its_text_or_raster(tmp_path, capsys, write_las, model, 
     assert set(np.unique(made.classification)) == {2, 6}
     listed = np.loadtxt(tmp_path / "o.txt", delimiter=",", skiprows=1)
     assert np.array_equal(listed[:, 3], np.asarray(made.classification))
+
+
+def test_pdals_own_pipelines_write_what_pdal_writes(tmp_path, capsys, write_las, pdal_program):
+    source = write_las(tmp_path / "in.las", flagged(), point_format=1)
+    made = []
+    for number, words in enumerate(([pdal_program], [sys.executable, "-m", "pdal_stages.cli"])):
+        out = tmp_path / f"{number}.txt"
+        (tmp_path / "job.json").write_text(
+            json.dumps([str(source), {"type": "writers.text", "filename": str(out)}])
+        )
+        subprocess.run([*words, "pipeline", str(tmp_path / "job.json")], check=True)
+        made.append(out.read_bytes())
+    assert made[0] == made[1]
 
 
 def test_writers_of_both_are_refused_before_work(tmp_path, capsys, write_las, model):

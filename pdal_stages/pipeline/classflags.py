@@ -70,8 +70,8 @@ class Parting:
     mixed: bool = False
 
 
-def parting(stages: Sequence[dict[str, Any]]) -> Parting:
-    """What must be done so that flags are neither lost nor become classes.
+def parting(stages: Sequence[dict[str, Any]], *, with_ours: bool = False) -> Parting:
+    """What must be done so that flags are neither lost nor become classes; `with_ours`: there are stages of ours besides.
 
     Raises
     ------
@@ -92,8 +92,11 @@ def parting(stages: Sequence[dict[str, Any]]) -> Parting:
     given = [n for n in writers if stages[n].get("type") not in registry.stages()]
     fit = [n for n in given if _holds_both(stages[n], stages[:n])]
     if known == {True}:
-        if len(fit) == len(given):
-            return Parting()
+        alone = not with_ours and not any(stage.get("type") in registry.stages() for stage in stages)
+        if len(fit) == len(given) or (
+            alone and not any(writes_las(stages[n]) for n in given if n not in fit)
+        ):
+            return Parting()  # without stages of ours, text and rasters come out as PDAL makes them
         if not fit:
             return Parting("split", old)
         if not any(writes_las(stages[n]) for n in given if n not in fit):

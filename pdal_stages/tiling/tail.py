@@ -35,7 +35,7 @@ def run_tail(
         check_complete(made, final, writers[number], None if "where" in writers[number] else run.count)
         supersede_copc(made)
 
-    flags = classflags.parting([*readers, *tail])
+    flags = classflags.parting([*readers, *tail], with_ours=True)
     with Callbacks() as callbacks:
         stages: list[dict[str, Any]] = []
         inputs = []

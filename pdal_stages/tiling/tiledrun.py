@@ -91,7 +91,7 @@ def run_plan(
     survey = Survey(plan, chosen)
     chosen = survey.options
     if survey.per == "tile":  # whose outputs have points of all readers
-        classflags.parting([*plan.readers, *plan.tail])
+        classflags.parting([*plan.readers, *plan.tail], with_ours=True)
     if dry_run:
         return estimate(plan, survey)
     if not folder.is_dir():
