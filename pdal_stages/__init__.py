@@ -23,6 +23,7 @@ _WHERE = {
     "TrainingOptions": "classifier",
     "Writer": "pipeline.native",
     "compute_features": "features",
+    "detached_noise": "terrain",
     "filtered_ground": "terrain",
     "hag_minima": "terrain",
     "load_model": "stages.loading",
@@ -50,7 +51,7 @@ if TYPE_CHECKING:
     from .reports.accuracypage import write_accuracy_report
     from .stages.loading import load_model
     from .synthetic import make_town
-    from .terrain import filtered_ground, hag_minima
+    from .terrain import detached_noise, filtered_ground, hag_minima
     from .tiling import run_tiled
     from .tiling.settings import TilingOptions
 

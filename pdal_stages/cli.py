@@ -220,6 +220,12 @@ def _parser() -> argparse.ArgumentParser:
         help="Extra dimensions to write beside the input's own: e.g. Reliability,Margin,Probability_6, all, or none; "
         "default HeightAboveGround,Reliability",
     )
+    takes(
+        "--noise",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="Mark low and high noise first (filters.detachednoise)",
+    )
     takes("--where", help="Classify only the points for which this holds; the others serve as neighbors")
     takes("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
     add_arguments(commands.choices["classify"], survey=True)
@@ -384,7 +390,7 @@ def _classify(options: argparse.Namespace) -> int:
 
     listed = options.dimensions
     named = WRITTEN if listed is None else tuple(name.strip() for name in listed.split(",") if name.strip())
-    request = ClassifyRequest(options.model, tuple(options.overrides), options.where, named)
+    request = ClassifyRequest(options.model, tuple(options.overrides), options.where, named, options.noise)
     files = {"metadata": options.metadata or "", "log": options.log or ""}
     return classify(
         ClassifyTask(tuple(options.inputs), options.output, request, options_of(options), **files), options

@@ -49,8 +49,8 @@ def models(town, tmp_path_factory):
 
 def test_none_is_forgotten():
     tested = {
-        "normalise", "features", "features-for-viewers", "train", "train-binary", "classify", "classify-with-rejection",
-        "evaluate", "train-on-smrf-ground", "classify-on-smrf-ground", "tiles-to-tiles",
+        "noise", "normalise", "features", "features-for-viewers", "train", "train-binary", "classify",
+        "classify-with-rejection", "evaluate", "train-on-smrf-ground", "classify-on-smrf-ground", "tiles-to-tiles",
         "copc-to-tiles", "tile-index-to-tiles",
     }  # fmt: skip
     assert {f.stem for f in FILES} == tested
@@ -63,6 +63,17 @@ def test_names_say_what_they_are(path):
     stages = json.loads(path.read_text())
     assert isinstance(stages, list)
     assert all("tag" in s for s in stages)
+
+
+def test_noise(town, tmp_path):
+    source, out = laspy.read(town), tmp_path / "o.laz"
+    source.z[:3] += np.array([200, -12, 50]) / source.header.scales[2]
+    source.write(str(tmp_path / "in.laz"))
+    run("noise", f"--stage.input.filename={tmp_path / 'in.laz'}", f"--stage.output.filename={out}")
+    codes = np.asarray(laspy.read(out).classification)
+    assert codes[:3].tolist() == [18, 7, 18] and np.array_equal(
+        codes[3:], np.asarray(source.classification)[3:]
+    )
 
 
 def test_normalise(town, tmp_path):

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..base.jit import CompilationNote
 from ..features import compute_features
-from ..terrain import filtered_ground, hag_minima
+from ..terrain import detached_noise, filtered_ground, hag_minima
 from .clouds import TrainingCloud
 from .context import Context
 from .forest import Forest
@@ -66,6 +66,7 @@ def _cloud() -> np.ndarray:
 
 def _heights(xyz: np.ndarray) -> dict[str, np.ndarray]:
     axes = np.ascontiguousarray(xyz.T)
+    detached_noise(*axes)
     dimensions = filtered_ground(*axes, openings=(5,), threads=1)
     dimensions["HeightAboveGround"] = hag_minima(*axes)
     return dimensions

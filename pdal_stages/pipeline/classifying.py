@@ -36,18 +36,23 @@ class ClassifyRequest:
         Classify only the points for which this holds.
     dimensions : tuple of str
         Which of the dimensions made on the way are written beside the input's own; ``all`` and ``none`` are known.
+    noise : bool
+        Whether low and high noise is marked first.
     """
 
     model: str = STANDARD
     overrides: tuple[Override, ...] = ()
     where: str | None = None
     dimensions: tuple[str, ...] = WRITTEN
+    noise: bool = True
+
+    @property
+    def _inside(self) -> dict[str, str]:
+        return {"where": self.where} if self.where else {}
 
     @cached_property
     def _classifier(self) -> dict[str, Any]:
-        stage: dict[str, Any] = {"type": "filters.modelclassifier", "model": self.model}
-        if self.where:
-            stage["where"] = self.where
+        stage: dict[str, Any] = {"type": "filters.modelclassifier", "model": self.model, **self._inside}
         for option, name in (
             ("margin", "Margin"),
             ("variance", "Variance"),
@@ -64,7 +69,7 @@ class ClassifyRequest:
 
     @cached_property
     def stages(self) -> list[dict[str, Any]]:
-        """Those that make what the model reads, and the classifier.
+        """What marks noise, what makes what the model reads, and the classifier.
 
         Raises
         ------
@@ -80,7 +85,8 @@ class ClassifyRequest:
                 "filters.modelclassifier, and the writer",
             )
         prepared = self.loaded.info.get("preparation") or preparation_of(self.loaded.required_dimensions)
-        return [*prepared, self._classifier]
+        noise = [{"type": "filters.detachednoise", **self._inside}] if self.noise else []
+        return [*noise, *prepared, self._classifier]
 
     @cached_property
     def beside(self) -> dict[str, str] | None:

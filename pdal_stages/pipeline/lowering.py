@@ -120,7 +120,7 @@ def tell(stage: Stage, before: Sequence[tuple[Mapping[str, Any], Mapping[str, st
     `before` are the stages before it in their order, as they are written, each with what :meth:`Stage.creates` says of it;
     for PDAL's own, :func:`heights_of`.
     """
-    wanted = set(stage.reads())
+    wanted = set(stage.reads()) - {"Classification"}  # which noise is marked in, too: it is no preparation
     made = [preparation.entry(given) for given, creates in before if wanted & set(creates)]
     stage.makes_again = bool({name for _, creates in before for name in creates} & set(stage.creates()))
     return Told(made, stage.makes_again, stage.follows(made))

@@ -167,7 +167,7 @@ def _hanging(keys, table, suspect, extremes, top, base, hung):
     for k in range(len(keys)):
         place = keys[k] >> BITS
         j, i = place // w, place % w
-        if not suspect[k] and extremes[k, 1] >= top[j, i] and top[j, i] - base[j, i] > HANGING:
+        if not suspect[k] and extremes[k, 1] >= top[j, i] and top[j, i] - base[j, i] > HANGING:  # noqa: SIM102
             if find(table, keys, keys[k] - 1) < 0 and find(table, keys, keys[k] - 2) < 0:
                 hung[j, i] = top[j, i]
 

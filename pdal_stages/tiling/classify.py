@@ -197,7 +197,8 @@ def classify_file(
     if metadata:
         write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
     report = pipeline.reports[-1][1][-1]
-    classes = {int(code): points for code, points in report.get("classes", {}).items()}
+    reports = [each[-1] for _, each in pipeline.reports if each]
+    classes = {int(code): n for one in reports for code, n in one.get("classes", {}).items()}
     counts = {key: report[key] for key in LEFT_ALONE if report.get(key)}
     notes = [*(f"PDAL says: {line}" for line in pipeline.said), *pipeline.told]
     return Written(target, count, classes, counts, notes, pipeline.metadata)

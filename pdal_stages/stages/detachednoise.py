@@ -1,0 +1,105 @@
+"""``filters.detachednoise``: points and small clusters detached from everything, as low and high noise."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.asprs import NOISE
+from ..terrain.detached import REACH, detached_noise
+from .base import Stage
+from .options import option
+from .points import Points
+from .selection import UNWANTED, Selection
+
+
+class DetachedNoise(Stage):
+    type = "filters.detachednoise"
+    summary = "Mark points and small clusters detached from everything as low and high noise"
+    where_chooses = True
+    where_help = "Points outside are not marked but still serve as neighbors."
+    cluster: int = option(
+        "integer", 60, "The most points of a cluster of noise", minimum=1, maximum=1_000_000
+    )
+    gap: float = option(
+        "number",
+        2.5,
+        "How far above everything near high noise lies at least; more in clouds below 3 points/m2",
+        minimum=0,
+        exclusive=True,
+        maximum=1000,
+        unit="m",
+    )
+    depth: float = option(
+        "number",
+        1.0,
+        "How far below the ground low noise lies at least; more where the ground is rough",
+        minimum=0,
+        exclusive=True,
+        maximum=1000,
+        unit="m",
+    )
+    low_class: int = option("integer", NOISE[0], "Class code of low noise", minimum=0, maximum=255)
+    high_class: int = option("integer", NOISE[1], "Class code of high noise", minimum=0, maximum=255)
+    ignore: Selection = option(
+        "selection",
+        UNWANTED,
+        "Points that are as good as not there, and keep their class: class codes, ranges such as Classification[7:7], "
+        "or the word withheld",
+        may_be_empty=True,
+    )
+    details = """
+Marks echoes from below the ground (multiple reflections), birds, clouds and the sun, alone or in small clusters, in clouds
+of any density. Put it first: one echo 10 m below ground spoils a ground filter, and features, for many meters around.
+
+A point is suspect if it is of a cluster of at most `cluster` points that nothing joins to the rest of the cloud. A suspect
+that lies above all that is near by more than `gap` is high noise (18); one that lies below a plane under its
+surroundings by more than `depth` is low noise (7). Echoes from just below the ground, which is near enough to join them,
+show as columns with a lowest point below that plane. Not marked are what hangs in line with others, as wires do; what is as
+deep as ground near by, as courtyards and wells of light are; ditches and pits, where many columns are deep side by side;
+and whatever has too little around it to be judged by. The thinner the cloud, the more it takes: at 0.3 points/m2 a tree may
+be a single point, and only what is some 15 m above everything is marked.
+
+Nothing depends on the order of points, and the grid is anchored to absolute coordinates: a tile with its halo gets the
+marks of the whole cloud. The counts are in the metadata as `low` and `high`.
+"""
+    after = (
+        {"type": "filters.hag_morphological"},
+        {"type": "writers.las", "filename": "output.laz", "forward": "all"},
+    )
+    example = {"type": "filters.detachednoise"}
+
+    def reads(self) -> list[str]:
+        return ["Classification"]
+
+    def creates(self) -> dict[str, str]:
+        return {"Classification": "uint8_t"}
+
+    def halo(self) -> float:
+        return REACH
+
+    def largest_class(self) -> int:
+        return max(self.low_class, self.high_class)
+
+    def run(self, points: Points) -> dict[str, NDArray]:
+        if points.count == 0:
+            return {}
+        ignored = points.ignored(self.ignore)
+        found = detached_noise(
+            points.xyz,
+            mask=None if not ignored.any() else ~ignored,
+            cluster=self.cluster,
+            gap=self.gap,
+            depth=self.depth,
+        )
+        if points.mask is not None:
+            found[~points.mask] = 0
+        codes = points.class_codes.copy()
+        for name, code, given in zip(("low", "high"), NOISE, (self.low_class, self.high_class), strict=True):
+            marked = found == code
+            codes[marked] = given
+            points.report[name] = int(np.count_nonzero(marked))
+            if points.report[name]:
+                classes = points.report.setdefault("classes", {})
+                classes[str(given)] = classes.get(str(given), 0) + points.report[name]
+        return {"Classification": points.with_codes(codes)}

@@ -1,0 +1,439 @@
+"""Detached noise: against a slow reference, what must hold whatever the points, and on real clouds."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import defaultdict, deque
+from itertools import product
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pdal_stages as ps
+from pdal_stages.base.errors import StageError
+from pdal_stages.stages.detachednoise import DetachedNoise
+from pdal_stages.terrain import clusters, detached, envelope
+from pdal_stages.terrain.detached import detached_noise
+
+DATA = Path(os.environ.get("PDAL_STAGES_DATA", "/nonexistent"))
+SIDE = clusters.SIDE
+
+
+def scene(seed=0, side=90, density=6.0, origin=(0.0, 0.0, 0.0)):
+    """A hillside with houses, a courtyard, a wood, a wire, and noise of all kinds: xyz and 0, 7 or 18."""
+    rng = np.random.default_rng(seed)
+    n = int(side * side * density)
+    x, y = rng.uniform(0, side, (2, n))
+    ground = 0.15 * x + 2 * np.sin(y / 15)
+    z = ground + rng.normal(0, 0.03, n)
+    house = (x > 20) & (x < 45) & (y > 20) & (y < 45)
+    court = (np.abs(x - 32) < 3) & (np.abs(y - 32) < 3)
+    z[house] = 15 + rng.normal(0, 0.03, house.sum())
+    z[court] = ground[court]
+    wood = (x > 60) & (y > 55)
+    z[wood] += rng.uniform(0, 12, wood.sum()) * (rng.random(wood.sum()) < 0.8)
+    along = np.linspace(0, side, 400)
+    wire = np.column_stack([along, np.full(400, 10.0), 25 + 0.002 * (along - side / 2) ** 2 + 0.1 * along])
+    noise, codes = [], []
+    for _ in range(24):
+        at = np.array([*rng.uniform(5, side - 5, 2), 0.0])
+        low = rng.random() < 0.5
+        level = 0.15 * at[0] + 2 * np.sin(at[1] / 15)
+        at[2] = level - rng.uniform(4, 25) if low else 45 + rng.uniform(0, 200)
+        size = 1 if rng.random() < 0.5 else rng.integers(2, 30)
+        noise.append(at + rng.normal(0, 0.3, (size, 3)))
+        codes += [7 if low else 18] * size
+    xyz = np.round(np.vstack([np.column_stack([x, y, z]), wire, *noise]) + origin, 3)
+    return xyz, np.r_[np.zeros(n + 400, np.uint8), np.array(codes, np.uint8)]
+
+
+# ---- a slow reference -----------------------------------------------------------------------------------
+
+
+def slow_small(count, usual, most):
+    """Voxels, as a mapping to their points, in small clusters; and points of each one's cluster."""
+    strong = {k for k, n in count.items() if n > int(clusters.WEAK * usual(k))}
+    around = [d for d in product((-1, 0, 1), repeat=3) if any(d)]
+    near = lambda k: [(k[0] + a, k[1] + b, k[2] + c) for a, b, c in around]  # noqa: E731
+    small, size, seen = {}, {}, set()
+    for start in sorted(strong):  # by row, column, level: the first voxel stands for the component
+        if start in seen:
+            continue
+        seen.add(start)
+        members, queue = [start], deque([start])
+        while queue:
+            for other in near(queue.popleft()):
+                if other in strong and other not in seen:
+                    seen.add(other)
+                    members.append(other)
+                    queue.append(other)
+        total = sum(count[m] for m in members)
+        extent = np.ptp(np.array(members), axis=0).max()
+        widest = min(clusters.EXTENT + clusters.EXTENT_GROWTH * usual(start), clusters.LARGEST_EXTENT)
+        for m in members:
+            small[m], size[m] = total <= most and extent < widest, total
+    for k in count:
+        if k not in strong:
+            small[k] = not any(o in strong and not small[o] for o in near(k))
+            size[k] = count[k]
+    return small, size
+
+
+def slow_plane(base, j, i, radius):
+    h, w = base.shape
+    cells = [
+        (a - i, b - j, base[b, a])
+        for b in range(max(j - radius, 0), min(j + radius + 1, h))
+        for a in range(max(i - radius, 0), min(i + radius + 1, w))
+        if 0 < (b - j) ** 2 + (a - i) ** 2 <= radius**2 and np.isfinite(base[b, a])
+    ]
+    n = len(cells)
+    if n < envelope.ENOUGH:
+        return None
+    u, v, z = np.array(cells).T
+    ordered = np.sort(z)
+    z = z - ordered[0]
+    weight = np.where((z >= ordered[n // 10] - ordered[0]) & (z <= ordered[n // 2] - ordered[0]), 1.0, 0.01)
+    design = np.column_stack([np.ones(n), u, v])
+    for _ in range(8):
+        normal = design.T @ (weight[:, None] * design) + np.diag([0, 1, 1]) * 1e-3 * weight.sum()
+        plane = np.linalg.solve(normal, design.T @ (weight * z))
+        off = z - design @ plane
+        weight = np.where(off < 0, 1 / (1 + off**2) ** 2, 0.1 / (1 + off**2))
+        under = weight[off < 0]
+        scatter = np.sqrt((under * off[off < 0] ** 2).sum() / under.sum()) if under.sum() else 0.0
+    return plane[0] + ordered[0], plane[1], plane[2], scatter
+
+
+def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
+    """From the definition, one voxel at a time, with dictionaries and searches over everything."""
+    at = np.floor(xyz * (1.0 / SIDE)).astype(int)[:, [1, 0, 2]]
+    block = clusters.BLOCK
+    whole = block << clusters.SCALES
+    low = (at[:, :2].min(axis=0) - 1) // whole * whole
+    at[:, :2] -= low
+    h, w = -(-(at[:, :2].max(axis=0) + 2) // whole) * whole
+    voxel = list(map(tuple, at))
+    members = defaultdict(list)
+    for p, k in enumerate(voxel):
+        members[k].append(p)
+    count = {k: len(m) for k, m in members.items()}
+    full = {k[:2] for k in count}
+
+    def blocks_round(k):
+        j, i = k[0] // block, k[1] // block
+        inside = lambda c: abs(c[0] // block - j) <= 1 and abs(c[1] // block - i) <= 1  # noqa: E731
+        n = sum(m for o, m in count.items() if inside(o))
+        held = [c for c in full if inside(c)]
+        return n, len(held), len({(c[0] // block, c[1] // block) for c in held})
+
+    known = {}
+
+    def density(k):
+        key = k[0] // block, k[1] // block
+        if key not in known:
+            n, held, blocks = blocks_round(k)
+            known[key] = n / held, np.sqrt(blocks * (block * SIDE) ** 2 / n)
+        return known[key]
+
+    small, size = slow_small(count, lambda k: density(k)[0], most)
+    for scale in range(1, clusters.SCALES + 1):
+        thin = [k for k in count if small[k] and density(k)[1] * clusters.SPACINGS > SIDE * 2 ** (scale - 1)]
+        if not thin:
+            break
+        wider = lambda k, s=scale: (k[0] >> s, k[1] >> s, k[2])  # noqa: E731
+        coarse = defaultdict(int)
+        for k, n in count.items():
+            coarse[wider(k)] += n
+        still, total = slow_small(coarse, lambda k: 1.0, most)
+        for k in thin:
+            small[k], size[k] = still[wider(k)], total[wider(k)]
+    top, base = np.full((h, w), -np.inf), np.full((h, w), np.inf)
+    lowest = {k: xyz[m, 2].min() for k, m in members.items()}
+    highest = {k: xyz[m, 2].max() for k, m in members.items()}
+    for k in count:
+        if not small[k]:
+            top[k[:2]] = max(top[k[:2]], highest[k])
+            base[k[:2]] = min(base[k[:2]], lowest[k])
+    hung = np.full((h, w), np.nan)
+    for k in count:
+        is_top = not small[k] and highest[k] >= top[k[:2]] and top[k[:2]] - base[k[:2]] > detached.HANGING
+        if is_top and not {(*k[:2], k[2] - 1), (*k[:2], k[2] - 2)} & count.keys():
+            hung[k[:2]] = top[k[:2]]
+    j, i = np.mgrid[:h, :w]
+    codes = {}
+    for k in count:
+        if not small[k]:
+            continue
+        square = (j - k[0]) ** 2 + (i - k[1]) ** 2
+        apart = density(k)[1]
+        least = gap + detached.GAP_OF_POINT * size[k] + detached.GAP_GROWTH * max(0, apart - detached.DENSE)
+        r = min(max(detached.ASIDE, int(np.ceil(detached.SPACINGS_ASIDE * apart / SIDE))), envelope.FAR)
+        while True:
+            near = top[(square <= r * r) & np.isfinite(top)]
+            if len(near) >= envelope.ENOUGH or r == envelope.FAR:
+                break
+            r = min(2 * r, envelope.FAR)
+        wires = (square <= detached.IN_LINE**2) & (
+            np.abs(hung - lowest[k]) <= 1.0 + 0.2 * SIDE * np.sqrt(square)
+        )
+        if len(near) >= envelope.ENOUGH and lowest[k] - near.max() >= least and wires.sum() < detached.WIRES:
+            codes[k] = 18
+    spread = {}
+    for k in codes:
+        spread[k[:2]] = min(spread.get(k[:2], np.inf), lowest[k])
+    strung = []
+    for k in codes:
+        others = []
+        for (b, a), z in spread.items():
+            square = (b - k[0]) ** 2 + (a - k[1]) ** 2
+            if 4 < square <= envelope.FAR**2 and abs(z - lowest[k]) <= 1 + 0.3 * SIDE * np.sqrt(square):
+                others.append((a - k[1], b - k[0], z - lowest[k]))
+        for u, v, dz in others:
+            far = np.hypot(u, v)
+            on = [
+                (u * p + v * q) / far
+                for p, q, rise in others
+                if abs(u * q - v * p) / far <= 1 and abs(rise - (u * p + v * q) / far**2 * dz) <= 2
+            ]
+            places = {int((part + envelope.FAR) / 3) for part in on}
+            if len(places) >= detached.STRUNG and len(on) > detached.STRUNG_SHARE * len(others):
+                strung.append(k)
+                break
+    codes = {k: c for k, c in codes.items() if k not in strung}
+    supported = np.zeros((h, w), bool)
+    for b, a in zip(*np.nonzero(np.isfinite(base)), strict=True):
+        square = base[max(b - 2, 0) : b + 3, max(a - 2, 0) : a + 3]
+        level = (np.abs(square - base[b, a]) <= envelope.LEVEL).sum()
+        supported[b, a] = level > envelope.SUPPORT + envelope.SUPPORT_SHARE * np.isfinite(square).sum()
+
+    def is_deep_elsewhere(k, z, plane):
+        square = (j - k[0]) ** 2 + (i - k[1]) ** 2
+        half = 0.5 * (plane[0] - z)
+        room = np.minimum(half, envelope.LEVEL + 0.15 * SIDE * np.sqrt(square))
+        there = plane[0] + plane[1] * (i - k[1]) + plane[2] * (j - k[0])
+        near = supported & (square <= envelope.FAR**2)
+        return (near & (base <= z + room) & (base < there - half)).sum() >= envelope.COMPANY
+
+    for k in count:
+        if small[k] and k not in codes:
+            plane = slow_plane(base, *k[:2], envelope.NEAR) or slow_plane(base, *k[:2], envelope.WIDER)
+            z = highest[k]
+            deep = plane and plane[0] - z > depth + detached.SCATTERS * plane[3]
+            if deep and not is_deep_elsewhere(k, z, plane):
+                codes[k] = 7
+    out = np.array([codes.get(k, 0) for k in voxel], np.uint8)
+    least = detached.JUST * depth
+    for c in full:
+        here = base[c]
+        if not np.isfinite(here):
+            continue
+        square = base[c[0] - 1 : c[0] + 2, c[1] - 1 : c[1] + 2]
+        seen, higher = np.isfinite(square).sum(), (np.isfinite(square) & (square > here + least)).sum()
+        if higher < 4 or 2 * higher < seen:
+            continue
+        plane = slow_plane(base, *c, envelope.NEAR)
+        if not plane or plane[0] - here <= least + detached.JUST_SCATTERS * plane[3]:
+            continue
+        there = plane[0] + plane[1] * (i - c[1]) + plane[2] * (j - c[0])
+        deep = (np.abs(j - c[0]) <= 2) & (np.abs(i - c[1]) <= 2) & (base < there - least)
+        if deep.sum() <= detached.TOGETHER and not is_deep_elsewhere(c, here, plane):
+            level = plane[0] - least - detached.JUST_SCATTERS * plane[3]
+            mine = (at[:, 0] == c[0]) & (at[:, 1] == c[1]) & (out == 0) & (xyz[:, 2] < level)
+            out[mine] = 7
+    return out
+
+
+@pytest.mark.parametrize(("seed", "density"), [(0, 6.0), (1, 0.4), (2, 1.2), (3, 70.0)])
+def test_the_kernels_equal_the_slow_reference(seed, density):
+    xyz, _ = scene(seed, 30 if density > 50 else 60, density)
+    xyz[:40:4, 2] -= 1.7  # just below the ground
+    found = detached_noise(xyz)
+    assert np.array_equal(found, slow_noise(xyz))
+    assert found.any()
+
+
+# ---- what must hold -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_is_found_and_nothing_else(seed):
+    xyz, truth = scene(seed)
+    report: dict = {}
+    found = detached_noise(xyz, report=report)
+    assert (found[truth == 0] == 0).all()  # wires, courtyards and trees too
+    assert (found == truth)[truth > 0].mean() > 0.95
+    assert report == {"low": int((found == 7).sum()), "high": int((found == 18).sum())}
+
+
+@settings(max_examples=10, deadline=None)
+@given(
+    seed=st.integers(0, 1000),
+    steps=st.tuples(*[st.integers(-400, 400)] * 3),
+    density=st.sampled_from([0.4, 5.0]),
+)
+def test_order_and_shifts_by_whole_blocks_change_nothing(seed, steps, density):
+    xyz, _ = scene(seed, 60, density)
+    xyz = np.round(xyz * 8) / 8  # so that a shift rounds nothing
+    found = detached_noise(xyz)
+    order = np.random.default_rng(seed).permutation(len(xyz))
+    assert np.array_equal(detached_noise(xyz[order]), found[order])
+    shift = np.array(steps) * SIDE * np.array([32, 32, 1])
+    assert np.array_equal(detached_noise(xyz + shift), found)
+
+
+@pytest.mark.parametrize("density", [0.5, 6.0])
+def test_a_tile_with_its_surroundings_gets_what_the_whole_gets(density):
+    xyz, _ = scene(5, 420, density)
+    found = detached_noise(xyz)
+    for x0, y0 in ((0, 0), (201.3, 177.7), (333, 40)):
+        beyond = np.max([[x0, y0] - xyz[:, :2], xyz[:, :2] - [x0 + 60, y0 + 60]], axis=(0, 2))
+        inside, near = beyond < 0, beyond < detached.REACH
+        assert near.sum() < len(xyz)
+        part = detached_noise(xyz[near])
+        assert np.array_equal(part[inside[near]], found[inside])
+
+
+def test_squares_of_a_large_cloud_give_what_the_whole_gives(monkeypatch):
+    xyz, _ = scene(6, 300, 2.0)
+    found = detached_noise(xyz)
+    from pdal_stages.terrain import patches
+
+    monkeypatch.setattr(patches, "LARGEST", 1000)
+    monkeypatch.setattr(patches, "SIDE", 64)
+    assert np.array_equal(detached_noise(xyz), found)
+
+
+def test_degenerate_clouds_hold_no_noise():
+    for xyz in (np.empty((0, 3)), np.zeros((1, 3)), np.zeros((500, 3)), np.full((3, 3), np.nan)):
+        assert not detached_noise(xyz).any()
+    far = np.array([[0.0, 0, 0], [1e9, 0, 0], [0, -1e9, 5]])
+    assert not detached_noise(far).any()  # nothing near to judge by
+    assert detached_noise([[0.0, 0, 2e6], [0, 0, -2e6]]).tolist() == [18, 7]
+    with pytest.raises(StageError, match="'mask' must have one value per point"):
+        detached_noise(np.zeros((3, 3)), mask=[True])
+
+
+def test_points_left_out_are_as_good_as_not_there():
+    xyz, _ = scene(7)
+    inside = np.random.default_rng(0).random(len(xyz)) < 0.7
+    found = detached_noise(xyz, mask=inside)
+    assert not found[~inside].any()
+    assert np.array_equal(found[inside], detached_noise(xyz[inside]))
+
+
+@pytest.mark.parametrize("spacing", [0.3, 2.0, 6.0])
+def test_a_wire_stays_however_thin_the_cloud(spacing):
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(0, 150, (2, int(150 * 150 * 0.4 / spacing)))
+    ground = np.column_stack([x, y, rng.normal(0, 0.05, len(x))])
+    along = np.arange(2, 148, spacing) + rng.uniform(-0.2, 0.2, len(np.arange(2, 148, spacing)))
+    wire = np.column_stack([along, 40 + 0.5 * along, 30 + 0.001 * (along - 75) ** 2])
+    found = detached_noise(np.vstack([ground, wire]))
+    assert (found[len(ground) :] > 0).mean() <= 0.05
+
+
+def test_a_ditch_and_a_pit_stay():
+    rng = np.random.default_rng(2)
+    x, y = rng.uniform(0, 80, (2, 30000))
+    z = rng.normal(0, 0.02, len(x))
+    z[np.abs(x - 40) < 1.0] -= 2.5
+    z[np.hypot(x - 15, y - 15) < 4] -= 6
+    assert not detached_noise(np.column_stack([x, y, z])).any()
+
+
+# ---- the stage ------------------------------------------------------------------------------------------
+
+
+def arrays_of(xyz, codes):
+    return {"X": xyz[:, 0], "Y": xyz[:, 1], "Z": xyz[:, 2], "Classification": codes.astype(np.uint8)}
+
+
+def test_the_stage_keeps_classes_and_where_and_takes_codes():
+    xyz, truth = scene(8)
+    codes = np.where(truth == 0, 2, 1)
+    codes[truth == 18] = 5
+    stage = DetachedNoise({"where": "Classification != 5", "low_class": 65})
+    points = stage.points(arrays_of(xyz, codes))
+    out = stage.run(points)["Classification"]
+    assert (out[truth == 18] == 5).all() and (out[truth == 0] == 2).all()
+    assert (out[truth == 7] == 65).mean() > 0.9
+    assert points.report["low"] == (out == 65).sum() and points.report["high"] == 0
+    assert stage.largest_class() == 65 and stage.creates() == {"Classification": "uint8_t"}
+
+
+def test_what_is_noise_already_is_as_good_as_not_there():
+    xyz, truth = scene(9)
+    marked = DetachedNoise({}).points(arrays_of(xyz, truth))
+    assert np.array_equal(DetachedNoise({}).run(marked)["Classification"], truth)
+    assert marked.report["ignored"] == (truth > 0).sum() and not marked.report["low"] + marked.report["high"]
+
+
+@pytest.mark.pdal
+def test_in_tiles_as_in_one_piece_and_in_feet(tmp_path, write_las):
+    xyz, truth = scene(10, 200, 3.0)
+    source = write_las(tmp_path / "in.las", arrays_of(xyz, np.ones(len(xyz))), point_format=1)
+    stages = [str(source), {"type": "filters.detachednoise"}, str(tmp_path / "whole.las")]
+    whole = ps.Pipeline(stages)
+    whole.execute()
+    stages[2] = {"type": "writers.las", "filename": str(tmp_path / "tiled.las"), "forward": "all"}
+    ps.run_tiled(stages, tile=60, workers=0)
+    one, two = (laspy.read(tmp_path / f"{name}.las") for name in ("whole", "tiled"))
+    assert np.array_equal(one.classification, two.classification)
+    assert (np.asarray(one.classification) == np.where(truth == 0, 1, truth)).mean() > 0.999
+    told = whole.metadata["metadata"]["filters.detachednoise"]
+    assert told["low"] == (np.asarray(one.classification) == 7).sum()
+    feet = DetachedNoise({"horizontal_unit": "foot", "vertical_unit": "foot"})
+    measured = feet.points(arrays_of(xyz / 0.3048, np.ones(len(xyz))))
+    assert np.mean(feet.run(measured)["Classification"] == np.asarray(one.classification)) > 0.9999
+
+
+@pytest.mark.pdal
+def test_classify_marks_noise_first_unless_told_not_to(tmp_path, capsys, write_las):
+    from pdal_stages.cli import main
+
+    xyz, truth = scene(11, 60)
+    source = write_las(tmp_path / "in.las", arrays_of(xyz, np.ones(len(xyz))), point_format=1)
+    out = tmp_path / "out.las"
+    assert main(["classify", str(source), str(out), "--metadata", str(tmp_path / "m.json")]) == 0
+    codes = np.asarray(laspy.read(out).classification)
+    assert (codes == truth)[truth > 0].mean() > 0.9
+    said = capsys.readouterr().out
+    assert "  7 Low point (noise)" in said and " 18 High noise" in said
+    assert "filters.detachednoise" in json.dumps(json.loads((tmp_path / "m.json").read_text()))
+    assert main(["classify", str(source), str(out), "--no-noise"]) == 0
+    assert not np.isin(laspy.read(out).classification, (7, 18)).any()
+    assert "(noise)" not in capsys.readouterr().out
+
+
+# ---- real clouds ----------------------------------------------------------------------------------------
+
+REAL = (
+    "delft/train.laz", "seville/plazanueva.laz", "rural/lidarhd_bank.laz", "rural/ign_0p3ppm2.laz", "forest/neon_osbs.laz",
+    "rural/ahn4_powerline.laz",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_clouds_lose_next_to_nothing_and_lose_their_noise(name):
+    path = DATA / name
+    if not path.exists():
+        pytest.skip("real clouds are in PDAL_STAGES_DATA")
+    las = laspy.read(path)
+    xyz, codes = np.column_stack([las.x, las.y, las.z]), np.asarray(las.classification)
+    found = detached_noise(xyz)
+    good = np.isin(codes, (2, 3, 4, 5, 6, 9, 12, 14, 15, 17))
+    assert (found[good] > 0).mean() <= 0.0002
+    assert not (codes == 14).any() or (found[codes == 14] > 0).mean() <= 0.005
+    rng = np.random.default_rng(0)
+    ground = xyz[codes == 2]
+    at = ground[rng.integers(len(ground), size=60)]
+    deep = at - np.column_stack([np.zeros((60, 2)), rng.uniform(5, 30, 60)])
+    high = at + np.column_stack([np.zeros((60, 2)), rng.uniform(60, 300, 60)])
+    found = detached_noise(np.vstack([xyz, deep, high]))[len(xyz) :]
+    assert (found[:60] == 7).mean() >= 0.9 and (found[60:] == 18).mean() >= 0.95
