@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 import pdal_stages as ps
+from pdal_stages.base.version import __version__
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.lowering import lower
 from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
@@ -636,6 +637,20 @@ def test_install_check_uninstall(tmp_path, plugin, monkeypatch, capsys):
     building.uninstall()
     assert [path.name for path in folder.iterdir()] == ["libpdal_plugin_filter_other.so"]
     assert building.uninstall(folder) == []
+
+
+def test_a_plugin_that_pip_installed(tmp_path, monkeypatch):
+    monkeypatch.setattr(building, "_by_pip", lambda: __version__)
+    assert any("pdal-stages-plugin" in line for line in building.check(tmp_path)[0])
+    monkeypatch.setattr(building, "_by_pip", lambda: "0.0.1")
+    assert "of another version" in building.check(tmp_path)[1][-1]
+    with pytest.raises(ps.StageError, match="pip uninstall pdal-stages-plugin"):
+        building.uninstall(tmp_path)
+
+
+def test_the_distribution_has_the_package_s_version():
+    text = (Path(__file__).resolve().parent.parent / "native" / "pyproject.toml").read_text()
+    assert f'\nversion = "{__version__}"' in text
 
 
 def test_what_is_missing_is_told(tmp_path, monkeypatch):

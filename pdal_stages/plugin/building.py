@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from . import declarations, places
 
 #: Beside the libraries: what was put there, by which version, for which PDAL.
 RECORD = "pdal_stages_plugin.json"
+_PACKAGE = "pdal-stages-plugin"
 _FLAGS = ["-std=c++17", "-O1", "-fPIC", "-fvisibility=hidden", "-w"]
 
 
@@ -76,7 +78,7 @@ def install(folder: Path | None = None) -> list[Path]:
 def compile_into(work: Path, pdal: places.Pdal) -> list[Path]:
     """The libraries, one for each stage, compiled in a folder."""
     source, cxx = places.sources(), places.compiler()
-    (work / "declarations.hpp").write_text(declarations.header())
+    declarations.write(work)
     flags = [*_FLAGS, f"-I{work}", f"-I{pdal.headers}"]
     _run([*cxx, *flags, "-c", str(source / "stage.cpp"), "-o", str(work / "stage.o")])
     link = ["-shared", f"-L{pdal.library}", "-lpdalcpp", f"-Wl,-rpath,{pdal.library}"]
@@ -94,6 +96,8 @@ def compile_into(work: Path, pdal: places.Pdal) -> list[Path]:
 def uninstall(folder: Path | None = None) -> list[Path]:
     """Take the plugin away; the files that were there."""
     target = folder or usual_folder()
+    if record(target) is None and _by_pip() is not None:
+        raise StageError("the plugin came as a package", found=_PACKAGE, cure=f"pip uninstall {_PACKAGE}")
     names = [*(record(target) or {}).get("files", []), *map(library_name, registry.stages()), RECORD]
     gone = [target / name for name in dict.fromkeys(names) if (target / Path(name).name).is_file()]
     for path in gone:
@@ -136,6 +140,14 @@ def check(folder: Path | None = None) -> tuple[list[str], list[str]]:
         return good, bad
     kept = record(folder)
     cure = "pdal-stages plugin --install"
+    if kept is None and (version := _by_pip()) is not None:
+        if version == __version__:
+            good.append(f"plugin: the package {_PACKAGE} {version}")
+        else:
+            bad.append(
+                f"{_PACKAGE} is of another version (found {version}, pdal-stages {__version__}). Upgrade both"
+            )
+        return good, bad
     if kept is None:
         bad.append(f"the plugin is not in {folder}. {cure}")
         return good, bad
@@ -153,6 +165,14 @@ def check(folder: Path | None = None) -> tuple[list[str], list[str]]:
     if not bad:
         good.append(f"plugin: {len(kept['files'])} stages in {folder}")
     return good, bad
+
+
+def _by_pip() -> str | None:
+    """The version of the plugin that pip or conda installed."""
+    try:
+        return metadata.version(_PACKAGE)
+    except metadata.PackageNotFoundError:
+        return None
 
 
 def _run(command: Sequence[str]) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import sys
 from functools import cache
+from pathlib import Path
 
 from ..base.version import __version__
 from ..stages import registry
@@ -74,6 +76,13 @@ def header() -> str:
     )
 
 
+def write(folder: Path) -> None:
+    """Write ``declarations.hpp``, and ``stages.txt`` with a type a line, for a compiler."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "declarations.hpp").write_text(header())
+    (folder / "stages.txt").write_text("".join(f"{name}\n" for name in registry.stages()))
+
+
 @cache
 def digest() -> str:
     """Changes with any stage, option, default or help that the plugin holds."""
@@ -141,3 +150,7 @@ def _text(text: str) -> str:
         else:
             out.append(f"\\{byte:03o}")
     return '"' + "".join(out) + '"'
+
+
+if __name__ == "__main__":  # CMake
+    write(Path(sys.argv[1]))
