@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from pdal_stages import Filter
-from pdal_stages.base.errors import OptionError, StageError
+from pdal_stages.base.errors import DimensionError, OptionError, StageError
 from pdal_stages.cli import main
 from pdal_stages.models import STANDARD, find, shipped
 from pdal_stages.pipeline import Pipeline
-from pdal_stages.stages.heights import preparation_of
+from pdal_stages.stages.heights import made_of_coordinates, preparation_of
 from pdal_stages.stages.loading import load_model
 from pdal_stages.synthetic import TownOptions, write_town
 from pdal_stages.tiling import run_tiled
@@ -47,6 +47,21 @@ def test_a_file_of_that_name_does_not_stand_in_for_it(tmp_path, monkeypatch):
     assert find(STANDARD) == str(shipped()[STANDARD]) and find("other.model") == "other.model"
     (tmp_path / STANDARD).write_text("mine")
     assert find(STANDARD) == str(shipped()[STANDARD]) and find(f"./{STANDARD}") == f"./{STANDARD}"
+
+
+def test_heights_are_made_as_in_training_beside_return_numbers():
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform(0, 40, (3000, 3)) * [1, 1, 0.01]
+    returns = {
+        name: rng.integers(1, 3, 3000).astype(np.uint8) for name in ("ReturnNumber", "NumberOfReturns")
+    }
+    model = load_model(shipped()[STANDARD])
+    found = model.predict(xyz, returns).classification
+    made = made_of_coordinates(model.info["preparation"], xyz)
+    assert np.array_equal(found, model.predict(xyz, {**made, **returns}).classification)
+    assert not np.array_equal(model.predict(xyz).reliability, model.predict(xyz, returns).reliability)
+    with pytest.raises(DimensionError, match=r"Leave out HeightAboveGround: .*hag_morphological"):
+        model.predict(xyz, {"HeightAboveGround": xyz[:, 2], **returns})
 
 
 @pytest.mark.pdal

@@ -154,8 +154,14 @@ def test_tiles_to_tiles(town, models, tmp_path):
         "--stage.tiles.length=40",
     )
     parts = [laspy.read(p) for p in sorted(tmp_path.glob("classified_*.laz"))]
-    assert len(parts) >= 4
+    assert len(parts) == 4
     assert sum(len(p) for p in parts) == len(laspy.read(town))
+    corners = set()
+    for part in parts:  # tiles of one grid, none a sliver of half a meter
+        cells = {axis: set(np.unique(np.asarray(part[axis]) // 40)) for axis in "xy"}
+        assert all(len(found) == 1 for found in cells.values()), cells
+        corners.add(tuple(found.pop() for found in cells.values()))
+    assert len(corners) == 4
 
 
 def test_copc_to_tiles(models, tmp_path):

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pdal_stages.base.errors import OptionError, StageError
-from pdal_stages.base.units import Units, parse_wkt, units_of_wkt
+from pdal_stages.base.units import Units, parse_wkt, units_of_wkt, utm_code
 
 GEOGCS = (
     'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.25]],UNIT["degree",0.0174532925199433]]'
@@ -55,6 +55,26 @@ def test_options_overrule():
 def test_degrees_are_refused_with_the_cure():
     with pytest.raises(StageError, match=r"filters\.reprojection"):
         units_of_wkt(GEOGCS)
+
+
+@pytest.mark.parametrize(
+    ("place", "name", "code"),
+    [
+        ((-5.99, 37.39), "ETRS89", 25830),  # Seville
+        ((-5.99, 37.39), "WGS 84", 32630),
+        ((3.87, 43.61), "RGF93", 32631),
+        ((-123.07, 44.05), "NAD83(HARN)", 26910),
+        ((151.2, -33.9), "GDA94", 32756),
+        ((5.3, 60.4), "ETRS89", 25832),  # Bergen
+        ((180.0, 10.0), "", 32660),
+        ((770600.0, 6277549.0), "", None),
+    ],
+)
+def test_the_zone_of_the_points_is_named(place, name, code):
+    assert utm_code(*place, name) == code
+    with pytest.raises(StageError) as caught:
+        units_of_wkt(GEOGCS.replace("WGS 84", name or "WGS 84"), place=place)
+    assert f"EPSG:{code or 'CODE'}" in str(caught.value)
 
 
 @given(st.text(max_size=60))

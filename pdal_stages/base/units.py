@@ -45,7 +45,9 @@ def named_unit(name: str, option: str) -> float:
         ) from None
 
 
-def units_of_wkt(wkt: str, *, horizontal: str = "", vertical: str = "") -> Units:
+def units_of_wkt(
+    wkt: str, *, horizontal: str = "", vertical: str = "", place: tuple[float, float] | None = None
+) -> Units:
     """The length units of a spatial reference in well-known text (WKT 1 or 2).
 
     Parameters
@@ -55,6 +57,8 @@ def units_of_wkt(wkt: str, *, horizontal: str = "", vertical: str = "") -> Units
     horizontal, vertical : str
         Unit names that overrule the spatial reference. Where it has no vertical part,
         heights are taken to be in the horizontal unit, as LAS files in feet are.
+    place : tuple of float, optional
+        An x and y among the points: of degrees, their UTM zone is then named.
 
     Raises
     ------
@@ -70,9 +74,7 @@ def units_of_wkt(wkt: str, *, horizontal: str = "", vertical: str = "") -> Units
             raise StageError(
                 "the coordinates are geographic (degrees); neighborhoods and grids need metres",
                 found=root.name or wkt[:60],
-                cure="Add a reprojection before this stage, e.g. "
-                '{"type": "filters.reprojection", "out_srs": "EPSG:25832"} with the UTM zone or '
-                "national grid of the area",
+                cure=reprojection_cure(root.name, place),
             )
         if across is None and projected is not None:
             across = projected.unit()
@@ -82,6 +84,32 @@ def units_of_wkt(wkt: str, *, horizontal: str = "", vertical: str = "") -> Units
     assumed = across is None and root is None
     across = 1.0 if across is None else across
     return Units(across, across if upward is None else upward, assumed)
+
+
+def reprojection_cure(name: str = "", place: tuple[float, float] | None = None) -> str:
+    """What to do about degrees: reproject into the UTM zone of a place, on the datum that a reference's name tells."""
+    zone = utm_code(*place, name) if place is not None else None
+    what = (
+        "the UTM zone of the points; or take the national grid of the area"
+        if zone
+        else "the UTM zone or national grid of the area in place of CODE"
+    )
+    stage = f'{{"type": "filters.reprojection", "out_srs": "EPSG:{zone or "CODE"}"}}'
+    return f"Add a reprojection before this stage, {stage}, with {what}"
+
+
+def utm_code(longitude: float, latitude: float, name: str = "") -> int | None:
+    """EPSG's code of the UTM zone of a place, on ETRS89 or NAD83 where a reference's name says so, else WGS 84."""
+    if not (-180.0 <= longitude <= 180.0 and -80.0 <= latitude <= 84.0):
+        return None
+    zone = min(60, int((longitude + 180.0) // 6.0) + 1)
+    if 56.0 <= latitude < 64.0 and 3.0 <= longitude < 12.0:
+        zone = 32  # southern Norway
+    if "ETRS" in name.upper() and 28 <= zone <= 38:
+        return 25800 + zone
+    if "NAD83" in name.upper().replace(" ", "") and 1 <= zone <= 23 and latitude > 0:
+        return 26900 + zone
+    return (32600 if latitude >= 0 else 32700) + zone
 
 
 @dataclass

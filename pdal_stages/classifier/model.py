@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..base.errors import ModelError, OptionError
+from ..base.errors import DimensionError, ModelError, OptionError
 from ..features import FeaturePlan
 from ..features.voxels import represent
 from . import modelfile, summary
@@ -161,8 +162,8 @@ class Model:
         xyz : (n, 3) float64
             Coordinates in metres.
         dimensions : mapping, optional
-            Name to (n,) values; must have ``required_dimensions``. Without, heights are made as in training, where the
-            model says how.
+            Name to (n,) values, e.g. return numbers. Without any of the heights in ``required_dimensions``, these are
+            made as in training, where the model says how.
         where : (n,) bool, optional
             Points to classify. The others keep their class but still serve as neighbors.
         current : (n,) int, optional
@@ -177,11 +178,21 @@ class Model:
         """
         how = PredictionOptions(**options)
         xyz = np.asarray(xyz, dtype=np.float64)
-        if dimensions is None and self.required_dimensions:
+        given, preparation = dict(dimensions or {}), self.info.get("preparation") or []
+        missing = [name for name in self.required_dimensions if name not in given]
+        if missing:
             usable = None if ignore is None else ~np.asarray(ignore, bool)
-            dimensions = preparing().made_of_coordinates(
-                self.info.get("preparation") or [], xyz, usable, how.threads
-            )
+            made = preparing().made_of_coordinates(preparation, xyz, usable, how.threads)
+            if made.keys() & given.keys() and made.keys() & set(
+                missing
+            ):  # heights of two kinds would be mixed
+                raise DimensionError(
+                    f"the dimension {missing[0]} is missing",
+                    found=", ".join(given),
+                    cure=f"Leave out {', '.join(sorted(made.keys() & given.keys()))}: all are then made as in training, by "
+                    f"{json.dumps(preparation[0])}",
+                )
+            given = {**made, **given}
         if how.variance and not self.gives_variance:
             raise OptionError(
                 "only a network gives a variance",
@@ -196,7 +207,7 @@ class Model:
         if ignore is not None and (gone := mask_of("ignore", ignore, len(xyz))).any():
             there = np.flatnonzero(~gone)
             rows = there if rows is None else rows[~gone[rows]]
-        return self._predict(xyz, dimensions or {}, rows, there, old, how, progress)
+        return self._predict(xyz, given, rows, there, old, how, progress)
 
     def _predict(
         self,

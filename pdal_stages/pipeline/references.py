@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from ..base.errors import StageError
-from ..base.las import projection
+from ..base.las import projection, read_header
 from ..base.units import Units, name_of_wkt, parse_wkt, units_of_wkt
 from . import pdal as pdal_env
 from .filenames import is_writer, readers_files
@@ -56,7 +57,7 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
     srs = (node[0] if isinstance(node, list) else node).get("srs", {})
     wkt = str(srs.get("compoundwkt") or srs.get("wkt") or "")
     try:
-        units = units_of_wkt(wkt, horizontal=horizontal)
+        units = units_of_wkt(wkt, horizontal=horizontal, place=_place(str(reader["filename"])))
     except StageError as error:
         raise error.at(str(reader["filename"])) from None
     words = str(srs.get("proj4") or "").split()
@@ -64,6 +65,15 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
     root = parse_wkt(wkt)
     height = root.find("VERT_CS", "VERTCRS", "VERTICALCRS") if root else None
     return Reference(units, plane, height.code() if height else "", name_of_wkt(wkt))
+
+
+def _place(path: str) -> tuple[float, float] | None:
+    """The middle of a LAS file."""
+    with contextlib.suppress(OSError, ValueError):
+        if (header := read_header(path)) is not None:
+            x0, y0, x1, y1 = header.box
+            return (x0 + x1) / 2, (y0 + y1) / 2
+    return None
 
 
 def check_one_reference(found: Mapping[str, Reference]) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..base.asprs import LEGACY_LIMIT, OVERLAP
 from ..base.errors import DimensionError, StageError
-from ..base.units import Units, units_of_wkt
+from ..base.units import Units, reprojection_cure, units_of_wkt
 from .selection import Selection
 from .where import Expression
 
@@ -82,13 +82,14 @@ class Points:
     @cached_property
     def units(self) -> Units:
         """Metres per unit; refuses degrees. An assumption is put in the report."""
-        units = units_of_wkt(self.wkt, horizontal=self._units[0], vertical=self._units[1])
+        x, y = (self.arrays[axis] for axis in "XY") if self.count else (np.zeros(0), np.zeros(0))
+        place = (float(x[0]), float(y[0])) if self.count else None
+        units = units_of_wkt(self.wkt, horizontal=self._units[0], vertical=self._units[1], place=place)
         if units.assumed and self.count:
             self.report["note"] = "the points have no spatial reference: metres were assumed"
-            x, y = self.arrays["X"], self.arrays["Y"]
             if np.abs(x).max() <= 180.0 and np.abs(y).max() <= 90.0 and max(np.ptp(x), np.ptp(y)) < 0.2:
                 self.report["warning"] = (
-                    "coordinates look like degrees; if they are, reproject with filters.reprojection first"
+                    f"coordinates look like degrees; if they are: {reprojection_cure(place=place)}"
                 )
         return units
 
