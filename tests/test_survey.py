@@ -91,6 +91,14 @@ def test_a_survey_has_no_seams_and_a_second_run_does_what_is_missing(survey, cla
     extra = {p.name: sorted(laspy.read(p).point_format.extra_dimension_names) for p in target.glob("t*")}
     assert extra["t0.laz"] == ["Amplitude", "HeightAboveGround", "Reliability"]
     assert extra["t1.las"] == ["HeightAboveGround", "Reliability"]
+    for number in (0, 1, 2, 3):  # headers are the inputs' own
+        (name,) = [p.name for p in (survey / "in").glob(f"t{number}.*")]
+        before, after = (laspy.read(folder / name).header for folder in (survey / "in", target))
+        assert np.array_equal(before.scales, after.scales) and np.array_equal(before.offsets, after.offsets)
+        assert before.point_format.id == after.point_format.id and before.parse_crs() == after.parse_crs()
+        one_file, other_file = laspy.read(survey / "in" / name), laspy.read(target / name)
+        for axis in ("X", "Y", "Z", "gps_time"):
+            assert np.array_equal(one_file[axis], other_file[axis])
     # Every file is said when it is there, with its classes; the table has them all.
     said = dict(re.findall(r"(t\d)\.la.: ([\d,]+) points; ", out))
     assert {name: int(n.replace(",", "")) for name, n in said.items()} == {

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base import kinds, las
-from ..base.errors import StageError
+from ..base.errors import OptionError, StageError
 from ..base.files import write_whole
 from ..base.outputs import Output, check_outputs
 from ..pipeline.classifying import ClassifyRequest
@@ -132,7 +132,12 @@ class ClassifyTask:
         for head in heads:
             if head["type"] == "readers.las":  # of LAS 1.0-1.3 PDAL leaves extra dimensions out unless told
                 head["use_eb_vlr"] = True
-        writer = {**self.request.writer(self._target()), "type": "writers.las"}
+        target = self._target()
+        if target.lower().endswith(".copc.laz"):
+            raise OptionError("outputs of tiles are plain LAS or LAZ", found=target, cure="Name them .laz")
+        # In a folder '#' may stand for a name with its suffix: always that of a LAS file.
+        named = "x.laz" if self._in_folder else target
+        writer = {**self.request.writer(named), "filename": target}
         pipeline = Pipeline([*heads, *self.request.stages, writer], self.request.overrides, whole=False)
         plan = make_plan(pipeline, self.options.buffer)
         beside = self.request.beside
