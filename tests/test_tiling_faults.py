@@ -24,6 +24,7 @@ import tiling_clouds as clouds
 
 from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.base.threads import available_threads
+from pdal_stages.pipeline import lifesigns, processes
 from pdal_stages.tiling import run_tiled
 from pdal_stages.tiling.store import Store
 
@@ -400,6 +401,63 @@ def test_workers_that_cannot_start(tmp_path, folder):
     assert done.returncode == 1 and "Traceback" not in done.stderr
     assert "no room here" in done.stderr and "a worker process could not be started" in done.stderr
     assert "--workers 0" in done.stderr
+
+
+@pytest.fixture()
+def impatient(monkeypatch):
+    """Silence is told of and ended after seconds."""
+    for name, seconds in (("LOOK", 0.5), ("TELL_AFTER", 2.0), ("END_AFTER", 4.0), ("START_WITHIN", 20.0)):
+        monkeypatch.setattr(lifesigns, name, seconds)
+
+
+@pytest.mark.parametrize("always", [False, True])
+def test_workers_that_stand_still(tmp_path, folder, impatient, capfd, always):
+    """A stopped worker is told of, ended and replaced; what stops it each time is given up."""
+    flag = tmp_path / "stopped"
+    stop = f"""first = ins['X'].min() < 1 and ins['Y'].min() < 1 and ({always} or not os.path.exists({str(flag)!r}))
+if first:
+    open({str(flag)!r}, 'w').close()
+    os.kill(os.getpid(), signal.SIGSTOP)"""
+    stages = pipeline(folder, tmp_path / "o_#.laz", python_filter(stop))
+    run = run_tiled(stages, 20, buffer=0, workers=2, per="tile", retries=1, progress=False)
+    err = capfd.readouterr().err
+    assert flag.exists() and "shows no sign of life since 2 s" in err and "was ended" in err
+    failed = [tile for tile in run.tiles if tile.state == "failed"]
+    assert bool(failed) == always
+    assert all("no sign of life" in tile.reason for tile in failed)
+
+
+def test_workers_that_compute_without_a_word_are_left_alone(tmp_path, folder, impatient, capfd):
+    """PDAL keeps Python from running for minutes, and so does this."""
+    stages = pipeline(folder, tmp_path / "o_#.laz", python_filter("sum(range(4 * 10**8))"))
+    run = run_tiled(stages, 100, buffer=0, workers=1, per="tile", retries=0, progress=False)
+    assert not run.failures and "was ended" not in capfd.readouterr().err
+
+
+def test_workers_that_never_begin(tmp_path, folder, impatient, monkeypatch):
+    """As OpenBLAS does where it finds no memory: it tries for ever."""
+    before = processes._command()
+    monkeypatch.setattr(processes, "_command", lambda: [*before[:-1], "while True: pass"])
+    with pytest.raises(StageError, match=r"could not be started.*did not begin within"):
+        run_tiled(pipeline(folder, tmp_path / "o_#.laz"), 40, workers=1, progress=False)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of addresses are Linux's")
+@pytest.mark.parametrize("words", [(), ("--tile", "40", "--workers", "1")])
+@pytest.mark.parametrize("limit", [500, 650, 740])
+def test_too_little_memory_for_the_libraries(tmp_path, folder, words, limit):
+    (tmp_path / "job.json").write_text(
+        json.dumps(
+            [str(sorted(folder.glob("*.laz"))[0]), {"type": "filters.hag_minima"}, str(tmp_path / "o_#.laz")]
+        )
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", "pdal_stages.cli", "pipeline", str(tmp_path / "job.json"), *words],
+        capture_output=True, text=True, timeout=120,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit * 10**6, limit * 10**6)),
+    )  # fmt: skip
+    assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
+    assert "need 770 MB" in done.stderr and f"a limit of {limit} MB" in done.stderr and "1 GB" in done.stderr
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -16,6 +16,7 @@ from functools import cache
 from typing import Any
 
 from ..base.errors import DependencyError, PipelineError
+from ..base.shortage import is_short, shortage
 from .interrupts import fragile
 
 INSTALL = (
@@ -43,6 +44,8 @@ def bindings():
     try:
         import pdal
     except ImportError as error:
+        if is_short(error):
+            raise shortage(f"python-pdal: {error}") from error
         raise DependencyError(
             "python-pdal cannot be imported", found=f"{sys.executable}: {error}", cure=INSTALL
         ) from error

@@ -9,17 +9,22 @@ import queue
 import subprocess
 import sys
 import threading
+import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..base import checks
 from ..base.errors import StageError
+from ..base.plain import tell
 from ..base.runlog import LoggedStream
+from ..base.shortage import check_limit
 from ..base.threads import available_threads
+from . import lifesigns
 from .work import Call, Task, TaskResult, perform
 
+_STUCK = "its worker showed no sign of life for {:.0f} s each time it was tried"
 _KILLED = "it killed its worker each time it was tried: too little memory, or a crash in a library"
 
 
@@ -32,7 +37,9 @@ class Processes(contextlib.AbstractContextManager):
 
     def __init__(self, slots: int, threads: int) -> None:
         self.slots, self.threads = slots, threads
+        check_limit()
         self._workers: list[_Worker] = []
+        self._next_look = 0.0
         self._answers: queue.SimpleQueue[tuple[_Worker, TaskResult | None]] = queue.SimpleQueue()
 
     def __exit__(self, *exc: object) -> None:
@@ -56,19 +63,28 @@ class Processes(contextlib.AbstractContextManager):
                     self._workers.append(worker)
                 busy[worker] = item
                 worker.give(task_of(item))
-            worker, answer = self._answers.get()
+            worker, answer = self._next_answer(busy)
             if answer is None:
                 self._workers.remove(worker)
-                if not worker.began:
-                    raise StageError(
-                        "a worker process could not be started",
-                        found=f"it ended with status {worker.process.wait()}",
-                        cure="What it said stands above. --workers 0 works in this process",
-                    )
+                failure = None if worker.began else worker.why_not()
+                worker.stop()
+                if failure is not None:
+                    raise failure
                 if worker not in busy:
                     continue
-                answer = TaskResult(reason=_KILLED, again=True)
+                reason = _STUCK.format(lifesigns.END_AFTER) if worker.stuck else _KILLED
+                answer = TaskResult(reason=reason, again=True)
             yield busy.pop(worker), answer
+
+    def _next_answer(self, busy: Mapping[_Worker, Any]) -> tuple[_Worker, TaskResult | None]:
+        """What a worker says next; meanwhile those that are silent are told of, and ended in the end."""
+        while True:
+            try:
+                return self._answers.get(timeout=max(0.0, self._next_look - time.monotonic()))
+            except queue.Empty:
+                for worker in busy:
+                    worker.look()
+                self._next_look = time.monotonic() + lifesigns.LOOK
 
 
 class _Worker:
@@ -76,6 +92,8 @@ class _Worker:
 
     def __init__(self, threads: int, answers: queue.SimpleQueue) -> None:
         self.began = False  #: whether it got so far as to take tasks
+        self.stuck = False  #: whether it was ended for showing no sign of life
+        self._said: Any = None
         self._answers = answers
         self.process = subprocess.Popen(
             _command(),
@@ -85,6 +103,7 @@ class _Worker:
             env=_environment(threads),
             start_new_session=True,  # Ctrl-C is for this process, which ends the others
         )
+        self._signs = lifesigns.LifeSigns(self.process.pid)
         threading.Thread(target=self._listen, daemon=True).start()
         self._hearer = threading.Thread(target=self._hear, args=(sys.stderr,), daemon=True)
         self._hearer.start()
@@ -92,6 +111,7 @@ class _Worker:
     def give(self, task: Task) -> None:
         """Send a task; where the process has ended, :meth:`_listen` tells."""
         assert self.process.stdin is not None
+        self._signs.begin()
         with contextlib.suppress(OSError):
             pickle.dump(task, self.process.stdin)
             self.process.stdin.flush()
@@ -100,10 +120,46 @@ class _Worker:
         """Hand on answers, and None at the end."""
         assert self.process.stdout is not None
         with contextlib.suppress(EOFError, OSError, ValueError, pickle.UnpicklingError):
-            self.began = pickle.load(self.process.stdout) == READY
+            self._said = pickle.load(self.process.stdout)
+            self.began = self._said == READY
             while self.began:
-                self._answers.put((self, pickle.load(self.process.stdout)))
+                answer = pickle.load(self.process.stdout)
+                self._signs.beat()
+                if answer != BEATING:
+                    self._answers.put((self, answer))
         self._answers.put((self, None))
+
+    def why_not(self) -> StageError:
+        """Why it could not be started."""
+        if isinstance(self._said, StageError):
+            return self._said
+        status = self.process.wait()
+        found = (
+            f"it did not begin within {lifesigns.START_WITHIN:.0f} s"
+            if self.stuck
+            else f"it ended with status {status}"
+        )
+        return StageError(
+            "a worker process could not be started",
+            found=found,
+            cure="What it said stands above. --workers 0 works in this process",
+        )
+
+    def look(self) -> None:
+        """See whether it still lives; tell if it does not seem to, and end it after a while."""
+        signs = self._signs
+        signs.look()
+        quiet = signs.silent if self.began else signs.waited
+        limit = lifesigns.END_AFTER if self.began else lifesigns.START_WITHIN
+        if lifesigns.TELL_AFTER <= quiet < lifesigns.TELL_AFTER + lifesigns.LOOK:
+            what = "shows no sign of life" if self.began else "has not begun to work"
+            tell(
+                f"worker process {self.process.pid} {what} since {quiet:.0f} s; it is replaced after {limit:.0f} s"
+            )
+        if quiet >= limit and not self.stuck:
+            self.stuck = True
+            tell(f"worker process {self.process.pid} was ended: nothing came of it for {quiet:.0f} s")
+            self.process.kill()
 
     def _hear(self, stream: Any) -> None:
         """Say what the process says, where a log hears it."""
@@ -113,15 +169,16 @@ class _Worker:
     def stop(self) -> None:
         """End the process, whatever it does."""
         self.process.kill()
-        self.process.wait()
+        with contextlib.suppress(subprocess.TimeoutExpired):  # one that waits for a disk that is gone
+            self.process.wait(10.0)
         self._hearer.join(1.0)
         for pipe in (self.process.stdin, self.process.stdout):
             with contextlib.suppress(OSError):
                 pipe.close()  # type: ignore[union-attr]
 
 
-#: What a worker says when it can take tasks.
-READY = "ready"
+#: What a worker says when it can take tasks, and every few seconds.
+READY, BEATING = "ready", "alive"
 
 
 def _command() -> list[str]:

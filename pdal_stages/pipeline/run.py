@@ -15,6 +15,7 @@ from ..base.errors import InterruptedStage, PipelineError, StageError
 from ..base.files import whole_files
 from ..base.las import check_readable, odd_text, supersede_copc
 from ..base.outputs import Output, check_outputs
+from ..base.shortage import check_limit
 from ..stages import registry
 from . import pdal as pdal_env
 from . import runtime
@@ -148,6 +149,8 @@ class Pipeline:
             check_complete(made, final, writers[number], count)
             supersede_copc(made)
 
+        if self.lowered.ours:
+            check_limit()
         runtime.remember_stdout()
         failure: StageError | None = None
         try:

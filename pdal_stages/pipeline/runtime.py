@@ -19,6 +19,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from ..base.errors import InterruptedStage, StageError
+from ..base.shortage import is_short, shortage
 from ..stages import registry
 from ..stages.base import Stage
 from ..stages.points import Points
@@ -160,6 +161,8 @@ def as_stage_error(error: BaseException, where: str) -> StageError:
             where=where,
             cure="Lower 'memory', work in tiles (--tile), or take fewer features",
         )
+    if isinstance(error, ImportError | OSError) and is_short(error):
+        return shortage(f"{type(error).__name__}: {error}", where)
     if isinstance(error, KeyboardInterrupt):
         return InterruptedStage("interrupted", where=where)
     failure = StageError(

@@ -18,6 +18,7 @@ from ..base.errors import (
     OptionError,
     StageError,
 )
+from ..base.shortage import is_short, shortage
 
 #: One tile at a time in a process: PDAL's threads are ours, and memory is stated for one.
 _one = threading.Lock()
@@ -67,16 +68,24 @@ def perform(task: Task) -> TaskResult:
             )  # nothing helps where the request itself is wrong
         except MemoryError:
             answer = TaskResult(reason="memory ran out. Take smaller tiles or fewer workers", again=True)
+        except (ImportError, OSError) as error:
+            if not is_short(error):
+                answer = _unforeseen(error)
+            else:
+                answer = TaskResult(reason=str(shortage(f"{type(error).__name__}: {error}")), again=True)
         except Exception as error:
-            last = traceback.extract_tb(error.__traceback__)[-1]
-            reason = f"{type(error).__name__}: {error} ({last.name}, line {last.lineno})"
-            answer = TaskResult(reason=reason, again=True)
+            answer = _unforeseen(error)
         answer.cost = {
             "seconds": time.perf_counter() - started,
             "cpu_seconds": time.process_time() - cpu,
             "peak_mb": _peak(),
         }
         return answer
+
+
+def _unforeseen(error: Exception) -> TaskResult:
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return TaskResult(reason=f"{type(error).__name__}: {error} ({last.name}, line {last.lineno})", again=True)
 
 
 def _peak() -> float:

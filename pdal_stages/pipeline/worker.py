@@ -10,7 +10,9 @@ import threading
 from typing import Any, BinaryIO
 
 from ..base.plain import PlainStream
-from .processes import READY
+from ..base.shortage import is_short, shortage
+from .lifesigns import beat
+from .processes import BEATING, READY
 from .work import perform
 
 
@@ -22,9 +24,25 @@ def serve() -> None:
     sys.stdout, sys.stderr = PlainStream(sys.stdout), PlainStream(sys.stderr)
     waiting: queue.SimpleQueue[Any] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(tasks, waiting), daemon=True).start()
+    try:
+        _load_libraries()
+    except (ImportError, OSError, MemoryError) as error:
+        if is_short(error):
+            _say(answers, shortage(f"in a worker process, {type(error).__name__}: {error}"))
+        raise
     _say(answers, READY)
+    beat(lambda: _say(answers, BEATING))
     while True:
         _say(answers, perform(waiting.get()))
+
+
+def _load_libraries() -> None:
+    """What tasks need, before the first: a worker that finds no room for it says so, and is not sent any."""
+    import numba
+    import scipy.linalg
+    import scipy.spatial
+
+    del numba, scipy
 
 
 def _listen(tasks: BinaryIO, waiting: queue.SimpleQueue) -> None:
@@ -36,9 +54,14 @@ def _listen(tasks: BinaryIO, waiting: queue.SimpleQueue) -> None:
         os._exit(0)
 
 
+_one_at_a_time = threading.Lock()
+
+
 def _say(answers: BinaryIO, what: Any) -> None:
+    said = pickle.dumps(what)
     try:
-        pickle.dump(what, answers)
-        answers.flush()
+        with _one_at_a_time:
+            answers.write(said)
+            answers.flush()
     except OSError:
         os._exit(0)
