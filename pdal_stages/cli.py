@@ -197,6 +197,7 @@ def _parser() -> argparse.ArgumentParser:
     takes("stage", help="e.g. filters.hag_minima; for PDAL's stages pdal --options is asked")
     takes("--showjson", action="store_true", help="As JSON Schema")
 
+    add("doctor", _doctor, "Tell what is there on this machine, and the cure for what is not")
     add("plugin", _plugin, "Build our stages into PDAL itself, so that all that runs PDAL has them")
     from .plugin.command import add_arguments as add_plugin_arguments
 
@@ -369,6 +370,16 @@ def _drivers(options: argparse.Namespace) -> None:
     from .pipeline import describe
 
     print(describe.drivers(ours_only=options.ours, as_json=options.showjson), end="")
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    from .plugin.doctor import examine
+
+    missing = 0
+    for finding in examine():
+        print(finding, flush=True)
+        missing += bool(finding.cure and finding.needed)
+    return int(missing > 0)
 
 
 def _plugin(options: argparse.Namespace) -> int:

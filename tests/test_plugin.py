@@ -625,7 +625,9 @@ def test_install_check_uninstall(tmp_path, plugin, monkeypatch, capsys):
     (folder / building.library_name("filters.hag_minima")).unlink()
     assert "libraries are missing" in building.check(folder)[1][0]
     record = json.loads((folder / building.RECORD).read_text())
-    (folder / building.RECORD).write_text(json.dumps({**record, "digest": "old", "pdal": "1.0.0"}))
+    (folder / building.RECORD).write_text(json.dumps({**record, "digest": "old"}))
+    assert "out of date" in "".join(building.check(folder)[1])
+    (folder / building.RECORD).write_text(json.dumps({**record, "pdal_stages": "0.0.1", "pdal": "1.0.0"}))
     said = "\n".join(building.check(folder)[1])
     assert "of another version" in said and "for another PDAL (found 1.0.0)" in said
     (folder / "libpdal_plugin_filter_former.so").write_text("")

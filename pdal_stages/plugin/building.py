@@ -156,10 +156,12 @@ def check(folder: Path | None = None) -> tuple[list[str], list[str]]:
     ]
     if missing:
         bad.append(f"libraries are missing in {folder} (found {', '.join(missing)}). {cure}")
-    if kept.get("digest") != declarations.digest() or kept.get("pdal_stages") != __version__:
+    if kept.get("pdal_stages") != __version__:
         bad.append(
             f"the plugin in {folder} is of another version (found {kept.get('pdal_stages')}, package {__version__}). {cure}"
         )
+    elif kept.get("digest") != declarations.digest():
+        bad.append(f"the plugin in {folder} is out of date: options of stages have changed since. {cure}")
     if pdal_version and kept.get("pdal") != pdal_version:
         bad.append(f"the plugin in {folder} was built for another PDAL (found {kept.get('pdal')}). {cure}")
     if not bad:

@@ -1,0 +1,174 @@
+"""``pdal-stages doctor``: what is there on this machine, and the cure for what is not."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+from ..base.errors import PipelineError, StageError
+from ..base.memory import free_memory
+from ..base.threads import available_threads
+from ..base.version import __version__
+from ..models import STANDARD
+from ..pipeline import pdal as pdal_env
+from ..stages.loading import loaded_model
+from . import building
+
+#: Extra -> the package that it brings, and what for.
+_EXTRAS = {
+    "dask": ("distributed", "tiles on several hosts"),
+    "deep": ("torch", "the neural network"),
+    "table": ("pandas", "tables as data frames"),
+}
+#: What a job needs beside the cloud itself; less is told.
+_LITTLE_MEMORY = 2 * 2**30
+_SCRIPT = """
+def look(ins, outs):
+    try:
+        import sys
+        try:
+            import pdal_stages
+            found = pdal_stages.__file__
+        except ImportError as error:
+            found = f"{type(error).__name__}: {error}"
+        with open(pdalargs["answer"], "w") as file:
+            file.write(sys.prefix + "\\n" + found)
+    except Exception:
+        pass
+    return True
+"""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the answer."""
+
+    what: str
+    found: str
+    cure: str = ""  #: empty where all is well
+    needed: bool = True  #: whether jobs fail without it
+
+    def __str__(self) -> str:
+        mark = "ok" if not self.cure else "MISSING" if self.needed else "no"
+        return f"{mark:8}{self.what}: {self.found}" + (f"\n        -> {self.cure}" if self.cure else "")
+
+
+def examine() -> Iterator[Finding]:
+    """Everything, one after the other; each looks by itself, so that one fault does not hide the next."""
+    looks: tuple[Callable[[], Iterator[Finding]], ...] = (
+        _package, _bindings, _program, _plugin, _machine, _kernels, _extras
+    )  # fmt: skip
+    for look in looks:
+        try:
+            yield from look()
+        except StageError as error:
+            found = " ".join(str(error.found or "").split())
+            yield Finding(error.what, found, error.cure or "See docs/install.md")
+
+
+def _package() -> Iterator[Finding]:
+    python = f"Python {sys.version.split()[0]} of {sys.prefix}"
+    yield Finding("pdal_stages", f"{__version__} in {Path(__file__).resolve().parents[1]}, {python}")
+    try:
+        loaded_model(STANDARD)
+        yield Finding("shipped model", STANDARD)
+    except StageError as error:
+        yield Finding("shipped model", str(error), "Install pdal-stages again")
+
+
+def _bindings() -> Iterator[Finding]:
+    module = pdal_env.bindings()
+    yield Finding("PDAL", f"{pdal_env.dotted_version()}, python-pdal {module.__version__}")
+    yield _python_of("filters.python in this process", lambda stages: pdal_env.execute(stages, arrays=False))
+
+
+def _program() -> Iterator[Finding]:
+    program = pdal_env.program()
+
+    def run(stages: list) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "job.json")
+            path.write_text(json.dumps(stages))
+            try:
+                pdal_env.ask_program("pipeline", str(path))
+            except PipelineError as error:
+                raise pdal_env.translate(str(error.found)) from None
+
+    yield _python_of(f"filters.python in {program}", run)
+
+
+def _python_of(what: str, run: Callable[[list], object]) -> Finding:
+    """Which Python PDAL runs, and whether our package is there."""
+    with tempfile.TemporaryDirectory() as folder:
+        answer = Path(folder, "answer")
+        points = {
+            "type": "readers.faux",
+            "mode": "constant",
+            "count": 1,
+            "bounds": "([1, 2], [1, 2], [1, 2])",
+        }
+        script = {"source": _SCRIPT, "function": "look", "module": "pdal_stages_doctor"}
+        run([points, {"type": "filters.python", **script, "pdalargs": {"answer": str(answer)}}])
+        if not answer.is_file():
+            return Finding(
+                what, "the script did not run", "Install pdal-plugins again, for this PDAL and this Python"
+            )
+        prefix, found = answer.read_text().splitlines()[:2]
+    if not os.path.isabs(found):
+        return Finding(
+            what, f"Python of {prefix}; {found}", f"{prefix}/bin/python -m pip install pdal-stages"
+        )
+    if Path(found).resolve().parent != Path(__file__).resolve().parents[1]:
+        return Finding(
+            what,
+            f"Python of {prefix}, which has another pdal_stages: {found}",
+            "Keep one of them, or one version",
+        )
+    return Finding(what, f"Python of {prefix}")
+
+
+def _plugin() -> Iterator[Finding]:
+    good, bad = building.check()
+    if bad:
+        what = "native stages (pdal pipeline knows our names)"
+        yield Finding(
+            what,
+            bad[-1].split(". ")[0],
+            "pdal-stages plugin --check; not needed by pdal-stages",
+            needed=False,
+        )
+    else:
+        yield Finding("native stages", good[-1])
+
+
+def _machine() -> Iterator[Finding]:
+    yield Finding("cores", str(available_threads()))
+    free = free_memory()
+    enough = free >= _LITTLE_MEMORY
+    cure = "" if enough else "Work in tiles (--tile), or close other programs"
+    yield Finding("free memory", f"{free / 2**30:.1f} GB", cure, needed=False)
+
+
+def _kernels() -> Iterator[Finding]:
+    named = os.environ.get("NUMBA_CACHE_DIR")
+    folders = (
+        [Path(named)] if named else [Path(__file__).resolve().parents[1], Path.home() / ".cache" / "numba"]
+    )
+    count = sum(1 for folder in folders for _ in folder.rglob("*.nbi"))
+    cure = "" if count else "pdal-stages warmup, once; otherwise the first job waits for the compiler"
+    yield Finding("compiled kernels", str(count) if count else "none yet", cure, needed=False)
+
+
+def _extras() -> Iterator[Finding]:
+    for extra, (package, purpose) in _EXTRAS.items():
+        try:
+            yield Finding(f"extra {extra}", f"{package} {metadata.version(package)}")
+        except metadata.PackageNotFoundError:
+            cure = f"pip install 'pdal-stages[{extra}]', for {purpose}"
+            yield Finding(f"extra {extra}", f"no {package}", cure, needed=False)

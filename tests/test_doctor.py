@@ -1,0 +1,73 @@
+"""What `pdal-stages doctor` finds, and what it says where something is missing."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from pdal_stages import cli
+from pdal_stages.plugin import doctor
+
+pytestmark = pytest.mark.pdal
+
+
+def test_all_that_is_needed_is_here(capsys, monkeypatch):
+    assert cli.main(["doctor"]) == 0
+    said = capsys.readouterr().out
+    for what in (
+        "pdal_stages: ",
+        "shipped model: ",
+        "PDAL: ",
+        "filters.python in this process",
+        "cores: ",
+        "compiled kernels",
+    ):
+        assert f"{what}" in said
+    assert "MISSING" not in said
+    assert said.count("filters.python in ") >= 2
+
+
+def test_what_is_missing_has_its_cure(tmp_path):
+    """PDAL without filters.python; a process of its own, since PDAL looks for plugins once."""
+    done = subprocess.run(
+        [sys.executable, "-m", "pdal_stages.cli", "doctor"],
+        env={**os.environ, "PDAL_DRIVER_PATH": str(tmp_path)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1, done.stderr
+    lines = done.stdout.splitlines()
+    missing = [n for n, line in enumerate(lines) if line.startswith("MISSING")]
+    assert len(missing) == 2
+    assert all("PDAL_DRIVER_PATH" in lines[n + 1] for n in missing)
+    assert any(line.startswith("ok      cores") for line in lines)  # one fault does not hide the next
+
+
+def test_another_python_is_told(tmp_path, monkeypatch):
+    def run(stages):
+        (answer := stages[1]["pdalargs"]["answer"])
+        with open(answer, "w") as file:
+            file.write("/other\nModuleNotFoundError: No module named 'pdal_stages'")
+
+    found = doctor._python_of("filters.python", run)
+    assert found.cure == "/other/bin/python -m pip install pdal-stages" and "MISSING" in str(found)
+
+    def another(stages):
+        with open(stages[1]["pdalargs"]["answer"], "w") as file:
+            file.write("/other\n/other/lib/pdal_stages/__init__.py")
+
+    assert "another pdal_stages" in doctor._python_of("filters.python", another).found
+    assert "did not run" in doctor._python_of("filters.python", lambda stages: None).found
+
+
+def test_extras_are_named(monkeypatch):
+    monkeypatch.setattr(doctor, "_EXTRAS", {"none": ("no-such-package", "nothing")})
+    (finding,) = doctor._extras()
+    assert "pdal-stages[none]" in finding.cure and not finding.needed
+
+
+def test_little_memory_is_told(monkeypatch):
+    monkeypatch.setattr(doctor, "free_memory", lambda: 10**8)
+    findings = {one.what: one for one in doctor._machine()}
+    assert "--tile" in findings["free memory"].cure
