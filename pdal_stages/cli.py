@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .base import kinds
-from .base.errors import StageError, suggest
+from .base.errors import OptionError, StageError, suggest
 from .base.outputs import Output, check_outputs
 from .base.plain import PlainStream, tell
 from .base.runlog import LoggedStream, RunLog
@@ -236,11 +236,22 @@ def _parser() -> argparse.ArgumentParser:
     takes = add("train", _train, "Train a model on labelled clouds", overrides=True)
     takes("inputs", nargs="+", metavar="input", help=f"Labelled: {_INPUTS[0].lower()}{_INPUTS[1:]}")
     takes("--model", required=True, help="The model file to write")
-    takes("--classes", help="Codes (2,5,6) or a JSON mapping of labels to classes")
+    takes(
+        "--classes",
+        metavar="MAP",
+        help="Codes (2,5,6), or a JSON mapping of labels to classes with their names, e.g. "
+        '\'{"2": "2 Ground", "3,4,5": "5 Vegetation", "6": "6 Building"}\'',
+    )
     takes("--neighborhoods", help="Preset or tokens, e.g. s5,k10,k50")
     takes("--feature-set", help="Groups or single features, e.g. covariance,geometric")
     takes("--count", type=int, help="Samples of each class")
     takes("--trees", help="Number of trees; of several the best is found")
+
+    commands.choices["train"].epilog = (
+        "Of several files the score is by file. Of one file, --writers.classifiermodel.groups=PointSourceId makes it one by "
+        "flight line (any dimension with a number for each group), and --writers.classifiermodel.survey=UserData says that "
+        "points of another number there are of another survey. " + _OVERRIDES
+    )
 
     takes = add("accuracy", _accuracy, "Compare two class dimensions, or two files", overrides=True)
     takes("inputs", nargs="+", metavar="input", help=f"Classified: {_INPUTS[0].lower()}{_INPUTS[1:]}")
@@ -473,7 +484,11 @@ def _model(options: argparse.Namespace) -> None:
 def _demo(options: argparse.Namespace) -> None:
     from .synthetic.demo import run_demo
 
-    run_demo(options.folder, size=options.size, density=options.density, seed=options.seed)
+    try:
+        run_demo(options.folder, size=options.size, density=options.density, seed=options.seed)
+    except OptionError as error:
+        error.what = re.sub(r"^'(\w+)'", r"'--\1'", error.what)
+        raise
 
 
 def _warmup(options: argparse.Namespace) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -137,9 +138,9 @@ def test_an_interrupt_says_what_is_finished(folder, tmp_path, write_las):
     command += ["--log", str(tmp_path / "log"), "--metadata", str(tmp_path / "m.json")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run:
         seen = [run.stdout.readline() for _ in range(3)]
-        logged = (tmp_path / "log").read_text()
         run.send_signal(signal.SIGINT)
         _, err = run.communicate(timeout=60)
+    logged = (tmp_path / "log").read_text()
     assert run.returncode == 130, err
     assert sorted(Path(line.partition(":")[0]).name for line in seen) == [
         "out_t0.laz",
@@ -196,6 +197,23 @@ def test_dimensions_are_chosen(folder, classify, tmp_path, words, made):
     assert code == 0, err
     extra = laspy.read(tmp_path / "o.laz").point_format.extra_dimensions
     assert sorted(d.name for d in extra) == made and all(d.dtype == np.float32 for d in extra)
+
+
+@pytest.mark.parametrize("suffix", ["txt", "ply"])
+@pytest.mark.parametrize(("words", "made"), [("none", []), ("Margin", ["margin"]), (None, ["reliability"])])
+def test_dimensions_are_chosen_for_text_and_ply(folder, classify, tmp_path, suffix, words, made):
+    out = tmp_path / f"o.{suffix}"
+    code, _, err = classify(folder / "in" / "t0.laz", out, *(("--dimensions", words) if words else ()))
+    assert code == 0, err
+    text = out.read_bytes().decode("ascii", "replace").lower()
+    names = (
+        [name.strip('"') for name in text.splitlines()[0].split(",")]
+        if suffix == "txt"
+        else re.findall(r"^property \w+ (\w+)", text, re.MULTILINE)
+    )
+    assert {"x", "y", "z", "classification", "gpstime", "amplitude"} <= set(names)
+    extra = {"margin", "reliability", "heightaboveground", "heightaboveopening_5", "ground"} & set(names)
+    assert extra == set(made) if words else set(made) <= extra
 
 
 def test_a_dimension_that_is_not_made(folder, classify, tmp_path):

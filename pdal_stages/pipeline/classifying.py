@@ -11,7 +11,7 @@ from ..models import STANDARD
 from ..stages import preparation, registry
 from ..stages.heights import preparation_of
 from ..stages.loading import loaded_model
-from .beside import extra_dims_option
+from .beside import dimensions_of, extra_dims_option, only
 from .ends import overridden, reader_of, writer_of
 from .filenames import LAS_WRITERS
 from .lowering import lower_stage
@@ -126,6 +126,8 @@ class ClassifyRequest:
         if self.beside is not None and _is_las(writer):
             listed = extra_dims_option([source], self.beside)
             writer |= {"extra_dims": listed} if listed else {}
+        elif self.beside is not None and self.dimensions != WRITTEN:
+            writer = only(writer, [*dimensions_of(reader_of(source, "input")), *self.beside])
         return Pipeline([reader_of(source, "input"), *self.stages, writer], self.overrides)
 
 

@@ -72,13 +72,14 @@ class Pipeline:
 
     @property
     def told(self) -> list[str]:
-        """Remarks, and the notes and warnings of our stages: the same of several stages once."""
+        """Remarks, and the notes and warnings of our stages: what several say is of the run, and said once."""
         by_text: dict[str, list[str]] = {}
         for place, reports in self.reports:
             for report in reports:
                 for text in (report[key] for key in ("warning", "note", "score") if report.get(key)):
                     by_text.setdefault(text, []).append(place)
-        notes = [f"{', '.join(dict.fromkeys(places))}: {text}" for text, places in by_text.items()]
+        by_text = {text: list(dict.fromkeys(places)) for text, places in by_text.items()}
+        notes = [text if len(places) > 1 else f"{places[0]}: {text}" for text, places in by_text.items()]
         return [*self.remarks, *notes]
 
     @property

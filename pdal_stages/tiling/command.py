@@ -71,7 +71,10 @@ def add_arguments(command: argparse.ArgumentParser, survey: bool = False) -> Non
 
 
 def _side(text: str) -> float | str:
-    return text if text == "auto" else float(text)
+    try:
+        return text if text == "auto" else float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"a length or auto, not {text!r}") from None
 
 
 def options_of(options: argparse.Namespace) -> TilingOptions:
