@@ -50,13 +50,7 @@ _COLUMNS: dict[str, tuple[type, np.ufunc]] = {
     "sum": (np.int64, np.add),  # of z, mm
     "sure": (np.int64, np.add),  # of their reliabilities, thousandths
     "told": (np.int32, np.add),  # points that have one
-    "west": (np.int16, np.minimum),  # of the points, from the cell's west side: 1/4096 of its width
-    "east": (np.int16, np.maximum),
-    "south": (np.int16, np.minimum),
-    "north": (np.int16, np.maximum),
 }
-#: Parts of a cell's width in which places inside it are counted.
-PARTS = 4096
 
 
 def cell_keys(kind: int, row: NDArray, column: NDArray) -> NDArray[np.int64]:
@@ -150,7 +144,7 @@ class Cells:
         if used.size == 0:
             return cls(size)
         x, y, z, kinds = x[used], y[used], z[used], kinds[used]
-        key, (into_x, into_y) = point_keys(x, y, kinds, size)
+        key = point_keys(x, y, kinds, size)
         height = np.rint(z * MM)
         if np.abs(height).max() > 2**31 - 2:
             raise StageError("heights lie beyond 2,000 km", found=f"{z.min():g} to {z.max():g} m")
@@ -168,10 +162,6 @@ class Cells:
             "sum": height.astype(np.int64),
             "sure": sure,
             "told": told,
-            "west": into_x,
-            "east": into_x,
-            "south": into_y,
-            "north": into_y,
         }
         return cls(size, key, columns)._joined()
 
@@ -217,20 +207,14 @@ class Cells:
         return Cells(self.size, self.key[which], {name: v[which] for name, v in self.columns.items()})
 
 
-def point_keys(
-    x: NDArray, y: NDArray, kinds: NDArray, size: float
-) -> tuple[NDArray[np.int64], tuple[NDArray[np.int16], NDArray[np.int16]]]:
-    """Keys of the cells that points fall in, and where in them they lie."""
+def point_keys(x: NDArray, y: NDArray, kinds: NDArray, size: float) -> NDArray[np.int64]:
+    """Keys of the cells that points fall in."""
     wide = np.where(kinds == Kind.GROUND, size * GROUND_CELLS, size)
-    across, up = x / wide, y / wide
-    column, row = np.floor(across), np.floor(up)
+    column, row = np.floor(x / wide), np.floor(y / wide)
     if max(np.abs(column).max(), np.abs(row).max()) >= _HALF:
         raise StageError(
             "coordinates lie too far out for the grid of cells",
             found=f"x {x.min():g} to {x.max():g}, y {y.min():g} to {y.max():g} m",
             cure="Drop stray points first, or give a larger 'cell'",
         )
-    into_x, into_y = (
-        np.minimum(PARTS * (v - f), PARTS - 1).astype(np.int16) for v, f in ((across, column), (up, row))
-    )
-    return np.asarray(cell_keys(0, row, column) | (kinds.astype(np.int64) << _KIND)), (into_x, into_y)
+    return np.asarray(cell_keys(0, row, column) | (kinds.astype(np.int64) << _KIND))

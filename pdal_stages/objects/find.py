@@ -115,7 +115,7 @@ class Objects:
         rows = np.flatnonzero(kinds >= 0)
         if rows.size == 0 or self.key.size == 0:
             return out
-        key, _ = point_keys(x[rows], y[rows], kinds[rows], self.settings.cell)
+        key = point_keys(x[rows], y[rows], kinds[rows], self.settings.cell)
         at = np.minimum(np.searchsorted(self.key, key), len(self.key) - 1)
         out[rows] = np.where(self.key[at] == key, self.owner[at], 0)
         return out

@@ -1,0 +1,384 @@
+"""Outlines of objects: along their cells, or straight along walls; in shapely's geometries (extra ``vector``).
+
+Straight outlines follow the main direction of what stands wall to wall. The boundary of all its cells together is cut into
+edges (Douglas, Peucker), each is turned along or across the main direction where it lies within 12 degrees of it, and put
+where the middle of its cells' steps lies. Walls between buildings are drawn once, so neighbors share them.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import DependencyError
+from .find import Table
+
+#: Holes smaller than this are closed, m2.
+SMALLEST_HOLE = 4.0
+#: How far an edge may lie from the cells' boundary, cells.
+_TOLERANCE = 1.6
+#: The least that a straight outline has in common with the cells: intersection over union.
+_LIKENESS = 0.85
+#: The same of a rectangle, which is then taken.
+_BOXLIKE = 0.82
+_GRID = 1.0 / 1024.0
+#: What is off the main direction by less is turned into it: a rise, and a number of cells for short walls.
+_DIAGONAL, _SLACK = math.tan(math.radians(12.0)), 2.5
+
+
+def vector(name: str) -> Any:
+    """shapely or pyogrio; an error says how to get it."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise DependencyError(
+            f"outlines need {name}",
+            found=str(error),
+            cure="Install the extra: pip install 'pdal-stages[vector]'",
+        ) from None
+
+
+def raw_outlines(table: Table, size: float, *, hole: float = SMALLEST_HOLE) -> list[Any]:
+    """The union of each object's cells, in numbers of cells; holes smaller than `hole` m2 closed."""
+    shapely = vector("shapely")
+    out = []
+    for number in range(len(table)):
+        row, column, _ = table.cells_of(number)
+        begins = np.flatnonzero(np.r_[True, (row[1:] != row[:-1]) | (column[1:] != column[:-1] + 1)])
+        ends = np.r_[begins[1:], len(row)] - 1
+        runs = shapely.box(column[begins], row[begins], column[ends] + 1, row[begins] + 1)
+        out.append(_without_holes(shapely, shapely.union_all(runs), hole / size**2))
+    return out
+
+
+def _without_holes(shapely: Any, shape: Any, least: float) -> Any:
+    parts = []
+    for part in shapely.get_parts(shape):
+        holes = [ring for ring in part.interiors if shapely.Polygon(ring).area >= least]
+        parts.append(shapely.Polygon(part.exterior, holes))
+    return parts[0] if len(parts) == 1 else shapely.MultiPolygon(parts)
+
+
+def straight_outlines(raw: list[Any], size: float) -> list[Any]:
+    """Outlines along walls; all in numbers of cells.
+
+    Parameters
+    ----------
+    raw : list of shapely Polygon
+        By :func:`raw_outlines`.
+    size : float
+        Side of a cell, metres.
+
+    Returns
+    -------
+    list of shapely Polygon or MultiPolygon
+        Valid ones, in the same order; the raw one where no straight one is like it.
+    """
+    shapely = vector("shapely")
+    out = list(raw)
+    for group in _touching(shapely, raw):
+        shapes = [raw[n] for n in group]
+        corner = np.floor(np.min([s.bounds[:2] for s in shapes], axis=0))
+        local = [shapely.transform(s, lambda xy, c=corner: xy - c) for s in shapes]  # type: ignore[misc]
+        for n, shape in zip(group, _straight(shapely, local, size), strict=True):
+            out[n] = shapely.transform(shape, lambda xy, c=corner: xy + c)  # type: ignore[misc]
+    return out
+
+
+def _touching(shapely: Any, shapes: list[Any]) -> list[list[int]]:
+    """Groups of shapes with an edge in common, by their numbers."""
+    parent = list(range(len(shapes)))
+
+    def root(n: int) -> int:
+        while parent[n] != n:
+            n = parent[n]
+        return n
+
+    if shapes:
+        tree = shapely.STRtree(shapes)
+        for a, b in zip(*tree.query(shapes, predicate="touches").tolist(), strict=True):
+            if a < b and shapes[a].intersection(shapes[b]).length > 0:
+                low, high = sorted((root(a), root(b)))
+                parent[high] = low
+    groups: dict[int, list[int]] = {}
+    for n in range(len(shapes)):
+        groups.setdefault(root(n), []).append(n)
+    return list(groups.values())
+
+
+def _straight(shapely: Any, shapes: list[Any], size: float) -> list[Any]:
+    """Straight outlines of shapes that stand wall to wall."""
+    whole = shapely.union_all(shapes)
+    angle = main_direction(np.concatenate([_middles(r) for r in _rings(shapely, whole)]))
+    made = []
+    for part in shapely.get_parts(whole):
+        shell = straight_ring(_middles(part.exterior), angle)
+        holes = [straight_ring(_middles(r), angle) for r in part.interiors]
+        shape = _polygon(shapely, shell, holes)
+        box = shapely.oriented_envelope(part).buffer(-0.5, join_style="mitre")
+        if not part.interiors and _likeness(box, part) >= _BOXLIKE:
+            shape = box
+        if shape is None or _likeness(shape, part) < _LIKENESS:
+            shape = part.simplify(_TOLERANCE)
+        made.append(shape if shape.is_valid and shape.geom_type == "Polygon" and shape.area > 0 else part)
+    outer = shapely.union_all(made)
+    if len(shapes) == 1:
+        return [outer]
+    walls = []
+    for a, one in enumerate(shapes):
+        for other in shapes[a + 1 :]:
+            between = one.boundary.intersection(other.boundary)
+            if between.length > 0:
+                walls += [w for w in shapely.get_parts(shapely.line_merge(between)) if w.length > 0]
+    lines = [_lengthened(_straight_wall(np.array(w.coords), angle), 4.0) for w in walls]
+    parts = _divided(shapely, outer, lines, shapes)
+    if not _good(parts, shapes):
+        parts = _shared_out(shapely, outer, shapes)
+    return parts if _good(parts, shapes) else shapes
+
+
+def _good(parts: list[Any], shapes: list[Any]) -> bool:
+    return all(p is not None and p.is_valid and _likeness(p, s) >= 0.5 for p, s in zip(parts, shapes, strict=True))
+
+
+def _shared_out(shapely: Any, outer: Any, shapes: list[Any]) -> list[Any]:
+    """An outline shared out among the shapes in it: each what it covers, and what is left beside it; inner walls smoothed."""
+    parts = [shapely.intersection(outer, shape, grid_size=_GRID) for shape in shapes]
+    left = shapely.difference(outer, shapely.union_all(parts, grid_size=_GRID), grid_size=_GRID)
+    more: list[list[Any]] = [[part] for part in parts]
+    for piece in shapely.get_parts(left):
+        shared = [piece.boundary.intersection(part.boundary).length for part in parts]
+        if max(shared, default=0.0) > 0:
+            more[int(np.argmax(shared))].append(piece)
+    whole = [_polygons(shapely, shapely.union_all(pieces, grid_size=_GRID)) for pieces in more]
+    return list(shapely.coverage_simplify(whole, _TOLERANCE, simplify_boundary=False))
+
+
+def _polygons(shapely: Any, shape: Any) -> Any:
+    """A shape without lines and points."""
+    kept = [part for part in shapely.get_parts(shape) if part.geom_type == "Polygon" and part.area > 0.5]
+    return kept[0] if len(kept) == 1 else shapely.MultiPolygon(kept)
+
+
+def _divided(shapely: Any, outer: Any, lines: list[NDArray], shapes: list[Any]) -> list[Any]:
+    """An outline divided by lines, for each shape what is nearest to it; None where nothing is."""
+    edges = [outer.boundary, *(shapely.LineString(line) for line in lines)]
+    owned: list[list[Any]] = [[] for _ in shapes]
+    for face in shapely.get_parts(shapely.polygonize(shapely.get_parts(shapely.union_all(edges)))):
+        inside = face.representative_point()
+        if not outer.contains(inside):
+            continue
+        shared = [face.intersection(shape).area for shape in shapes]
+        nearest = [shape.distance(inside) for shape in shapes] if not any(shared) else []
+        owned[int(np.argmin(nearest) if nearest else np.argmax(shared))].append(face)
+    return [shapely.union_all(one) if one else None for one in owned]
+
+
+def _rings(shapely: Any, shape: Any) -> list[Any]:
+    return [ring for part in shapely.get_parts(shape) for ring in (part.exterior, *part.interiors)]
+
+
+def _likeness(a: Any, b: Any) -> float:
+    return a.intersection(b).area / max(a.union(b).area, 1e-9)
+
+
+def _polygon(shapely: Any, shell: NDArray | None, holes: list[NDArray | None]) -> Any:
+    if shell is None:
+        return None
+    shape = shapely.Polygon(shell, [hole for hole in holes if hole is not None])
+    return shape if shape.is_valid else None
+
+
+def _middles(ring: Any) -> NDArray[np.float64]:
+    """Middles of the unit steps of a boundary along cells (n, 2)."""
+    corners = np.rint(np.array(ring.coords)).astype(np.int64)
+    out = []
+    for (x0, y0), (x1, y1) in zip(corners[:-1], corners[1:], strict=True):
+        n = max(abs(x1 - x0), abs(y1 - y0))
+        t = (np.arange(n) + 0.5)[:, None] / n
+        out.append(np.array([x0, y0]) + t * np.array([x1 - x0, y1 - y0]))
+    return np.concatenate(out)
+
+
+def main_direction(places: NDArray) -> float:
+    """The angle, radians in [0, pi/2), of the frame in which the walls through places (n, 2) along boundaries run.
+
+    The one in which the steps from a place to the fifth after it are longest along one axis and shortest along the other:
+    the least sum of their extents along both.
+    """
+    away = np.roll(places, -5, axis=0) - places
+    away = away[np.hypot(*away.T) < 8.0]  # not from one ring to the next
+    if not len(away):
+        return 0.0
+    best = [(0.0, 0.0)]
+    for step, span in ((math.radians(2.0), math.pi / 4), (math.radians(0.2), math.radians(3.0))):
+        middle = best[0][1] if step < 0.01 else math.pi / 4
+        angles = middle + np.arange(-round(span / step), round(span / step) + 1) * step
+        c, s = np.cos(angles), np.sin(angles)
+        u = np.abs(np.outer(c, away[:, 0]) + np.outer(s, away[:, 1]))
+        v = np.abs(np.outer(c, away[:, 1]) - np.outer(s, away[:, 0]))
+        total = (u + v).sum(axis=1)
+        n = int(np.argmin(np.round(total, 6)))
+        best = [(float(total[n]), float(angles[n]))]
+    return best[0][1] % (math.pi / 2)
+
+
+def _turned(xy: NDArray, angle: float) -> NDArray[np.float64]:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.column_stack([xy[:, 0] * c + xy[:, 1] * s, xy[:, 1] * c - xy[:, 0] * s])
+
+
+def _peucker(xy: NDArray, tolerance: float) -> list[int]:
+    """Numbers of the places that stay of a line (Douglas, Peucker 1973)."""
+    keep, todo = {0, len(xy) - 1}, [(0, len(xy) - 1)]
+    while todo:
+        a, b = todo.pop()
+        if b - a < 2:
+            continue
+        along, between = xy[b] - xy[a], xy[a + 1 : b] - xy[a]
+        length = math.hypot(*along)
+        if length > 0:
+            t = np.clip(between @ along / length**2, 0.0, 1.0)
+            away = np.hypot(*(between - t[:, None] * along).T)
+        else:
+            away = np.hypot(*between.T)
+        far = int(np.argmax(away))
+        if away[far] > tolerance:
+            n = a + 1 + far
+            keep.add(n)
+            todo += [(a, n), (n, b)]
+    return sorted(keep)
+
+
+def straight_ring(places: NDArray, angle: float) -> NDArray[np.float64] | None:
+    """Corners (k, 2) of a ring of walls along or across a direction, or on a slant; None where fewer than three remain.
+
+    Parameters
+    ----------
+    places : (n, 2) float64
+        Along the boundary, in order, in numbers of cells.
+    angle : float
+        Of the main direction, radians.
+    """
+    if len(places) < 8:
+        return None
+    xy = _turned(places, angle)
+    # Begun at a corner: the place farthest from the middle.
+    xy = np.roll(xy, -int(np.argmax(np.round(np.hypot(*(xy - xy.mean(axis=0)).T), 6))), axis=0)
+    closed = np.vstack([xy, xy[:1]])
+    at = _peucker(closed, _TOLERANCE)
+    lines = [_line(closed[a : b + 1]) for a, b in zip(at[:-1], at[1:], strict=True)]
+    lines = _one_after_the_other(lines)
+    if len(lines) < 3:
+        return None
+    corners = []
+    for n, line in enumerate(lines):
+        corner = _meeting(lines[n - 1], line)
+        if corner is None:
+            return None
+        corners.append(corner)
+    return _turned(np.array(corners), -angle)
+
+
+#: A wall: its direction ("h" along, "v" across, "d" on a slant), a place on it, its unit vector and its length.
+_Wall = tuple[str, NDArray, NDArray, float]
+
+
+def _line(xy: NDArray) -> _Wall:
+    """The wall that places lie along."""
+    away = xy[-1] - xy[0]
+    length = float(math.hypot(*away))
+    inner = xy[1:-1] if len(xy) > 4 else xy
+    east, north = abs(away[0]), abs(away[1])
+    if north < east and north <= max(_DIAGONAL * east, _SLACK):
+        return "h", np.array([xy[:, 0].mean(), np.median(inner[:, 1])]), np.array([1.0, 0.0]), length
+    if east <= north and east <= max(_DIAGONAL * north, _SLACK):
+        return "v", np.array([np.median(inner[:, 0]), xy[:, 1].mean()]), np.array([0.0, 1.0]), length
+    if length < 6.0:  # a short slant is a corner cut by the grid
+        kind = "h" if abs(away[0]) >= abs(away[1]) else "v"
+        return kind, xy.mean(axis=0), np.array([1.0, 0.0] if kind == "h" else [0.0, 1.0]), length
+    return "d", inner.mean(axis=0), away / length, length
+
+
+def _one_after_the_other(lines: list[_Wall]) -> list[_Wall]:
+    """Walls round a ring, of which none goes on in the direction of the one before: joined, or with a short wall between."""
+    walls = list(lines)
+    n = 0
+    while len(walls) > 3 and n < len(walls):
+        before, line = walls[n - 1], walls[n]
+        if not _parallel(before, line) or _apart(before, line) > _TOLERANCE:
+            n += 1
+            continue
+        share = line[3] / max(line[3] + before[3], 1e-9)
+        walls[n] = (line[0], before[1] + share * (line[1] - before[1]), before[2], before[3] + line[3])
+        del walls[n - 1]  # the last one where n is 0
+        n = max(n - 1, 0)
+    out: list[_Wall] = []
+    for n, line in enumerate(walls):
+        before = walls[n - 1]
+        if _parallel(before, line) and line[0] != "d":
+            kind, way = ("v", np.array([0.0, 1.0])) if line[0] == "h" else ("h", np.array([1.0, 0.0]))
+            out.append((kind, 0.5 * (before[1] + line[1]), way, _apart(before, line)))
+        out.append(line)
+    return out
+
+
+def _apart(a: _Wall, b: _Wall) -> float:
+    """How far parallel walls lie from each other."""
+    return abs(float((b[1] - a[1]) @ np.array([-a[2][1], a[2][0]])))
+
+
+def _parallel(a: _Wall, b: _Wall) -> bool:
+    return a[0] == b[0] and (a[0] != "d" or abs(float(a[2] @ b[2])) > 0.97)
+
+
+def _meeting(a: _Wall, b: _Wall) -> NDArray | None:
+    """Where two walls meet."""
+    cross = float(a[2][0] * b[2][1] - a[2][1] * b[2][0])
+    if abs(cross) < 0.05:
+        return None
+    away = b[1] - a[1]
+    return a[1] + a[2] * float((away[0] * b[2][1] - away[1] * b[2][0]) / cross)
+
+
+def _straight_wall(corners: NDArray, angle: float) -> NDArray[np.float64]:
+    """A wall between two buildings: few corners, its edges along or across the direction where they nearly are."""
+    steps = []
+    for (x0, y0), (x1, y1) in zip(corners[:-1], corners[1:], strict=True):
+        n = max(1, round(max(abs(x1 - x0), abs(y1 - y0))))
+        t = (np.arange(n) + 0.5)[:, None] / n
+        steps.append(np.array([x0, y0]) + t * np.array([x1 - x0, y1 - y0]))
+    xy = _turned(np.concatenate([corners[:1], *steps, corners[-1:]]), angle)
+    at = _peucker(xy, _TOLERANCE)
+    lines = [_line(xy[a : b + 1]) for a, b in zip(at[:-1], at[1:], strict=True)]
+    if len(lines) == 1:
+        _, place, way, length = lines[0]
+        sign = 1.0 if float(way @ (xy[-1] - xy[0])) >= 0 else -1.0
+        half = 0.5 * sign * length * way
+        return _turned(np.array([place - half, place + half]), -angle)
+    return _turned(xy[at], -angle)
+
+
+def _lengthened(xy: NDArray, by: float) -> NDArray[np.float64]:
+    """A line that goes on at both ends."""
+    out = np.array(xy, np.float64)
+    for end, before in ((0, 1), (-1, -2)):
+        away = out[end] - out[before]
+        length = math.hypot(*away)
+        if length > 0:
+            out[end] = out[end] + away * (by / length)
+    return out
+
+
+def crown_outlines(raw: list[Any]) -> list[Any]:
+    """Crowns with smoother edges, which neighbors share; in numbers of cells."""
+    shapely = vector("shapely")
+    if not raw:
+        return []
+    fine = [shapely.segmentize(shape, 1.0) for shape in raw]
+    made = shapely.coverage_simplify(fine, 1.2)
+    return [m if m.is_valid and not m.is_empty else r for m, r in zip(made, raw, strict=True)]

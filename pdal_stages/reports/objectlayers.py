@@ -1,0 +1,221 @@
+"""Objects as layers of vector files, through pyogrio (extra ``vector``): whole or not at all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import StageError
+from ..base.files import check_writable, whole_files
+from ..base.units import Units
+from ..objects import Objects
+from ..objects.cells import Kind
+from ..objects.measure import CHECK
+from ..objects.outlines import crown_outlines, raw_outlines, straight_outlines, vector
+
+#: Ending of a file's name -> GDAL's driver, and whether one file holds many layers.
+DRIVERS = {
+    ".gpkg": ("GPKG", True),
+    ".geojson": ("GeoJSON", False),
+    ".fgb": ("FlatGeobuf", False),
+    ".shp": ("ESRI Shapefile", False),
+}
+_F, _I, _S = np.float64, np.int64, np.str_
+_JUDGED = {"points": _I, "reliab": _F, "verdict": _S, "reason": _S}
+#: Columns of each layer, none longer than a shapefile's ten characters.
+COLUMNS: dict[Kind, dict[str, type]] = {
+    Kind.BUILDING: {
+        "area": _F, "h_eave": _F, "h_ridge": _F, "ground": _F, "slope": _F, "planes": _I, "planar": _F, **_JUDGED,
+    },
+    Kind.TREE: {"height": _F, "area": _F, "diam": _F, "ground": _F, **_JUDGED},
+    Kind.SPAN: {"length": _F, "h_low": _F, "z_high": _F, "sag": _F, **_JUDGED},
+    Kind.DECK: {"area": _F, "z": _F, "clear": _F, "ground": _F, **_JUDGED},
+}  # fmt: skip
+
+
+class Layer(NamedTuple):
+    """One layer: geometries (shapely), their type, and a value of each column for each."""
+
+    shapes: list[Any]
+    kind: str
+    columns: dict[str, NDArray]
+
+
+def object_layers(objects: Objects, *, straight: bool = True, units: Units | None = None) -> dict[str, Layer]:
+    """Layers ``buildings``, ``trees``, ``crowns``, ``spans``, ``decks``.
+
+    Parameters
+    ----------
+    objects : Objects
+    straight : bool
+        Outlines of buildings and decks along walls, instead of along cells.
+    units : Units, optional
+        Of the coordinates; measures are in metres whatever these are.
+    """
+    shapely = vector("shapely")
+    across = units.horizontal if units else 1.0
+    up = units.vertical if units else 1.0
+    size = objects.settings.cell
+
+    def placed(shapes: list[Any]) -> list[Any]:
+        """In the coordinates' unit, to a thousandth of it where that leaves them valid."""
+        exact = [shapely.transform(shape, lambda xy: xy * (size / across)) for shape in shapes]
+        rounded = [shapely.transform(shape, lambda xy: np.round(xy, 3)) for shape in exact]
+        return [r if r.is_valid else e for e, r in zip(exact, rounded, strict=True)]
+
+    layers = {}
+    for kind, name in ((Kind.BUILDING, "buildings"), (Kind.DECK, "decks")):
+        table = objects.tables[kind]
+        shapes = raw_outlines(table, size)
+        if straight:
+            shapes = straight_outlines(shapes, size)
+        columns = _columns(objects, kind)
+        columns["area"] = np.array([shape.area * size**2 for shape in shapes], np.float64)
+        many = [s if s.geom_type == "MultiPolygon" else shapely.MultiPolygon([s]) for s in placed(shapes)]
+        layers[name] = Layer(many, "MultiPolygon", columns)
+    trees, columns = objects.tables[Kind.TREE], _columns(objects, Kind.TREE)
+    tops = [
+        shapely.Point(x / across, y / across)
+        for x, y in zip(trees.columns.get("x", ()), trees.columns.get("y", ()), strict=True)
+    ]
+    layers["trees"] = Layer(tops, "Point", columns)
+    crowns = raw_outlines(trees, size, hole=1.0)
+    crowns = crown_outlines(crowns) if straight else crowns
+    many = [s if s.geom_type == "MultiPolygon" else shapely.MultiPolygon([s]) for s in placed(crowns)]
+    layers["crowns"] = Layer(many, "MultiPolygon", columns)
+    scale = np.array([across, across, up])
+    lines = [shapely.LineString(path / scale) for path in objects.tables[Kind.SPAN].paths]
+    layers["spans"] = Layer(lines, "LineString Z", _columns(objects, Kind.SPAN))
+    order = ("buildings", "trees", "crowns", "spans", "decks")
+    return {name: layers[name] for name in order}
+
+
+def _columns(objects: Objects, kind: Kind) -> dict[str, NDArray]:
+    table = objects.tables[kind]
+    out: dict[str, NDArray] = {"object_id": table.ids}
+    for name, of in COLUMNS[kind].items():
+        out[name] = table.columns[name] if len(table) else np.empty(0, of)
+        if of is np.float64:
+            out[name] = np.round(out[name].astype(np.float64), 3)
+        elif of is np.str_:
+            out[name] = out[name].astype(object)
+    return out
+
+
+def check_target(path: str | Path) -> None:
+    """Refuse a name with another ending, and what cannot be written."""
+    if Path(path).suffix.lower() not in DRIVERS:
+        raise StageError(
+            "objects are written to a vector file",
+            found=str(path),
+            cure=f"Give a name that ends in {', '.join(DRIVERS)}",
+        )
+    vector("pyogrio")
+    vector("shapely")
+    for name in _names(Path(path), ("buildings",)).values():
+        check_writable(name, "objects")
+
+
+def _names(path: Path, layers: Any) -> dict[str, Path]:
+    """The file of each layer."""
+    many = DRIVERS[path.suffix.lower()][1]
+    return {name: path if many else path.with_name(f"{path.stem}_{name}{path.suffix}") for name in layers}
+
+
+def write_layers(path: str | Path, layers: dict[str, Layer], wkt: str = "") -> list[Path]:
+    """Write layers; the files that were written.
+
+    A GeoPackage holds all of them, with styles for QGIS; other formats get a file for each layer that has objects, named
+    after it, with a style beside it.
+    """
+    check_target(path)
+    target = Path(path)
+    driver, many = DRIVERS[target.suffix.lower()]
+    if many:
+        with whole_files(target, what="objects") as (part,):
+            for name, layer in layers.items():
+                _write(part, name, layer, driver, wkt)
+            _write_styles(part, layers)
+        return [target]
+    names = _names(target, [name for name, layer in layers.items() if layer.shapes])
+    for name, file in names.items():
+        styled = file.with_suffix(".qml")
+        with whole_files(file, styled, what="objects") as (part, style):
+            _write(part, name, layers[name], driver, wkt)
+            style.write_text(qml(layers[name].kind), encoding="utf-8")
+    return list(names.values())
+
+
+def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
+    pyogrio, shapely = vector("pyogrio"), vector("shapely")
+    options = {"layer": name} if driver == "GPKG" else {}
+    try:
+        pyogrio.raw.write(
+            path,
+            np.array([shapely.to_wkb(shape) for shape in layer.shapes], object),
+            list(layer.columns.values()),
+            list(layer.columns),
+            driver=driver,
+            geometry_type=layer.kind,
+            crs=wkt or None,
+            promote_to_multi=False,
+            append=False,
+            **options,
+        )
+    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, pyogrio.errors.CRSError) as error:
+        raise StageError("objects could not be written", found=str(error)) from None
+
+
+#: Fill of objects that are sure, and of those to be checked.
+_FILLS = {"sure": "214,78,60,140", CHECK: "250,190,20,200"}
+
+
+def qml(kind: str) -> str:
+    """A style for QGIS that tells what is sure from what is to be checked."""
+    symbol, layer, fill = {
+        "Point": ("marker", "SimpleMarker", "color"),
+        "LineString Z": ("line", "SimpleLine", "line_color"),
+    }.get(kind, ("fill", "SimpleFill", "color"))
+    categories = "".join(
+        f'<category value="{value}" symbol="{n}" label="{value}" render="true"/>' for n, value in enumerate(_FILLS)
+    )
+    symbols = "".join(
+        f'<symbol type="{symbol}" name="{n}" alpha="1"><layer class="{layer}" enabled="1" pass="0">'
+        f'<Option type="Map"><Option type="QString" name="{fill}" value="{color}"/></Option></layer></symbol>'
+        for n, color in enumerate(_FILLS.values())
+    )
+    return (
+        "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
+        '<qgis version="3.22" styleCategories="Symbology"><renderer-v2 type="categorizedSymbol" attr="verdict">'
+        f"<categories>{categories}</categories><symbols>{symbols}</symbols></renderer-v2></qgis>\n"
+    )
+
+
+def _write_styles(path: Path, layers: dict[str, Layer]) -> None:
+    """The table of styles that QGIS looks for in a GeoPackage."""
+    import sqlite3
+
+    base = sqlite3.connect(path)
+    try:
+        with base:
+            base.execute(
+                "CREATE TABLE layer_styles (id INTEGER PRIMARY KEY AUTOINCREMENT, f_table_catalog TEXT, "
+                "f_table_schema TEXT, f_table_name TEXT, f_geometry_column TEXT, styleName TEXT, styleQML TEXT, "
+                "styleSLD TEXT, useAsDefault BOOLEAN, description TEXT, owner TEXT, ui TEXT, "
+                "update_time DATETIME DEFAULT '2020-01-01T00:00:00.000Z')"
+            )
+            base.execute(
+                "INSERT INTO gpkg_contents (table_name, data_type, identifier, description, last_change, srs_id) "
+                "VALUES ('layer_styles', 'attributes', 'layer_styles', '', '2020-01-01T00:00:00.000Z', 0)"
+            )
+            base.executemany(
+                "INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, "
+                "styleName, styleQML, styleSLD, useAsDefault, description, owner) "
+                "VALUES ('', '', ?, 'geom', ?, ?, '', 1, '', '')",
+                [(name, name, qml(layer.kind)) for name, layer in layers.items()],
+            )
+    finally:
+        base.close()

@@ -1,0 +1,262 @@
+"""The command ``pdal-stages objects``: classified files in, one vector file out, objects across their borders whole.
+
+Each file is read once, in parts, into records of cells; these are kept until the end, so that a run that was stopped goes
+on with ``--resume``. Then objects are found block by block in the records of all files together.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import OptionError, StageError
+from ..base.files import check_writable, write_whole
+from ..base.las import read_header
+from ..base.plain import tell
+from ..base.progress import Progress
+from ..base.stamps import stamp
+from ..base.units import Units
+from ..base.version import __version__
+from ..objects import Cells, Objects, ObjectSettings, find_objects
+from ..objects.cells import kind_of_code
+from ..objects.measure import CHECK
+from ..pipeline import pdal as pdal_env
+from ..pipeline.overrides import Override
+from ..pipeline.processes import each_file
+from ..pipeline.references import check_one_reference, reference_of
+from ..reports.objectlayers import check_target, object_layers, write_layers
+from ..stages.objectoptions import refuse_unclassified
+from ..stages.objectswriter import STRAIGHT, ObjectsWriter
+from .cloudindex import BLOCK, open_las, read_block
+
+#: Blocks of points read at a time.
+_BLOCKS = 20
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """Add the flags to the parser of ``objects``."""
+    takes = command.add_argument
+    takes("inputs", nargs="+", metavar="input", help="Classified files PDAL can read, folders, patterns")
+    takes("output", help="Vector file to write: .gpkg, .geojson, .fgb or .shp")
+    takes("--outlines", choices=("straight", "cells"), help="Outlines along walls (default) or along cells")
+    takes("--cell", type=float, metavar="METRES", help="Side of the grid's cells (0.5)")
+    takes("--workers", type=int, default=1, metavar="N", help="Files read at the same time (1)")
+    takes("--resume", action="store_true", help="Keep what an earlier run read")
+    takes("--metadata", metavar="FILE", help="Write counts, verdicts and settings to a JSON file")
+
+
+def run_command(options: argparse.Namespace) -> int:
+    """Run ``pdal-stages objects``; the exit code."""
+    from ..pipeline.jobs import las_files
+
+    given = {name: value for name in ("outlines", "cell") if (value := getattr(options, name)) is not None}
+    stage = writer(options.output, options.overrides, **given)
+    if options.metadata:
+        check_writable(options.metadata, "metadata")
+    inputs = las_files(options.inputs)
+    found, reference = objects_of_files(inputs, stage, workers=options.workers, resume=options.resume)
+    layers = object_layers(found, straight=stage.outlines == STRAIGHT, units=reference[0])
+    files = write_layers(options.output, layers, reference[1])
+    _forget(options.output)
+    summary = summarize(found)
+    for kind, one in summary.items():
+        print(f"{one['objects']:,} {kind}, {one['to_be_checked']:,} to be checked")
+        for reason, count in one["reasons"].items():
+            print(f"  {reason:28s} {count:>10,}")
+    print("written to " + ", ".join(str(file) for file in files))
+    if options.metadata:
+        about = {
+            "version": __version__,
+            "inputs": inputs,
+            "files": [str(f) for f in files],
+            "settings": {one.name: getattr(stage.settings, one.name) for one in fields(ObjectSettings)},
+            "objects": summary,
+        }
+        write_whole(options.metadata, (json.dumps(about, indent=1) + "\n").encode(), "metadata")
+    return 0
+
+
+def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> ObjectsWriter:
+    """The stage whose options the command follows: those of ``--writers.objects.NAME=``, or ``--filters.objects.NAME=``."""
+    for one in overrides:
+        if one.stage not in ("writers.objects", "filters.objects"):
+            raise OptionError(
+                "objects takes options of writers.objects and filters.objects alone", found=one.flag
+            )
+        given[one.option] = one.value
+    return ObjectsWriter({**given, "filename": output})
+
+
+def summarize(found: Objects) -> dict[str, Any]:
+    """Objects by kind: how many, how many are to be checked, and why."""
+    out = {}
+    for kind, table in found.tables.items():
+        texts = table.columns["reason"].tolist() if len(table) else []
+        reasons = [reason for text in texts for reason in text.split(", ") if reason]
+        out[kind.name.lower() + "s"] = {
+            "objects": len(table),
+            "to_be_checked": int(np.count_nonzero(table.columns["verdict"] == CHECK)) if len(table) else 0,
+            "reasons": {reason: reasons.count(reason) for reason in sorted(set(reasons))},
+        }
+    return out
+
+
+def objects_of_files(
+    inputs: Sequence[str], stage: ObjectsWriter, *, workers: int = 1, resume: bool = False
+) -> tuple[Objects, tuple[Units, str]]:
+    """The objects of all files together; units of the coordinates and their reference (WKT)."""
+    check_target(stage.filename)
+    references = {path: _reference(path, stage) for path in inputs}
+    check_one_reference({path: one for path, (one, _) in references.items()})
+    units, wkt = references[inputs[0]][0].units, references[inputs[0]][1]
+    folder = _kept(stage.filename)
+    if not resume:
+        shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(exist_ok=True)
+    what = json.dumps({k: str(v) for k, v in sorted(stage.options.items())})
+    parts, failed, seen = [], [], np.zeros(256, bool)
+    work = []
+    for path in inputs:
+        mark = json.dumps([__version__, what, str(Path(path).resolve()), stamp(path)])
+        work.append((path, stage.options, units, wkt, str(folder / _digest(mark))))
+    sizes = [max(Path(path).stat().st_size, 1) if Path(path).exists() else 1 for path in inputs]
+    size_of = dict(zip(inputs, sizes, strict=True))
+    with Progress(sum(sizes) // 1000, "reading", "kB") as line:
+        for item, answer in each_file(read_cells, work, workers):
+            if answer.reason:
+                failed.append(answer.reason)
+            else:
+                seen |= np.array(answer.result, bool)
+            line.update(size_of[item[0]] // 1000)
+    if failed:
+        raise StageError(
+            f"{len(failed)} of {len(inputs)} inputs cannot be read",
+            found="; ".join(failed[:3]),
+            cure="Once they can be read, --resume reads these alone",
+        )
+    for *_, kept in work:
+        parts.append(_load(kept, stage.settings.cell))
+        if len(parts) == 32:  # so that overlapping files are not held apart
+            parts = [Cells.join(parts)]
+    cells = Cells.join(parts)
+    refuse_unclassified(cells, np.flatnonzero(seen).astype(np.uint8))
+    _tell_density(cells)
+    return find_objects(cells, stage.settings), (units, wkt)
+
+
+def _tell_density(cells: Cells) -> None:
+    """Say where cells are too small for the points."""
+    from ..objects.cells import Kind
+
+    roofs = cells.of_kind(Kind.BUILDING)
+    if len(roofs) > 100 and float(roofs.columns["count"].mean()) < 1.6:
+        mean = float(roofs.columns["count"].mean())
+        tell(
+            f"cells of {cells.size:g} m hold {mean:.1f} points of buildings on average, so roofs may fall apart: "
+            f"try --cell {2 * cells.size:g}"
+        )
+
+
+def _reference(path: str, stage: ObjectsWriter) -> tuple[Any, str]:
+    reader = {"type": pdal_env.inferred_reader(path), "filename": path}
+    if reader["type"] == "readers.las":
+        reader["count"] = 1
+    one = reference_of(reader, stage.horizontal_unit)
+    metadata = pdal_env.execute([dict(reader)], arrays=False).metadata.get("metadata", {})
+    node = metadata.get(reader["type"], {})
+    srs = (node[0] if isinstance(node, list) else node).get("srs", {})
+    return one, str(srs.get("horizontal") or srs.get("wkt") or "")
+
+
+def read_cells(path: str, options: dict[str, Any], units: Units, wkt: str, kept: str) -> list[int]:
+    """Read a file's records and keep them in a file; which class codes it has (256 of 0 or 1)."""
+    stage = ObjectsWriter(options)
+    target = Path(kept + ".npz")
+    if not target.exists():
+        seen = np.zeros(256, np.int64)
+        parts = [Cells(stage.settings.cell)]
+        kinds = kind_of_code(stage.classes)
+        for arrays in _points_of(path):
+            points = stage.points(arrays, wkt=wkt)
+            seen += np.bincount(points.class_codes, minlength=256)
+            usable = points.inside & ~points.chosen(stage.ignore)
+            usable &= kinds[points.class_codes] >= 0
+            x, y, z = points.xyz[usable].T
+            told = arrays.get("Reliability")
+            parts.append(
+                Cells.of(
+                    x,
+                    y,
+                    z,
+                    points.class_codes[usable],
+                    stage.settings.cell,
+                    reliability=None if told is None else told[usable],
+                    classes=stage.classes,
+                )
+            )
+            if len(parts) >= 8:
+                parts = [Cells.join(parts)]
+        cells = Cells.join(parts)
+        partial = target.with_name(f"partial-{target.name}")
+        np.savez(partial, key=cells.key, seen=(seen > 0).astype(np.int64), **cells.columns)  # type: ignore[arg-type]
+        partial.replace(target)
+    with np.load(target) as held:
+        return [int(v) for v in held["seen"]]
+
+
+def _load(kept: str, size: float) -> Cells:
+    with np.load(kept + ".npz") as held:
+        names = [name for name in held.files if name not in ("key", "seen")]
+        return Cells(size, held["key"], {name: held[name] for name in names})
+
+
+def _points_of(path: str) -> Iterator[dict[str, NDArray]]:
+    """The dimensions that objects read, a part of a LAS or LAZ file at a time; of others all, by PDAL."""
+    header = read_header(path) if Path(path).suffix.lower() in (".las", ".laz") else None
+    if header is None:
+        (points,) = pdal_env.execute([{"type": pdal_env.inferred_reader(path), "filename": path}]).arrays
+        yield {name: np.asarray(points[name]) for name in points.dtype.names}
+        return
+    with open_las(path) as reader:
+        total = reader.header.point_count
+        extra = [n for n in ("Reliability",) if n in reader.header.point_format.extra_dimension_names]
+        for start in range(0, total, BLOCK * _BLOCKS):
+            blocks = [
+                read_block(reader, path, at, total)
+                for at in range(start, min(start + BLOCK * _BLOCKS, total), BLOCK)
+            ]
+            made: dict[str, list[NDArray]] = {}
+            for points in blocks:
+                for name, values in (
+                    ("X", points.x),
+                    ("Y", points.y),
+                    ("Z", points.z),
+                    ("Classification", points.classification),
+                    ("Withheld", points.withheld),
+                    *((n, points[n]) for n in extra),
+                ):
+                    made.setdefault(name, []).append(np.asarray(values))
+            yield {name: np.concatenate(values) for name, values in made.items()}
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:24]
+
+
+def _kept(output: str) -> Path:
+    """The folder in which a run keeps what it read."""
+    path = Path(output).absolute()
+    return path.with_name(f".{path.name}.cells")
+
+
+def _forget(output: str) -> None:
+    shutil.rmtree(_kept(output), ignore_errors=True)
