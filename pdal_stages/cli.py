@@ -35,7 +35,7 @@ _SAID = 10
 _VERBOSE = ("-v", "--verbose")
 _LEVELS = {0: logging.ERROR, 1: logging.WARNING, 2: logging.INFO}
 #: Commands that work long enough for a log and progress.
-_LOGGED = ("pipeline", "classify", "train", "accuracy", "demo")
+_LOGGED = ("pipeline", "classify", "objects", "train", "accuracy", "demo")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -231,6 +231,16 @@ def _parser() -> argparse.ArgumentParser:
     takes("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
     add_arguments(commands.choices["classify"], survey=True)
 
+    add(
+        "objects",
+        _objects,
+        "Write buildings, trees, spans of wires and bridge decks of classified files to a vector file",
+        overrides=True,
+    )
+    from .tiling.objects import add_arguments as add_objects_arguments
+
+    add_objects_arguments(commands.choices["objects"])
+
     add("models", _models, "List the models that come with the package")
 
     takes = add("train", _train, "Train a model on labelled clouds", overrides=True)
@@ -417,6 +427,12 @@ def _classify(options: argparse.Namespace) -> int:
     return classify(
         ClassifyTask(tuple(options.inputs), options.output, request, options_of(options), **files), options
     )
+
+
+def _objects(options: argparse.Namespace) -> int:
+    from .tiling.objects import run_command
+
+    return run_command(options)
 
 
 def _models(options: argparse.Namespace) -> None:

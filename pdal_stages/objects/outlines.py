@@ -8,6 +8,7 @@ where the middle of its cells' steps lies. Walls between buildings are drawn onc
 from __future__ import annotations
 
 import importlib
+import itertools
 import math
 from typing import Any
 
@@ -119,8 +120,10 @@ def _straight(shapely: Any, shapes: list[Any], size: float) -> list[Any]:
         shell = straight_ring(_middles(part.exterior), angle)
         holes = [straight_ring(_middles(r), angle) for r in part.interiors]
         shape = _polygon(shapely, shell, holes)
-        box = shapely.oriented_envelope(part).buffer(-0.5, join_style="mitre")
-        if not part.interiors and _likeness(box, part) >= _BOXLIKE:
+        box = shapely.oriented_envelope(part)  # which the cells' corners make too large
+        box = box.buffer(-max(0.0, box.area - part.area) / box.length, join_style="mitre")
+        alike = _likeness(shape, part) - 0.03 if shape is not None else 0.0
+        if not part.interiors and _likeness(box, part) >= max(_BOXLIKE, alike):
             shape = box
         if shape is None or _likeness(shape, part) < _LIKENESS:
             shape = part.simplify(_TOLERANCE)
@@ -134,7 +137,8 @@ def _straight(shapely: Any, shapes: list[Any], size: float) -> list[Any]:
             between = one.boundary.intersection(other.boundary)
             if between.length > 0:
                 walls += [w for w in shapely.get_parts(shapely.line_merge(between)) if w.length > 0]
-    lines = [_lengthened(_straight_wall(np.array(w.coords), angle), 4.0) for w in walls]
+    corners = np.concatenate([np.array(ring.coords)[:-1] for ring in _rings(shapely, outer)])
+    lines = [_attached(_straight_wall(np.array(w.coords), angle), corners) for w in walls]
     parts = _divided(shapely, outer, lines, shapes)
     if not _good(parts, shapes):
         parts = _shared_out(shapely, outer, shapes)
@@ -142,11 +146,13 @@ def _straight(shapely: Any, shapes: list[Any], size: float) -> list[Any]:
 
 
 def _good(parts: list[Any], shapes: list[Any]) -> bool:
-    return all(p is not None and p.is_valid and _likeness(p, s) >= 0.5 for p, s in zip(parts, shapes, strict=True))
+    return all(
+        p is not None and p.is_valid and _likeness(p, s) >= 0.5 for p, s in zip(parts, shapes, strict=True)
+    )
 
 
 def _shared_out(shapely: Any, outer: Any, shapes: list[Any]) -> list[Any]:
-    """An outline shared out among the shapes in it: each what it covers, and what is left beside it; inner walls smoothed."""
+    """An outline shared out among the shapes in it: each what it covers, and what is left beside it."""
     parts = [shapely.intersection(outer, shape, grid_size=_GRID) for shape in shapes]
     left = shapely.difference(outer, shapely.union_all(parts, grid_size=_GRID), grid_size=_GRID)
     more: list[list[Any]] = [[part] for part in parts]
@@ -155,7 +161,8 @@ def _shared_out(shapely: Any, outer: Any, shapes: list[Any]) -> list[Any]:
         if max(shared, default=0.0) > 0:
             more[int(np.argmax(shared))].append(piece)
     whole = [_polygons(shapely, shapely.union_all(pieces, grid_size=_GRID)) for pieces in more]
-    return list(shapely.coverage_simplify(whole, _TOLERANCE, simplify_boundary=False))
+    inner = shapely.coverage_simplify(whole, _TOLERANCE, simplify_boundary=False)
+    return list(shapely.coverage_simplify(inner, 0.1))  # corners on straight walls, where cells crossed them
 
 
 def _polygons(shapely: Any, shape: Any) -> Any:
@@ -197,7 +204,7 @@ def _middles(ring: Any) -> NDArray[np.float64]:
     """Middles of the unit steps of a boundary along cells (n, 2)."""
     corners = np.rint(np.array(ring.coords)).astype(np.int64)
     out = []
-    for (x0, y0), (x1, y1) in zip(corners[:-1], corners[1:], strict=True):
+    for (x0, y0), (x1, y1) in itertools.pairwise(corners):
         n = max(abs(x1 - x0), abs(y1 - y0))
         t = (np.arange(n) + 0.5)[:, None] / n
         out.append(np.array([x0, y0]) + t * np.array([x1 - x0, y1 - y0]))
@@ -271,7 +278,7 @@ def straight_ring(places: NDArray, angle: float) -> NDArray[np.float64] | None:
     xy = np.roll(xy, -int(np.argmax(np.round(np.hypot(*(xy - xy.mean(axis=0)).T), 6))), axis=0)
     closed = np.vstack([xy, xy[:1]])
     at = _peucker(closed, _TOLERANCE)
-    lines = [_line(closed[a : b + 1]) for a, b in zip(at[:-1], at[1:], strict=True)]
+    lines = [_line(closed[a : b + 1]) for a, b in itertools.pairwise(at)]
     lines = _one_after_the_other(lines)
     if len(lines) < 3:
         return None
@@ -348,13 +355,13 @@ def _meeting(a: _Wall, b: _Wall) -> NDArray | None:
 def _straight_wall(corners: NDArray, angle: float) -> NDArray[np.float64]:
     """A wall between two buildings: few corners, its edges along or across the direction where they nearly are."""
     steps = []
-    for (x0, y0), (x1, y1) in zip(corners[:-1], corners[1:], strict=True):
+    for (x0, y0), (x1, y1) in itertools.pairwise(corners):
         n = max(1, round(max(abs(x1 - x0), abs(y1 - y0))))
         t = (np.arange(n) + 0.5)[:, None] / n
         steps.append(np.array([x0, y0]) + t * np.array([x1 - x0, y1 - y0]))
     xy = _turned(np.concatenate([corners[:1], *steps, corners[-1:]]), angle)
     at = _peucker(xy, _TOLERANCE)
-    lines = [_line(xy[a : b + 1]) for a, b in zip(at[:-1], at[1:], strict=True)]
+    lines = [_line(xy[a : b + 1]) for a, b in itertools.pairwise(at)]
     if len(lines) == 1:
         _, place, way, length = lines[0]
         sign = 1.0 if float(way @ (xy[-1] - xy[0])) >= 0 else -1.0
@@ -363,14 +370,18 @@ def _straight_wall(corners: NDArray, angle: float) -> NDArray[np.float64]:
     return _turned(xy[at], -angle)
 
 
-def _lengthened(xy: NDArray, by: float) -> NDArray[np.float64]:
-    """A line that goes on at both ends."""
+def _attached(xy: NDArray, corners: NDArray, near: float = 2.5, by: float = 4.0) -> NDArray[np.float64]:
+    """A line whose ends lie at corners near them, or else go on."""
     out = np.array(xy, np.float64)
     for end, before in ((0, 1), (-1, -2)):
-        away = out[end] - out[before]
-        length = math.hypot(*away)
+        away = np.hypot(*(corners - out[end]).T)
+        if away.min() <= near:
+            out[end] = corners[int(np.argmin(away))]
+            continue
+        way = out[end] - out[before]
+        length = math.hypot(*way)
         if length > 0:
-            out[end] = out[end] + away * (by / length)
+            out[end] = out[end] + way * (by / length)
     return out
 
 

@@ -180,7 +180,8 @@ def qml(kind: str) -> str:
         "LineString Z": ("line", "SimpleLine", "line_color"),
     }.get(kind, ("fill", "SimpleFill", "color"))
     categories = "".join(
-        f'<category value="{value}" symbol="{n}" label="{value}" render="true"/>' for n, value in enumerate(_FILLS)
+        f'<category value="{value}" symbol="{n}" label="{value}" render="true"/>'
+        for n, value in enumerate(_FILLS)
     )
     symbols = "".join(
         f'<symbol type="{symbol}" name="{n}" alpha="1"><layer class="{layer}" enabled="1" pass="0">'

@@ -46,8 +46,8 @@ whatever the unit of the coordinates; names fit into shapefiles):
 - `spans`: lines along wires. `length`, `h_low` (the lowest point above the ground), `z_high`, `sag`.
 - `decks`: polygons of bridges. `area`, `z`, `clear`ance above what is below, `ground`.
 
-All have `object_id`, `points`, `reliab` (the points' mean `Reliability`, where they have one), `verdict` (sure, check) and the
-`reason` of a check. Straight outlines follow the main direction of what stands wall to wall; neighbors that touch share
+All have `object_id`, `points`, `reliab` (the points' mean `Reliability`, where they have one), `verdict` (sure, check) and
+the `reason` of a check. Straight outlines follow the main direction of what stands wall to wall; neighbors that touch share
 their edge; where no straight outline is like the cells, theirs is taken. A GeoPackage carries styles for QGIS, which
 tell what is to be checked; beside other files lies a `.qml`. Needs the extra `vector` (pyogrio, shapely).
 """

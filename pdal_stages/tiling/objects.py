@@ -30,9 +30,10 @@ from ..objects import Cells, Objects, ObjectSettings, find_objects
 from ..objects.cells import kind_of_code
 from ..objects.measure import CHECK
 from ..pipeline import pdal as pdal_env
+from ..pipeline.ends import input_files
 from ..pipeline.overrides import Override
 from ..pipeline.processes import each_file
-from ..pipeline.references import check_one_reference, reference_of
+from ..pipeline.references import Reference, check_one_reference, reference_of
 from ..reports.objectlayers import check_target, object_layers, write_layers
 from ..stages.objectoptions import refuse_unclassified
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter
@@ -56,13 +57,11 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run_command(options: argparse.Namespace) -> int:
     """Run ``pdal-stages objects``; the exit code."""
-    from ..pipeline.jobs import las_files
-
     given = {name: value for name in ("outlines", "cell") if (value := getattr(options, name)) is not None}
     stage = writer(options.output, options.overrides, **given)
     if options.metadata:
         check_writable(options.metadata, "metadata")
-    inputs = las_files(options.inputs)
+    inputs = input_files(options.inputs)
     found, reference = objects_of_files(inputs, stage, workers=options.workers, resume=options.resume)
     layers = object_layers(found, straight=stage.outlines == STRAIGHT, units=reference[0])
     files = write_layers(options.output, layers, reference[1])
@@ -88,7 +87,7 @@ def run_command(options: argparse.Namespace) -> int:
 def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> ObjectsWriter:
     """The stage whose options the command follows: those of ``--writers.objects.NAME=``, or ``--filters.objects.NAME=``."""
     for one in overrides:
-        if one.stage not in ("writers.objects", "filters.objects"):
+        if one.by_tag or one.selector not in ("writers.objects", "filters.objects"):
             raise OptionError(
                 "objects takes options of writers.objects and filters.objects alone", found=one.flag
             )
@@ -127,7 +126,7 @@ def objects_of_files(
     work = []
     for path in inputs:
         mark = json.dumps([__version__, what, str(Path(path).resolve()), stamp(path)])
-        work.append((path, stage.options, units, wkt, str(folder / _digest(mark))))
+        work.append((path, stage, wkt, str(folder / _digest(mark))))
     sizes = [max(Path(path).stat().st_size, 1) if Path(path).exists() else 1 for path in inputs]
     size_of = dict(zip(inputs, sizes, strict=True))
     with Progress(sum(sizes) // 1000, "reading", "kB") as line:
@@ -166,20 +165,25 @@ def _tell_density(cells: Cells) -> None:
         )
 
 
-def _reference(path: str, stage: ObjectsWriter) -> tuple[Any, str]:
-    reader = {"type": pdal_env.inferred_reader(path), "filename": path}
-    if reader["type"] == "readers.las":
-        reader["count"] = 1
-    one = reference_of(reader, stage.horizontal_unit)
-    metadata = pdal_env.execute([dict(reader)], arrays=False).metadata.get("metadata", {})
-    node = metadata.get(reader["type"], {})
+def _reference(path: str, stage: ObjectsWriter) -> tuple[Reference, str]:
+    """A file's reference, and its well-known text."""
+    reader: dict[str, Any] = {"filename": path}
+    if _is_las(path):
+        reader |= {"type": "readers.las", "count": 1}
+    metadata = pdal_env.execute([reader], arrays=False).metadata.get("metadata", {})
+    name = next(key for key in metadata if key.startswith("readers."))
+    node = metadata[name]
     srs = (node[0] if isinstance(node, list) else node).get("srs", {})
+    one = reference_of({**reader, "type": name}, stage.horizontal_unit)
     return one, str(srs.get("horizontal") or srs.get("wkt") or "")
 
 
-def read_cells(path: str, options: dict[str, Any], units: Units, wkt: str, kept: str) -> list[int]:
+def _is_las(path: str) -> bool:
+    return Path(path).suffix.lower() in (".las", ".laz") and read_header(path) is not None
+
+
+def read_cells(path: str, stage: ObjectsWriter, wkt: str, kept: str) -> list[int]:
     """Read a file's records and keep them in a file; which class codes it has (256 of 0 or 1)."""
-    stage = ObjectsWriter(options)
     target = Path(kept + ".npz")
     if not target.exists():
         seen = np.zeros(256, np.int64)
@@ -221,10 +225,9 @@ def _load(kept: str, size: float) -> Cells:
 
 def _points_of(path: str) -> Iterator[dict[str, NDArray]]:
     """The dimensions that objects read, a part of a LAS or LAZ file at a time; of others all, by PDAL."""
-    header = read_header(path) if Path(path).suffix.lower() in (".las", ".laz") else None
-    if header is None:
-        (points,) = pdal_env.execute([{"type": pdal_env.inferred_reader(path), "filename": path}]).arrays
-        yield {name: np.asarray(points[name]) for name in points.dtype.names}
+    if not _is_las(path):
+        for points in pdal_env.execute([{"filename": path}]).arrays:
+            yield {name: np.asarray(points[name]) for name in points.dtype.names}
         return
     with open_las(path) as reader:
         total = reader.header.point_count

@@ -1,0 +1,195 @@
+"""Outlines, ``writers.objects`` and ``pdal-stages objects``: files as GDAL reads them back."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+
+import laspy
+import numpy as np
+import pytest
+
+import pdal_stages as ps
+from pdal_stages import cli
+from pdal_stages.base.errors import StageError
+from pdal_stages.objects.outlines import main_direction, raw_outlines, straight_outlines, straight_ring
+from pdal_stages.pipeline.run import Pipeline
+from pdal_stages.synthetic import write_town
+
+shapely = pytest.importorskip("shapely")
+pytest.importorskip("shapely.affinity")
+pyogrio = pytest.importorskip("pyogrio")
+LAYERS = ("buildings", "trees", "crowns", "spans", "decks")
+
+
+def layer(path, name=None):
+    """Columns and shapes of a layer as GDAL reads it, and its description."""
+    about, _, geometry, fields = pyogrio.raw.read(path, layer=name)
+    return dict(zip(about["fields"], fields, strict=True)), shapely.from_wkb(geometry), about
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("files")
+    town = ps.make_town(140.0, 8.0, seed=4, progress=False)
+    write_town(town, folder / "town.laz")
+    las = laspy.read(folder / "town.laz")
+    (folder / "parts").mkdir()
+    for number in range(4):
+        mine = (las.x >= 500_070) == number % 2
+        mine &= (las.y >= 5_400_070) == number // 2
+        part = laspy.LasData(las.header)
+        part.points = las.points[mine]
+        part.write(folder / "parts" / f"{number}.laz")
+    return folder
+
+
+def turned_rectangles(*boxes, angle=0.3):
+    """Rectangles on a grid of cells, turned, as unions of the cells they cover most of."""
+    c, s = np.cos(angle), np.sin(angle)
+    true = [shapely.affinity.rotate(shapely.box(*b), angle, origin=(0, 0), use_radians=True) for b in boxes]
+    grid = [shapely.box(x, y, x + 1, y + 1) for x in range(-60, 80) for y in range(-20, 90)]
+    owners = [next((k for k, t in enumerate(true) if t.contains(g.centroid)), -1) for g in grid]
+    assert abs(c * c + s * s - 1) < 1e-9
+    return true, [
+        shapely.union_all([g for g, o in zip(grid, owners, strict=True) if o == k]) for k in range(len(true))
+    ]
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, 0.7, 1.2])
+def test_walls_are_straight(angle):
+    true, cells = turned_rectangles((5, 5, 45, 25), angle=angle)
+    (made,) = straight_outlines(cells, 0.5)
+    assert made.is_valid and len(made.exterior.coords) == 5
+    assert made.symmetric_difference(true[0]).area < 0.05 * true[0].area
+
+
+def test_neighbors_share_their_wall():
+    true, cells = turned_rectangles((5, 5, 30, 25), (30, 5, 50, 20), angle=0.4)
+    made = straight_outlines(cells, 0.5)
+    assert all(m.is_valid for m in made)
+    assert made[0].intersection(made[1]).area < 1e-6
+    assert made[0].boundary.intersection(made[1].boundary).length > 12
+    for m, t in zip(made, true, strict=True):
+        assert m.intersection(t).area / m.union(t).area > 0.9
+
+
+def test_an_l_keeps_its_corner():
+    shape = shapely.box(0, 0, 40, 20).union(shapely.box(0, 20, 16, 40))
+    (made,) = straight_outlines([shape], 0.5)
+    assert made.equals(shape) or made.symmetric_difference(shape).area < 25
+    ring = shapely.segmentize(shape, 1.0).exterior
+    places = np.array(ring.coords)[:-1] + 0.0
+    assert main_direction(places) % (np.pi / 2) == pytest.approx(0, abs=0.01)
+    assert straight_ring(places[:5], 0.0) is None
+
+
+def test_holes_stay_and_small_ones_close():
+    from pdal_stages.objects import Cells, find_objects
+    from pdal_stages.objects.cells import Kind
+
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(0, 40, 0.25), np.arange(0, 40, 0.25)))
+    court = (np.abs(x - 20) < 5) & (np.abs(y - 20) < 5)
+    chimney = (np.abs(x - 8) < 0.8) & (np.abs(y - 8) < 0.8)
+    roof = (x > 4) & (x < 36) & (y > 4) & (y < 36) & ~court & ~chimney
+    found = find_objects(
+        Cells.of(x, y, np.where(roof, 6.0, 0.0), np.where(roof, 6, 2).astype(np.uint8), 0.5), progress=False
+    )
+    raw = raw_outlines(found.tables[Kind.BUILDING], 0.5)
+    for (shape,) in (raw, straight_outlines(raw, 0.5)):
+        assert shape.is_valid and len(shape.interiors) == 1
+        assert shapely.Polygon(shape.interiors[0]).area * 0.25 == pytest.approx(100, rel=0.15)
+
+
+@pytest.mark.pdal
+def test_one_file_or_four_give_the_same(folder, capsys):
+    assert cli.main(["objects", str(folder / "town.laz"), str(folder / "one.gpkg")]) == 0
+    assert cli.main(["objects", str(folder / "parts"), str(folder / "four.gpkg"), "--workers", "2"]) == 0
+    assert "buildings, " in capsys.readouterr().out
+    assert not list(folder.glob(".*"))
+    for name in LAYERS:
+        one, shapes, about = layer(folder / "one.gpkg", name)
+        four, others, _ = layer(folder / "four.gpkg", name)
+        assert about["crs"] == "EPSG:25832" and list(one) == list(four)
+        for column in one:
+            np.testing.assert_array_equal(one[column], four[column])
+        assert all(shapely.equals_exact(shapes, others)) and shapely.is_valid(shapes).all()
+        assert len(set(one["object_id"].tolist())) == len(shapes)
+    buildings, shapes, _ = layer(folder / "one.gpkg", "buildings")
+    assert len(shapes) > 15 and (buildings["h_ridge"] >= buildings["h_eave"]).all()
+    overlap = shapely.area(shapes).sum() - shapely.union_all(shapes).area
+    assert overlap < 1e-2 * len(shapes)
+    with sqlite3.connect(folder / "one.gpkg") as base:
+        styled = base.execute("SELECT f_table_name, styleQML FROM layer_styles").fetchall()
+    assert [name for name, _ in styled] == list(LAYERS) and all("verdict" in text for _, text in styled)
+
+
+@pytest.mark.pdal
+@pytest.mark.parametrize("ending", ["geojson", "fgb", "shp"])
+def test_other_formats_hold_the_same(folder, tmp_path, ending):
+    target = tmp_path / f"town.{ending}"
+    job = [str(folder / "town.laz"), {"type": "writers.objects", "filename": str(target)}]
+    Pipeline(job).execute(arrays=False)
+    Pipeline([job[0], {**job[1], "filename": str(tmp_path / "town.gpkg")}]).execute(arrays=False)
+    one, shapes, about = layer(tmp_path / f"town_buildings.{ending}")
+    two, others, _ = layer(tmp_path / "town.gpkg", "buildings")
+    order, other = np.argsort(one["object_id"]), np.argsort(two["object_id"])
+    np.testing.assert_array_equal(one["object_id"][order], two["object_id"][other])
+    np.testing.assert_allclose(one["h_ridge"][order], two["h_ridge"][other], atol=1e-3)
+    np.testing.assert_allclose(shapely.area(shapes[order]), shapely.area(others[other]), atol=1e-3)
+    assert about["crs"] and (tmp_path / "town_buildings.qml").read_text().startswith("<!DOCTYPE qgis")
+
+
+@pytest.mark.pdal
+def test_a_stopped_run_goes_on(folder, tmp_path, monkeypatch):
+    from pdal_stages.tiling import objects
+
+    bad = tmp_path / "bad.laz"
+    bad.write_bytes((folder / "parts" / "0.laz").read_bytes()[:-3000])
+    target = tmp_path / "town.gpkg"
+    parts = [str(folder / "parts" / f"{n}.laz") for n in (1, 2, 3)]
+    assert cli.main(["objects", *parts, str(bad), str(target)]) == 1
+    assert not target.exists()
+    read = []
+    original = objects._points_of
+    monkeypatch.setattr(objects, "_points_of", lambda path: read.append(path) or original(path))
+    bad.write_bytes((folder / "parts" / "0.laz").read_bytes())
+    assert cli.main(["objects", *parts, str(bad), str(target), "--resume"]) == 0
+    assert str(bad) in read and len(read) <= 4 and target.exists()
+
+
+@pytest.mark.pdal
+def test_settings_and_metadata(folder, tmp_path):
+    def run(*more):
+        files = [str(folder / "town.laz"), str(tmp_path / "t.gpkg"), "--metadata", str(tmp_path / "m.json")]
+        assert cli.main(["objects", *files, *more]) == 0
+        return json.loads((tmp_path / "m.json").read_text())
+
+    one, two = run(), run("--writers.objects.tree_height=9", "--cell", "1", "--outlines", "cells")
+    assert two["settings"]["tree_height"] == 9 and two["settings"]["cell"] == 1
+    assert two["objects"]["trees"]["objects"] < one["objects"]["trees"]["objects"]
+
+
+@pytest.mark.pdal
+@pytest.mark.parametrize(
+    ("target", "text"),
+    [("town.txt", "ends in .gpkg"), ("nowhere/town.gpkg", "nowhere"), ("town.gpkg", "no point has a class")],
+)
+def test_what_cannot_be(folder, tmp_path, target, text, capsys):
+    las = laspy.read(folder / "parts" / "0.laz")
+    las.classification[:] = 1
+    las.write(tmp_path / "raw.laz")
+    assert cli.main(["objects", str(tmp_path / "raw.laz"), str(tmp_path / target)]) == 1
+    assert text in capsys.readouterr().err
+    assert not (tmp_path / target).exists()
+
+
+def test_without_the_extra(monkeypatch):
+    from pdal_stages.objects import outlines
+
+    def missing(name):
+        raise ImportError(f"No module named '{name}'")
+
+    monkeypatch.setattr(outlines.importlib, "import_module", missing)
+    with pytest.raises(StageError, match=r"pip install 'pdal-stages\[vector\]'"):
+        outlines.vector("shapely")
