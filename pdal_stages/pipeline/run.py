@@ -17,9 +17,9 @@ from ..base.las import check_readable, odd_text, supersede_copc
 from ..base.outputs import Output, check_outputs
 from ..base.shortage import check_limit
 from ..stages import registry
+from . import packing, runtime
 from . import pdal as pdal_env
-from . import runtime
-from .filenames import is_writer, named_files, readers_files, stage_files, with_outputs, writers_outputs
+from .filenames import is_writer, named_files, readers_files, stage_files, writers_outputs
 from .foreseen import check_dimensions, unread_extra_dimensions
 from .interrupts import gentle
 from .lowering import Lowered, lower
@@ -159,9 +159,10 @@ class Pipeline:
                 try:
                     with gentle(signal.SIGINT) as interrupts:
                         result = pdal_env.execute(
-                            with_outputs(stages, partials), arrays=arrays, loglevel=loglevel
+                            packing.unpacked(stages, partials), arrays=arrays, loglevel=loglevel
                         )
                         interrupts.check()
+                    packed = packing.pack(partials)
                 finally:
                     self.reports = []
                     for ours in self.lowered.ours:
@@ -176,6 +177,7 @@ class Pipeline:
                 raise KeyboardInterrupt from None
             raise failure or self._located(error) from None
         names = {str(made): final for made, final in zip(partials, outputs, strict=True)}
+        names |= {made: names.get(target, target) for made, target in packed.items()}
         self.metadata = _renamed(_named_metadata(result.metadata, self.reports), names)
         self.arrays, self.said = result.arrays, pdal_env.said(result.log)
         return result.count

@@ -98,17 +98,13 @@ def _code_limit(writer: dict[str, Any], before: list[dict[str, Any]]) -> CodeLim
             f"(LAS 1.{minor}, dataformat_id {format_id})",
             'Give writers.las "minor_version": 4 and "dataformat_id": 6 (7 with colours, 8 with near infrared)',
         )
-    compressed = str(writer.get("compression", "")).lower() not in ("", "none", "false") or str(
-        writer.get("filename", "")
-    ).lower().endswith(".laz")
-    if compressed and not pdal_env.writes_extended_classes_to_laz():
-        return CodeLimit(
-            LEGACY_LIMIT,
-            f"PDAL {pdal_env.dotted_version()} cannot write class codes above {LEGACY_LIMIT} to LAZ 1.4: they "
-            "would come out wrong",
-            "Write .las and compress it afterwards, or use PDAL 2.3 or later",
-        )
     return None
+
+
+def compresses(writer: dict[str, Any]) -> bool:
+    """Whether a writer of LAS writes LAZ."""
+    named = str(writer.get("filename", "")).lower().endswith(".laz")
+    return named or str(writer.get("compression", "")).lower() not in ("", "none", "false")
 
 
 def las_version(writer: dict[str, Any], before: Iterable[dict[str, Any]]) -> tuple[int, int]:

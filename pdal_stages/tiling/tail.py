@@ -13,7 +13,7 @@ from ..base.complete import check_complete
 from ..base.errors import StageError
 from ..base.files import whole_files
 from ..base.las import supersede_copc
-from ..pipeline import classflags, extradims
+from ..pipeline import classflags, extradims, packing
 from ..pipeline import pdal as pdal_env
 from ..pipeline.callbacks import Callbacks
 from .results import NewValues
@@ -53,12 +53,11 @@ def run_tail(
         with whole_files(*outputs, check=finish) as partials:
             waiting = iter(partials)
             for stage in tail:
-                stages.append(
-                    {**stage, "filename": str(next(waiting))}
-                    if stage["type"].startswith("writers.")
-                    else stage
-                )
+                if stage["type"].startswith("writers."):
+                    stage = packing.unpacked_writer({**stage, "filename": str(next(waiting))}, readers)
+                stages.append(stage)
             run = pdal_env.execute(extradims.settle(stages), arrays=False)
+            packing.pack(partials)
     return written(outputs, run.count)
 
 
