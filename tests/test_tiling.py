@@ -20,9 +20,9 @@ from pdal_stages.synthetic.townfile import wkt
 from pdal_stages.terrain.minima import terrain_reach
 from pdal_stages.tiling import TilingOptions, run_tiled
 from pdal_stages.tiling.cloudindex import index_las
-from pdal_stages.tiling.extract import cut, plain_header
+from pdal_stages.tiling.extract import Member, cut, plain_header
 from pdal_stages.tiling.grid import TileGrid, inside, touching
-from pdal_stages.tiling.sources import find_sources, las_extent
+from pdal_stages.tiling.sources import InputSource, find_sources, las_extent
 from pdal_stages.tiling.tileplan import make_plan
 
 pytestmark = pytest.mark.pdal
@@ -104,7 +104,8 @@ def test_a_cut_is_the_files_own_bytes(tmp_path, random_cloud, write_las, suffix,
     assert index.count == len(xyz) and sum(n for _, _, n in index.tiles) == len(xyz)
     assert touching(index.boxes, (0, 0, 10, 100)) == [0]
     target = tmp_path / "piece.las"
-    piece = cut(str(path), index, TileGrid(25.0), (1, 2), 3.0, str(target), str(tmp_path / "core.las"))
+    member = Member(InputSource(str(path), {}, "las"), str(path), index)
+    piece = cut([member], TileGrid(25.0), (1, 2), 3.0, str(target), str(tmp_path / "core.las"))
     las, all_ = laspy.read(target), laspy.read(path)
     expected = np.flatnonzero((xyz[:, 0] >= 22) & (xyz[:, 0] <= 53) & (xyz[:, 1] >= 47) & (xyz[:, 1] <= 78))
     assert np.array_equal(piece.index, expected)

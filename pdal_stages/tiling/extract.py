@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import struct
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,25 +16,65 @@ from numpy.typing import NDArray
 from ..base import las
 from ..base.errors import StageError
 from .cloudindex import BLOCK, CloudIndex, open_las, read_block
-from .grid import TileGrid, touching
+from .grid import Box, TileGrid, touching
+from .sources import InputSource
 
 _COMPRESSOR = b"laszip encoded"
+#: Bytes of the header that decide how points are read: encoding, version, sizes, point format, scales and offsets.
+_COMPARED = ((6, 8), (24, 26), (94, 107), (131, 179))
+#: Points of a file at most that is kept in memory; 2,048 such files hold 250 MB or less.
+_SMALL = 2_500
+
+
+@dataclass(frozen=True)
+class Member:
+    """An input of which a part is cut out."""
+
+    source: InputSource
+    path: str  #: the file that holds its points: its own, or what was fetched of it
+    index: CloudIndex
 
 
 @dataclass
 class Piece:
-    """Points of one file, in that file's order, as an uncompressed LAS file."""
+    """Points of one file, or of several that are alike, in their order, as an uncompressed LAS file."""
 
     path: str
     core: str  #: another file, with the tile's own points alone; empty where none was asked for
-    index: NDArray[np.int64]  #: (n,) number of each point in the input file
+    index: NDArray[np.int64]  #: (n,) number of each point in its input file
     #: (n,) how far it lies outside the tile, in the unit of the coordinates; -1 inside
     away: NDArray[np.float64]
+    spans: list[tuple[InputSource, int, int]]  #: whose points are the rows from one number to another
 
     @cached_property
     def own(self) -> NDArray[np.int64]:
         """Rows of the tile's own points."""
         return np.flatnonzero(self.away < 0)
+
+    @property
+    def reader(self) -> dict[str, Any]:
+        """The reader of its inputs, without a file's name."""
+        return {**self.spans[0][0].reader, "type": "readers.las"}
+
+
+def likeness(path: str) -> bytes:
+    """What is the same in files whose points may go through one reader: everything before them but counts and extents.
+
+    Name and date of the file's maker and its identifiers are not looked at.
+    """
+    status = os.stat(path)
+    return _likeness(path, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=1 << 16)
+def _likeness(path: str, changed: int, size: int) -> bytes:
+    head, tail = plain_header(path)
+    digest = hashlib.sha256(tail)
+    for start, end in _COMPARED:
+        digest.update(head[start:end])
+    (length,) = struct.unpack_from("<H", head, 94)
+    digest.update(head[length:])
+    return digest.digest()
 
 
 def plain_header(path: str) -> tuple[bytearray, bytes]:
@@ -72,61 +114,95 @@ def finish(file: Any, head: bytearray, tail: bytes, count: int) -> None:
 
 
 def cut(
-    path: str,
-    index: CloudIndex,
+    members: Sequence[Member],
     grid: TileGrid,
     tile: tuple[int, int],
     halo: float,
     target: str,
     core: str = "",
 ) -> Piece | None:
-    """Cut a tile and its surroundings out of a LAS or LAZ file; None where the file has no point there.
+    """Cut a tile and its surroundings out of files that are alike (:func:`likeness`); None where they have no point there.
 
     `halo` is in the unit of the coordinates. A LAS file `target` is written, and a second one, `core`, for the tile's
     own points alone, where it is given.
     """
     box = grid.box(tile, halo)
-    blocks = touching(index.boxes, box)
-    if not blocks:
-        return None
     rows_cut: list[NDArray[np.int64]] = []
     aways: list[NDArray[np.float64]] = []
-    cores = 0
-    head, tail = plain_header(path)
+    spans: list[tuple[InputSource, int, int]] = []
+    cores = found = 0
+    head, tail = plain_header(members[0].path)
+    (width,) = struct.unpack_from("<H", head, 105)
     try:
-        with open_las(path) as reader, open(target, "wb") as out, open(core or os.devnull, "wb") as core_out:
+        with open(target, "wb") as out, open(core or os.devnull, "wb") as core_out:
             out.write(head)
             core_out.write(head)
-            for block in blocks:
-                start = block * BLOCK
-                points = read_block(reader, path, start, index.count)
-                x, y = np.asarray(points.x), np.asarray(points.y)
-                rows = np.flatnonzero((x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3]))
-                if not rows.size:
-                    continue
-                away = outside(x[rows], y[rows], grid, tile)
-                raw = points.array[rows]
-                if raw.dtype.itemsize != struct.unpack_from("<H", head, 105)[0]:
-                    raise StageError("the points have another length than the header says", where=path)
-                out.write(raw.tobytes())
-                if core:
-                    mine = away < 0
-                    core_out.write(raw[mine].tobytes())
-                    cores += int(np.count_nonzero(mine))
-                rows_cut.append(rows + start)
-                aways.append(away)
-            found = sum(map(len, rows_cut))
+            for member in members:
+                first = found
+                for start, points in _blocks(member, box):
+                    x, y = points.x, points.y
+                    rows = np.flatnonzero((x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3]))
+                    if not rows.size:
+                        continue
+                    away = outside(x[rows], y[rows], grid, tile)
+                    raw = points.array[rows]
+                    if raw.dtype.itemsize != width:
+                        raise StageError(
+                            "the points have another length than the header says", where=member.path
+                        )
+                    out.write(raw.tobytes())
+                    if core:
+                        mine = away < 0
+                        core_out.write(raw[mine].tobytes())
+                        cores += int(np.count_nonzero(mine))
+                    rows_cut.append(rows + start)
+                    aways.append(away)
+                    found += len(rows)
+                if found > first:
+                    spans.append((member.source, first, found))
             finish(out, bytearray(head), tail, found)
             if core:
                 finish(core_out, bytearray(head), tail, cores)
     except OSError as error:
-        raise StageError("a tile could not be cut out", where=path, found=error) from error
+        raise StageError("a tile could not be cut out", where=members[0].path, found=error) from error
     if not rows_cut:
         os.unlink(target)
         if core:
             os.unlink(core)
         return None
-    return Piece(target, core, np.concatenate(rows_cut), np.concatenate(aways))
+    return Piece(target, core, np.concatenate(rows_cut), np.concatenate(aways), spans)
+
+
+class _Points(NamedTuple):
+    """Points as a file holds them, and their coordinates."""
+
+    array: NDArray
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+
+
+def _blocks(member: Member, box: Box) -> Iterator[tuple[int, _Points]]:
+    """Blocks of a file that may have points in a box, each with the number of its first."""
+    blocks = touching(member.index.boxes, box)
+    if not blocks:
+        return
+    if member.index.count <= _SMALL:
+        status = os.stat(member.path)
+        yield 0, _small(member.path, member.index.count, status.st_mtime_ns, status.st_size)
+        return
+    with open_las(member.path) as reader:
+        for block in blocks:
+            start = block * BLOCK
+            points = read_block(reader, member.path, start, member.index.count)
+            yield start, _Points(points.array, np.asarray(points.x), np.asarray(points.y))
+
+
+@lru_cache(maxsize=2048)
+def _small(path: str, count: int, changed: int, size: int) -> _Points:
+    """All points of a small file, which tiles side by side read again and again."""
+    with open_las(path) as reader:
+        points = read_block(reader, path, 0, count)
+        return _Points(points.array, np.array(points.x), np.array(points.y))
 
 
 def outside(x: NDArray, y: NDArray, grid: TileGrid, tile: tuple[int, int]) -> NDArray[np.float64]:

@@ -69,10 +69,12 @@ class FileTask:
 def write_tile(results: list[PieceResults], plan: TilePlan, outputs: list[str]) -> dict[str, Any]:
     """Write one tile's own points, from the files that were cut for it."""
     mine = [result for result in results if result.piece.own.size]
-    tail = with_beside(plan.tail, plan.beside, [result.source.path for result in mine])
+    tail = with_beside(
+        plan.tail, plan.beside, [source.path for result in mine for source, *_ in result.piece.spans]
+    )
     if not mine:
         return {"outputs": []}
-    readers = [{**r.source.reader, "type": "readers.las", "filename": r.piece.core} for r in mine]
+    readers = [{**result.piece.reader, "filename": result.piece.core} for result in mine]
     return run_tail(readers, [of_own_points(result) for result in mine], tail, outputs)
 
 

@@ -21,7 +21,6 @@ from ..stages.base import Stage
 from .extract import Piece
 from .grid import Box, TileGrid
 from .results import PieceResults
-from .sources import InputSource
 from .tileplan import INPUT, OUTSIDE, ROW, TilePlan
 
 _MARK_TYPES = {ROW: "uint32_t", INPUT: "uint32_t", OUTSIDE: "double"}
@@ -49,22 +48,20 @@ class HeadRun:
     notes: list[str] = field(default_factory=list)  #: warnings and notes
 
 
-def run_head(
-    context: RunContext, tile: tuple[int, int], cuts: list[tuple[InputSource, Piece]], everything: bool
-) -> HeadRun:
+def run_head(context: RunContext, tile: tuple[int, int], cuts: list[Piece], everything: bool) -> HeadRun:
     """Run the head once; `everything`: all inputs were read, so nothing can lie farther away."""
     plan = context.plan
     if not plan.head:
-        return HeadRun([PieceResults(source, piece, piece.own, {}) for source, piece in cuts], 0.0)
-    marks = [_Mark(number, piece, context) for number, (_, piece) in enumerate(cuts)]
+        return HeadRun([PieceResults(piece, piece.own, {}) for piece in cuts], 0.0)
+    marks = [_Mark(number, piece, context) for number, piece in enumerate(cuts)]
     old = [mark.old_format for mark in marks]
     for mark in marks:
         mark.mixed = any(old) and not all(old)
     reaches: dict[int, _Reach] = {}
     with Callbacks() as callbacks:
         stages: list[dict[str, Any]] = []
-        for number, (source, piece) in enumerate(cuts):
-            reader = {**source.reader, "type": "readers.las", "filename": piece.path, "tag": f"in{number}"}
+        for number, piece in enumerate(cuts):
+            reader = {**piece.reader, "filename": piece.path, "tag": f"in{number}"}
             marked = callbacks.filter(marks[number], _MARK_TYPES, inputs=[f"in{number}"], tag=f"mark{number}")
             stages += [reader, marked]
         inputs = {"inputs": [f"mark{number}" for number in range(len(cuts))]}
@@ -155,7 +152,7 @@ class _Reach:
 
 def _collect(
     arrays: list[NDArray],
-    cuts: list[tuple[InputSource, Piece]],
+    cuts: list[Piece],
     creates: list[str] | None,
     marks: list[_Mark],
 ) -> list[PieceResults]:
@@ -166,7 +163,7 @@ def _collect(
     else:
         names = [n for n in creates if n in names]
     results = []
-    for number, (source, piece) in enumerate(cuts):
+    for number, piece in enumerate(cuts):
         mine = [(a, np.flatnonzero((a[OUTSIDE] < 0) & (a[INPUT] == number))) for a in arrays]
         rows = np.concatenate([a[ROW][at].astype(np.int64) for a, at in mine] or [np.empty(0, np.int64)])
         order = np.argsort(rows, kind="stable")
@@ -178,7 +175,7 @@ def _collect(
             )
         values = {name: np.concatenate([a[name][at] for a, at in mine])[order] for name in names}
         marks[number].put_flags_back(rows, values)
-        results.append(PieceResults(source, piece, rows, values, marks[number].holds_flags))
+        results.append(PieceResults(piece, rows, values, marks[number].holds_flags))
     if creates is None:
         for name in names:
             if not any(

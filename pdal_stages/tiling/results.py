@@ -20,9 +20,8 @@ from .sources import InputSource
 
 @dataclass
 class PieceResults:
-    """Results of a tile's own points of one source."""
+    """Results of a tile's own points of one piece."""
 
-    source: InputSource
     piece: Piece
     rows: NDArray[np.int64]  #: (n,) rows of the piece that came out, ascending
     values: dict[str, NDArray]  #: (n,) new values of dimensions
@@ -61,10 +60,15 @@ def save(path: str | Path, results: Iterable[PieceResults]) -> None:
     """Write a tile's results, for the files that outputs are put together from."""
     content: dict[str, NDArray] = {}
     for result in results:
-        key = result.source.key
-        content[f"{key}/index"] = result.piece.index[result.rows]
-        content[f"{key}/core"] = np.array(len(result.piece.own))
-        content |= {f"{key}/dim/{name}": values for name, values in result.values.items()}
+        piece = result.piece
+        for source, first, end in piece.spans:
+            own = np.searchsorted(piece.own, (first, end))
+            if own[0] == own[1]:
+                continue
+            mine = slice(*np.searchsorted(result.rows, (first, end)))
+            content[f"{source.key}/index"] = piece.index[result.rows[mine]]
+            content[f"{source.key}/core"] = np.array(own[1] - own[0])
+            content |= {f"{source.key}/dim/{name}": values[mine] for name, values in result.values.items()}
     content["names"] = np.array(sorted(content))
     with whole_files(path, what="result") as (partial,):
         np.savez(partial, **content)  # type: ignore[arg-type]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from dataclasses import dataclass
 from tempfile import TemporaryDirectory
@@ -12,9 +13,9 @@ import numpy as np
 from ..base.errors import NoTerrainError
 from .cloudindex import CloudIndex
 from .ept import fetch
-from .extract import Piece, cut
+from .extract import Member, Piece, cut, likeness
 from .file_task import write_tile
-from .grid import inside
+from .grid import inside, touching
 from .headrun import HeadRun, RunContext, run_head
 from .results import PieceResults, class_counts, save
 from .sources import InputSource
@@ -58,8 +59,8 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
     head: HeadRun | None = None
     for attempt in range(_WIDENINGS + 1):
         cuts = _cut_all(task, halo_m / context.unit, folder)
-        read = sum(len(piece.index) for _, piece in cuts)
-        own = sum(len(piece.own) for _, piece in cuts)
+        read = sum(len(piece.index) for piece in cuts)
+        own = sum(len(piece.own) for piece in cuts)
         if not own:
             break
         everything = inside(context.bounds, context.grid.box(tile, halo_m / context.unit))
@@ -83,7 +84,7 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
         halo_m, short = need + 1e-6, False
     if head is None:
         empty = np.empty(0, np.int64)
-        head = HeadRun([PieceResults(source, piece, empty, {}) for source, piece in cuts], 0.0)
+        head = HeadRun([PieceResults(piece, empty, {}) for piece in cuts], 0.0)
     report = {
         "points": own,
         "read": read,
@@ -97,19 +98,22 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
     return head.results, report
 
 
-def _cut_all(task: TileTask, halo: float, folder: str) -> list[tuple[InputSource, Piece]]:
-    """The tile's points and their surroundings, out of every input."""
-    grid, cuts = task.context.grid, []
+def _cut_all(task: TileTask, halo: float, folder: str) -> list[Piece]:
+    """The tile's points and their surroundings, out of every input; inputs that are alike are read as one."""
+    grid = task.context.grid
+    box = grid.box(task.tile, halo)
+    alike: dict[tuple[bytes, str], list[Member]] = {}
     for number, (source, index) in enumerate(task.sources):
         path = source.path
         if source.kind == "ept":
             path = os.path.join(folder, f"fetched{number}.las")
             index = fetch(source, grid, task.tile, halo, path)
-        if index is None:
+        if index is None or not touching(index.boxes, box):
             continue
-        target = os.path.join(folder, f"piece{number}.las")
+        reader = json.dumps(source.reader, sort_keys=True)
+        alike.setdefault((likeness(path), reader), []).append(Member(source, path, index))
+    pieces = []
+    for number, members in enumerate(alike.values()):
         core = "" if task.outputs is None else os.path.join(folder, f"core{number}.las")
-        piece = cut(path, index, grid, task.tile, halo, target, core)
-        if piece is not None:
-            cuts.append((source, piece))
-    return cuts
+        pieces.append(cut(members, grid, task.tile, halo, os.path.join(folder, f"piece{number}.las"), core))
+    return [piece for piece in pieces if piece is not None]
