@@ -238,3 +238,46 @@ def test_time_left_is_told_from_what_tasks_took():
     for _ in range(4):
         pace.finished("tile", 10, 2.0)
     assert pace.seconds_left() == pytest.approx(40 * 0.2 / 2)
+
+
+# ---- many small inputs -----------------------------------------------------------------------------------
+
+
+def test_inputs_that_are_alike_go_through_one_reader(survey, classify, tmp_path, write_las, monkeypatch):
+    """25 files of two kinds (offsets differ) are two readers of a tile; results are those of one run over all."""
+    from pdal_stages.tiling import tile_task
+
+    las = laspy.read(survey / "town.laz")
+    x, y = np.asarray(las.x), np.asarray(las.y)
+    (tmp_path / "in").mkdir()
+    for i in range(5):
+        for j in range(5):
+            mine = (np.floor((x - 500_000) / 18) == i) & (np.floor((y - 5_400_000) / 18) == j)
+            part = {"X": x[mine], "Y": y[mine], "Z": np.asarray(las.z)[mine]}
+            part |= {
+                "Classification": np.asarray(las.classification)[mine],
+                "GpsTime": np.asarray(las.gps_time)[mine],
+            }
+            offset = (499_000.0, 5_399_000.0, 100.0 * (i % 2))
+            write_las(
+                tmp_path / "in" / f"t{i}{j}.laz",
+                part,
+                point_format=6,
+                wkt=wkt("EPSG:25832"),
+                scale=0.001,
+                offset=offset,
+            )
+    seen, run = [], tile_task.run_head
+    monkeypatch.setattr(
+        tile_task, "run_head", lambda c, t, cuts, e: seen.append(len(cuts)) or run(c, t, cuts, e)
+    )
+    code, _, err = classify(tmp_path / "in", tmp_path / "out/", "--tile", 40, "--workers", 0)
+    assert code == 0 and seen and max(seen) == 2, err
+    code, _, err = classify(tmp_path / "in", tmp_path / "one/", "--tile", 1000, "--workers", 0)
+    assert code == 0, err
+    assert contents(tmp_path / "out") == contents(tmp_path / "one")
+    paths = sorted((tmp_path / "in").iterdir())
+    for path in paths:
+        before, after = laspy.read(path), laspy.read(tmp_path / "out" / path.name)
+        for axis in ("X", "Y", "Z", "gps_time"):
+            assert np.array_equal(before[axis], after[axis])
