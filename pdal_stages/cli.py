@@ -274,6 +274,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     takes("--dimension", default="Classification", help="Classes to judge")
     takes("--reference-dimension", help="Dimension with the true classes")
+    takes(
+        "--objects",
+        metavar="FILE",
+        help="Compare objects instead: the input is a vector file of pdal-stages objects, this one has true buildings "
+        "(polygons) or trees (points; 'height')",
+    )
+    takes("--area", metavar="FILE", help="With --objects: polygons inside of which objects count")
     takes("--json", help="Write figures to this file")
     takes("--html", help="Write a report to this file")
 
@@ -468,6 +475,11 @@ def _accuracy(options: argparse.Namespace) -> None:
         "Classification" if options.reference else "Reference"
     )
     outputs = {k: v for k in ("json", "html") if (v := getattr(options, k))}
+    if options.objects:
+        _compare_objects(options)
+        return
+    if options.area:
+        raise StageError("--area needs --objects", found=options.area)
     if options.reference:
         compare_files(
             options.inputs,
@@ -480,6 +492,31 @@ def _accuracy(options: argparse.Namespace) -> None:
         return
     stages = accuracy_pipeline(options.inputs, options.dimension, reference_dimension, **outputs)
     _run(options, Pipeline(stages, options.overrides))
+
+
+def _compare_objects(options: argparse.Namespace) -> None:
+    """``accuracy town.gpkg --objects reference.gpkg``."""
+    from .base.files import write_whole
+    from .reports import objectaccuracy
+
+    if len(options.inputs) != 1 or options.reference or options.overrides:
+        raise StageError(
+            "--objects compares one vector file with another, and takes --area, --json and --html alone",
+            found=", ".join(options.inputs),
+        )
+    found, reference = options.inputs[0], options.objects
+    pages = {"json": kinds.JSON, "html": kinds.HTML}
+    outputs = [Output(path, k, kind) for k, kind in pages.items() if (path := getattr(options, k))]
+    check_outputs(outputs, [found, reference, *([options.area] if options.area else [])])
+    figures, one, two = objectaccuracy.compare_files(found, reference, options.area)
+    print(objectaccuracy.table(figures), end="")
+    if options.json:
+        text = json.dumps(objectaccuracy.to_json(figures), indent=1) + "\n"
+        write_whole(options.json, text.encode(), "json")
+    if options.html:
+        write_whole(
+            options.html, objectaccuracy.page(figures, one, two, "Accuracy of objects").encode(), "html"
+        )
 
 
 def _model(options: argparse.Namespace) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -152,6 +153,7 @@ def write_layers(path: str | Path, layers: dict[str, Layer], wkt: str = "") -> l
 def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
     pyogrio, shapely = vector("pyogrio"), vector("shapely")
     options = {"layer": name} if driver == "GPKG" else {}
+    warnings.filterwarnings("ignore", "'crs' was not provided")  # as the points have none
     try:
         pyogrio.raw.write(
             path,

@@ -1,0 +1,147 @@
+"""``pdal-stages accuracy --objects``: figures against counting by hand, files, errors."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import numpy as np
+import pytest
+
+from pdal_stages import cli
+from pdal_stages.objects.compare import compare_buildings, compare_trees, matched_by_overlap, matched_by_place
+
+shapely = pytest.importorskip("shapely")
+pyogrio = pytest.importorskip("pyogrio")
+
+
+def write(path, shapes, kind="Polygon", layer=None, crs="EPSG:25832", **columns):
+    pyogrio.raw.write(
+        path,
+        np.array([shapely.to_wkb(s) for s in shapes], object),
+        [np.asarray(v) for v in columns.values()],
+        list(columns),
+        geometry_type=kind,
+        crs=crs,
+        layer=layer or "buildings",
+        driver="GPKG",
+    )
+    return str(path)
+
+
+def test_overlaps_are_matched_as_by_hand():
+    rng = np.random.default_rng(2)
+
+    def boxes(n):
+        low = rng.uniform(0, 40, (n, 2))
+        return [shapely.box(*p, *(p + s)) for p, s in zip(low, rng.uniform(2, 12, (n, 2)), strict=True)]
+
+    found, true = boxes(60), boxes(60)
+    all_pairs = sorted(
+        (-f.intersection(t).area / f.union(t).area, a, b)
+        for a, f in enumerate(found)
+        for b, t in enumerate(true)
+        if f.intersection(t).area / f.union(t).area >= 0.3
+    )
+    kept, one, other = [], set(), set()
+    for _, a, b in all_pairs:
+        if a not in one and b not in other:
+            one.add(a)
+            other.add(b)
+            kept.append((a, b))
+    assert len(kept) > 5 and sorted(matched_by_overlap(found, true, 0.3)) == sorted(kept)
+
+
+def test_trees_are_matched_as_by_hand():
+    rng = np.random.default_rng(3)
+    found, true = rng.uniform(0, 60, (80, 2)), rng.uniform(0, 60, (70, 2))
+    high, true_high = rng.uniform(4, 20, 80), rng.uniform(4, 20, 70)
+    pairs = sorted(
+        (float(np.hypot(*(f - t))), a, b)
+        for a, f in enumerate(found)
+        for b, t in enumerate(true)
+        if np.hypot(*(f - t)) <= 4 and abs(high[a] - true_high[b]) <= 0.3 * true_high[b]
+    )
+    kept, one, other = [], set(), set()
+    for _, a, b in pairs:
+        if a not in one and b not in other:
+            one.add(a)
+            other.add(b)
+            kept.append((a, b))
+    assert len(kept) > 10 and sorted(matched_by_place(found, high, true, true_high)) == sorted(kept)
+
+
+def test_figures_of_buildings():
+    true = [shapely.box(0, 0, 10, 10), shapely.box(20, 0, 30, 10), shapely.box(60, 0, 62, 2)]
+    found = [shapely.box(0, 0, 10, 10.5), shapely.box(20, 0, 24, 10), shapely.box(100, 0, 110, 10)]
+    got = compare_buildings(found, true)
+    assert got["objects"]["matched"] == 1 and got["objects"]["completeness"] == pytest.approx(1 / 3)
+    assert got["area"]["iou"] == pytest.approx(140 / (204 + 245 - 140))
+    assert got["covered"] == pytest.approx(1 / 3)
+    assert got["boundary"]["p95"] == pytest.approx(0.5) and got["boundary"]["median"] == 0
+    assert got["sizes"]["0 to 25 m2"]["completeness"] == 0
+    empty = compare_buildings([], true)
+    assert empty["objects"]["completeness"] == 0 and np.isnan(empty["objects"]["correctness"])
+
+
+def test_figures_of_trees():
+    got = compare_trees(
+        np.array([[0.0, 0], [10, 0]]),
+        np.array([10.0, 8]),
+        np.array([[1.0, 0], [11, 0]]),
+        np.array([9.0, np.nan]),
+    )
+    assert got["objects"]["matched"] == 2 and got["height"]["bias"] == 1.0 and got["place"]["median"] == 1.0
+
+
+def test_the_command(tmp_path, capsys):
+    houses = [shapely.box(0, 0, 10, 10), shapely.box(20, 0, 30, 10)]
+    found, true = tmp_path / "found.gpkg", tmp_path / "true.gpkg"
+    write(found, houses[:1], verdict=["sure"])
+    write(found, [shapely.Point(5, 30)], "Point", "trees", height=[8.0])
+    write(true, houses)
+    write(true, [shapely.Point(6, 30), shapely.Point(50, 30)], "Point", "trees", height=[8.5, 9.0])
+    command = ["accuracy", str(found), "--objects", str(true), "--json", str(tmp_path / "a.json")]
+    assert cli.main([*command, "--html", str(tmp_path / "a.html")]) == 0
+    figures = json.loads((tmp_path / "a.json").read_text())
+    assert (
+        figures["buildings"]["objects"]["completeness"] == 0.5 and figures["trees"]["objects"]["matched"] == 1
+    )
+    assert "buildings: 1 found, 2 in the reference" in capsys.readouterr().out
+    assert (tmp_path / "a.html").read_text().count("<path d=") == 3
+    area = write(tmp_path / "area.gpkg", [shapely.box(-1, -1, 12, 40)])
+    assert cli.main([*command, "--area", area]) == 0
+    figures = json.loads((tmp_path / "a.json").read_text())
+    assert figures["buildings"]["objects"]["f1"] == 1 and figures["trees"]["objects"]["f1"] == 1
+
+
+def test_errors(tmp_path, capsys):
+    house = [shapely.box(0, 0, 10, 10)]
+    found = write(tmp_path / "found.gpkg", house)
+    other = write(tmp_path / "other.gpkg", house, crs="EPSG:2154")
+    (tmp_path / "cloud.laz").write_bytes(b"LASF" + b"\0" * 400)
+    for command, text in (
+        (["accuracy", found, "--objects", other], "another reference system"),
+        (["accuracy", str(tmp_path / "cloud.laz"), "--objects", found], "pdal-stages objects classified.laz"),
+        (["accuracy", found, "--objects", str(tmp_path / "none.gpkg")], "no such file"),
+        (["accuracy", found, found, "--objects", other], "one vector file"),
+        (["accuracy", found, "--area", other], "--area needs --objects"),
+    ):
+        assert cli.main(command) == 1
+        assert text in capsys.readouterr().err
+
+
+@pytest.mark.data
+@pytest.mark.pdal
+def test_delft_against_official_outlines(tmp_path, capsys):
+    """Houses stand wall to wall, so they are covered rather than told apart."""
+    data = os.environ.get("PDAL_STAGES_DATA")
+    if not data:
+        pytest.skip("PDAL_STAGES_DATA is not set")
+    outlines = tmp_path / "delft.gpkg"
+    assert cli.main(["objects", f"{data}/delft/train.laz", str(outlines)]) == 0
+    command = ["accuracy", str(outlines), "--objects", f"{data}/delft/buildings_train.geojson"]
+    assert cli.main([*command, "--json", str(tmp_path / "a.json")]) == 0
+    figures = json.loads((tmp_path / "a.json").read_text())["buildings"]
+    assert figures["covered"] >= 0.96 and figures["area"]["completeness"] >= 0.96
+    assert figures["boundary"]["median"] <= 0.4
