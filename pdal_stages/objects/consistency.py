@@ -1,0 +1,309 @@
+"""Classes that contradict their surroundings, mended by named rules, each of which counts what it changes.
+
+A classifier looks at each point by itself, and at what a pass before said of its surroundings. What is left are
+contradictions that a person sees at once: a building that the ground filter calls ground, a patch of ground on a
+roof, a leaf in the middle of a roof's plane or of a wall, one point against all its neighbors. Neighborhoods are cubes
+of voxels of an absolute grid, their sums whole numbers, so neither the order of points nor the tile matters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..base.asprs import NOISE
+from ..base.errors import OptionError, StageError
+from ..base.jit import device, njit
+from ..terrain.clusters import BITS, find, voxels
+
+#: Rules in the order in which they are applied.
+RULES = ("ground", "islands", "roofs", "facades", "lone")
+#: Side of a voxel, metres, and how far away points can change a point's class: two voxels for each rule that looks.
+SIDE = 1.0
+REACH = 2.0 * 4 * SIDE
+GROUND, VEGETATION, BUILDING = 2, (3, 4, 5), 6
+#: Kinds of points that rules know.
+_GROUND, _VEGETATION, _BUILDING, _OTHER = range(4)
+#: Ground, in metres above the terrain at most; and what is surely none, at least.
+LOW, HIGH = 0.3, 2.0
+#: Neighbors that are enough to say something, and the share of them that must be buildings, or of one kind.
+ENOUGH, SHARE, ALL = 10, 0.9, 0.9
+#: A plane's scatter, and how far from it a point may lie and be of it, metres.
+SCATTER, NEAR = 0.1, 0.2
+#: Coordinates within a voxel are whole numbers of this part of a metre.
+_PARTS = 1024.0
+
+
+def consistent(
+    xyz: ArrayLike,
+    codes: ArrayLike,
+    *,
+    height: ArrayLike | None = None,
+    ground: ArrayLike | None = None,
+    mask: ArrayLike | None = None,
+    change: ArrayLike | None = None,
+    rules: Sequence[str] = RULES,
+    report: dict[str, Any] | None = None,
+) -> NDArray[np.uint8]:
+    """Class codes without the contradictions that the rules know.
+
+    Parameters
+    ----------
+    xyz : array_like, shape (n, 3)
+        Coordinates in metres.
+    codes : array_like of uint8, shape (n,)
+        Class codes; only ground (2), vegetation (3, 4, 5) and buildings (6) are changed, and into one another.
+    height : array_like, shape (n,), optional
+        Height above ground, metres; without it the rules ``ground`` and ``islands`` do nothing.
+    ground : array_like, shape (n,), optional
+        Whether a ground filter calls the point ground; without it the same.
+    mask, change : array_like of bool, shape (n,), optional
+        Points that are neighbors, and of these, those that may be changed; by default all.
+    rules : sequence of str
+        Some of :data:`RULES`: ``ground``: a building on the ground, below 0.3 m, is ground. ``islands``: ground more than
+        2 m above the terrain is what its neighbors are. ``roofs``: vegetation in the plane of a roof is building.
+        ``facades``: vegetation in the plane of a wall is building. ``lone``: one point against all its neighbors is of their
+        class.
+    report : dict, optional
+        Receives the number of points that each rule changed.
+
+    Returns
+    -------
+    ndarray of uint8, shape (n,)
+
+    Raises
+    ------
+    OptionError
+        If a rule is not known.
+    StageError
+        If shapes differ.
+    """
+    if unknown := [rule for rule in rules if rule not in RULES]:
+        raise OptionError(f"'rules' must be of {', '.join(RULES)}", found=", ".join(map(repr, unknown)))
+    xyz = np.asarray(xyz, np.float64)
+    out = np.array(codes, np.uint8)
+    given = [np.asarray(a) for a in (height, ground, mask, change) if a is not None]
+    if xyz.shape != (len(out), 3) or any(a.shape != out.shape for a in given):
+        raise StageError("arrays must have one row per point", found=[xyz.shape, *(a.shape for a in given)])
+    seen = np.ones(len(out), bool) if mask is None else np.asarray(mask, bool)
+    seen = seen & ~np.isin(out, NOISE) & np.isfinite(xyz).all(axis=1)
+    may = seen if change is None else seen & np.asarray(change, bool)
+    counts = dict.fromkeys(rules, 0)
+    there = np.flatnonzero(seen)
+    if len(there):
+        kinds = np.full(256, _OTHER, np.uint8)
+        kinds[GROUND], kinds[list(VEGETATION)], kinds[BUILDING] = _GROUND, _VEGETATION, _BUILDING
+        work = _Neighborhoods(xyz[there], kinds[out[there]])
+        free = may[there] & (work.kind != _OTHER)
+        flat = None if ground is None else np.asarray(ground)[there] != 0
+        above = None if height is None else np.asarray(height, np.float64)[there]
+        before = work.kind.copy()
+        for rule in RULES:
+            if rule in rules:
+                new = _RULES[rule](work, above, flat)
+                changed = free & (new != work.kind)
+                counts[rule] = int(np.count_nonzero(changed))
+                work.kind = np.where(changed, new, work.kind)
+        other = work.kind != before
+        # A mixture of vegetation classes: high vegetation is what the shipped models know.
+        out[there[other]] = np.array([GROUND, VEGETATION[-1], BUILDING, 0], np.uint8)[work.kind[other]]
+    if report is not None:
+        report.update(counts)
+    return out
+
+
+class _Neighborhoods:
+    """Points sorted into voxels, and what is round these."""
+
+    def __init__(self, xyz: NDArray[np.float64], kind: NDArray[np.uint8]) -> None:
+        self.xyz, self.kind = xyz, kind
+        cell = np.floor(xyz * (1.0 / SIDE)).astype(np.int64)
+        self.left, self.bottom = cell[:, 0].min() - 2, cell[:, 1].min() - 2
+        self.width = int(cell[:, 0].max() - self.left + 3)
+        column, row, level = (np.ascontiguousarray(one) for one in cell.T)
+        self.voxel, self.keys, _, self.table = voxels(column, row, level, self.left, self.bottom, self.width)
+        self.part = np.rint((xyz - cell * SIDE) * _PARTS).astype(np.int16)
+
+    def shares(self) -> NDArray[np.int64]:
+        """Points of each kind in the cube of 3 x 3 x 3 voxels round each voxel, (voxels, 4)."""
+        own = np.bincount(self.voxel * 4 + self.kind, minlength=4 * len(self.keys)).reshape(-1, 4)
+        sums = np.empty_like(own)
+        _add_round(self.keys, self.table, self.width, 1, own, sums)
+        return sums
+
+    def beside(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Points with one of the chosen in the 5 x 5 columns round their own, at any height."""
+        column = self.keys >> BITS
+        held = np.unique(column[self.voxel[chosen]])
+        steps = np.array([dj * self.width + di for dj in range(-2, 3) for di in range(-2, 3)])
+        near = np.isin(column, (held[:, None] + steps).ravel())
+        return near[self.voxel]
+
+    def in_planes(self, levels: int, upright: bool) -> NDArray[np.bool_]:
+        """Vegetation in planes of buildings near: leaning ones of roofs, or `upright` ones of walls."""
+        own = np.bincount(self.voxel * 4 + self.kind, minlength=4 * len(self.keys)).reshape(-1, 4)
+        moments = np.zeros((len(self.keys), 10), np.int64)
+        _add_moments(self.voxel, self.kind, self.part, moments)
+        planes = np.full((len(self.keys), 4), np.nan)
+        _fit(self.keys, self.table, self.width, levels, upright, own, moments, planes)
+        near = np.zeros(len(self.voxel), bool)
+        _near_planes(self.voxel, self.kind, self.part, planes, near)
+        return near
+
+
+def _ground(work: _Neighborhoods, height, flat) -> NDArray[np.uint8]:
+    if height is None or flat is None:
+        return work.kind
+    wrong = (work.kind == _BUILDING) & flat & (height < LOW)
+    if not wrong.any():
+        return work.kind
+    # Feet of walls are labeled building as often as ground, so only what is away from all buildings.
+    stands = (work.kind == _BUILDING) & ~flat & (height > HIGH)
+    return np.where(wrong & ~work.beside(stands), np.uint8(_GROUND), work.kind)
+
+
+def _islands(work: _Neighborhoods, height, flat) -> NDArray[np.uint8]:
+    if height is None or flat is None:
+        return work.kind
+    wrong = (work.kind == _GROUND) & ~flat & (height > HIGH)
+    if not wrong.any():
+        return work.kind
+    vegetation, building = work.shares()[work.voxel][:, [_VEGETATION, _BUILDING]].T
+    new = np.where(building >= vegetation, _BUILDING, _VEGETATION).astype(np.uint8)
+    return np.where(wrong & (building + vegetation > 0), new, work.kind)
+
+
+def _roofs(work: _Neighborhoods, height, flat) -> NDArray[np.uint8]:
+    return np.where(work.in_planes(1, False), np.uint8(_BUILDING), work.kind)
+
+
+def _facades(work: _Neighborhoods, height, flat) -> NDArray[np.uint8]:
+    return np.where(work.in_planes(2, True), np.uint8(_BUILDING), work.kind)
+
+
+def _lone(work: _Neighborhoods, height, flat) -> NDArray[np.uint8]:
+    near = work.shares()[work.voxel]
+    n = near.sum(axis=1)
+    rows = np.arange(len(n))
+    most = near.argmax(axis=1).astype(np.uint8)
+    alone = (near[rows, work.kind] == 1) & (n > ENOUGH) & (near[rows, most] >= ALL * n) & (most != _OTHER)
+    # Ground under leaves, and leaves above ground, are alone and right.
+    alone &= (work.kind != _GROUND) & (most != _GROUND)
+    return np.where(alone, most, work.kind)
+
+
+_RULES = {"ground": _ground, "islands": _islands, "roofs": _roofs, "facades": _facades, "lone": _lone}
+
+
+# ---- kernels --------------------------------------------------------------------------------------------
+
+
+@njit
+def _add_round(keys, table, w, levels, own, sums):
+    """Fill `sums` with those of the voxels of 3 x 3 columns and so many levels up and down."""
+    for k in range(len(keys)):
+        for c in range(own.shape[1]):
+            sums[k, c] = 0
+        for dj in range(-1, 2):
+            for di in range(-1, 2):
+                for dl in range(-levels, levels + 1):
+                    q = find(table, keys, keys[k] + ((dj * w + di) << BITS) + dl)
+                    if q >= 0:
+                        for c in range(own.shape[1]):
+                            sums[k, c] += own[q, c]
+
+
+@njit
+def _add_moments(voxel, kind, part, moments):
+    for p in range(len(voxel)):
+        if kind[p] == _BUILDING:
+            m = moments[voxel[p]]
+            x, y, z = np.int64(part[p, 0]), np.int64(part[p, 1]), np.int64(part[p, 2])
+            m[0] += 1
+            m[1] += x
+            m[2] += y
+            m[3] += z
+            m[4] += x * x
+            m[5] += x * y
+            m[6] += x * z
+            m[7] += y * y
+            m[8] += y * z
+            m[9] += z * z
+
+
+@device
+def _shifted(m, dx, dy, dz, total):
+    """Add moments, as seen from a voxel that lies so far away."""
+    n, x, y, z = m[0], m[1], m[2], m[3]
+    total[0] += n
+    total[1] += x + n * dx
+    total[2] += y + n * dy
+    total[3] += z + n * dz
+    total[4] += m[4] + 2 * dx * x + n * dx * dx
+    total[5] += m[5] + dx * y + dy * x + n * dx * dy
+    total[6] += m[6] + dx * z + dz * x + n * dx * dz
+    total[7] += m[7] + 2 * dy * y + n * dy * dy
+    total[8] += m[8] + dy * z + dz * y + n * dy * dz
+    total[9] += m[9] + 2 * dz * z + n * dz * dz
+
+
+@njit
+def _fit(keys, table, w, levels, upright, own, moments, planes):
+    """Fill `planes` (normal, distance from the voxel's corner; metres) of buildings round voxels with vegetation."""
+    total = np.empty(10, np.int64)
+    side = np.int64(SIDE * _PARTS)
+    for k in range(len(keys)):
+        if own[k, _VEGETATION] == 0:
+            continue
+        total[:] = 0
+        points = 0
+        for dj in range(-1, 2):
+            for di in range(-1, 2):
+                for dl in range(-levels, levels + 1):
+                    q = find(table, keys, keys[k] + ((dj * w + di) << BITS) + dl)
+                    if q >= 0:
+                        points += own[q, _VEGETATION] + own[q, _BUILDING] + own[q, _OTHER]
+                        _shifted(moments[q], di * side, dj * side, dl * side, total)
+        n = total[0]
+        if n < ENOUGH or n < SHARE * points:
+            continue
+        x, y, z = total[1] / n, total[2] / n, total[3] / n
+        xx, xy, xz = total[4] / n - x * x, total[5] / n - x * y, total[6] / n - x * z
+        yy, yz, zz = total[7] / n - y * y, total[8] / n - y * z, total[9] / n - z * z
+        if upright:
+            # The narrow direction in plan; a wall is tall, and long.
+            half, apart = 0.5 * (xx + yy), np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+            wide, narrow = half + apart, half - apart
+            if narrow > (SCATTER * _PARTS) ** 2 or wide < (0.4 * _PARTS) ** 2 or zz < (0.6 * _PARTS) ** 2:
+                continue
+            a, b = xy, narrow - xx
+            if abs(a) + abs(b) < 1e-6 * wide:
+                a, b = narrow - yy, xy
+            length = np.sqrt(a * a + b * b)
+            if length == 0.0:
+                continue
+            a, b, c = a / length, b / length, 0.0
+        else:
+            det = xx * yy - xy * xy
+            if det < (0.09 * _PARTS * _PARTS) ** 2:
+                continue
+            gx, gy = (xz * yy - yz * xy) / det, (yz * xx - xz * xy) / det
+            length = np.sqrt(1.0 + gx * gx + gy * gy)
+            scatter = (zz - gx * xz - gy * yz) / (length * length)
+            if scatter > (SCATTER * _PARTS) ** 2 or gx * gx + gy * gy > 4.0:
+                continue
+            a, b, c = -gx / length, -gy / length, 1.0 / length
+        planes[k, 0], planes[k, 1], planes[k, 2] = a, b, c
+        planes[k, 3] = a * x + b * y + c * z
+
+
+@njit
+def _near_planes(voxel, kind, part, planes, near):
+    for p in range(len(voxel)):
+        if kind[p] == _VEGETATION:
+            k = voxel[p]
+            away = planes[k, 0] * part[p, 0] + planes[k, 1] * part[p, 1] + planes[k, 2] * part[p, 2] - planes[k, 3]
+            near[p] = abs(away) <= NEAR * _PARTS
