@@ -227,6 +227,12 @@ def _parser() -> argparse.ArgumentParser:
         default=True,
         help="Mark low and high noise first (filters.detachednoise)",
     )
+    takes(
+        "--consistency",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="Mend classes that contradict their surroundings at the end (filters.consistency)",
+    )
     takes("--where", help="Classify only the points for which this holds; the others serve as neighbors")
     takes("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
     add_arguments(commands.choices["classify"], survey=True)
@@ -429,7 +435,9 @@ def _classify(options: argparse.Namespace) -> int:
 
     listed = options.dimensions
     named = WRITTEN if listed is None else tuple(name.strip() for name in listed.split(",") if name.strip())
-    request = ClassifyRequest(options.model, tuple(options.overrides), options.where, named, options.noise)
+    request = ClassifyRequest(
+        options.model, tuple(options.overrides), options.where, named, options.noise, options.consistency
+    )
     files = {"metadata": options.metadata or "", "log": options.log or ""}
     return classify(
         ClassifyTask(tuple(options.inputs), options.output, request, options_of(options), **files), options

@@ -29,7 +29,8 @@ GROUND, VEGETATION, BUILDING = 2, (3, 4, 5), 6
 _GROUND, _VEGETATION, _BUILDING, _OTHER = range(4)
 #: Ground, in metres above the terrain at most; and what is surely none, at least.
 LOW, HIGH = 0.3, 2.0
-#: Neighbors that are enough to say something, and the share of them that must be buildings, or of one kind.
+#: Neighbors that are enough to say something, and the share of them that must be buildings, or of one kind. As it was found
+#: on labeled surveys: with 0.75, one point in eight that a plane claims is a leaf.
 ENOUGH, SHARE, ALL = 10, 0.9, 0.9
 #: A plane's scatter, and how far from it a point may lie and be of it, metres.
 SCATTER, NEAR = 0.1, 0.2
@@ -63,7 +64,8 @@ def consistent(
     mask, change : array_like of bool, shape (n,), optional
         Points that are neighbors, and of these, those that may be changed; by default all.
     rules : sequence of str
-        Some of :data:`RULES`: ``ground``: a building on the ground, below 0.3 m, is ground. ``islands``: ground more than
+        Some of :data:`RULES`: ``ground``: a building that the filter calls ground, below 0.3 m and away from all
+        that stands, is ground. ``islands``: ground more than
         2 m above the terrain is what its neighbors are. ``roofs``: vegetation in the plane of a roof is building.
         ``facades``: vegetation in the plane of a wall is building. ``lone``: one point against all its neighbors is of their
         class.
@@ -305,5 +307,10 @@ def _near_planes(voxel, kind, part, planes, near):
     for p in range(len(voxel)):
         if kind[p] == _VEGETATION:
             k = voxel[p]
-            away = planes[k, 0] * part[p, 0] + planes[k, 1] * part[p, 1] + planes[k, 2] * part[p, 2] - planes[k, 3]
+            away = (
+                planes[k, 0] * part[p, 0]
+                + planes[k, 1] * part[p, 1]
+                + planes[k, 2] * part[p, 2]
+                - planes[k, 3]
+            )
             near[p] = abs(away) <= NEAR * _PARTS

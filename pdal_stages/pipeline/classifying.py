@@ -38,6 +38,8 @@ class ClassifyRequest:
         Which of the dimensions made on the way are written beside the input's own; ``all`` and ``none`` are known.
     noise : bool
         Whether low and high noise is marked first.
+    consistency : bool
+        Whether classes that contradict their surroundings are mended at the end.
     """
 
     model: str = STANDARD
@@ -45,6 +47,7 @@ class ClassifyRequest:
     where: str | None = None
     dimensions: tuple[str, ...] = WRITTEN
     noise: bool = True
+    consistency: bool = True
 
     @property
     def _inside(self) -> dict[str, str]:
@@ -86,7 +89,17 @@ class ClassifyRequest:
             )
         prepared = self.loaded.info.get("preparation") or preparation_of(self.loaded.required_dimensions)
         noise = [{"type": "filters.detachednoise", **self._inside}] if self.noise else []
-        return [*noise, *prepared, self._classifier]
+        return [*noise, *prepared, self._classifier, *self._mending]
+
+    @property
+    def _mending(self) -> list[dict[str, Any]]:
+        """The rules at the end, for models whose classes they are of; a `where` by class means another one by then."""
+        known = {code for code, _ in self.loaded.classes}
+        if not self.consistency or not known >= {2, 6} or "Classification" in (self.where or ""):
+            return []
+        settled = overridden(self._classifier, self.overrides)
+        taken: dict[str, Any] = {name: settled[name] for name in ("ignore", "keep") if name in settled}
+        return [{"type": "filters.consistency", **taken, **self._inside}]
 
     @cached_property
     def beside(self) -> dict[str, str] | None:

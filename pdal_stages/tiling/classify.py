@@ -201,18 +201,18 @@ def classify_file(
     count = pipeline.execute(arrays=False, loglevel=logging.WARNING)
     if metadata:
         write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
-    report = pipeline.reports[-1][1][-1]
     reports = [each[-1] for _, each in pipeline.reports if each]
     classes = {int(code): n for one in reports for code, n in one.get("classes", {}).items()}
-    counts = {key: report[key] for key in LEFT_ALONE if report.get(key)}
+    counts = {key: one[key] for one in reports for key in LEFT_ALONE if one.get(key)}
     notes = [*(f"PDAL says: {line}" for line in pipeline.said), *pipeline.told]
     return Written(target, count, classes, counts, notes, pipeline.metadata)
 
 
-#: Points that a classifier did not give a class, by their name in its report.
+#: Points that did not get a class from the classifier, or another one, by their names in reports.
 LEFT_ALONE = {
     "rejected": "rejected as unreliable",
     "ignored": "left out: noise, withheld (ignore)",
     "kept": "class kept (keep)",
     "outside_where": "outside where",
+    "changed": "mended by rules (consistency)",
 }

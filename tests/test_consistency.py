@@ -1,0 +1,263 @@
+"""Rules of consistency: against a slow reference, and what must hold whatever the points."""
+
+from __future__ import annotations
+
+import os
+from collections import defaultdict
+from itertools import product
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pdal_stages as ps
+from pdal_stages.base.errors import OptionError, StageError
+from pdal_stages.cli import main
+from pdal_stages.objects import consistency
+from pdal_stages.objects.consistency import RULES, consistent
+from pdal_stages.stages.consistency import Consistency
+
+DATA = Path(os.environ.get("PDAL_STAGES_DATA", "/nonexistent"))
+
+
+def scene(seed=0, side=40, density=12):
+    """A house with a leaning roof and walls, a bank, a tree, and classes with faults: xyz, codes, height, ground, truth."""
+    rng = np.random.default_rng(seed)
+    n = side * side * density
+    x, y = rng.uniform(0, side, (2, n))
+    z, truth = rng.normal(0, 0.02, n), np.full(n, 2)
+    roof = (np.abs(x - 10) < 6) & (np.abs(y - 10) < 6)
+    z[roof], truth[roof] = 6 + 0.4 * x[roof] + rng.normal(0, 0.02, roof.sum()), 6
+    tree = np.hypot(x - 28, y - 28) < 4
+    z[tree], truth[tree] = rng.uniform(2, 9, tree.sum()), 5
+    k = 1500
+    wall = np.column_stack([rng.uniform(4, 16, k), 4 + rng.normal(0, 0.02, k), rng.uniform(0.3, 8, k)])
+    xyz = np.round(np.vstack([np.column_stack([x, y, z]), wall]), 3)
+    truth = np.r_[truth, np.full(k, 6)].astype(np.uint8)
+    height, ground = xyz[:, 2].copy(), (truth == 2).astype(np.uint8)
+    codes, flip = truth.copy(), rng.random(len(truth))
+    codes[(truth == 6) & (flip < 0.03)] = 5  # on the roof, and on the wall
+    codes[(truth == 5) & (flip < 0.02)] = 6
+    bank = (truth == 2) & (xyz[:, 0] > 28) & (xyz[:, 1] < 15)
+    codes[bank & (flip < 0.5)] = 6
+    codes[(truth == 6) & (height > 6) & (flip > 0.98)] = 2
+    return xyz, codes, height, ground, truth
+
+
+# ---- a slow reference -----------------------------------------------------------------------------------
+
+KIND = {2: "g", 3: "v", 4: "v", 5: "v", 6: "b"}
+
+
+def slow(xyz, codes, height, ground, rules=RULES):
+    cell = np.floor(xyz).astype(int)
+    members = defaultdict(list)
+    for p, at in enumerate(map(tuple, cell)):
+        members[at].append(p)
+    kind = np.array([KIND.get(c, "o") for c in codes])
+
+    def near(p, levels=1):
+        steps = product((-1, 0, 1), (-1, 0, 1), range(-levels, levels + 1))
+        return [q for d in steps for q in members.get(tuple(cell[p] + d), ())]
+
+    def in_plane(p, upright):
+        around = near(p, 2 if upright else 1)
+        solid = [q for q in around if kind[q] == "b"]
+        others = sum(kind[q] in "vbo" for q in around)
+        if len(solid) < consistency.ENOUGH or len(solid) < consistency.SHARE * others:
+            return False
+        at = np.rint(xyz[solid] * 1024) / 1024
+        middle = at.mean(axis=0)
+        cov = np.cov(at.T, bias=True)
+        if upright:
+            values, vectors = np.linalg.eigh(cov[:2, :2])
+            if values[0] > consistency.SCATTER**2 or values[1] < 0.16 or cov[2, 2] < 0.36:
+                return False
+            normal = np.array([*vectors[:, 0], 0.0])
+        else:
+            if np.linalg.det(cov[:2, :2]) < 0.09**2:
+                return False
+            slope = np.linalg.solve(cov[:2, :2], cov[:2, 2])
+            length = np.sqrt(1 + slope @ slope)
+            scatter = (cov[2, 2] - slope @ cov[:2, 2]) / length**2
+            if scatter > consistency.SCATTER**2 or slope @ slope > 4:
+                return False
+            normal = np.array([-slope[0], -slope[1], 1]) / length
+        return abs((np.rint(xyz[p] * 1024) / 1024 - middle) @ normal) <= consistency.NEAR
+
+    counts = {}
+    for rule in RULES:
+        if rule not in rules:
+            continue
+        new = kind.copy()
+        stands = {tuple(at) for at in cell[(kind == "b") & (ground == 0) & (height > 2)][:, :2]}
+        for p in range(len(xyz)):
+            if rule == "ground" and kind[p] == "b" and ground[p] and height[p] < 0.3:
+                i, j = cell[p, :2]
+                if not any((i + a, j + b) in stands for a in range(-2, 3) for b in range(-2, 3)):
+                    new[p] = "g"
+            if rule == "islands" and kind[p] == "g" and not ground[p] and height[p] > 2:
+                around = kind[near(p)]
+                v, b = (around == "v").sum(), (around == "b").sum()
+                if v + b:
+                    new[p] = "b" if b >= v else "v"
+            if rule in ("roofs", "facades") and kind[p] == "v" and in_plane(p, rule == "facades"):
+                new[p] = "b"
+            if rule == "lone" and kind[p] in "vb":
+                around = kind[near(p)]
+                for other in "vb".replace(kind[p], ""):
+                    if (
+                        len(around) > consistency.ENOUGH
+                        and (around == kind[p]).sum() == 1
+                        and (around == other).sum() >= consistency.ALL * len(around)
+                    ):
+                        new[p] = other
+        counts[rule] = int((new != kind).sum())
+        kind = new
+    code = {"g": 2, "v": 5, "b": 6}
+    same = np.array([KIND.get(c, "o") for c in codes]) == kind
+    return np.array([c if s else code[k] for c, k, s in zip(codes, kind, same, strict=True)]), counts
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_kernels_equal_the_slow_reference(seed):
+    xyz, codes, height, ground, _ = scene(seed, 36, 6)
+    codes[::97] = 9
+    report: dict = {}
+    found = consistent(xyz, codes, height=height, ground=ground, report=report)
+    want, counts = slow(xyz, codes, height, ground)
+    assert np.array_equal(found, want)
+    assert report == counts and all(counts[rule] for rule in ("ground", "islands", "roofs", "facades"))
+
+
+# ---- what must hold -------------------------------------------------------------------------------------
+
+
+def test_faults_are_mended():
+    xyz, codes, height, ground, truth = scene(4)
+    before, after = codes != truth, consistent(xyz, codes, height=height, ground=ground) != truth
+    assert after.sum() < 0.25 * before.sum()
+    bank = (xyz[:, 0] > 28) & (xyz[:, 1] < 15)
+    assert before[bank].sum() > 300 and not after[bank].any()
+    roof = (truth == 6) & (height > 6)
+    assert after[roof].sum() < 0.3 * before[roof].sum()
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_each_rule_can_be_left_out(rule):
+    xyz, codes, height, ground, _ = scene(5)
+    report: dict = {}
+    consistent(xyz, codes, height=height, ground=ground, rules=[r for r in RULES if r != rule], report=report)
+    assert rule not in report
+    assert np.array_equal(consistent(xyz, codes, height=height, ground=ground, rules=[]), codes)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 1000), steps=st.tuples(*[st.integers(-5000, 5000)] * 3))
+def test_order_and_shifts_change_nothing(seed, steps):
+    xyz, codes, height, ground, _ = scene(seed, 36, 5)
+    xyz = np.round(xyz * 64) / 64  # so that a shift rounds nothing
+    found = consistent(xyz, codes, height=height, ground=ground)
+    order = np.random.default_rng(seed).permutation(len(xyz))
+    again = consistent(xyz[order], codes[order], height=height[order], ground=ground[order])
+    assert np.array_equal(again, found[order])
+    assert np.array_equal(consistent(xyz + np.array(steps), codes, height=height, ground=ground), found)
+
+
+def test_a_tile_with_its_surroundings_gets_what_the_whole_gets():
+    xyz, codes, height, ground, _ = scene(6, 60, 8)
+    found = consistent(xyz, codes, height=height, ground=ground)
+    for x0, y0 in ((5.3, 3.1), (20, 10), (28.5, 0)):
+        beyond = np.max([[x0, y0] - xyz[:, :2], xyz[:, :2] - [x0 + 8, y0 + 8]], axis=(0, 2))
+        inside, near = beyond < 0, beyond < consistency.REACH
+        part = consistent(xyz[near], codes[near], height=height[near], ground=ground[near])
+        assert np.array_equal(part[inside[near]], found[inside])
+
+
+def test_only_what_may_be_changed_is():
+    xyz, codes, height, ground, _ = scene(7)
+    change = np.random.default_rng(0).random(len(codes)) < 0.5
+    found = consistent(xyz, codes, height=height, ground=ground, change=change)
+    assert np.array_equal(found[~change], codes[~change]) and (found != codes).any()
+    everything = np.full(len(codes), 9, np.uint8)
+    assert np.array_equal(consistent(xyz, everything, height=height, ground=ground), everything)
+    left_out = consistent(xyz, codes, height=height, ground=ground, mask=change)
+    assert np.array_equal(left_out[~change], codes[~change])
+
+
+def test_what_is_wrong_is_said():
+    assert not len(consistent(np.empty((0, 3)), []))
+    with pytest.raises(OptionError, match="'rules' must be of ground, islands"):
+        consistent(np.zeros((1, 3)), [2], rules=["grond"])
+    with pytest.raises(StageError, match="one row per point"):
+        consistent(np.zeros((2, 3)), [2])
+
+
+# ---- the stage ------------------------------------------------------------------------------------------
+
+
+def arrays_of(seed=8, **size):
+    xyz, codes, height, ground, truth = scene(seed, **size)
+    arrays = {"X": xyz[:, 0], "Y": xyz[:, 1], "Z": xyz[:, 2], "Classification": codes.astype(np.uint8)}
+    return {**arrays, "HeightAboveGround": height, "Ground": ground}, truth
+
+
+def test_the_stage_counts_by_rule_and_says_what_it_lacks():
+    arrays, truth = arrays_of()
+    stage = Consistency({"lone": False})
+    points = stage.points(arrays)
+    codes = stage.run(points)["Classification"]
+    assert points.report["ground"] > 100 and points.report["roofs"] > 10 and "lone" not in points.report
+    assert points.report["changed"] == (codes != arrays["Classification"]).sum()
+    assert points.report["classes"] == {str(c): int((codes == c).sum()) for c in (2, 5, 6)}
+    assert (codes != truth).sum() < (arrays["Classification"] != truth).sum()
+    bare = Consistency({}).points({k: v for k, v in arrays.items() if k in ("X", "Y", "Z", "Classification")})
+    Consistency({}).run(bare)
+    assert bare.report["ground"] == 0 and "no HeightAboveGround" in bare.report["warning"]
+
+
+def test_overlap_noise_and_where_keep_their_class():
+    arrays, _ = arrays_of()
+    codes = arrays["Classification"].copy()
+    codes[:100], codes[100:200] = 12, 7
+    stage = Consistency({"where": "X > 10"})
+    out = stage.run(stage.points({**arrays, "Classification": codes}))["Classification"]
+    left = (codes == 12) | (codes == 7) | (arrays["X"] <= 10)
+    assert np.array_equal(out[left], codes[left]) and (out != codes).any()
+
+
+@pytest.mark.pdal
+def test_in_tiles_as_in_one_piece(tmp_path, write_las):
+    arrays, _ = arrays_of(9, side=60)
+    arrays = {k: v for k, v in arrays.items() if k in ("X", "Y", "Z", "Classification")}
+    source = write_las(tmp_path / "in.las", arrays, point_format=1)
+    stages = [str(source), {"type": "filters.consistency"}, str(tmp_path / "whole.las")]
+    ps.Pipeline(stages).execute()
+    stages[2] = {"type": "writers.las", "filename": str(tmp_path / "tiled.las"), "forward": "all"}
+    ps.run_tiled(stages, tile=15, workers=0)
+    one, two = (laspy.read(tmp_path / f"{name}.las") for name in ("whole", "tiled"))
+    assert np.array_equal(one.classification, two.classification)
+    assert not np.array_equal(one.classification, laspy.read(source).classification)
+
+
+@pytest.mark.pdal
+def test_classify_mends_at_the_end_unless_told_not_to(tmp_path, capsys):
+    source = DATA / "rural/lidarhd_bank.laz"
+    if not source.exists():
+        pytest.skip("real clouds are in PDAL_STAGES_DATA")
+    las = laspy.read(source)
+    las.points = las.points[(las.x < las.x.min() + 25) & (las.y < las.y.min() + 25)]
+    las.write(tmp_path / "in.laz")
+    truth = np.asarray(las.classification)
+    kept = {}
+    for words in ([], ["--no-consistency"]):
+        out = tmp_path / "out.laz"
+        assert main(["classify", str(tmp_path / "in.laz"), str(out), *words]) == 0
+        said = capsys.readouterr().out
+        codes = np.asarray(laspy.read(out).classification)
+        kept[bool(words)] = ((codes == 6) & (truth == 2)).sum()
+        assert ("mended by rules" in said) == (not words)
+    assert kept[False] <= kept[True]
