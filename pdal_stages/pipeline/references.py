@@ -14,7 +14,7 @@ from . import pdal as pdal_env
 from .filenames import is_writer, readers_files
 
 #: Stages that may give points of several references one.
-_MOVING = ("filters.reprojection", "filters.projpipeline", "filters.transformation", "filters.georeference")
+MOVING = ("filters.reprojection", "filters.projpipeline", "filters.transformation", "filters.georeference")
 #: What differs between references whose coordinates lie within a metre: units are compared apart.
 _ALIKE = ("+datum=WGS84", "+datum=NAD83", "+ellps=WGS84", "+ellps=GRS80")
 _ASIDE = (
@@ -108,7 +108,7 @@ def check_one_reference(found: Mapping[str, Reference]) -> None:
 
 def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> None:
     """Refuse a pipeline whose LAS readers read different references, unless a stage moves points."""
-    if any(stage.get("type") in _MOVING for stage in stages):
+    if any(stage.get("type") in MOVING for stage in stages):
         return
     first: dict[str, dict[str, Any]] = {}
     for stage in stages:

@@ -25,6 +25,7 @@ from .interrupts import gentle
 from .lowering import Lowered, lower
 from .overrides import Override, apply_overrides
 from .read import PipelineSource, read_pipeline
+from .records import keep_records
 from .references import check_readers
 from .wiring import check_start
 
@@ -149,6 +150,8 @@ class Pipeline:
             count = result.count if alone and "#" not in outputs[0] else None
             check_complete(made, final, writers[number], count)
             supersede_copc(made)
+            if self.lowered.ours:  # else the file is as PDAL writes it, to the byte
+                keep_records(made, writers[number], stages)
 
         if self.lowered.ours:
             check_limit()

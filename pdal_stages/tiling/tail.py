@@ -16,6 +16,7 @@ from ..base.las import supersede_copc
 from ..pipeline import classflags, extradims, packing
 from ..pipeline import pdal as pdal_env
 from ..pipeline.callbacks import Callbacks
+from ..pipeline.records import keep_records
 from .results import NewValues
 
 #: PDAL's names of types that are not NumPy's with ``_t``.
@@ -34,6 +35,7 @@ def run_tail(
     def finish(made: Path, final: Path, number: int) -> None:
         check_complete(made, final, writers[number], None if "where" in writers[number] else run.count)
         supersede_copc(made)
+        keep_records(made, writers[number], [*readers, *tail])
 
     flags = classflags.parting([*readers, *tail], with_ours=True)
     with Callbacks() as callbacks:

@@ -39,6 +39,8 @@ SITES = {
     "classifier/modelfile:write": "model",
     "cli:_expand": "expanded pipeline",
     "cli:_ran": "metadata",
+    "base/projection:_rewrite": "records kept",
+    "pipeline/packing:_pack": "writers.las .laz 1.4",
     "pipeline/run:Pipeline.execute": "writers.las .las",
     "reports/accuracypage:write_accuracy_report": "accuracy html",
     "reports/modelpage:write_model_report": "model page",

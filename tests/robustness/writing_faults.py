@@ -23,6 +23,12 @@ FAUX = {
     "bounds": "([500000,500060],[5400000,5400060],[0,9])",
 }
 HAG = {"type": "filters.hag_minima"}
+WKT = (
+    'PROJCS["WGS 84 / UTM zone 32N", GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],'
+    'PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433]],PROJECTION["Transverse_Mercator"],'
+    'PARAMETER["latitude_of_origin",0],PARAMETER["central_meridian",9],PARAMETER["scale_factor",0.9996],'
+    'PARAMETER["false_easting",500000],PARAMETER["false_northing",0],UNIT["metre",1]]'
+)
 FOREST = {"neighborhoods": "c1", "feature_set": "covariance", "dimensions": [], "count": 50, "trees": 2}
 #: Ways of failing, by the numbers that faulty.c knows them by; the last writes a part first.
 KINDS = {"short write": (1,), "disk full": (2,), "disk full once": (3, 5), "I/O error once": (4,)}
@@ -96,6 +102,8 @@ def plain(output: str, *words: str, exact: bool = True) -> Case:
 CASES = {
     "writers.las .las": pdal("o.las", {"type": "writers.las"}),
     "writers.las .laz": pdal("o.laz", {"type": "writers.las"}),
+    "writers.las .laz 1.4": pdal("o.laz", {"type": "writers.las", "minor_version": 4, "dataformat_id": 6}),
+    "records kept": plain("o.laz", "classify", "{inputs}/wkt.laz", "{target}", "--model", "{inputs}/in.model", exact=False),
     "writers.text": pdal("o.txt", {"type": "writers.text"}),
     "writers.text geojson": pdal("o.geojson", {"type": "writers.text", "format": "geojson"}),
     "writers.ply": pdal("o.ply", {"type": "writers.ply"}),
@@ -140,6 +148,13 @@ def prepare(inputs: Path) -> None:
     las.z = np.where(las.x > 500_030, 5.0, 0.0)
     las.classification = np.where(las.x > 500_030, 6, 2)
     las.write(inputs / "in.las")
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales, header.offsets = las.header.scales, las.header.offsets
+    header.global_encoding.wkt = True
+    header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(WKT))
+    named = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(2000, header=header))
+    named.x, named.y, named.z, named.classification = las.x, las.y, las.z, las.classification
+    named.write(inputs / "wkt.laz")
     (inputs / "plain.json").write_text(json.dumps([str(inputs / "in.las"), HAG]))
     ps.run_pipeline(
         [
