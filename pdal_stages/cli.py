@@ -253,6 +253,9 @@ def _parser() -> argparse.ArgumentParser:
     takes("inputs", nargs="+", metavar="input", help=f"Labelled: {_INPUTS[0].lower()}{_INPUTS[1:]}")
     takes("--model", required=True, help="The model file to write")
     takes(
+        "--base", metavar="MODEL", help="A model to build on: standard, or a file; then few labels are enough"
+    )
+    takes(
         "--classes",
         metavar="MAP",
         help="Codes (2,5,6), or a JSON mapping of labels to classes with their names, e.g. "
@@ -467,7 +470,7 @@ def _train(options: argparse.Namespace) -> None:
     from .pipeline.trainjob import train_pipeline
     from .stages.loading import load_model
 
-    named = ("classes", "neighborhoods", "feature_set", "count", "trees")
+    named = ("classes", "neighborhoods", "feature_set", "count", "trees", "base")
     extra = {name: value for name in named if (value := getattr(options, name)) is not None}
     stages = train_pipeline(input_files(options.inputs), options.model, options.overrides, **extra)
     _run(options, Pipeline(stages, options.overrides))

@@ -25,6 +25,10 @@ ALGORITHMS = {
 }
 
 
+#: Passes that training makes by itself, on top of others.
+ON_TOP = {"refined_forest": "pdal_stages.classifier.refinement:RefinedForest"}
+
+
 @dataclass(frozen=True)
 class InputPlan:
     """What a classifier looks at, where a :class:`FeaturePlan` does not say it."""
@@ -153,6 +157,8 @@ class Trainer(Protocol):
 
 def algorithm(name: str) -> type[Algorithm]:
     """The class of a kind by its name; ModelError where there is none."""
+    if name in ON_TOP:
+        return pkgutil.resolve_name(ON_TOP[name])
     if name not in ALGORITHMS:
         raise ModelError(
             "the model uses an algorithm this release does not know",

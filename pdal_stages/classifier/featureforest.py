@@ -122,6 +122,10 @@ class FeatureForest:
         """The arrays a model file stores."""
         return self.forest.arrays()
 
+    def classes_before(self, codes: Sequence[int]) -> list[int]:
+        """Classes of the pass before, whose probabilities it reads; `codes` are its own."""
+        return list(codes)
+
     def columns(self, codes: Sequence[int]) -> list[Column]:
         """The features; a histogram's bins are one feature."""
         group_of = {name: group for group in ("covariance", "geometric", "shapes") for name in GROUPS[group]}
@@ -134,6 +138,7 @@ class FeatureForest:
                 found.append((feature, group, part.neighborhood.token))
         found += [(name, "dimension", "(dimension)") for name in self.plan.dimensions]
         columns = [Column(name, *rest) for name, rest in zip(self.plan.names, found, strict=True)]
+        codes = self.classes_before(codes)
         for token in () if self.context is None else self.context.tokens:
             for name, code in zip(Context((token,)).names(codes), codes, strict=True):
                 columns.append(Column(name, f"Probability_{code}", "context", token))

@@ -140,7 +140,15 @@ def sample_context(
     """(m, columns): the context of the m points asked for, as passes say, one after the other, that have not seen them."""
     asked: Any = request.rows
     out = np.empty((len(asked), len(context.tokens) * classes), np.float32)
-    run = PassRun([*passes, ContextOnly(context)], classes, request)
+    return context_of(
+        PassRun([*passes, ContextOnly(context)], [classes] * (len(passes) + 1), request), asked, out
+    )
+
+
+def context_of(
+    run: PassRun, rows: npt.NDArray[np.int64], out: npt.NDArray[np.float32]
+) -> npt.NDArray[np.float32]:
+    """Fill `out` with the context of `rows`, ascending, that a run ends with."""
     for part, columns in run.blocks(lambda _, rows, columns: columns):
-        out[np.searchsorted(asked, part)] = columns
+        out[np.searchsorted(rows, part)] = columns
     return out

@@ -29,6 +29,7 @@ from .folds import FoldForests, Folds, sample_context
 from .forest import Forest
 from .growing import TreeOptions, grow
 from .model import Model
+from .refining import Below, held_by_base, on_top, trust
 from .samplefeatures import must_fit, percentiles, sample_features
 from .sampling import Samples, draw_samples
 from .thinning import density_range
@@ -52,8 +53,9 @@ def own_options(given: Any) -> None:
 
 
 def inputs(options: TrainingOptions) -> tuple[str, ...]:
-    """Dimensions used as features."""
-    return feature_plan(options).dimensions
+    """Dimensions used as features, by the forest or by the model it is built on."""
+    own = feature_plan(options).dimensions
+    return own if options.base is None else tuple(dict.fromkeys([*own, *options.base.plan.dimensions]))
 
 
 def feature_plan(options: TrainingOptions) -> FeaturePlan:
@@ -72,7 +74,9 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     classes = labelled.classes
     shares = [f"{cloud.flight} {cloud.copy}" for cloud in clouds] if options.balance else None
     samples = draw_samples(labelled, len(classes.codes), options.count, options.seed, shares)
-    of_context = len(options.context) * len(classes.codes) if options.passes > 1 else 0
+    base = options.base
+    read = 0 if options.passes == 1 and base is None else len(classes.codes if base is None else base.classes)
+    of_context = len(options.context) * read
     must_fit(len(plan.names) + of_context, len(samples))
     share = np.bincount(samples.cloud, minlength=len(clouds))
     used = [cloud.xyz for cloud, n in zip(clouds, share, strict=True) if n]
@@ -81,12 +85,20 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     values, notes = sample_features(clouds, samples, features, options, progress)
     timed = {"features": time.perf_counter() - started}
     limits = percentiles(values, plan, options)
+    below = None if base is None else Below(base, clouds, samples, options, progress)
     xy = samples.take([cloud.xyz[:, :2] for cloud in clouds])
     chosen, validation = _validate(
-        values, samples, xy, samples.take(groups), classes.codes, plan, options, progress
+        values if below is None else np.concatenate([values, below.columns], axis=1),
+        samples,
+        xy,
+        samples.take(groups),
+        classes.codes,
+        plan,
+        options,
+        progress,
     )
     started = time.perf_counter()
-    passes = _Passes(labelled, samples, values, features, chosen, options, progress)
+    passes = _Passes(labelled, samples, values, features, chosen, options, progress, below)
     passes.grow(*limits)
     left_out = passes.without_each_survey() if options.leave_one_survey_out else None
     timed["trees"] = time.perf_counter() - started
@@ -103,6 +115,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
             "min_samples_leaf": chosen["min_samples_leaf"],
             "max_depth": chosen["max_depth"],
             **passes.notes,
+            **({} if below is None or options.target is not None else _held(below, classes.codes)),
             **notes,
         },
         "priors": _priors(samples, len(classes.codes), options.prior_weight),
@@ -112,7 +125,13 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
         "passes": passes.scores,
         "created_by": _versions(),
     }
-    return Model(tuple(passes.made), list(zip(classes.codes, classes.names, strict=True)), info, timed)
+    made = Model(tuple(passes.made), list(zip(classes.codes, classes.names, strict=True)), info, timed)
+    return made if base is None else on_top(base, made, trust(int(np.bincount(samples.label).min())))
+
+
+def _held(below: Below, codes: Sequence[int]) -> dict[str, Any]:
+    held = held_by_base(below, codes)
+    return {"held_by_base": held} if held else {}
 
 
 def _priors(samples: Samples, n_classes: int, weight: float) -> dict[str, Any] | None:
@@ -223,7 +242,9 @@ class _Passes:
         chosen: Mapping[str, Any],
         options: TrainingOptions,
         progress: bool,
+        below: Below | None = None,
     ) -> None:
+        self.below = below
         self.clouds, self.codes = labelled.clouds, labelled.classes.codes
         self.samples, self.values, self.features = samples, values, features
         self.chosen, self.options, self.progress = chosen, options, progress
@@ -233,7 +254,7 @@ class _Passes:
         self.scores: list[dict[str, Any]] = []
         self.notes: dict[str, Any] = {}
         self.flights = [cloud.flight for cloud in self.clouds]
-        if options.passes > 1:
+        if options.passes > 1 and below is None:
             self.folds = Folds.of(labelled, self.flights, options.pass_folds)
             self.notes["pass_folds"] = self.folds.count
 
@@ -241,7 +262,8 @@ class _Passes:
         """Fill `made` and `scores`; `low` and `high` are the percentiles of the features."""
         for number, columns in enumerate(self._columns(self.samples.weight)):
             forest, importances, bag = self._forest(columns, number)
-            self.made.append(FeatureForest(self.features, forest, self.context if number else None))
+            reads = number or self.below is not None
+            self.made.append(FeatureForest(self.features, forest, self.context if reads else None))
             read = columns[:, self.values.shape[1] :]
             percentiles = {
                 "low": [*low, *read.min(axis=0).tolist()],
@@ -274,6 +296,9 @@ class _Passes:
         """What each pass reads of the samples; those of weight 0 teach none of them anything."""
         held_out: list[list[Forest]] = []
         columns = self.values
+        if self.below is not None:
+            yield np.concatenate([columns, self.below.columns], axis=1)
+            return
         yield columns
         for number in range(1, self.options.passes):
             held_out.append(self._hold_out(columns, weight, number))
@@ -346,7 +371,8 @@ class _Passes:
         total = np.zeros((len(self.samples), len(self.codes)))
         trees = []
         importance = np.zeros(columns.shape[1])
-        what = f"growing pass {number + 1}" if self.options.passes > 1 else "growing"
+        several = self.options.passes > 1 and self.below is None
+        what = f"growing pass {number + 1}" if several else "growing"
         count, weight = self.chosen["trees"], self.samples.weight
         with Progress(count, what, "trees", enabled=self.progress) as bar:
             for tree, rows, shares in self._grown(columns, weight, count, bar, score="out of bag"):

@@ -19,7 +19,7 @@ from . import modelfile, summary
 from .algorithms import InputPlan, PredictRequest, algorithm
 from .deciding import Outcome, Prediction, PredictionOptions, decide
 from .dimensions import known, required, welcome
-from .passes import Passes
+from .passes import Passes, weighed
 from .preparing import preparing
 from .smoothing import count_shares, smooth
 from .thinning import density, out_of_range
@@ -55,7 +55,14 @@ class Model:
     @cached_property
     def algorithm(self) -> Any:
         """What classifies clouds: the only pass, or all of them as one."""
-        return self.passes[0] if len(self.passes) == 1 else Passes(self.passes, len(self.classes))
+        if len(self.passes) == 1:
+            return self.passes[0]
+        factors = (one.get("factors") for one in self.info["passes"])
+        return Passes(
+            self.passes,
+            tuple(map(len, self.codes_of)),
+            tuple(None if one is None else np.array(one) for one in factors),
+        )
 
     @property
     def plan(self) -> FeaturePlan | InputPlan:
@@ -66,6 +73,12 @@ class Model:
     def codes(self) -> npt.NDArray[np.uint8]:
         """ASPRS codes, in the order of the columns of probabilities."""
         return np.array([code for code, _ in self.classes], np.uint8)
+
+    @property
+    def codes_of(self) -> list[list[int]]:
+        """The classes of each pass: the model's own, but for passes of a base, which have theirs."""
+        own = self.codes.tolist()
+        return [list(one.get("codes") or own) for one in self.info["passes"]]
 
     @property
     def factors(self) -> npt.NDArray[np.float64] | None:
@@ -111,13 +124,14 @@ class Model:
             Place of the pass in ``passes``; the last by default.
         """
         values = self.info["passes"][number]["importances"]
-        return summary.importances(values, self.passes[number].columns(self.codes.tolist()), by)
+        return summary.importances(values, self.passes[number].columns(self.codes_of[number]), by)
 
     def describe(self) -> dict[str, Any]:
         """Everything about the model as plain data; ``str(model)`` is the same as text."""
         more = {"required_dimensions": list(self.required_dimensions), "halo": self.halo}
         return summary.describe(
-            {**self.manifest(), **more}, [one.columns(self.codes.tolist()) for one in self.passes]
+            {**self.manifest(), **more},
+            [one.columns(codes) for one, codes in zip(self.passes, self.codes_of, strict=True)],
         )
 
     def __repr__(self) -> str:
@@ -131,8 +145,8 @@ class Model:
     def manifest(self) -> dict[str, Any]:
         """What the model file says beside its arrays."""
         passes = [
-            {"algorithm": one.name, **one.to_file(self.codes.tolist()), **scores}
-            for one, scores in zip(self.passes, self.info["passes"], strict=True)
+            {"algorithm": one.name, **one.to_file(codes), **scores}
+            for one, codes, scores in zip(self.passes, self.codes_of, self.info["passes"], strict=True)
         ]
         return {**self.info, "passes": passes}
 
@@ -220,10 +234,10 @@ class Model:
         progress: Any,
     ) -> Prediction:
         """Classify the points `rows` of those that are `there`; None: all."""
-        codes = self.codes
+        codes, factors = self.codes, self.factors
 
         def finish(p):
-            p = self._weigh(p)
+            p = weighed(p, factors)
             return count_shares(p) if how.smooth else decide(p, codes, how)
 
         outcome = Outcome(len(xyz), len(codes), old, how)
@@ -286,14 +300,6 @@ class Model:
             )
         return out
 
-    def _weigh(self, p: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        factors = self.factors
-        if factors is None:
-            return p
-        p = p * factors
-        p /= p.sum(axis=1, keepdims=True)
-        return p
-
 
 def load_model(path: str | os.PathLike) -> Model:
     """Read a model file. Nothing in it is executed, and nothing in it is believed unchecked.
@@ -322,9 +328,17 @@ def assemble(manifest: dict[str, Any], arrays: modelfile.Arrays) -> Model:
     priors = manifest.get("priors")
     if priors is not None and len(priors["factors"]) != len(classes):
         raise ModelError("the manifest's priors must have one factor per class", found=len(priors["factors"]))
-    passes = []
+    passes, before = [], codes
     for number, entry in enumerate(manifest["passes"]):
-        made = algorithm(entry["algorithm"]).from_file(entry, arrays[number], codes)
+        own = entry.get("codes") or codes
+        if sorted(set(own)) != own or len(entry.get("factors") or own) != len(own):
+            raise ModelError("a pass's classes must ascend, each once, with one factor each", found=own[:10])
+        made = algorithm(entry["algorithm"]).from_file(entry, arrays[number], own)
+        if number and made.classes_before(own) != before:
+            raise ModelError(
+                "a pass reads other classes than the one before gives", found=f"pass {number + 1}"
+            )
+        before = own
         if (number > 0) != bool(entry["context"]):
             raise ModelError("every pass but the first must read context", found=f"pass {number + 1}")
         for key, group in (
@@ -336,8 +350,10 @@ def assemble(manifest: dict[str, Any], arrays: modelfile.Arrays) -> Model:
                 raise ModelError(f"the manifest's {key} must have one value per feature", found=len(group))
         passes.append(made)
     info = {key: value for key, value in manifest.items() if key not in ("format", "version", "arrays")}
-    scores = ("percentiles", "importances", "out_of_bag")
-    info["passes"] = [{key: entry[key] for key in scores} for entry in manifest["passes"]]
+    scores = ("percentiles", "importances", "out_of_bag", "codes", "factors")
+    info["passes"] = [{key: entry[key] for key in scores if key in entry} for entry in manifest["passes"]]
+    if before != codes:
+        raise ModelError("the last pass has other classes than the model", found=before[:10])
     return Model(tuple(passes), classes, info)
 
 

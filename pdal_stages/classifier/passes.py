@@ -43,7 +43,9 @@ class Passes:
 
     #: of a model file: the first any :class:`Algorithm`, then forests
     members: tuple[Any, ...]
-    classes: int
+    classes: tuple[int, ...]  #: of each pass
+    #: of each pass: what its classes' probabilities are multiplied by before they are handed on; None for nothing
+    factors: tuple[npt.NDArray[np.float64] | None, ...] = ()
 
     gives_variance = False
 
@@ -70,7 +72,7 @@ class Passes:
         self, request: PredictRequest, finish: Callable[[npt.NDArray[np.float64]], Any]
     ) -> PredictResult:
         """Classify; see ``Algorithm.predict``."""
-        run = PassRun(self.members, self.classes, request)
+        run = PassRun(self.members, self.classes, request, self.factors)
 
         def last(values, rows, context):
             return finish(self.members[-1].probabilities(joined(values, context), rows))
@@ -85,8 +87,15 @@ class PassRun:
     `report` has what was counted, complete when all blocks are read.
     """
 
-    def __init__(self, members: Sequence[Pass], classes: int, request: PredictRequest) -> None:
+    def __init__(
+        self,
+        members: Sequence[Pass],
+        classes: Sequence[int],
+        request: PredictRequest,
+        factors: Sequence[npt.NDArray[np.float64] | None] = (),
+    ) -> None:
         self._members, self._classes, self._request = members, classes, request
+        self._factors = tuple(factors) or (None,) * len(members)
         self.report: dict[str, Any] = {}
         rows = [request.rows]  # wanted of each pass
         for one in members[:0:-1]:
@@ -128,7 +137,8 @@ class PassRun:
         if first.features is None:
             asked = self._request
             inner = PredictRequest(asked.xyz, asked.dimensions, self._rows[0], asked.threads, asked.memory_mb)
-            predicted = cast(Algorithm, first).predict(inner, count_shares)
+            factors = self._factors[0]
+            predicted = cast(Algorithm, first).predict(inner, lambda p: count_shares(weighed(p, factors)))
             every = np.arange(len(asked.xyz))
             for block in predicted.blocks:
                 yield Passed(every[block.rows], block.result, None)
@@ -150,7 +160,8 @@ class PassRun:
 
         def apply(values, rows, context=None):
             read = values if context is None else joined(values, context)
-            return count_shares(one.probabilities(read, rows)), values if same else None
+            p = weighed(one.probabilities(read, rows), self._factors[number])
+            return count_shares(p), values if same else None
 
         return apply
 
@@ -168,7 +179,7 @@ class PassRun:
             self._rows[number - 1],
             self._rows[number],
             _context_of(one),
-            self._classes,
+            self._classes[number - 1],
             threads=asked.threads,
             keep_bytes=asked.memory_mb * 2**20 * _KEPT / (len(self._members) - 1),
             again=again,
@@ -184,6 +195,15 @@ def _context_of(one: Pass) -> Context:
     """Of a pass after the first, which has one."""
     assert one.context is not None
     return one.context
+
+
+def weighed(p: npt.NDArray[np.float64], factors: npt.NDArray[np.float64] | None) -> npt.NDArray[np.float64]:
+    """Probabilities (b, classes), each class's multiplied by its factor; None leaves them as they are."""
+    if factors is None:
+        return p
+    p = p * factors
+    p /= p.sum(axis=1, keepdims=True)
+    return p
 
 
 def joined(values: npt.NDArray[np.float32], context: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

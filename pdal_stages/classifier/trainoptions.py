@@ -17,7 +17,8 @@ from ..base.threads import resolve_threads
 from ..features.voxels import LARGEST
 from .algorithms import ALGORITHMS, trainer
 from .classes import MAX_LABEL
-from .context import Context
+from .context import OWN, Context
+from .refinement import check_base
 
 #: Most passes a model can have.
 MOST_PASSES = 3
@@ -214,6 +215,13 @@ class TrainingOptions:
         low=2,
         high=100,
     )
+    base: Any = setting(
+        None,
+        "model",
+        "A model to build on: what it says all around a point is read by a forest on top, which few labels train; classes "
+        "that the labels lack keep its answer",
+        "A ``Model``; voxels and preparation are its own. Beside few labels it is believed, beside many the labels are.",
+    )
     algorithm: str = setting(
         "random_forest",
         "string",
@@ -260,11 +268,14 @@ class TrainingOptions:
         if self.folds == 1:
             raise OptionError("'folds' must be 0 or at least 2", found=1)
         self._check_algorithm()
+        self._check_base()
         put("context", lambda _, tokens: Context.parse(tokens).tokens)
         if self.passes > 1 and not self.context:
             raise OptionError(
                 "several passes need a context", found="an empty list", cure="Leave 'context' out"
             )
+        if self.base is not None and OWN not in self.context:
+            raise OptionError(f"with a 'base', 'context' must have '{OWN}'", found=", ".join(self.context))
         if self.strategy == "binary" and self.target is None:
             raise OptionError("the binary strategy needs 'target', the code of the class to find")
         if self.strategy == "multiclass" and self.target is not None:
@@ -299,6 +310,20 @@ class TrainingOptions:
         own = trainer(self.algorithm).own_options(getattr(self, self.algorithm, None))
         if own is not None:
             object.__setattr__(self, self.algorithm, own)
+
+    def _check_base(self) -> None:
+        if self.base is None:
+            return
+        check_base(self.base)
+        if self.algorithm != "random_forest":
+            raise OptionError(
+                "only a forest is built on a 'base'", found=self.algorithm, cure="Leave 'algorithm' out"
+            )
+        if self.leave_one_survey_out:
+            raise OptionError(
+                "'leave_one_survey_out' is not for a model with a 'base'", cure="Leave one of them out"
+            )
+        object.__setattr__(self, "voxel", self.base.voxel)
 
     @property
     def inputs(self) -> tuple[str, ...]:

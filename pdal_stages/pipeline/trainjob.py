@@ -32,7 +32,8 @@ def train_pipeline(
 
     writer = {"type": "writers.classifiermodel", "filename": model, **options}
     stage = cast(ClassifierModel, lower_stage(overridden(writer, overrides)).stage)
-    heights = preparation_of(stage.wished)
+    base = stage.training.base
+    heights = preparation_of(stage.wished) if base is None else base.info.get("preparation") or []
     readers = [reader_of(name, f"input{i}") for i, name in enumerate(sources, 1)]
     if len(readers) == 1 or stage.groups or stage.survey or stage.algorithm != "random_forest":
         return [*readers, *heights, writer]

@@ -20,6 +20,7 @@ from ..classifier.algorithms import ALGORITHMS, Trainer, trainer
 from ..classifier.classes import ClassMap
 from ..classifier.dimensions import ALWAYS, required, welcome
 from .base import Stage, files_read
+from .loading import digest_of, loaded_model
 from .options import option
 from .points import Points
 from .preparation import check
@@ -65,6 +66,7 @@ class ClassifierModel(Stage):
     where_help = "Samples are drawn from the points inside; all points are neighbors."
     filename: str = option("filename", None, "The model file to write", required=True)
     label: str = option("string", "Classification", "Dimension that holds the labels")
+    base: str | None = trained("base")
     algorithm: str = trained("algorithm", choices=tuple(ALGORITHMS))
     alsnet: dict | None = trained("alsnet")
     neighborhoods: list = trained("neighborhoods")
@@ -180,6 +182,7 @@ holds the classes.
         if self.automatic:
             values["dimensions"] = ALWAYS
         values["ignore"] = self.ignore.codes
+        values["base"] = None if self.base is None else loaded_model(self.base)
         values["thin"] = [_number(v) if isinstance(v, str) else v for v in values["thin"]]
         return TrainingOptions(**values, memory_mb=self.memory)
 
@@ -252,6 +255,8 @@ holds the classes.
             cloud = cloud.part(np.flatnonzero(~gone))
         model = train(self._surveys(cloud, points), training)
         model.info["preparation"] = self._preparation
+        if self.base is not None:
+            model.info["base"] = {"name": Path(self.base).stem, "sha256": digest_of(self.base)}
         if self._by_hand:
             model.info["by_hand"] = self._by_hand
         model.save(self.filename)
@@ -266,6 +271,12 @@ holds the classes.
             said = (
                 f"the classes follow from one dimension almost alone: {listed}. If it was made of the labels, or of what "
                 "unlabelled points do not have, leave it out of 'dimensions': the score is worth nothing"
+            )
+            points.report["warning"] = ". ".join(filter(None, [points.report.get("warning"), said]))
+        for code, (all_, held) in model.info["training"].get("held_by_base", {}).items():
+            said = (
+                f"{held:,} of {all_:,} samples of class {code} are, to the base, of a class that no label has, and stay it: "
+                "label some of that class too, or find this one alone (strategy binary, target)"
             )
             points.report["warning"] = ". ".join(filter(None, [points.report.get("warning"), said]))
         crossed = model.info["accuracy"]["cross_validation"] or {}

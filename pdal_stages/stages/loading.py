@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from functools import lru_cache
 from pathlib import Path
@@ -34,6 +35,11 @@ def load_model(path: str | os.PathLike) -> Model:
         error.cure = _CURE
         raise error.at(path) from None
     return model
+
+
+def digest_of(path: str) -> str:
+    """SHA-256 of a model file, or of a shipped model by its name."""
+    return hashlib.sha256(Path(find(path)).read_bytes()).hexdigest()
 
 
 def loaded_model(path: str) -> Model:

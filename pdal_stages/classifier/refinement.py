@@ -1,0 +1,181 @@
+"""A few labels on top of a trained model: a last pass that reads what the base says and changes what the labels teach.
+
+The base's passes stay as they are. The forest on top knows the classes of the labels; what the base says of classes that
+the labels lack is left alone, and of the others it is believed the more the fewer labels there are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from ..base.errors import ModelError, OptionError
+from .context import OWN, Context
+from .featureforest import FeatureForest, Features, check_names
+from .forest import Forest
+
+#: As many labelled points of its rarest class count as much as the base.
+EVEN = 30
+#: Most passes of a base.
+MOST_BELOW = 3
+
+
+def trust(labels: int) -> float:
+    """How far the forest is believed beside the base, 0 to 1, by the labelled points of its rarest class."""
+    return labels / (labels + EVEN)
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedForest(FeatureForest):
+    """The forest on top.
+
+    Attributes
+    ----------
+    before : tuple of int
+        The base's classes.
+    labelled : tuple of int
+        Those the forest was trained on, in the order of its columns.
+    trusted : float
+        See :func:`trust`.
+    target : int or None
+        With the binary strategy, the class that alone is changed.
+    """
+
+    before: tuple[int, ...] = ()
+    labelled: tuple[int, ...] = ()
+    trusted: float = 1.0
+    target: int | None = None
+
+    name: ClassVar[str] = "refined_forest"
+
+    @property
+    def codes(self) -> list[int]:
+        """The classes that come out."""
+        new = self.labelled if self.target is None else (self.target,)
+        return sorted({*self.before, *new})
+
+    @classmethod
+    def from_file(
+        cls, entry: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]], codes: Sequence[int]
+    ) -> RefinedForest:
+        """Made from what a model file says of a pass, everything checked."""
+        said = entry["parameters"]
+        before, labelled = _codes(said.get("before")), _codes(said.get("labelled"))
+        trusted, target = said.get("trusted"), said.get("target")
+        if type(trusted) is not float or not 0.0 <= trusted <= 1.0:
+            raise ModelError(
+                "'trusted' of a refined forest must be a number from 0 to 1", found=str(trusted)[:20]
+            )
+        if target is not None and (target not in labelled or len(labelled) != 2):
+            raise ModelError(
+                "'target' of a refined forest must be one of its two classes", found=str(target)[:20]
+            )
+        features, context = Features.from_dict(entry), Context(tuple(entry["context"]))
+        check_names(features.plan, context.names(before), entry)
+        forest = Forest.from_arrays(arrays, len(entry["feature_names"]), len(labelled))
+        made = cls(features, forest, context, before, labelled, trusted, target)
+        if made.codes != list(codes):
+            raise ModelError(
+                "the classes of a refined forest do not add up to the model's", found=made.codes[:10]
+            )
+        return made
+
+    def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
+        """What a model file says of it beside its arrays."""
+        entry = super().to_file(codes)
+        own = {"before": list(self.before), "labelled": list(self.labelled), "trusted": self.trusted}
+        return {**entry, "parameters": {**entry["parameters"], **own, "target": self.target}}
+
+    def classes_before(self, codes: Sequence[int]) -> list[int]:
+        """The base's."""
+        return list(self.before)
+
+    def probabilities(
+        self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64] | None = None
+    ) -> npt.NDArray[np.float64]:
+        """Probabilities (b, classes): what the base says, changed as far as the labels are to be believed."""
+        assert self.context is not None
+        first = len(self.plan.names) + self.context.tokens.index(OWN) * len(self.before)
+        said = values[:, first : first + len(self.before)].astype(np.float64)
+        said /= np.maximum(said.sum(axis=1, keepdims=True), 1e-9)
+        return blended(
+            said, self.forest.predict_proba(values), self.before, self.labelled, self.trusted, self.target
+        )
+
+
+def blended(
+    said: npt.NDArray[np.float64],
+    grown: npt.NDArray[np.float64],
+    before: Sequence[int],
+    labelled: Sequence[int],
+    trusted: float,
+    target: int | None = None,
+) -> npt.NDArray[np.float64]:
+    """Put the base's probabilities and the forest's together.
+
+    Parameters
+    ----------
+    said : (n, len(before)) float64
+        The base's, rows summing to 1.
+    grown : (n, len(labelled)) float64
+        The forest's.
+    before, labelled : sequence of int
+        Their classes.
+    trusted : float
+        0: the forest counts for nothing where the base knows the class; 1: the base for nothing among the labelled.
+    target : int, optional
+        The one class of `labelled` that counts; the other is everything else.
+
+    Returns
+    -------
+    (n, classes) float64, rows summing to 1; the classes of both, ascending.
+
+    Classes that only the base knows keep its probability. The rest is shared among the labelled ones.
+    """
+    counted = list(labelled) if target is None else [target]
+    codes = sorted({*before, *counted})
+    out = np.zeros((len(said), len(codes)))
+    out[:, np.searchsorted(codes, before)] = said
+    at = np.searchsorted(codes, counted)
+    if target is not None:
+        mine = grown[:, list(labelled).index(target)]
+        if target in before:
+            mine = trusted * mine + (1.0 - trusted) * out[:, at[0]]
+        out[:, at[0]] = 0.0
+        rest = out.sum(axis=1)
+        # Where the base knows of nothing else it stays the target
+        out *= np.where(rest > 0, (1.0 - mine) / np.maximum(rest, 1e-300), 0.0)[:, None]
+        out[:, at[0]] = np.where(rest > 0, mine, 1.0)
+        return out
+    theirs = out[:, at]
+    share = theirs.sum(axis=1, keepdims=True)
+    known = np.where(share > 0, theirs / np.maximum(share, 1e-300), grown)
+    kept = np.delete(out, at, axis=1).sum(axis=1, keepdims=True)
+    out[:, at] = np.maximum(1.0 - kept, 0.0) * (trusted * grown + (1.0 - trusted) * known)
+    return out
+
+
+def check_base(base: Any) -> None:
+    """Refuse what cannot be built on."""
+    passes = getattr(base, "passes", None)
+    if passes is None:
+        raise OptionError("'base' must be a model", found=type(base).__name__, cure="Load it with load_model")
+    if len(passes) > MOST_BELOW:
+        raise OptionError(
+            f"a base may have {MOST_BELOW} passes",
+            found=len(passes),
+            cure="Start from the model that it was built on, with all labels together",
+        )
+
+
+def _codes(given: Any) -> tuple[int, ...]:
+    good = isinstance(given, list) and all(type(one) is int and 0 <= one <= 255 for one in given)
+    if not good or sorted(set(given)) != given or len(given) < 2:
+        raise ModelError(
+            "a refined forest's classes must be codes, ascending, each once", found=str(given)[:60]
+        )
+    return tuple(given)

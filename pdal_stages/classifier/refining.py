@@ -1,0 +1,121 @@
+"""Training on top of a model: what it says of the samples' surroundings, and the model that both make."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..base.progress import Progress
+from .algorithms import PredictRequest
+from .clouds import TrainingCloud
+from .context import OWN, Context
+from .folds import ContextOnly, context_of
+from .model import Model
+from .passes import PassRun
+from .refinement import RefinedForest, trust
+from .sampling import Samples
+from .trainoptions import TrainingOptions
+
+__all__ = ["Below", "on_top", "trust"]
+
+
+class Below:
+    """A base at work on the training clouds. It has not seen their labels, so no ground need be held out."""
+
+    def __init__(
+        self,
+        base: Model,
+        clouds: Sequence[TrainingCloud],
+        samples: Samples,
+        options: TrainingOptions,
+        progress: bool,
+    ) -> None:
+        self.base, self._clouds, self.samples = base, clouds, samples
+        self.options, self._progress = options, progress
+
+    @cached_property
+    def columns(self) -> npt.NDArray[np.float32]:
+        """What it says around the samples, (samples, columns)."""
+        context, o, samples = Context(tuple(self.options.context)), self.options, self.samples
+        classes = [*map(len, self.base.codes_of), len(self.base.classes)]
+        out = np.empty((len(samples), len(context.tokens) * len(self.base.classes)), np.float32)
+        factors = [*(array(one.get("factors")) for one in self.base.info["passes"]), None]
+        factors[len(self.base.passes) - 1] = self.base.factors
+        with Progress(len(samples), "what the base says", enabled=self._progress) as bar:
+            for number, cloud in enumerate(self._clouds):
+                at, rows = samples.of_cloud(number)
+                if not len(at):
+                    continue
+                request = PredictRequest(cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb, bar)
+                run = PassRun([*self.base.passes, ContextOnly(context)], classes, request, factors)
+                mine = np.empty((len(rows), out.shape[1]), np.float32)
+                out[at] = context_of(run, rows, mine)
+        return out
+
+
+def on_top(base: Model, made: Model, trusted: float) -> Model:
+    """The model of the base's passes and the one pass of `made`, with the classes of both."""
+    (forest,) = made.passes
+    target = made.info["target"]
+    shared = {field.name: getattr(forest, field.name) for field in fields(forest)}
+    before, labelled = tuple(base.codes.tolist()), tuple(made.codes.tolist())
+    refined = RefinedForest(**shared, before=before, labelled=labelled, trusted=trusted, target=target)
+    names, entries = dict(base.classes), {one["code"]: one for one in made.info["classes"]}
+    names.update((code, name) for code, name in made.classes if code in refined.codes and code not in names)
+    unseen = {"available": 0, "samples": 0, "duplicates": 0}
+    inherited = {one["code"]: {"labels": one["labels"]} for one in base.info["classes"]}
+    scores = []
+    for codes, one in zip(base.codes_of, base.info["passes"], strict=True):
+        scores.append({**one, "codes": codes})
+    if base.factors is not None:
+        scores[-1]["factors"] = base.factors.tolist()
+    info = {
+        **made.info,
+        "strategy": "multiclass",
+        "target": None,
+        "background": None,
+        "classes": [
+            {**unseen, **inherited.get(code, {}), **entries.get(code, {}), "code": code, "name": names[code]}
+            for code in refined.codes
+        ],
+        "priors": None,
+        "densities": _spanned(base.info.get("densities"), made.info["densities"]),
+        "preparation": base.info.get("preparation") or [],
+        "passes": [*scores, *made.info["passes"]],
+    }
+    return Model((*base.passes, refined), [(code, names[code]) for code in refined.codes], info, made.seconds)
+
+
+def held_by_base(below: Below, codes: Sequence[int]) -> dict[str, list[int]]:
+    """Labelled classes new to the base: [different samples, of these what it calls a class that the labels lack].
+
+    Such points stay what the base calls them.
+    """
+    base, samples = below.base, below.samples
+    before = base.codes.tolist()
+    own = Context(tuple(below.options.context)).tokens.index(OWN) * len(before)
+    said = np.array(before)[below.columns[:, own : own + len(before)].argmax(axis=1)]
+    out = {}
+    for place, code in enumerate(codes):
+        mine = samples.label == place
+        held = int(np.count_nonzero(~np.isin(said[mine], codes)))
+        if code not in before and held:
+            out[str(code)] = [int(np.count_nonzero(mine)), held]
+    return out
+
+
+def array(given: Any) -> npt.NDArray[np.float64] | None:
+    """Numbers of a manifest, or None."""
+    return None if given is None else np.array(given)
+
+
+def _spanned(one: Any, other: Any) -> Any:
+    """Densities that either was trained for."""
+    if one is None or other is None:
+        return other
+    return {**other, "low": min(one["low"], other["low"]), "high": max(one["high"], other["high"])}

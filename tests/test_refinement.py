@@ -1,0 +1,228 @@
+"""A few labels on top of a trained model: nothing is forgotten, and a file holds all of it."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from test_classifier_passes import FEW
+from test_classifier_training import scene
+
+import pdal_stages as ps
+from pdal_stages.base.errors import ModelError, OptionError
+from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, train
+from pdal_stages.classifier.refinement import EVEN, blended, trust
+
+BEFORE = (2, 5, 6)
+
+
+def shares(classes):
+    """(4, classes) rows that sum to 1, among them rows sure of one class."""
+    whole = arrays(np.float64, (4, classes), elements=st.floats(0.0, 1.0))
+    return whole.filter(lambda a: (a.sum(axis=1) > 1e-6).all()).map(
+        lambda a: a / a.sum(axis=1, keepdims=True)
+    )
+
+
+def by_hand(said, grown, before, labelled, trusted):
+    """The rule, point by point and class by class."""
+    codes = sorted({*before, *labelled})
+    out = []
+    for b, f in zip(said, grown, strict=True):
+        b, f = dict(zip(before, b, strict=True)), dict(zip(labelled, f, strict=True))
+        kept = sum(b[c] for c in before if c not in labelled)
+        shared = sum(b.get(c, 0.0) for c in labelled)
+        row = []
+        for c in codes:
+            if c not in labelled:
+                row.append(b[c])
+            else:
+                known = b.get(c, 0.0) / shared if shared > 0 else f[c]
+                row.append((1.0 - kept) * (trusted * f[c] + (1.0 - trusted) * known))
+        out.append(row)
+    return np.array(out)
+
+
+@given(shares(3), shares(2), st.sampled_from([(2, 6), (2, 17), (17, 64)]), st.floats(0.0, 1.0))
+def test_blended_equals_the_rule(said, grown, labelled, trusted):
+    got = blended(said, grown, BEFORE, labelled, trusted)
+    assert np.allclose(got.sum(axis=1), 1.0, atol=1e-9) and (got >= 0).all()
+    assert np.allclose(got, by_hand(said, grown, BEFORE, labelled, trusted), atol=1e-9)
+    codes = sorted({*BEFORE, *labelled})
+    for code in set(BEFORE) - set(labelled):
+        assert np.array_equal(got[:, codes.index(code)], said[:, BEFORE.index(code)])
+
+
+@given(shares(3), shares(3))
+def test_without_trust_the_base_stands(said, grown):
+    assert np.allclose(blended(said, grown, BEFORE, BEFORE, 0.0), said, atol=1e-12)
+    assert np.allclose(blended(said, grown, BEFORE, BEFORE, 1.0), grown, atol=1e-9)
+
+
+@given(shares(3), shares(2), st.sampled_from([6, 17]), st.floats(0.0, 1.0))
+def test_a_target_alone_changes(said, grown, target, trusted):
+    got = blended(said, grown, BEFORE, (1, target), trusted, target)
+    codes = sorted({*BEFORE, target})
+    assert np.allclose(got.sum(axis=1), 1.0, atol=1e-9)
+    others = [code for code in BEFORE if code != target]
+    ours = got[:, [codes.index(code) for code in others]]
+    theirs = said[:, [BEFORE.index(code) for code in others]]
+    for mine, before in zip(ours, theirs, strict=True):  # among themselves they stay as they were
+        assert np.allclose(mine * before.sum(), before * mine.sum(), atol=1e-9)
+
+
+def test_trust_grows_with_labels():
+    assert trust(0) == 0.0 and trust(EVEN) == 0.5
+    assert all(a < b < 1.0 for a, b in zip(map(trust, range(99)), map(trust, range(1, 100)), strict=True))
+
+
+@pytest.fixture(scope="module")
+def base():
+    xyz, label, dimensions = scene()
+    options = TrainingOptions(**{**FEW, "voxel": 0.25}, passes=2, prior_weight=0.5)
+    return train([TrainingCloud(xyz, label, dimensions, "a.laz")], options, progress=False)
+
+
+def on_top(base, keep=None, n=40, **more):
+    """Trained on a few points of another scene, of the classes `keep`."""
+    xyz, label, dimensions = scene(seed=3)
+    rng = np.random.default_rng(0)
+    mask = np.zeros(len(xyz), bool)
+    for code in keep or np.unique(label):
+        mask[rng.choice(np.flatnonzero(label == code), n, replace=False)] = True
+    options = TrainingOptions(**{**FEW, **more}, base=base, folds=0)
+    return train([TrainingCloud(xyz, label, dimensions, "b.laz", mask)], options, progress=False)
+
+
+def test_a_file_holds_the_base(base, tmp_path):
+    model = on_top(base)
+    assert [one.name for one in model.passes] == ["random_forest", "random_forest", "refined_forest"]
+    assert model.voxel == base.voxel and model.halo > base.halo
+    model.save(tmp_path / "m.model")
+    again = load_model(tmp_path / "m.model")
+    xyz, _, dimensions = scene(seed=7, n=4000)
+    one, two = (m.predict(xyz, dimensions, probabilities=True) for m in (model, again))
+    assert np.array_equal(one.probabilities, two.probabilities)
+    again.save(tmp_path / "n.model")
+    assert (tmp_path / "n.model").read_bytes() == (tmp_path / "m.model").read_bytes()
+    assert "refined_forest" in str(again)
+
+
+def test_any_order_and_any_part(base):
+    model = on_top(base)
+    xyz, _, dimensions = scene(seed=7, n=4000)
+    whole = model.predict(xyz, dimensions, probabilities=True).probabilities
+    order = np.random.default_rng(1).permutation(len(xyz))
+    turned = model.predict(
+        xyz[order], {k: np.asarray(v)[order] for k, v in dimensions.items()}, probabilities=True, threads=1
+    ).probabilities
+    assert np.array_equal(turned, whole[order])
+    where = xyz[:, 0] < np.median(xyz[:, 0])
+    part = model.predict(xyz, dimensions, where, probabilities=True).probabilities
+    assert np.array_equal(part[where], whole[where])
+
+
+def test_a_class_without_labels_is_kept(base):
+    codes = base.codes.tolist()
+    gone, *rest = codes[::-1]
+    model = on_top(base, keep=rest)
+    assert model.codes.tolist() == codes
+    xyz, _, dimensions = scene(seed=7, n=4000)
+    before = base.predict(xyz, dimensions, probabilities=True).probabilities[:, codes.index(gone)]
+    after = model.predict(xyz, dimensions, probabilities=True).probabilities[:, codes.index(gone)]
+    assert np.abs(after - before).max() < 1e-3  # of what the base hands on in 65535ths
+
+
+def test_a_new_class_is_learnt(base):
+    xyz, label, dimensions = scene(seed=3)
+    tall = (label == 6) & ((xyz[:, 0] // 10 + xyz[:, 1] // 10) % 2 == 0)
+    xyz[tall, 2] += 6
+    dimensions["HeightAboveGround"] = xyz[:, 2].copy()
+    label[tall] = 17
+    cloud = TrainingCloud(xyz, label, dimensions, "b.laz")
+    model = train([cloud], TrainingOptions(**FEW, base=base, folds=0), progress=False)
+    assert set(model.codes.tolist()) == {*base.codes.tolist(), 17}
+    found = model.predict(xyz, dimensions).classification
+    assert (found == label).mean() > (base.predict(xyz, dimensions).classification == label).mean() + 0.05
+
+
+def test_one_class_alone_changes(base):
+    codes = base.codes.tolist()
+    target = codes[-1]
+    model = on_top(base, strategy="binary", target=target)
+    assert model.codes.tolist() == codes
+    xyz, _, dimensions = scene(seed=7, n=4000)
+    before = base.predict(xyz, dimensions).classification
+    after = model.predict(xyz, dimensions).classification
+    changed = before != after
+    assert ((before[changed] == target) | (after[changed] == target)).all()
+
+
+def test_what_cannot_be_built_on(base):
+    with pytest.raises(OptionError, match="'base' must be a model"):
+        TrainingOptions(base="standard")
+    with pytest.raises(OptionError, match="'own'"):
+        TrainingOptions(base=base, context=["box1"])
+    with pytest.raises(OptionError, match="only a forest"):
+        TrainingOptions(base=base, algorithm="alsnet")
+    once = on_top(base)
+    twice = on_top(once)
+    assert len(twice.passes) == 4
+    with pytest.raises(OptionError, match="a base may have 3 passes"):
+        TrainingOptions(base=twice)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda p: p[-1]["parameters"].update(before=[2, 5]),
+        lambda p: p[-1]["parameters"].update(labelled=[6, 5]),
+        lambda p: p[-1]["parameters"].update(trusted=2.0),
+        lambda p: p[-1]["parameters"].update(target=5),
+        lambda p: p[-1]["parameters"].pop("before"),
+        lambda p: p[0].update(codes=[2, 5]),
+        lambda p: p[1].update(codes=[2, 5, 64]),
+        lambda p: p[1].update(factors=[1.0]),
+    ],
+)
+def test_a_manifest_that_contradicts_itself(base, tmp_path, change):
+    from pdal_stages.classifier.model import assemble
+
+    model = on_top(base)
+    manifest = json.loads(json.dumps(model.manifest()))
+    good = assemble(json.loads(json.dumps(manifest)), [one.arrays() for one in model.passes])
+    assert good.codes.tolist() == model.codes.tolist()
+    change(manifest["passes"])
+    with pytest.raises(ModelError):
+        assemble(manifest, [one.arrays() for one in model.passes])
+
+
+@pytest.mark.pdal
+def test_through_pdal(tmp_path, write_las):
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, 60, (2, 20_000))
+    block = (x > 20) & (x < 40) & (y > 20) & (y < 40)
+    z = np.where(block, 8.0, 0.0) + rng.normal(0, 0.02, len(x))
+    label = np.where(block, 6, np.where(y < 10, 11, 2)).astype(np.uint8)
+    cloud = {"X": x + 5e5, "Y": y + 5e6, "Z": z + 100, "Classification": label}
+    source = write_las(tmp_path / "in.las", cloud, point_format=3)
+    model = tmp_path / "mine.model"
+    ps.run_pipeline(
+        [
+            str(source),
+            *ps.load_model("standard").info["preparation"],
+            {
+                "type": "writers.classifiermodel",
+                "filename": str(model),
+                "base": "standard",
+                "classes": "2,6,11",
+                "trees": 5,
+            },
+        ]
+    )
+    made = ps.load_model(model)
+    assert made.codes.tolist() == [2, 5, 6, 11]
+    assert made.info["base"]["name"] == "standard" and len(made.info["base"]["sha256"]) == 64
+    assert made.info["preparation"] == ps.load_model("standard").info["preparation"]
