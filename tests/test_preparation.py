@@ -19,7 +19,7 @@ _PATHS = ("filename", "mapping", "string")
 
 def test_no_option_that_holds_a_path_is_carried():
     for kind in registry.stages().values():
-        declared = {name: one for one in kind.all_options() for name in (one.name, one.also)}
+        declared = {one.name: one for one in kind.all_options()}
         for name in kind.in_models or {}:
             assert declared[name].kind not in _PATHS, (kind.type, name)
             assert name not in ("threads", "horizontal_unit", "vertical_unit")

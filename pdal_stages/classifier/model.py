@@ -304,14 +304,19 @@ class Model:
 def load_model(path: str | os.PathLike) -> Model:
     """Read a model file. Nothing in it is executed, and nothing in it is believed unchecked.
 
+    The stages that it wants before it (``info["preparation"]``) are of a short list, with options in bounds.
+
     Raises
     ------
     ModelError
-        The file is missing, damaged, of a newer version, or not what it says.
+        The file is missing, damaged, of a newer version, not what it says, or asks for what no model may ask for.
     """
     manifest, arrays = modelfile.read(path, lambda name: algorithm(name).rules)
     try:
-        return assemble(manifest, arrays)
+        model = assemble(manifest, arrays)
+        if asked := model.info.get("preparation"):
+            model.info["preparation"] = preparing().checked(asked)
+        return model
     except ModelError as error:
         error.cure = error.cure or modelfile.CURE
         raise error.at(str(path)) from None

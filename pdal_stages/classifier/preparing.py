@@ -1,6 +1,6 @@
 """What makes the dimensions that a model reads, where coordinates are all there is.
 
-The stages that do so stand above this room, which knows them by these two questions alone.
+The stages that do so stand above this room, which knows them by these questions alone.
 """
 
 from __future__ import annotations
@@ -15,6 +15,9 @@ import numpy.typing as npt
 
 class Preparing(Protocol):
     """Stages before a classifier, as a model file holds them."""
+
+    def checked(self, preparation: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """The same in one spelling; :class:`ModelError` for what a model file may not ask for."""
 
     def preparation_of(self, names: Iterable[str]) -> list[dict[str, Any]]:
         """The stages that make these dimensions, as far as they are heights."""

@@ -26,7 +26,6 @@ class HagMinima(Stage):
         "cell": carried.number(1, 1000),
         "resolution": carried.number(0.05, 1000),
         "ignore": carried.selection,
-        "ignore_classes": carried.selection,
         "where": carried.condition,
     }
     cell: float = option(

@@ -27,7 +27,6 @@ class HagMorphological(Stage):
         "threshold": carried.number(0, 1000),
         "scalar": carried.number(0, 1000),
         "ignore": carried.selection,
-        "ignore_classes": carried.selection,
         "ground": carried.flag,
         "terrain_slope": carried.flag,
         "openings": carried.numbers(1, 1000),

@@ -9,11 +9,17 @@ import numpy as np
 import numpy.typing as npt
 
 from ..terrain import filtered_ground, hag_minima
+from . import preparation as asked_for
 
 #: The stage that makes the dimensions a model is trained on by default.
 PREPARATION = ({"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]},)
 #: Its options by the arguments of the function.
 _MORPHOLOGICAL = ("cell", "slope", "window", "threshold", "scalar")
+
+
+def checked(preparation: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """See :func:`.preparation.check`."""
+    return asked_for.check(preparation)
 
 
 def made_of_coordinates(

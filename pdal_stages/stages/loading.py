@@ -1,4 +1,4 @@
-"""Model files for whoever applies them: a shipped model's name or a path, and all that a file asks for looked at."""
+"""Model files for whoever applies them: a shipped model's name or a path."""
 
 from __future__ import annotations
 
@@ -7,34 +7,20 @@ import os
 from functools import lru_cache
 from pathlib import Path
 
-from ..base.errors import ModelError
 from ..classifier import Model
 from ..classifier import load_model as read_model
 from ..models import find
-from . import preparation
-
-_CURE = "Training writes no such file: ask where it comes from"
 
 
 def load_model(path: str | os.PathLike) -> Model:
     """Read a model file, or a shipped model by its name. Nothing in it is executed or believed unchecked.
-
-    The stages that it wants before it (``info["preparation"]``) are of a short list, with options in bounds; see
-    :func:`.preparation.check`.
 
     Raises
     ------
     ModelError
         The file is missing, damaged, of a newer version, not what it says, or asks for what no model may ask for.
     """
-    path = find(os.fspath(path))
-    model = read_model(path)
-    try:
-        model.info["preparation"] = preparation.check(model.info.get("preparation") or [])
-    except ModelError as error:
-        error.cure = _CURE
-        raise error.at(path) from None
-    return model
+    return read_model(find(os.fspath(path)))
 
 
 def digest_of(path: str) -> str:

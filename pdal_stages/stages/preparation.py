@@ -29,6 +29,8 @@ OF_PDAL = (
 _ASIDE = ("tag", "inputs", "user_data", "log", "threads", "where_merge", "horizontal_unit", "vertical_unit")
 #: Most stages of a preparation.
 _MOST = 8
+#: What to do about a file that asks for more.
+_CURE = "Training writes no such file: ask where it comes from"
 
 
 def entry(stage: Mapping[str, Any]) -> dict[str, Any]:
@@ -64,7 +66,11 @@ def check(preparation: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """
     if len(preparation) > _MOST:
         raise ModelError(f"a preparation has at most {_MOST} stages", found=len(preparation))
-    return [_checked(stage) for stage in preparation]
+    try:
+        return [_checked(stage) for stage in preparation]
+    except ModelError as error:
+        error.cure = _CURE
+        raise
 
 
 def _checked(stage: Mapping[str, Any]) -> dict[str, Any]:

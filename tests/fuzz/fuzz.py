@@ -25,6 +25,7 @@ _KERNELS = [
 ]
 with atheris.instrument_imports(include=["pdal_stages", "json", "zipfile"], exclude=_KERNELS):
     import hostile
+    import manifests
     import targets
 
 
@@ -32,7 +33,7 @@ def main() -> None:
     name, *options = sys.argv[1:]
     corpus = HERE.parents[1] / "build" / "fuzz" / name
     corpus.mkdir(parents=True, exist_ok=True)
-    own = targets if name in targets.TARGETS else hostile
+    own = next(module for module in (targets, hostile, manifests) if name in module.TARGETS)
     for number, seed in enumerate(own.seeds(name)):
         (corpus / f"seed{number}").write_bytes(seed)
     words = _dictionary(name, corpus.parent)

@@ -15,12 +15,13 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import hostile
+import manifests
 import targets
 
 HERE = Path(__file__).resolve().parent
 CASES = sorted(path for path in (HERE / "cases").rglob("*") if path.is_file())
 
-TARGETS = targets.TARGETS | hostile.TARGETS
+TARGETS = targets.TARGETS | hostile.TARGETS | manifests.TARGETS
 #: Changed inputs that are tried for each target.
 TRIES = {
     "pipeline": 1500,
@@ -32,6 +33,7 @@ TRIES = {
     "store": 700,
     "result": 500,
     "network": 150,
+    "manifest": 400,
 }
 #: Or seconds of them.
 SECONDS = float(os.environ.get("PDAL_STAGES_FUZZ_SECONDS", 0))
@@ -61,7 +63,8 @@ def test_findings_stay_fixed(path):
 
 
 def seeds_of(name: str) -> list[bytes]:
-    return list(targets.seeds(name) if name in targets.TARGETS else hostile.seeds(name))
+    own = next(module for module in (targets, hostile, manifests) if name in module.TARGETS)
+    return list(own.seeds(name))
 
 
 def change(data: bytes, rng: random.Random, others: list[bytes]) -> bytes:
