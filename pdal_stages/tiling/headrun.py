@@ -23,6 +23,8 @@ from .grid import Box, TileGrid
 from .results import PieceResults
 from .tileplan import INPUT, OUTSIDE, ROW, TilePlan
 
+#: Points are left out before a stage that needs less than this share of the halo.
+_NARROW = 0.5
 _MARK_TYPES = {ROW: "uint32_t", INPUT: "uint32_t", OUTSIDE: "double"}
 
 
@@ -48,8 +50,14 @@ class HeadRun:
     notes: list[str] = field(default_factory=list)  #: warnings and notes
 
 
-def run_head(context: RunContext, tile: tuple[int, int], cuts: list[Piece], everything: bool) -> HeadRun:
-    """Run the head once; `everything`: all inputs were read, so nothing can lie farther away."""
+def run_head(
+    context: RunContext, tile: tuple[int, int], cuts: list[Piece], everything: bool, narrowing: bool = True
+) -> HeadRun:
+    """Run the head once; `everything`: all inputs were read, so nothing can lie farther away.
+
+    With `narrowing`, stages after one that reaches far get the points alone that they can reach themselves. Where that
+    turns out to be too few (the k nearest neighbors of sparse points), it is done again without.
+    """
     plan = context.plan
     if not plan.head:
         return HeadRun([PieceResults(piece, piece.own, {}) for piece in cuts], 0.0)
@@ -58,6 +66,7 @@ def run_head(context: RunContext, tile: tuple[int, int], cuts: list[Piece], ever
     for mark in marks:
         mark.mixed = any(old) and not all(old)
     reaches: dict[int, _Reach] = {}
+    narrowed = False
     with Callbacks() as callbacks:
         stages: list[dict[str, Any]] = []
         for number, piece in enumerate(cuts):
@@ -76,6 +85,9 @@ def run_head(context: RunContext, tile: tuple[int, int], cuts: list[Piece], ever
             if kind is not None and kind.open_ended and not everything:
                 reach = reaches[len(stages) - 1] = _Reach(context.grid.box(tile), later)
                 stages.append(callbacks.filter(reach))
+            if narrowing and kind is not None and 0 < later < plan.halo_m * _NARROW:
+                narrowed = True
+                stages.append({"type": "filters.range", "limits": f"{OUTSIDE}[:{later!r}]"})
         pipeline = Pipeline(stages, whole=False)
         ours_there = [(ours.stage, ours.place, ours.index) for ours in pipeline.lowered.ours]
         check_writers([*pipeline.lowered.stages, *plan.tail], ours_there)
@@ -86,7 +98,10 @@ def run_head(context: RunContext, tile: tuple[int, int], cuts: list[Piece], ever
     results = _collect(pipeline.arrays, cuts, plan.creates, marks)
     need = max((reach.need for reach in reaches.values()), default=0.0)
     beyond = [report.get("beyond_halo") or {} for _, reports in pipeline.reports for report in reports]
-    if not everything and any(number for one in beyond for number in one.values()):
+    far = any(number for one in beyond for number in one.values())
+    if far and narrowed:
+        return run_head(context, tile, cuts, everything, narrowing=False)
+    if far and not everything:
         most = max(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
         need = max(need, _far_neighbors(pipeline.arrays, most, context, tile))
     notes = [*(f"PDAL says: {line}" for line in pipeline.said), *pipeline.told]
