@@ -619,3 +619,25 @@ def test_a_failed_tile_is_crossed_out():
     text = run_page(TiledRun(jobs, [], {}, [], [], summary).to_dict())
     assert text.count("<rect") == 2 and text.count('d="M1.2') == 1
     assert "&lt;odd&gt; &amp; broken" in text and "<odd>" not in text
+
+
+def test_points_far_away_do_not_stop_a_tile(tmp_path, random_cloud, write_las):
+    """The surroundings a tile needs may hold no more points than the survey, however far they would reach."""
+    xyz = random_cloud(600, seed=8, extent=(250, 250, 4))
+    xyz[::60, 2] += 1.2e6  # their neighbors are far above
+    path = write_las(tmp_path / "high.las", dict(zip("XYZ", xyz.T, strict=True)))
+    features = {
+        "type": "filters.multiscalefeatures",
+        "neighborhoods": "k50",
+        "feature_set": "Linearity,Radius",
+    }
+    stages = [
+        str(path),
+        features,
+        {"type": "writers.las", "filename": str(tmp_path / "a.las"), "extra_dims": "all"},
+    ]
+    ps.Pipeline(stages).execute(arrays=False)
+    stages[-1] = {**stages[-1], "filename": str(tmp_path / "b.las")}
+    run = run_tiled(stages, 100, workers=0)
+    assert not run.failures and not any(job.report["short"] for job in run.tiles)
+    clouds.same_points(tmp_path / "a.las", tmp_path / "b.las")

@@ -14,6 +14,11 @@ def plain(text: str) -> str:
     return _COMMANDS.sub(lambda match: ascii(match.group())[1:-1], text)
 
 
+def one_line(text: str) -> str:
+    """The same with line breaks as codes too, so that a name cannot pass for lines of its own."""
+    return plain(text).replace("\n", "\\n")
+
+
 def tell(*lines: str) -> None:
     """Say lines on standard error, as the command does."""
     for line in lines:

@@ -12,6 +12,7 @@ from typing import Any
 from .errors import StageError
 from .files import open_to_append
 from .kinds import kind_of
+from .plain import one_line
 from .version import __version__
 
 
@@ -59,7 +60,7 @@ class RunLog:
             if self._file is None:
                 return
             try:
-                self._file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line.strip()}\n")
+                self._file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {one_line(line.strip())}\n")
                 self._file.flush()
             except OSError as error:  # the run goes on without its log
                 with contextlib.suppress(OSError):

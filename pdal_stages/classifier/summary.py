@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..base.errors import ModelError, OptionError
+from ..base.plain import one_line
 from .algorithms import Column
 
 #: The dimension in which the command `train` numbers its files.
@@ -50,6 +51,7 @@ def describe(manifest: Mapping[str, Any], columns: Sequence[Sequence[Column]]) -
 
 def text(info: Mapping[str, Any]) -> str:
     """What :func:`describe` gives as a page of text."""
+    info = _in_one_line(info)
     training, several = info["training"], len(info["passes"]) > 1
     lines = scores(info, training.get("held_out"))
     for number, one in enumerate(info["passes"], 1):
@@ -94,6 +96,15 @@ def text(info: Mapping[str, Any]) -> str:
             top = list(one["importances"][by].items())[:10]
             lines.append(f"importance by {by:<13}" + ", ".join(f"{k} {100 * v:.1f} %" for k, v in top))
     return "\n".join(lines)
+
+
+def _in_one_line(value: Any) -> Any:
+    """Names come from files and people: none of them may look like lines of ours."""
+    if isinstance(value, str):
+        return one_line(value)
+    if isinstance(value, Mapping):
+        return {_in_one_line(key): _in_one_line(inner) for key, inner in value.items()}
+    return [_in_one_line(inner) for inner in value] if isinstance(value, list | tuple) else value
 
 
 def scores(info: Mapping[str, Any], held_out: dict[str, Any] | None = None) -> list[str]:

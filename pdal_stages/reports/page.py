@@ -12,6 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ..accuracy.text import percent
 from ..base.asprs import class_color
+from ..base.plain import plain
 from ..base.version import __version__
 
 
@@ -22,7 +23,9 @@ def render(template: str, *, date: str | None = None, **context: Any) -> str:
     """
     context = {"subtitle": "", "version": __version__, "date": date or _today(), **context}
     page = _templates().get_template(template).render(context)
-    return page.encode(errors="backslashreplace").decode()  # names that are not UTF-8
+    return plain(
+        page.encode(errors="backslashreplace").decode()
+    )  # names that are not UTF-8, or command a terminal
 
 
 @lru_cache(maxsize=1)

@@ -133,7 +133,9 @@ class Worklist:
     def tasks(self, store: Store, threads: int):
         """A function that gives the task of a tile or an output."""
         plan, survey = self.plan, self.survey
-        most, scratch = self.options.most_points, str(store.scratch)
+        scratch, most = str(store.scratch), self.options.most_points
+        if sum(header.count for header in survey.extents.values()) <= most:
+            most = 1 << 62  # wider surroundings never hold more than all there is, however far they reach
         run = replace(plan, readers=[])  # tasks travel, and there may be thousands
         context = RunContext(run, survey.grid, survey.unit, survey.bounds, threads, most, scratch)
         # Farther inputs too: a tile may have to be read with wider surroundings.

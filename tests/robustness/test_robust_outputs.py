@@ -12,6 +12,7 @@ from pathlib import Path
 import laspy
 import pytest
 from robustness_kit import job
+from test_robust_models import repack
 
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.links import followed
@@ -319,3 +320,33 @@ def test_a_lock_that_only_writers_can_hold(tmp_path, cloud):
         assert stat.S_IMODE((tmp_path / ".pdal-stages" / "lock").stat().st_mode) == 0o600
     finally:
         os.umask(before)
+
+
+# ---- names that would pass for lines of ours -------------------------------------------------------------------
+
+
+def test_names_in_logs_and_pages(cell, tmp_path, cloud, model):
+    """A log has one line of what was asked for; a page holds no control characters."""
+    odd = tmp_path / "a\n2026-01-01 00:00:00 exit code 0 after 1.0 s\x1b[2J.las"
+    odd.write_bytes(Path(cloud).read_bytes())
+    log = tmp_path / "run.log"
+    it = cell(GROUP, "file name of two lines in a log")
+    it.runs(
+        ["classify", odd, tmp_path / "o.las", "--model", model, "--log", log],
+        "one line, with codes such as \\n",
+    )
+    text = log.read_text()
+    assert "\\n2026-01-01 00:00:00 exit code 0" in text and "\x1b" not in text
+    assert sum("exit code" in line and "\\n" not in line for line in text.splitlines()) == 1
+
+
+def test_names_in_what_is_said_of_a_model(cell, tmp_path, model):
+    def edit(head, _):
+        head["training"]["clouds"][0]["name"] = "a\noverall accuracy 100 %\x1b[2J"
+        head["classes"][0]["name"] = "Ground\n  6 Roof"
+
+    target = repack(model, tmp_path / "odd.model", edit)
+    it = cell("Models", "names of two lines in a model")
+    done = it.runs(["model", target, "--html", tmp_path / "m.html"], "one line, with codes such as \\n")
+    assert "a\\noverall accuracy 100 %\\x1b[2J" in done.out and "Ground\\n  6 Roof" in done.out
+    assert "\x1b" not in (tmp_path / "m.html").read_text()
