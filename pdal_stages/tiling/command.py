@@ -17,7 +17,7 @@ from ..base.asprs import class_name
 from ..base.errors import OptionError, StageError
 from ..base.files import check_writable, write_whole
 from ..base.memory import parse_size
-from ..base.plain import tell
+from ..base.plain import one_line, tell
 from ..pipeline.ends import is_folder, is_las
 from ..pipeline.read import PipelineSource
 from ..pipeline.run import Pipeline
@@ -161,7 +161,7 @@ def _end(options: argparse.Namespace, run: TiledRun, again: str) -> int:
 def classify(task: ClassifyTask, options: argparse.Namespace) -> int:
     """Run ``pdal-stages classify``; the exit code, 1 where anything failed."""
     _check_reports(options)
-    names = dict(task.request.loaded.classes)
+    names = {code: one_line(name) for code, name in task.request.loaded.classes}
     if options.dry_run and (task.in_one_piece() or not task.can_be_cut):
         task.request.pipeline(
             task.files[0], str(Path(task.output) / "dry-run.laz") if is_folder(task.output) else task.output

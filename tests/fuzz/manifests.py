@@ -246,11 +246,14 @@ def _put_to_work(made: Any, path: Path, source: Path, target: Path) -> Pipeline 
         rules = carried.OF_PDAL.get(stage["type"])
         assert set(stage) - {"type"} <= set(registry.get(stage["type"]).in_models if rules is None else rules)
     pipeline = ClassifyRequest(str(path)).pipeline(str(source), str(target))
-    given = [
-        stage for stage in pipeline.source.stages if stage.get("type") not in ("readers.las", "writers.las")
+    asked = made.info["preparation"]
+    own = [
+        s
+        for s in pipeline.source.stages
+        if s not in asked and s["type"] not in ("readers.las", "writers.las")
     ]
-    assert [s["type"] for s in given[-1:]] == ["filters.modelclassifier"]
-    for stage in given[:-1]:
+    assert {s["type"] for s in own} <= set(registry.stages()) | set(carried.OF_PDAL), own
+    for stage in asked:
         assert "/" not in json.dumps({k: v for k, v in stage.items() if k != "where"})
     bare = Pipeline([str(source), {"type": "filters.modelclassifier", "model": str(path)}])
     assert bare.lowered.ours
