@@ -56,6 +56,7 @@ class ClassifyRequest:
     @cached_property
     def _classifier(self) -> dict[str, Any]:
         stage: dict[str, Any] = {"type": "filters.modelclassifier", "model": self.model, **self._inside}
+        stage["compact"] = True
         for option, name in (
             ("margin", "Margin"),
             ("variance", "Variance"),
