@@ -660,11 +660,6 @@ def test_a_plugin_that_pip_installed(tmp_path, monkeypatch):
         building.uninstall(tmp_path)
 
 
-def test_the_distribution_has_the_package_s_version():
-    text = (Path(__file__).resolve().parent.parent / "native" / "pyproject.toml").read_text()
-    assert f'\nversion = "{__version__}"' in text
-
-
 def test_what_is_missing_is_told(tmp_path, monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
     _, bad = building.check(tmp_path)

@@ -1,0 +1,36 @@
+"""`classify` writes heights and reliabilities in 64ths, so that its outputs stay small."""
+
+from __future__ import annotations
+
+import laspy
+import numpy as np
+import pytest
+
+from pdal_stages import cli
+from pdal_stages.synthetic import TownOptions, write_town
+
+pytestmark = pytest.mark.pdal
+MADE = ("HeightAboveGround", "Reliability")
+
+
+def test_outputs_are_half_as_large_again_at_most(tmp_path):
+    town = tmp_path / "town.laz"
+    write_town(TownOptions(size=60, density=12, seed=4), town)
+    words = ["--where", "X > 500020", "--dimensions", "HeightAboveGround,Reliability,Margin"]
+    for name, more in (("small", []), ("exact", ["--filters.modelclassifier.compact=false"])):
+        assert cli.main(["classify", str(town), str(tmp_path / f"{name}.laz"), *more]) == 0
+        assert cli.main(["classify", str(town), str(tmp_path / f"{name}_where.laz"), *words, *more]) == 0
+    assert (tmp_path / "small.laz").stat().st_size <= 1.5 * town.stat().st_size
+    small, exact = laspy.read(tmp_path / "small.laz"), laspy.read(tmp_path / "exact.laz")
+    np.testing.assert_array_equal(small.classification, exact.classification)
+    for name in MADE:
+        values, exactly = np.asarray(small[name]), np.asarray(exact[name])
+        np.testing.assert_array_equal(values * 64, np.round(values * 64))
+        assert np.abs(values - exactly).max() <= 1 / 128 + 1e-6
+        assert not np.array_equal(values, exactly)
+    small, exact = laspy.read(tmp_path / "small_where.laz"), laspy.read(tmp_path / "exact_where.laz")
+    inside = np.asarray(small.x) > 500020
+    for name in (*MADE, "Margin"):
+        values, exactly = np.asarray(small[name]), np.asarray(exact[name])
+        np.testing.assert_array_equal(values[inside] * 64, np.round(values[inside] * 64))
+        np.testing.assert_array_equal(values[~inside], exactly[~inside])

@@ -1,0 +1,83 @@
+"""What a release consists of: one version, a recipe that asks for the same, a wheel with all that it needs."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from pdal_stages.base.version import __version__
+
+ROOT = Path(__file__).resolve().parent.parent
+PYPROJECT = (ROOT / "pyproject.toml").read_text()
+#: Names on PyPI that conda-forge has otherwise.
+_CONDA = {"laspy[lazrs]": "laspy"}
+
+
+def test_one_version_everywhere():
+    assert f'\nversion = "{__version__}"' in (ROOT / "native" / "pyproject.toml").read_text()
+    assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f'\n  version: "{__version__}"\n' in (ROOT / "recipe" / "recipe.yaml").read_text()
+    assert f"\n## {__version__} " in (ROOT / "CHANGELOG.md").read_text()
+
+
+@pytest.mark.parametrize("file", ["recipe/recipe.yaml", "environment.yml"])
+def test_conda_asks_for_what_pip_asks_for(file):
+    block = re.search(r"\ndependencies = \[\n(.*?)\n\]", PYPROJECT, re.DOTALL)
+    wanted = re.findall(r'"([^">]+)>=([^"]+)"', block[1])
+    text = (ROOT / file).read_text()
+    assert len(wanted) >= 9
+    for name, bound in wanted:
+        assert f"- {_CONDA.get(name, name)} >={bound}\n" in text, name
+
+
+@pytest.mark.slow
+def test_a_wheel_has_all_that_it_needs(tmp_path):
+    """Built from a copy, installed into a clean environment whose packages are this one's."""
+    source = tmp_path / "source"
+    subprocess.run(["git", "-C", ROOT, "rev-parse"], check=True, capture_output=True)
+    listed = subprocess.run(["git", "-C", ROOT, "ls-files", "-z"], check=True, capture_output=True, text=True)
+    for name in filter(None, listed.stdout.split("\0")):
+        if name.startswith(("pdal_stages/", "native/")) or "/" not in name:
+            (source / name).parent.mkdir(parents=True, exist_ok=True)
+            (source / name).write_bytes((ROOT / name).read_bytes())
+    wheels = tmp_path / "wheels"
+    command = [sys.executable, "-m", "pip", "wheel", "--no-deps", "-q", "-w", wheels, source]
+    built = subprocess.run(command, capture_output=True, text=True, check=False)
+    if built.returncode and re.search(
+        "No matching distribution|Could not find a version|connection", built.stderr
+    ):
+        pytest.skip("pip's index has no setuptools to build with")
+    assert built.returncode == 0, built.stderr
+    (wheel,) = wheels.glob("*.whl")
+    names = set(zipfile.ZipFile(wheel).namelist())
+    here = {path.relative_to(ROOT).as_posix() for path in (ROOT / "pdal_stages").rglob("*.py")}
+    assert here - {name for name in here if name not in listed.stdout.split("\0")} <= names
+    for needed in (
+        "models/standard.model",
+        "reports/templates/style.css",
+        "native/stage.cpp",
+        "native/entry.cpp",
+        "py.typed",
+    ):
+        assert f"pdal_stages/{needed}" in names, needed
+    target = tmp_path / "env"
+    subprocess.run(
+        [sys.executable, "-m", "pip", "install", "--no-deps", "-q", "--target", target, wheel], check=True
+    )
+    code = (
+        "import pdal_stages, pdal_stages.plugin.places as places\n"
+        "from pdal_stages.stages.loading import loaded_model\n"
+        "print(pdal_stages.__file__, places.sources(), len(loaded_model('standard').classes))"
+    )
+    said = subprocess.run(
+        [sys.executable, "-c", code], env={"PYTHONPATH": str(target)}, cwd=tmp_path,
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert said.returncode == 0, said.stderr
+    package, sources, classes = said.stdout.split()
+    assert package.startswith(str(target)) and sources.startswith(str(target)) and int(classes) >= 2
