@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,8 +12,10 @@ from ..base.asprs import class_name
 from ..base.files import write_whole
 from .page import duration, render
 
-#: Most tiles drawn, and most rows of the table of times.
-DRAWN, ROWS = 20_000, 200
+#: Most squares drawn, and most rows of the table of times.
+DRAWN, ROWS = 8_000, 200
+#: States of a tile, the one that a square of several tiles shows first.
+_WORST = ("failed", "waiting", "done", "kept")
 #: Settings shown, by their names in the report.
 _SETTINGS = {
     "pipeline": "pipeline",
@@ -49,7 +52,7 @@ def run_page(run: Mapping[str, Any]) -> str:
         run=run,
         figures=_figures(run),
         what=_what(run),
-        plan=_plan(run["tiles"][:DRAWN], run["tile"]),
+        plan=_plan(*_drawn(run["tiles"], run["tile"])),
         classes=[(int(code), class_name(int(code)), count) for code, count in classes.items()],
         slowest=[(t, _corner(t["tile"], run["tile"])) for t in done[:ROWS]],
         done=len(done),
@@ -91,6 +94,31 @@ def _what(run: Mapping[str, Any]) -> dict[str, Any]:
 def _corner(tile: Sequence[int], side: float, right: int = 0, up: int = 0) -> str:
     """The coordinates of a tile's lower left corner, or of another one."""
     return f"{(tile[0] + right) * side:.10g}, {(tile[1] + up) * side:.10g}"
+
+
+def _drawn(tiles: Sequence[Mapping[str, Any]], side: float) -> tuple[Sequence[Mapping[str, Any]], float]:
+    """What the map shows as squares of a side: tiles, or where there are too many, several of them as one."""
+    if len(tiles) <= DRAWN:
+        return tiles, side
+    together = math.ceil(math.sqrt(len(tiles) / DRAWN))
+    groups: dict[tuple[int, int], list[Mapping[str, Any]]] = {}
+    for t in tiles:
+        groups.setdefault((t["tile"][0] // together, t["tile"][1] // together), []).append(t)
+    squares = []
+    for place, group in groups.items():
+        state = next(s for s in (*_WORST, group[0]["state"]) if any(t["state"] == s for t in group))
+        failed = [t for t in group if t["state"] == "failed"]
+        squares.append(
+            {
+                "name": f"{len(group)} tiles",
+                "tile": place,
+                "state": state,
+                "points": sum(t["points"] for t in group),
+                "seconds": sum(t.get("seconds", 0.0) for t in group),
+                **({"reason": f"{len(failed)} failed: {failed[0].get('reason', '')}"} if failed else {}),
+            }
+        )
+    return squares, side * together
 
 
 def _plan(tiles: Sequence[Mapping[str, Any]], side: float) -> dict[str, Any] | None:
