@@ -1,8 +1,8 @@
 """Outlines of objects: along their cells, or straight along walls; in shapely's geometries (extra ``vector``).
 
 Straight outlines follow the main direction of what stands wall to wall. The boundary of all its cells together is cut into
-edges (Douglas, Peucker), each is turned along or across the main direction where it lies within 12 degrees of it, and put
-where the middle of its cells' steps lies. Walls between buildings are drawn once, so neighbors share them.
+edges (Douglas, Peucker), each is turned along or across the main direction where its ends are little off it, and put where
+the middle of its cells' steps lies. Walls between buildings are drawn once, so neighbors share them.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import itertools
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +27,8 @@ _LIKENESS = 0.85
 #: The same of a rectangle, which is then taken.
 _BOXLIKE = 0.82
 _GRID = 1.0 / 1024.0
-#: What is off the main direction by less is turned into it: a rise, and a number of cells for short walls.
-_DIAGONAL, _SLACK = math.tan(math.radians(12.0)), 2.5
+#: A wall whose ends are off the main direction by no more cells is turned into it.
+_SLACK = 2.5
 
 
 def vector(name: str) -> Any:
@@ -282,33 +282,38 @@ def straight_ring(places: NDArray, angle: float) -> NDArray[np.float64] | None:
     lines = _one_after_the_other(lines)
     if len(lines) < 3:
         return None
-    corners = []
+    corners: list[NDArray] = []
     for n, line in enumerate(lines):
-        corner = _meeting(lines[n - 1], line)
-        if corner is None:
-            return None
-        corners.append(corner)
+        corners += _meeting(lines[n - 1], line)
     return _turned(np.array(corners), -angle)
 
 
-#: A wall: its direction ("h" along, "v" across, "d" on a slant), a place on it, its unit vector and its length.
-_Wall = tuple[str, NDArray, NDArray, float]
+class _Wall(NamedTuple):
+    """An edge of an outline: a line, and where on the boundary it ends (None where it was put in between)."""
+
+    place: NDArray
+    way: NDArray  # unit vector
+    length: float
+    end: NDArray | None
 
 
 def _line(xy: NDArray) -> _Wall:
     """The wall that places lie along."""
-    away = xy[-1] - xy[0]
+    away, end = xy[-1] - xy[0], xy[-1]
     length = float(math.hypot(*away))
     inner = xy[1:-1] if len(xy) > 4 else xy
+    along, across = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     east, north = abs(away[0]), abs(away[1])
-    if north < east and north <= max(_DIAGONAL * east, _SLACK):
-        return "h", np.array([xy[:, 0].mean(), np.median(inner[:, 1])]), np.array([1.0, 0.0]), length
-    if east <= north and east <= max(_DIAGONAL * north, _SLACK):
-        return "v", np.array([np.median(inner[:, 0]), xy[:, 1].mean()]), np.array([0.0, 1.0]), length
+    if north < east and north <= _SLACK:
+        return _Wall(np.array([xy[:, 0].mean(), np.median(inner[:, 1])]), along, length, end)
+    if east <= north and east <= _SLACK:
+        return _Wall(np.array([np.median(inner[:, 0]), xy[:, 1].mean()]), across, length, end)
     if length < 6.0:  # a short slant is a corner cut by the grid
-        kind = "h" if abs(away[0]) >= abs(away[1]) else "v"
-        return kind, xy.mean(axis=0), np.array([1.0, 0.0] if kind == "h" else [0.0, 1.0]), length
-    return "d", inner.mean(axis=0), away / length, length
+        return _Wall(xy.mean(axis=0), along if east >= north else across, length, end)
+    middle = inner.mean(axis=0)
+    u, v = (inner - middle).T
+    slant = 0.5 * math.atan2(2.0 * float(u @ v), float(u @ u - v @ v))  # of the places' main axis
+    return _Wall(middle, np.array([math.cos(slant), math.sin(slant)]), length, end)
 
 
 def _one_after_the_other(lines: list[_Wall]) -> list[_Wall]:
@@ -320,36 +325,42 @@ def _one_after_the_other(lines: list[_Wall]) -> list[_Wall]:
         if not _parallel(before, line) or _apart(before, line) > _TOLERANCE:
             n += 1
             continue
-        share = line[3] / max(line[3] + before[3], 1e-9)
-        walls[n] = (line[0], before[1] + share * (line[1] - before[1]), before[2], before[3] + line[3])
+        share = line.length / max(line.length + before.length, 1e-9)
+        way = line.way if share >= 0.5 else before.way
+        middle = before.place + share * (line.place - before.place)
+        walls[n] = _Wall(middle, way, before.length + line.length, line.end)
         del walls[n - 1]  # the last one where n is 0
         n = max(n - 1, 0)
     out: list[_Wall] = []
     for n, line in enumerate(walls):
         before = walls[n - 1]
-        if _parallel(before, line) and line[0] != "d":
-            kind, way = ("v", np.array([0.0, 1.0])) if line[0] == "h" else ("h", np.array([1.0, 0.0]))
-            out.append((kind, 0.5 * (before[1] + line[1]), way, _apart(before, line)))
+        if _parallel(before, line):
+            across = np.array([-line.way[1], line.way[0]])
+            middle = before.end if before.end is not None else 0.5 * (before.place + line.place)
+            out.append(_Wall(middle, across, _apart(before, line), None))
         out.append(line)
     return out
 
 
 def _apart(a: _Wall, b: _Wall) -> float:
     """How far parallel walls lie from each other."""
-    return abs(float((b[1] - a[1]) @ np.array([-a[2][1], a[2][0]])))
+    return abs(float((b.place - a.place) @ np.array([-a.way[1], a.way[0]])))
 
 
 def _parallel(a: _Wall, b: _Wall) -> bool:
-    return a[0] == b[0] and (a[0] != "d" or abs(float(a[2] @ b[2])) > 0.97)
+    return abs(float(a.way @ b.way)) > 0.995
 
 
-def _meeting(a: _Wall, b: _Wall) -> NDArray | None:
-    """Where two walls meet."""
-    cross = float(a[2][0] * b[2][1] - a[2][1] * b[2][0])
-    if abs(cross) < 0.05:
-        return None
-    away = b[1] - a[1]
-    return a[1] + a[2] * float((away[0] * b[2][1] - away[1] * b[2][0]) / cross)
+def _meeting(a: _Wall, b: _Wall, near: float = 4.0) -> list[NDArray]:
+    """Where two walls meet; where that is far from where the first ends on the boundary, the places on both beside it."""
+    cross = float(a.way[0] * b.way[1] - a.way[1] * b.way[0])
+    away = b.place - a.place
+    if abs(cross) > 0.05:
+        corner = a.place + a.way * float((away[0] * b.way[1] - away[1] * b.way[0]) / cross)
+        if a.end is None or b.end is None or math.hypot(*(corner - a.end)) <= near:
+            return [corner]
+    end = a.end if a.end is not None else 0.5 * (a.place + b.place)
+    return [wall.place + wall.way * float((end - wall.place) @ wall.way) for wall in (a, b)]
 
 
 def _straight_wall(corners: NDArray, angle: float) -> NDArray[np.float64]:
@@ -363,7 +374,7 @@ def _straight_wall(corners: NDArray, angle: float) -> NDArray[np.float64]:
     at = _peucker(xy, _TOLERANCE)
     lines = [_line(xy[a : b + 1]) for a, b in itertools.pairwise(at)]
     if len(lines) == 1:
-        _, place, way, length = lines[0]
+        place, way, length, _ = lines[0]
         sign = 1.0 if float(way @ (xy[-1] - xy[0])) >= 0 else -1.0
         half = 0.5 * sign * length * way
         return _turned(np.array([place - half, place + half]), -angle)

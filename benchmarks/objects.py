@@ -1,0 +1,156 @@
+"""Objects of generated towns and of Delft's train part against what truly stands there.
+
+python benchmarks/objects.py [--data FOLDER] [--classified MODEL]
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import time
+from pathlib import Path
+
+import numpy as np
+import shapely
+
+from pdal_stages.objects import Cells, ObjectSettings, find_objects
+from pdal_stages.objects.cells import Kind
+from pdal_stages.objects.compare import compare_buildings, matched_by_place
+from pdal_stages.objects.outlines import raw_outlines, straight_outlines
+from pdal_stages.synthetic import TownOptions, make_town
+from pdal_stages.synthetic.truth import true_objects
+
+SIZE, DENSITY = 300.0, 8.0
+#: Two roofs are one building where they differ by at most STEP along a third of the wall they share.
+STEP, SHARE, TOUCHING = 2.5, 0.34, 0.6
+
+
+def true_buildings(houses, step):
+    """Outlines of buildings: houses that touch and whose roofs meet; a `step` of 0: all that touch."""
+    shapes = [shapely.Polygon(house.corners) for house in houses]
+    parent = list(range(len(shapes)))
+
+    def root(n):
+        while parent[n] != n:
+            n = parent[n]
+        return n
+
+    for a, b in itertools.combinations(range(len(shapes)), 2):
+        if shapes[a].distance(shapes[b]) >= TOUCHING:
+            continue
+        near = []
+        for one, other in ((a, b), (b, a)):
+            edge = shapes[one].exterior
+            places = shapely.line_interpolate_point(edge, np.arange(0, edge.length, 0.25))
+            places = shapely.get_coordinates(places[shapely.dwithin(shapes[other], places, TOUCHING)])
+            near.append(np.abs(houses[a].height(places) - houses[b].height(places)) <= (step or np.inf))
+        near = np.concatenate(near)
+        if len(near) and near.mean() >= SHARE:
+            parent[root(a)] = root(b)
+    groups = {}
+    for n, shape in enumerate(shapes):
+        groups.setdefault(root(n), []).append(shape)
+    joined = [shapely.union_all(shapely.buffer(g, 0.3, join_style="mitre")) for g in groups.values()]
+    return [shape.buffer(-0.3, join_style="mitre") for shape in joined]
+
+
+def town(seed, codes=None):
+    """Figures of a town, by its true classes or by others."""
+    made = make_town(SIZE, DENSITY, seed, progress=False)
+    true = true_objects(TownOptions(SIZE, DENSITY, seed))
+    x0, y0 = made.options.origin[:2]
+    square = shapely.box(x0, y0, x0 + SIZE, y0 + SIZE)
+    codes = made.classification if codes is None else codes(made)
+    rows = {}
+    for step in (STEP, 0.0):
+        started = time.process_time()
+        found = find_objects(Cells.of(*made.xyz.T, codes, 0.5), ObjectSettings(step=step), progress=False)
+        raw = raw_outlines(found.tables[Kind.BUILDING], 0.5)
+        shapes = [shapely.transform(s, lambda xy: xy / 2) for s in straight_outlines(raw, 0.5)]
+        seconds = time.process_time() - started
+        houses = [h.intersection(square) for h in true_buildings(true.houses, step)]
+        rows[f"buildings, step {step:g}"] = (
+            compare_buildings(shapes, [h for h in houses if h.area >= 4]),
+            seconds,
+        )
+    trees = [t for t in true.trees if t.height >= 3 and square.buffer(-2).contains(shapely.Point(t.x, t.y))]
+    places, high = np.array([(t.x, t.y) for t in trees]), np.array([t.height for t in trees])
+    radius = np.array([t.radius for t in trees])
+    table = found.tables[Kind.TREE].columns
+    at = np.column_stack([table["x"], table["y"]])
+    inner = shapely.contains_xy(square.buffer(-2), *at.T)
+    at, tall = at[inner], table["height"][inner]
+    pairs = matched_by_place(at, tall, places, high)
+    away = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))
+    np.fill_diagonal(away, np.inf)
+    alone = (away > radius[:, None] + radius[None] + 0.5).all(1)
+    extra = sorted(set(range(len(at))) - {a for a, _ in pairs})
+    wrong = sum(alone[np.argmin(np.hypot(*(places - at[n]).T))] for n in extra)
+    hit = sum(alone[b] for _, b in pairs)
+    rows["trees"] = 2 * len(pairs) / (len(at) + len(places)), 2 * hit / (hit + wrong + alone.sum())
+    return rows
+
+
+def delft(data):
+    """Figures of Delft's train part by its own classes: houses covered, area, boundary."""
+    import json
+
+    import laspy
+
+    las = laspy.read(Path(data) / "delft" / "train.laz")
+    xyz, codes = np.column_stack([las.x, las.y, las.z]), np.asarray(las.classification)
+    found = find_objects(Cells.of(*xyz.T, codes, 0.5), progress=False)
+    raw = raw_outlines(found.tables[Kind.BUILDING], 0.5)
+    listed = json.loads((Path(data) / "delft" / "buildings_train.geojson").read_text())["features"]
+    true = [shapely.make_valid(shapely.from_geojson(json.dumps(f["geometry"]))) for f in listed]
+    for name, shapes in (("cells", raw), ("straight", straight_outlines(raw, 0.5))):
+        shapes = [shapely.transform(s, lambda xy: xy / 2) for s in shapes]
+        got = compare_buildings(shapes, true)
+        print(
+            f"Delft, {name}: {100 * got['covered']:.1f} % of {len(true)} outlines covered by 80 % or more, "
+            f"{100 * got['area']['completeness']:.1f} % of their area, boundary {got['boundary']['median']:.2f} m, "
+            f"95 %: {got['boundary']['p95']:.2f} m"
+        )
+
+
+def classified(model):
+    """Codes of a town by a model file, as `pdal-stages classify` gives them."""
+
+    def codes(made):
+        import tempfile
+
+        import laspy
+
+        from pdal_stages.cli import main
+        from pdal_stages.synthetic import write_town
+
+        with tempfile.TemporaryDirectory() as folder:
+            write_town(made, f"{folder}/town.laz")
+            main(["classify", f"{folder}/town.laz", f"{folder}/out.laz", "--model", model])
+            return np.asarray(laspy.read(f"{folder}/out.laz").classification)
+
+    return codes
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", help="folder of the real clouds")
+    parser.add_argument(
+        "--classified", metavar="MODEL", help="classes by this model instead of the true ones"
+    )
+    parser.add_argument("--seeds", type=int, nargs="*", default=[1, 2, 3])
+    options = parser.parse_args()
+    for seed in options.seeds:
+        for name, value in town(seed, classified(options.classified) if options.classified else None).items():
+            if name == "trees":
+                print(f"town {seed}, trees: F1 {value[0]:.3f}, isolated ones {value[1]:.3f}")
+            else:
+                got, seconds = value
+                of = got["objects"]
+                print(
+                    f"town {seed}, {name}: F1 {of['f1']:.3f} ({of['completeness']:.3f} complete, "
+                    f"{of['correctness']:.3f} correct), area IoU {got['area']['iou']:.3f}, boundary "
+                    f"{got['boundary']['median']:.2f} m, 95 %: {got['boundary']['p95']:.2f} m; {seconds:.2f} CPU s"
+                )
+    if options.data:
+        delft(options.data)
