@@ -561,6 +561,48 @@ def test_too_many_features_for_one_las_record(cloud, tmp_path):
 # ---- threads ---------------------------------------------------------------------------------------------
 
 
+def test_standard_output_is_back_after_runs_in_threads(cloud, capsys):
+    """PDAL swaps sys.stdout for its log while it runs, and in two threads puts back the other's."""
+    before = sys.stdout
+    failed = []
+
+    def work():
+        try:
+            for _ in range(4):
+                ps.Pipeline([str(cloud), {"type": "filters.hag_minima"}]).execute(arrays=False)
+        except ps.StageError as error:
+            failed.append(error)
+
+    threads = [threading.Thread(target=work) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not failed and sys.stdout is before
+    print("heard")
+    assert "heard" in capsys.readouterr().out
+
+
+def test_one_pipeline_in_several_threads_says_so(cloud):
+    pipeline = ps.Pipeline([str(cloud), {"type": "filters.hag_minima"}])
+    counts, failures = [], []
+
+    def work():
+        try:
+            counts.append(pipeline.execute(arrays=False))
+        except ps.StageError as error:
+            failures.append(str(error))
+
+    threads = [threading.Thread(target=work) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert counts and len(set(counts)) == 1
+    assert all("running already, in another thread" in failure for failure in failures)
+    assert pipeline.execute(arrays=False) == counts[0]
+
+
 def test_pipelines_run_in_threads(cloud):
     results: dict[int, np.ndarray] = {}
 

@@ -10,6 +10,7 @@ import re
 import shutil
 import subprocess
 import sys
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -94,7 +95,6 @@ def ask_program(*arguments: str) -> str:
     return done.stdout
 
 
-@fragile
 def execute(
     stages: list[dict[str, Any]], *, arrays: bool = True, loglevel: int = logging.WARNING
 ) -> Execution:
@@ -107,6 +107,17 @@ def execute(
     DependencyError
         If python-pdal or filters.python is missing.
     """
+    with _one_run:
+        return _execute(stages, arrays, loglevel)
+
+
+#: PDAL puts its log in the place of sys.stdout while it runs and puts back what it found there, which in two threads is the
+#: other's log. It also holds Python still, so runs in threads gain nothing from each other.
+_one_run = threading.RLock()
+
+
+@fragile
+def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execution:
     pdal = bindings()
     stdout = sys.stdout
     try:

@@ -6,6 +6,7 @@ import json
 import logging
 import re
 import signal
+import threading
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,9 @@ from .read import PipelineSource, read_pipeline
 from .records import keep_records
 from .references import check_readers
 from .wiring import check_start
+
+#: Held while a pipeline is marked as running.
+_marking = threading.Lock()
 
 
 class Pipeline:
@@ -70,6 +74,7 @@ class Pipeline:
         self.said: list[str] = []
         self.reports: list[tuple[str, list[dict[str, Any]]]] = []
         self.remarks: list[str] = []
+        self._running = False
 
     @property
     def told(self) -> list[str]:
@@ -139,6 +144,20 @@ class Pipeline:
         StageError
             What went wrong, where, and the cure.
         """
+        with _marking:
+            if self._running:
+                raise PipelineError(
+                    "this pipeline is running already, in another thread",
+                    where=self.source.name or None,
+                    cure="Make one Pipeline for each thread",
+                )
+            self._running = True
+        try:
+            return self._execute(arrays, loglevel)
+        finally:
+            self._running = False
+
+    def _execute(self, arrays: bool, loglevel: int) -> int:
         self._check_inputs()
         self.check_outputs()
         stages = self.lowered.stages
