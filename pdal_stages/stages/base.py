@@ -101,6 +101,8 @@ class Stage(ABC):
         "string", "", "Unit of z, where the spatial reference does not say; otherwise that of x and y"
     )
 
+    #: In tiles: what :meth:`left_of` gave of points farther away than :meth:`near_halo`.
+    surroundings: NDArray[np.float64] | None = None
     #: Whether stages before it in the pipeline make what it makes too.
     makes_again: bool = False
     #: Set where a pipeline's writer cannot hold every class code.
@@ -146,6 +148,14 @@ class Stage(ABC):
     def halo(self) -> float:
         """How far beyond a tile, in metres, points can change the tile's results."""
         return 0.0
+
+    def near_halo(self) -> float | None:
+        """The same where a tile is given :meth:`left_of` the points farther away; None where all points are needed."""
+        return None
+
+    def left_of(self, points: Points) -> NDArray[np.float64]:
+        """What the stage needs of points far away, for :attr:`surroundings`: coordinates (n, 3), metres."""
+        raise NotImplementedError
 
     def inner_reach(self) -> float:
         """How far apart, in metres, points use each other's results of this very stage; part of the halo."""

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import OptionError
-from ..terrain.morphological import check_sizes, filtered_ground, reach
+from ..terrain.lowpoints import lowest_of_cells
+from ..terrain.morphological import check_sizes, filtered_ground, reach, reach_of_points
 from ..terrain.profile import opening_names
 from . import carried
 from .base import HEIGHTS_OUTSIDE, Stage
@@ -130,15 +131,23 @@ of Z.
     def halo(self) -> float:
         return reach(cell=self.cell, window=self.window, openings=self.windows)
 
-    def run(self, points: Points) -> dict[str, NDArray]:
+    def near_halo(self) -> float:
+        return reach_of_points(self.cell)
+
+    def left_of(self, points: Points) -> NDArray[np.float64]:
         x, y, z = points.xyz.T
+        return points.xyz[lowest_of_cells(x, y, z, points.usable(self.ignore), self.cell)]
+
+    def run(self, points: Points) -> dict[str, NDArray]:
         usable = points.usable(self.ignore)
         wanted = points.wanting("HeightAboveGround", self.makes_again)
+        xyz, usable = points.xyz[wanted], usable[wanted]
+        if self.surroundings is not None:
+            xyz = np.concatenate([xyz, self.surroundings])
+            usable = np.concatenate([usable, np.ones(len(self.surroundings), bool)])
         found = filtered_ground(
-            x[wanted],
-            y[wanted],
-            z[wanted],
-            mask=usable[wanted],
+            xyz,
+            mask=usable,
             cell=self.cell,
             slope=self.slope,
             window=self.window,
@@ -155,5 +164,5 @@ of Z.
             if name.startswith("HeightAbove") and points.units.vertical != 1.0:
                 values = values / points.units.vertical
             out[name] = np.array(points.arrays[name], values.dtype)
-            out[name][wanted] = values
+            out[name][wanted] = values[: np.count_nonzero(wanted)]
         return out

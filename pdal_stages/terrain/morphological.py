@@ -30,6 +30,7 @@ from ..base.jit import njit
 from ..base.threads import map_blocks
 from .columns import columns
 from .lowest import COMPANY, SURROUNDINGS, cell_values, lowest_points, pits
+from .lowpoints import HIGHEST
 from .minima import cell_numbers
 from .openings import HOLE
 from .patches import patches
@@ -48,8 +49,6 @@ _ROUNDS = 3
 _MOST_CELLS = 300
 #: Points handed to a thread at a time.
 _SPAN = 1 << 17
-#: Heights beyond this, in metres, are no terrain, and too much for the sums.
-_HIGHEST = 1e6
 #: Sums of coordinates are whole numbers of this part of a metre, so that order does not matter.
 _PARTS = 2.0**20
 
@@ -119,7 +118,7 @@ def filtered_ground(
     all_finite = bool(finite.all())
     if not all_finite:
         x, y, z, use = x[finite], y[finite], z[finite], use[finite]
-    use &= np.abs(z) < _HIGHEST
+    use &= np.abs(z) < HIGHEST
     counts = {"pits": 0, "without_terrain": 0}
     out: dict[str, NDArray] = {
         "HeightAboveGround": np.zeros(len(x)),
@@ -159,6 +158,13 @@ def reach(*, cell: float = 1.0, window: float = 75.0, openings: Sequence[float] 
     near, far = (planes_reach(_levels(block, cell)) for block in (_NEAR, _FAR))
     before = COMPANY + SURROUNDINGS + 2 * radius + plateau_reach(cell)
     return (before + (_ROUNDS + 1) * near + far + 2) * cell
+
+
+def reach_of_points(cell: float) -> float:
+    """How far away, in metres, more than the lowest points of cells matters: those of :func:`.lowpoints.lowest_of_cells`
+    are enough beyond.
+    """
+    return (planes_reach(_levels(_FAR, cell)) + 4) * cell
 
 
 def _link(cell: float, window: float, openings: Sequence[float]) -> int:

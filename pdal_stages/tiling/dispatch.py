@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import math
+import os
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
 
 from ..base.errors import StageError
 from ..base.progress import Progress
+from ..base.version import build
+from .firstround import FirstRoundTask
+from .grid import TileGrid
 from .outcome import FileJob, TileJob
 from .pace import Pace
 from .pool import Pool, last_tries
-from .store import Store
+from .store import Store, fingerprint
 from .worklist import Worklist
 
 #: A run stops when so many tiles failed for one reason and none succeeded.
@@ -97,3 +103,92 @@ def _make_ready(out: FileJob, waiting: deque) -> None:
     else:
         out.state = "ready"
         waiting.appendleft(out)
+
+
+@dataclass
+class _Item:
+    """A tile of the round, to be done."""
+
+    job: TileJob
+    mark: str
+    tries: int = 0
+
+
+def run_first_round(work: Worklist, store: Store, pool: Pool, retries: int, show: bool | None) -> None:
+    """Make what tiles that are to be run need, but what an earlier run left; tiles near one that fails fail too.
+
+    Raises
+    ------
+    StageError
+        If all fail for one reason.
+    """
+    first, survey = work.plan.first, work.survey
+    if first is None or len(work.jobs) == 1:
+        return
+    grid, halo = survey.grid, first.halo_m / survey.unit
+    far = first.far_m / survey.unit
+    by_tile = {job.tile: job for job in work.jobs}
+    users: dict[tuple[int, int], list[TileJob]] = {}
+    for job in work.jobs:
+        if job.state == "waiting":
+            for tile in _around(grid, job.tile, far, by_tile):
+                users.setdefault(tile, []).append(job)
+    waiting: deque[_Item] = deque()
+    for tile in users:
+        read = [s for s in survey.near(tile, halo) if s.path not in survey.unreadable]
+        mark = fingerprint(
+            build(),
+            work.plan.head[: first.at + 1],
+            survey.stamps_of(work.plan.head[: first.at + 1]),
+            [tile, grid.size, first.halo_m, survey.unit],
+            [[s.path, survey.stamps[s.path], s.reader] for s in read],
+        )
+        known = store.finished(_name(by_tile[tile].name))
+        if (
+            known is None
+            or known["fingerprint"] != mark
+            or not os.path.exists(store.left(by_tile[tile].name))
+        ):
+            waiting.append(_Item(by_tile[tile], mark))
+    context = work.context(store, pool.threads)
+
+    def task_of(item: _Item) -> FirstRoundTask:
+        sources = [s for s in survey.near(item.job.tile, halo) if s.path not in survey.unreadable]
+        with_index = [work.with_index(s) for s in sources]
+        return FirstRoundTask(context, first, item.job.tile, with_index, str(store.left(item.job.name)))
+
+    count, failures = len(waiting), []
+    with Progress(
+        sum(item.job.points for item in waiting), "lowest points of cells", enabled=show
+    ) as progress:
+        for item, answer in last_tries(pool, waiting, task_of, retries):
+            progress.update(item.job.points)
+            if answer.reason:
+                failures.append(answer.reason)
+                for job in users[item.job.tile]:
+                    if job.state == "waiting":
+                        job.state, job.reason = "failed", answer.reason
+                continue
+            with contextlib.suppress(StageError, OSError):  # no room: a later run does it again
+                store.finish(_name(item.job.name), item.mark, {})
+    if count and len(failures) == count and len(set(failures)) == 1:
+        raise StageError("all tiles failed for one reason, so the run was stopped", found=failures[0])
+
+
+def _name(tile: str) -> str:
+    """What the store calls what is left of a tile."""
+    return f"{tile}.first"
+
+
+def _around(
+    grid: TileGrid, tile: tuple[int, int], far: float, known: Collection[tuple[int, int]]
+) -> Iterator[tuple[int, int]]:
+    """The known tiles that a tile with surroundings of `far` touches."""
+    reach = math.ceil(far / grid.size)
+    if (2 * reach + 1) ** 2 > len(known):
+        yield from (t for t in known if max(abs(t[0] - tile[0]), abs(t[1] - tile[1])) <= reach)
+        return
+    for j in range(tile[1] - reach, tile[1] + reach + 1):
+        for i in range(tile[0] - reach, tile[0] + reach + 1):
+            if (i, j) in known:
+                yield i, j

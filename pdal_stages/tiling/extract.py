@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import struct
 from collections.abc import Iterator, Sequence
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from ..base import las
 from ..base.errors import StageError
 from .cloudindex import BLOCK, CloudIndex, open_las, read_block
+from .ept import fetch
 from .grid import Box, TileGrid, touching
 from .sources import InputSource
 
@@ -55,6 +57,36 @@ class Piece:
     def reader(self) -> dict[str, Any]:
         """The reader of its inputs, without a file's name."""
         return {**self.spans[0][0].reader, "type": "readers.las"}
+
+
+def cut_all(
+    grid: TileGrid,
+    tile: tuple[int, int],
+    sources: Sequence[tuple[InputSource, CloudIndex | None]],
+    halo: float,
+    folder: str,
+    cores: bool,
+) -> list[Piece]:
+    """A tile's points and their surroundings, out of every input; inputs that are alike are read as one.
+
+    `halo` is in the unit of the coordinates; `cores`: the tile's own points come in files of their own, too.
+    """
+    box = grid.box(tile, halo)
+    alike: dict[tuple[bytes, str], list[Member]] = {}
+    for number, (source, index) in enumerate(sources):
+        path = source.path
+        if source.kind == "ept":
+            path = os.path.join(folder, f"fetched{number}.las")
+            index = fetch(source, grid, tile, halo, path)
+        if index is None or not touching(index.boxes, box):
+            continue
+        reader = json.dumps(source.reader, sort_keys=True)
+        alike.setdefault((likeness(path), reader), []).append(Member(source, path, index))
+    pieces = []
+    for number, members in enumerate(alike.values()):
+        core = os.path.join(folder, f"core{number}.las") if cores else ""
+        pieces.append(cut(members, grid, tile, halo, os.path.join(folder, f"piece{number}.las"), core))
+    return [piece for piece in pieces if piece is not None]
 
 
 def likeness(path: str) -> bytes:

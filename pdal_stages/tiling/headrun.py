@@ -21,7 +21,7 @@ from ..stages.base import Stage
 from .extract import Piece
 from .grid import Box, TileGrid
 from .results import PieceResults
-from .tileplan import INPUT, OUTSIDE, ROW, TilePlan
+from .tileplan import INPUT, OUTSIDE, ROW, FirstRound, TilePlan
 
 #: Points are left out before a stage that needs less than this share of the halo.
 _NARROW = 0.5
@@ -51,37 +51,35 @@ class HeadRun:
 
 
 def run_head(
-    context: RunContext, tile: tuple[int, int], cuts: list[Piece], everything: bool, narrowing: bool = True
+    context: RunContext,
+    tile: tuple[int, int],
+    cuts: list[Piece],
+    everything: bool,
+    surroundings: NDArray[np.float64] | None = None,
+    narrowing: bool = True,
 ) -> HeadRun:
-    """Run the head once; `everything`: all inputs were read, so nothing can lie farther away.
+    """Run the head once.
 
-    With `narrowing`, stages after one that reaches far get the points alone that they can reach themselves. Where that
-    turns out to be too few (the k nearest neighbors of sparse points), it is done again without.
+    `everything`: all inputs were read, so nothing can lie farther away. `surroundings`: what the first round left of
+    points farther away than those of `cuts`. With `narrowing`, stages after one that reaches far get the points alone
+    that they can reach themselves. Where that turns out to be too few (the k nearest neighbors of sparse points), it is
+    done again without.
     """
     plan = context.plan
     if not plan.head:
         return HeadRun([PieceResults(piece, piece.own, {}) for piece in cuts], 0.0)
-    marks = [_Mark(number, piece, context) for number, piece in enumerate(cuts)]
-    old = [mark.old_format for mark in marks]
-    for mark in marks:
-        mark.mixed = any(old) and not all(old)
+    marks = _marks(cuts, context)
     reaches: dict[int, _Reach] = {}
     narrowed = False
+    from_afar = None
     with Callbacks() as callbacks:
-        stages: list[dict[str, Any]] = []
-        for number, piece in enumerate(cuts):
-            reader = {**piece.reader, "filename": piece.path, "tag": f"in{number}"}
-            marked = callbacks.filter(marks[number], _MARK_TYPES, inputs=[f"in{number}"], tag=f"mark{number}")
-            stages += [reader, marked]
-        inputs = {"inputs": [f"mark{number}" for number in range(len(cuts))]}
-        for given, later in zip(plan.head, plan.later, strict=True):
-            stage = {**given, **inputs}
-            inputs = {}
+        stages = _marked(callbacks, cuts, marks)
+        for number, (given, later) in enumerate(zip(plan.head, plan.later, strict=True)):
+            stage = _with_threads(given, context.threads)
+            stages.append(stage if number else {**stage, **_after(marks)})
+            if plan.first is not None and number == plan.first.at:
+                from_afar = len(stages) - 1
             kind = registry.stages().get(stage["type"])
-            if kind is not None:
-                asked = int(stage.get("threads") or 0)
-                stage["threads"] = min(asked, context.threads) if asked else context.threads
-            stages.append(stage)
             if kind is not None and kind.open_ended and not everything:
                 reach = reaches[len(stages) - 1] = _Reach(context.grid.box(tile), later)
                 stages.append(callbacks.filter(reach))
@@ -92,6 +90,8 @@ def run_head(
         ours_there = [(ours.stage, ours.place, ours.index) for ours in pipeline.lowered.ours]
         check_writers([*pipeline.lowered.stages, *plan.tail], ours_there)
         for ours in pipeline.lowered.ours:
+            if ours.number == from_afar:
+                ours.stage.surroundings = surroundings
             if ours.number in reaches:
                 reaches[ours.number].stage = ours.stage
         pipeline.execute(arrays=True)
@@ -100,12 +100,69 @@ def run_head(
     beyond = [report.get("beyond_halo") or {} for _, reports in pipeline.reports for report in reports]
     far = any(number for one in beyond for number in one.values())
     if far and narrowed:
-        return run_head(context, tile, cuts, everything, narrowing=False)
+        return run_head(context, tile, cuts, everything, surroundings, narrowing=False)
     if far and not everything:
         most = max(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
         need = max(need, _far_neighbors(pipeline.arrays, most, context, tile))
     notes = [*(f"PDAL says: {line}" for line in pipeline.said), *pipeline.told]
     return HeadRun(results, need, notes)
+
+
+def run_first(context: RunContext, cuts: list[Piece], first: FirstRound) -> NDArray[np.float64]:
+    """What the first round leaves of a tile's own points, after the stages before the one that wants it: (n, 3), metres."""
+    marks = _marks(cuts, context)
+    with Callbacks() as callbacks:
+        stages = _marked(callbacks, cuts, marks)
+        head = [_with_threads(given, context.threads) for given in context.plan.head[: first.at + 1]]
+        head[0] |= _after(marks)
+        wanting = Pipeline([*stages, *head], whole=False).lowered.ours[-1].stage
+        left = _Left(wanting)
+        run = callbacks.filter(left, **(_after(marks) if first.at == 0 else {}))
+        Pipeline([*stages, *head[:-1], run], whole=False).execute(arrays=False)
+    return np.concatenate(left.found) if left.found else np.empty((0, 3))
+
+
+def _marks(cuts: list[Piece], context: RunContext) -> list[_Mark]:
+    marks = [_Mark(number, piece, context) for number, piece in enumerate(cuts)]
+    old = [mark.old_format for mark in marks]
+    for mark in marks:
+        mark.mixed = any(old) and not all(old)
+    return marks
+
+
+def _marked(callbacks: Callbacks, cuts: list[Piece], marks: list[_Mark]) -> list[dict[str, Any]]:
+    """Readers of the pieces, whose points are numbered."""
+    stages: list[dict[str, Any]] = []
+    for number, piece in enumerate(cuts):
+        reader = {**piece.reader, "filename": piece.path, "tag": f"in{number}"}
+        marked = callbacks.filter(marks[number], _MARK_TYPES, inputs=[f"in{number}"], tag=f"mark{number}")
+        stages += [reader, marked]
+    return stages
+
+
+def _after(marks: list[_Mark]) -> dict[str, Any]:
+    return {"inputs": [f"mark{number}" for number in range(len(marks))]}
+
+
+def _with_threads(given: dict[str, Any], threads: int) -> dict[str, Any]:
+    if given["type"] not in registry.stages():
+        return dict(given)
+    asked = int(given.get("threads") or 0)
+    return {**given, "threads": min(asked, threads) if asked else threads}
+
+
+class _Left:
+    """Keeps what a stage would need of a tile's own points if they were far away."""
+
+    def __init__(self, stage: Stage) -> None:
+        self.stage = stage
+        self.found: list[NDArray[np.float64]] = []  # one for each view
+
+    def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        mine = ins[OUTSIDE] < 0
+        if mine.any():
+            points = points_of(self.stage, module, {name: values[mine] for name, values in ins.items()})
+            self.found.append(self.stage.left_of(points))
 
 
 class _Mark:

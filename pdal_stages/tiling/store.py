@@ -28,6 +28,11 @@ def fingerprint(*parts: Any) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:32]
 
 
+def left_file(tile: str) -> str:
+    """The name of the file of what the first round left of a tile."""
+    return f"{tile}.first.npy"
+
+
 class Store:
     """The folder of one run, locked while it is used.
 
@@ -121,6 +126,15 @@ class Store:
     def result(self, name: str) -> Path:
         """The file of a tile's results."""
         return self.tiles / f"{name}.npz"
+
+    def left(self, name: str) -> Path:
+        """The file of what the first round left of a tile."""
+        return self.tiles / left_file(name)
+
+    def forget_left(self) -> None:
+        """Remove what the first round left."""
+        for path in self.tiles.glob(left_file("*")):
+            path.unlink(missing_ok=True)
 
     def has_result(self, name: str, report: dict[str, Any]) -> bool:
         """Whether the file of a tile's results is there, as long as the tile's report says."""

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import dataclass
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..base.errors import NoTerrainError
 from .cloudindex import CloudIndex
-from .ept import fetch
-from .extract import Member, Piece, cut, likeness
+from .extract import cut_all
 from .file_task import write_tile
-from .grid import inside, touching
+from .firstround import left_around
+from .grid import inside
 from .headrun import HeadRun, RunContext, run_head
 from .results import PieceResults, class_counts, save
 from .sources import InputSource
@@ -35,6 +35,7 @@ class TileTask:
     complete: float  #: metres around the tile up to which these are all the inputs there are
     result: str  #: file for the results, where outputs are put together from tiles
     outputs: list[str] | None  #: otherwise: what each of the writers writes
+    afar: str  #: the folder of what the first round left
 
     def run(self) -> dict[str, Any]:
         """Run the head; write its results, or the outputs. The report says which."""
@@ -58,14 +59,16 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
     side, halo_m, short = context.grid.size * context.unit, least_m, False
     head: HeadRun | None = None
     for attempt in range(_WIDENINGS + 1):
-        cuts = _cut_all(task, halo_m / context.unit, folder)
+        cuts = cut_all(
+            context.grid, tile, task.sources, halo_m / context.unit, folder, task.outputs is not None
+        )
         read = sum(len(piece.index) for piece in cuts)
         own = sum(len(piece.own) for piece in cuts)
         if not own:
             break
         everything = inside(context.bounds, context.grid.box(tile, halo_m / context.unit))
         try:
-            head = run_head(context, tile, cuts, everything)
+            head = run_head(context, tile, cuts, everything, _beyond(task, halo_m))
             need = head.need
         except NoTerrainError:
             if everything:
@@ -98,22 +101,9 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
     return head.results, report
 
 
-def _cut_all(task: TileTask, halo: float, folder: str) -> list[Piece]:
-    """The tile's points and their surroundings, out of every input; inputs that are alike are read as one."""
-    grid = task.context.grid
-    box = grid.box(task.tile, halo)
-    alike: dict[tuple[bytes, str], list[Member]] = {}
-    for number, (source, index) in enumerate(task.sources):
-        path = source.path
-        if source.kind == "ept":
-            path = os.path.join(folder, f"fetched{number}.las")
-            index = fetch(source, grid, task.tile, halo, path)
-        if index is None or not touching(index.boxes, box):
-            continue
-        reader = json.dumps(source.reader, sort_keys=True)
-        alike.setdefault((likeness(path), reader), []).append(Member(source, path, index))
-    pieces = []
-    for number, members in enumerate(alike.values()):
-        core = "" if task.outputs is None else os.path.join(folder, f"core{number}.las")
-        pieces.append(cut(members, grid, task.tile, halo, os.path.join(folder, f"piece{number}.las"), core))
-    return [piece for piece in pieces if piece is not None]
+def _beyond(task: TileTask, halo_m: float) -> NDArray[np.float64] | None:
+    """What the first round left of points farther away than those that are read."""
+    context = task.context
+    if context.plan.first is None:
+        return None
+    return left_around(task.afar, context.grid, task.tile, context.unit, halo_m, context.plan.first.far_m)

@@ -15,7 +15,7 @@ from ..base.files import sweep
 from ..pipeline import classflags
 from ..pipeline.overrides import Override
 from ..pipeline.run import Pipeline
-from .dispatch import run_all
+from .dispatch import run_all, run_first_round
 from .estimate import estimate
 from .outcome import FileJob, InterruptedRun, TiledRun, TileJob, summarize
 from .pool import open_pool
@@ -110,6 +110,7 @@ def run_plan(
                     work.take_over(store)
                 with contextlib.suppress(KeyboardInterrupt):
                     interrupted = True
+                    run_first_round(work, store, pool, chosen.retries, progress)
                     run_all(work, store, pool, chosen.retries, progress, finished)
                     interrupted = False
                     work.forget_results(store)

@@ -43,6 +43,15 @@ _DRIVERS |= {".laz": "las", ".txt": "text", ".csv": "text", ".tif": "gdal"}
 
 
 @dataclass(frozen=True)
+class FirstRound:
+    """What a stage that looks far is given of points far away, made in tiles before: see :mod:`.firstround`."""
+
+    at: int  #: number of the stage in the head
+    halo_m: float  #: metres of surroundings that the stages before it need
+    far_m: float  #: metres around a tile within which it needs what is left of points
+
+
+@dataclass(frozen=True)
 class TilePlan:
     """What a tiled run does to each tile."""
 
@@ -52,6 +61,7 @@ class TilePlan:
     #: Stages that look at single points, and the writers: run on the points of one output.
     tail: list[dict[str, Any]]
     halo_m: float  #: metres of surroundings
+    sees_m: float  #: metres around a tile within which any point may matter
     #: Dimensions the head changes; None where PDAL's filters in it make that unknown.
     creates: list[str] | None
     unit: str  #: `horizontal_unit` of our stages, empty for the spatial reference's
@@ -59,6 +69,7 @@ class TilePlan:
     name: str  #: the pipeline's file, or what else its source is called
     #: Of the dimensions that stages make, those that LAS files get beside the input's own; None leaves it to the writer.
     beside: dict[str, str] | None = None
+    first: FirstRound | None = None  #: what is made of the points before any tile
     whole_names: bool = False  #: '#' in an output's name is the whole name of the input file, with its suffix
 
     @property
@@ -124,6 +135,8 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
                 cure="Reproject the files first, or put it after the last stage of pdal_stages",
             )
     reaches = [step.reach(buffer) for step in head]
+    sees_m = sum(reaches)
+    first = _first_round(head, reaches)
     later = [sum(reaches[n + 1 :]) for n in range(len(head))]
     stages = [step.ours for step in head if step.ours is not None]
     foreign = any(step.ours is None and step.type != "filters.merge" for step in head)
@@ -139,6 +152,8 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
         later=later,
         tail=[step.given for step in [*tail, *writers]],
         halo_m=sum(reaches),
+        sees_m=sees_m,
+        first=first,
         creates=None
         if foreign
         else list(dict.fromkeys(name for stage in stages for name in stage.creates())),
@@ -146,6 +161,19 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
         notes=notes,
         name=source.name,
     )
+
+
+def _first_round(head: list[_Step], reaches: list[float]) -> FirstRound | None:
+    """Find the one stage that needs little of points far away; it then reaches less far, and so do the tiles."""
+    for at, step in enumerate(head):
+        near = None if step.ours is None else step.ours.near_halo()
+        if near is not None:
+            found = FirstRound(at, sum(reaches[:at]), sum(reaches[at:]))
+            reaches[at] = min(near, reaches[at])
+            return found
+        if step.ours is not None and step.ours.open_ended:
+            return None  # it may have to read farther
+    return None
 
 
 def _object(stage: Any, index: int, count: int) -> dict[str, Any]:

@@ -30,7 +30,7 @@ class Worklist:
             plan.head,
             survey.stamps_of(plan.head),
             plan.creates,
-            plan.halo_m,
+            [plan.halo_m, plan.sees_m],
             survey.grid.size,
             self.options.most_points,
             self._tail if survey.per == "tile" else [],
@@ -43,7 +43,7 @@ class Worklist:
         plan, survey = self.plan, self.survey
         jobs = []
         for tile, points in survey.tiles().items():
-            near = survey.near(tile, survey.halo)
+            near = survey.near(tile, plan.sees_m / survey.unit)
             job = TileJob(tile, survey.grid.name(tile), points, near)
             bad = [s.path for s in near if s.path in survey.unreadable]
             if bad:
@@ -62,8 +62,8 @@ class Worklist:
         That is known from the report alone, as a tile may be read with wider surroundings.
         """
         survey = self.survey
-        halo = max(float(report.get("halo_m", 0.0)) / survey.unit, survey.halo)
-        read = survey.near(job.tile, halo)
+        halo_m = max(float(report.get("halo_m", 0.0)), self.plan.sees_m)
+        read = survey.near(job.tile, halo_m / survey.unit)
         return fingerprint(self._common, job.tile, [[s.path, survey.stamps[s.path], s.reader] for s in read])
 
     def output_mark(self, out: FileJob, marks: Mapping[tuple[int, int], str]) -> str:
@@ -119,6 +119,8 @@ class Worklist:
         for job in self.jobs:
             if job.tile not in needed:
                 store.result(job.name).unlink(missing_ok=True)
+        if not any(job.state in ("waiting", "failed") for job in self.jobs):
+            store.forget_left()
 
     def keep(self, store: Store, item: TileJob | FileJob) -> None:
         """Remember what was finished, for runs to come."""
@@ -130,14 +132,18 @@ class Worklist:
         else:
             store.finish(item.name, self.mark_of(item, item.report), item.report)
 
-    def tasks(self, store: Store, threads: int):
-        """A function that gives the task of a tile or an output."""
-        plan, survey = self.plan, self.survey
-        scratch, most = str(store.scratch), self.options.most_points
+    def context(self, store: Store, threads: int) -> RunContext:
+        """What all tiles have in common."""
+        survey, scratch, most = self.survey, str(store.scratch), self.options.most_points
         if sum(header.count for header in survey.extents.values()) <= most:
             most = 1 << 62  # wider surroundings never hold more than all there is, however far they reach
-        run = replace(plan, readers=[])  # tasks travel, and there may be thousands
-        context = RunContext(run, survey.grid, survey.unit, survey.bounds, threads, most, scratch)
+        run = replace(self.plan, readers=[])  # tasks travel, and there may be thousands
+        return RunContext(run, survey.grid, survey.unit, survey.bounds, threads, most, scratch)
+
+    def tasks(self, store: Store, threads: int):
+        """A function that gives the task of a tile or an output."""
+        plan, survey, scratch = self.plan, self.survey, str(store.scratch)
+        context = self.context(store, threads)
         # Farther inputs too: a tile may have to be read with wider surroundings.
         far = max(4 * survey.halo, survey.halo + survey.grid.size)
 
@@ -150,15 +156,16 @@ class Worklist:
             return TileTask(
                 context,
                 item.tile,
-                [self._with_index(s) for s in sources if s.path not in survey.unreadable],
+                [self.with_index(s) for s in sources if s.path not in survey.unreadable],
                 math.inf if len(sources) == len(survey.placed) else far * survey.unit,
                 str(store.result(item.name)),
                 item.outputs,
+                str(store.tiles),
             )
 
         return task_of
 
-    def _with_index(self, source: InputSource) -> tuple[InputSource, CloudIndex | None]:
+    def with_index(self, source: InputSource) -> tuple[InputSource, CloudIndex | None]:
         """A source and its index, of which the blocks are all that a worker needs."""
         index = self.survey.indexes.get(source.path)
         return source, index and replace(index, tiles=[])
