@@ -1,0 +1,183 @@
+"""Tiles of filtered ground: a first round leaves the lowest points of cells; the same bits as in one piece."""
+
+from __future__ import annotations
+
+import laspy
+import numpy as np
+import pytest
+from test_terrain_morphological import town
+
+import pdal_stages as ps
+from pdal_stages.stages.hag_morphological import HagMorphological
+from pdal_stages.terrain import filtered_ground
+from pdal_stages.terrain.lowpoints import lowest_of_cells
+from pdal_stages.terrain.morphological import reach, reach_of_points
+from pdal_stages.tiling import run_tiled
+
+HEIGHTS = {"type": "filters.hag_morphological", "window": 8, "ground": True, "openings": [5, 9]}
+MADE = ("HeightAboveGround", "Ground", "HeightAboveOpening_5", "HeightAboveOpening_9")
+SIDE, TILE = 640, 200
+
+
+@pytest.mark.parametrize("cell", [1.0, 0.7, 3.0])
+def test_the_lowest_points_of_cells(cell):
+    rng = np.random.default_rng(int(10 * cell))
+    x, y, z = np.round(rng.uniform(-40, 40, (3, 3000)), 1)
+    x[:5] += 1e7  # strays
+    z[7] = -1e7
+    use = rng.random(3000) < 0.9
+    found = lowest_of_cells(x, y, z, use, cell)
+    best: dict[tuple[int, int], tuple] = {}
+    for n in np.flatnonzero(use & (np.abs(z) < 1e6)):
+        key = (int(np.floor(x[n] / cell)), int(np.floor(y[n] / cell)))
+        best[key] = min(best.get(key, (np.inf,)), (z[n], x[n], y[n]))
+    assert {(z[n], x[n], y[n]) for n in found} == set(best.values())
+    assert len(found) == len(best)
+    assert lowest_of_cells(x, y, z, np.zeros(3000, bool), cell).size == 0
+
+
+@pytest.mark.parametrize("origin", [(0.0, 0.0), (770_500.0, 6_277_550.0)])
+def test_lowest_points_are_enough_beyond_the_reach_of_points(origin):
+    x, y, z, _ = town(4, side=500, density=0.8, origin=origin)
+    options = {"window": 8.0, "openings": (5, 9), "slope_too": True}
+    whole = filtered_ground(x, y, z, **options)
+    u, v = x - origin[0], y - origin[1]
+    away = np.maximum(np.maximum(220 - u, u - 260), np.maximum(230 - v, v - 280))
+    near = away <= reach_of_points(1.0)
+    lowest = lowest_of_cells(x, y, z, np.ones(len(x), bool), 1.0)
+    far = lowest[~near[lowest]]
+    assert len(far) < 0.7 * np.count_nonzero(~near)
+    points = np.concatenate([np.flatnonzero(near), far])
+    some = filtered_ground(x[points], y[points], z[points], **options)
+    core = away[points] < 0
+    for name, values in some.items():
+        assert np.array_equal(values[core], whole[name][points][core]), name
+    assert reach_of_points(1.0) < 0.3 * reach()
+
+
+def test_a_stage_is_given_what_it_left(write_las):
+    stage = HagMorphological({"openings": "5"})
+    assert stage.near_halo() < stage.halo() and stage.surroundings is None
+
+
+@pytest.fixture(scope="module")
+def survey(tmp_path_factory, write_las):
+    """Two files that adjoin, with noise that is ignored by its class and some that is not."""
+    folder = tmp_path_factory.mktemp("survey")
+    x, y, z, height = town(3, side=SIDE, density=0.3)
+    rng = np.random.default_rng(0)
+    codes = np.where((height < 0) & (rng.random(len(x)) < 0.5), 7, 1).astype(np.uint8)
+    paths = []
+    for name, mine in (("west", x < 270), ("east", x >= 270)):
+        arrays = {"X": x[mine], "Y": y[mine], "Z": z[mine], "Classification": codes[mine]}
+        paths.append(str(write_las(folder / f"{name}.las", arrays)))
+    return paths
+
+
+def in_tiles(paths, stages, folder, **options):
+    folder.mkdir(exist_ok=True)
+    writer = {"type": "writers.las", "filename": str(folder / "#.las"), "extra_dims": "all", "forward": "all"}
+    return run_tiled([*paths, *stages, writer], TILE, workers=0, progress=False, **options)
+
+
+def of_files(folder, name):
+    return np.concatenate([np.asarray(laspy.read(folder / f"{f}.las")[name]) for f in ("west", "east")])
+
+
+@pytest.mark.pdal
+@pytest.mark.parametrize(
+    "before", [[], [{"type": "filters.detachednoise"}], [{"type": "filters.range", "limits": "Z[60:]"}]]
+)
+def test_tiles_are_the_same_bits_and_read_few_points(tmp_path, survey, before):
+    run = in_tiles(survey, [*before, HEIGHTS], tmp_path / "out")
+    assert not run.failures
+    whole = np.concatenate(ps.run_pipeline([*survey, *before, HEIGHTS]).arrays)
+    for name in MADE:
+        assert np.array_equal(of_files(tmp_path / "out", name), whole[name]), name
+    read = sum(job.report["read"] for job in run.tiles)
+    own = sum(job.report["points"] for job in run.tiles)
+    near = reach_of_points(1.0) + (120 if before and "noise" in before[0]["type"] else 0)
+    assert read < own * (1 + 2 * near / TILE) ** 2
+    assert not list((tmp_path / "out" / ".pdal-stages" / "tiles").glob("*.npy"))
+
+
+@pytest.mark.pdal
+def test_where_and_units_reach_the_first_round(tmp_path, survey):
+    stage = {**HEIGHTS, "where": "X < 400", "horizontal_unit": "foot", "vertical_unit": "foot"}
+    assert not in_tiles(survey, [stage], tmp_path / "out").failures
+    whole = np.concatenate(ps.run_pipeline([*survey, stage]).arrays)
+    for name in MADE:
+        assert np.array_equal(of_files(tmp_path / "out", name), whole[name]), name
+
+
+@pytest.mark.pdal
+def test_resume_makes_what_is_missing_alone(tmp_path, survey, monkeypatch):
+    from pdal_stages.tiling import tile_task
+    from pdal_stages.tiling.firstround import FirstRoundTask
+
+    made, real, refused = [], FirstRoundTask.run, tile_task.run_head
+
+    def noted(self):
+        made.append(self.tile)
+        return real(self)
+
+    def failing(context, tile, *rest):
+        if tile == (1, 1):
+            raise ps.StageError("no luck")
+        return refused(context, tile, *rest)
+
+    monkeypatch.setattr(FirstRoundTask, "run", noted)
+    monkeypatch.setattr(tile_task, "run_head", failing)
+    folder = tmp_path / "out"
+    assert len(in_tiles(survey, [HEIGHTS], folder, retries=0).failures) >= 1
+    assert len(made) == len(set(made)) == 16
+    left = folder / ".pdal-stages" / "tiles"
+    assert len(list(left.glob("*.npy"))) == 16
+    monkeypatch.setattr(tile_task, "run_head", refused)
+    (left / "0_0.first.npy").unlink()
+    made.clear()
+    assert not in_tiles(survey, [HEIGHTS], folder, resume=True).failures
+    assert made == [(0, 0)]
+    whole = np.concatenate(ps.run_pipeline([*survey, HEIGHTS]).arrays)
+    assert np.array_equal(of_files(folder, "HeightAboveGround"), whole["HeightAboveGround"])
+
+
+@pytest.mark.pdal
+def test_a_damaged_file_of_the_first_round_is_made_again(tmp_path, survey, monkeypatch):
+    from pdal_stages.tiling.firstround import FirstRoundTask
+
+    real = FirstRoundTask.run
+
+    def damaged(self):
+        answer = real(self)
+        if self.tile == (2, 2):
+            with open(self.target, "r+b") as file:
+                file.truncate(100)
+        return answer
+
+    monkeypatch.setattr(FirstRoundTask, "run", damaged)
+    run = in_tiles(survey, [HEIGHTS], tmp_path / "out", retries=0)
+    assert any("first round left" in job.reason for job in run.tiles)
+    monkeypatch.setattr(FirstRoundTask, "run", real)
+    assert not in_tiles(survey, [HEIGHTS], tmp_path / "out", resume=True).failures
+
+
+@pytest.mark.pdal
+def test_what_fails_in_the_first_round_is_said_of_the_tiles_that_need_it(tmp_path, survey, monkeypatch):
+    from pdal_stages.tiling.firstround import FirstRoundTask
+
+    real = FirstRoundTask.run
+
+    def failing(self):
+        if self.tile == (0, 0):
+            raise ps.StageError("no luck")
+        return real(self)
+
+    monkeypatch.setattr(FirstRoundTask, "run", failing)
+    small = {**HEIGHTS, "window": 1, "openings": []}
+    run = in_tiles(survey, [small], tmp_path / "out", retries=0)
+    failed = {job.tile for job in run.tiles if job.state == "failed"}
+    assert (0, 0) in failed and all("no luck" in job.reason for job in run.tiles if job.tile in failed)
+    monkeypatch.setattr(FirstRoundTask, "run", lambda self: (_ for _ in ()).throw(ps.StageError("no luck")))
+    with pytest.raises(ps.StageError, match="all tiles failed for one reason"):
+        in_tiles(survey, [small], tmp_path / "other", retries=0)
