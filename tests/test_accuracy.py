@@ -439,7 +439,7 @@ def test_an_empty_tile_adds_but_has_no_figures():
     ("arguments", "message"),
     [
         ({"matrix": [[1, 2]], "classes": [2, 6]}, "does not fit"),
-        ({"matrix": [[1, 2], [3, 4]], "classes": [2, 2]}, "twice"),
+        ({"matrix": [[1, 2], [3, 4]], "classes": [2, 2]}, "duplicate class"),
         ({"matrix": [[1, 2.5], [3, 4]], "classes": [2, 6]}, "counts"),
         ({"matrix": [[1, -2], [3, 4]], "classes": [2, 6]}, "counts"),
         ({"matrix": np.zeros((0, 0)), "classes": []}, "does not fit"),

@@ -164,7 +164,7 @@ def test_missing_dimension_and_coordinates_that_are_none():
     xyz, _, dimensions = scene(300, 8.0)
     model = model_of(net_with())
     assert model.required_dimensions == ("HeightAboveGround", "Intensity")
-    with pytest.raises(DimensionError, match=r"HeightAboveGround.*hag_minima"):
+    with pytest.raises(DimensionError, match=r"HeightAboveGround.*filtered_ground"):
         model.predict(xyz, {"Intensity": dimensions["Intensity"]})
     xyz[3, 1] = np.nan
     with pytest.raises(Exception, match="finite"):

@@ -221,9 +221,9 @@ def test_wrong_features(trained):
 
 def test_a_missing_dimension_names_itself_and_its_maker(trained, other):
     xyz, label, _ = other
-    with pytest.raises(DimensionError, match=r"HeightAboveGround.*hag_minima"):
+    with pytest.raises(DimensionError, match=r"HeightAboveGround.*filtered_ground"):
         trained.predict(xyz, {})
-    with pytest.raises(DimensionError, match=r"HeightAboveGround.*hag_minima"):
+    with pytest.raises(DimensionError, match=r"HeightAboveGround.*filtered_ground"):
         train([TrainingCloud(xyz, label, {}, "b.laz")], TrainingOptions(**SMALL), progress=False)
     bad = {"HeightAboveGround": np.where(np.arange(len(xyz)) < 5, np.nan, 1.0)}
     with pytest.raises(DimensionError, match="5 points"):

@@ -78,7 +78,7 @@ def save(path: str | Path, results: Iterable[PieceResults]) -> None:
 def _opened(name: str) -> Iterator[Any]:
     """The results in a file; one that cannot be read is removed, so that a later run makes it anew."""
     try:
-        with np.load(name, allow_pickle=False) as tile:
+        with open(name, "rb") as file, np.load(file, allow_pickle=False) as tile:
             if sorted({*tile.files} - {"names"}) != tile["names"].tolist():
                 raise ValueError("its members have other names")
             yield tile
