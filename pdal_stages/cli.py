@@ -228,6 +228,14 @@ def _parser() -> argparse.ArgumentParser:
         help="Mark low and high noise first (filters.detachednoise)",
     )
     takes(
+        "--polygons",
+        action="append",
+        default=[],
+        metavar="FILE=CODE",
+        help="Class of ground inside the polygons of an OGR file, e.g. lakes.gpkg=9; of other classes too: "
+        "bridges.gpkg=17:2,6; may be repeated (filters.polygons)",
+    )
+    takes(
         "--consistency",
         action=argparse.BooleanOptionalAction,
         default=True,
@@ -439,7 +447,13 @@ def _classify(options: argparse.Namespace) -> int:
     listed = options.dimensions
     named = WRITTEN if listed is None else tuple(name.strip() for name in listed.split(",") if name.strip())
     request = ClassifyRequest(
-        options.model, tuple(options.overrides), options.where, named, options.noise, options.consistency
+        options.model,
+        tuple(options.overrides),
+        options.where,
+        named,
+        noise=options.noise,
+        consistency=options.consistency,
+        polygons=tuple(options.polygons),
     )
     files = {"metadata": options.metadata or "", "log": options.log or ""}
     return classify(

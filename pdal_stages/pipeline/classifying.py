@@ -40,6 +40,8 @@ class ClassifyRequest:
         Whether low and high noise is marked first.
     consistency : bool
         Whether classes that contradict their surroundings are mended at the end.
+    polygons : tuple of str
+        Files of polygons and the class of what is inside, as ``filters.polygons`` takes them.
     """
 
     model: str = STANDARD
@@ -48,6 +50,7 @@ class ClassifyRequest:
     dimensions: tuple[str, ...] = WRITTEN
     noise: bool = True
     consistency: bool = True
+    polygons: tuple[str, ...] = ()
 
     @property
     def _inside(self) -> dict[str, str]:
@@ -94,13 +97,25 @@ class ClassifyRequest:
 
     @property
     def _mending(self) -> list[dict[str, Any]]:
-        """The rules at the end, for models whose classes they are of; a `where` by class means another one by then."""
+        """The rules at the end, for models whose classes they are of, and polygons over all."""
         known = {code for code, _ in self.loaded.classes}
-        if not self.consistency or not known >= {2, 6} or "Classification" in (self.where or ""):
-            return []
+        by_class = "Classification" in (self.where or "")  # which means another one by then
+        if by_class and self.polygons:
+            raise OptionError(
+                "--where by Classification cannot be combined with --polygons: the classes are new by then",
+                found=self.where,
+                cure="Add filters.polygons in a second run",
+            )
         settled = overridden(self._classifier, self.overrides)
         taken: dict[str, Any] = {name: settled[name] for name in ("ignore", "keep") if name in settled}
-        return [{"type": "filters.consistency", **taken, **self._inside}]
+        wanted = {
+            "filters.consistency": self.consistency and known >= {2, 6} and not by_class,
+            "filters.polygons": bool(self.polygons),
+        }
+        stages = [{"type": kind, **taken, **self._inside} for kind, chosen in wanted.items() if chosen]
+        if self.polygons:
+            stages[-1]["polygons"] = list(self.polygons)
+        return stages
 
     @cached_property
     def beside(self) -> dict[str, str] | None:

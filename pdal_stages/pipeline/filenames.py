@@ -74,7 +74,7 @@ def stage_files(stage: Stage) -> list[str]:
     written = {output.path for output in stage.outputs()}
     given = [(o.kind, stage.options[o.name]) for o in stage.all_options() if o.kind in ("filename", "model")]
     found = [find(name) if kind == "model" else name for kind, name in given if name]
-    return [name for name in found if name not in written]
+    return [name for name in [*found, *stage.inputs()] if name not in written]
 
 
 def is_writer(stage: dict[str, Any], stages: list[dict[str, Any]]) -> bool:

@@ -133,6 +133,10 @@ class Stage(ABC):
         """Told, before it runs in a pipeline, which stages made what it reads; what the user should know of it."""
         return None
 
+    def inputs(self) -> list[str]:
+        """Files the stage reads, beside those that its options of kind ``filename`` and ``model`` name."""
+        return []
+
     def outputs(self) -> list[Output]:
         """Files the stage will write."""
         return []

@@ -1,0 +1,169 @@
+"""Points inside the polygons of an OGR file: a map's lakes, roads or bridges laid over a cloud (extra ``vector``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import DependencyError, OptionError, StageError
+from .outlines import vector
+
+#: Between a file and a layer of it, as QGIS writes them.
+_LAYER = "|layername="
+#: What surfaces are made of: the class that a polygon changes unless told otherwise.
+GROUND = 2
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """A file of polygons, the class of points inside, and the classes that it is put in place of (empty: all)."""
+
+    file: str
+    layer: str
+    code: int
+    over: tuple[int, ...]
+
+    @classmethod
+    def parse(cls, text: str) -> Overlay:
+        """From ``FILE=CODE``, ``FILE=CODE:FROM,FROM`` or ``FILE=CODE:all``; a layer follows the file as ``|layername=NAME``.
+
+        Raises
+        ------
+        OptionError
+            If it is not written so, or a code is not 0 to 255.
+        """
+        source, found, codes = text.rpartition("=")
+        code, told, over = codes.partition(":")
+        file, _, layer = source.partition(_LAYER)
+        given = (
+            []
+            if over.strip() == "all"
+            else [one.strip() for one in over.split(",")]
+            if told
+            else [str(GROUND)]
+        )
+        if not (
+            found
+            and file.strip()
+            and all(one.strip().isdigit() and int(one) <= 255 for one in [code, *given])
+        ):
+            raise OptionError(
+                "polygons are written FILE=CODE",
+                found=text,
+                cure="For example lakes.gpkg=9, which makes ground inside water; bridges.gpkg=17:2,6 is for ground and "
+                "buildings, 17:all for all classes; a layer is named as in lakes.gpkg|layername=canals=9",
+            )
+        return cls(file.strip(), layer.strip(), int(code), tuple(map(int, given)))
+
+    def check(self) -> str:
+        """The layer that will be read.
+
+        Raises
+        ------
+        StageError
+            If there is no such file, or no such layer of polygons in it.
+        """
+        if "://" not in self.file and not Path(self.file).exists():
+            raise StageError("the file of polygons does not exist", where=self.file)
+        try:
+            layers = [
+                str(name)
+                for name, kind in vector("pyogrio").list_layers(self.file)
+                if _may_hold_polygons(kind)
+            ]
+        except DependencyError:
+            raise
+        except Exception as error:  # pyogrio's own
+            raise StageError("the polygons cannot be read", where=self.file, found=str(error)) from None
+        layer = self.layer or (layers[0] if len(layers) == 1 else "")
+        if layer not in layers:
+            raise StageError(
+                "the file has no such layer of polygons"
+                if self.layer
+                else "the file must have one layer of polygons",
+                where=self.file,
+                found=", ".join(layers) or "none",
+                cure=f"Name one: {self.file}{_LAYER}NAME={self.code}",
+            )
+        return layer
+
+
+def _may_hold_polygons(kind: str | None) -> bool:
+    return kind is not None and (
+        "Polygon" in kind or "Surface" in kind or kind in ("Unknown", "GeometryCollection")
+    )
+
+
+def polygons_of(overlay: Overlay, wkt: str, box: tuple[float, float, float, float]) -> tuple[list[Any], str]:
+    """Polygons near a box, in the reference system of `wkt`, as the box is; and what the user should know.
+
+    Raises
+    ------
+    StageError
+        If the file cannot be read or holds no polygons, or its reference system cannot be made the points'.
+    """
+    pyogrio, shapely = vector("pyogrio"), vector("shapely")
+    layer = overlay.check()
+    note, forward = "", None
+    crs = pyogrio.read_info(overlay.file, layer=layer)["crs"]
+    if crs and wkt:
+        forward, box = _transform(overlay.file, crs, wkt, box)
+    else:
+        note = f"{overlay.file}: {'the points have' if crs else 'it has'} no reference system: the same was assumed"
+    _, _, geometry, _ = pyogrio.raw.read(overlay.file, layer=layer, columns=[], bbox=box)
+    shapes = shapely.from_wkb(geometry) if len(geometry) else np.empty(0, object)
+    shapes = shapely.force_2d(shapes[~shapely.is_missing(shapes)]) if len(shapes) else shapes
+    flat = [s for s in shapely.get_parts(shapely.get_parts(shapes)) if s.geom_type == "Polygon"]
+    if forward is not None:
+        flat = list(shapely.transform(np.array(flat, object), lambda x, y: forward(x, y), interleaved=False))
+    return [s if shapely.is_valid(s) else shapely.make_valid(s) for s in flat], note
+
+
+def _transform(file: str, crs: str, wkt: str, box: tuple[float, float, float, float]) -> tuple[Any, Any]:
+    """How to get from the file's reference system to the points', and their box in the file's; None where they are one."""
+    pyproj = vector("pyproj")
+    try:
+        mine, theirs = (_flat(pyproj.CRS.from_user_input(one)) for one in (wkt, crs))
+        if mine.equals(theirs, ignore_axis_order=True):
+            return None, box
+        forward = pyproj.Transformer.from_crs(theirs, mine, always_xy=True)
+        back = pyproj.Transformer.from_crs(mine, theirs, always_xy=True)
+        west, south, east, north = back.transform_bounds(*box)
+    except Exception as error:  # pyproj's own
+        raise StageError(
+            "the polygons' reference system cannot be made the points'",
+            where=file,
+            found=str(error),
+            cure="Reproject the file first: ogr2ogr -t_srs",
+        ) from None
+    aside = 0.01 * max(east - west, north - south)
+    return forward.transform, (west - aside, south - aside, east + aside, north + aside)
+
+
+def _flat(crs: Any) -> Any:
+    """The horizontal part of a reference system."""
+    return _flat(crs.sub_crs_list[0]) if crs.is_compound else crs.to_2d() if len(crs.axis_info) > 2 else crs
+
+
+def points_inside(x: NDArray[np.float64], y: NDArray[np.float64], polygons: list[Any]) -> NDArray[np.bool_]:
+    """Which points (n,) lie inside polygons, or on their edge."""
+    shapely = vector("shapely")
+    order = np.argsort(x, kind="stable")
+    x, y = x[order], y[order]
+    inside = np.zeros(len(x), bool)
+    for shape in polygons:
+        west, south, east, north = shape.bounds
+        first, last = np.searchsorted(x, west, "left"), np.searchsorted(x, east, "right")
+        near = first + np.flatnonzero(
+            (y[first:last] >= south) & (y[first:last] <= north) & ~inside[first:last]
+        )
+        if len(near):
+            shapely.prepare(shape)
+            inside[near] = shapely.intersects_xy(shape, x[near], y[near])
+    out = np.empty(len(x), bool)
+    out[order] = inside
+    return out

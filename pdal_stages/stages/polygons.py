@@ -1,0 +1,87 @@
+"""``filters.polygons``: the class of points inside the polygons of a map."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.asprs import OVERLAP
+from ..objects.overlay import Overlay, points_inside, polygons_of
+from .base import Stage
+from .options import option
+from .points import Points
+from .selection import UNWANTED, Selection
+
+
+class Polygons(Stage):
+    type = "filters.polygons"
+    summary = "Give points inside the polygons of any OGR file a class, such as water inside lakes"
+    where_chooses = True
+    where_help = "Points outside keep their class."
+    polygons: list = option(
+        "list",
+        None,
+        "Files and classes, FILE=CODE: lakes.gpkg=9 makes ground (2) inside water, bridges.gpkg=17:2,6 ground and buildings "
+        "bridge decks, FILE=CODE:all everything inside; a layer is named as in lakes.gpkg|layername=canals=9",
+        required=True,
+    )
+    ignore: Selection = option(
+        "selection", UNWANTED, "Points that keep their class, as noise does", may_be_empty=True
+    )
+    keep: Selection = option(
+        "selection", (OVERLAP,), "Further points that keep their class", may_be_empty=True
+    )
+    details = """
+Lays a map over the points: lakes, roads, bridges. A point inside a polygon, or on its edge, gets the code that belongs to
+the file, if its class is one of those that the code may be put in place of: ground (2) unless others are named, so
+that trees over a lake stay trees. Of several files a later one finds what the ones before made.
+
+Polygons are read with GDAL's vector drivers (OGR), only those near the points, and reprojected where their reference
+system is another than the points' (their corners; long edges stay straight). Every point is looked at by itself, so tiles
+have no seams. This takes the extra `vector`: `pip install 'pdal-stages[vector]'`. The counts are in the metadata by file.
+
+PDAL's own `filters.overlay` takes a class from a column of the file instead; it neither reprojects nor looks at the
+class a point has.
+"""
+    dimensions_help = (
+        "- Reads: X, Y, `Classification`\n- Writes: `Classification` (uint8_t)\n- Halo: 0 m round a tile"
+    )
+    after = ({"type": "writers.las", "filename": "output.laz", "forward": "all"},)
+    example = {"type": "filters.polygons", "polygons": ["lakes.gpkg=9"]}
+
+    def check(self) -> None:
+        self.overlays = [Overlay.parse(str(one)) for one in self.polygons]
+        for overlay in self.overlays:
+            overlay.check()
+
+    def inputs(self) -> list[str]:
+        return [overlay.file for overlay in self.overlays if "://" not in overlay.file]
+
+    def creates(self) -> dict[str, str]:
+        return {"Classification": "uint8_t"}
+
+    def largest_class(self) -> int:
+        return max((overlay.code for overlay in self.overlays), default=0)
+
+    def run(self, points: Points) -> dict[str, NDArray]:
+        if points.count == 0:
+            return {}
+        change = points.inside & ~points.ignored(self.ignore) & ~points.chosen(self.keep)
+        x, y = (np.asarray(points.arrays[name], np.float64) for name in "XY")
+        box = float(x.min()), float(y.min()), float(x.max()), float(y.max())
+        codes = points.class_codes.copy()
+        counts, notes = {}, []
+        for overlay in self.overlays:
+            shapes, note = polygons_of(overlay, points.wkt, box)
+            may = np.flatnonzero(change & np.isin(codes, overlay.over) if overlay.over else change)
+            found = may[points_inside(x[may], y[may], shapes)]
+            codes[found] = overlay.code
+            name = f"{overlay.file}|layername={overlay.layer}" if overlay.layer else overlay.file
+            counts[f"{name}={overlay.code}"] = {"polygons": len(shapes), "points": len(found)}
+            notes += [note] if note else []
+        points.report["polygons"] = counts
+        there, number = np.unique(codes[change], return_counts=True)
+        points.report["classes"] = {str(int(c)): int(n) for c, n in zip(there, number, strict=True)}
+        if notes:
+            points.report["note"] = "; ".join(notes)
+        return {"Classification": points.with_codes(codes)}

@@ -1,0 +1,210 @@
+"""Polygons of a map over the points: parsing, reprojection, layers, tiles, and the command."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+
+import pdal_stages as ps
+from pdal_stages.base.errors import DependencyError, OptionError, StageError
+from pdal_stages.cli import main
+from pdal_stages.objects import overlay as overlays
+from pdal_stages.objects.overlay import Overlay, points_inside
+from pdal_stages.stages.polygons import Polygons
+
+pyogrio, shapely, pyproj = (pytest.importorskip(name) for name in ("pyogrio", "shapely", "pyproj"))
+DATA = Path(os.environ.get("PDAL_STAGES_DATA", "/nonexistent"))
+RD = 28992
+LAKE = shapely.Polygon(
+    [(85010, 446010), (85050, 446000), (85080, 446060), (85020, 446070)],
+    [[(85030, 446030), (85050, 446030), (85050, 446045), (85030, 446045)]],
+)
+ISLET = shapely.box(85035, 446035, 85040, 446040)
+
+
+def write(path, shapes, epsg: int | None = RD, layer=None, kind="MultiPolygon", append=False):
+    """An OGR file of polygons given in RD New, in another reference system if wanted."""
+    shapes = [shapely.MultiPolygon([s]) if s.geom_type == "Polygon" else s for s in shapes]
+    if epsg not in (None, RD):
+        move = pyproj.Transformer.from_crs(RD, epsg, always_xy=True).transform
+        shapes = [shapely.transform(shapely.segmentize(s, 5), move, interleaved=False) for s in shapes]
+    pyogrio.raw.write(
+        str(path), np.array([shapely.to_wkb(s) for s in shapes], object), [np.arange(len(shapes))], ["id"],
+        crs=None if epsg is None else f"EPSG:{epsg}", geometry_type=kind, layer=layer, append=append,
+    )  # fmt: skip
+    return str(path)
+
+
+def cloud(n=6000, seed=0):
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0, 100, (2, n)).round(2)
+    x, y = x + 85000, y + 446000
+    codes = rng.choice([2, 5, 6, 7, 12], n, p=[0.6, 0.2, 0.1, 0.05, 0.05]).astype(np.uint8)
+    return {"X": x, "Y": y, "Z": np.zeros(n), "Classification": codes}
+
+
+def inside(arrays, *shapes):
+    points = shapely.points(arrays["X"], arrays["Y"])
+    return np.any([shapely.intersects(shape, points) for shape in shapes], axis=0)
+
+
+def run(polygons, arrays, epsg=RD, **more):
+    stage = Polygons({"polygons": polygons, **more})
+    points = stage.points(arrays, wkt=pyproj.CRS(epsg).to_wkt("WKT1_GDAL") if epsg else "")
+    return stage.run(points)["Classification"], points.report
+
+
+def test_what_is_written_for_a_file_and_a_class():
+    assert Overlay.parse("a=b/lakes.gpkg=9") == Overlay("a=b/lakes.gpkg", "", 9, (2,))
+    assert Overlay.parse("b.gpkg|layername=deck 1=17: 2, 6") == Overlay("b.gpkg", "deck 1", 17, (2, 6))
+    assert Overlay.parse("C:\\maps\\r.shp=11:all") == Overlay("C:\\maps\\r.shp", "", 11, ())
+    for text in (
+        "lakes.gpkg",
+        "=9",
+        "lakes.gpkg=",
+        "lakes.gpkg=256",
+        "lakes.gpkg=9:",
+        "lakes.gpkg=9:x",
+        "l=-1",
+    ):
+        with pytest.raises(OptionError, match="polygons are written FILE=CODE"):
+            Overlay.parse(text)
+
+
+@pytest.mark.filterwarnings("ignore:'crs' was not provided")
+@pytest.mark.parametrize("epsg", [RD, 4326, 25831, None])
+@pytest.mark.parametrize("suffix", ["gpkg", "geojson", "shp"])
+def test_ground_inside_becomes_the_class_and_nothing_else(tmp_path, suffix, epsg):
+    if suffix == "geojson" and epsg in (None, 25831):
+        pytest.skip("GeoJSON is in degrees unless it says otherwise")
+    arrays = cloud()
+    path = write(tmp_path / f"lakes.{suffix}", [LAKE, ISLET], epsg)
+    found, report = run([f"{path}=9"], arrays)
+    codes = arrays["Classification"]
+    want = np.where(inside(arrays, LAKE, ISLET) & (codes == 2), 9, codes)
+    edge = shapely.distance(
+        shapely.union_all([LAKE.boundary, ISLET.boundary]), shapely.points(arrays["X"], arrays["Y"])
+    )
+    certain = edge > (0.0 if epsg in (RD, None) else 0.01)
+    assert np.array_equal(found[certain], want[certain]) and (want == 9).sum() > 300
+    assert report["polygons"] == {f"{path}=9": {"polygons": 2, "points": int((found == 9).sum())}}
+    assert ("note" in report) == (epsg is None)
+
+
+def test_other_classes_and_several_files_in_their_order(tmp_path):
+    arrays = cloud()
+    lake, islet = write(tmp_path / "a.gpkg", [LAKE]), write(tmp_path / "b.gpkg", [ISLET])
+    codes, at = arrays["Classification"], inside(arrays, LAKE)
+    found, _ = run([f"{lake}=17:5,6"], arrays)
+    assert np.array_equal(found, np.where(at & np.isin(codes, (5, 6)), 17, codes))
+    found, _ = run([f"{lake}=40:all", f"{islet}=41:2,40"], arrays, ignore="", keep="")
+    want = np.where(at, 40, codes)
+    assert np.array_equal(found, np.where(inside(arrays, ISLET) & np.isin(want, (2, 40)), 41, want))
+    found, _ = run([f"{lake}=40:all"], arrays)
+    assert np.array_equal(found == 40, at & ~np.isin(codes, (7, 12)))
+    found, _ = run([f"{lake}=9"], arrays, where="X > 85040")
+    assert np.array_equal(found == 9, at & (codes == 2) & (arrays["X"] > 85040))
+
+
+def test_layers_of_a_file(tmp_path):
+    path = write(tmp_path / "map.gpkg", [LAKE], layer="lakes")
+    write(path, [ISLET], layer="islets", append=True)
+    arrays = cloud()
+    with pytest.raises(StageError, match=r"must have one layer of polygons.*lakes, islets"):
+        run([f"{path}=9"], arrays)
+    with pytest.raises(StageError, match=r"no such layer of polygons"):
+        run([f"{path}|layername=seas=9"], arrays)
+    found, report = run([f"{path}|layername=islets=9"], arrays)
+    assert np.array_equal(found == 9, inside(arrays, ISLET) & (arrays["Classification"] == 2))
+    assert list(report["polygons"]) == [f"{path}|layername=islets=9"]
+
+
+def test_shapes_of_all_kinds(tmp_path):
+    arrays = cloud()
+    bow = shapely.Polygon([(85000, 446000), (85020, 446020), (85020, 446000), (85000, 446020)])
+    solid = shapely.force_3d(shapely.MultiPolygon([shapely.box(85060, 446070, 85090, 446090)]), 3.0)
+    mixed = shapely.GeometryCollection(
+        [shapely.Point(85001, 446099), shapely.box(85000, 446080, 85020, 446099)]
+    )
+    shapes = [bow, solid, mixed]
+    path = tmp_path / "kinds.gpkg"
+    pyogrio.raw.write(
+        str(path), np.array([*map(shapely.to_wkb, shapes), None], object), [np.arange(4)], ["id"],
+        crs=f"EPSG:{RD}", geometry_type="Unknown",
+    )  # fmt: skip
+    found, _ = run([f"{path}=9"], arrays)
+    shapes = [shapely.make_valid(bow), shapely.force_2d(solid), mixed.geoms[1]]
+    assert np.array_equal(found == 9, inside(arrays, *shapes) & (arrays["Classification"] == 2))
+    found, report = run([f"{write(tmp_path / 'far.gpkg', [shapely.box(0, 0, 1, 1)])}=9"], arrays)
+    assert np.array_equal(found, arrays["Classification"])
+    assert not next(iter(report["polygons"].values()))["points"]
+
+
+def test_points_on_an_edge_are_inside():
+    x, y = np.array([0.0, 1, 0.5, 1.0000001]), np.array([0.0, 1, 0, 0.5])
+    assert points_inside(x, y, [shapely.box(0, 0, 1, 1)]).tolist() == [True, True, True, False]
+    assert not points_inside(x, y, []).any() and not len(points_inside(x[:0], y[:0], [LAKE]))
+
+
+def test_what_is_wrong_is_said_before_any_work(tmp_path, monkeypatch):
+    with pytest.raises(StageError, match="the file of polygons does not exist"):
+        Polygons({"polygons": [f"{tmp_path}/none.gpkg=9"]})
+    (tmp_path / "bad.gpkg").write_text("no map")
+    with pytest.raises(StageError, match="the polygons cannot be read"):
+        Polygons({"polygons": [f"{tmp_path}/bad.gpkg=9"]})
+    lines = tmp_path / "lines.gpkg"
+    wkb = np.array([shapely.to_wkb(LAKE.exterior)], object)
+    pyogrio.raw.write(str(lines), wkb, [np.arange(1)], ["id"], crs="EPSG:28992", geometry_type="LineString")
+    with pytest.raises(StageError, match="must have one layer of polygons"):
+        Polygons({"polygons": [f"{lines}=9"]})
+    path = write(tmp_path / "a.gpkg", [LAKE])
+    stage = Polygons({"polygons": [f"{path}=9", f"{path}=65:9"]})
+    assert stage.largest_class() == 65 and stage.inputs() == [path, path] and stage.halo() == 0
+
+    def missing(name):
+        raise DependencyError("polygons need pyogrio", cure="pip install 'pdal-stages[vector]'")
+
+    monkeypatch.setattr(overlays, "vector", missing)
+    with pytest.raises(DependencyError, match="vector"):
+        Polygons({"polygons": [f"{path}=9"]})
+
+
+@pytest.mark.pdal
+def test_in_tiles_as_in_one_piece(tmp_path, write_las):
+    path = write(tmp_path / "lakes.gpkg", [LAKE])
+    source = write_las(tmp_path / "in.las", cloud(), point_format=1)
+    stages = [str(source), {"type": "filters.polygons", "polygons": f"{path}=9"}, str(tmp_path / "whole.las")]
+    ps.Pipeline(stages).execute()
+    stages[2] = {"type": "writers.las", "filename": str(tmp_path / "tiled.las"), "forward": "all"}
+    ps.run_tiled(stages, tile=30, workers=0)
+    one, two = (laspy.read(tmp_path / f"{name}.las") for name in ("whole", "tiled"))
+    assert np.array_equal(one.classification, two.classification)
+    assert (np.asarray(one.classification) == 9).sum() > 300
+    with pytest.raises(StageError):  # a map is no output
+        ps.Pipeline([str(source), stages[1], {"type": "writers.las", "filename": path}]).execute()
+
+
+@pytest.mark.pdal
+def test_water_of_delft_on_the_command_line(tmp_path, capsys):
+    water = DATA / "delft/water_train.geojson"
+    if not water.exists():
+        pytest.skip("real clouds are in PDAL_STAGES_DATA")
+    las = laspy.read(DATA / "delft/train.laz")
+    near = (np.abs(las.x - 84825) < 40) & (np.abs(las.y - 447545) < 40)
+    las.points = las.points[near]
+    las.write(tmp_path / "in.laz")
+    out = tmp_path / "out.laz"
+    words = ["classify", str(tmp_path / "in.laz"), str(out), "--polygons", f"{water}=9"]
+    assert main(words) == 0
+    codes = np.asarray(laspy.read(out).classification)
+    assert (codes == 9).any() and "  9 Water" in capsys.readouterr().out
+    shapes = shapely.from_wkb(pyogrio.raw.read(str(water))[2])
+    points = shapely.points(las.x, las.y)
+    at = np.any([shapely.intersects(shape, points) for shape in shapes], axis=0)
+    assert not (codes[~at] == 9).any() and not (codes[at] == 2).any()
+    assert main([*words, "--where", "Classification == 1"]) == 1
+    assert "--where by Classification cannot be combined with --polygons" in capsys.readouterr().err
