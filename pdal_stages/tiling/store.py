@@ -116,7 +116,10 @@ class Store:
 
     def keep_side(self, side: float) -> None:
         """Remember the side of the tiles, for :meth:`side`."""
-        _keep(self.folder / "run.json", {"tile": side}, "result")
+        path = self.folder / "run.json"
+        if path.is_dir():
+            _remove(path)
+        _keep(path, {"tile": side}, "result")
 
     def side(self) -> float | None:
         """The side of the last run's tiles, where it is known."""
