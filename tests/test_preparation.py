@@ -85,6 +85,14 @@ def test_what_is_not_carried_is_refused_by_name(stage, says):
     assert says in str(caught.value)
 
 
+def test_heights_above_ground_points_need_ground():
+    """PDAL 2.2 crashes without."""
+    for kind in carried.NEEDS_GROUND:
+        with pytest.raises(ModelError, match=r"without filters\.smrf before it"):
+            check([{"type": kind}, {"type": "filters.smrf"}])
+        assert check([{"type": "filters.smrf"}, {"type": kind}])
+
+
 def test_only_a_few_stages():
     with pytest.raises(ModelError, match="at most 8"):
         check([HAG] * 9)

@@ -21,6 +21,10 @@ NAMED = {
 }
 
 
+#: Metres of the smallest and the largest unit that is believed.
+_SMALLEST, _LARGEST = 1e-6, 1e6
+
+
 @dataclass(frozen=True)
 class Units:
     """Metres per unit of x and y (`horizontal`) and of z (`vertical`).
@@ -83,6 +87,13 @@ def units_of_wkt(
             upward = height.unit()
     assumed = across is None and root is None
     across = 1.0 if across is None else across
+    for metres in (across, upward):
+        if metres is not None and not _SMALLEST <= metres <= _LARGEST:
+            raise StageError(
+                "the spatial reference has a unit of length that no survey is in",
+                found=f"{metres:g} m",
+                cure="Set horizontal_unit and vertical_unit",
+            )
     return Units(across, across if upward is None else upward, assumed)
 
 

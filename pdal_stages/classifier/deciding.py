@@ -45,6 +45,7 @@ class PredictionOptions:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "smooth", checks.number("'smooth'", self.smooth, 0, FARTHEST, unit="m"))
+        checks.number("'memory_mb'", self.memory_mb, 1, unit="MB")
         if self.reject_below is not None:
             checks.number("'reject_below'", self.reject_below, 0, 1)
         if self.rejected_code is not None:

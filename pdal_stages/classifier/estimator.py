@@ -98,7 +98,14 @@ class PointClassifier(ClassifierMixin, BaseEstimator):
         if options is None:
             given = {k: v for k, v in self.get_params(deep=False).items() if k != "options"}
             options = TrainingOptions(**given)
-        model = train(_cloud(X), np.asarray(y), options, dimensions=dimensions, progress=False)
+        if not isinstance(options, TrainingOptions):
+            raise OptionError("'options' must be TrainingOptions", found=repr(options)[:60])
+        xyz, labels = _cloud(X), np.asarray(y)
+        if labels.shape != (len(xyz),):
+            raise OptionError(
+                f"there must be one label for each of the {len(xyz):,} points", found=f"shape {labels.shape}"
+            )
+        model = train(xyz, labels, options, dimensions=dimensions, progress=False)
         self.model_: Model = model
         self.classes_ = model.codes
         self.n_features_in_ = 3

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from ..base.errors import DimensionError, ModelError, OptionError
 from ..features import FeaturePlan
-from ..features.voxels import represent
+from ..features.voxels import check_side, represent
 from . import modelfile, summary
 from .algorithms import InputPlan, PredictRequest, algorithm
 from .deciding import Outcome, Prediction, PredictionOptions, decide
@@ -330,6 +330,10 @@ def assemble(manifest: dict[str, Any], arrays: modelfile.Arrays) -> Model:
     codes = [code for code, _ in classes]
     if sorted(set(codes)) != codes:
         raise ModelError("the model's classes must be ascending, each once", found=codes[:10])
+    try:
+        check_side(manifest.get("voxel") or 0.0)
+    except OptionError as error:
+        raise ModelError(f"the model's {error.what}", found=error.found) from None
     priors = manifest.get("priors")
     if priors is not None and len(priors["factors"]) != len(classes):
         raise ModelError("the manifest's priors must have one factor per class", found=len(priors["factors"]))

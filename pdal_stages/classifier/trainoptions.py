@@ -14,7 +14,7 @@ from ..base import checks
 from ..base.asprs import NOISE
 from ..base.errors import OptionError, suggest
 from ..base.threads import resolve_threads
-from ..features.voxels import LARGEST
+from ..features.voxels import LARGEST, check_side
 from .algorithms import ALGORITHMS, trainer
 from .classes import MAX_LABEL
 from .context import OWN, Context
@@ -265,6 +265,7 @@ class TrainingOptions:
                 put(one.name, checks.flag)
         if not isinstance(self.groups, str):
             raise OptionError("'groups' must be the name of a dimension", found=repr(self.groups)[:60])
+        check_side(self.voxel)
         if self.folds == 1:
             raise OptionError("'folds' must be 0 or at least 2", found=1)
         self._check_algorithm()

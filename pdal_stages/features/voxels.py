@@ -14,12 +14,20 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ..base.errors import OptionError
 from ..base.hashing import hash_of
 from ..base.runs import begins_run
 from .cells import cell_keys
 
-#: Largest side in metres.
-LARGEST = 5.0
+#: Smallest and largest side in metres.
+SMALLEST, LARGEST = 1e-4, 5.0
+
+
+def check_side(side: float) -> float:
+    """A side there can be, 0 for no voxels; OptionError for others."""
+    if side != 0 and not SMALLEST <= side <= LARGEST:
+        raise OptionError(f"'voxel' must be 0, or {SMALLEST:g} to {LARGEST:g} m", found=f"{side:g}")
+    return side
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +66,7 @@ def represent(
     too, but are not listed. `there` (k,) are the points that are there at all, `rows` among them (default: all n).
     Both ascend.
     """
+    check_side(side)
     found = _one_each(xyz if there is None else xyz[there], side, values)
     if there is None:
         if found is None:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from ..base.errors import StageError
-from .selection import RANGE, Selection
+from .selection import Selection
 from .where import Expression
 
 Rule = Callable[[Any], Any]
@@ -96,14 +96,6 @@ def selection(value: Any) -> list[str]:
     return found
 
 
-def ranges(value: Any) -> list[str]:
-    """Ranges of dimensions as PDAL's filters take them."""
-    found = _items(value)
-    if not all(isinstance(one, str) and RANGE.fullmatch(one) for one in found):
-        raise ValueError("ranges such as Classification[7:7]")
-    return found
-
-
 def condition(value: Any) -> str:
     """A condition over dimensions, for a stage that evaluates it itself: all of ours."""
     try:
@@ -125,6 +117,9 @@ def _items(value: Any) -> list[Any]:
     return list(value)
 
 
+#: Those of PDAL's that measure from points of class 2, and what must stand before them: PDAL 2.2 crashes where there are
+#: none.
+NEEDS_GROUND, MAKES_GROUND = ("filters.hag_nn", "filters.hag_delaunay"), "filters.smrf"
 #: PDAL's stages that a model may carry. They read no file, move no point and leave none out; each writes `Classification`
 #: or `HeightAboveGround` alone.
 OF_PDAL: Mapping[str, Mapping[str, Rule]] = {
@@ -135,7 +130,7 @@ OF_PDAL: Mapping[str, Mapping[str, Rule]] = {
         "slope": number(0, 100),
         "threshold": number(0, 1000),
         "window": number(1, 1000),
-        "ignore": ranges,
+        "ignore": words("Classification[7:7]", "Classification[18:18]"),
         "returns": words("first", "last", "intermediate", "only"),
     },
     "filters.hag_nn": {"count": whole(1, 1000), "max_distance": number(0, 1e6), "allow_extrapolation": flag},

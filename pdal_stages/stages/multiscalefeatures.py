@@ -17,7 +17,7 @@ from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.neighborhoods import LEAST_RADIUS, Neighborhood, parse_neighborhoods
 from ..features.plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS
-from ..features.voxels import LARGEST, represent
+from ..features.voxels import LARGEST, check_side, represent
 from .base import Stage
 from .options import option
 from .points import Points
@@ -130,6 +130,7 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
             raise OptionError(
                 f"option '{option}': {error.what}", found=error.found, cure=error.cure
             ) from None
+        check_side(self.voxel)
         self.chosen  # noqa: B018  refused here where there is not one
         for name in names:
             if len(name.encode()) > _NAME_BYTES:

@@ -67,7 +67,14 @@ def check(preparation: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     if len(preparation) > _MOST:
         raise ModelError(f"a preparation has at most {_MOST} stages", found=len(preparation))
     try:
-        return [_checked(stage) for stage in preparation]
+        made = [_checked(stage) for stage in preparation]
+        for number, stage in enumerate(made):
+            before = [one["type"] for one in made[:number]]
+            if stage["type"] in carried.NEEDS_GROUND and carried.MAKES_GROUND not in before:
+                raise ModelError(
+                    f"a model cannot carry {stage['type']} without {carried.MAKES_GROUND} before it"
+                )
+        return made
     except ModelError as error:
         error.cure = _CURE
         raise
