@@ -129,6 +129,12 @@ def pytest_make_collect_report():
     _fail(outcome.get_result())
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--all-pairs", action="store_true", help="all rows of the covering array of test_pairs.py"
+    )
+
+
 def pytest_report_header() -> list[str]:
     program, why = find_pdal()
     data, no = find_data()

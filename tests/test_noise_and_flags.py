@@ -189,6 +189,22 @@ def test_pdals_own_pipelines_write_what_pdal_writes(tmp_path, capsys, write_las,
     assert made[0] == made[1]
 
 
+def test_where_sees_classes_without_flags(write_las, tmp_path, model):
+    """Of LAS 1.2 as of LAS 1.4."""
+    classes = []
+    for point_format in (1, 6):
+        source = write_las(tmp_path / f"{point_format}.las", flagged(), point_format=point_format)
+        stage = {
+            "type": "filters.modelclassifier",
+            "model": str(model),
+            "ignore": "",
+            "where": "Classification == 6",
+        }
+        run_ = ps.run_pipeline([str(source), {"type": "filters.hag_minima"}, stage])
+        classes.append(run_.reports[-1][1][-1]["where"])
+    assert classes[0] == classes[1] == np.count_nonzero(flagged()["Classification"] == 6)
+
+
 def test_writers_of_both_are_refused_before_work(tmp_path, capsys, write_las, model):
     if pdal_env.splits_class_flags():
         pytest.skip("PDAL 2.6 and newer read flags as dimensions of their own")

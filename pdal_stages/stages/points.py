@@ -69,7 +69,8 @@ class Points:
         self._units = units
         self.mask: NDArray[np.bool_] | None = None
         if where is not None:
-            self.mask = where.evaluate(arrays)
+            freed = {**arrays, "Classification": self.class_codes} if legacy_flags else arrays
+            self.mask = where.evaluate(freed)
             self.report["where"] = int(np.count_nonzero(self.mask))
             if self.count and not self.report["where"]:
                 self.report["warning"] = f"'where' holds for none of the {self.count:,} points: {where.text}"
