@@ -13,8 +13,10 @@ from .base.version import __version__
 
 _WHERE = {
     "Accuracy": "accuracy",
+    "Cells": "objects",
     "Filter": "pipeline.native",
     "Model": "classifier",
+    "ObjectSettings": "objects",
     "FeatureTable": "features",
     "Pipeline": "pipeline",
     "PointClassifier": "classifier.estimator",
@@ -24,10 +26,12 @@ _WHERE = {
     "Writer": "pipeline.native",
     "compute_features": "features",
     "detached_noise": "terrain",
+    "find_objects": "objects",
     "filtered_ground": "terrain",
     "hag_minima": "terrain",
     "load_model": "stages.loading",
     "make_town": "synthetic",
+    "object_layers": "reports.objectlayers",
     "parse_neighborhoods": "features.neighborhoods",
     "run_pipeline": "pipeline",
     "run_stage": "pipeline.runtime",
@@ -46,9 +50,11 @@ if TYPE_CHECKING:
     from .classifier.estimator import PointClassifier
     from .features import FeatureTable, compute_features
     from .features.neighborhoods import parse_neighborhoods
+    from .objects import Cells, ObjectSettings, find_objects
     from .pipeline import Pipeline, run_pipeline
     from .pipeline.native import Filter, Writer
     from .reports.accuracypage import write_accuracy_report
+    from .reports.objectlayers import object_layers
     from .stages.loading import load_model
     from .synthetic import make_town
     from .terrain import detached_noise, filtered_ground, hag_minima

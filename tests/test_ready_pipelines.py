@@ -51,7 +51,7 @@ def test_none_is_forgotten():
     tested = {
         "noise", "normalise", "features", "features-for-viewers", "train", "train-binary", "classify",
         "classify-with-rejection", "evaluate", "train-on-smrf-ground", "classify-on-smrf-ground", "tiles-to-tiles",
-        "copc-to-tiles", "tile-index-to-tiles",
+        "copc-to-tiles", "tile-index-to-tiles", "raw-to-footprints",
     }  # fmt: skip
     assert {f.stem for f in FILES} == tested
     listed = (FOLDER.parent / "docs" / "how-to.md").read_text()
@@ -234,3 +234,15 @@ def _same_points(some, others):
         return np.column_stack(columns)[np.lexsort(columns)]
 
     np.testing.assert_array_equal(table(some), table(others))
+
+
+def test_raw_to_footprints(town, tmp_path):
+    pyogrio = pytest.importorskip("pyogrio")
+    run(
+        "raw-to-footprints",
+        f"--stage.input.filename={town}",
+        f"--stage.output.filename={tmp_path / 'o.gpkg'}",
+    )
+    names = [name for name, _ in pyogrio.list_layers(tmp_path / "o.gpkg")]
+    assert names[:5] == ["buildings", "trees", "crowns", "spans", "decks"]
+    assert pyogrio.read_info(tmp_path / "o.gpkg", layer="buildings")["features"] > 0

@@ -167,6 +167,11 @@ def path_of(body: Body, size: float, every: float = 2.0) -> NDArray[np.float64]:
     piece = np.floor((along - along.min()) / every).astype(np.int64)
     _, piece = np.unique(piece, return_inverse=True)
     many = np.bincount(piece)
+    aside = v * math.cos(angle) - u * math.sin(angle)
+    if np.ptp(aside) < 4.0:  # wires side by side: one straight line between them
+        aside = np.full(len(aside), aside.mean())
+        u = along * math.cos(angle) - aside * math.sin(angle)
+        v = along * math.sin(angle) + aside * math.cos(angle)
     middle = [np.bincount(piece, weights=values) / many for values in (u, v, body.z)]
     path = np.column_stack([middle[0] + origin[0], middle[1] + origin[1], middle[2]])
     if len(path) == 1:  # a wire seen in one place
