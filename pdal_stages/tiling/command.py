@@ -357,6 +357,8 @@ def _print_dry(run: TiledRun) -> None:
     print(f"up to {memory:,.0f} MB for {workers} with {_counted(s['threads_per_worker'], 'thread')}")
     hours = f"roughly {s['core_hours']:.2f}" if s["core_hours"] >= 0.01 else "less than 0.01"
     print(f"{hours} core hours at {rate:,} points/s and core; the model decides")
+    if s["disk_gb"] >= 0.01:
+        print(f"{s['disk_gb']:,.2f} GB of disk beside the outputs, until these are written")
     for job in run.tiles[:50]:
         print(f"  {job.name:24s} {job.points:>14,} points  {_counted(len(job.sources), 'input')}")
     if len(run.tiles) > 50:
