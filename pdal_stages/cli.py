@@ -236,6 +236,12 @@ def _parser() -> argparse.ArgumentParser:
         "bridges.gpkg=17:2,6; may be repeated (filters.polygons)",
     )
     takes(
+        "--objects",
+        metavar="FILE",
+        help="Then write buildings, trees, spans and decks of all outputs to this vector file (.gpkg, ...), as "
+        "pdal-stages objects does",
+    )
+    takes(
         "--consistency",
         action=argparse.BooleanOptionalAction,
         default=True,
@@ -456,9 +462,14 @@ def _classify(options: argparse.Namespace) -> int:
         polygons=tuple(options.polygons),
     )
     files = {"metadata": options.metadata or "", "log": options.log or ""}
-    return classify(
-        ClassifyTask(tuple(options.inputs), options.output, request, options_of(options), **files), options
-    )
+    task = ClassifyTask(tuple(options.inputs), options.output, request, options_of(options), **files)
+    if not options.objects:
+        return classify(task, options)
+    from .tiling.objects import objects_of_outputs, refuse_tiles
+
+    refuse_tiles(task, options.objects)
+    code = classify(task, options)
+    return code if code or options.dry_run else objects_of_outputs(task, options.objects)
 
 
 def _objects(options: argparse.Namespace) -> int:

@@ -193,3 +193,17 @@ def test_without_the_extra(monkeypatch):
     monkeypatch.setattr(outlines.importlib, "import_module", missing)
     with pytest.raises(StageError, match=r"pip install 'pdal-stages\[vector\]'"):
         outlines.vector("shapely")
+
+
+@pytest.mark.pdal
+def test_classify_goes_on_to_objects(folder, tmp_path, capsys):
+    command = ["classify", str(folder / "parts" / "0.laz"), str(tmp_path / "0.laz"), "--model", "standard"]
+    assert cli.main([*command, "--objects", str(tmp_path / "town.gpkg")]) == 0
+    assert cli.main(["objects", str(tmp_path / "0.laz"), str(tmp_path / "two.gpkg")]) == 0
+    one, shapes, _ = layer(tmp_path / "town.gpkg", "buildings")
+    two, others, _ = layer(tmp_path / "two.gpkg", "buildings")
+    np.testing.assert_array_equal(one["object_id"], two["object_id"])
+    assert len(shapes) and all(shapely.equals_exact(shapes, others))
+    (tmp_path / "0.laz").unlink()
+    assert cli.main([*command, "--objects", str(tmp_path / "town.txt")]) == 1
+    assert "ends in .gpkg" in capsys.readouterr().err and not (tmp_path / "0.laz").exists()

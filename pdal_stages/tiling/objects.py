@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from ..base.errors import OptionError, StageError
 from ..base.files import check_writable, write_whole
 from ..base.las import read_header
+from ..base.outputs import Output, check_outputs
 from ..base.plain import tell
 from ..base.progress import Progress
 from ..base.stamps import stamp
@@ -30,13 +31,14 @@ from ..objects import Cells, Objects, ObjectSettings, find_objects
 from ..objects.cells import kind_of_code
 from ..objects.measure import CHECK
 from ..pipeline import pdal as pdal_env
-from ..pipeline.ends import input_files
+from ..pipeline.ends import input_files, outputs_of
 from ..pipeline.overrides import Override
 from ..pipeline.processes import each_file
 from ..pipeline.references import Reference, check_one_reference, reference_of
 from ..reports.objectlayers import check_target, object_layers, write_layers
 from ..stages.objectoptions import refuse_unclassified
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter
+from .classify import ClassifyTask
 from .cloudindex import BLOCK, open_las, read_block
 
 #: Blocks of points read at a time.
@@ -61,18 +63,42 @@ def run_command(options: argparse.Namespace) -> int:
     stage = writer(options.output, options.overrides, **given)
     if options.metadata:
         check_writable(options.metadata, "metadata")
-    inputs = input_files(options.inputs)
-    found, reference = objects_of_files(inputs, stage, workers=options.workers, resume=options.resume)
+    return _write(input_files(options.inputs), stage, options)
+
+
+def refuse_tiles(task: ClassifyTask, output: str) -> None:
+    """Refuse, before any work, what ``classify --objects`` cannot do."""
+    check_target(output)
+    if task.options.per == "tile" or not all(map(_is_las, task.files)):
+        raise OptionError(
+            "classify --objects needs an output for each LAS or LAZ input",
+            cure="Classify first, then: pdal-stages objects OUTPUT town.gpkg",
+        )
+    check_outputs([Output(output, "objects")], task.files)
+
+
+def objects_of_outputs(task: ClassifyTask, output: str) -> int:
+    """What ``classify --objects`` does when all is classified."""
+    return _write(
+        outputs_of(task.files, task.output), ObjectsWriter({"filename": output}), argparse.Namespace()
+    )
+
+
+def _write(inputs: list[str], stage: ObjectsWriter, options: argparse.Namespace) -> int:
+    """Find objects, write them, say what was found."""
+    metadata = getattr(options, "metadata", None)
+    workers, resume = getattr(options, "workers", 1), getattr(options, "resume", False)
+    found, reference = objects_of_files(inputs, stage, workers=workers, resume=resume)
     layers = object_layers(found, straight=stage.outlines == STRAIGHT, units=reference[0])
-    files = write_layers(options.output, layers, reference[1])
-    _forget(options.output)
+    files = write_layers(stage.filename, layers, reference[1])
+    _forget(stage.filename)
     summary = summarize(found)
     for kind, one in summary.items():
         print(f"{one['objects']:,} {kind}, {one['to_be_checked']:,} to be checked")
         for reason, count in one["reasons"].items():
             print(f"  {reason:28s} {count:>10,}")
     print("written to " + ", ".join(str(file) for file in files))
-    if options.metadata:
+    if metadata:
         about = {
             "version": __version__,
             "inputs": inputs,
@@ -80,7 +106,7 @@ def run_command(options: argparse.Namespace) -> int:
             "settings": {one.name: getattr(stage.settings, one.name) for one in fields(ObjectSettings)},
             "objects": summary,
         }
-        write_whole(options.metadata, (json.dumps(about, indent=1) + "\n").encode(), "metadata")
+        write_whole(metadata, (json.dumps(about, indent=1) + "\n").encode(), "metadata")
     return 0
 
 
