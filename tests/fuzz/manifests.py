@@ -245,11 +245,11 @@ def _put_to_work(made: Any, path: Path, source: Path, target: Path) -> Pipeline 
     """What the command does with a model before PDAL runs: describe it, and build the pipeline."""
     text = str(made)
     assert text and "\x1b" not in json.dumps(made.describe(), default=str)
-    for stage in made.info["preparation"]:
+    asked = made.info.get("preparation") or []
+    for stage in asked:
         rules = carried.OF_PDAL.get(stage["type"])
         assert set(stage) - {"type"} <= set(registry.get(stage["type"]).in_models if rules is None else rules)
     pipeline = ClassifyRequest(str(path)).pipeline(str(source), str(target))
-    asked = made.info["preparation"]
     own = [
         s
         for s in pipeline.source.stages

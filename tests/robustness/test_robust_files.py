@@ -1,0 +1,118 @@
+"""Every file that a command opens for writing is one it was asked for, or lies in a hidden folder of its own.
+
+Watched from outside by strace, so that PDAL's and libraries' own files are seen as well.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from robustness_kit import job
+
+pytestmark = [
+    pytest.mark.pdal,
+    pytest.mark.skipif(shutil.which("strace") is None, reason="watches with strace"),
+]
+
+HAG = {"type": "filters.hag_minima"}
+SMALL = ["--neighborhoods", "c1", "--count", "50", "--trees", "2"]
+_OPENED = re.compile(r'\b(?:open|openat|creat)\((?:[^"]*)"((?:[^"\\]|\\.)*)", ([A-Z_|0-9a-fx]+).*\) = \d+')
+_CHANGED = re.compile(
+    r"\b(rename\w*|link\w*|symlink\w*|truncate|chmod|fchmodat|chown|fchownat|mknod\w*|unlink\w*|mkdir\w*|rmdir)\((.*)\) = 0"
+)
+_WRITES = {"O_WRONLY", "O_RDWR", "O_CREAT", "O_TRUNC", "O_APPEND"}
+#: Ours: hidden folders beside outputs, notes of tiled runs, compiled kernels, temporary folders; and the system's.
+_OWN = (
+    r"/\.pdal-stages-partial-[^/]+(/|$)", r"/\.pdal-stages(/|$)", r"\.nb[ic](\.tmp\.\w+)?$", r"/__pycache__(/|$)",
+    r"^/(tmp|var/tmp)/pdal-stages-[^/]+(/|$)", r"^/dev/(null|tty|shm/(sem\.)?[\w.-]+)$", r"^/proc/self/",
+    r"\.nb[ic]", r"^/tmp/tmp\w+(/|$)", r"^/tmp/[a-z0-9_]{8}$",
+)  # fmt: skip
+
+
+def changed_files(log: str, folder: Path) -> set[str]:
+    """Files and folders that were opened for writing, made, renamed or removed."""
+    found = set()
+    for line in log.splitlines():
+        if opened := _OPENED.search(line):
+            if _WRITES & set(opened[2].split("|")):
+                found.add(opened[1])
+        elif done := _CHANGED.search(line):
+            found.update(re.findall(r'"((?:[^"\\]|\\.)*)"', done[2]))
+    return {os.path.normpath(os.path.join(folder, name)) for name in found}
+
+
+def watched(folder: Path, *words: object) -> set[str]:
+    """What a command changed beyond what is its own."""
+    log = folder / "trace.txt"
+    calls = "trace=open,openat,creat,rename,renameat,renameat2,link,linkat,symlink,symlinkat,truncate,chmod,fchmodat,chown,fchownat,unlink,unlinkat,mkdir,mkdirat,rmdir"
+    command = [
+        "strace",
+        "-f",
+        "-qq",
+        "-s",
+        "4096",
+        "-o",
+        str(log),
+        "-e",
+        calls,
+        sys.executable,
+        "-m",
+        "pdal_stages.cli",
+    ]
+    done = subprocess.run(
+        [*command, *map(str, words)], cwd=folder, capture_output=True, text=True, timeout=500
+    )
+    if not log.exists() or "ptrace" in done.stderr:
+        pytest.skip(f"nothing may be traced here: {done.stderr[:200]}")
+    assert done.returncode == 0, done.stderr[-2000:]
+    names = changed_files(log.read_text(errors="replace"), folder)
+    own = [re.compile(pattern) for pattern in _OWN]
+    return {name for name in names if not any(pattern.search(name) for pattern in own)}
+
+
+def test_files_that_are_written(tmp_path, cloud, model):
+    raw = shutil.copy(cloud, tmp_path / "raw.las")
+
+    def inside(*names):
+        return {str(tmp_path / name) for name in names}
+
+    found = watched(
+        tmp_path, "classify", raw, "out.las", "--model", model, "--metadata", "m.json", "--log", "run.log"
+    )
+    assert found == inside("out.las", "m.json", "run.log")
+    found = watched(tmp_path, "train", raw, "--model", "own.model", *SMALL)
+    assert found == inside("own.model")
+    keep = {"type": "filters.ferry", "dimensions": "Classification=>Reference"}
+    labelled = job(
+        tmp_path,
+        str(raw),
+        keep,
+        {"type": "writers.las", "filename": "r.las", "extra_dims": "all", "minor_version": 4},
+    )
+    found = watched(tmp_path, "pipeline", labelled)
+    assert found == inside("r.las")
+    found = watched(tmp_path, "accuracy", "r.las", "--json", "a.json", "--html", "a.html")
+    assert found == inside("a.json", "a.html")
+
+
+def test_files_that_tiled_runs_write(tmp_path, cloud, model):
+    raw = shutil.copy(cloud, tmp_path / "raw.las")
+    path = job(tmp_path, str(raw), HAG, {"type": "filters.modelclassifier", "model": str(model)}, "o_#.las")
+    found = watched(tmp_path, "pipeline", path, "--tile", "15", "--workers", "2", "--report", "r.html")
+    assert found == {str(tmp_path / "o_raw.las"), str(tmp_path / "r.html")}
+
+
+def test_what_the_watch_sees():
+    """Made-up lines: flags, relative names, calls that failed."""
+    log = """1 openat(AT_FDCWD, "a", O_RDONLY|O_CLOEXEC) = 3
+1 openat(AT_FDCWD, "b", O_WRONLY|O_CREAT|O_TRUNC, 0666) = 4
+1 open("/c", O_RDWR) = -1 EACCES (Permission denied)
+1 rename("d", "/e") = 0
+1 unlink("/f") = -1 ENOENT (No such file or directory)"""
+    assert changed_files(log, Path("/here")) == {"/here/b", "/here/d", "/e"}
