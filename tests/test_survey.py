@@ -269,7 +269,7 @@ def test_inputs_that_are_alike_go_through_one_reader(survey, classify, tmp_path,
             )
     seen, run = [], tile_task.run_head
     monkeypatch.setattr(
-        tile_task, "run_head", lambda c, t, cuts, e: seen.append(len(cuts)) or run(c, t, cuts, e)
+        tile_task, "run_head", lambda c, t, cuts, *rest: seen.append(len(cuts)) or run(c, t, cuts, *rest)
     )
     code, _, err = classify(tmp_path / "in", tmp_path / "out/", "--tile", 40, "--workers", 0)
     assert code == 0 and seen and max(seen) == 2, err
