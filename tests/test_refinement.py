@@ -160,6 +160,21 @@ def test_one_class_alone_changes(base):
     assert ((before[changed] == target) | (after[changed] == target)).all()
 
 
+def test_every_label_counts(base):
+    """Whichever point stands for a voxel."""
+    xyz, label, dimensions = scene(seed=3, n=40_000)  # many points a voxel
+    rng = np.random.default_rng(0)
+    few = np.zeros(len(xyz), int)
+    for code in (2, 6):
+        few[rng.choice(np.flatnonzero(label == code), 30, replace=False)] = code
+    options = TrainingOptions(**FEW, base=base, folds=0)
+    voxels = len(np.unique(np.floor(xyz[few > 0] / base.voxel), axis=0))
+    for cloud in (TrainingCloud(xyz, few, dimensions), TrainingCloud(xyz, label, dimensions, mask=few > 0)):
+        model = train([cloud], options, progress=False)
+        told = sum(one["available"] for one in model.info["classes"])
+        assert told == voxels
+
+
 def test_what_cannot_be_built_on(base):
     with pytest.raises(OptionError, match="'base' must be a model"):
         TrainingOptions(base="standard")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ..base.asprs import UNINFORMATIVE
 from ..base.errors import OptionError, StageError
-from ..features.voxels import represent
+from ..features.voxels import Representatives, represent
 from .classes import MAX_LABEL, ClassMap, as_labels
 from .dimensions import known, required, welcome
 from .telltale import telltale
@@ -88,12 +88,30 @@ def prepared(sources: Iterable[CloudSource], options: TrainingOptions) -> Iterat
         values = known(options.inputs, cloud.dimensions, len(cloud.xyz), where=cloud.name)
         representatives = represent(cloud.xyz, options.voxel, values)
         if representatives is not None:
-            cloud = cloud.part(representatives.rows)
+            few = options.base is not None  # then each label counts, whichever point stands for its voxel
+            cloud = _told(cloud, representatives, named) if few else cloud.part(representatives.rows)
         yield cloud
         for wanted in options.thin:
             rows = thinned(cloud.xyz, wanted, options.seed)
             if rows is not None and len(rows):
                 yield cloud.part(rows, f"thinned to {wanted:g} per m2")
+
+
+def _told(cloud: TrainingCloud, representatives: Representatives, named: set[int]) -> TrainingCloud:
+    """The representatives, each with its own label or else the least of its voxel that may be trained on."""
+    labels = as_labels(cloud.labels, cloud.name)
+    usable = np.isin(labels, list(named)) if named else ~np.isin(labels, UNINFORMATIVE)
+    if cloud.mask is not None:
+        usable &= np.asarray(cloud.mask)
+    rows = representatives.rows
+    points, place = representatives.members(slice(None))
+    good = usable[points]
+    least = np.full(len(rows), MAX_LABEL + 1, np.int64)
+    np.minimum.at(least, place[good], labels[points[good]])
+    lent = ~usable[rows] & (least <= MAX_LABEL)
+    part = cloud.part(rows)
+    told = np.where(lent, least, labels[rows])
+    return replace(part, labels=told, mask=None if cloud.mask is None else usable[rows] | lent)
 
 
 def spooled(clouds: Iterable[TrainingCloud], folder: Path) -> list[TrainingCloud]:
