@@ -153,10 +153,10 @@ def _good(parts: list[Any], shapes: list[Any]) -> bool:
 
 def _shared_out(shapely: Any, outer: Any, shapes: list[Any]) -> list[Any]:
     """An outline shared out among the shapes in it: each what it covers, and what is left beside it."""
-    parts = [shapely.intersection(outer, shape, grid_size=_GRID) for shape in shapes]
+    parts = [_polygons(shapely, shapely.intersection(outer, shape, grid_size=_GRID)) for shape in shapes]
     left = shapely.difference(outer, shapely.union_all(parts, grid_size=_GRID), grid_size=_GRID)
     more: list[list[Any]] = [[part] for part in parts]
-    for piece in shapely.get_parts(left):
+    for piece in shapely.get_parts(_polygons(shapely, left)):
         shared = [piece.boundary.intersection(part.boundary).length for part in parts]
         if max(shared, default=0.0) > 0:
             more[int(np.argmax(shared))].append(piece)
