@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from clouds import SURVEYS
 from leave_one_out import tables
-from recipe import DENSITIES, MOST, OPTIONS, SAMPLES, SLOPES
+from recipe import DENSITIES, MOST, OPTIONS, SLOPES
 
 from pdal_stages.classifier import load_model
 from pdal_stages.stages.heights import PREPARATION
@@ -28,12 +28,15 @@ def main() -> None:
     options.add_argument("--scores", type=Path, required=True)
     args = options.parse_args()
     model, scores = load_model(args.model), json.loads(args.scores.read_text())
-    surveys = ["| survey | what | labelled points | left out | licence |", "|---|---|---:|---:|---|"]
+    surveys = [
+        "| survey | what | labelled points | left out | samples per copy | licence |",
+        "|---|---|---:|---:|---:|---|",
+    ]
     runs = {run["cloud"]: run for run in scores["surveys"]}
     for name, survey in SURVEYS.items():
-        surveys.append(
-            f"| {name} | {survey.what} | {runs[name]['points']:,} | {runs[name]['contradicted']:,} | (c) {survey.licence} |"
-        )
+        run = runs[name]
+        numbers = f"{run['points']:,} | {run['contradicted']:,} | {survey.samples:,}"
+        surveys.append(f"| {name} | {survey.what} | {numbers} | (c) {survey.licence} |")
     worst = min(scores["surveys"], key=lambda run: run["oa"])
     own = [run["oa"] for run in scores["surveys"] if run["cloud"] in SURVEYS]
     print(
@@ -56,7 +59,6 @@ def main() -> None:
             below=OPTIONS.contradicted_below,
             densities=", ".join(f"{density:g}" for density in DENSITIES),
             slopes=f"{100 * max(slope for slope, *_ in SLOPES):.0f}",
-            samples=SAMPLES,
         ),
         end="",
     )

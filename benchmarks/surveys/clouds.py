@@ -38,6 +38,8 @@ class Survey:
         Whether that is true enough to score by, or to train on only.
     returns : bool
         Whether it records return numbers.
+    samples : int
+        Of each class from each copy, at most: fewer from what is alike all over, or has one building.
     what, licence : str
         For the card.
     """
@@ -50,6 +52,7 @@ class Survey:
     tall: Mapping[int, float] = field(default_factory=dict)
     tall_scored: bool = False
     returns: bool = True
+    samples: int = 1500
 
 
 _LIDARHD = "IGN, LiDAR HD, Licence Ouverte Etalab 2.0"
@@ -100,6 +103,7 @@ SURVEYS = {
         _AHN + ", arranged by github hankersyan/AHN_transmission_corridor",
         dropped=(7, 18, 26, 1),
         returns=False,
+        samples=300,
     ),
     "bank": Survey(
         ("rural/lidarhd_bank.laz",),
@@ -107,6 +111,7 @@ SURVEYS = {
         "French steep wooded bank and a house",
         _LIDARHD,
         dropped=(7, 18, 65),
+        samples=150,
     ),
     "town's edge": Survey(
         ("rural/ign_0p3ppm2.laz",),
@@ -114,6 +119,7 @@ SURVEYS = {
         "French town's edge with large halls, at 0.3 points/m²",
         _LIDARHD + _ARRANGED,
         dropped=(7, 18, 64, 65, 66, 67),
+        samples=200,
     ),
     "bridges": Survey(
         ("bridge/ign_0299_6802.laz",),
@@ -121,6 +127,7 @@ SURVEYS = {
         "French river, fields and bridges, at 0.3 points/m²",
         _LIDARHD + _ARRANGED,
         dropped=(7, 18, 66, 67),
+        samples=200,
     ),
     "meadows": Survey(
         ("rural/ahn3_achterhoek.laz",),
@@ -129,12 +136,14 @@ SURVEYS = {
         _AHN + ", arranged by eEcoLiDAR/Laserfarm",
         tall={1: 2.0},
         tall_scored=True,
+        samples=150,
     ),
     "pines": Survey(
         ("forest/neon_osbs.laz",),
         {2: GROUND, 5: VEGETATION},
         "Open pine forest in Florida (NEON)",
         "NEON open data, arranged by brycefrank/pyfor",
+        samples=150,
     ),
 }
 

@@ -23,15 +23,12 @@ SLOPES = ((0.3, 8.0, False), (0.6, 3.0, False), (0.9, 1.0, False), (0.5, 0.3, Fa
 MOST = 50_000
 #: Steps by this share of a whole, over and over, fall evenly everywhere.
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
-#: Samples of each class from each copy, at most.
-SAMPLES = 1500
-
 OPTIONS = TrainingOptions(
     neighborhoods="s5,k10,k20,k50",
     feature_set="covariance,Verticality,HeightRange,HeightStd,HeightAboveLowest",
     dimensions=("HeightAboveGround", "Ground", "HeightAboveOpening_5", "HeightAboveOpening_17", "returns"),
     classes={"2": 2, "5": 5, "6": 6},
-    count=30_000,
+    count=40_000,
     contradicted_below=0.3,
     trees=40,
     min_samples_leaf=10,
@@ -60,8 +57,8 @@ def copies(cloud: Cloud) -> Iterator[Cloud]:
 
 
 def training_cloud(cloud: Cloud, number: int) -> TrainingCloud:
-    """A survey's copy of this number as it is trained on: as dense, a strip of it, with a mask of :data:`SAMPLES` points of
-    each class, chosen by their coordinates."""
+    """A survey's copy of this number as it is trained on: as dense, a strip of it, with a mask of as many points of
+    each class as the survey gives from a copy, chosen by their coordinates."""
     representatives = represent(cloud.xyz, OPTIONS.voxel, cloud.dimensions.values())
     if representatives is not None:
         cloud = cloud.taken(representatives.rows)
@@ -72,7 +69,7 @@ def training_cloud(cloud: Cloud, number: int) -> TrainingCloud:
     gone = contradicted(whole, OPTIONS.contradicted_below)
     usable = cloud.labels if gone is None else np.where(gone, 0, cloud.labels)
     for code in (2, 5, 6):
-        mask[order[usable[order] == code][:SAMPLES]] = True
+        mask[order[usable[order] == code][: SURVEYS[cloud.survey].samples]] = True
     return replace(whole, mask=mask | (gone if gone is not None else False))
 
 
