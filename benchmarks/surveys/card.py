@@ -47,6 +47,7 @@ def main() -> None:
             stage=as_json(PREPARATION),
             passes=len(model.passes),
             trees=OPTIONS.trees,
+            fewer=scores["trees"],
             voxel=OPTIONS.voxel,
             size=args.model.stat().st_size / 1e6,
             digest=hashlib.sha256(args.model.read_bytes()).hexdigest()[:16],

@@ -39,9 +39,10 @@ def features_of(cloud: TrainingCloud) -> npt.NDArray[np.float32]:
 
 
 class LeaveOneOut:
-    """The copies of all surveys, and models without one of these."""
+    """The copies of all surveys, and models of so many trees a pass without one of these."""
 
-    def __init__(self, data: Path, surveys: Iterable[str], folder: Path) -> None:
+    def __init__(self, data: Path, surveys: Iterable[str], folder: Path, trees: int = OPTIONS.trees) -> None:
+        self.trees = trees
         self.names = sorted(surveys)
         self.clouds: list[TrainingCloud] = []
         self.tables: list[npt.NDArray[np.float32]] = []
@@ -67,13 +68,13 @@ class LeaveOneOut:
 
     def _grown_without(self, one: int, other: int) -> Forest:
         kept = (self.survey != one) & (self.survey != other)
-        return self._grow(self.values, kept, max(1, round(FOLD_TREES * OPTIONS.trees)))
+        return self._grow(self.values, kept, max(1, round(FOLD_TREES * self.trees)))
 
     def without(self, name: str) -> Model:
         """The model of all surveys but this one."""
         left = self.names.index(name)
         kept = self.survey != left
-        first = self._grow(self.values, kept, OPTIONS.trees)
+        first = self._grow(self.values, kept, self.trees)
         around = np.zeros((len(self.samples), len(CONTEXT.tokens) * len(self.classes)), np.float32)
         for number, (cloud, table) in enumerate(zip(self.clouds, self.tables, strict=True)):
             at, rows = self.samples.of_cloud(number)
@@ -84,6 +85,6 @@ class LeaveOneOut:
             shares = count_shares(forest.predict_proba(np.ascontiguousarray(table)))
             CONTEXT.tables(cloud.xyz, shares).fill(rows, part)
             around[at] = part
-        second = self._grow(np.concatenate([self.values, around], axis=1), kept, OPTIONS.trees)
+        second = self._grow(np.concatenate([self.values, around], axis=1), kept, self.trees)
         passes = FeatureForest(FEATURES, first), FeatureForest(FEATURES, second, CONTEXT)
         return Model(passes, self.classes, {"voxel": OPTIONS.voxel})

@@ -113,6 +113,7 @@ def main() -> None:
     options.add_argument("--data", type=Path, required=True, help="folder of the clouds")
     options.add_argument("--json", type=Path, help="where the figures go")
     options.add_argument("--surveys", nargs="+", default=list(SURVEYS), choices=list(SURVEYS))
+    options.add_argument("--trees", type=int, default=OPTIONS.trees, help="of a forest")
     options.add_argument("--ground", type=Path, help="model file to score on the ISPRS samples")
     options.add_argument(
         "--pictures", type=Path, help="folder for pictures of the surveys at their own density"
@@ -121,7 +122,7 @@ def main() -> None:
     runs: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
         started = time.process_time()
-        all_of_them = LeaveOneOut(args.data, SURVEYS, Path(folder))
+        all_of_them = LeaveOneOut(args.data, SURVEYS, Path(folder), args.trees)
         print(f"features: {time.process_time() - started:.0f} CPU s", flush=True)
         for left_out in args.surveys:
             started = time.process_time()
@@ -137,7 +138,9 @@ def main() -> None:
         samples = [ground_only(model, args.data, sample) for sample in SAMPLES]
     print(tables(runs, samples))
     if args.json:
-        args.json.write_text(json.dumps({"surveys": runs, "isprs": samples}, indent=1) + "\n")
+        args.json.write_text(
+            json.dumps({"trees": args.trees, "surveys": runs, "isprs": samples}, indent=1) + "\n"
+        )
 
 
 if __name__ == "__main__":
