@@ -34,9 +34,9 @@ def main() -> None:
     ]
     runs = {run["cloud"]: run for run in scores["surveys"]}
     for name, survey in SURVEYS.items():
-        run = runs[name]
-        numbers = f"{run['points']:,} | {run['contradicted']:,} | {survey.samples:,}"
-        surveys.append(f"| {name} | {survey.what} | {numbers} | (c) {survey.licence} |")
+        run = runs.get(name)  # none of a survey that was not left out
+        numbers = f"{run['points']:,} | {run['contradicted']:,}" if run else "- | -"
+        surveys.append(f"| {name} | {survey.what} | {numbers} | {survey.samples:,} | (c) {survey.licence} |")
     worst = min(scores["surveys"], key=lambda run: run["oa"])
     own = [run["oa"] for run in scores["surveys"] if run["cloud"] in SURVEYS]
     print(
@@ -51,6 +51,8 @@ def main() -> None:
             voxel=OPTIONS.voxel,
             size=args.model.stat().st_size / 1e6,
             digest=hashlib.sha256(args.model.read_bytes()).hexdigest()[:16],
+            scored=len(own),
+            known=len(SURVEYS),
             scores=tables(scores["surveys"], scores["isprs"]),
             read=f"At their own densities the mean is {np.mean(own):.1f}; the worst of all is {worst['cloud']}, "
             f"{worst['oa']:.1f}.",
