@@ -104,7 +104,7 @@ def compare_files(
     out: dict[str, Any] = {}
     if one.buildings is not None and two.buildings is not None:
         out["buildings"] = compare_buildings(one.buildings, two.buildings)
-    if one.trees is not None and two.trees is not None:
+    if one.trees is not None and two.trees is not None and len(one.trees[0]) + len(two.trees[0]):
         out["trees"] = compare_trees(*one.trees, *two.trees)
     if not out:
         raise StageError(
