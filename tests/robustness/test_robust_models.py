@@ -99,6 +99,7 @@ BROKEN = [
     ("model with features in another order", swap_names, ["features"]),
     ("model with a feature this release lacks", lambda h, m: h["passes"][0]["feature_names"].__setitem__(0, "Magic_c1"), ["features"]),
     ("model with a neighborhood that is none", lambda h, m: h["passes"][0]["features"].update(neighborhoods=["q5"]), [""]),
+    ("model of densities of 400 digits", lambda h, m: h["densities"].update(high=10**400), ["densities"]),
     ("model without its classes", lambda h, m: h.pop("classes"), ["classes"]),
     ("model with class code 300", lambda h, m: h["classes"][0].update(code=300), ["classes"]),
     ("model with an array missing", lambda h, m: m.pop(h["arrays"]["1.threshold"]["file"]), ["differ"]),
