@@ -258,7 +258,7 @@ def _words(name, town, halves, models, folder):
     if name.startswith("train"):
         return [*words, f"--stage.model.filename={folder / 'm.model'}", *QUICK]
     words.append(f"--stage.output.filename={folder / out.get(name, 'o.laz')}")
-    if "features" not in name and name != "normalise":
+    if any(stage.get("tag") == "classifier" for stage in with_words(name)):
         words.append(f"--stage.classifier.model={models / ('smrf' if 'smrf' in name else 'classes')}.model")
     if name == "evaluate":
         words += [f"--stage.accuracy.json={folder / 'a.json'}", f"--stage.accuracy.html={folder / 'a.html'}"]
@@ -267,7 +267,10 @@ def _words(name, town, halves, models, folder):
     return words
 
 
-@pytest.mark.parametrize("name", [path.stem for path in PIPELINES])
+# What writes objects cannot run in the program of PDAL 2.2: see test_objects_are_written
+@pytest.mark.parametrize(
+    "name", [path.stem for path in PIPELINES if "writers.objects" not in path.read_text()]
+)
 def test_a_ready_pipeline_gives_the_same_bytes(pipeline, environment, town, halves, models, tmp_path, name):
     if name == "tile-index-to-tiles":
         subprocess.run(
