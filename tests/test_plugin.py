@@ -208,7 +208,7 @@ STAGES = {
 
 
 def test_no_stage_is_forgotten():
-    """Each is compared with our command's points, here or in a ready pipeline; filters.polygons, of a vector file, is not."""
+    """Each is compared with our command, here or in a ready pipeline; filters.polygons, of a vector file, is not."""
     ready = {stage["type"] for path in PIPELINES for stage in json.loads(path.read_text())}
     tested = ready | {stage["type"] for stage in STAGES.values()} | {"writers.objects", "filters.polygons"}
     assert set(registry.stages()) <= tested
