@@ -140,6 +140,7 @@ def write_layers(path: str | Path, layers: dict[str, Layer], wkt: str = "") -> l
             for name, layer in layers.items():
                 _write(part, name, layer, driver, wkt)
             _write_styles(part, layers)
+            _check_whole(part, layers, driver)
         return [target]
     names = _names(target, [name for name, layer in layers.items() if layer.shapes])
     for name, file in names.items():
@@ -147,6 +148,7 @@ def write_layers(path: str | Path, layers: dict[str, Layer], wkt: str = "") -> l
         with whole_files(file, styled, what="objects") as (part, style):
             _write(part, name, layers[name], driver, wkt)
             style.write_text(qml(layers[name].kind), encoding="utf-8")
+            _check_whole(part, {name: layers[name]}, driver)
     return list(names.values())
 
 
@@ -169,6 +171,44 @@ def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
         )
     except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, pyogrio.errors.CRSError) as error:
         raise StageError("objects could not be written", found=str(error)) from None
+
+
+def _check_whole(path: Path, layers: dict[str, Layer], driver: str) -> None:
+    """Read back what was written: GDAL goes on after some writes that fail."""
+    pyogrio = vector("pyogrio")
+    lost = ""
+    try:
+        for name, layer in layers.items():
+            which = {"layer": name} if driver == "GPKG" else {}
+            found = pyogrio.read_info(path, force_feature_count=True, **which)["features"]
+            if found != len(layer.shapes):
+                lost = f"{found:,} of {len(layer.shapes):,} {name}"
+        if driver == "GPKG":
+            lost = lost or _damage(path, layers)
+    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
+        lost = str(error)
+    if lost:
+        raise StageError("objects could not be written completely", found=lost, cure="Make room on the disk")
+
+
+def _damage(path: Path, layers: dict[str, Layer]) -> str:
+    """What a GeoPackage lacks, or nothing."""
+    import sqlite3
+
+    base = sqlite3.connect(path)
+    try:
+        state = base.execute("PRAGMA quick_check").fetchone()[0]
+        if state != "ok":
+            return state
+        rows = base.execute(
+            "SELECT table_name FROM gpkg_extensions WHERE extension_name = 'gpkg_rtree_index'"
+        )
+        indexed = {name for (name,) in rows}
+    except sqlite3.Error as error:
+        return str(error)
+    finally:
+        base.close()
+    return ", ".join(f"no index of {name}" for name in layers if name not in indexed)
 
 
 #: Fill of objects that are sure, and of those to be checked.

@@ -99,6 +99,16 @@ def plain(output: str, *words: str, exact: bool = True) -> Case:
     return Case(output, lambda inputs, target: [w.format(inputs=inputs, target=target) for w in words], exact)
 
 
+def objects(output: str, name: str, folder: str = "") -> Case:
+    """Of a layer that has a file of its own, whose name follows from the one given."""
+    return Case(
+        output,
+        lambda inputs, target: ["objects", inputs / "in.las", target.with_name(name), "--cell", 2],
+        False,
+        folder,
+    )
+
+
 CASES = {
     "writers.las .las": pdal("o.las", {"type": "writers.las"}),
     "writers.las .laz": pdal("o.laz", {"type": "writers.las"}),
@@ -124,6 +134,19 @@ CASES = {
     "expanded pipeline": plain("o.json", "expand", "{inputs}/plain.json", "-o", "{target}", exact=False),
     "model page": plain("o.html", "model", "{inputs}/in.model", "--html", "{target}", exact=False),
     "town": plain("o.laz", "town", "{target}", "--size", "30", "--density", "2", exact=False),
+    "objects .geojson": objects("o_buildings.geojson", "o.geojson"),
+    "objects .gpkg": plain("o.gpkg", "objects", "{inputs}/in.las", "{target}", exact=False),
+    "objects: what a run keeps": objects("o_buildings.geojson", "o.geojson", ".o.geojson.cells"),
+    "metadata of classify": plain(
+        "o.json", "classify", "{inputs}/in.las", "{inputs}/classified.las", "--model", "{inputs}/in.model", "--metadata", "{target}",
+        exact=False,
+    ),
+    "classify in tiles: what a run keeps": Case(
+        "o.las",
+        lambda inputs, target: ["classify", inputs / "in.las", target, "--model", inputs / "in.model", "--tile", 30, "--workers", 0],
+        False,
+        ".pdal-stages",
+    ),
     "tiles: output of a file": tiled("in_o.las", "#_o.las"),
     "tiles: output of a tile": tiled("499980_5400000_o.las", "#_o.las", "--per", "tile", exact=False),
     "tiles: what a run keeps": tiled("in_o.las", "#_o.las", folder=".pdal-stages"),
