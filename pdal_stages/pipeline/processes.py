@@ -172,9 +172,10 @@ class _Worker:
         with contextlib.suppress(subprocess.TimeoutExpired):  # one that waits for a disk that is gone
             self.process.wait(10.0)
         self._hearer.join(1.0)
-        for pipe in (self.process.stdin, self.process.stdout):
+        for pipe in (self.process.stdin, self.process.stdout, self.process.stderr):
             with contextlib.suppress(OSError):
-                pipe.close()  # type: ignore[union-attr]
+                if pipe is not None:
+                    pipe.close()
 
 
 #: What a worker says when it can take tasks, and every few seconds.
