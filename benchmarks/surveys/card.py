@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 from clouds import SURVEYS
 from leave_one_out import tables
+from recipe import DENSITIES, MOST, OPTIONS, SLOPES
 
 from pdal_stages.classifier import load_model
 from pdal_stages.stages.heights import PREPARATION
 from pdal_stages.stages.preparation import as_json
-from recipe import DENSITIES, MOST, OPTIONS, SLOPES
 
 
 def main() -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from recipe import OPTIONS, training_clouds
 
 from pdal_stages.classifier import FeatureForest, Forest, Model, TrainingCloud
 from pdal_stages.classifier.algorithms import PredictRequest
@@ -23,7 +24,6 @@ from pdal_stages.classifier.foresttraining import FOLD_TREES, feature_plan
 from pdal_stages.classifier.growing import TreeOptions, grow
 from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.classifier.smoothing import count_shares
-from recipe import OPTIONS, training_clouds
 
 FEATURES = Features(feature_plan(OPTIONS))
 CONTEXT = Context(tuple(OPTIONS.context))

@@ -20,13 +20,13 @@ import laspy
 import numpy as np
 from clouds import SURVEYS, Cloud, load, thinned, with_heights
 from folds import LeaveOneOut
+from recipe import OPTIONS
 
 from pdal_stages.accuracy import Accuracy
 from pdal_stages.classifier import Model, TrainingCloud, load_model
 from pdal_stages.classifier.clouds import contradicted
 from pdal_stages.reports.panels import triptych
 from pdal_stages.reports.pictures import write_png
-from recipe import OPTIONS
 
 SAMPLES = (11, 12, 21, 31, 41, 51, 54, 61)
 NAMES = {2: "ground", 5: "vegetation", 6: "building"}
