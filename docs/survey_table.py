@@ -11,6 +11,20 @@ from pathlib import Path
 DOCS = Path(__file__).resolve().parent
 MEASURED = DOCS.parent / "benchmarks" / "results" / "surveys.json"
 TARGET = DOCS / "surveys-not-seen.inc"
+#: Where the surveys are, and what is there.
+PLACES = {
+    "Montpellier": "France, city",
+    "Delft": "Netherlands, old town",
+    "Seville": "Spain, old town",
+    "hamlet": "France, hamlet on a slope",
+    "farm": "France, farm",
+    "power line": "Netherlands, corridor",
+    "bank": "France, wooded bank",
+    "town's edge": "France, edge of a town",
+    "bridges": "France, countryside",
+    "meadows": "Netherlands, meadows and farms",
+    "pines": "Florida, pine forest",
+}
 
 
 def table() -> str:
@@ -18,10 +32,13 @@ def table() -> str:
     rows = [
         row for row in json.loads(MEASURED.read_text(encoding="utf-8"))["surveys"] if "," not in row["cloud"]
     ]
-    lines = ["| survey | points per m² | points classified right |", "|---|---:|---:|"]
-    lines += [f"| {row['cloud']} | {row['density']:.1f} | {row['oa']:.1f} % |" for row in rows]
+    lines = ["| survey left out | points per m² | points classified right |", "|---|---:|---:|"]
+    lines += [
+        f"| {row['cloud']} ({PLACES[row['cloud']]}) | {row['density']:.1f} | {row['oa']:.1f} % |"
+        for row in rows
+    ]
     mean = sum(row["oa"] for row in rows) / len(rows)
-    return "\n".join([*lines, f"| **mean** | | **{mean:.1f} %** |", ""])
+    return "\n".join([*lines, f"| **mean of {len(rows)}** | | **{mean:.1f} %** |", ""])
 
 
 def write() -> None:
