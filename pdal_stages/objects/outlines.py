@@ -7,9 +7,14 @@ the middle of its cells' steps lies. Walls between buildings are drawn once, so 
 
 from __future__ import annotations
 
+import ctypes
 import importlib
+import importlib.util
 import itertools
 import math
+import os
+import sys
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,7 +37,8 @@ _SLACK = 2.5
 
 
 def vector(name: str) -> Any:
-    """shapely or pyogrio; an error says how to get it."""
+    """shapely or pyogrio; an error says how to get it, or that this process is none for it."""
+    _check_process(name)
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -41,6 +47,40 @@ def vector(name: str) -> Any:
             found=str(error),
             cure="Install the extra: pip install 'pdal-stages[vector]'",
         ) from None
+
+
+#: A function of the C library that each of these packages brings.
+_SYMBOLS = {"shapely": ("GEOS", "GEOSversion"), "pyogrio": ("GDAL", "GDALVersionInfo")}
+
+
+def _check_process(name: str) -> None:
+    """Refuse a package with a library of its own in a program that is linked to another one.
+
+    On Linux, what the program itself is linked to comes first for all that it loads: the package would call functions of
+    the program's library beside those of its own, and crash. Python is linked to neither, and what it loads sees its own.
+    """
+    if name not in _SYMBOLS or not sys.platform.startswith("linux"):
+        return
+    library, symbol = _SYMBOLS[name]
+    if not hasattr(ctypes.CDLL(None), symbol):
+        return
+    found = importlib.util.find_spec(name)
+    places = found.submodule_search_locations if found is not None else None
+    own = [file for place in places or () for file in Path(place + ".libs").glob(f"lib{library.lower()}*")]
+    if own:
+        raise DependencyError(
+            f"{name} brings a {library} of its own, and this program has another one: together they crash",
+            found=f"{own[0].name} in {_program()}",
+            cure="Run the pipeline by pdal-stages pipeline, or from Python; of points that are written already, "
+            "pdal-stages objects makes objects",
+        )
+
+
+def _program() -> str:
+    try:
+        return os.readlink("/proc/self/exe")
+    except OSError:
+        return sys.executable
 
 
 def raw_outlines(table: Table, size: float, *, hole: float = SMALLEST_HOLE) -> list[Any]:
