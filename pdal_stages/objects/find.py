@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,6 +119,21 @@ class Objects:
         key = point_keys(x[rows], y[rows], kinds[rows], self.settings.cell)
         at = np.minimum(np.searchsorted(self.key, key), len(self.key) - 1)
         out[rows] = np.where(self.key[at] == key, self.owner[at], 0)
+        return out
+
+    def summary(self) -> dict[str, dict[str, Any]]:
+        """Of each kind (``buildings``): how many objects, how many are to be checked, and why."""
+        out = {}
+        for kind, table in self.tables.items():
+            texts = table.columns["reason"].tolist() if len(table) else []
+            reasons = [reason for text in texts for reason in text.split(", ") if reason]
+            out[kind.name.lower() + "s"] = {
+                "objects": len(table),
+                "to_be_checked": int(np.count_nonzero(table.columns["verdict"] == measure.CHECK))
+                if len(table)
+                else 0,
+                "reasons": {reason: reasons.count(reason) for reason in sorted(set(reasons))},
+            }
         return out
 
 

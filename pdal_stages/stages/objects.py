@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,7 +132,7 @@ the tile is read wider. To write objects as polygons and points use `pdal-stages
             for name in ("ObjectVerdict", "ObjectHeight", "ObjectExtent"):
                 out[name] = np.array(points.arrays[name])
                 out[name][points.inside] = 0
-        points.report |= self._report(found)
+        points.report |= {name: one for name, one in found.summary().items() if one["objects"]}
         refused = np.zeros(points.count, bool)
         for kind, (which, rows) in at.items():
             columns = found.tables[kind].columns
@@ -159,18 +158,6 @@ the tile is read wider. To write objects as polygons and points use `pdal-stages
         if points.mask is not None:
             out["ObjectID"] = np.where(points.mask, out["ObjectID"], points.arrays["ObjectID"])
         return out
-
-    def _report(self, found: Objects) -> dict[str, Any]:
-        report: dict[str, Any] = {}
-        for kind, table in found.tables.items():
-            if len(table):
-                reasons = [r for text in table.columns["reason"].tolist() for r in text.split(", ") if r]
-                report[kind.name.lower() + "s"] = {
-                    "objects": len(table),
-                    "to_be_checked": int(np.count_nonzero(table.columns["verdict"] == CHECK)),
-                    "reasons": {reason: reasons.count(reason) for reason in sorted(set(reasons))},
-                }
-        return report
 
 
 def _places(ids: NDArray[np.int64], known: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -29,7 +29,6 @@ from ..base.units import Units
 from ..base.version import __version__
 from ..objects import Cells, Objects, ObjectSettings, find_objects
 from ..objects.cells import kind_of_code
-from ..objects.measure import CHECK
 from ..pipeline import pdal as pdal_env
 from ..pipeline.ends import input_files, outputs_of
 from ..pipeline.overrides import Override
@@ -92,7 +91,7 @@ def _write(inputs: list[str], stage: ObjectsWriter, options: argparse.Namespace)
     layers = object_layers(found, straight=stage.outlines == STRAIGHT, units=reference[0])
     files = write_layers(stage.filename, layers, reference[1])
     _forget(stage.filename)
-    summary = summarize(found)
+    summary = found.summary()
     for kind, one in summary.items():
         print(f"{one['objects']:,} {kind}, {one['to_be_checked']:,} to be checked")
         for reason, count in one["reasons"].items():
@@ -119,20 +118,6 @@ def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> Obj
             )
         given[one.option] = one.value
     return ObjectsWriter({**given, "filename": output})
-
-
-def summarize(found: Objects) -> dict[str, Any]:
-    """Objects by kind: how many, how many are to be checked, and why."""
-    out = {}
-    for kind, table in found.tables.items():
-        texts = table.columns["reason"].tolist() if len(table) else []
-        reasons = [reason for text in texts for reason in text.split(", ") if reason]
-        out[kind.name.lower() + "s"] = {
-            "objects": len(table),
-            "to_be_checked": int(np.count_nonzero(table.columns["verdict"] == CHECK)) if len(table) else 0,
-            "reasons": {reason: reasons.count(reason) for reason in sorted(set(reasons))},
-        }
-    return out
 
 
 def objects_of_files(
