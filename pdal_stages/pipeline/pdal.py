@@ -365,6 +365,11 @@ def writes_numbered_features() -> bool:
     return version() >= (2, 5, 0)
 
 
+def crashes_without_ground() -> bool:
+    """Whether filters.hag_nn and filters.hag_delaunay end the process where no point is ground (PDAL 2.2 does)."""
+    return version() < (2, 9, 0)
+
+
 def knows_class_flags() -> bool:
     """Whether writers know that `ClassFlags` is no extra dimension of LAS 1.4 (PDAL 2.2 does not)."""
     return version() >= (2, 3, 0)

@@ -22,6 +22,7 @@ from . import packing, runtime
 from . import pdal as pdal_env
 from .filenames import is_writer, named_files, readers_files, stage_files, writers_outputs
 from .foreseen import check_dimensions, unread_extra_dimensions
+from .groundcheck import GroundChecks
 from .interrupts import gentle
 from .lowering import Lowered, lower
 from .overrides import Override, apply_overrides
@@ -177,12 +178,11 @@ class Pipeline:
         runtime.remember_stdout()
         failure: StageError | None = None
         try:
-            with whole_files(*outputs, check=finish) as partials:
+            with GroundChecks() as ground, whole_files(*outputs, check=finish) as partials:
                 try:
                     with gentle(signal.SIGINT) as interrupts:
-                        result = pdal_env.execute(
-                            packing.unpacked(stages, partials), arrays=arrays, loglevel=loglevel
-                        )
+                        run = ground.put_before(packing.unpacked(stages, partials))
+                        result = pdal_env.execute(run, arrays=arrays, loglevel=loglevel)
                         interrupts.check()
                     packed = packing.pack(partials)
                 finally:
@@ -197,7 +197,7 @@ class Pipeline:
         except StageError as error:
             if isinstance(failure, InterruptedStage):
                 raise KeyboardInterrupt from None
-            raise failure or self._located(error) from None
+            raise failure or ground.failure or self._located(error) from None
         names = {str(made): final for made, final in zip(partials, outputs, strict=True)}
         names |= {made: names.get(target, target) for made, target in packed.items()}
         self.metadata = _renamed(_named_metadata(result.metadata, self.reports), names)
