@@ -121,12 +121,13 @@ def check(folder: Path | None = None) -> tuple[list[str], list[str]]:
     """What is there, and what is missing or wrong, each with its cure."""
     good: list[str] = []
     bad: list[str] = []
+    no_compiler: list[str] = []  # which is no fault where all is built
     pdal_version = ""
     for what in ("compiler", "pdal", "plugin_folder"):
         try:
             found = getattr(places, what)()
         except DependencyError as error:
-            bad.append(str(error))
+            (no_compiler if what == "compiler" else bad).append(str(error))
             continue
         if isinstance(found, places.Pdal):
             pdal_version = found.version
@@ -137,7 +138,7 @@ def check(folder: Path | None = None) -> tuple[list[str], list[str]]:
             good.append(f"filters.python: {found}")
             folder = folder or usual_folder()
     if folder is None:
-        return good, bad
+        return good, no_compiler + bad
     kept = record(folder)
     cure = "pdal-stages plugin --install"
     if kept is None and (version := _by_pip()) is not None:
@@ -150,7 +151,7 @@ def check(folder: Path | None = None) -> tuple[list[str], list[str]]:
         return good, bad
     if kept is None:
         bad.append(f"the plugin is not in {folder}. {cure}")
-        return good, bad
+        return good, no_compiler + bad
     missing = [
         library_name(name) for name in registry.stages() if not (folder / library_name(name)).is_file()
     ]
@@ -164,9 +165,10 @@ def check(folder: Path | None = None) -> tuple[list[str], list[str]]:
         bad.append(f"the plugin in {folder} is out of date: options of stages have changed since. {cure}")
     if pdal_version and kept.get("pdal") != pdal_version:
         bad.append(f"the plugin in {folder} was built for another PDAL (found {kept.get('pdal')}). {cure}")
-    if not bad:
-        good.append(f"plugin: {len(kept['files'])} stages in {folder}")
-    return good, bad
+    if bad:
+        return good, no_compiler + bad
+    good.append(f"plugin: {len(kept['files'])} stages in {folder}")
+    return good, []
 
 
 def _by_pip() -> str | None:

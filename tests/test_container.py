@@ -1,0 +1,160 @@
+"""The container, without Docker: its file is a list of the script's steps, and the script starts with the right kernels."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+SCRIPT = ROOT / "scripts" / "container"
+FILES = [ROOT / name for name in ("Dockerfile", "compose.yaml", ".dockerignore", "scripts/container")]
+
+
+def instructions():
+    lines = (ROOT / "Dockerfile").read_text().splitlines()
+    return [tuple(line.split(maxsplit=1)) for line in lines if line and not line.startswith("#")]
+
+
+def test_every_run_line_is_one_step_of_the_script_and_every_step_is_run():
+    run = [rest for word, rest in instructions() if word == "RUN"]
+    steps = [re.fullmatch(r"(?:/opt/pdal_stages/)?scripts/container (\w+)", line) for line in run]
+    assert all(steps), run
+    named = re.search(r"^  ([\w| ]+)\)\n    mkdir -p", SCRIPT.read_text(), re.MULTILINE)[1].split(" | ")
+    assert [step[1] for step in steps] == named
+    for step in named:
+        assert f"\n{step}() {{\n" in SCRIPT.read_text(), step
+        assert f"\n#   scripts/container {step} " in SCRIPT.read_text(), step
+    assert subprocess.run(["bash", "-n", SCRIPT], check=False).returncode == 0
+    assert os.access(SCRIPT, os.X_OK)
+
+
+def test_the_image_runs_as_a_user_and_takes_the_commands_arguments():
+    made = dict(instructions())
+    assert json.loads(made["ENTRYPOINT"]) == ["pdal-stages"]
+    assert re.search(rf"\buseradd\b.*\s{re.escape(made['USER'])}$", SCRIPT.read_text(), re.MULTILINE)
+    words = [word for word, _ in instructions()]
+    assert words.index("USER") > max(place for place, word in enumerate(words) if word == "RUN")
+    assert set(words) <= {"FROM", "WORKDIR", "COPY", "RUN", "USER", "ENTRYPOINT"}
+    bases = {rest.split(" AS ")[0] for word, rest in instructions() if word == "FROM"}
+    assert bases == {"debian:12-slim"}
+
+
+def test_what_the_build_needs_is_sent_to_it():
+    lines = (ROOT / ".dockerignore").read_text().splitlines()
+    assert "*" in lines
+    sent = {line[1:] for line in lines if line.startswith("!")}
+    assert all((ROOT / name).exists() for name in sent)
+    copied = {rest.split()[0] for word, rest in instructions() if word == "COPY"} - {".", "--from=build"}
+    setup = re.search(r"^    cat (pyproject.*)$", (ROOT / "scripts/setup").read_text(), re.MULTILINE)[
+        1
+    ].split()
+    assert copied | {name.split("/")[0] for name in setup} | {"pdal_stages", "native"} <= sent
+
+
+def test_compose_has_one_image_one_folder_and_no_open_port():
+    compose = pytest.importorskip("yaml").safe_load((ROOT / "compose.yaml").read_text())
+    services = compose["services"]
+    assert set(services) == {"scheduler", "worker", "job"}
+    for service in services.values():
+        assert service["image"] == "pdal-stages" and service["build"] == "."
+        assert "ports" not in service and "privileged" not in service
+        assert [volume.split(":")[-1] for volume in service["volumes"]] == ["/data", "/var/cache/pdal-stages"]
+    assert "/data" in SCRIPT.read_text() and "/var/cache/pdal-stages" in SCRIPT.read_text()
+    kept = {volume.split(":")[0] for volume in services["worker"]["volumes"][1:]}
+    assert kept == set(compose["volumes"])
+    assert services["scheduler"]["entrypoint"][:2] == ["dask", "scheduler"]
+    assert services["worker"]["entrypoint"][:3] == ["dask", "worker", "tcp://scheduler:8786"]
+    assert services["job"]["entrypoint"] == json.loads(dict(instructions())["ENTRYPOINT"])
+    page = (ROOT / "docs" / "large-areas.md").read_text()
+    lines = re.findall(r"^#   (docker .*)$", (ROOT / "compose.yaml").read_text(), re.MULTILINE)
+    assert len(lines) == 3 and all(line in page for line in lines)
+
+
+def test_no_host_or_mirror_is_named():
+    for path in FILES:
+        assert not re.search(r"https?://|ftp://|\b[\w-]+\.(org|com|net|io)\b", path.read_text()), path.name
+
+
+# ---- starting ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def image(tmp_path):
+    """What the build leaves, with programs that tell how they were started."""
+    root = tmp_path / "image"
+    (root / "scripts").mkdir(parents=True)
+    for name in ("container", "lib.sh"):
+        shutil.copy(ROOT / "scripts" / name, root / "scripts" / name)
+    (root / ".venv/bin").mkdir(parents=True)
+    (root / ".kernels/one").mkdir(parents=True)
+    (root / ".kernels/one/kernel.nbi").write_text("compiled")
+    (root / ".build").write_text("0123\n")
+    program = root / ".venv/bin/pdal-stages"
+    program.write_text(
+        '#!/bin/sh\n[ -z "$FAIL" ] || [ "$1" != warmup ] || exit 1\n'
+        f'echo "$1 ${{NUMBA_CPU_NAME:-host}} $NUMBA_CACHE_DIR" >>{root}/calls\nexit "${{EXIT:-0}}"\n'
+    )
+    program.chmod(0o755)
+    (tmp_path / "tmp").mkdir()
+
+    def start(*words, **variables):
+        (root / "calls").unlink(missing_ok=True)
+        inherited = {key: text for key, text in os.environ.items() if not key.startswith("NUMBA_")}
+        ended = subprocess.run(
+            [root / "scripts/container", "start", "pdal-stages", *words],
+            env=inherited | {"TMPDIR": str(tmp_path / "tmp")} | variables, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        return ended, [line.split() for line in (root / "calls").read_text().splitlines()]
+
+    return start
+
+
+def test_without_a_volume_the_kernels_of_any_processor_are_there(image, tmp_path):
+    ended, ((command, processor, folder),) = image("classify", "a.laz", EXIT="3")
+    assert (ended.returncode, command) == (3, "classify") and processor != "host"
+    assert Path(folder, "one/kernel.nbi").read_text() == "compiled"
+    assert Path(folder).parent == tmp_path / "tmp" and Path(folder).stat().st_mode & 0o077 == 0
+    _, ((_, _, again),) = image("classify", "a.laz")
+    assert again == folder and len(os.listdir(tmp_path / "tmp")) == 1
+
+
+def test_a_volume_gets_the_kernels_of_this_processor_once(image, tmp_path):
+    volume = tmp_path / "volume"
+    volume.mkdir()
+    kept = {"PDAL_STAGES_KERNELS": str(volume)}
+    ended, calls = image("doctor", **kept)
+    assert [name for name, *_ in calls] == ["doctor"], "short answers wait for nothing"
+    assert calls[0][1] != "host" and not ended.stderr
+    _, calls = image("classify", "--help", **kept)
+    assert [name for name, *_ in calls] == ["classify"]
+    ended, calls = image("classify", "a.laz", **kept)
+    assert calls == [["warmup", "host", str(volume)], ["classify", "host", str(volume)]]
+    assert "once" in ended.stderr and not ended.stdout
+    for command in ("classify", "doctor"):
+        ended, calls = image(command, **kept)
+        assert calls == [[command, "host", str(volume)]] and not ended.stderr
+
+
+def test_where_compiling_fails_the_job_runs_all_the_same(image, tmp_path):
+    volume = tmp_path / "volume"
+    volume.mkdir()
+    ended, ((command, processor, _),) = image("classify", FAIL="1", PDAL_STAGES_KERNELS=str(volume))
+    assert ended.returncode == 0 and command == "classify" and processor != "host"
+    assert "any processor" in ended.stderr
+    assert not list(volume.glob("ready-*"))
+
+
+def test_another_users_folder_is_not_believed(image, tmp_path):
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (tmp_path / f"tmp/pdal-stages-kernels-{os.getuid()}-0123").symlink_to(elsewhere)
+    _, ((command, *rest),) = image("classify")
+    assert (
+        command == "classify" and str(elsewhere) not in rest and not any("kernels" in word for word in rest)
+    )
