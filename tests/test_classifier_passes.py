@@ -209,7 +209,7 @@ def test_a_pass_may_come_from_elsewhere(two, other):
 
     xyz, _, dimensions = other
     model = type(two)((two.passes[0],), two.classes, two.info)
-    object.__setattr__(model, "algorithm", Passes((Whole(), two.passes[1]), 3))
+    object.__setattr__(model, "algorithm", Passes((Whole(), two.passes[1]), (3, 3)))
     same(everything(two, xyz, dimensions), everything(model, xyz, dimensions))
     inner = (np.abs(xyz[:, :2] - 30) < 8).all(axis=1)
     part = everything(model, xyz, dimensions, inner)

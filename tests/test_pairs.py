@@ -284,7 +284,9 @@ def run(row, files, model, folder):
     if row["door"] == "stock":
         if main(["expand", str(folder / "job.json"), "-o", str(folder / "plain.json")]):
             return 1
-        return subprocess.run(["pdal", "pipeline", str(folder / "plain.json")], cwd=folder).returncode
+        return subprocess.run(
+            [pdal_env.program(), "pipeline", str(folder / "plain.json")], cwd=folder
+        ).returncode
     code = main(command)
     if row["tiles"] == "resumed" and code == 0:
         lost = sorted(folder.glob("o_*"))[0]

@@ -516,7 +516,11 @@ def test_a_package_that_is_missing(pipeline, environment, town, tmp_path):
     broken.mkdir(parents=True)
     (broken / "__init__.py").write_text("raise OSError('cannot open shared object')")
     assert "cannot be imported" in (said := run(broken.parent)) and "cannot open shared object" in said
-    (broken / "__init__.py").write_text("")
+    (broken / "__init__.py").write_text(  # a package that lacks what the library asks for
+        "import sys\nclass Old:\n    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.startswith('pdal_stages.'):\n            raise ModuleNotFoundError(name, name=name)\n"
+        "sys.meta_path.insert(0, Old())\n"
+    )
     assert "plugin --install" in run(broken.parent)
     assert not (tmp_path / "o.laz").exists()
 

@@ -85,7 +85,7 @@ def text(info: Mapping[str, Any]) -> str:
     for entry in info["classes"]:
         f1 = (bag.get("f1") or {}).get(str(entry["code"]))
         lines.append(
-            f"{entry['code']:>3} {entry['name'][:29]:<30}{entry['available']:>12,}{entry['samples']:>10,}"
+            f"{entry['code']:>3} {_short(entry['name']):<30}{entry['available']:>12,}{entry['samples']:>10,}"
             f"{entry['duplicates']:>12,}{_percent(f1):>15}"
         )
     lines.append("")
@@ -96,6 +96,11 @@ def text(info: Mapping[str, Any]) -> str:
             top = list(one["importances"][by].items())[:10]
             lines.append(f"importance by {by:<13}" + ", ".join(f"{k} {100 * v:.1f} %" for k, v in top))
     return "\n".join(lines)
+
+
+def _short(name: str) -> str:
+    """A class's name as the table has room for it; codes of control characters stay whole."""
+    return name if "\\" in name else name[:29]
 
 
 def _in_one_line(value: Any) -> Any:

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from ..base.errors import StageError
 from ..base.outputs import Output
 from ..objects import find_objects
-from ..reports.objectlayers import check_target, object_layers, write_layers
 from .base import Stage
 from .objectoptions import ObjectOptions
 from .options import option
@@ -56,6 +55,8 @@ tell what is to be checked; beside other files lies a `.qml`. Needs the extra `v
     example = {"type": "writers.objects", "filename": "town.gpkg"}
 
     def check(self) -> None:
+        from ..reports.objectlayers import check_target
+
         self.check_classes()
         check_target(self.filename)
 
@@ -70,6 +71,8 @@ tell what is to be checked; beside other files lies a `.qml`. Needs the extra `v
             raise StageError(
                 "there are no points", cure="Check the reader's file and the filters before this stage"
             )
+        from ..reports.objectlayers import object_layers, write_layers
+
         found = find_objects(self.cells(points), self.settings)
         layers = object_layers(found, straight=self.outlines == STRAIGHT, units=points.units)
         files = write_layers(self.filename, layers, points.wkt)
