@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections import defaultdict
 from itertools import product
-from pathlib import Path
 
 import laspy
 import numpy as np
@@ -19,8 +17,6 @@ from pdal_stages.cli import main
 from pdal_stages.objects import consistency
 from pdal_stages.objects.consistency import RULES, consistent
 from pdal_stages.stages.consistency import Consistency
-
-DATA = Path(os.environ.get("PDAL_STAGES_DATA", "/nonexistent"))
 
 
 def scene(seed=0, side=40, density=12):
@@ -244,10 +240,8 @@ def test_in_tiles_as_in_one_piece(tmp_path, write_las):
 
 
 @pytest.mark.pdal
-def test_classify_mends_at_the_end_unless_told_not_to(tmp_path, capsys):
-    source = DATA / "rural/lidarhd_bank.laz"
-    if not source.exists():
-        pytest.skip("real clouds are in PDAL_STAGES_DATA")
+def test_classify_mends_at_the_end_unless_told_not_to(tmp_path, capsys, data_dir):
+    source = data_dir / "rural/lidarhd_bank.laz"
     las = laspy.read(source)
     las.points = las.points[(las.x < las.x.min() + 25) & (las.y < las.y.min() + 25)]
     las.write(tmp_path / "in.laz")

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 from collections import defaultdict, deque
 from itertools import product
-from pathlib import Path
 
 import laspy
 import numpy as np
@@ -20,7 +18,6 @@ from pdal_stages.stages.detachednoise import DetachedNoise
 from pdal_stages.terrain import clusters, detached, envelope
 from pdal_stages.terrain.detached import detached_noise
 
-DATA = Path(os.environ.get("PDAL_STAGES_DATA", "/nonexistent"))
 SIDE = clusters.SIDE
 
 
@@ -420,10 +417,8 @@ REAL = (
 
 
 @pytest.mark.parametrize("name", REAL)
-def test_real_clouds_lose_next_to_nothing_and_lose_their_noise(name):
-    path = DATA / name
-    if not path.exists():
-        pytest.skip("real clouds are in PDAL_STAGES_DATA")
+def test_real_clouds_lose_next_to_nothing_and_lose_their_noise(name, data_dir):
+    path = data_dir / name
     las = laspy.read(path)
     xyz, codes = np.column_stack([las.x, las.y, las.z]), np.asarray(las.classification)
     found = detached_noise(xyz)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 
 import numpy as np
 import pytest
@@ -133,14 +132,11 @@ def test_errors(tmp_path, capsys):
 
 @pytest.mark.data
 @pytest.mark.pdal
-def test_delft_against_official_outlines(tmp_path, capsys):
+def test_delft_against_official_outlines(tmp_path, capsys, data_dir):
     """Houses stand wall to wall, so they are covered rather than told apart."""
-    data = os.environ.get("PDAL_STAGES_DATA")
-    if not data:
-        pytest.skip("PDAL_STAGES_DATA is not set")
     outlines = tmp_path / "delft.gpkg"
-    assert cli.main(["objects", f"{data}/delft/train.laz", str(outlines)]) == 0
-    command = ["accuracy", str(outlines), "--objects", f"{data}/delft/buildings_train.geojson"]
+    assert cli.main(["objects", f"{data_dir}/delft/train.laz", str(outlines)]) == 0
+    command = ["accuracy", str(outlines), "--objects", f"{data_dir}/delft/buildings_train.geojson"]
     assert cli.main([*command, "--json", str(tmp_path / "a.json")]) == 0
     figures = json.loads((tmp_path / "a.json").read_text())["buildings"]
     assert figures["covered"] >= 0.96 and figures["area"]["completeness"] >= 0.96

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import laspy
 import numpy as np
 import pytest
@@ -17,7 +14,6 @@ from pdal_stages.objects.overlay import Overlay, points_inside
 from pdal_stages.stages.polygons import Polygons
 
 pyogrio, shapely, pyproj = (pytest.importorskip(name) for name in ("pyogrio", "shapely", "pyproj"))
-DATA = Path(os.environ.get("PDAL_STAGES_DATA", "/nonexistent"))
 RD = 28992
 LAKE = shapely.Polygon(
     [(85010, 446010), (85050, 446000), (85080, 446060), (85020, 446070)],
@@ -189,11 +185,9 @@ def test_in_tiles_as_in_one_piece(tmp_path, write_las):
 
 
 @pytest.mark.pdal
-def test_water_of_delft_on_the_command_line(tmp_path, capsys):
-    water = DATA / "delft/water_train.geojson"
-    if not water.exists():
-        pytest.skip("real clouds are in PDAL_STAGES_DATA")
-    las = laspy.read(DATA / "delft/train.laz")
+def test_water_of_delft_on_the_command_line(tmp_path, capsys, data_dir):
+    water = data_dir / "delft/water_train.geojson"
+    las = laspy.read(data_dir / "delft/train.laz")
     near = (np.abs(las.x - 84825) < 40) & (np.abs(las.y - 447545) < 40)
     las.points = las.points[near]
     las.write(tmp_path / "in.laz")
