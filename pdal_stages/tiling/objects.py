@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base import kinds
 from ..base.errors import OptionError, StageError
-from ..base.files import check_writable, write_whole
+from ..base.files import write_whole
 from ..base.las import read_header
 from ..base.outputs import Output, check_outputs
 from ..base.plain import tell
@@ -28,7 +29,7 @@ from ..base.stamps import stamp
 from ..base.units import Units
 from ..base.version import __version__
 from ..objects import Cells, Objects, ObjectSettings, find_objects
-from ..objects.cells import kind_of_code
+from ..objects.cells import Kind, kind_of_code
 from ..pipeline import pdal as pdal_env
 from ..pipeline.ends import input_files, outputs_of
 from ..pipeline.overrides import Override
@@ -50,7 +51,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     takes("inputs", nargs="+", metavar="input", help="Classified files PDAL can read, folders, patterns")
     takes("output", help="Vector file to write: .gpkg, .geojson, .fgb or .shp")
     takes("--outlines", choices=("straight", "cells"), help="Outlines along walls (default) or along cells")
-    takes("--cell", type=float, metavar="METRES", help="Side of the grid's cells (0.5)")
+    takes("--cell", type=float, metavar="METERS", help="Side of the grid's cells (0.5)")
     takes("--workers", type=int, default=1, metavar="N", help="Files read at the same time (1)")
     takes("--resume", action="store_true", help="Keep what an earlier run read")
     takes("--metadata", metavar="FILE", help="Write counts, verdicts and settings to a JSON file")
@@ -60,9 +61,11 @@ def run_command(options: argparse.Namespace) -> int:
     """Run ``pdal-stages objects``; the exit code."""
     given = {name: value for name in ("outlines", "cell") if (value := getattr(options, name)) is not None}
     stage = writer(options.output, options.overrides, **given)
-    if options.metadata:
-        check_writable(options.metadata, "metadata")
-    return _write(input_files(options.inputs), stage, options)
+    check_target(options.output)
+    inputs = input_files(options.inputs)
+    more = [Output(options.metadata, "metadata", kinds.JSON)] if options.metadata else []
+    check_outputs([Output(options.output, "objects"), *more], [*inputs, *options.inputs])
+    return _write(inputs, stage, options.workers, options.resume, options.metadata)
 
 
 def refuse_tiles(task: ClassifyTask, output: str) -> None:
@@ -78,15 +81,17 @@ def refuse_tiles(task: ClassifyTask, output: str) -> None:
 
 def objects_of_outputs(task: ClassifyTask, output: str) -> int:
     """What ``classify --objects`` does when all is classified."""
-    return _write(
-        outputs_of(task.files, task.output), ObjectsWriter({"filename": output}), argparse.Namespace()
-    )
+    return _write(outputs_of(task.files, task.output), ObjectsWriter({"filename": output}))
 
 
-def _write(inputs: list[str], stage: ObjectsWriter, options: argparse.Namespace) -> int:
+def _write(
+    inputs: list[str],
+    stage: ObjectsWriter,
+    workers: int = 1,
+    resume: bool = False,
+    metadata: str | None = None,
+) -> int:
     """Find objects, write them, say what was found."""
-    metadata = getattr(options, "metadata", None)
-    workers, resume = getattr(options, "workers", 1), getattr(options, "resume", False)
     found, reference = objects_of_files(inputs, stage, workers=workers, resume=resume)
     layers = object_layers(found, straight=stage.outlines == STRAIGHT, units=reference[0])
     files = write_layers(stage.filename, layers, reference[1])
@@ -165,8 +170,6 @@ def objects_of_files(
 
 def _tell_density(cells: Cells) -> None:
     """Say where cells are too small for the points."""
-    from ..objects.cells import Kind
-
     roofs = cells.of_kind(Kind.BUILDING)
     if len(roofs) > 100 and float(roofs.columns["count"].mean()) < 1.6:
         mean = float(roofs.columns["count"].mean())
@@ -199,12 +202,12 @@ def read_cells(path: str, stage: ObjectsWriter, wkt: str, kept: str) -> list[int
     if not target.exists():
         seen = np.zeros(256, np.int64)
         parts = [Cells(stage.settings.cell)]
-        kinds = kind_of_code(stage.classes)
+        kind_of = kind_of_code(stage.classes)
         for arrays in _points_of(path):
             points = stage.points(arrays, wkt=wkt)
             seen += np.bincount(points.class_codes, minlength=256)
             usable = points.inside & ~points.chosen(stage.ignore)
-            usable &= kinds[points.class_codes] >= 0
+            usable &= kind_of[points.class_codes] >= 0
             x, y, z = points.xyz[usable].T
             told = arrays.get("Reliability")
             parts.append(
