@@ -143,6 +143,27 @@ def test_resume_makes_what_is_missing_alone(tmp_path, survey, monkeypatch):
 
 
 @pytest.mark.pdal
+def test_what_is_left_of_an_input_that_is_gone_is_removed(tmp_path, survey, monkeypatch):
+    from pdal_stages.tiling import tile_task
+
+    real = tile_task.run_head
+
+    def failing(context, tile, *rest):
+        if tile == (1, 1):
+            raise ps.StageError("no luck")
+        return real(context, tile, *rest)
+
+    monkeypatch.setattr(tile_task, "run_head", failing)
+    folder = tmp_path / "out"
+    assert in_tiles(survey, [HEIGHTS], folder, retries=0).failures
+    left = folder / ".pdal-stages" / "tiles"
+    names = {path.name for path in left.glob("*.npy")}
+    np.save(left / "-200_0.first.npy", np.array([[-1.0, 100.0, -500.0]]))  # of a tile without points now
+    assert in_tiles(survey, [HEIGHTS], folder, resume=True, retries=0).failures
+    assert {path.name for path in left.glob("*.npy")} == names
+
+
+@pytest.mark.pdal
 def test_a_damaged_file_of_the_first_round_is_made_again(tmp_path, survey, monkeypatch):
     from pdal_stages.tiling.firstround import FirstRoundTask
 

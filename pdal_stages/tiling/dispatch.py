@@ -123,6 +123,7 @@ def run_first_round(work: Worklist, store: Store, pool: Pool, retries: int, show
         If all fail for one reason.
     """
     first, survey = work.plan.first, work.survey
+    store.forget_left([job.name for job in work.jobs])  # an earlier run may have had other inputs
     if first is None or len(work.jobs) == 1:
         return
     grid, halo = survey.grid, first.halo_m / survey.unit

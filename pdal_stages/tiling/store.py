@@ -10,6 +10,7 @@ import shutil
 import socket
 import stat
 import time
+from collections.abc import Collection
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TextIO
@@ -134,10 +135,12 @@ class Store:
         """The file of what the first round left of a tile."""
         return self.tiles / left_file(name)
 
-    def forget_left(self) -> None:
-        """Remove what the first round left."""
+    def forget_left(self, but: Collection[str] = ()) -> None:
+        """Remove what the first round left, of all tiles but these."""
+        kept = {left_file(name) for name in but}
         for path in self.tiles.glob(left_file("*")):
-            path.unlink(missing_ok=True)
+            if path.name not in kept:
+                path.unlink(missing_ok=True)
 
     def has_result(self, name: str, report: dict[str, Any]) -> bool:
         """Whether the file of a tile's results is there, as long as the tile's report says."""
