@@ -685,7 +685,8 @@ def test_install_check_uninstall(tmp_path, plugin, monkeypatch, capsys):
     said = "\n".join(building.check(folder)[1])
     assert "of another version" in said and "for another PDAL (found 1.0.0)" in said
     (folder / "libpdal_plugin_filter_former.so").write_text("")
-    record["files"].append("libpdal_plugin_filter_former.so")
+    record["files"] += ["libpdal_plugin_filter_former.so", "../outside.so"]
+    (tmp_path / "outside.so").write_text("of somebody else")
     (folder / building.RECORD).write_text(json.dumps(record))
     (folder / "libpdal_plugin_filter_other.so").write_text("of somebody else")
     monkeypatch.setenv("PDAL_DRIVER_PATH", f"{tmp_path}{os.pathsep}{folder}")
@@ -693,6 +694,7 @@ def test_install_check_uninstall(tmp_path, plugin, monkeypatch, capsys):
     building.uninstall()
     assert [path.name for path in folder.iterdir()] == ["libpdal_plugin_filter_other.so"]
     assert building.uninstall(folder) == []
+    assert (tmp_path / "outside.so").exists()
 
 
 def test_a_plugin_that_pip_installed(tmp_path, monkeypatch):

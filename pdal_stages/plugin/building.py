@@ -99,7 +99,8 @@ def uninstall(folder: Path | None = None) -> list[Path]:
     if record(target) is None and _by_pip() is not None:
         raise StageError("the plugin came as a package", found=_PACKAGE, cure=f"pip uninstall {_PACKAGE}")
     names = [*(record(target) or {}).get("files", []), *map(library_name, registry.stages()), RECORD]
-    gone = [target / name for name in dict.fromkeys(names) if (target / Path(name).name).is_file()]
+    files = [target / Path(name).name for name in dict.fromkeys(names)]  # never outside the folder
+    gone = [path for path in files if path.is_file()]
     for path in gone:
         try:
             path.unlink()
