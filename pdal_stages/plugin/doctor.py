@@ -25,6 +25,7 @@ _EXTRAS = {
     "dask": ("distributed", "tiles on several hosts"),
     "deep": ("torch", "the neural network"),
     "table": ("pandas", "tables as data frames"),
+    "vector": ("pyogrio", "objects as vector files, and polygons of a map"),
 }
 #: What a job needs beside the cloud itself; less is told.
 _LITTLE_MEMORY = 2 * 2**30

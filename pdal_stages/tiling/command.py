@@ -18,7 +18,7 @@ from ..base.errors import OptionError, StageError
 from ..base.files import check_writable, write_whole
 from ..base.memory import parse_size
 from ..base.plain import one_line, tell
-from ..pipeline.ends import is_folder, is_las
+from ..pipeline.ends import is_ept, is_folder, is_las
 from ..pipeline.read import PipelineSource
 from ..pipeline.run import Pipeline
 from .classify import LEFT_ALONE, ClassifyTask, Written
@@ -210,7 +210,7 @@ def _classify_each(task: ClassifyTask, options: argparse.Namespace, names: Mappi
         if getattr(options, flag):
             raise OptionError(
                 f"--{flag} needs inputs that can be cut into tiles: LAS, LAZ, COPC or EPT",
-                found=next(name for name in task.files if not is_las(name)),
+                found=next(name for name in task.files if not is_las(name) and not is_ept(name)),
                 cure="Convert them first: pdal translate INPUT input.laz",
             )
     notes = _SaidOnce()

@@ -256,7 +256,7 @@ def _check_local(step: _Step, buffer: float | None) -> None:
         raise PipelineError(
             f"{step.type} may look at neighbors, and PDAL does not say how far",
             where=step.where,
-            cure="Give --buffer METRES, wide enough for it (0 if it looks at single points)",
+            cure="Give --buffer METERS, wide enough for it (0 if it looks at single points)",
         )
 
 
