@@ -241,9 +241,7 @@ def test_in_tiles_as_in_one_piece(tmp_path, write_las):
 
 @pytest.mark.pdal
 def test_classify_mends_at_the_end_unless_told_not_to(tmp_path, capsys, data_dir):
-    source = data_dir / "rural/lidarhd_bank.laz"
-    las = laspy.read(source)
-    las.points = las.points[(las.x < las.x.min() + 25) & (las.y < las.y.min() + 25)]
+    las = laspy.read(data_dir / "montpellier/test_77060_627760.laz")
     las.write(tmp_path / "in.laz")
     truth = np.asarray(las.classification)
     kept = {}
