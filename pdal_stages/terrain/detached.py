@@ -278,10 +278,6 @@ def _low(keys, suspect, extremes, base, supported, depth, verdict):
             verdict[k] = LOW
 
 
-#: As DEPTH and SCATTERS, for what is near enough to the ground to be one with it; and the most columns of it in 5 x 5.
-JUST, JUST_SCATTERS, TOGETHER = 0.8, 5.0, 4
-
-
 @njit
 def _just_below(base, supported, least, below):
     """Fill `below` with the level that points of a column must not lie under; NaN where there is none."""
