@@ -771,6 +771,44 @@ def test_a_cluster_of_another_version(tmp_path, folder, cluster, monkeypatch):
     assert "other versions" in answer.reason and answer.again
 
 
+_JOINER = """
+import pathlib
+from pdal_stages.tiling import scheduler
+scheduler.build = lambda: "0.0.9 (0)"
+def dask_setup(worker):
+    worker.loop.call_later(1, pathlib.Path({!r}).touch)
+"""
+
+
+def test_a_worker_of_another_version_that_joins(tmp_path, folder, expected, cluster):
+    """It gets no tiles, as there is a good one."""
+    begun, joined, preload = (tmp_path / name for name in ("begun", "joined", "preload.py"))
+    preload.write_text(_JOINER.format(str(joined)))
+    words = [sys.executable, "-m", "distributed.cli.dask_worker", cluster[0], "--no-nanny", "--nthreads", "1"]
+    words += ["--no-dashboard", "--memory-limit", "0", "--preload", preload]
+    others = []
+
+    def join():
+        while not begun.exists():
+            time.sleep(0.05)
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": tmp_path}
+        others.append(subprocess.Popen(words, **quiet))
+
+    wait = f"open({str(begun)!r}, 'w').close()\nwhile not os.path.exists({str(joined)!r}): time.sleep(0.05)"
+    stages = pipeline(folder, tmp_path / "o_#.laz", python_filter(f"{wait}\ntime.sleep(0.2)"))
+    thread = threading.Thread(target=join, daemon=True)
+    thread.start()
+    try:
+        run = run_tiled(stages, 20, scheduler=cluster[0], buffer=0.0)
+    finally:
+        begun.touch()
+        thread.join()
+        others[0].kill()
+        others[0].wait()
+    assert joined.exists() and not run.failures
+    check_same(tmp_path, expected)
+
+
 def test_a_host_without_the_folder(tmp_path, folder, cluster, monkeypatch):
     """Refused before any work; and by a worker that joins later, with each task."""
     from pdal_stages.tiling import scheduler

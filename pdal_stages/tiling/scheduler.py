@@ -31,6 +31,9 @@ class OnDask:
         self.address, self.folder = options.scheduler, folder
         self.threads, self.slots = options.threads, 1
         self._stack = contextlib.ExitStack()
+        self._unfit: dict[str, str] = {}  # why workers that joined later get no tasks, by their address
+        self._asked: set[str] = set()
+        self._chosen: list[str] = []
 
     def __enter__(self) -> OnDask:
         self._dask: Any = optional_import("distributed", "dask", "a Dask scheduler (--scheduler)")
@@ -75,6 +78,25 @@ class OnDask:
                 raise StageError(_OTHER, found=_difference(worker, theirs, versions()), cure=_SAME)
             if not sees:
                 raise StageError(_APART, found=f"no {self.folder} on {host}", cure=_SHARE)
+        self._asked = set(found)
+
+    def _fit(self) -> list[str]:
+        """Addresses of the workers there are that may have tasks; those that joined since are asked first."""
+        there = list(self._client.nthreads())
+        new = [worker for worker in there if worker not in self._asked]
+        if new:
+            found = self._client.run(at_hand, self.folder, workers=new, on_error="return")
+            self._asked.update(found)
+            for worker, answer in found.items():
+                if isinstance(answer, OSError):  # gone again, or not yet there
+                    self._asked.discard(worker)
+                elif isinstance(answer, BaseException):
+                    self._unfit[worker] = f"{worker} cannot say what it has: {answer}"
+                elif answer[0] != versions():
+                    self._unfit[worker] = f"{_OTHER} ({_difference(worker, answer[0], versions())}). {_SAME}"
+                elif not answer[2]:
+                    self._unfit[worker] = f"{_APART} (found no {self.folder} on {answer[1]}). {_SHARE}"
+        return [worker for worker in there if worker not in self._unfit]
 
     def run(self, waiting: deque, task_of: Callable[[Any], Task]) -> Iterator[tuple[Any, TaskResult]]:
         """Yield (item, answer) for every item; see :meth:`pdal_stages.pipeline.processes.Processes.run`.
@@ -85,6 +107,7 @@ class OnDask:
         whose worker was killed is tried once more with nothing beside it before it is blamed.
         """
         out: dict[Any, Any] = {}  # items by their future
+        stranded: dict[int, int] = {}  # how often an item waited for workers that are gone
         suspects: deque[Any] = deque()
         try:
             while waiting or out or suspects:
@@ -104,10 +127,22 @@ class OnDask:
                         yield waiting.popleft(), TaskResult(reason=str(lost))
                     return
                 for future in done:
-                    item, error = out.pop(future), future.exception()
+                    item = out.pop(future)
+                    if not future.done():
+                        future.cancel(force=True)
+                        stranded[id(item)] = stranded.get(id(item), 0) + 1
+                        if stranded[id(item)] < _TRIES:
+                            waiting.appendleft(item)
+                        else:
+                            yield item, TaskResult(reason=_KILLED)
+                        continue
+                    error = future.exception()
                     killed = isinstance(error, self._dask.KilledWorker)
                     answer = future.result() if error is None else _failed(error, killed)
                     future.release()
+                    if error is None and self._refused(answer):
+                        waiting.appendleft(item)  # from now on for workers that are fit
+                        continue
                     if killed and not alone:
                         # It may only have waited on a worker that another tile killed: judge it by itself.
                         suspects.append(item)
@@ -122,12 +157,23 @@ class OnDask:
         content = pickle.dumps(task)
         try:
             words = versions(), self.folder, socket.gethostname(), content
-            return self._client.submit(perform_for, *words, pure=False, retries=0)
+            # Only where others are there: Dask itself moves a task whose worker is gone, but not past these.
+            only = {"workers": self._chosen} if self._unfit and self._chosen else {}
+            future = self._client.submit(perform_for, *words, pure=False, retries=0, **only)
+            future.chosen = frozenset(self._chosen if only else ())
+            return future
         except (OSError, RuntimeError):
             raise _LostError(_LOST) from None
 
+    def _refused(self, answer: TaskResult) -> bool:
+        """Whether a worker refused a task that another one may do."""
+        if not answer.reason.startswith((_OTHER, _APART)):
+            return False
+        self._slots_now()
+        return bool(self._unfit and self._chosen)
+
     def _wait(self, futures: list[Any]) -> list[Any]:
-        """Futures that are done."""
+        """Futures that are done, or that wait for workers that are gone while others are there."""
         gone: float | None = None
         while True:
             try:
@@ -141,12 +187,16 @@ class OnDask:
                 raise _LostError(_LOST)
             now = time.monotonic()
             gone = None if self._slots_now(0) else gone or now
+            lost = [f for f in futures if f.chosen and f.chosen.isdisjoint(self._chosen) and not f.done()]
+            if gone is None and lost:
+                return lost
             if gone is not None and now - gone > _WAIT:
                 raise _LostError("all workers of the Dask scheduler are gone")
 
     def _slots_now(self, least: int = 1) -> int:
         with contextlib.suppress(Exception):
-            self.slots = len(self._client.nthreads())
+            self._chosen = self._fit()
+            self.slots = len(self._chosen)
         return max(least, self.slots)
 
 
@@ -154,6 +204,9 @@ class _LostError(Exception):
     """Nothing more will come from the scheduler."""
 
 
+#: How often a task may wait for workers that went away before it is blamed.
+_TRIES = 4
+_KILLED = "it killed its worker each time it was tried: too little memory, or a crash in a library"
 _LOST = "the Dask scheduler cannot be reached any more"
 _OTHER = "a worker of the scheduler has other versions than this program"
 _SAME = "Install the same versions of pdal-stages and PDAL on all hosts"
@@ -183,7 +236,7 @@ def perform_for(wanted: tuple[str, str], folder: str, host: str, task: bytes) ->
     """Do a task on a worker, if it has the versions of the program that sent it, from `host`, and sees its folder."""
     here = socket.gethostname()
     if versions() != wanted:
-        return TaskResult(reason=f"{_OTHER} ({_difference('it', versions(), wanted)}). {_SAME}", again=True)
+        return TaskResult(reason=f"{_OTHER} ({_difference(here, versions(), wanted)}). {_SAME}", again=True)
     if not _sees(folder):
         return TaskResult(reason=f"{_APART} (found no {folder} on {here}). {_SHARE}", again=True)
     answer = perform(pickle.loads(task))
@@ -199,6 +252,5 @@ def _difference(worker: str, theirs: tuple[str, str], ours: tuple[str, str]) -> 
 def _failed(error: BaseException, killed: bool) -> TaskResult:
     """The answer of a task that gave none."""
     if killed:
-        reason = "it killed its worker each time it was tried: too little memory, or a crash in a library"
-        return TaskResult(reason=reason)
+        return TaskResult(reason=_KILLED)
     return TaskResult(reason=f"{type(error).__name__}: {error}", again=True)
