@@ -63,6 +63,7 @@ def test_what_is_written_for_a_file_and_a_class():
         "=9",
         "lakes.gpkg=",
         "lakes.gpkg=256",
+        "lakes.gpkg=²",
         "lakes.gpkg=9:",
         "lakes.gpkg=9:x",
         "l=-1",

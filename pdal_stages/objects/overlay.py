@@ -49,7 +49,7 @@ class Overlay:
         if not (
             found
             and file.strip()
-            and all(one.strip().isdigit() and int(one) <= 255 for one in [code, *given])
+            and all(one.strip().isdecimal() and int(one) <= 255 for one in [code, *given])
         ):
             raise OptionError(
                 "polygons are written FILE=CODE",
