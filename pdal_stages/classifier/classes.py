@@ -175,7 +175,7 @@ def _labels(text: Any) -> tuple[int, ...]:
 
 def _code(value: Any, what: str) -> int:
     limit = MAX_CODE if what == "code" else MAX_LABEL
-    if isinstance(value, str) and value.strip().isdigit():
+    if isinstance(value, str) and value.strip().isdecimal():
         value = int(value)
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value <= limit:
         raise OptionError(

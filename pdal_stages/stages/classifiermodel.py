@@ -176,7 +176,7 @@ holds the classes.
         """The trainer's options."""
         values = {name: value for name, value in self.options.items() if name in _TRAINING}
         for name in ("trees", "max_depth", "min_samples_leaf"):
-            numbers = [int(v) if str(v).strip().lstrip("-").isdigit() else v for v in values[name]]
+            numbers = [int(v) if str(v).strip().lstrip("-").isdecimal() else v for v in values[name]]
             values[name] = numbers[0] if len(numbers) == 1 else numbers
         values["max_features"] = _number(values["max_features"])
         if self.automatic:
