@@ -38,7 +38,7 @@ from pdal_stages.features import FeatureEngine
 from pdal_stages.features.voxels import represent
 
 TREES, FOLDS, SEED = 50, 5, 0
-#: Metres: side of the cells of segments, and the distance at which the graph's edges count 1/e.
+#: Meters: side of the cells of segments, and the distance at which the graph's edges count 1/e.
 CELL, REACH = 0.5, 0.5
 
 Table = npt.NDArray[np.float32]

@@ -1,6 +1,6 @@
 """Time of features and forests beside libraries that do some of the same: pgeof, jakteristics, PDAL, scikit-learn.
 
-    python benchmarks/features.py                               # generated town, 500,000 points, 7 per square metre
+    python benchmarks/features.py                               # generated town, 500,000 points, 7 per square meter
     python benchmarks/features.py --cloud delft montpellier     # real clouds, from PDAL_STAGES_DATA
     python benchmarks/features.py --cloud file.laz --only moments kopt --repeats 5
     python benchmarks/features.py --scaling                     # 0.25 to 16 million points at constant density
@@ -91,7 +91,7 @@ def load(name: str, points: int, density: float) -> Cloud:
 
 
 def point_density(xyz: np.ndarray) -> float:
-    """Points per square metre of the occupied square metres."""
+    """Points per square meter of the occupied square meters."""
     return len(xyz) / max(len(np.unique(np.floor(xyz[:, :2]), axis=0)), 1)
 
 
@@ -269,7 +269,7 @@ def spread(values: Iterable[float], form: str = ".2f") -> str:
 
 def table(cloud: str, xyz: np.ndarray, results: list[dict], threads: int) -> str:
     lines = [
-        f"{cloud}: {len(xyz):,} points, {point_density(xyz):.1f} per occupied square metre, {threads} threads",
+        f"{cloud}: {len(xyz):,} points, {point_density(xyz):.1f} per occupied square meter, {threads} threads",
         "",
         "| what | who | CPU s | wall s | CPU time over ours | points/s |",
         "|---|---|---:|---:|---:|---:|",
@@ -413,8 +413,8 @@ def plot(clouds: dict[str, tuple[int, list[dict]]], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    colours = {"pdal_stages": "#1b6ca8", "pgeof": "#b0b7bf", "jakteristics": "#8d97a1", "PDAL": "#6b7682"}
-    colours["scikit-learn"] = "#c7ccd1"
+    colors = {"pdal_stages": "#1b6ca8", "pgeof": "#b0b7bf", "jakteristics": "#8d97a1", "PDAL": "#6b7682"}
+    colors["scikit-learn"] = "#c7ccd1"
     entries = [
         (cloud, n, entry) for cloud, (n, results) in clouds.items() for entry in results if entry["peers"]
     ]
@@ -428,7 +428,7 @@ def plot(clouds: dict[str, tuple[int, list[dict]]], path: Path) -> None:
         start = place
         for who, times in rows.items():
             each = float(np.median([cpu for cpu, _ in times])) / n * 1e6
-            axis.barh(place, each, 0.85, color=colours[who])
+            axis.barh(place, each, 0.85, color=colors[who])
             axis.text(each, place, f" {who} {each:.1f}", va="center", fontsize=8)
             place += 1
         ticks.append((start + place - 1) / 2)
@@ -449,7 +449,7 @@ def main() -> None:
     parser.add_argument("--cloud", nargs="+", default=["town"], help=f"town, {', '.join(REAL)}, or files")
     parser.add_argument("--points", type=int, default=500_000, help="of the town (default 500000)")
     parser.add_argument(
-        "--density", type=float, default=7.0, help="of the town, per square metre (default 7)"
+        "--density", type=float, default=7.0, help="of the town, per square meter (default 7)"
     )
     parser.add_argument("--only", nargs="+", choices=list(cases(1)), default=list(cases(1)))
     parser.add_argument("--repeats", type=int, default=3)

@@ -1,6 +1,6 @@
 """What the machine could do at best, and how far the kernels are from it: operations and bytes of each part of a job.
 
-    python benchmarks/limits.py                                # a generated town, 500,000 points, 7 per square metre
+    python benchmarks/limits.py                                # a generated town, 500,000 points, 7 per square meter
     python benchmarks/limits.py --cloud delft --json FILE      # a real cloud, from PDAL_STAGES_DATA
 
 The bounds are measured here, on one core, by loops that do nothing else:

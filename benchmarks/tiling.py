@@ -2,7 +2,7 @@
 
     python benchmarks/tiling.py --points 1e6 5e6 --tile 250 --workers 2
 
-Writes generated towns of 5 points a square metre (kept in --folder and used again), trains a model on another
+Writes generated towns of 5 points a square meter (kept in --folder and used again), trains a model on another
 town, classifies each in tiles, and prints points per second and the most memory each process held. A
 number of points with an `x` (4x5e6) is a mosaic of shifted copies of one town, which is quicker to make.
 CPU seconds are those of the workers' tasks, so they hold on a busy machine too; wall seconds do not.

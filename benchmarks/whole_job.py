@@ -2,7 +2,7 @@
 
     python benchmarks/whole_job.py                                  # 500,000 points of a generated town
     python benchmarks/whole_job.py --sizes 0.5 5 20                 # millions of points, peak memory
-    python benchmarks/whole_job.py --densities 1 7 50 200 500       # points per square metre, time per point
+    python benchmarks/whole_job.py --densities 1 7 50 200 500       # points per square meter, time per point
     python benchmarks/whole_job.py --parts                          # CPU seconds of each part, one thread
     python benchmarks/whole_job.py --json FILE
 
@@ -52,7 +52,7 @@ def town(folder: Path, millions: float, density: float, seed: int) -> Path:
         size = (millions * 1e6 / density) ** 0.5
         if size < 20.0:
             raise SystemExit(
-                f"{millions:g} million points at {density:g} per square metre are too small a town"
+                f"{millions:g} million points at {density:g} per square meter are too small a town"
             )
         write_town(make_town(size=size, density=density, seed=seed, progress=False), path)
     return path

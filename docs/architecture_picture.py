@@ -27,7 +27,7 @@ COLUMNS = (
         "In PDAL: whole cloud or tile",
         (
             ("Reader", "", "PDAL"),
-            ("Hand the points to the stage,", "in metres, class codes without flags", "pipeline/runtime.py"),
+            ("Hand the points to the stage,", "in meters, class codes without flags", "pipeline/runtime.py"),
             ("Heights above a terrain", "", "terrain/minima.py"),
             ("Features of many neighborhoods,", "block by block", "features/engine.py"),
             (

@@ -149,7 +149,7 @@ def _first_lowest(entropies):
 def kopt(xyz, q, k_min=10, k_max=100, cap=math.inf):
     """Members, radius and all entropies of the k in k_min..k_max with the lowest eigenentropy [B16].
 
-    k counts neighbors besides the point itself. A neighborhood holds nothing beyond `cap` metres; where fewer
+    k counts neighbors besides the point itself. A neighborhood holds nothing beyond `cap` meters; where fewer
     than k_min lie within it, all that do are taken.
     """
     points, distance = by_distance(xyz, q)
@@ -214,7 +214,7 @@ def copt(xyz, q, threshold):
 
 
 def shape_metrics(a, b, c, d, centroid):
-    """A3, D1, D2, D3, D4 of four pulled points, in radians and metres [B16 3.2.2]."""
+    """A3, D1, D2, D3, D4 of four pulled points, in radians and meters [B16 3.2.2]."""
     a, b, c, d = (np.asarray(v, float) for v in (a, b, c, d))
     u, v, w = b - a, c - a, d - a
     lengths = np.linalg.norm(u) * np.linalg.norm(v)

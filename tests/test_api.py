@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 @pytest.fixture(scope="module")
 def scene():
-    """Ground (2) and a block (6), metres."""
+    """Ground (2) and a block (6), meters."""
     rng = np.random.default_rng(0)
     x, y = rng.uniform(0, 40, (2, 1500))
     block = (x > 25) & (y > 25)

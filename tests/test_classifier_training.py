@@ -266,7 +266,7 @@ def test_counts_scores_and_importances(trained):
     assert set(trained.importances("neighborhood")) == {"c1", "s2", "kopt(5,20)", "(dimension)"}
     assert set(trained.importances("group")) == {"covariance", "geometric", "shapes", "dimension"}
     with pytest.raises(OptionError, match="grouped"):
-        trained.importances("colour")
+        trained.importances("color")
     text = str(trained)
     for word in ("Ground", "Building", "c1 s2 kopt(5,20)", "HeightAboveGround", "a.laz", "out of bag"):
         assert word in text

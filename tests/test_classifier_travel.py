@@ -1,4 +1,4 @@
-"""Training that generalises: copies, surveys that weigh alike, surveys left out, noise, clouds one at a time, densities."""
+"""Training that generalizes: copies, surveys that weigh alike, surveys left out, noise, clouds one at a time, densities."""
 
 import json
 

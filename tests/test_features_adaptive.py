@@ -65,7 +65,7 @@ def scattered(n, seed, size=(12.0, 12.0, 3.0), origin=(0.0, 0.0, 0.0)):
 
 
 def town(n=3000, seed=3, origin=(0.0, 0.0, 0.0)):
-    """Ground, a roof, a wall and a tree, in millimetres."""
+    """Ground, a roof, a wall and a tree, in millimeters."""
     rng = np.random.default_rng(seed)
     xyz = rng.uniform(0, 1, (n, 3)) * (20, 20, 0.05)
     roof = (abs(xyz[:, 0] - 5) < 3) & (abs(xyz[:, 1] - 6) < 4)

@@ -142,14 +142,14 @@ def test_crowded_cell(rng):
 
 
 def test_large_spheres_in_a_dense_cloud(rng):
-    """10 m round points of a cloud of 100 a square metre: 30,000 members each."""
+    """10 m round points of a cloud of 100 a square meter: 30,000 members each."""
     xyz = rng.uniform(0, 30, (90_000, 3)) * [1, 1, 0.05]
     near = np.argsort(((xyz[:, :2] - 15) ** 2).sum(axis=1))[:6]
     check(xyz, near, radii=(10.0,))
 
 
 def test_sparse_cloud_has_no_nan(rng):
-    xyz = rng.uniform(0, 100, (3000, 3)) * [1, 1, 0.1]  # 0.3 points a square metre
+    xyz = rng.uniform(0, 100, (3000, 3)) * [1, 1, 0.1]  # 0.3 points a square meter
     values = compute_features(xyz, None, "c0.5,c1,c5,s0.5,s1,s5,k3,kopt,ropt,copt", "all").values
     assert np.isfinite(values).all()
 

@@ -1,4 +1,4 @@
-"""Pictures: valid PNG, the right pixel in the right colour, clear errors, any extent."""
+"""Pictures: valid PNG, the right pixel in the right color, clear errors, any extent."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def pixels(data: bytes) -> np.ndarray:
     st.booleans(),
 )
 def test_png_holds_the_pixels(rgb, palette):
-    assert np.array_equal(pixels(png(rgb, palette)), rgb)  # 144 colours at most, so a palette holds them
+    assert np.array_equal(pixels(png(rgb, palette)), rgb)  # 144 colors at most, so a palette holds them
 
 
 def test_a_palette_is_close_and_keeps_rare_colours():

@@ -443,10 +443,10 @@ def test_rejection_is_counted(cloud, model):
 
 def test_feet_are_converted(tmp_path, write_las):
     foot = 0.3048
-    metres = scene()
-    feet = {**metres, **{n: metres[n] / foot for n in "XYZ"}}
+    meters = scene()
+    feet = {**meters, **{n: meters[n] / foot for n in "XYZ"}}
     wkt = UTM.replace('UNIT["metre",1]', 'UNIT["foot",0.3048]')
-    a = write_las(tmp_path / "m.las", metres, point_format=7, wkt=UTM, scale=1e-4)
+    a = write_las(tmp_path / "m.las", meters, point_format=7, wkt=UTM, scale=1e-4)
     b = write_las(tmp_path / "f.las", feet, point_format=7, wkt=wkt, scale=1e-4)
     stages = [
         {"type": "filters.hag_minima"},

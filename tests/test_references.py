@@ -1,4 +1,4 @@
-"""Inputs of metres, feet and degrees beside each other are refused, in tiles and without."""
+"""Inputs of meters, feet and degrees beside each other are refused, in tiles and without."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def mercator(meridian: int, unit: str) -> str:
     return f'PROJCS["p",{DEGREES},PROJECTION["Transverse_Mercator"],{parameters},UNIT[{unit}]]'
 
 
-METRES, OTHER = mercator(9, '"metre",1'), mercator(15, '"metre",1')
+METERS, OTHER = mercator(9, '"metre",1'), mercator(15, '"metre",1')
 ALIKE = (
-    METRES.replace("WGS 84", "GRS 1980")
+    METERS.replace("WGS 84", "GRS 1980")
     .replace("WGS_1984", "ETRS_1989")
     .replace("298.257223563", "298.257222101")
 )
@@ -57,7 +57,7 @@ def ways(tmp_path, pattern, *more):
     yield lambda: run_tiled([*stages, {**writer, "filename": str(tmp_path / "o_#.las")}], 40, workers=0)
 
 
-@pytest.mark.parametrize(("one", "two"), [(METRES, FEET), (FEET, METRES), (FEET, None)])
+@pytest.mark.parametrize(("one", "two"), [(METERS, FEET), (FEET, METERS), (FEET, None)])
 def test_units_of_two_kinds(tmp_path, inputs, one, two):
     for way in ways(tmp_path, inputs(one, two)):
         with pytest.raises(StageError, match="the inputs have different units of length") as caught:
@@ -68,7 +68,7 @@ def test_units_of_two_kinds(tmp_path, inputs, one, two):
     assert not list(tmp_path.glob("o_*")) and not (tmp_path / "whole.las").exists()
 
 
-@pytest.mark.parametrize("references", [(METRES, DEGREES), (DEGREES, METRES)])
+@pytest.mark.parametrize("references", [(METERS, DEGREES), (DEGREES, METERS)])
 def test_degrees_beside_metres(tmp_path, inputs, references):
     for way in ways(tmp_path, inputs(*references)):
         with pytest.raises(StageError, match=r"degrees") as caught:
@@ -76,7 +76,7 @@ def test_degrees_beside_metres(tmp_path, inputs, references):
         assert f"in{references.index(DEGREES)}.las" in str(caught.value)
 
 
-@pytest.mark.parametrize("references", [(METRES, OTHER), (OTHER, METRES)])
+@pytest.mark.parametrize("references", [(METERS, OTHER), (OTHER, METERS)])
 def test_references_of_two_kinds(tmp_path, inputs, references):
     for way in ways(tmp_path, inputs(*references)):
         with pytest.raises(StageError, match="the inputs have different reference systems") as caught:
@@ -85,7 +85,7 @@ def test_references_of_two_kinds(tmp_path, inputs, references):
 
 
 @pytest.mark.parametrize(
-    "references", [(METRES, METRES), (METRES, ALIKE), (METRES, None), (None, None), (FEET, FEET)]
+    "references", [(METERS, METERS), (METERS, ALIKE), (METERS, None), (None, None), (FEET, FEET)]
 )
 def test_units_of_one_kind(tmp_path, inputs, references):
     for way in ways(tmp_path, inputs(*references)):
@@ -94,6 +94,6 @@ def test_units_of_one_kind(tmp_path, inputs, references):
 
 
 def test_references_in_files(tmp_path, inputs):
-    inputs(METRES, FEET, METRES, None)
+    inputs(METERS, FEET, METERS, None)
     found = [projection(tmp_path / f"in{number}.las") for number in range(4)]
     assert found[0] == found[2] and len(set(found)) == 3 and found[3] == ""

@@ -212,7 +212,7 @@ def test_date_can_be_reproducible(monkeypatch, accuracy):
     assert "1970-01-02" in accuracy_page(accuracy)
 
 
-# ---- colours ---------------------------------------------------------------------------------------------
+# ---- colors ---------------------------------------------------------------------------------------------
 
 
 def luminance(color):
@@ -226,7 +226,7 @@ def contrast(a, b):
 
 
 def palettes():
-    """The colours that the style sheet gives light, dark and printed pages, in that order."""
+    """The colors that the style sheet gives light, dark and printed pages, in that order."""
     sheet = files("pdal_stages.reports").joinpath("templates/style.css").read_text()
     blocks = re.findall(r":root \{(.*?)\}", sheet, re.S)
     return [

@@ -40,12 +40,12 @@ def as_record(members):
 
 
 def pulls(members, repeats=400, seed=0):
-    """Metrics of many neighborhoods' pulls in radians and metres: {"A3": (repeats * 255,), ...}."""
-    record, centre = as_record(members)
+    """Metrics of many neighborhoods' pulls in radians and meters: {"A3": (repeats * 255,), ...}."""
+    record, center = as_record(members)
     out, work = np.zeros((5, PULLS), f32), make_work()
     rows = []
     for s in seeds_of(repeats, seed):
-        shape_values(record, len(members), *centre, s, work, out)
+        shape_values(record, len(members), *center, s, work, out)
         rows.append(out.astype(float))
     a3, d1, d2, d3, d4 = np.concatenate(rows, axis=1)
     angle = np.arccos(np.clip(-np.sign(a3) * np.sqrt(abs(a3)), -1, 1))
@@ -212,11 +212,11 @@ def test_seeds():
 
 
 def counts_and_values(members, bins, seed=0):
-    record, centre = as_record(members)
+    record, center = as_record(members)
     work, counts, values = make_work(), np.zeros(50, f32), np.zeros((5, PULLS), f32)
     s = seeds_of(1, seed)[0]
-    shape_counts(record, len(members), *centre, s, bins.comparable(["c1"])[0], work, counts)
-    shape_values(record, len(members), *centre, s, work, values)
+    shape_counts(record, len(members), *center, s, bins.comparable(["c1"])[0], work, counts)
+    shape_values(record, len(members), *center, s, work, values)
     draw(s, len(members), work.draws)
     return counts.reshape(5, 10), values, work.draws.reshape(4, ROOM)[:, :PULLS].copy()
 
@@ -238,8 +238,8 @@ def test_counts_are_the_oracle_s(shape):
     counts, _, at = counts_and_values(members, bins)
     assert counts.sum(axis=1) == pytest.approx(1, abs=1e-6)
     assert np.array_equal(np.round(counts * PULLS).sum(axis=1), [PULLS] * 5)
-    centre = members.mean(axis=0)
-    metrics = [oracle.shape_metrics(*members[pull], centre) for pull in at.T]
+    center = members.mean(axis=0)
+    metrics = [oracle.shape_metrics(*members[pull], center) for pull in at.T]
     for m, name in enumerate(METRICS):
         expected = np.array([metric[name] for metric in metrics])
         # Values within rounding of a threshold may fall to either side.

@@ -56,7 +56,7 @@ def test_equals_the_slow_reference(seed, offset):
 
 
 def test_a_plane_of_minima_is_reproduced_between_cell_centres():
-    # One point at each cell centre, on a plane: bilinear interpolation is exact on it.
+    # One point at each cell center, on a plane: bilinear interpolation is exact on it.
     cx, cy = np.meshgrid(np.arange(10.0, 200, 20), np.arange(10.0, 200, 20))
     plane = 5 + 0.2 * cx - 0.1 * cy
     x, y = np.append(cx.ravel(), 87.25), np.append(cy.ravel(), 101.75)
@@ -121,7 +121,7 @@ def test_sizes_and_shapes_are_checked():
 @given(st.integers(0, 2**32 - 1), st.integers(1, 200), st.integers(-50, 50))
 def test_order_and_whole_cell_shifts_change_nothing(seed, n, cells):
     rng = np.random.default_rng(seed)
-    # Quarter metres are exact in binary, so a shift by whole cells is exact too.
+    # Quarter meters are exact in binary, so a shift by whole cells is exact too.
     x, y, z = rng.integers(0, 800, (3, n)) / 4.0
     height = hag_minima(x, y, z)
     order = rng.permutation(n)

@@ -56,8 +56,8 @@ def octagon(radius):
 
 def slow_opening(raster, radius):
     eroded = ndimage.grey_erosion(raster, footprint=octagon(radius), mode="constant", cval=np.inf)
-    centres = np.where(np.isinf(raster), -np.inf, eroded).astype(np.float32)
-    return ndimage.grey_dilation(centres, footprint=octagon(radius), mode="constant", cval=-np.inf)
+    centers = np.where(np.isinf(raster), -np.inf, eroded).astype(np.float32)
+    return ndimage.grey_dilation(centers, footprint=octagon(radius), mode="constant", cval=-np.inf)
 
 
 def raster_with_holes(seed, shape, holes=0.3):
@@ -145,7 +145,7 @@ def test_a_plane_is_carried_across_a_hole():
 def slow_planes(cells, left, bottom, level, floor, at):
     """Plane (height, gradient) of one block of the pyramid, by least squares over its cells, and recursion."""
     size = 2**level
-    centre = (np.array(at) + 0.5) * size
+    center = (np.array(at) + 0.5) * size
 
     def weight(cell):
         far = np.abs(cell // size - np.array(at))
@@ -158,7 +158,7 @@ def slow_planes(cells, left, bottom, level, floor, at):
             return None
         prior = np.array([np.average([f for _, f in known], weights=[k for k, _ in known]), 0, 0])
     else:
-        uv = centre / (2 * size) - 0.5
+        uv = center / (2 * size) - 0.5
         base = np.floor(uv).astype(int)
         total, prior = 0.0, np.zeros(3)
         for a in (0, 1):
@@ -167,7 +167,7 @@ def slow_planes(cells, left, bottom, level, floor, at):
                 plane = slow_planes(cells, left, bottom, level + 1, floor, tuple(parent))
                 share = (1 - abs(uv[0] - parent[0])) * (1 - abs(uv[1] - parent[1]))
                 if plane is not None and share > 0:
-                    d = centre - (parent + 0.5) * 2 * size
+                    d = center - (parent + 0.5) * 2 * size
                     prior += share * np.array([plane[0] + plane[1] * d[0] + plane[2] * d[1], *plane[1:]])
                     total += share
         if total == 0:
@@ -178,7 +178,7 @@ def slow_planes(cells, left, bottom, level, floor, at):
     rows, right = [], []
     n = sum(weight(c) for c, _, _ in ground)
     for c, p, z in ground:
-        d = c + 0.5 + p - centre
+        d = c + 0.5 + p - center
         k = np.sqrt(weight(c))
         rows.append(k * np.array([1, *d]))
         right.append(k * (z - prior[0] - prior[1:] @ d))
@@ -344,7 +344,7 @@ def test_a_hall_of_150_metres_and_a_ridge():
 @given(st.integers(0, 2**32 - 1), st.integers(1, 400), st.integers(-40, 40))
 def test_order_and_shifts_by_whole_cells_change_nothing(seed, n, cells):
     rng = np.random.default_rng(seed)
-    # Quarter metres are exact in binary, so a shift by whole blocks of the pyramid is exact too.
+    # Quarter meters are exact in binary, so a shift by whole blocks of the pyramid is exact too.
     x, y, z = rng.integers(0, 160, (3, n)) / 4.0
     found = filtered_ground(x, y, z, **SMALL)
     order = rng.permutation(n)

@@ -469,7 +469,7 @@ def test_moving_points_before_our_stages_is_refused(tmp_path, town_file):
         ({"workers": 10_000}, "more workers than cores"),
         ({"workers": 1, "scheduler": "tcp://x:1"}, "one of them"),
         ({"per": "day"}, "one of"),
-        ({"buffer": -1.0}, "0 metres or more"),
+        ({"buffer": -1.0}, "0 meters or more"),
         ({"retries": -1}, "0 or more"),
     ],
 )

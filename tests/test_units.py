@@ -12,10 +12,10 @@ from pdal_stages.base.units import Units, parse_wkt, units_of_wkt, utm_code
 GEOGCS = (
     'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.25]],UNIT["degree",0.0174532925199433]]'
 )
-METRES = (
+METERS = (
     f'PROJCS["UTM 32N",{GEOGCS},PROJECTION["Transverse_Mercator"],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
 )
-FEET = METRES.replace('UNIT["metre",1', 'UNIT["US survey foot",0.304800609601219')
+FEET = METERS.replace('UNIT["metre",1', 'UNIT["US survey foot",0.304800609601219')
 VERTICAL = 'VERT_CS["NAVD88",VERT_DATUM["x",2005],UNIT["{}",{}]]'
 WKT2 = (
     'PROJCRS["x",BASEGEOGCRS["WGS 84",DATUM["d",ELLIPSOID["e",6378137,298.2,LENGTHUNIT["metre",1]]]],'
@@ -25,14 +25,14 @@ WKT2 = (
 
 
 def test_metres_and_feet():
-    assert units_of_wkt(METRES) == Units()
+    assert units_of_wkt(METERS) == Units()
     feet = units_of_wkt(FEET)
     assert feet.horizontal == pytest.approx(1200 / 3937)
     assert feet.vertical == feet.horizontal  # no vertical part: as x and y
 
 
 def test_compound_systems_have_two_units():
-    mixed = units_of_wkt(f'COMPD_CS["both",{METRES},{VERTICAL.format("foot", 0.3048)}]')
+    mixed = units_of_wkt(f'COMPD_CS["both",{METERS},{VERTICAL.format("foot", 0.3048)}]')
     assert (mixed.horizontal, mixed.vertical) == (1.0, 0.3048)
 
 
@@ -42,11 +42,11 @@ def test_wkt2_units_may_sit_on_axes():
 
 def test_no_reference_means_metres_and_says_so():
     assert units_of_wkt("").assumed
-    assert not units_of_wkt(METRES).assumed
+    assert not units_of_wkt(METERS).assumed
 
 
 def test_options_overrule():
-    units = units_of_wkt(METRES, vertical="ft")
+    units = units_of_wkt(METERS, vertical="ft")
     assert (units.horizontal, units.vertical) == (1.0, 0.3048)
     with pytest.raises(OptionError, match="Did you mean 'metre'"):
         units_of_wkt("", horizontal="mtre")

@@ -14,7 +14,7 @@ from pdal_stages.terrain.minima import hag_minima
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """A labelled cloud: (n, 3) coordinates in metres, (n,) class codes, and the points' own dimensions."""
+    """A labelled cloud: (n, 3) coordinates in meters, (n,) class codes, and the points' own dimensions."""
 
     name: str
     xyz: np.ndarray

@@ -29,14 +29,14 @@ def main() -> None:
     args = options.parse_args()
     model, scores = load_model(args.model), json.loads(args.scores.read_text())
     surveys = [
-        "| survey | what | labelled points | left out | samples per copy | licence |",
+        "| survey | what | labelled points | left out | samples per copy | license |",
         "|---|---|---:|---:|---:|---|",
     ]
     runs = {run["cloud"]: run for run in scores["surveys"]}
     for name, survey in SURVEYS.items():
         run = runs.get(name)  # none of a survey that was not left out
         numbers = f"{run['points']:,} | {run['contradicted']:,}" if run else "- | -"
-        surveys.append(f"| {name} | {survey.what} | {numbers} | {survey.samples:,} | (c) {survey.licence} |")
+        surveys.append(f"| {name} | {survey.what} | {numbers} | {survey.samples:,} | (c) {survey.license} |")
     worst = min(scores["surveys"], key=lambda run: run["oa"])
     own = [run["oa"] for run in scores["surveys"] if run["cloud"] in SURVEYS]
     print(

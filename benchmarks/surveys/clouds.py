@@ -33,21 +33,21 @@ class Survey:
     dropped : tuple of int
         Codes that do not even serve as neighbors: noise, points added by computer.
     tall : mapping
-        Codes of everything else: vegetation from a height in metres on.
+        Codes of everything else: vegetation from a height in meters on.
     tall_scored : bool
         Whether that is true enough to score by, or to train on only.
     returns : bool
         Whether it records return numbers.
     samples : int
         Of each class from each copy, at most: fewer from what is alike all over, or has one building.
-    what, licence : str
+    what, license : str
         For the card.
     """
 
     files: tuple[str, ...]
     labels: Mapping[int, int]
     what: str
-    licence: str
+    license: str
     dropped: tuple[int, ...] = (7, 18)
     tall: Mapping[int, float] = field(default_factory=dict)
     tall_scored: bool = False
@@ -156,7 +156,7 @@ class Cloud:
     ----------
     survey, name : str
     xyz : (n, 3) float64
-        Metres.
+        Meters.
     labels : (n,) uint8
         2, 5, 6, or 0: what is trained on.
     truth : (n,) uint8
@@ -197,7 +197,7 @@ class Cloud:
 
     @property
     def density(self) -> float:
-        """Points per square metre of the 4 m cells that hold more than one, the median."""
+        """Points per square meter of the 4 m cells that hold more than one, the median."""
         _, number = np.unique(np.floor(self.xyz[:, :2] / 4.0), axis=0, return_counts=True)
         return float(np.median(number[number > 1]) / 16.0)
 
@@ -234,7 +234,7 @@ def with_heights(cloud: Cloud) -> Cloud:
 
 
 def thinned(cloud: Cloud, density: float) -> Cloud | None:
-    """A copy of so many points per square metre, chosen by their coordinates; None if it is hardly denser itself."""
+    """A copy of so many points per square meter, chosen by their coordinates; None if it is hardly denser itself."""
     share = density / cloud.density
     if share > 0.87:
         return None

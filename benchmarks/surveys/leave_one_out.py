@@ -2,7 +2,7 @@
 
     python benchmarks/surveys/leave_one_out.py --data DIR --json FILE
 
-Every survey at its own density and thinned to 2 and 0.5 points per square metre. OA and F1 over ground, vegetation and
+Every survey at its own density and thinned to 2 and 0.5 points per square meter. OA and F1 over ground, vegetation and
 building; low vegetation and what is none of the three is not scored. With --ground the ISPRS filter samples are scored
 on ground alone, by a model of all surveys.
 """

@@ -15,9 +15,9 @@ from pdal_stages.classifier.clouds import contradicted
 from pdal_stages.features.voxels import represent
 from pdal_stages.stages.heights import PREPARATION
 
-#: Points per square metre of thinned copies.
+#: Points per square meter of thinned copies.
 DENSITIES = (8.0, 2.0, 0.6)
-#: (slope, points per square metre, whether in terraces) of copies on synthetic terrain.
+#: (slope, points per square meter, whether in terraces) of copies on synthetic terrain.
 SLOPES = ((0.3, 8.0, False), (0.6, 3.0, False), (0.9, 1.0, False), (0.5, 0.3, False), (0.5, 1.0, True))
 #: Points of a copy at most: a strip of it, each copy's somewhere else.
 MOST = 50_000

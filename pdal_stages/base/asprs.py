@@ -1,4 +1,4 @@
-"""ASPRS class codes: names, colours, and what each LAS point format can hold.
+"""ASPRS class codes: names, colors, and what each LAS point format can hold.
 
 Source: ASPRS LAS specification 1.4-R15, tables 9 and 17.
 """
@@ -53,7 +53,7 @@ def class_name(code: int) -> str:
 
 
 def class_color(code: int) -> tuple[int, int, int]:
-    """An sRGB colour (0-255) for maps; other codes get a stable one of their own."""
+    """An sRGB color (0-255) for maps; other codes get a stable one of their own."""
     code = int(code)
     if code in _CLASSES:
         return _CLASSES[code][1]

@@ -9,7 +9,7 @@ commands that need none, and errors, come at once. Three repairs of numba's cach
 * where neither the package's folder nor the user's cache folder is writable numba refuses to compile
   at all; here a private folder under the system's temporary folder is tried, then no cache.
 * divisions follow NumPy (``error_model="numpy"``): a Python-style check for zero in a loop keeps it
-  from being vectorised.
+  from being vectorized.
 
 Compiled code is cached at first use rather than shipped, because it is made for the processor it
 runs on (AVX-512 or not): that is where the speed comes from. ``pdal_stages.features.warmup()`` fills the

@@ -1,4 +1,4 @@
-"""Length units of a spatial reference: how many metres one unit of x, y and z is."""
+"""Length units of a spatial reference: how many meters one unit of x, y and z is."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from .errors import OptionError, StageError, suggest
 
-#: Names users write, in metres.
+#: Names users write, in meters.
 NAMED = {
     "metre": 1.0,
     "meter": 1.0,
@@ -21,7 +21,7 @@ NAMED = {
 }
 
 
-#: Metres of the smallest and the largest unit that is believed.
+#: Meters of the smallest and the largest unit that is believed.
 _SMALLEST, _LARGEST = 1e-6, 1e6
 
 
@@ -29,7 +29,7 @@ _SMALLEST, _LARGEST = 1e-6, 1e6
 class Units:
     """Metres per unit of x and y (`horizontal`) and of z (`vertical`).
 
-    `assumed` says that the cloud names no spatial reference and metres were assumed.
+    `assumed` says that the cloud names no spatial reference and meters were assumed.
     """
 
     horizontal: float = 1.0
@@ -57,7 +57,7 @@ def units_of_wkt(
     Parameters
     ----------
     wkt : str
-        Empty where the cloud has no spatial reference: metres are assumed.
+        Empty where the cloud has no spatial reference: meters are assumed.
     horizontal, vertical : str
         Unit names that overrule the spatial reference. Where it has no vertical part,
         heights are taken to be in the horizontal unit, as LAS files in feet are.
@@ -87,11 +87,11 @@ def units_of_wkt(
             upward = height.unit()
     assumed = across is None and root is None
     across = 1.0 if across is None else across
-    for metres in (across, upward):
-        if metres is not None and not _SMALLEST <= metres <= _LARGEST:
+    for meters in (across, upward):
+        if meters is not None and not _SMALLEST <= meters <= _LARGEST:
             raise StageError(
                 "the spatial reference has a unit of length that no survey is in",
-                found=f"{metres:g} m",
+                found=f"{meters:g} m",
                 cure="Set horizontal_unit and vertical_unit",
             )
     return Units(across, across if upward is None else upward, assumed)

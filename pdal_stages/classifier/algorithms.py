@@ -35,7 +35,7 @@ class InputPlan:
 
     names: tuple[str, ...]  #: its inputs, in order
     dimensions: tuple[str, ...]  #: which of them are dimensions of the points
-    halo: float  #: metres around a tile whose points the tile's results depend on
+    halo: float  #: meters around a tile whose points the tile's results depend on
     #: the most a point is asked for, where their number decides how far away they are
     most_neighbors: int = 0
 
@@ -53,7 +53,7 @@ class Column(NamedTuple):
 class PredictRequest:
     """A cloud, and the points of it that are to be classified."""
 
-    xyz: npt.NDArray[np.float64]  #: (n, 3) metres
+    xyz: npt.NDArray[np.float64]  #: (n, 3) meters
     dimensions: Mapping[str, npt.ArrayLike]  #: name to (n,) values
     #: (m,) points wanted, ascending; None for all; the others are neighbors
     rows: npt.NDArray[np.int64] | None = None

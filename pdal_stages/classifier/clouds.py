@@ -27,7 +27,7 @@ class TrainingCloud:
     Attributes
     ----------
     xyz : (n, 3) float64
-        Coordinates in metres.
+        Coordinates in meters.
     labels : (n,) int
     dimensions : mapping
         Name to (n,) values, as the options' `dimensions` need.
@@ -151,7 +151,7 @@ class Labelled:
 
     clouds: Sequence[TrainingCloud]
     classes: ClassMap
-    contradicted_below: float = 0.0  #: metres; see ``TrainingOptions``
+    contradicted_below: float = 0.0  #: meters; see ``TrainingOptions``
     left_out: Mapping[str, int] = field(default_factory=dict)  #: points of each label that are so left out
 
     def __len__(self) -> int:
@@ -199,7 +199,7 @@ STANDING = (4, 5, 6)
 
 
 def contradicted(cloud: TrainingCloud, below: float) -> npt.NDArray[np.bool_] | None:
-    """(n,) points whose label their height contradicts: of :data:`STANDING`, but Ground and lower than `below` metres.
+    """(n,) points whose label their height contradicts: of :data:`STANDING`, but Ground and lower than `below` meters.
 
     None where nothing can be said.
     """

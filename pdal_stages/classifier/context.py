@@ -32,7 +32,7 @@ class Kind:
     text: str
 
 
-#: Word of a token, which the side of a cell in metres follows.
+#: Word of a token, which the side of a cell in meters follows.
 CELLS = {
     "box": Kind(3, False, "mean probabilities of the points in 3 x 3 x 3 cells around the point's"),
     "column": Kind(2, False, "mean probabilities of the points in 3 x 3 columns, of any height, around the point's"),
@@ -78,7 +78,7 @@ class Context:
                 raise OptionError(
                     "a token of 'context' is not known",
                     found=repr(token)[:60],
-                    cure=f"Write {OWN}, or {', '.join(CELLS)} and a side in metres that is a power of two "
+                    cure=f"Write {OWN}, or {', '.join(CELLS)} and a side in meters that is a power of two "
                     f"from {SIDES[0]:g} to {SIDES[-1]:g}: box1, column8",
                 )
             if match:
@@ -92,7 +92,7 @@ class Context:
 
     @property
     def strip(self) -> float:
-        """Width in metres of strips such that a point's cells all lie in its own and the two beside it."""
+        """Width in meters of strips such that a point's cells all lie in its own and the two beside it."""
         return max((scale.side for scale in self.scales), default=SIDES[-1])
 
     def names(self, codes: Sequence[int]) -> tuple[str, ...]:
@@ -111,7 +111,7 @@ class Context:
         Parameters
         ----------
         xyz : (n, 3) float64
-            Metres. Cells that points at hand lie in must be complete, and so must those around them.
+            Meters. Cells that points at hand lie in must be complete, and so must those around them.
         shares : (n, classes) uint16
             Of each point; see ``smoothing.count_shares``.
         """

@@ -36,12 +36,12 @@ def block_folds(
     Parameters
     ----------
     xy : (n, 2) float64
-        In metres. Blocks are anchored to absolute coordinates: clouds that overlap share them.
+        In meters. Blocks are anchored to absolute coordinates: clouds that overlap share them.
     label, weight : (n,) int
         Class position of each sample and how often it counts.
     folds : int
     block_size : float
-        Metres.
+        Meters.
 
     Returns
     -------

@@ -30,7 +30,7 @@ class PredictionOptions:
     rejected_code : int, optional
         Class of rejected points, instead of their old one.
     smooth : float
-        Metres, 0 for none: probabilities become half the point's own, half the mean over the classified
+        Meters, 0 for none: probabilities become half the point's own, half the mean over the classified
         points in a sphere of that radius around it. Classes, reliability and margin follow from these.
     """
 

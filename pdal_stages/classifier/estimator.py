@@ -20,7 +20,7 @@ from .trainoptions import TrainingOptions
 class PointClassifier(ClassifierMixin, BaseEstimator):
     """A forest on the multi-scale features of points: ``PointClassifier().fit(xyz, y).predict(xyz)``.
 
-    ``X`` is a whole cloud, coordinates in metres: a point's features follow from the points around it, so rows cannot be
+    ``X`` is a whole cloud, coordinates in meters: a point's features follow from the points around it, so rows cannot be
     dealt out as scikit-learn's own cross-validation does. Labels 0, 1, 7, 12 and 18 are left out unless `classes`
     names them, as in all training here.
 

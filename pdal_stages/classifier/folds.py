@@ -23,7 +23,7 @@ from .passes import PassRun
 
 #: Fewer surveys than this are cut into strips instead: too little would be left to train on.
 SURVEYS = 3
-#: Width of a strip in metres, halved until there are enough of them.
+#: Width of a strip in meters, halved until there are enough of them.
 WIDTH, NARROWEST = 10.0, 0.01
 
 
@@ -33,7 +33,7 @@ class Folds:
 
     count: int
     surveys: dict[str, int] | None = None  #: fold of each survey, where whole surveys are folds
-    #: metres of a strip along the diagonal otherwise; every `count`-th strip is of the same fold
+    #: meters of a strip along the diagonal otherwise; every `count`-th strip is of the same fold
     width: float = WIDTH
 
     @classmethod
@@ -47,7 +47,7 @@ class Folds:
 
         Parameters
         ----------
-        clouds : re-iterable of ((n, 3) float64 coordinates in metres, (n,) class positions)
+        clouds : re-iterable of ((n, 3) float64 coordinates in meters, (n,) class positions)
             A position of -1 is not trained on.
         surveys : sequence of str
             The survey of each cloud.

@@ -98,7 +98,7 @@ class Model:
 
     @property
     def voxel(self) -> float:
-        """Side in metres of voxels that one point represents; 0: each point stands for itself."""
+        """Side in meters of voxels that one point represents; 0: each point stands for itself."""
         return float(self.info.get("voxel") or 0.0)
 
     @property
@@ -174,7 +174,7 @@ class Model:
         Parameters
         ----------
         xyz : (n, 3) float64
-            Coordinates in metres.
+            Coordinates in meters.
         dimensions : mapping, optional
             Name to (n,) values, e.g. return numbers. Without any of the heights in ``required_dimensions``, these are
             made as in training, where the model says how.

@@ -19,12 +19,12 @@ import numpy.typing as npt
 from ..base.errors import OptionError
 from ..base.hashing import coordinate_hash
 
-#: Side of a cell of the curve in metres.
+#: Side of a cell of the curve in meters.
 CELL = 0.5
 #: Points of a class that are put in order at a time; of more, those with the smallest hashes.
 MOST = 5_000_000
 
-#: ((n, 3) float64 coordinates in metres, (n,) class positions) of each cloud; may be made when asked for.
+#: ((n, 3) float64 coordinates in meters, (n,) class positions) of each cloud; may be made when asked for.
 Clouds = Any
 
 
@@ -73,7 +73,7 @@ def draw_samples(
 
     Parameters
     ----------
-    clouds : sequence of ((n, 3) float64 coordinates in metres, (n,) class positions)
+    clouds : sequence of ((n, 3) float64 coordinates in meters, (n,) class positions)
         A position of -1 leaves the point out.
     n_classes : int
     count : int
@@ -180,7 +180,7 @@ def spread(
 def curve_keys(xyz: npt.NDArray[np.float64], seed: int) -> npt.NDArray[Any]:
     """Morton code of each point's cell in plan, and a hash of its coordinates and the seed."""
     # Anchored to absolute coordinates, so a larger extent changes nothing; 31 bits an axis hold
-    # half a million kilometres either way.
+    # half a million kilometers either way.
     cells = np.clip(np.floor(xyz[:, :2] / CELL) + 2**30, 0, 2**31 - 1).astype(np.uint64)
     keys = np.empty(len(xyz), dtype=[("cell", np.uint64), ("hash", np.uint64)])
     keys["cell"] = _spread_bits(cells[:, 0]) | (_spread_bits(cells[:, 1]) << np.uint64(1))

@@ -19,7 +19,7 @@ from ..base.threads import map_blocks
 from ..features.cells import WHOLE
 from ..features.index import build_grid, check_xyz
 
-#: Farthest that can be asked for, metres: beyond it nothing is a neighbor any more.
+#: Farthest that can be asked for, meters: beyond it nothing is a neighbor any more.
 FARTHEST = 10.0
 
 #: Points of a piece of work.
@@ -39,11 +39,11 @@ def smooth(
     Parameters
     ----------
     xyz : (n, 3) float64
-        The classified points, metres.
+        The classified points, meters.
     shares : (n, classes) uint16
         See :func:`count_shares`.
     radius : float
-        Metres, above 0.
+        Meters, above 0.
     threads : int, optional
 
     Returns

@@ -39,7 +39,7 @@ class Sweep:
     Parameters
     ----------
     xyz : (n, 3) float64
-        Metres.
+        Meters.
     coming : (k,) int64 or None
         Points the pass before hands over, each once; None for all. Those that :func:`context.around` names.
     wanted : (m,) int64 or None

@@ -11,7 +11,7 @@ from ..base.hashing import coordinate_hash
 from ..base.runs import begins_run
 from ..features.cells import cell_keys
 
-#: Side in metres of the cells that density is measured in.
+#: Side in meters of the cells that density is measured in.
 CELL = 2.0
 #: How many times sparser or denser a cloud may be than those trained on before that is said.
 TOLERANCE = 2.0
@@ -20,7 +20,7 @@ WORTH = 0.75
 
 
 def density(xyz: npt.NDArray[np.float64]) -> float:
-    """Points per square metre: the median over the occupied cells of :data:`CELL` metres, 0 for an empty cloud.
+    """Points per square meter: the median over the occupied cells of :data:`CELL` meters, 0 for an empty cloud.
 
     Strays, holes and the cloud's outline do not matter, and the order of the points does not.
     """
@@ -44,7 +44,7 @@ def density_range(clouds: Iterable[npt.NDArray[np.float64]]) -> dict[str, float]
 
 
 def thinned(xyz: npt.NDArray[np.float64], wanted: float, seed: int = 0) -> npt.NDArray[np.int64] | None:
-    """Rows of a copy with `wanted` points per square metre, or None where the cloud is hardly denser.
+    """Rows of a copy with `wanted` points per square meter, or None where the cloud is hardly denser.
 
     A point stays or goes by a hash of its coordinates: the same ones in any order and in any tile.
     """

@@ -33,7 +33,7 @@ def train(
     Parameters
     ----------
     clouds : (n, 3) array, TrainingCloud, iterable of TrainingCloud, or of functions that make one
-        Coordinates in metres of points that have `labels`; or one cloud per file or view. Features see only their own
+        Coordinates in meters of points that have `labels`; or one cloud per file or view. Features see only their own
         cloud. Where functions are given, or anything but a list or tuple, one cloud at a time is in memory; all are
         kept in a temporary folder while training lasts.
     labels : (n,) int, optional

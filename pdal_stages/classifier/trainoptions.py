@@ -139,7 +139,7 @@ class TrainingOptions:
     thin: Sequence[float] = setting(
         (),
         "list",
-        "Points per square metre of sparser copies to train on as well, so that the model bears sparse clouds",
+        "Points per square meter of sparser copies to train on as well, so that the model bears sparse clouds",
         "Features are computed on the copies; dimensions keep the values they have in the whole cloud.",
     )
     voxel: float = setting(

@@ -20,7 +20,7 @@ _CURE = "Fit the thresholds again, or take them from the model file as it was wr
 
 
 class ShapeBins:
-    """Bins of A3 (radians) and D1, D2, D3, D4 (metres) for each neighborhood.
+    """Bins of A3 (radians) and D1, D2, D3, D4 (meters) for each neighborhood.
 
     Bin i holds the values with ``threshold[i - 1] < value <= threshold[i]``; the first and the last bin are
     open.
@@ -28,7 +28,7 @@ class ShapeBins:
     Parameters
     ----------
     thresholds : mapping of str to (5, 9) array
-        Neighborhood token -> ascending inner thresholds of A3, D1, D2, D3, D4, in radians and metres.
+        Neighborhood token -> ascending inner thresholds of A3, D1, D2, D3, D4, in radians and meters.
 
     Raises
     ------
@@ -67,7 +67,7 @@ class ShapeBins:
         return tuple(self._thresholds)
 
     def thresholds(self, token: str) -> np.ndarray:
-        """Thresholds of one neighborhood: (5, 9) float64, in radians and metres."""
+        """Thresholds of one neighborhood: (5, 9) float64, in radians and meters."""
         try:
             return self._thresholds[token].copy()
         except KeyError:
@@ -139,7 +139,7 @@ def _checked(token: str, rows: Any) -> np.ndarray:
 
 
 def _to_units(rows: np.ndarray) -> np.ndarray:
-    """Comparable values (see ``shapes``) as radians and metres."""
+    """Comparable values (see ``shapes``) as radians and meters."""
     a3, d1, d2, d3, d4 = rows
     cosine = -np.sign(a3) * np.sqrt(np.abs(a3))
     return np.array(
@@ -148,7 +148,7 @@ def _to_units(rows: np.ndarray) -> np.ndarray:
 
 
 def _to_comparable(rows: np.ndarray) -> np.ndarray:
-    """Radians and metres as the kernels compare them."""
+    """Radians and meters as the kernels compare them."""
     a3, d1, d2, d3, d4 = rows
     cosine = np.cos(a3)
     return np.array([-cosine * np.abs(cosine), d1**2, d2**2, 4 * d3**4, 6 * d4**3])

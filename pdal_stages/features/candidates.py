@@ -18,13 +18,13 @@ from .index import SPARE
 FAR = 1e150
 LANES = SPARE
 
-#: With no more rows of cells than this between centre and rim, sharing the inner cells costs more than it saves.
+#: With no more rows of cells than this between center and rim, sharing the inner cells costs more than it saves.
 INNER_FROM = 2
 
 
 @intrinsic
 def order_bits(types, value):
-    """The bits of a float64 as an int64 that orders like the float (integer minima vectorise, float ones do not)."""
+    """The bits of a float64 as an int64 that orders like the float (integer minima vectorize, float ones do not)."""
 
     def codegen(context, builder, signature, args):
         i64 = ir.IntType(64)

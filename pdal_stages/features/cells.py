@@ -23,7 +23,7 @@ def cell_means(
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
     """(cell of each point, means (cells, columns) over each cell and those around it).
 
-    Two coordinates make columns of any height; they and `side`, one of :data:`SIDES`, are in metres. `shares` (n, columns)
+    Two coordinates make columns of any height; they and `side`, one of :data:`SIDES`, are in meters. `shares` (n, columns)
     are in 65535ths; with `votes` the largest column of each point counts alone, as a whole.
     """
     keys, offsets = cell_keys(coordinates, side)

@@ -1,7 +1,7 @@
-"""Eigenvalues of 3x3 covariance matrices and the features made of them, for scalar and vectorised use.
+"""Eigenvalues of 3x3 covariance matrices and the features made of them, for scalar and vectorized use.
 
 Every function here is branch-free apart from selections, and is inlined where it is called, so a loop over
-arrays of moments is vectorised by LLVM; no fast-math flag is set, so a value does not depend on its place in
+arrays of moments is vectorized by LLVM; no fast-math flag is set, so a value does not depend on its place in
 the array or on the loop it is called from.
 
 The method is Jacobi's: unlike the closed form with arc cosines it keeps full accuracy where two eigenvalues
@@ -27,7 +27,7 @@ LINE = 1e-12
 
 @intrinsic
 def _bits(types, value):
-    """The 64 bits of a float64 as int64 (a register move; a view through memory would not vectorise)."""
+    """The 64 bits of a float64 as int64 (a register move; a view through memory would not vectorize)."""
 
     def codegen(context, builder, signature, args):
         return builder.bitcast(args[0], ir.IntType(64))

@@ -31,7 +31,7 @@ class FeatureEngine:
     Parameters
     ----------
     xyz : (n, 3) array
-        The cloud, float64, in metres.
+        The cloud, float64, in meters.
     plan : FeaturePlan
     bins : ShapeBins, optional
         Thresholds of the shape distributions; fitted to this cloud where absent and needed.
@@ -60,7 +60,7 @@ class FeatureEngine:
     Notes
     -----
     A result is the same to the last bit for any order of the points, any queries asked beside it, any number of
-    threads, any block size, and in a tile whose surroundings are covered by ``plan.halo`` metres.
+    threads, any block size, and in a tile whose surroundings are covered by ``plan.halo`` meters.
 
     Memory over the cloud's own: 28 bytes a point for the index (about 52 while it is being sorted), about 10 more with
     neighborhoods of k points, and the block budget of :meth:`blocks`.
@@ -324,7 +324,7 @@ def compute_features(
     Parameters
     ----------
     xyz : (n, 3) array
-        The cloud, float64, in metres.
+        The cloud, float64, in meters.
     queries : array, optional
         Whose features: ``None`` for every point, an array of indices into the cloud, or (m, 3) coordinates.
     neighborhoods : str or list of str

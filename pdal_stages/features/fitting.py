@@ -20,7 +20,7 @@ def fit_clouds(
 
     Curvatures of all points of all clouds are parted together [H17 eq. 3], and the 500 sample neighborhoods
     [B16 3.2.2] are those round the points with the smallest hashes of all. A neighborhood lies within its own cloud. Of
-    one cloud the result is :meth:`FeatureEngine.fit`'s; the order of the clouds (n, 3), in metres, does not matter. None
+    one cloud the result is :meth:`FeatureEngine.fit`'s; the order of the clouds (n, 3), in meters, does not matter. None
     where the plan has no shapes, or no copt.
     """
     if not (plan.shapes or plan.copt):

@@ -4,7 +4,7 @@ Cells are anchored to absolute coordinates (``floor(x / cell)``) and their size 
 alone, never from the cloud, so every tile of a cloud sees the same cells with the same points in the same
 order. That order is what makes sums the same to the last bit however the points were stored.
 
-Only occupied cells are kept, so one stray point a million kilometres away costs one cell.
+Only occupied cells are kept, so one stray point a million kilometers away costs one cell.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ..base.errors import StageError
 from ..base.jit import device, njit
 from ..base.runs import begins_run
 
-#: Coordinates beyond this many metres are no point cloud (and would overflow cell numbers).
+#: Coordinates beyond this many meters are no point cloud (and would overflow cell numbers).
 LIMIT = 1e12
 
 #: Values behind the last coordinate that kernels may read.
@@ -28,7 +28,7 @@ SPARE = 8
 class CellGrid:
     """A sorted cloud and its occupied cells."""
 
-    #: Edge of a cell in metres, a power of two (so that cell corners are exact).
+    #: Edge of a cell in meters, a power of two (so that cell corners are exact).
     cell: float
     #: (n,) int32 or int64: ``order[i]`` is the index, in the cloud as it was given, of the i-th sorted point.
     order: np.ndarray
@@ -46,17 +46,17 @@ class CellGrid:
 
     @property
     def x(self) -> np.ndarray:
-        """Sorted x, metres."""
+        """Sorted x, meters."""
         return self.xyz[0, : len(self)]
 
     @property
     def y(self) -> np.ndarray:
-        """Sorted y, metres."""
+        """Sorted y, meters."""
         return self.xyz[1, : len(self)]
 
     @property
     def z(self) -> np.ndarray:
-        """Sorted z, metres."""
+        """Sorted z, meters."""
         return self.xyz[2, : len(self)]
 
     def tables(self) -> tuple[np.ndarray, ...]:

@@ -29,7 +29,7 @@ GROUP = 8
 BINS = 256
 HALF = BINS // 2
 
-#: First guess of the reach, metres; each group starts from what the one before needed.
+#: First guess of the reach, meters; each group starts from what the one before needed.
 FIRST_REACH = 1.0
 
 #: The next group's first reach, in squared distance, as a multiple of what this one needed.
@@ -39,7 +39,7 @@ SPARE = 1.2
 CROWD = 4
 ROOM = 256
 
-#: Squared metres too small to divide by.
+#: Squared meters too small to divide by.
 TINY = 1e-200
 
 #: Factor that outweighs the rounding of a product or quotient.

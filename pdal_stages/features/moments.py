@@ -1,4 +1,4 @@
-"""Moments of cylinders and spheres as flat vectorised loops, and the features made of moments.
+"""Moments of cylinders and spheres as flat vectorized loops, and the features made of moments.
 
 A neighborhood is one masked sum over the candidates its cell shares (``candidates.py``). A squared distance is
 ``(x - qx)**2 + (y - qy)**2`` rounded exactly as NumPy rounds it (nothing contracted): the members are the points
@@ -40,7 +40,7 @@ COINCIDENT = 1e-13
 
 @intrinsic
 def _add(types, a, b):
-    """a + b that may be reordered in a sum and contracted with a product: what lets LLVM vectorise it."""
+    """a + b that may be reordered in a sum and contracted with a product: what lets LLVM vectorize it."""
 
     def codegen(context, builder, signature, args):
         return builder.fadd(args[0], args[1], flags=("reassoc", "contract", "nsz"))
@@ -155,7 +155,7 @@ def finish(moments, count, volumes, heights, few, copies):
     SurfaceVariation is 1/3 [H17]; the heights are what the points there are have; with none
     (queries that are not points of the cloud) they are 0.
     """
-    # Made here and of a constant shape: rows known not to overlap let the loop be vectorised.
+    # Made here and of a constant shape: rows known not to overlap let the loop be vectorized.
     out = np.empty((FEATURES, WIDTH))
     for j in range(count):
         n = moments[N, j]

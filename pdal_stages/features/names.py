@@ -23,14 +23,14 @@ COVARIANCE = {
     "SurfaceVariation": "e3",
 }
 GEOMETRIC = {
-    "Density": "points per square metre of the cylinder's base, or per cubic metre of the sphere",
+    "Density": "points per square meter of the cylinder's base, or per cubic meter of the sphere",
     "Verticality": "1 - |nz|, n the unit eigenvector of l3",
     "HeightRange": "highest minus lowest z, metres",
     "HeightStd": "standard deviation of z (divisor n), metres",
-    "Radius": "the chosen size in metres; kopt, ropt and copt only",
+    "Radius": "the chosen size in meters; kopt, ropt and copt only",
 }
 #: What the papers' sets of features lack, and "all" therefore leaves out.
-RELATIVE = {"HeightAboveLowest": "z of the point minus the lowest z of the neighborhood, metres [HWS16]"}
+RELATIVE = {"HeightAboveLowest": "z of the point minus the lowest z of the neighborhood, meters [HWS16]"}
 SHAPES = {
     "A3": "angle between two pulled points seen from a third",
     "D1": "distance of a pulled point from the centroid",

@@ -22,20 +22,20 @@ PRESETS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 
 KOPT_DEFAULT = (10.0, 100.0)  # k_min, k_max [B16]
-ROPT_DEFAULT = (0.25, 2.0, 0.05)  # r_min, r_max, step in metres [H17]
+ROPT_DEFAULT = (0.25, 2.0, 0.05)  # r_min, r_max, step in meters [H17]
 #: Members below which [H17]'s inadequate neighborhood begins: radii of ``ropt`` and ``copt`` with fewer are not
 #: candidates, and the curvature is 1/3. The paper gives no number; with ten, its c_t of 0.03 and the counts of its
 #: Table 1 come out (docs/papers.md), with three they do not.
 LEAST_MEMBERS = 10
-COPT_REACH = 3.0  # metres: the cap of the scattered branch, the largest radius copt looks at [H17]
+COPT_REACH = 3.0  # meters: the cap of the scattered branch, the largest radius copt looks at [H17]
 MAX_K = 10_000
-#: Density takes smaller radii as this, metres: copies of one point lie at a distance of 0.
+#: Density takes smaller radii as this, meters: copies of one point lie at a distance of 0.
 LEAST_RADIUS = 0.001
-MIN_RADIUS, MAX_RADIUS = 0.001, 100_000.0  # metres
+MIN_RADIUS, MAX_RADIUS = 0.001, 100_000.0  # meters
 #: Neighborhoods of one plan: a model file of a few kB must not ask for hours of work.
 MOST = 64
 
-#: Sides of cells of an absolute grid that can be asked for, metres: powers of two, so that corners are exact.
+#: Sides of cells of an absolute grid that can be asked for, meters: powers of two, so that corners are exact.
 SIDES = tuple(2.0**k for k in range(-3, 7))
 
 _KNOWN = ("c2", "s1", "k50", "kopt", "ropt", "copt", *PRESETS)
@@ -54,7 +54,7 @@ class Neighborhood:
 
     #: ``cylinder``, ``sphere``, ``knn``, ``kopt``, ``ropt`` or ``copt``.
     kind: str
-    #: Cylinder and sphere: (radius in metres,); knn: (k,); kopt: (k_min, k_max); ropt: (r_min, r_max, step) in metres;
+    #: Cylinder and sphere: (radius in meters,); knn: (k,); kopt: (k_min, k_max); ropt: (r_min, r_max, step) in meters;
     #: copt: ().
     parameters: tuple[float, ...] = ()
 
@@ -76,7 +76,7 @@ class Neighborhood:
 
     @property
     def reach(self) -> float | None:
-        """The farthest a member can be, in metres; ``None`` where a number of points decides."""
+        """The farthest a member can be, in meters; ``None`` where a number of points decides."""
         if self.kind in ("cylinder", "sphere"):
             return self.parameters[0]
         if self.kind == "ropt":
@@ -202,7 +202,7 @@ def _adaptive(text: str, head: str, inner: str | None) -> Neighborhood:
             MIN_RADIUS <= values[0] <= values[1] <= MAX_RADIUS and values[2] >= MIN_RADIUS
         ):
             raise OptionError(
-                f"ropt takes metres, ropt(r_min,r_max,step), each at least {MIN_RADIUS}, r_min <= r_max",
+                f"ropt takes meters, ropt(r_min,r_max,step), each at least {MIN_RADIUS}, r_min <= r_max",
                 found=text,
             )
         if (values[1] - values[0]) / values[2] > 1000:

@@ -4,7 +4,7 @@ The neighborhood of k nearest neighbors is the point and its k nearest: n = k + 
 Weinmann et al. 2015, whose structure tensor sums from 0 to k. Members are added in the order of distance
 and the moments kept after each, so all k of a range cost one pass.
 
-Which candidate wins is decided in two steps. A vectorised closed form estimates all entropies to 1e-7; those
+Which candidate wins is decided in two steps. A vectorized closed form estimates all entropies to 1e-7; those
 within ``MARGIN`` of the lowest are computed again by the exact method of the features. Entropies that then
 lie within ``TIE`` of each other count as equal, and the smallest neighborhood wins: in a perfect plane or
 line rounding noise would decide otherwise.
@@ -284,7 +284,7 @@ def kopt_block(tree, qx, qy, qz, k_min, k_max, cap2, table, radius, reach, seeds
     table : ndarray of float64, shape (12, m)
         Out: moments about the query, in the rows of ``moments``.
     radius : ndarray of float64, shape (m,)
-        Out: distance to the farthest member, metres.
+        Out: distance to the farthest member, meters.
     reach : ndarray of float64, shape (m,)
         Out: distance to the k_max-th neighbor, on which the result depends; infinity where there are fewer.
     seeds : ndarray of uint64, shape (m,)

@@ -17,7 +17,7 @@ from .neighborhoods import LEAST_MEMBERS, Neighborhood, parse_neighborhoods, pre
 #: What is computed where nothing is asked for, by the function and the stage alike.
 DEFAULT_NEIGHBORHOODS = ("c1", "c2", "c3", "c5", "kopt")
 DEFAULT_FEATURES = ("covariance", "geometric")
-#: Halo of neighborhoods whose size is a number of points, metres: see :attr:`FeaturePlan.halo`.
+#: Halo of neighborhoods whose size is a number of points, meters: see :attr:`FeaturePlan.halo`.
 POINTS_HALO = 15.0
 
 
@@ -128,7 +128,7 @@ class FeaturePlan:
 
     @cached_property
     def cell(self) -> float:
-        """Edge of the grid's cells in metres, a power of two that follows from the largest radius alone.
+        """Edge of the grid's cells in meters, a power of two that follows from the largest radius alone.
 
         1 m for radii from 0.75 to 20 m, finer below, coarser above.
         """
@@ -146,7 +146,7 @@ class FeaturePlan:
 
         The largest reach and one cell. ``k50`` and ``kopt`` reach as far as their points lie, which no number
         bounds; for them at least 15 m are asked for, enough for 100 neighbors down to 0.15 points a square
-        metre. How many queries had to look farther is counted in ``FeatureEngine.report["beyond_halo"]``.
+        meter. How many queries had to look farther is counted in ``FeatureEngine.report["beyond_halo"]``.
         """
         reach = max((n.reach for n in self.neighborhoods if n.reach is not None), default=0.0)
         reach = max(reach, returns.reach(self.dimensions))

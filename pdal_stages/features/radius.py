@@ -81,13 +81,13 @@ def radius_block(
     grid : tuple
         ``CellGrid.tables()`` of the cloud.
     cell : float
-        Edge of a grid cell, metres.
+        Edge of a grid cell, meters.
     qx, qy, qz : (m,) float64 arrays
         Queries, in the order of their cells (row, then column).
     copies : (m,) int64 array
         How many queries of the user's each stands for (equal coordinates are computed once).
     radii : (r,) float64 array
-        Distinct radii, metres.
+        Distinct radii, meters.
     widths, reaches : arrays
         :func:`width_table` of the radii.
     wanted : (r, 2) int64 array
@@ -129,8 +129,8 @@ def radius_block(
                 r2 = radii[k] * radii[k]
                 c, s = wanted[k, 0], wanted[k, 1]
                 if c >= 0:
-                    centre = (ix + 0.5) * cell, (iy + 0.5) * cell
-                    cylinders(px, py, pz, shared, end, qx, qy, qz, a, b, r2, centre, inner, moments[c], start)
+                    center = (ix + 0.5) * cell, (iy + 0.5) * cell
+                    cylinders(px, py, pz, shared, end, qx, qy, qz, a, b, r2, center, inner, moments[c], start)
                 if s >= 0:
                     spheres(px[:end], py[:end], pz[:end], qx, qy, qz, a, b, r2, moments[s], start)
                 if shapes is not None:
@@ -173,9 +173,9 @@ def _last_column(qx, qy, a, cell, iy, limit):
 
 
 @device
-def cylinders(px, py, pz, shared, end, qx, qy, qz, a, b, r2, centre, inner, out, start):
-    """Moments of one radius' cylinders for the queries a..b of one cell, whose centre is given."""
-    cx, cy = centre
+def cylinders(px, py, pz, shared, end, qx, qy, qz, a, b, r2, center, inner, out, start):
+    """Moments of one radius' cylinders for the queries a..b of one cell, whose center is given."""
+    cx, cy = center
     cz = 0.0
     rx, ry, rz = px[shared:end], py[shared:end], pz[shared:end]
     if shared:

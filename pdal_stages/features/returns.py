@@ -44,7 +44,7 @@ class ReturnFeature:
     flag: str
     #: 3 for boxes, 2 for columns, 0 for the point itself.
     axes: int = 0
-    #: Of a cell, metres.
+    #: Of a cell, meters.
     side: float = 0.0
 
 

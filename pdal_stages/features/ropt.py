@@ -36,16 +36,16 @@ from .optimal import (
     write_shapes,
 )
 
-#: Radius of the sphere whose curvature is looked at, metres [H17].
+#: Radius of the sphere whose curvature is looked at, meters [H17].
 CURVATURE_RADIUS = 1.0
 
 #: Curvature where there are too few neighbors to tell [H17].
 SCATTERED = 1.0 / 3.0
 
-#: Regular points: first and last radius and step, metres [H17].
+#: Regular points: first and last radius and step, meters [H17].
 COPT_RADII = (0.5, 2.0, 0.05)
 
-#: Scattered points: fewest and most neighbors, and how far they may be, metres [H17].
+#: Scattered points: fewest and most neighbors, and how far they may be, meters [H17].
 COPT_K = (10, 50)
 COPT_CAP = 3.0
 
@@ -66,7 +66,7 @@ def radii_of(first: float, last: float, step: float) -> np.ndarray:
 def curvature_threshold(curvatures: np.ndarray) -> float:
     """The curvature from which on a point is scattered [H17 eq. 1-3].
 
-    Two means, started at the smallest and the largest value, give the centres cur1 and cur2 of two groups of
+    Two means, started at the smallest and the largest value, give the centers cur1 and cur2 of two groups of
     n1 and n2 = n - n1 values; c_t = cur1 + (cur2 - cur1) n2 / n. Where all values are equal that is the
     value, and all points are scattered, which needs no radius to hold enough points.
 
@@ -229,7 +229,7 @@ def ropt_block(tree, qx, qy, qz, radii, least, table, radius, seeds, shapes):
         Over a cloud in canonical order.
     qx, qy, qz : ndarray of float64, shape (m,)
     radii : ndarray of float64, shape (r,)
-        Ascending and evenly spaced, metres; see :func:`radii_of`.
+        Ascending and evenly spaced, meters; see :func:`radii_of`.
     least : int
         Members a radius must hold to be a candidate.
     table, radius, seeds, shapes

@@ -4,10 +4,10 @@ A pull draws four different members a, b, c, d. All five metrics are taken from 
 
 ==== =================================================== ===================
 A3   angle at a between b and c                          radians
-D1   distance of a from the centroid                     metres
-D2   distance of a and b                                 metres
-D3   square root of the area of the triangle a b c       metres
-D4   cube root of the volume of the tetrahedron a b c d  metres
+D1   distance of a from the centroid                     meters
+D2   distance of a and b                                 meters
+D3   square root of the area of the triangle a b c       meters
+D4   cube root of the volume of the tetrahedron a b c d  meters
 ==== =================================================== ===================
 
 Each metric's distribution is what separate pulls would give; only the metrics of one neighborhood share
@@ -246,7 +246,7 @@ def pull(record, n, gx, gy, gz, seed, work):
             work.values[m * ROOM + i] = -np.inf
 
 
-@device(fastmath={"reassoc", "nsz"})  # sums of ones, exact in any order: what lets LLVM vectorise them
+@device(fastmath={"reassoc", "nsz"})  # sums of ones, exact in any order: what lets LLVM vectorize them
 def count_above(values, t, above):
     """How many of each metric's values lie above each of nine thresholds (no scatter: compare and add)."""
     one, zero = np.float32(1.0), np.float32(0.0)

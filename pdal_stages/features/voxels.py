@@ -19,7 +19,7 @@ from ..base.hashing import hash_of
 from ..base.runs import begins_run
 from .cells import cell_keys
 
-#: Smallest and largest side in metres.
+#: Smallest and largest side in meters.
 SMALLEST, LARGEST = 1e-4, 5.0
 
 
@@ -61,7 +61,7 @@ def represent(
 ) -> Representatives | None:
     """Representatives of a cloud's points, or None where each stands for itself.
 
-    `side` is a voxel's, in metres as `xyz`; 0 for none. `values` (k,) are what else is known of the points that are there,
+    `side` is a voxel's, in meters as `xyz`; 0 for none. `values` (k,) are what else is known of the points that are there,
     and decide between points of the same coordinates. `rows` (m,) are the points asked for; the others are represented
     too, but are not listed. `there` (k,) are the points that are there at all, `rows` among them (default: all n).
     Both ascend.

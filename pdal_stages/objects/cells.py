@@ -96,7 +96,7 @@ class Cells:
     Attributes
     ----------
     size : float
-        Side of a cell, metres; those of the ground are `GROUND_CELLS` times as wide.
+        Side of a cell, meters; those of the ground are `GROUND_CELLS` times as wide.
     key : (n,) int64
     columns : dict of str to (n,) ndarray
         See the table in the source: count, low, high, sum, ...
@@ -128,11 +128,11 @@ class Cells:
         Parameters
         ----------
         x, y, z : (n,) float64
-            Metres.
+            Meters.
         codes : (n,) uint8
             Class codes.
         size : float
-            Side of a cell, metres.
+            Side of a cell, meters.
         reliability : (n,) float, optional
             0 to 1.
         classes : mapping, optional

@@ -1,7 +1,7 @@
 """Objects against a reference: as objects, by area, by boundary; trees by place and height.
 
 Completeness is the share of the reference that was found, correctness the share of what was found that is in the reference,
-quality their harmonic mean (F1). Coordinates are metres.
+quality their harmonic mean (F1). Coordinates are meters.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from .outlines import vector
 #: Buildings are told apart by area, m2, and trees by height, m.
 AREAS = (0.0, 25.0, 100.0, 500.0, np.inf)
 HEIGHTS = (0.0, 5.0, 10.0, 20.0, np.inf)
-#: Boundaries are compared at places so far apart, metres.
+#: Boundaries are compared at places so far apart, meters.
 EVERY = 0.5
 
 
@@ -58,7 +58,7 @@ def matched_by_place(
     away: float = 4.0,
     share: float = 0.3,
 ) -> list[tuple[int, int]]:
-    """Pairs (found, true) of trees within `away` metres whose heights differ by at most a `share` of the true one.
+    """Pairs (found, true) of trees within `away` meters whose heights differ by at most a `share` of the true one.
 
     The nearest first, each once. Where the true height is not known (NaN) the place alone decides.
     """
@@ -88,7 +88,7 @@ def _each_once(a: NDArray, b: NDArray, cost: NDArray, allowed: NDArray[np.bool_]
 
 
 def compare_buildings(found: Sequence[Any], true: Sequence[Any]) -> dict[str, Any]:
-    """Figures of outlines (shapely polygons, metres) against true ones.
+    """Figures of outlines (shapely polygons, meters) against true ones.
 
     Returns
     -------
@@ -96,7 +96,7 @@ def compare_buildings(found: Sequence[Any], true: Sequence[Any]) -> dict[str, An
         ``objects`` (matched at an intersection over union of 0.5), ``sizes`` (the same by area), ``area`` (completeness,
         correctness and intersection over union of all area), ``covered`` (the share of true outlines of which found ones
         cover at least 80 %), ``boundary`` (how far places along the true boundary lie from the found one, of blocks that
-        match: median and 95th percentile, metres), and which were matched.
+        match: median and 95th percentile, meters), and which were matched.
     """
     shapely = vector("shapely")
     found, true = [shapely.make_valid(s) for s in found], [shapely.make_valid(s) for s in true]
@@ -137,7 +137,7 @@ def compare_buildings(found: Sequence[Any], true: Sequence[Any]) -> dict[str, An
 
 
 def boundary_offsets(found: Sequence[Any], true: Sequence[Any]) -> NDArray[np.float64]:
-    """How far places along the boundaries of true blocks lie from those of the blocks that match them, metres."""
+    """How far places along the boundaries of true blocks lie from those of the blocks that match them, meters."""
     shapely = vector("shapely")
     out = [np.empty(0)]
     for a, b in matched_by_overlap(found, true):
@@ -150,7 +150,7 @@ def boundary_offsets(found: Sequence[Any], true: Sequence[Any]) -> NDArray[np.fl
 def compare_trees(
     found: NDArray, found_height: NDArray, true: NDArray, true_height: NDArray
 ) -> dict[str, Any]:
-    """Figures of trees, (n, 2) places and (n,) heights in metres, against true ones; heights may be NaN."""
+    """Figures of trees, (n, 2) places and (n,) heights in meters, against true ones; heights may be NaN."""
     pairs = matched_by_place(found, found_height, true, true_height)
     a, b = (np.array([p[k] for p in pairs], np.int64) for k in (0, 1))
     away = np.hypot(*(found[a] - true[b]).T) if pairs else np.empty(0)

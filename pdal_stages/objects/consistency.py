@@ -21,20 +21,20 @@ from ..terrain.clusters import BITS, find, voxels
 
 #: Rules in the order in which they are applied.
 RULES = ("ground", "islands", "roofs", "facades", "lone")
-#: Side of a voxel, metres, and how far away points can change a point's class: two voxels for each rule that looks.
+#: Side of a voxel, meters, and how far away points can change a point's class: two voxels for each rule that looks.
 SIDE = 1.0
 REACH = 2.0 * 4 * SIDE
 GROUND, VEGETATION, BUILDING = 2, (3, 4, 5), 6
 #: Kinds of points that rules know.
 _GROUND, _VEGETATION, _BUILDING, _OTHER = range(4)
-#: Ground, in metres above the terrain at most; and what is surely none, at least.
+#: Ground, in meters above the terrain at most; and what is surely none, at least.
 LOW, HIGH = 0.3, 2.0
 #: Neighbors that are enough to say something, and the share of them that must be buildings, or of one kind. As it was found
 #: on labeled surveys: with 0.75, one point in eight that a plane claims is a leaf.
 ENOUGH, SHARE, ALL = 10, 0.9, 0.9
-#: A plane's scatter, and how far from it a point may lie and be of it, metres.
+#: A plane's scatter, and how far from it a point may lie and be of it, meters.
 SCATTER, NEAR = 0.1, 0.2
-#: Coordinates within a voxel are whole numbers of this part of a metre.
+#: Coordinates within a voxel are whole numbers of this part of a meter.
 _PARTS = 1024.0
 
 
@@ -54,11 +54,11 @@ def consistent(
     Parameters
     ----------
     xyz : array_like, shape (n, 3)
-        Coordinates in metres.
+        Coordinates in meters.
     codes : array_like of uint8, shape (n,)
         Class codes; only ground (2), vegetation (3, 4, 5) and buildings (6) are changed, and into one another.
     height : array_like, shape (n,), optional
-        Height above ground, metres; without it the rules ``ground`` and ``islands`` do nothing.
+        Height above ground, meters; without it the rules ``ground`` and ``islands`` do nothing.
     ground : array_like, shape (n,), optional
         Whether a ground filter calls the point ground; without it the same.
     mask, change : array_like of bool, shape (n,), optional
@@ -254,7 +254,7 @@ def _shifted(m, dx, dy, dz, total):
 
 @njit
 def _fit(keys, table, w, levels, upright, own, moments, planes):
-    """Fill `planes` (normal, distance from the voxel's corner; metres) of buildings round voxels with vegetation."""
+    """Fill `planes` (normal, distance from the voxel's corner; meters) of buildings round voxels with vegetation."""
     total = np.empty(10, np.int64)
     side = np.int64(SIDE * _PARTS)
     for k in range(len(keys)):

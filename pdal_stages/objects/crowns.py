@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..base.jit import device, njit
 
-#: Farthest that a cell lies from the top of its tree, metres.
+#: Farthest that a cell lies from the top of its tree, meters.
 REACH = 15.0
 
 
@@ -24,7 +24,7 @@ def canopy(high: NDArray, ground: NDArray) -> NDArray[np.float64]:
     Parameters
     ----------
     high : (r, c) float64
-        Height of the highest point of vegetation in each cell, metres; NaN where there is none.
+        Height of the highest point of vegetation in each cell, meters; NaN where there is none.
     ground : (r, c) float64
     """
     height = high - ground
@@ -115,7 +115,7 @@ def summits(s: NDArray, lowest: float) -> NDArray:
 def heirs(s: NDArray, up: NDArray, base: float, slope: float, most: float, depth: float) -> NDArray:
     """Of each maximum (a cell that is its own `up`) the higher one that it goes to, itself where it is a top.
 
-    A window has a radius of `base` cells and `slope` per metre of height, `most` at most. Of the higher maxima inside,
+    A window has a radius of `base` cells and `slope` per meter of height, `most` at most. Of the higher maxima inside,
     the one over the highest saddle (on the line between) takes it, where the saddle lies no more than `depth` times its
     height below.
     """

@@ -23,7 +23,7 @@ from .cells import GROUND_CELLS, MM, Cells, Kind, cell_keys, object_id, point_ke
 from .measure import Body
 from .rasters import GROUND_REACH, Window
 
-#: Metres around a place that decide about it, but for the extent of buildings, spans and decks.
+#: Meters around a place that decide about it, but for the extent of buildings, spans and decks.
 MARGIN = GROUND_REACH + 2 * crowns.REACH
 #: Side of a block, cells.
 BLOCK = 2048
@@ -62,7 +62,7 @@ class ObjectSettings:
     window: float = _setting(
         1.5, "Radius in which a tree has no second top, for a tree of no height", 0.1, 10
     )
-    window_slope: float = _setting(0.1, "Added to the radius per metre of height", 0, 1, "")
+    window_slope: float = _setting(0.1, "Added to the radius per meter of height", 0, 1, "")
     saddle: float = _setting(
         0.1,
         "Two tops that near are one tree where the saddle is no deeper than this share of the lower",
@@ -173,7 +173,7 @@ def find_objects(
     Parameters
     ----------
     cells : Cells
-        Records of all points of the area, by :meth:`Cells.of`; a metre or two of its edge may be cut off objects.
+        Records of all points of the area, by :meth:`Cells.of`; a meter or two of its edge may be cut off objects.
     settings : ObjectSettings, optional
     block : int
         Side of the blocks of work, in cells; even. It changes nothing but memory.

@@ -24,7 +24,7 @@ class Body(NamedTuple):
 
     row: NDArray[np.int64]
     column: NDArray[np.int64]
-    z: NDArray[np.float64]  # of the roof, the canopy, the wires: highest point, metres
+    z: NDArray[np.float64]  # of the roof, the canopy, the wires: highest point, meters
     low: NDArray[np.float64]  # lowest point; NaN in cells without points
     ground: NDArray[np.float64]  # NaN where it is not known
     points: NDArray[np.int64]  # points
@@ -157,7 +157,7 @@ def _chord(path: NDArray) -> NDArray:
 
 
 def path_of(body: Body, size: float, every: float = 2.0) -> NDArray[np.float64]:
-    """A line along wires (n, 3), metres: the middle of each piece of `every` metres along their main direction."""
+    """A line along wires (n, 3), meters: the middle of each piece of `every` meters along their main direction."""
     x, y = (body.column + 0.5) * size, (body.row + 0.5) * size
     origin = np.array([x.min(), y.min()])
     u, v = x - origin[0], y - origin[1]

@@ -112,7 +112,7 @@ def straight_outlines(raw: list[Any], size: float) -> list[Any]:
     raw : list of shapely Polygon
         By :func:`raw_outlines`.
     size : float
-        Side of a cell, metres.
+        Side of a cell, meters.
 
     Returns
     -------

@@ -13,7 +13,7 @@ SMALLEST = 3.0
 
 @njit
 def _gradients(z: NDArray, size: float) -> tuple[NDArray, NDArray, NDArray]:
-    """Rise per metre east and north of the plane through each cell and its neighbors, and how far they lie from it."""
+    """Rise per meter east and north of the plane through each cell and its neighbors, and how far they lie from it."""
     rows, columns = z.shape
     east, north = np.full(z.shape, np.nan), np.full(z.shape, np.nan)
     off = np.full(z.shape, np.inf)
@@ -100,9 +100,9 @@ def roof_planes(z: NDArray[np.float64], size: float) -> tuple[int, float, float]
     Parameters
     ----------
     z : (r, c) float64
-        Heights of the roof's cells, NaN elsewhere; metres.
+        Heights of the roof's cells, NaN elsewhere; meters.
     size : float
-        Side of a cell, metres.
+        Side of a cell, meters.
     """
     east, north, off = _gradients(z, size)
     cells = int(np.count_nonzero(~np.isnan(z)))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..base.jit import njit
 from .cells import GROUND_CELLS, MM, Cells, Kind, unpack
 
-#: How far the ground is looked for, metres: half the width of the largest building.
+#: How far the ground is looked for, meters: half the width of the largest building.
 GROUND_REACH = 120.0
 
 
@@ -37,7 +37,7 @@ class Window:
         return cells.within(kind, self.row, self.column, self.rows, self.columns)
 
     def ground(self, cells: Cells) -> NDArray[np.float64]:
-        """Height of the ground in each cell, metres; NaN where none is within reach."""
+        """Height of the ground in each cell, meters; NaN where none is within reach."""
         half = Window(
             self.row // GROUND_CELLS,
             self.column // GROUND_CELLS,

@@ -13,7 +13,7 @@ from ..base.jit import device, njit
 def roof_cells(
     high: NDArray, ground: NDArray, lowest: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Cells of roofs and the height of each, metres.
+    """Cells of roofs and the height of each, meters.
 
     Cells of which the highest point lies `lowest` above the ground; empty ones with at least seven of eight neighbors are
     filled, twice, and what is one cell wide, a wall or a stray point, is left out.
@@ -25,7 +25,7 @@ def roof_cells(
     ground : (r, c) float64
         NaN where it is not known: then every height will do.
     lowest : float
-        Metres.
+        Meters.
     """
     with np.errstate(invalid="ignore"):
         taken = ~np.isnan(high) & ~(high - ground < lowest)

@@ -46,7 +46,7 @@ def stage(ins, outs):
 _LABEL = "pdal_stages_class_flags"
 _CURE = (
     'Write the older files as LAS 1.4 first: pdal-stages pipeline, with the file and {"type": "writers.las", "filename": '
-    '"new.laz", "forward": "all", "extra_dims": "all", "minor_version": 4, "dataformat_id": 6} (7 with colours)'
+    '"new.laz", "forward": "all", "extra_dims": "all", "minor_version": 4, "dataformat_id": 6} (7 with colors)'
 )
 
 
@@ -109,7 +109,7 @@ def parting(stages: Sequence[dict[str, Any]], *, with_ours: bool = False) -> Par
         + ("writers of both" if known == {True} else "readers of both, and a writer of LAS 1.0-1.3"),
         cure=_CURE
         if known == {True}
-        else 'Give the writer "minor_version": 4 and "dataformat_id": 6 (7 with colours)',
+        else 'Give the writer "minor_version": 4 and "dataformat_id": 6 (7 with colors)',
     )
 
 

@@ -1,4 +1,4 @@
-"""The reference systems of several inputs, which must be one: PDAL merges points of metres and of feet as they are."""
+"""The reference systems of several inputs, which must be one: PDAL merges points of meters and of feet as they are."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .filenames import is_writer, readers_files
 
 #: Stages that may give points of several references one.
 MOVING = ("filters.reprojection", "filters.projpipeline", "filters.transformation", "filters.georeference")
-#: What differs between references whose coordinates lie within a metre: units are compared apart.
+#: What differs between references whose coordinates lie within a meter: units are compared apart.
 _ALIKE = ("+datum=WGS84", "+datum=NAD83", "+ellps=WGS84", "+ellps=GRS80")
 _ASIDE = (
     "+units",

@@ -96,7 +96,7 @@ def _code_limit(writer: dict[str, Any], before: list[dict[str, Any]]) -> CodeLim
             LEGACY_LIMIT,
             f"class codes above {LEGACY_LIMIT} do not fit the LAS file that writers.las would write "
             f"(LAS 1.{minor}, dataformat_id {format_id})",
-            'Give writers.las "minor_version": 4 and "dataformat_id": 6 (7 with colours, 8 with near infrared)',
+            'Give writers.las "minor_version": 4 and "dataformat_id": 6 (7 with colors, 8 with near infrared)',
         )
     return None
 

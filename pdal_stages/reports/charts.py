@@ -29,7 +29,7 @@ class Chart:
     #: points, and a kind: "line" or "ideal" (dashed)
     lines: Sequence[tuple[Sequence[tuple[float, float]], str]] = ()
     dots: Sequence[tuple[float, float, str]] = ()  #: x, y, title
-    values: Sequence[tuple[float, float, str]] = ()  #: x, y, and text centred above that place
+    values: Sequence[tuple[float, float, str]] = ()  #: x, y, and text centered above that place
 
     #: Size of the drawing, and what is left for the axes' texts.
     WIDE: ClassVar = 520

@@ -28,7 +28,7 @@ SECTION_LENGTH, SECTION_DEPTH = 400, 8
 
 #: Two ends (x, y).
 Line = tuple[tuple[float, float], tuple[float, float]]
-#: A colour and what it means.
+#: A color and what it means.
 Key = tuple[tuple[int, int, int], str]
 
 
@@ -262,7 +262,7 @@ def draw_section(
         image = section_view(
             x, y, z, codes[drawn], start=line[0], end=line[1], thickness=depth, width=SECTION_WIDTH
         )
-        return Picture.of(image, heading, f"{what}, coloured by {word} class")
+        return Picture.of(image, heading, f"{what}, colored by {word} class")
 
     views = [
         view(scene.reference, "Reference", "reference"),

@@ -54,7 +54,7 @@ def object_layers(objects: Objects, *, straight: bool = True, units: Units | Non
     straight : bool
         Outlines of buildings and decks along walls, instead of along cells.
     units : Units, optional
-        Of the coordinates; measures are in metres whatever these are.
+        Of the coordinates; measures are in meters whatever these are.
     """
     shapely = vector("shapely")
     across = units.horizontal if units else 1.0

@@ -31,7 +31,7 @@ Entry = tuple[str, tuple[int, int, int]]
 
 
 def legend(codes: Sequence[int], width: int, extra: Sequence[Entry] = ()) -> np.ndarray:
-    """A band of colour patches with class names, then with `extra` texts: (height, width, 3) uint8, as high as it needs."""
+    """A band of color patches with class names, then with `extra` texts: (height, width, 3) uint8, as high as it needs."""
     entries = [(f"{c} {class_name(c)}", tuple(CLASS_COLORS[c].tolist())) for c in codes]
     spots, left, line = [], 16, 0
     for text, color in [*entries, *extra]:
@@ -108,7 +108,7 @@ def triptych(
 
 
 def _scale_bar(pen: ImageDraw.ImageDraw, left: int, y: int, most: int, pixel: float) -> None:
-    """A bar of a round length, at most about half as long as `most` pixels; `pixel` in metres."""
+    """A bar of a round length, at most about half as long as `most` pixels; `pixel` in meters."""
     length = nice_step(0.2 * most * pixel)
     long = max(2, round(length / pixel))
     pen.rectangle((left, y - 2, left + long - 1, y + 2), fill=INK)

@@ -28,8 +28,8 @@ def png(rgb: npt.NDArray[np.uint8], palette: bool = False) -> bytes:
     ----------
     rgb : (height, width, 3) uint8
     palette : bool
-        Round the channels until 256 colours are left: a third of the size, for maps inside a page. Class maps
-        are few colours in many shades, so steps of 4 to 16 levels do, and a rare class keeps its colour.
+        Round the channels until 256 colors are left: a third of the size, for maps inside a page. Class maps
+        are few colors in many shades, so steps of 4 to 16 levels do, and a rare class keeps its color.
 
     Raises
     ------
@@ -43,7 +43,7 @@ def png(rgb: npt.NDArray[np.uint8], palette: bool = False) -> bytes:
         )
     image = Image.fromarray(np.ascontiguousarray(rgb))
     if palette:
-        for step in (1, 4, 8, 12, 16, 24, 32, 48, 64):  # 64: at most 5 x 5 x 5 colours
+        for step in (1, 4, 8, 12, 16, 24, 32, 48, 64):  # 64: at most 5 x 5 x 5 colors
             rounded = np.minimum((rgb.astype(np.uint16) + step // 2) // step * step, 255)
             image = Image.fromarray(rounded.astype(np.uint8))
             if image.getcolors(256):

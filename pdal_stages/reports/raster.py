@@ -146,17 +146,17 @@ def shading(s: Surface) -> np.ndarray:
     gy, gx = np.gradient(fine, s.frame.pixel)
     gy = -gy  # rows run south
     sun = (0.5 * gx - 0.5 * gy + 0.75) / np.sqrt(1 + gx * gx + gy * gy) / 0.75
-    metres = 1.0 / s.frame.pixel
+    meters = 1.0 / s.frame.pixel
     low = 0.0
     for size in (1.5, 6.0):
-        around = height_around(max(size * metres, 1.2 * s.spacing))
+        around = height_around(max(size * meters, 1.2 * s.spacing))
         low = low + 0.5 * np.clip((fine - around) / (1.2 * size), -1, 1)
     light = 0.62 + 0.34 * np.clip(sun, 0, 1.35) + 0.22 * low
     return np.where(known, np.clip(light, 0.42, 1.18), 1.0)
 
 
 def paint(s: Surface, colors: np.ndarray, light: np.ndarray | None) -> np.ndarray:
-    """Pixels from per-pixel colours and light; empty ones get the background."""
+    """Pixels from per-pixel colors and light; empty ones get the background."""
     out = colors.astype(float)
     if light is not None:
         out = np.where(light[..., None] <= 1, out * light[..., None], 255 - (255 - out) / light[..., None])

@@ -17,7 +17,7 @@ from .raster import BACKGROUND, Frame, Surface, paint, shading, surface
 INK, FAINT, GRIDLINE = (34, 38, 44), (110, 114, 120), (226, 226, 222)
 RIGHT, WRONG, IGNORED = (196, 196, 192), (204, 24, 32), (232, 232, 228)
 
-# Colour ramps, as a few anchors: heights like a tinted map; values dark to bright with even lightness.
+# Color ramps, as a few anchors: heights like a tinted map; values dark to bright with even lightness.
 _RAMPS = {
     "height": (
         (38, 84, 106),
@@ -33,10 +33,10 @@ _RAMPS = {
 
 
 def ramp(values: np.ndarray, low: float, high: float, name: str = "value") -> np.ndarray:
-    """Colours, (..., 3) uint8, of values between `low` and `high`; NaN becomes mid grey."""
+    """Colors, (..., 3) uint8, of values between `low` and `high`; NaN becomes mid gray."""
     if name not in _RAMPS:
         raise StageError(
-            "unknown colour ramp", where="picture", found=name, cure=f"Use one of {', '.join(_RAMPS)}"
+            "unknown color ramp", where="picture", found=name, cure=f"Use one of {', '.join(_RAMPS)}"
         )
     anchors = np.array(_RAMPS[name], dtype=float)
     share = (np.asarray(values, dtype=float) - low) / max(high - low, 1e-12) * (len(anchors) - 1)
@@ -47,7 +47,7 @@ def ramp(values: np.ndarray, low: float, high: float, name: str = "value") -> np
     return np.round(out).astype(np.uint8)
 
 
-#: The colour of each class code, (256, 3) uint8.
+#: The color of each class code, (256, 3) uint8.
 CLASS_COLORS = np.array([class_color(code) for code in range(256)], dtype=np.uint8)
 #: Discs of 5 and 21 pixels that a point of a section is drawn as.
 _SMALL_DOT = ndimage.generate_binary_structure(2, 1)
@@ -100,7 +100,7 @@ def top_view(
     width: int = 900,
     limits: tuple[float, float] | None = None,
 ) -> np.ndarray:
-    """The cloud from above, coloured by ASPRS class, by a value or by height; the highest point of a pixel wins.
+    """The cloud from above, colored by ASPRS class, by a value or by height; the highest point of a pixel wins.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def error_view(
     *,
     width: int = 900,
 ) -> np.ndarray:
-    """The cloud from above: grey where points are right, red where they are `wrong`, pale where they are `left_out`.
+    """The cloud from above: gray where points are right, red where they are `wrong`, pale where they are `left_out`.
 
     A wrong point is drawn over right ones of the same pixel, so that no error hides under a roof or a crown. Arrays are as
     for :func:`top_view`.
@@ -169,7 +169,7 @@ def error_view(
 def verdict(
     s: Surface, x: np.ndarray, y: np.ndarray, z: np.ndarray, wrong: np.ndarray, left_out: np.ndarray
 ) -> np.ndarray:
-    """Colours of the pixels of a surface, (height, width, 3) uint8: right, wrong or left out."""
+    """Colors of the pixels of a surface, (height, width, 3) uint8: right, wrong or left out."""
     kinds = s.spread(np.where(left_out, 2, wrong).astype(np.int64), 0)
     shown = np.array([RIGHT, WRONG, IGNORED], dtype=np.uint8)[kinds]
     if wrong.any():
@@ -201,7 +201,7 @@ def section_view(
     ----------
     x, y, z : (n,) float
     classes : (n,) integer, optional
-        Colours; heights where not given.
+        Colors; heights where not given.
     start, end : (x, y), optional
         Ends of the section line; west to east through the middle where not given.
     thickness : float

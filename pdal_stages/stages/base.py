@@ -95,7 +95,7 @@ class Stage(ABC):
         "integer", 0, "Threads to use; 0 takes every available core", minimum=0, maximum=1024
     )
     horizontal_unit: str = option(
-        "string", "", "Unit of x and y (metre, foot, us-ft), where the spatial reference is missing or wrong"
+        "string", "", "Unit of x and y (meter, foot, us-ft), where the spatial reference is missing or wrong"
     )
     vertical_unit: str = option(
         "string", "", "Unit of z, where the spatial reference does not say; otherwise that of x and y"
@@ -150,7 +150,7 @@ class Stage(ABC):
         return {}
 
     def halo(self) -> float:
-        """How far beyond a tile, in metres, points can change the tile's results."""
+        """How far beyond a tile, in meters, points can change the tile's results."""
         return 0.0
 
     def near_halo(self) -> float | None:
@@ -158,11 +158,11 @@ class Stage(ABC):
         return None
 
     def left_of(self, points: Points) -> NDArray[np.float64]:
-        """What the stage needs of points far away, for :attr:`surroundings`: coordinates (n, 3), metres."""
+        """What the stage needs of points far away, for :attr:`surroundings`: coordinates (n, 3), meters."""
         raise NotImplementedError
 
     def inner_reach(self) -> float:
-        """How far apart, in metres, points use each other's results of this very stage; part of the halo."""
+        """How far apart, in meters, points use each other's results of this very stage; part of the halo."""
         return 0.0
 
     def largest_class(self) -> int:
@@ -179,7 +179,7 @@ class Stage(ABC):
     def reach_of(self, points: Points, wanted: NDArray[np.bool_], box: Sequence[float]) -> float:
         """How far around a box lie the points that decide the results of the wanted ones, for an open-ended stage.
 
-        `points` are what was read: the box (min x, min y, max x, max y) and some surroundings. All in metres; more than
+        `points` are what was read: the box (min x, min y, max x, max y) and some surroundings. All in meters; more than
         was read, where that was not enough.
         """
         return 0.0

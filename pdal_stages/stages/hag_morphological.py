@@ -78,7 +78,7 @@ class HagMorphological(Stage):
     openings: list = option(
         "list",
         (),
-        "Also write heights above openings of the minimum grid with windows of these widths in metres, e.g. 5,9,17,33,65: "
+        "Also write heights above openings of the minimum grid with windows of these widths in meters, e.g. 5,9,17,33,65: "
         "HeightAboveOpening_5, ...",
         may_be_empty=True,
     )
@@ -101,7 +101,7 @@ metadata counts these as `without_terrain`.
 need no threshold and tell a classifier what a point stands on: low above the narrow window and high above the wide one
 is a roof.
 
-Lengths are metres, whatever the unit of the points; `HeightAboveGround` and the heights above openings are in the unit
+Lengths are meters, whatever the unit of the points; `HeightAboveGround` and the heights above openings are in the unit
 of Z.
 """
     after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)

@@ -35,7 +35,7 @@ def made_of_coordinates(
     preparation : sequence of mapping
         As model files have it.
     xyz : (n, 3) float64
-        Metres.
+        Meters.
     usable : (n,) bool, optional
         Points that may form the ground; the others only receive heights.
     threads : int, optional

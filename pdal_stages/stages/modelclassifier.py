@@ -88,7 +88,7 @@ class ModelClassifier(Stage):
     vegetation_heights: list = option(
         "list",
         (),
-        "Two heights above ground in metres, e.g. 0.5,2: points the model calls vegetation (5) become low (3) below the "
+        "Two heights above ground in meters, e.g. 0.5,2: points the model calls vegetation (5) become low (3) below the "
         "first and medium (4) below the second",
         may_be_empty=True,
     )
@@ -134,7 +134,7 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
 
     @cached_property
     def bands(self) -> tuple[float, float] | None:
-        """Below these heights in metres vegetation is low, and medium."""
+        """Below these heights in meters vegetation is low, and medium."""
         if not self.vegetation_heights:
             return None
         try:
@@ -143,7 +143,7 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
             low = medium = 0.0
         if not 0.0 < low < medium < 1000.0:
             raise OptionError(
-                "option 'vegetation_heights' must be two heights in metres, the lower one first",
+                "option 'vegetation_heights' must be two heights in meters, the lower one first",
                 found=", ".join(map(str, self.vegetation_heights)),
                 cure="For example 0.5,2",
             )

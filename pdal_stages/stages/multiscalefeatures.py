@@ -86,7 +86,7 @@ of radius 2 m. See [neighborhoods and features](../features.md) for all tokens, 
 Shape distributions (`shapes`) need histogram thresholds, which are fitted to the points unless `bins` names a file;
 name one when several files must have comparable features. Features are 32-bit floats. LAS writers need
 `"extra_dims": "all"`, and one file describes at most 341 extra dimensions: training and classification compute
-features inside and need no dimensions at all. In clouds of hundreds of points per square metre `voxel` keeps the
+features inside and need no dimensions at all. In clouds of hundreds of points per square meter `voxel` keeps the
 time per point bounded, whatever the radius: see [dense clouds](../features.md#dense-clouds).
 """
     after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)

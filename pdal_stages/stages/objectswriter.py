@@ -36,7 +36,7 @@ class ObjectsWriter(ObjectOptions, Stage):
         choices=(STRAIGHT, CELLS),
     )
     details = """
-The objects are those of `filters.objects`, with the same ids and options. Layers and their columns (measures in metres,
+The objects are those of `filters.objects`, with the same ids and options. Layers and their columns (measures in meters,
 whatever the unit of the coordinates; names fit into shapefiles):
 
 - `buildings`: polygons. `area`; `h_eave`, `h_ridge` above the ground; `ground`, its elevation; `slope` of the roof in

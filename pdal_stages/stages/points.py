@@ -1,4 +1,4 @@
-"""The points a stage works on: PDAL's arrays, in metres, with class codes freed of flag bits."""
+"""The points a stage works on: PDAL's arrays, in meters, with class codes freed of flag bits."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class Points:
         place = (float(x[0]), float(y[0])) if self.count else None
         units = units_of_wkt(self.wkt, horizontal=self._units[0], vertical=self._units[1], place=place)
         if units.assumed and self.count:
-            self.report["note"] = "the points have no spatial reference: metres were assumed"
+            self.report["note"] = "the points have no spatial reference: meters were assumed"
             if np.abs(x).max() <= 180.0 and np.abs(y).max() <= 90.0 and max(np.ptp(x), np.ptp(y)) < 0.2:
                 self.report["warning"] = (
                     f"coordinates look like degrees; if they are: {reprojection_cure(place=place)}"
@@ -96,7 +96,7 @@ class Points:
 
     @cached_property
     def xyz(self) -> NDArray[np.float64]:
-        """Coordinates in metres, shape (n, 3).
+        """Coordinates in meters, shape (n, 3).
 
         Raises
         ------
@@ -107,7 +107,7 @@ class Points:
         for column, (name, unit) in enumerate(
             (("X", self.units.horizontal), ("Y", self.units.horizontal), ("Z", self.units.vertical))
         ):
-            np.multiply(self.dimension(name, metres=False), unit, out=out[:, column])
+            np.multiply(self.dimension(name, meters=False), unit, out=out[:, column])
         bad = int(np.count_nonzero(~np.isfinite(out).all(axis=1)))
         if bad:
             raise StageError(
@@ -118,8 +118,8 @@ class Points:
             )
         return out
 
-    def dimension(self, name: str, *, metres: bool = True) -> NDArray:
-        """A dimension's values; lengths upward are converted to metres.
+    def dimension(self, name: str, *, meters: bool = True) -> NDArray:
+        """A dimension's values; lengths upward are converted to meters.
 
         Raises
         ------
@@ -135,7 +135,7 @@ class Points:
         values = self.arrays[name]
         if name == "Classification":
             return self.class_codes
-        if metres and (name == "Z" or name.startswith(_HEIGHTS)) and self.units.vertical != 1.0:
+        if meters and (name == "Z" or name.startswith(_HEIGHTS)) and self.units.vertical != 1.0:
             return values * self.units.vertical
         return values
 
@@ -189,7 +189,7 @@ class Points:
                 found |= (self.class_codes == 0) & (self.flag("Overlap") != 0)
         for span in selection.spans:
             name = span.dimension
-            found |= span.holds(self.flag(name) if name in _FLAGS else self.dimension(name, metres=False))
+            found |= span.holds(self.flag(name) if name in _FLAGS else self.dimension(name, meters=False))
         return found
 
     def ignored(self, selection: Selection) -> NDArray[np.bool_]:

@@ -6,14 +6,14 @@ import math
 
 import numpy as np
 
-SPEED = 60.0  # metres a second
+SPEED = 60.0  # meters a second
 TURN = 240.0  # seconds from the end of a strip to the start of the next
 GPS_START = 270_000_000.0  # adjusted standard GPS time: April 2020
-MARGIN = 25.0  # metres beyond the square that are flown as well: what stands outside throws shadows into it
+MARGIN = 25.0  # meters beyond the square that are flown as well: what stands outside throws shadows into it
 
 
 class Flight:
-    """Pulses over a square of `size` metres, `spacing` metres apart below the sensor."""
+    """Pulses over a square of `size` meters, `spacing` meters apart below the sensor."""
 
     def __init__(self, options, size: float, spacing: float) -> None:
         self.size, self.altitude, self.spacing = size, options.altitude, spacing
@@ -43,7 +43,7 @@ class Flight:
     def pulses(self, strip: int, first: int, last: int) -> list[np.ndarray]:
         """The pulses of some scan lines of a strip that come near the square, in order of time.
 
-        Origin (n, 3) in metres from the middle of the square at its mean height, unit direction (n, 3), place (n, 2)
+        Origin (n, 3) in meters from the middle of the square at its mean height, unit direction (n, 3), place (n, 2)
         where the beam would meet level ground, GPS time in seconds, scan angle in degrees (right of the flight: positive).
         """
         forward = 1.0 - 2.0 * (strip % 2)

@@ -17,7 +17,7 @@ def beside(a: float, b: float, turn: float, along: float, left: float) -> tuple[
 def house(s: Site, a, b, turn, half_l, half_w, eave, roof, pitch=0.8, *, plain=False) -> None:
     """One building, with dormers and chimneys (on a flat roof: a rim and machines) unless it is plain.
 
-    The ridge runs along its length; `eave` is metres above the mean ground; `pitch` is rise over run; `roof` is 'flat',
+    The ridge runs along its length; `eave` is meters above the mean ground; `pitch` is rise over run; `roof` is 'flat',
     'gable', 'hip', 'halfhip', 'shed' or 'pyramid'.
     """
     corners = [s.z(*beside(a, b, turn, p * half_l, q * half_w)) for p in (-1, 1) for q in (-1, 1)]
@@ -88,7 +88,7 @@ def mast(s: Site, a, b, turn, height, arm) -> None:
 
 
 def cable(s: Site, start, end, sag: float) -> None:
-    """A conductor between two places (a, b, z) that hangs by `sag` metres in the middle (a parabola)."""
+    """A conductor between two places (a, b, z) that hangs by `sag` meters in the middle (a parabola)."""
     places = [[p + n / 6 * (q - p) for p, q in zip(start, end, strict=True)] for n in range(7)]
     for n, place in enumerate(places):
         place[2] -= sag * n * (6 - n) / 9

@@ -12,7 +12,7 @@ from .townplan import GRASS, LAWN, REFLECTANCE, SOIL, WATER, ground, patches
 
 SUB_BEAMS = 5  # a pulse has at most as many returns
 HALF_DIVERGENCE = 0.25e-3  # radians from the middle of a beam to its outer sub-beams
-SEPARATION = 0.6  # metres; returns closer in range are one (half the length of a 4 ns pulse)
+SEPARATION = 0.6  # meters; returns closer in range are one (half the length of a 4 ns pulse)
 
 
 @device

@@ -17,9 +17,9 @@ VEGETATION = 255  # its class follows from the height above ground: 3, 4 or 5
 
 # Columns of a thing after its bounding box (lowest u, v, z, highest u, v, z).
 FIRST, COUNT, CLASS, TOP, SIDE, LEAFY = range(6, 12)
-CELL = 3.0  # metres
+CELL = 3.0  # meters
 STEP = 1.5  # between two looks along a beam; a thing is listed half of it around its box
-MARGIN = 6.2  # metres from a street's axis to the land that may be built on
+MARGIN = 6.2  # meters from a street's axis to the land that may be built on
 MARGINS = {BANK: 14.0, CANAL: 15.5}  # from the other lines
 
 
@@ -37,8 +37,8 @@ class Scene(NamedTuple):
 class Site:
     """The things of one block and of the streets on its low sides.
 
-    Places are (a, b) in metres along u and v from the low corner of the land that may be built on; that land is
-    `w` by `d` metres, and the line below it lies at b = `axis`. Heights are absolute.
+    Places are (a, b) in meters along u and v from the low corner of the land that may be built on; that land is
+    `w` by `d` meters, and the line below it lies at b = `axis`. Heights are absolute.
     """
 
     def __init__(self, plan: Plan, i: int, j: int) -> None:

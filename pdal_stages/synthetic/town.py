@@ -22,8 +22,8 @@ from .townplan import block_at, heights, make_plan
 
 PULSES_PER_CHUNK = 60_000
 SAMPLE = 20_000  # pulses that tell how many returns a pulse gives
-SIDEWAYS = 45.0  # metres a beam may travel between the highest thing and the lowest ground
-SPAN = 65.0  # metres a thing may stand out of its block: the wires to the next
+SIDEWAYS = 45.0  # meters a beam may travel between the highest thing and the lowest ground
+SPAN = 65.0  # meters a thing may stand out of its block: the wires to the next
 
 
 def _option(default, what: str, low=None, high=None):
@@ -35,7 +35,7 @@ class TownOptions:
     """How to make a town; wrong values raise an OptionError."""
 
     size: float = _option(200.0, "side of the square, metres", 20, 20_000)
-    density: float = _option(7.0, "returns per square metre, met within a few per cent", 0.05, 500)
+    density: float = _option(7.0, "returns per square meter, met within a few per cent", 0.05, 500)
     seed: int = _option(1, "another number, another town", 0, 2**31 - 1)
     altitude: float = _option(350.0, "flying height, metres", 150, 4_000)
     scan_angle: float = _option(25.0, "half opening of the scanner, degrees", 3, 35)
@@ -59,7 +59,7 @@ class TownOptions:
 class Town:
     """Points of a town (or of a chunk of one) with what is true about them."""
 
-    xyz: np.ndarray  # (n, 3) float64: metres, multiples of 1 mm
+    xyz: np.ndarray  # (n, 3) float64: meters, multiples of 1 mm
     classification: np.ndarray  # (n,) uint8: true ASPRS class; 3, 4, 5: below 0.5 m, below 2 m, above
     intensity: np.ndarray  # (n,) uint16
     return_number: np.ndarray  # (n,) uint8

@@ -1,6 +1,6 @@
 """The bare ground of the town, its surfaces, and the plan drawn on it.
 
-Town coordinates (u, v) are metres from the middle of the town along its two families of streets. Lines of constant v
+Town coordinates (u, v) are meters from the middle of the town along its two families of streets. Lines of constant v
 are, in turn, a street, a railway bank, a street and a canal. All is a function of the seed and the place, so any
 part of a town of any size is made on its own, and always the same.
 """
@@ -33,9 +33,9 @@ class Plan(NamedTuple):
     """What differs from town to town."""
 
     seed: int
-    waves: np.ndarray  # (n, 4): height in metres, wave numbers along u and v in 1/m, phase
+    waves: np.ndarray  # (n, 4): height in meters, wave numbers along u and v in 1/m, phase
     shift: int  # of the pattern of blocks
-    turn: np.ndarray  # (2, 2): metres east and north from the middle, times this, are town coordinates
+    turn: np.ndarray  # (2, 2): meters east and north from the middle, times this, are town coordinates
 
 
 def make_plan(seed: int) -> Plan:
@@ -64,7 +64,7 @@ def _from_line(value, first, every):
 
 @device
 def patches(u, v):
-    """Smooth patches some ten metres wide: a number in [0, 1]."""
+    """Smooth patches some ten meters wide: a number in [0, 1]."""
     a, b = u / 3.1 + 1.7 * math.sin(v / 7.3), v / 3.7 + 1.3 * math.sin(u / 5.9)
     return 0.5 + 0.25 * (math.sin(a) + math.sin(b))
 

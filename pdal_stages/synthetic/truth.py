@@ -18,7 +18,7 @@ from .townplan import block_at, make_plan
 class House(NamedTuple):
     """A part of a building under one roof."""
 
-    corners: NDArray  # (4, 2): of the roof, overhang and all, in order; metres, the town's coordinates
+    corners: NDArray  # (4, 2): of the roof, overhang and all, in order; meters, the town's coordinates
     eave: float  # its height, absolute
     ridge: float
     walls: NDArray  # (4, 2): corners of the walls
@@ -63,7 +63,7 @@ def true_objects(options: TownOptions) -> TrueObjects:
     Returns
     -------
     TrueObjects
-        In the town's coordinates (metres).
+        In the town's coordinates (meters).
     """
     plan, half = make_plan(int(options.seed)), options.size / 2
     square = np.array([(p * half, q * half) for p in (-1, 1) for q in (-1, 1)]) @ plan.turn

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..base.jit import device, njit
 
-#: Side of a voxel, metres.
+#: Side of a voxel, meters.
 SIDE = 1.5
 #: The greatest extent of a cluster in voxels: it grows with the points in a column, as clusters touch where they are many.
 EXTENT, EXTENT_GROWTH, LARGEST_EXTENT = 3, 0.3, 10
@@ -24,7 +24,7 @@ WEAK = 0.02
 SCALES, SPACINGS = 2, 1.6
 #: Levels of voxels above and below 0, and their bits in a key.
 LEVELS, BITS = 1 << 21, 22
-#: How far away, in metres, points can decide whether a point is of a small cluster: a component in full and its density.
+#: How far away, in meters, points can decide whether a point is of a small cluster: a component in full and its density.
 CLUSTER_REACH = (LARGEST_EXTENT + 3 * BLOCK + 2) * SIDE
 
 
@@ -79,7 +79,7 @@ def voxels(column, row, level, left, bottom, w):
 
 @njit
 def surroundings(keys, counts, w, h):
-    """For each block: the usual number of points in a column, and the spacing of points in metres (over 3 x 3 blocks)."""
+    """For each block: the usual number of points in a column, and the spacing of points in meters (over 3 x 3 blocks)."""
     bh, bw = h // BLOCK, w // BLOCK
     points, full = np.zeros((bh, bw), np.int64), np.zeros((bh, bw), np.int64)
     seen = np.zeros((h, w), np.bool_)

@@ -32,11 +32,11 @@ from .minima import cell_numbers
 from .patches import patches
 
 LOW, HIGH = NOISE
-#: The gap in metres grows by this with each point of a cluster, and with the spacing of points beyond DENSE metres.
+#: The gap in meters grows by this with each point of a cluster, and with the spacing of points beyond DENSE meters.
 GAP_OF_POINT, GAP_GROWTH, DENSE = 0.1, 10.0, 0.55
 #: The least columns within which nothing is as high, and so many spacings of points.
 ASIDE, SPACINGS_ASIDE = 3, 2.5
-#: Columns within which wires are looked for, so many of which show one, and how high they hang at least, metres.
+#: Columns within which wires are looked for, so many of which show one, and how high they hang at least, meters.
 IN_LINE, WIRES, HANGING = 14, 4, 5.0
 #: A line has others at so many places of three columns each, and such a share of all that is suspect near.
 STRUNG, STRUNG_SHARE = 4, 0.5
@@ -44,7 +44,7 @@ STRUNG, STRUNG_SHARE = 4, 0.5
 SCATTERS = 4.0
 #: The same of echoes from just below, the share of `depth` that is enough there, and the most such columns in 5 x 5.
 JUST_SCATTERS, JUST, TOGETHER = 5.0, 0.8, 4
-#: Heights beyond this, in metres, are noise whatever else there is.
+#: Heights beyond this, in meters, are noise whatever else there is.
 _HIGHEST = 1e6
 
 
@@ -64,15 +64,15 @@ def detached_noise(
     Parameters
     ----------
     x, y, z : array_like, shape (n,)
-        Coordinates in metres; or `x` alone, of shape (n, 3).
+        Coordinates in meters; or `x` alone, of shape (n, 3).
     mask : array_like of bool, shape (n,), optional
         Points to look at; the others are as good as not there, and get 0.
     cluster : int, default 60
         The most points of a cluster of noise.
     gap : float, default 2.5
-        How far above everything near high noise lies at least, metres; more in clouds below 3 points/m2.
+        How far above everything near high noise lies at least, meters; more in clouds below 3 points/m2.
     depth : float, default 1.0
-        How far below the ground low noise lies at least, metres; more where that is rough.
+        How far below the ground low noise lies at least, meters; more where that is rough.
     report : dict, optional
         Receives the counts ``low`` and ``high``.
 
@@ -109,7 +109,7 @@ def detached_noise(
     return codes
 
 
-#: How far away, in metres, points can change what a point is: the halo a tile needs.
+#: How far away, in meters, points can change what a point is: the halo a tile needs.
 REACH = (2 * FAR + 4) * SIDE + CLUSTER_REACH
 
 

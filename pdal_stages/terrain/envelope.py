@@ -13,7 +13,7 @@ NEAR, WIDER = 6, 13
 ENOUGH = 12
 #: Columns within which other ground is looked for, and so many of them show that a deep place is ground.
 FAR, COMPANY = 20, 4
-#: A column of ground has so many others of its level, in metres, in the 5 x 5 round it, and such a share of those.
+#: A column of ground has so many others of its level, in meters, in the 5 x 5 round it, and such a share of those.
 SUPPORT, SUPPORT_SHARE, LEVEL = 2, 0.2, 1.0
 
 

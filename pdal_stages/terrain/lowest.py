@@ -15,12 +15,12 @@ from .openings import HOLE
 #: Cells within which a lone low cell looks for company, and within which smooth surroundings are judged.
 COMPANY, SURROUNDINGS = 20, 4
 
-#: A pit has fewer than `NEED` other cells within `LEVEL` + `GRADE` x distance of its height (metres).
+#: A pit has fewer than `NEED` other cells within `LEVEL` + `GRADE` x distance of its height (meters).
 NEED, LEVEL, GRADE = 4, 1.0, 0.15
 #: Cells with points that must be in view before a cell may be called lonely.
 IN_VIEW = 12
-#: Or it lies `DROP` metres below all but a `SHARE` of the cells around, if these are smooth: from the lowest
-#: eighth to the middle no more than `SPREAD` metres, and `MANY`.
+#: Or it lies `DROP` meters below all but a `SHARE` of the cells around, if these are smooth: from the lowest
+#: eighth to the middle no more than `SPREAD` meters, and `MANY`.
 DROP, SPREAD, SHARE, MANY = 3.0, 0.75, 0.15, 10
 
 
@@ -51,7 +51,7 @@ def lowest_points(z, x, y, use, column, row, left, bottom, grid):
 
 @njit
 def cell_values(x, y, z, cell, grid):
-    """Place in the cell (from its centre, in cells) and height of each cell's lowest point."""
+    """Place in the cell (from its center, in cells) and height of each cell's lowest point."""
     h, w = grid.shape
     place = np.zeros((h, w, 3))
     raster = np.full((h, w), HOLE, np.float32)
@@ -128,7 +128,7 @@ def _below_smooth(raster, out):
 
 
 def pits(raster: np.ndarray, cell: float) -> np.ndarray:
-    """Cells (h, w) of a minimum grid whose lowest point is a low outlier, from float32 heights, holes ``inf``; in metres."""
+    """Cells (h, w) of a minimum grid whose lowest point is a low outlier, from float32 heights, holes ``inf``; in meters."""
     out = np.zeros(raster.shape, np.uint8)
     offsets, distances = _by_distance(COMPANY)
     _lonely(raster, offsets, distances, cell, out)

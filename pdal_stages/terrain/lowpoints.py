@@ -9,7 +9,7 @@ from .lowest import lowest_points
 from .minima import cell_numbers
 from .patches import patches
 
-#: Heights beyond this, in metres, are no terrain, and too much for the sums.
+#: Heights beyond this, in meters, are no terrain, and too much for the sums.
 HIGHEST = 1e6
 #: Groups of points farther apart, in cells, are worked on apart.
 _APART = 128
@@ -22,7 +22,7 @@ def lowest_of_cells(
     use: NDArray[np.bool_],
     cell: float,
 ) -> NDArray[np.int64]:
-    """Numbers of the points that are the lowest usable ones of their cells, ascending; metres, finite coordinates."""
+    """Numbers of the points that are the lowest usable ones of their cells, ascending; meters, finite coordinates."""
     use = use & (np.abs(z) < HIGHEST)
     mine = np.flatnonzero(use)
     if not mine.size:

@@ -1,7 +1,7 @@
 """Height above a coarse terrain: the minima of a grid, interpolated [W18 section 3.2].
 
 The terrain is the lowest point of each cell of a coarse grid (20 m), interpolated
-bilinearly between cell centres and evaluated on a fine grid (0.5 m); a point's height is
+bilinearly between cell centers and evaluated on a fine grid (0.5 m); a point's height is
 its z minus the value of the fine cell it falls in. Both grids are anchored to absolute
 coordinates (``floor(x / cell)``), so every tile of a survey sees the same cells. No raster
 is held: the fine value is computed where a point falls, and only cells with points and
@@ -76,7 +76,7 @@ class MinimaTerrain:
         return terrain
 
     def at(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-        """Terrain height where points fall: bilinear, at the centre of their fine cell; NaN for those not finite.
+        """Terrain height where points fall: bilinear, at the center of their fine cell; NaN for those not finite.
 
         NoTerrainError if no point formed a terrain.
         """
@@ -111,7 +111,7 @@ class MinimaTerrain:
     def _filled(self, keys: NDArray[np.int64]) -> NDArray[np.float64]:
         """Values of the cells `keys`; empty ones from the filled ones about as near as the nearest.
 
-        Weights are one over the fourth power of the distance between cell centres. [W18] does not say what becomes
+        Weights are one over the fourth power of the distance between cell centers. [W18] does not say what becomes
         of empty cells.
         """
         place = np.minimum(np.searchsorted(self._keys, keys), self._keys.size - 1)
@@ -126,9 +126,9 @@ class MinimaTerrain:
             nearest = tree.query(wanted_at, k=1)[0]
             # All filled cells within reach of the nearest one: a set, so the outcome
             # does not depend on how a search tree orders equal distances.
-            for at, centre, radius in zip(empty, wanted_at, nearest + 1.5, strict=True):
-                near = np.sort(tree.query_ball_point(centre, radius))
-                squared = ((filled_at[near] - centre) ** 2).sum(axis=1)
+            for at, center, radius in zip(empty, wanted_at, nearest + 1.5, strict=True):
+                near = np.sort(tree.query_ball_point(center, radius))
+                squared = ((filled_at[near] - center) ** 2).sum(axis=1)
                 weight = 1.0 / squared**2  # distance to the fourth power
                 values[at] = np.dot(weight, self._minima[near]) / weight.sum()
             self.report["interpolated_cells"] = int(empty.size)
@@ -150,7 +150,7 @@ def hag_minima(
     Parameters
     ----------
     x, y, z : array_like, shape (n,)
-        Coordinates in metres (or any one unit, with `cell` and `resolution` in it too); or `x` alone, of shape (n, 3).
+        Coordinates in meters (or any one unit, with `cell` and `resolution` in it too); or `x` alone, of shape (n, 3).
     cell : float, default 20
         Side of the coarse cells whose lowest points form the terrain.
     resolution : float, default 0.5
@@ -214,9 +214,9 @@ def terrain_reach(
     cells = np.unique(np.concatenate([low + np.array([a, b]) for a in (0, 1) for b in (0, 1)]), axis=0)
     nearest = cKDTree(filled).query(cells)[0]
     radius = np.where(nearest > 0, nearest + 1.5, 0.0)[:, None] + 0.5  # whole cells around it
-    centre = cells + 0.5
-    below = np.asarray(box[:2]) - (centre - radius) * cell
-    above = (centre + radius) * cell - np.asarray(box[2:])
+    center = cells + 0.5
+    below = np.asarray(box[:2]) - (center - radius) * cell
+    above = (center + radius) * cell - np.asarray(box[2:])
     return float(max(0.0, below.max(), above.max()))
 
 

@@ -6,7 +6,7 @@ point is ground if it lies within `threshold` plus `scalar` times the terrain's 
 
 * the grid is anchored to absolute coordinates and every step reaches a bounded way (:func:`reach`), so that a tile
   with its halo gets the bits of the whole cloud, and so does any order of the points;
-* windows grow to the size of large halls, and a drop of a few metres is enough there (:mod:`.progressive`);
+* windows grow to the size of large halls, and a drop of a few meters is enough there (:mod:`.progressive`);
 * holes are left open, not painted over; a pyramid of planes carries the surface across them (:mod:`.planes`);
 * ground that openings took from ridges, dams and the upper side of walls is regained where it continues the surface;
 * what is higher than all around it on every side is no ground (:mod:`.plateaus`);
@@ -41,7 +41,7 @@ from .plateaus import remove_plateaus
 from .profile import above_opening, opening_names, opening_radius
 from .progressive import objects_of
 
-#: Blocks, in metres, from which the surface is made: that for telling ground, and that of the heights.
+#: Blocks, in meters, from which the surface is made: that for telling ground, and that of the heights.
 _NEAR, _FAR = 8.0, 32.0
 #: How often ground is regained.
 _ROUNDS = 3
@@ -49,7 +49,7 @@ _ROUNDS = 3
 _MOST_CELLS = 300
 #: Points handed to a thread at a time.
 _SPAN = 1 << 17
-#: Sums of coordinates are whole numbers of this part of a metre, so that order does not matter.
+#: Sums of coordinates are whole numbers of this part of a meter, so that order does not matter.
 _PARTS = 2.0**20
 
 
@@ -74,19 +74,19 @@ def filtered_ground(
     Parameters
     ----------
     x, y, z : array_like, shape (n,)
-        Coordinates in metres; or `x` alone, of shape (n, 3).
+        Coordinates in meters; or `x` alone, of shape (n, 3).
     mask : array_like of bool, shape (n,), optional
         Points that may be ground, e.g. all but noise; the others only receive heights.
     cell : float, default 1
-        Side of the grid's cells, metres.
+        Side of the grid's cells, meters.
     slope : float, default 0.15
         Rise over run: a window of radius r removes what it lowers by more than `slope` times r, or by 3.5 m.
     window : float, default 75
-        Radius of the largest window, metres: half the width of the largest building.
+        Radius of the largest window, meters: half the width of the largest building.
     threshold, scalar : float, default 0.5 and 1.25
-        A point is ground within `threshold` + `scalar` times the terrain's slope of the surface, metres.
+        A point is ground within `threshold` + `scalar` times the terrain's slope of the surface, meters.
     openings : sequence of float
-        Windows, in metres, of openings of the minimum grid above which heights are wanted too.
+        Windows, in meters, of openings of the minimum grid above which heights are wanted too.
     slope_too : bool
         Whether the slope of the terrain is wanted.
     threads : int, optional
@@ -149,7 +149,7 @@ def filtered_ground(
 
 
 def reach(*, cell: float = 1.0, window: float = 75.0, openings: Sequence[float] = ()) -> float:
-    """How far away, in metres, points can change a point's results: the halo a tile needs.
+    """How far away, in meters, points can change a point's results: the halo a tile needs.
 
     An opening looks twice its radius away, a plateau as far as it is wide; low outliers are judged before, and surfaces
     led through ground after it.
@@ -161,7 +161,7 @@ def reach(*, cell: float = 1.0, window: float = 75.0, openings: Sequence[float] 
 
 
 def reach_of_points(cell: float) -> float:
-    """How far away, in metres, more than the lowest points of cells matters: those of :func:`.lowpoints.lowest_of_cells`
+    """How far away, in meters, more than the lowest points of cells matters: those of :func:`.lowpoints.lowest_of_cells`
     are enough beyond.
     """
     return (planes_reach(_levels(_FAR, cell)) + 4) * cell

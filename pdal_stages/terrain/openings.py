@@ -1,7 +1,7 @@
 """Morphological openings of a raster with holes, by octagons of growing radius.
 
-A hole is ``+inf``: erosion passes over it, and no window is centred on one, so an opening is the highest
-level that a window centred on measured cells reaches. Octagons (squares and diamonds taken in turn) treat
+A hole is ``+inf``: erosion passes over it, and no window is centered on one, so an opening is the highest
+level that a window centered on measured cells reaches. Octagons (squares and diamonds taken in turn) treat
 ridges alike whatever their direction, as discs do, but fall apart into lines, so an opening costs the
 logarithm of its radius.
 """
@@ -30,7 +30,7 @@ def opening_radii(largest: int) -> list[int]:
 
 @device
 def _higher(a, b, out):
-    """Element by element maximum; a function of its own, or the compiler does not vectorise it."""
+    """Element by element maximum; a function of its own, or the compiler does not vectorize it."""
     for i in range(len(out)):
         out[i] = a[i] if a[i] > b[i] else b[i]
 

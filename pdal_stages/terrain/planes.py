@@ -1,7 +1,7 @@
 """A surface through scattered ground heights: planes on a pyramid of blocks, coarse to fine.
 
 Every block of the pyramid (a cell, 2 x 2 cells, 4 x 4, ...; anchored to absolute coordinates) has a plane at
-its centre: a least squares fit to the ground of the 3 x 3 blocks round it, held by what the planes of the
+its center: a least squares fit to the ground of the 3 x 3 blocks round it, held by what the planes of the
 four nearest blocks of the next coarser level say there. Where ground is dense the finest level decides;
 across a hole the finest level that sees its rim does. The reach is bounded (:func:`reach`), sums are taken
 in a fixed tree, so the same ground gives the same bits whatever lies further away.
@@ -44,7 +44,7 @@ def _add(total, m, dx, dy, weight):
 
 @njit
 def _moments_of_cells(ground, place, left, bottom, out, out_left, out_bottom):
-    """n, x, y, xx, xy, yy, z, xz, yz of the ground of each block of 2 x 2 cells, about its centre."""
+    """n, x, y, xx, xy, yy, z, xz, yz of the ground of each block of 2 x 2 cells, about its center."""
     one = np.ones(9)
     for j in range(ground.shape[0]):
         for i in range(ground.shape[1]):
@@ -71,7 +71,7 @@ def _moments_of_blocks(fine, left, bottom, size, out, out_left, out_bottom):
 def blend(planes, i, j, s, t, size):
     """Height and gradient of the four planes round a place, weighted by nearness; NaN where none is known.
 
-    The place lies `s` and `t` (0 to 1) blocks of `size` cells beyond the centre of block (j, i): given apart, so that
+    The place lies `s` and `t` (0 to 1) blocks of `size` cells beyond the center of block (j, i): given apart, so that
     rounding does not depend on where the array begins.
     """
     height, across, along, total = 0.0, 0.0, 0.0, 0.0
@@ -157,7 +157,7 @@ def _fit(moments, size, planes):
 
 @njit
 def _from_parents(parents, parents_left, parents_bottom, size, left, bottom, planes):
-    """What the planes of blocks of twice the `size` say at the centres of blocks of `size`."""
+    """What the planes of blocks of twice the `size` say at the centers of blocks of `size`."""
     for j in range(planes.shape[0]):
         for i in range(planes.shape[1]):
             # A left child lies 3/4 of the way from the block before its parent's, a right one 1/4 beyond its parent.
@@ -189,9 +189,9 @@ def surface(
     bottom: int,
     levels: int,
 ) -> np.ndarray:
-    """Planes at the centres of all cells (h, w, 3): height, gradient per cell; NaN beyond the reach of all measured cells.
+    """Planes at the centers of all cells (h, w, 3): height, gradient per cell; NaN beyond the reach of all measured cells.
 
-    `ground` (h, w) says which cells hold ground, `place` (h, w, 3) where it is: from the cell's centre, in cells, and its
+    `ground` (h, w) says which cells hold ground, `place` (h, w, 3) where it is: from the cell's center, in cells, and its
     height; `floor` (h, w) is the level to take where no ground is near, `raster` (h, w) is not finite where nothing was
     measured. `left` and `bottom` number the first column and row from the origin of the coordinates. There are
     `levels` coarser levels, at least 1.

@@ -12,13 +12,13 @@ import numpy as np
 from ..base.jit import device, njit
 from .openings import HOLE
 
-#: The widest roof, in metres along either axis.
+#: The widest roof, in meters along either axis.
 WIDEST = 200.0
-#: Two cells are linked across a step of so many metres, or of so much per metre of their distance.
+#: Two cells are linked across a step of so many meters, or of so much per meter of their distance.
 STEP, GRADE = 0.75, 0.3
 #: How far apart cells are linked, and how far beyond an edge ground is looked for, in cells.
 LINK, BEYOND = 4, 8
-#: A jump down has more than so many metres, and more than so much per metre of distance.
+#: A jump down has more than so many meters, and more than so much per meter of distance.
 JUMP, WALL = 1.5, 0.75
 #: The share of a set's cells that must have been taken for ground: a few are more likely ground among treetops.
 FOOTING = 0.05
@@ -127,7 +127,7 @@ def _take(number, plateau, level, ground, floor):
 def remove_plateaus(ground: np.ndarray, floor: np.ndarray, raster: np.ndarray, cell: float) -> None:
     """Take plateaus from the `ground` (h, w) of a minimum grid; what lies around them becomes their `floor`.
 
-    `raster` (h, w) holds the heights, in metres like `cell`, a cell's side; ground is measured everywhere.
+    `raster` (h, w) holds the heights, in meters like `cell`, a cell's side; ground is measured everywhere.
     """
     number = np.empty(ground.shape, np.int64)
     count = _linked(raster, cell, number)

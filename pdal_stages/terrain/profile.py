@@ -10,7 +10,7 @@ from ..base.jit import njit
 
 
 def opening_radius(window: float, cell: float) -> int:
-    """Radius in cells of a window of about `window` metres, the middle cell counted."""
+    """Radius in cells of a window of about `window` meters, the middle cell counted."""
     return max(1, round((window / cell - 1) / 2))
 
 
@@ -21,7 +21,7 @@ def opening_names(windows: Sequence[float]) -> list[str]:
 
 @njit
 def above_opening(x, y, z, cell, left, bottom, opening, fallback, out):
-    """z minus the opening, bilinear between the centres of measured cells; `fallback` where there is none."""
+    """z minus the opening, bilinear between the centers of measured cells; `fallback` where there is none."""
     h, w = opening.shape
     for p in range(len(x)):
         u, v = x[p] / cell - 0.5, y[p] / cell - 0.5

@@ -28,7 +28,7 @@ def objects_of(
 ) -> tuple[np.ndarray, np.ndarray, Mapping[int, np.ndarray]]:
     """Cells that an opening lowers by more than `slope` times its radius, or than `LARGEST_DROP`.
 
-    `raster` is the minimum grid (h, w), float32, with holes; it and `cell`, a cell's side, are in metres. `window` is the
+    `raster` is the minimum grid (h, w), float32, with holes; it and `cell`, a cell's side, are in meters. `window` is the
     largest radius and `keep` lists radii whose openings are wanted, in cells. Returned are the objects (h, w), what the
     opening that showed an object left there (elsewhere the cell's own height), and the openings of `keep`.
     """

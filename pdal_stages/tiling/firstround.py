@@ -1,6 +1,6 @@
 """A round before the tiles: every point is read once, and what a far-reaching stage needs of it is kept.
 
-Filtered ground looks half a kilometre around a tile, but at points far away it needs the lowest ones of cells alone. So
+Filtered ground looks half a kilometer around a tile, but at points far away it needs the lowest ones of cells alone. So
 each tile's own points are read first, with the surroundings that the stages before need (noise is marked before heights
 are made), and the lowest are written into a file. Then a tile reads the points near it, and is given those of the files.
 """
@@ -25,7 +25,7 @@ from .sources import InputSource
 from .store import left_file
 from .tileplan import FirstRound
 
-#: Of what is read for a tile, so much is given from the files too, in metres: the same points, and so no harm.
+#: Of what is read for a tile, so much is given from the files too, in meters: the same points, and so no harm.
 _OVERLAP = 0.01
 
 
@@ -57,7 +57,7 @@ class FirstRoundTask:
 def left_around(
     folder: str, grid: TileGrid, tile: tuple[int, int], unit: float, read_m: float, far_m: float
 ) -> NDArray[np.float64]:
-    """What is left of points up to `far_m` metres around a tile and not within the `read_m` that are read: (n, 3)."""
+    """What is left of points up to `far_m` meters around a tile and not within the `read_m` that are read: (n, 3)."""
     box = grid.box(tile)
     found = [np.empty((0, 3))]
     for other in grid.covering(grid.box(tile, far_m / unit)):
@@ -79,7 +79,7 @@ def left_around(
 
 
 def _outside(points: NDArray[np.float64], box: Box, unit: float) -> NDArray[np.float64]:
-    """How far points (n, 3), in metres, lie outside a box in the unit of the coordinates, along the farther axis."""
+    """How far points (n, 3), in meters, lie outside a box in the unit of the coordinates, along the farther axis."""
     x0, y0, x1, y1 = (side * unit for side in box)
     x, y = points[:, 0], points[:, 1]
     return np.maximum(np.maximum(x0 - x, x - x1), np.maximum(y0 - y, y - y1))

@@ -34,7 +34,7 @@ class RunContext:
 
     plan: TilePlan
     grid: TileGrid
-    unit: float  #: metres per unit of the coordinates
+    unit: float  #: meters per unit of the coordinates
     bounds: Box  #: of all inputs
     threads: int
     most_points: int  #: a tile is not read with wider surroundings that hold more
@@ -46,7 +46,7 @@ class HeadRun:
     """What a run of the head gave."""
 
     results: list[PieceResults]
-    need: float  #: the metres of surroundings that it took
+    need: float  #: the meters of surroundings that it took
     notes: list[str] = field(default_factory=list)  #: warnings and notes
 
 
@@ -109,7 +109,7 @@ def run_head(
 
 
 def run_first(context: RunContext, cuts: list[Piece], first: FirstRound) -> NDArray[np.float64]:
-    """What the first round leaves of a tile's own points, after the stages before the one that wants it: (n, 3), metres."""
+    """What the first round leaves of a tile's own points, after the stages before the one that wants it: (n, 3), meters."""
     marks = _marks(cuts, context)
     with Callbacks() as callbacks:
         stages = _marked(callbacks, cuts, marks)
@@ -208,7 +208,7 @@ class _Mark:
 
 
 class _Reach:
-    """Finds how far an open-ended stage reached for what is used of its results: up to `later` metres outside the tile."""
+    """Finds how far an open-ended stage reached for what is used of its results: up to `later` meters outside the tile."""
 
     def __init__(self, box: Box, later: float) -> None:
         self.box, self.later, self.need = box, later, 0.0

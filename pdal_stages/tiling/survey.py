@@ -52,7 +52,7 @@ class Survey:
             raise OptionError("--per file needs LAS or LAZ inputs", cure="Use --per tile")
         #: ``file`` or ``tile``: what one output is made of.
         self.per = options.per if options.per != "auto" else "file" if files else "tile"
-        self.unit = self._unit(plan)  #: metres per unit of the coordinates
+        self.unit = self._unit(plan)  #: meters per unit of the coordinates
         self.halo = plan.halo_m / self.unit  #: surroundings of a tile, in the unit of the coordinates
         self._place()
         #: With the tiles' side and the workers settled.

@@ -32,7 +32,7 @@ class TileTask:
     tile: tuple[int, int]
     #: Inputs that may hold points of it or its surroundings; EPT sources have no index.
     sources: list[tuple[InputSource, CloudIndex | None]]
-    complete: float  #: metres around the tile up to which these are all the inputs there are
+    complete: float  #: meters around the tile up to which these are all the inputs there are
     result: str  #: file for the results, where outputs are put together from tiles
     outputs: list[str] | None  #: otherwise: what each of the writers writes
     afar: str  #: the folder of what the first round left

@@ -47,8 +47,8 @@ class FirstRound:
     """What a stage that looks far is given of points far away, made in tiles before: see :mod:`.firstround`."""
 
     at: int  #: number of the stage in the head
-    halo_m: float  #: metres of surroundings that the stages before it need
-    far_m: float  #: metres around a tile within which it needs what is left of points
+    halo_m: float  #: meters of surroundings that the stages before it need
+    far_m: float  #: meters around a tile within which it needs what is left of points
 
 
 @dataclass(frozen=True)
@@ -57,11 +57,11 @@ class TilePlan:
 
     readers: list[dict[str, Any]]  #: as given
     head: list[dict[str, Any]]  #: stages that see neighbors: run on a tile and its surroundings
-    later: list[float]  #: metres outside the tile within which the results of each of them are still used
+    later: list[float]  #: meters outside the tile within which the results of each of them are still used
     #: Stages that look at single points, and the writers: run on the points of one output.
     tail: list[dict[str, Any]]
-    halo_m: float  #: metres of surroundings
-    sees_m: float  #: metres around a tile within which any point may matter
+    halo_m: float  #: meters of surroundings
+    sees_m: float  #: meters around a tile within which any point may matter
     #: Dimensions the head changes; None where PDAL's filters in it make that unknown.
     creates: list[str] | None
     unit: str  #: `horizontal_unit` of our stages, empty for the spatial reference's
@@ -106,7 +106,7 @@ class _Step:
 
 
 def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
-    """Check that a pipeline can be run in tiles, and cut it; `buffer`: how far PDAL's filters look, metres.
+    """Check that a pipeline can be run in tiles, and cut it; `buffer`: how far PDAL's filters look, meters.
 
     Raises
     ------

@@ -62,7 +62,7 @@ ODD = {
     "one stray point 1e6 m up": np.vstack([random(300), [[10.0, 10.0, 1e6]]]),
     "a gap of water wider than a cell": np.vstack([random(200), random(200) + [90.0, 0.0, 0.0]]),
     "a pit 30 m deep": np.vstack([random(300, size=(60.0, 60.0, 0.1)), [[30.0, 30.0, -30.0]]]),
-    "coordinates one millimetre apart": random(300) / 1000.0,
+    "coordinates one millimeter apart": random(300) / 1000.0,
 }
 
 
@@ -299,7 +299,7 @@ WKT = {
 WKT["us-ft"] = WKT["metre"].replace('UNIT["metre",1]', 'UNIT["US survey foot",0.304800609601219]')
 UP = 'VERT_CS["height",VERT_DATUM["sea",2005],UNIT["%s",%s],AXIS["Up",UP]]'
 WKT["compound, feet up"] = f'COMPD_CS["both",{WKT["metre"]},{UP % ("foot", "0.3048")}]'
-WKT["compound, metres up"] = f'COMPD_CS["both",{WKT["us-ft"]},{UP % ("metre", "1")}]'
+WKT["compound, meters up"] = f'COMPD_CS["both",{WKT["us-ft"]},{UP % ("metre", "1")}]'
 WKT["compound, geographic"] = f'COMPD_CS["both",{WKT["degree"]},{UP % ("metre", "1")}]'
 
 
@@ -309,13 +309,13 @@ WKT["compound, geographic"] = f'COMPD_CS["both",{WKT["degree"]},{UP % ("metre", 
         ("no spatial reference", None, 1.0, 1.0),
         ("a projected reference in metres", "metre", 1.0, 1.0),
         ("a projected reference in US survey feet", "us-ft", 0.304800609601219, 0.304800609601219),
-        ("a compound reference: metres, heights in feet", "compound, feet up", 1.0, 0.3048),
-        ("a compound reference: feet, heights in metres", "compound, metres up", 0.304800609601219, 1.0),
+        ("a compound reference: meters, heights in feet", "compound, feet up", 1.0, 0.3048),
+        ("a compound reference: feet, heights in metres", "compound, meters up", 0.304800609601219, 1.0),
     ],
 )
 def test_references(cell, tmp_path, write_las, case, wkt, across, up):
-    metres = random(300, size=(30.0, 30.0, 8.0))
-    xyz = metres / [across, across, up]
+    meters = random(300, size=(30.0, 30.0, 8.0))
+    xyz = meters / [across, across, up]
     arrays = {"X": xyz[:, 0], "Y": xyz[:, 1], "Z": xyz[:, 2]}
     source = write_las(tmp_path / "in.las", arrays, point_format=6, wkt=WKT[wkt] if wkt else None, scale=1e-6)
     path = job(tmp_path, str(source), HAG, {**FEATURES, "neighborhoods": "s2", "feature_set": "HeightRange"},
@@ -325,11 +325,11 @@ def test_references(cell, tmp_path, write_las, case, wkt, across, up):
     )
     assert ("metres were assumed" in done.err) == (wkt is None)
     out = laspy.read(tmp_path / "out.las")
-    expected = ps.hag_minima(*metres.T) / up
+    expected = ps.hag_minima(*meters.T) / up
     # A point on the border of a fine cell may fall on either side of it after conversion.
     assert np.mean(np.abs(np.asarray(out["HeightAboveGround"]) - expected) < 1e-3) > 0.97
-    near = cKDTree(metres).query_ball_point(metres, 2.0)
-    ranges = [np.ptp(metres[rows, 2]) for rows in near]  # metres, whatever the file's unit
+    near = cKDTree(meters).query_ball_point(meters, 2.0)
+    ranges = [np.ptp(meters[rows, 2]) for rows in near]  # meters, whatever the file's unit
     assert np.mean(np.abs(np.asarray(out["HeightRange_s2"]) - ranges) < 1e-3) > 0.97
 
 

@@ -158,7 +158,7 @@ def test_only_gps_time(cell, tmp_path, write_las, model):
     source = write_las(
         tmp_path / "in.las", {**scene(), "GpsTime": np.linspace(1e8, 1e8 + 5, 600)}, point_format=1
     )
-    cell("LAS files", "GPS time and no colours").runs(
+    cell("LAS files", "GPS time and no colors").runs(
         ["pipeline", pipeline(tmp_path, source, model)], "times are kept"
     )
     assert np.array_equal(check(tmp_path).gps_time, np.linspace(1e8, 1e8 + 5, 600))

@@ -13,15 +13,15 @@ from conftest import scene
 from robustness_kit import job
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from test_references import DEGREES, FEET, METRES, OTHER
+from test_references import DEGREES, FEET, METERS, OTHER
 
 pytestmark = pytest.mark.pdal
 HAG = {"type": "filters.hag_minima"}
 
 PAIRS = [
-    ("metres beside feet", METRES, FEET, ["different units of length"]),
-    ("metres beside degrees", METRES, DEGREES, ["degrees", "b.las"]),
-    ("two zones of one projection", METRES, OTHER, ["different reference systems"]),
+    ("metres beside feet", METERS, FEET, ["different units of length"]),
+    ("metres beside degrees", METERS, DEGREES, ["degrees", "b.las"]),
+    ("two zones of one projection", METERS, OTHER, ["different reference systems"]),
     ("feet beside no reference", FEET, None, ["different units of length", "no reference says otherwise"]),
 ]
 

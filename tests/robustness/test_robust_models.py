@@ -196,7 +196,7 @@ def test_trained_in_feet(cell, tmp_path, write_las, cloud):
     model = trained(tmp_path, source)
     cell("Models", "model trained on points in feet, applied to metres").runs(
         ["classify", cloud, tmp_path / "out.las", "--model", model],
-        "classes: features are metres whatever the file's unit",
+        "classes: features are meters whatever the file's unit",
     )
     assert (
         np.mean(np.asarray(laspy.read(tmp_path / "out.las").classification) == scene()["Classification"])
