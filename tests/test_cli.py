@@ -67,7 +67,7 @@ def test_pipeline_with_overrides(job, tmp_path, capsys):
     assert code == 0, err
     assert len(laspy.read(out)) == 800
     assert json.loads((tmp_path / "m.json").read_text())["metadata"]["filters.hag_minima"]["cells"] == 9
-    assert "metres were assumed" in err
+    assert "meters were assumed" in err
 
 
 @pytest.mark.parametrize(
