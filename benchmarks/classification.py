@@ -284,7 +284,7 @@ def main() -> None:
     parser.add_argument("--leaf", type=int, default=TrainingOptions.min_samples_leaf)
     parser.add_argument("--prior-weight", type=float, default=TrainingOptions.prior_weight)
     parser.add_argument("--max-features", type=number, default=TrainingOptions.max_features)
-    parser.add_argument("--smooth", type=float, default=0.0, help="radius in metres")
+    parser.add_argument("--smooth", type=float, default=0.0, help="radius in meters")
     parser.add_argument("--target", type=int, help="binary: this class against the rest")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int)

@@ -125,7 +125,7 @@ def main() -> None:
     )
     options.add_argument("--cloud", default="town", help="town, delft, montpellier, oakland, or a file")
     options.add_argument("--points", type=int, default=500_000, help="of the town")
-    options.add_argument("--density", type=float, default=7.0, help="of the town, per square metre")
+    options.add_argument("--density", type=float, default=7.0, help="of the town, per square meter")
     options.add_argument("--json", type=Path)
     given = options.parse_args()
     cloud = load(given.cloud, given.points, given.density)

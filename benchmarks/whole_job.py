@@ -168,7 +168,7 @@ def main() -> None:
     )
     options.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir(), "pdal-stages-whole-job"))
     options.add_argument("--sizes", type=float, nargs="+", help="millions of points")
-    options.add_argument("--densities", type=float, nargs="+", help="points per square metre")
+    options.add_argument("--densities", type=float, nargs="+", help="points per square meter")
     options.add_argument("--parts", action="store_true")
     options.add_argument("--model", help="a model file, or standard; by default one is trained")
     options.add_argument("--repeats", type=int, default=3)

@@ -314,8 +314,8 @@ def _parser() -> argparse.ArgumentParser:
 
     takes = add("demo", _demo, "Generate a town, train on one half, classify the other")
     takes("folder", nargs="?", default="pdal-stages-demo", help="Where results go")
-    takes("--size", type=float, default=200.0, help="Side of the town in metres")
-    takes("--density", type=float, default=7.0, help="Points per square metre")
+    takes("--size", type=float, default=200.0, help="Side of the town in meters")
+    takes("--density", type=float, default=7.0, help="Points per square meter")
     takes("--seed", type=int, default=1)
 
     takes = add(

@@ -68,7 +68,7 @@ def test_a_log_file(cloud, tmp_path, run):
     assert run([cloud, {"type": "filters.hag_minima", "cell": -1}, tmp_path / "o.las"], "--log", log)[0] == 1
     lines = log.read_text().splitlines()
     assert "pipeline" in lines[0] and "--log" in lines[0] and lines[0][:4].isdigit()
-    assert any("metres were assumed" in line for line in lines)
+    assert any("meters were assumed" in line for line in lines)
     assert any("must be a number above 0" in line for line in lines)
     assert [line.split(" ", 2)[2].split(" after")[0] for line in lines if "exit code" in line] == [
         "exit code 0",

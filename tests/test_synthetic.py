@@ -286,7 +286,7 @@ def test_command(tmp_path, capsys):
     out = tmp_path / "t.laz"
     assert synthetic.main([str(out), "--points", "5000", "--density", "4", "--origin", "0", "0", "9"]) == 0
     said = capsys.readouterr().out
-    assert "Ground" in said and "per square metre" in said
+    assert "Ground" in said and "per square meter" in said
     assert len(laspy.read(out)) == pytest.approx(5000, rel=0.1) and laspy.read(out).x.min() < 1
 
 

@@ -385,7 +385,7 @@ def test_sparse_points_widen_the_surroundings(tmp_path, random_cloud, write_las)
     ps.Pipeline(pipeline).execute(arrays=False)
     pipeline[-1] = {**pipeline[-1], "filename": str(tmp_path / "b.las")}
     run = run_tiled(pipeline, 60, workers=0)
-    assert not run.failures and not [note for note in run.notes if "metres were assumed" not in note]
+    assert not run.failures and not [note for note in run.notes if "meters were assumed" not in note]
     assert any(job.report["widened"] for job in run.tiles)
     clouds.same_points(tmp_path / "a.las", tmp_path / "b.las")
     pipeline[-1] = {**pipeline[-1], "filename": str(tmp_path / "c.las")}

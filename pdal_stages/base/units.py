@@ -76,7 +76,7 @@ def units_of_wkt(
         projected = root.find("PROJCS", "PROJCRS", "PROJECTEDCRS", "LOCAL_CS", "ENGCRS")
         if projected is None and root.find("GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "GEODCRS", "GEODETICCRS"):
             raise StageError(
-                "the coordinates are geographic (degrees); neighborhoods and grids need metres",
+                "the coordinates are geographic (degrees); neighborhoods and grids need meters",
                 found=root.name or wkt[:60],
                 cure=reprojection_cure(root.name, place),
             )

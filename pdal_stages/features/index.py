@@ -86,7 +86,7 @@ def check_xyz(xyz, what: str = "xyz") -> np.ndarray:
             cure="Use np.column_stack([points['X'], points['Y'], points['Z']])",
         )
     if array.dtype.kind not in "fiu" or (array.dtype.kind == "f" and array.dtype.itemsize < 4):
-        raise StageError(f"'{what}' must hold float64 coordinates in metres", found=f"dtype {array.dtype}")
+        raise StageError(f"'{what}' must hold float64 coordinates in meters", found=f"dtype {array.dtype}")
     if array.ndim != 2 or array.shape[1] != 3:
         cure = "Rows are points: one column each for x, y and z"
         if array.ndim == 2 and array.shape[0] == 3:

@@ -19,14 +19,14 @@ COVARIANCE = {
     "Omnivariance": "cube root of e1 e2 e3",
     "Anisotropy": "(e1 - e3) / e1",
     "Eigenentropy": "-(e1 ln e1 + e2 ln e2 + e3 ln e3), 0 ln 0 = 0",
-    "EigenvalueSum": "l1 + l2 + l3, square metres",
+    "EigenvalueSum": "l1 + l2 + l3, square meters",
     "SurfaceVariation": "e3",
 }
 GEOMETRIC = {
     "Density": "points per square meter of the cylinder's base, or per cubic meter of the sphere",
     "Verticality": "1 - |nz|, n the unit eigenvector of l3",
-    "HeightRange": "highest minus lowest z, metres",
-    "HeightStd": "standard deviation of z (divisor n), metres",
+    "HeightRange": "highest minus lowest z, meters",
+    "HeightStd": "standard deviation of z (divisor n), meters",
     "Radius": "the chosen size in meters; kopt, ropt and copt only",
 }
 #: What the papers' sets of features lack, and "all" therefore leaves out.

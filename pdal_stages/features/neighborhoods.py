@@ -179,7 +179,7 @@ def _sized(text: str, head: str, size: float) -> Neighborhood:
             raise OptionError(f"k must be a whole number from 1 to {MAX_K}", found=text)
         return Neighborhood("knn", (size,))
     if not (MIN_RADIUS <= size <= MAX_RADIUS):
-        raise OptionError(f"a radius must be from {MIN_RADIUS} to {MAX_RADIUS:g} metres", found=text)
+        raise OptionError(f"a radius must be from {MIN_RADIUS} to {MAX_RADIUS:g} meters", found=text)
     return Neighborhood("cylinder" if head == "c" else "sphere", (_rounded(size),))
 
 

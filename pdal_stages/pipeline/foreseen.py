@@ -35,7 +35,7 @@ def check_dimensions(lowered: Lowered) -> None:
         moved = [s for s in before if s.get("type") == "filters.reprojection"]
         if moved and _DEGREES.search(str(moved[-1].get("out_srs", ""))):
             raise PipelineError(
-                "the points are in degrees here; neighborhoods and grids need metres",
+                "the points are in degrees here; neighborhoods and grids need meters",
                 where=ours.place,
                 found=f"filters.reprojection to {moved[-1]['out_srs']}",
                 cure="Put the reprojection after the stages of pdal_stages, or reproject to a projected reference",

@@ -112,7 +112,7 @@ of Z.
             self.windows = [float(size) for size in self.openings]
         except ValueError:
             raise OptionError(
-                "option 'openings' must list widths in metres", found=", ".join(map(str, self.openings))
+                "option 'openings' must list widths in meters", found=", ".join(map(str, self.openings))
             ) from None
         try:
             check_sizes(self.cell, self.slope, self.window, self.threshold, self.scalar, self.windows)

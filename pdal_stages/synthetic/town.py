@@ -34,13 +34,13 @@ def _option(default, what: str, low=None, high=None):
 class TownOptions:
     """How to make a town; wrong values raise an OptionError."""
 
-    size: float = _option(200.0, "side of the square, metres", 20, 20_000)
+    size: float = _option(200.0, "side of the square, meters", 20, 20_000)
     density: float = _option(7.0, "returns per square meter, met within a few per cent", 0.05, 500)
     seed: int = _option(1, "another number, another town", 0, 2**31 - 1)
-    altitude: float = _option(350.0, "flying height, metres", 150, 4_000)
+    altitude: float = _option(350.0, "flying height, meters", 150, 4_000)
     scan_angle: float = _option(25.0, "half opening of the scanner, degrees", 3, 35)
     overlap: float = _option(0.3, "share of a swath seen twice", 0, 0.8)
-    noise: float = _option(0.02, "standard deviation of a range, metres", 0, 0.5)
+    noise: float = _option(0.02, "standard deviation of a range, meters", 0, 0.5)
     origin: tuple = _option((500_000.0, 5_400_000.0, 60.0), "x, y of the low corner; height of the quays")
     srs: str = _option("EPSG:25832", "of files: EPSG:25828 to EPSG:25838, or none")
 

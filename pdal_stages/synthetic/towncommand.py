@@ -48,6 +48,6 @@ def main(argv: list[str] | None = None) -> int:
     total = sum(counts.values())
     for code, count in counts.items():
         print(f"{code:>4}  {class_name(code):<26}{count:>13,}  {100 * count / total:5.1f} %")
-    density = f"{total / options.size**2:.2f} per square metre"
+    density = f"{total / options.size**2:.2f} per square meter"
     print(f"{output}: {total:,} points, {density}, {time.monotonic() - started:.1f} s")
     return 0

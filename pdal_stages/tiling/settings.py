@@ -67,7 +67,7 @@ class TilingOptions:
             )
         checks.one_of("--per", self.per, PER)
         if self.buffer is not None:
-            checks.number("--buffer", self.buffer, 0, unit="metres")
+            checks.number("--buffer", self.buffer, 0, unit="meters")
         checks.whole("--retries", self.retries, 0)
         cores = available_threads()
         if self.workers is not None and self.workers > cores:

@@ -307,10 +307,10 @@ WKT["compound, geographic"] = f'COMPD_CS["both",{WKT["degree"]},{UP % ("metre", 
     ("case", "wkt", "across", "up"),
     [
         ("no spatial reference", None, 1.0, 1.0),
-        ("a projected reference in metres", "metre", 1.0, 1.0),
+        ("a projected reference in meters", "metre", 1.0, 1.0),
         ("a projected reference in US survey feet", "us-ft", 0.304800609601219, 0.304800609601219),
         ("a compound reference: meters, heights in feet", "compound, feet up", 1.0, 0.3048),
-        ("a compound reference: feet, heights in metres", "compound, meters up", 0.304800609601219, 1.0),
+        ("a compound reference: feet, heights in meters", "compound, meters up", 0.304800609601219, 1.0),
     ],
 )
 def test_references(cell, tmp_path, write_las, case, wkt, across, up):
@@ -321,9 +321,9 @@ def test_references(cell, tmp_path, write_las, case, wkt, across, up):
     path = job(tmp_path, str(source), HAG, {**FEATURES, "neighborhoods": "s2", "feature_set": "HeightRange"},
                {"type": "writers.las", "filename": str(tmp_path / "out.las"), "extra_dims": "all", "minor_version": 4})  # fmt: skip
     done = cell("Clouds", case).runs(
-        ["pipeline", path], "metres are assumed, and it says so" if wkt is None else "lengths are converted"
+        ["pipeline", path], "meters are assumed, and it says so" if wkt is None else "lengths are converted"
     )
-    assert ("metres were assumed" in done.err) == (wkt is None)
+    assert ("meters were assumed" in done.err) == (wkt is None)
     out = laspy.read(tmp_path / "out.las")
     expected = ps.hag_minima(*meters.T) / up
     # A point on the border of a fine cell may fall on either side of it after conversion.

@@ -19,8 +19,8 @@ pytestmark = pytest.mark.pdal
 HAG = {"type": "filters.hag_minima"}
 
 PAIRS = [
-    ("metres beside feet", METERS, FEET, ["different units of length"]),
-    ("metres beside degrees", METERS, DEGREES, ["degrees", "b.las"]),
+    ("meters beside feet", METERS, FEET, ["different units of length"]),
+    ("meters beside degrees", METERS, DEGREES, ["degrees", "b.las"]),
     ("two zones of one projection", METERS, OTHER, ["different reference systems"]),
     ("feet beside no reference", FEET, None, ["different units of length", "no reference says otherwise"]),
 ]

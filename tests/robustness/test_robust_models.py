@@ -194,7 +194,7 @@ def test_trained_in_feet(cell, tmp_path, write_las, cloud):
         feet[axis] = feet[axis] / 0.304800609601219
     source = write_las(tmp_path / "feet.las", feet, point_format=6, wkt=WKT["us-ft"], scale=1e-4)
     model = trained(tmp_path, source)
-    cell("Models", "model trained on points in feet, applied to metres").runs(
+    cell("Models", "model trained on points in feet, applied to meters").runs(
         ["classify", cloud, tmp_path / "out.las", "--model", model],
         "classes: features are meters whatever the file's unit",
     )
