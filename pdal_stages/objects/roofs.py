@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
+from ..base.unionfind import root as root_of
 
 
 def roof_cells(
@@ -67,16 +68,8 @@ def opened(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 @device
-def _root(parent, n):
-    while parent[n] != n:
-        parent[n] = parent[parent[n]]
-        n = parent[n]
-    return n
-
-
-@device
 def _unite(parent, a, b):
-    a, b = _root(parent, a), _root(parent, b)
+    a, b = root_of(parent, a), root_of(parent, b)
     if a < b:
         parent[b] = a
     elif b < a:
@@ -104,7 +97,7 @@ def connected(mask: NDArray, z: NDArray, step: float) -> NDArray:
     for r in range(rows):
         for c in range(columns):
             if mask[r, c]:
-                out[r, c] = _root(parent, r * columns + c)
+                out[r, c] = root_of(parent, r * columns + c)
     return out
 
 

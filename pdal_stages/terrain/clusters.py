@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..base.jit import device, njit
+from ..base.unionfind import root as root_of
 
 #: Side of a voxel, meters.
 SIDE = 1.5
@@ -105,14 +106,6 @@ def surroundings(keys, counts, w, h):
     return usual, spacing
 
 
-@device
-def _root(parent, k):
-    while parent[k] != k:
-        parent[k] = parent[parent[k]]
-        k = parent[k]
-    return k
-
-
 @njit
 def _small(keys, counts, table, usual, w, most):
     """Voxels of small components, and weak ones that no large component touches."""
@@ -135,7 +128,7 @@ def _small(keys, counts, table, usual, w, most):
             for s in range(13):
                 q = find(table, keys, keys[k] + step[s])
                 if q >= 0 and strong[q]:
-                    a, b = _root(parent, k), _root(parent, q)
+                    a, b = root_of(parent, k), root_of(parent, q)
                     if keys[a] < keys[b]:  # so that a component's first voxel stands for it
                         parent[b] = a
                     else:
@@ -143,7 +136,7 @@ def _small(keys, counts, table, usual, w, most):
     total = np.zeros(n, np.int64)
     box = np.empty((n, 6), np.int32)
     for k in range(n):
-        r = _root(parent, k)
+        r = root_of(parent, k)
         place, level = keys[k] >> BITS, keys[k] & (2 * LEVELS - 1)
         j, i = place // w, place % w
         if total[r] == 0:
@@ -158,7 +151,7 @@ def _small(keys, counts, table, usual, w, most):
     size = counts.astype(np.int64)
     for k in range(n):
         if strong[k]:
-            r = _root(parent, k)
+            r = root_of(parent, k)
             extent = max(box[r, 1] - box[r, 0], box[r, 3] - box[r, 2], box[r, 5] - box[r, 4])
             place = keys[r] >> BITS
             widest = EXTENT + EXTENT_GROWTH * usual[place // w // BLOCK, place % w // BLOCK]

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..base.jit import device, njit
+from ..base.jit import njit
+from ..base.unionfind import root as root_of
 from .openings import HOLE
 
 #: The widest roof, in meters along either axis.
@@ -32,14 +33,6 @@ def reach(cell: float) -> int:
     return int(WIDEST / cell) + 1 + LINK + BEYOND
 
 
-@device
-def _root(parent, i):
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = parent[i]
-    return i
-
-
 @njit
 def _linked(raster, cell, number):
     """Number the measured cells of each linked set alike; returns how many sets there are."""
@@ -56,14 +49,14 @@ def _linked(raster, cell, number):
                     if b * b + a * a > LINK * LINK or y >= h or x < 0 or x >= w or raster[y, x] == HOLE:
                         continue
                     if abs(raster[y, x] - here) <= max(STEP, GRADE * cell * np.sqrt(float(a * a + b * b))):
-                        one, other = _root(parent, j * w + i), _root(parent, y * w + x)
+                        one, other = root_of(parent, j * w + i), root_of(parent, y * w + x)
                         parent[max(one, other)] = min(one, other)
     count = 0
     for j in range(h):
         for i in range(w):
             number[j, i] = -1
             if raster[j, i] != HOLE:
-                root = _root(parent, j * w + i)
+                root = root_of(parent, j * w + i)
                 if root == j * w + i:
                     number[j, i] = count
                     count += 1
