@@ -108,6 +108,20 @@ def test_degenerate_clouds(rng, name, make):
     assert np.isfinite(values).all()
 
 
+@pytest.mark.parametrize("copies", [3, 40, 700])
+def test_points_of_one_place_coincide_wherever_it_is(rng, copies):
+    """Sums shared by a cell are taken about its center and moved to the query: what is left of that is no variance."""
+    places = rng.uniform(0, 2000, (300, 3)) + np.array([500_000, 5_400_000, 100])
+    xyz = np.tile(places, (copies, 1))
+    table = compute_features(xyz, np.arange(300), "c1,c3,s3", ["covariance", *oracle.GEOMETRIC])
+    alone = np.array([np.sum(np.hypot(*(places - p)[:, :2].T) <= 3) == 1 for p in places])
+    assert alone.sum() > 200
+    for name in table.names:
+        if not name.startswith("Density"):
+            wanted = np.float32(1 / 3) if name.startswith("SurfaceVariation") else 0
+            assert (table[name][alone] == wanted).all(), name
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
 def test_few_points(count, rng):
     check(rng.uniform(0, 1, (count, 3)), np.arange(count), radii=(0.5, 3.0))

@@ -204,7 +204,7 @@ def write_columns(table, radius, heights, few, copies, columns, out):
             for row in range(MOMENTS):
                 moments[row, j] = table[row, start + j]
         part = slice(start, start + count)
-        values = finish(moments, count, volumes, heights[part], few, copies[part])
+        values = finish(moments, count, volumes, 0.0, heights[part], few, copies[part])
         for f in range(FEATURES):
             if columns[f] >= 0:
                 for j in range(count):

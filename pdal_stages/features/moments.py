@@ -34,7 +34,8 @@ WIDTH = BATCH + 8
 TOP = np.int64(0x7FF0000000000000)
 BOTTOM = np.int64(-0x7FF0000000000001)
 
-#: A variance below this part of the mean squared distance to the query is rounding: the points coincide.
+#: A variance below this part of the mean squared distance to the query is rounding: the points coincide. Where moments were
+#: taken about another point than the query first, the squared distance to that counts as well.
 COINCIDENT = 1e-13
 
 
@@ -125,7 +126,7 @@ def add_shared(inner, dx, dy, dz, out, j):
 
 
 @device
-def finish(moments, count, volumes, heights, few, copies):
+def finish(moments, count, volumes, moved, heights, few, copies):
     """The thirteen features made of moments, of `count` neighborhoods, from their moments.
 
     Parameters
@@ -136,6 +137,8 @@ def finish(moments, count, volumes, heights, few, copies):
         How many: at most BATCH.
     volumes : (count,) float64 array
         Area of the cylinder's base or volume of the sphere: what Density divides by.
+    moved : float
+        How far, squared, moments may have been moved by :func:`add_shared`; 0 where none were.
     heights : (count,) float64 array
         z of the queries.
     few : (1,) int64 array
@@ -166,7 +169,7 @@ def finish(moments, count, volumes, heights, few, copies):
         xy = moments[SXY, j] * inverse - mx * my
         xz = moments[SXZ, j] * inverse - mx * mz
         yz = moments[SYZ, j] * inverse - my * mz
-        apart = xx + yy + zz > COINCIDENT * (ax + ay + az)
+        apart = xx + yy + zz > COINCIDENT * (ax + ay + az + moved)
         l1, l2, l3, nz = eigen3(xx, xy, xz, yy, yz, zz)
         real = (n >= 3.0) & apart
         f = covariance_features(n if apart else 0.0, l1, l2, l3)

@@ -149,10 +149,14 @@ def radius_block(
                 number = wanted[k, kind]
                 if number >= 0:
                     volumes[:] = math.pi * r * r if kind == 0 else 4.0 / 3.0 * math.pi * r * r * r
+                    moved = (
+                        r * r if kind == 0 else 0.0
+                    )  # points that all queries of a cell share are within r
                     tally = few[number : number + 1]
                     values = finish(
-                        moments[number], stop - start, volumes, qz[start:stop], tally, copies[start:stop]
-                    )
+                        moments[number], stop - start, volumes, moved, qz[start:stop], tally,
+                        copies[start:stop],
+                    )  # fmt: skip
                     for f in range(FEATURES):
                         column = columns[number, f]
                         if column >= 0:
