@@ -102,7 +102,7 @@ def judge(model: Model, test: TrainingCloud, merged: dict | None, threads: int, 
             "margin": round(area(-found.margin[known], wrong), 3),
             "reliability": round(area(-found.reliability[known], wrong), 3),
         },
-        "report": {k: v for k, v in found.report.items() if k.startswith("batches")},
+        "report": {k: v for k, v in found.report.figures.items() if k.startswith("batches")},
     }
     if found.variance is not None:
         out["errors_found_by"]["variance"] = round(area(found.variance[known], wrong), 3)

@@ -105,8 +105,8 @@ def test_averages_equal_a_hand_computation():
     for i, part in enumerate(each):
         np.testing.assert_allclose(found.result[i], np.mean(part, axis=0), rtol=1e-9)
         np.testing.assert_allclose(found.variance[i], np.var(part, axis=0).mean(), rtol=1e-6, atol=1e-12)
-    assert predicted.report["batches"] == len(circles)
-    assert predicted.report["batches_per_point"]["least"] == coverage(circles).min()
+    assert predicted.report.figures["batches"] == len(circles)
+    assert predicted.report.figures["batches_per_point"]["least"] == coverage(circles).min()
     assert found.variance[coverage(circles) > 1].max() > 0
 
 
@@ -131,7 +131,7 @@ def test_order_of_points_threads_and_rows_do_not_matter():
     assert np.array_equal(part.probabilities[where], whole.probabilities[where])
     assert not part.probabilities[~where].any() and not part.variance[~where].any()
     assert (part.classification[~where] == 9).all()
-    assert part.report["batches"] < whole.report["batches"]
+    assert part.report.figures["batches"] < whole.report.figures["batches"]
     top = np.sort(whole.probabilities, axis=1)
     np.testing.assert_allclose(whole.margin, top[:, -1] - top[:, -2], atol=1e-6)
 
@@ -157,7 +157,7 @@ def test_small_and_empty_clouds():
     one = model.predict(np.array([[5.0, 5.0, 5.0]]), {}, variance=True)
     assert one.classified == 1 and one.variance[0] == 0.0
     same = model.predict(np.ones((700, 3)), {})  # more than a batch at one place
-    assert same.report["batches_per_point"]["least"] >= 1
+    assert same.report.figures["batches_per_point"]["least"] >= 1
 
 
 def test_missing_dimension_and_coordinates_that_are_none():

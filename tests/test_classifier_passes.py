@@ -126,7 +126,7 @@ def test_smoothing_rejection_and_empty_clouds(two, other):
     some = two.predict(xyz, dimensions, reject_below=0.7, rejected_code=30)
     assert low.sum() > 0 and (some.classification[low] == 30).all() and some.rejected == low.sum()
     calm = two.predict(xyz, dimensions, smooth=1.0)
-    assert calm.report["smooth"] == 1.0 and (calm.classification == label).mean() > 0.8
+    assert calm.report.figures["smooth"] == 1.0 and (calm.classification == label).mean() > 0.8
     assert len(two.predict(np.zeros((0, 3)), {"HeightAboveGround": np.zeros(0)}).classification) == 0
     lone = two.predict(np.array([[1e6, 2e6, 3.0]]), {"HeightAboveGround": np.zeros(1)})
     assert lone.classified == 1
@@ -192,6 +192,7 @@ def test_hostile_passes_are_refused(two, tmp_path, edit):
 
 def test_a_pass_may_come_from_elsewhere(two, other):
     """The first pass may be any classifier of clouds: here one that hands over all points at once, like a network."""
+    from pdal_stages.base.report import Report
     from pdal_stages.classifier.algorithms import Block, PredictResult
     from pdal_stages.classifier.passes import Passes
 
@@ -205,7 +206,7 @@ def test_a_pass_may_come_from_elsewhere(two, other):
             for block in predicted.blocks:
                 p[block.rows] = block.result
             rows = slice(None) if request.rows is None else request.rows
-            return PredictResult([Block(rows, finish(p[rows]))], {"batches": 1})
+            return PredictResult([Block(rows, finish(p[rows]))], Report({"batches": 1}))
 
     xyz, _, dimensions = other
     model = type(two)((two.passes[0],), two.classes, two.info)
@@ -214,7 +215,7 @@ def test_a_pass_may_come_from_elsewhere(two, other):
     inner = (np.abs(xyz[:, :2] - 30) < 8).all(axis=1)
     part = everything(model, xyz, dimensions, inner)
     same(everything(two, xyz, dimensions), part, inner, inner)
-    assert part.report["batches"] == 1
+    assert part.report.figures["batches"] == 1
 
 
 def test_folds_are_strips_or_whole_surveys():

@@ -95,4 +95,4 @@ def test_prediction():
         np.testing.assert_allclose(calm.margin[rows], top[:, -1] - top[:, -2], atol=1e-6)
         if mask is not None:
             assert not calm.probabilities[~where].any() and not calm.classification[~where].any()
-        assert calm.report["smooth"] == 1.0 and "smooth" not in raw.report
+        assert calm.report.figures["smooth"] == 1.0 and "smooth" not in raw.report.figures

@@ -84,7 +84,7 @@ def test_another_place_is_classified(trained, other):
     assert np.allclose(result.margin, p[:, -1] - p[:, -2], atol=1e-6)
     assert np.array_equal(trained.codes[result.probabilities.argmax(axis=1)], result.classification)
     assert result.classified == len(xyz) and result.rejected == 0
-    assert sum(result.report["classes"].values()) == len(xyz)
+    assert sum(result.report.figures["classes"].values()) == len(xyz)
 
 
 def test_equals_sklearn_on_the_same_features(other, monkeypatch):
@@ -167,7 +167,7 @@ def test_where_keeps_the_rest_which_still_are_neighbors(trained, other):
     assert np.array_equal(part.reliability[where], whole.reliability[where])
     assert np.array_equal(part.classification[~where], current[~where])
     assert not part.reliability[~where].any() and not part.probabilities[~where].any()
-    assert part.classified == where.sum() and part.report["outside_where"] == (~where).sum()
+    assert part.classified == where.sum() and part.report.figures["outside_where"] == (~where).sum()
     # Without them as neighbors the result near the line is another one.
     alone = trained.predict(xyz[where], {k: v[where] for k, v in dimensions.items()})
     assert not np.array_equal(alone.reliability, whole.reliability[where])
@@ -194,11 +194,11 @@ def test_reject(trained, other):
         ({"current": np.full(len(xyz), 9), "rejected_code": 30}, 30),
     ):
         result = trained.predict(xyz, dimensions, reject_below=0.7, **keywords)
-        assert result.rejected == low.sum() == result.report["rejected"]
+        assert result.rejected == low.sum() == result.report.figures["rejected"]
         assert (result.classification[low] == expected).all()
         assert np.array_equal(result.classification[~low], whole.classification[~low])
         assert np.array_equal(result.reliability, whole.reliability)
-        assert result.report["classified"] == (~low).sum()
+        assert result.report.figures["classified"] == (~low).sum()
     for bad in (-0.1, 1.1, float("nan"), True):
         with pytest.raises(OptionError, match="reject_below"):
             trained.predict(xyz, dimensions, reject_below=bad)
@@ -244,7 +244,7 @@ def test_return_ratio_and_intensity(other):
     assert accuracy(model.predict(xyz, dimensions), label) > 0.85
     dimensions = {**dimensions, "NumberOfReturns": dimensions["NumberOfReturns"].copy()}
     dimensions["NumberOfReturns"][:7] = 0
-    assert model.predict(xyz, dimensions).report["points_without_return_numbers"] == 7
+    assert model.predict(xyz, dimensions).report.figures["points_without_return_numbers"] == 7
     dimensions["NumberOfReturns"][:] = 0
     with pytest.raises(DimensionError, match="0 everywhere"):
         model.predict(xyz, dimensions)

@@ -82,15 +82,15 @@ def test_a_cloud_of_another_density_is_told(tmp_path):
     model = learnt(clouds(1))
     xyz, _, dimensions = scene(5, 3000)
     report = model.predict(xyz, dimensions).report
-    assert "warning" not in report and report["density"] == pytest.approx(3000 / 3600, rel=0.3)
+    assert not report.warnings and report.figures["density"] == pytest.approx(3000 / 3600, rel=0.3)
     some = thinned(np.repeat(xyz, 1, axis=0), 0.1, 1)
     report = model.predict(xyz[some], {k: v[some] for k, v in dimensions.items()}).report
-    assert "points/m2, the model was trained on" in report["warning"]
-    assert "fewer than three neighbors in s1" in report["warning"]
+    assert "points/m2, the model was trained on" in report.warnings[0]
+    assert "fewer than three neighbors in s1" in report.warnings[0]
     many = np.vstack([xyz + shift for shift in np.linspace(0, 0.1, 4)])
-    assert "warning" in model.predict(many, {"HeightAboveGround": many[:, 2]}).report
+    assert model.predict(many, {"HeightAboveGround": many[:, 2]}).report.warnings
     model.info.pop("densities")  # an older model does not say
-    assert "density" not in model.predict(xyz, dimensions).report
+    assert "density" not in model.predict(xyz, dimensions).report.figures
     model.save(tmp_path / "m")
     assert load_model(tmp_path / "m").info.get("densities") is None
 
@@ -230,7 +230,7 @@ def test_noise_is_not_even_a_neighbor(tmp_path):
     for name in ("classification", "reliability", "margin", "probabilities"):
         assert np.array_equal(getattr(found, name)[at], getattr(whole, name)), name
     assert (found.classification[gone[p]] == 9).all() and not found.reliability[gone[p]].any()
-    assert found.report["ignored"] == 500 and found.report["points"] == len(noisy)
+    assert found.report.figures["ignored"] == 500 and found.report.figures["points"] == len(noisy)
     where = noisy[:, 0] < 30
     part = clean.predict(noisy, more, where, ignore=gone, current=current)
     assert np.array_equal(

@@ -122,11 +122,11 @@ def slow(xyz, codes, height, ground, rules=RULES):
 def test_the_kernels_equal_the_slow_reference(seed):
     xyz, codes, height, ground, _ = scene(seed, 36, 6)
     codes[::97] = 9
-    report: dict = {}
-    found = consistent(xyz, codes, height=height, ground=ground, report=report)
+    figures: dict = {}
+    found = consistent(xyz, codes, height=height, ground=ground, figures=figures)
     want, counts = slow(xyz, codes, height, ground)
     assert np.array_equal(found, want)
-    assert report == counts and all(counts[rule] for rule in ("ground", "islands", "roofs", "facades"))
+    assert figures == counts and all(counts[rule] for rule in ("ground", "islands", "roofs", "facades"))
 
 
 # ---- what must hold -------------------------------------------------------------------------------------
@@ -145,9 +145,11 @@ def test_faults_are_mended():
 @pytest.mark.parametrize("rule", RULES)
 def test_each_rule_can_be_left_out(rule):
     xyz, codes, height, ground, _ = scene(5)
-    report: dict = {}
-    consistent(xyz, codes, height=height, ground=ground, rules=[r for r in RULES if r != rule], report=report)
-    assert rule not in report
+    figures: dict = {}
+    consistent(
+        xyz, codes, height=height, ground=ground, rules=[r for r in RULES if r != rule], figures=figures
+    )
+    assert rule not in figures
     assert np.array_equal(consistent(xyz, codes, height=height, ground=ground, rules=[]), codes)
 
 
@@ -206,13 +208,17 @@ def test_the_stage_counts_by_rule_and_says_what_it_lacks():
     stage = Consistency({"lone": False})
     points = stage.points(arrays)
     codes = stage.run(points)["Classification"]
-    assert points.report["ground"] > 100 and points.report["roofs"] > 10 and "lone" not in points.report
-    assert points.report["changed"] == (codes != arrays["Classification"]).sum()
-    assert points.report["classes"] == {str(c): int((codes == c).sum()) for c in (2, 5, 6)}
+    assert (
+        points.report.figures["ground"] > 100
+        and points.report.figures["roofs"] > 10
+        and "lone" not in points.report.figures
+    )
+    assert points.report.figures["changed"] == (codes != arrays["Classification"]).sum()
+    assert points.report.figures["classes"] == {str(c): int((codes == c).sum()) for c in (2, 5, 6)}
     assert (codes != truth).sum() < (arrays["Classification"] != truth).sum()
     bare = Consistency({}).points({k: v for k, v in arrays.items() if k in ("X", "Y", "Z", "Classification")})
     Consistency({}).run(bare)
-    assert bare.report["ground"] == 0 and "no HeightAboveGround" in bare.report["warning"]
+    assert bare.report.figures["ground"] == 0 and "no HeightAboveGround" in bare.report.warnings[0]
 
 
 def test_overlap_noise_and_where_keep_their_class():

@@ -261,11 +261,11 @@ def test_the_kernels_equal_the_slow_reference(seed, density):
 @pytest.mark.parametrize("seed", range(4))
 def test_noise_is_found_and_nothing_else(seed):
     xyz, truth = scene(seed)
-    report: dict = {}
-    found = detached_noise(xyz, report=report)
+    figures: dict = {}
+    found = detached_noise(xyz, figures=figures)
     assert (found[truth == 0] == 0).all()  # wires, courtyards and trees too
     assert (found == truth)[truth > 0].mean() > 0.95
-    assert report == {"low": int((found == 7).sum()), "high": int((found == 18).sum())}
+    assert figures == {"low": int((found == 7).sum()), "high": int((found == 18).sum())}
 
 
 @settings(max_examples=10, deadline=None)
@@ -360,7 +360,7 @@ def test_the_stage_keeps_classes_and_where_and_takes_codes():
     out = stage.run(points)["Classification"]
     assert (out[truth == 18] == 5).all() and (out[truth == 0] == 2).all()
     assert (out[truth == 7] == 65).mean() > 0.9
-    assert points.report["low"] == (out == 65).sum() and points.report["high"] == 0
+    assert points.report.figures["low"] == (out == 65).sum() and points.report.figures["high"] == 0
     assert stage.largest_class() == 65 and stage.creates() == {"Classification": "uint8_t"}
 
 
@@ -368,7 +368,10 @@ def test_what_is_noise_already_is_as_good_as_not_there():
     xyz, truth = scene(9)
     marked = DetachedNoise({}).points(arrays_of(xyz, truth))
     assert np.array_equal(DetachedNoise({}).run(marked)["Classification"], truth)
-    assert marked.report["ignored"] == (truth > 0).sum() and not marked.report["low"] + marked.report["high"]
+    assert (
+        marked.report.figures["ignored"] == (truth > 0).sum()
+        and not marked.report.figures["low"] + marked.report.figures["high"]
+    )
 
 
 @pytest.mark.pdal

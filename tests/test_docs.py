@@ -98,7 +98,7 @@ def test_the_worked_example_of_a_stage_works(monkeypatch):
     }
     points = made.points(arrays)
     assert made.run(points)["Classification"].tolist() == [3, 4, 5, 2, 4]
-    assert points.report["changed"] == 3
+    assert points.report.figures["changed"] == 3
     assert "medium" in stage.schema()["properties"]
 
 

@@ -466,14 +466,14 @@ def test_a_tile_gives_the_same_bits(reference):
     tile = np.flatnonzero(x < 15)
     part = again(xyz[tile], engine)
     got = part.table(np.searchsorted(tile, inside))
-    assert part.report["beyond_halo"] == {}
+    assert part.report.beyond_halo == {}
     assert np.array_equal(got.values, table.values[inside])
 
 
 def test_what_reaches_beyond_the_halo_is_counted():
     xyz = np.vstack([scattered(300, 15), [[500.0, 0.0, 0.0]] * 3])
     report = compute_features(xyz, neighborhoods="k10,kopt", feature_set="Density").report
-    assert report["beyond_halo"] == {"k10": 3, "kopt": 3}
+    assert report.beyond_halo == {"k10": 3, "kopt": 3}
 
 
 def test_a_different_seed_changes_shapes_only(reference):

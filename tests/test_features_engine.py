@@ -291,14 +291,14 @@ def test_progress_counts_queries(cloud):
 def test_report(cloud):
     far = np.vstack([cloud, cloud.max(axis=0) + 1000.0])
     table = compute_features(far, None, "c1,s0.5,kopt(5,30)", MOMENTS)
-    counts = table.report["fewer_than_three"]
+    counts = table.report.figures["fewer_than_three"]
     for token in ("c1", "s0.5"):
         suffix = token.replace(".", "_")
         volume = np.pi if token == "c1" else 4 / 3 * np.pi * 0.125
         assert counts[token] == np.count_nonzero(np.rint(table[f"Density_{suffix}"] * volume) < 3) > 0
     assert counts["kopt(5,30)"] == 0
-    assert table.report["points"] == table.report["queries"] == len(far)
-    assert table.report["beyond_halo"] == {"kopt(5,30)": 1}
+    assert table.report.figures["points"] == table.report.figures["queries"] == len(far)
+    assert table.report.beyond_halo == {"kopt(5,30)": 1}
 
 
 # ---- dimensions --------------------------------------------------------------------------------------------

@@ -201,7 +201,7 @@ def test_where_sees_classes_without_flags(write_las, tmp_path, model):
             "where": "Classification == 6",
         }
         run_ = ps.run_pipeline([str(source), {"type": "filters.hag_minima"}, stage])
-        classes.append(run_.reports[-1][1][-1]["where"])
+        classes.append(run_.reports[-1][1][-1].figures["where"])
     assert classes[0] == classes[1] == np.count_nonzero(flagged()["Classification"] == 6)
 
 

@@ -46,8 +46,8 @@ def test_ids_and_verdicts_of_points(town, tmp_path):
     assert ((np.asarray(las["ObjectVerdict"]) > 0) == (ids > 0)).all()
     one = ids == ids[codes == 6][0]
     assert len(np.unique(np.asarray(las["ObjectHeight"])[one])) == 1
-    report = job.reports[-1][1][-1]
-    assert report["buildings"]["objects"] == len(np.unique(ids[(ids >> np.uint64(50)) == 1]))
+    figures = job.reports[-1][1][-1].figures
+    assert figures["buildings"]["objects"] == len(np.unique(ids[(ids >> np.uint64(50)) == 1]))
 
 
 def test_tiles_give_the_same(town, tmp_path):

@@ -88,8 +88,8 @@ def test_ground_inside_becomes_the_class_and_nothing_else(tmp_path, suffix, epsg
     )
     certain = edge > (0.0 if epsg in (RD, None) else 0.01)
     assert np.array_equal(found[certain], want[certain]) and (want == 9).sum() > 300
-    assert report["polygons"] == {f"{path}=9": {"polygons": 2, "points": int((found == 9).sum())}}
-    assert ("note" in report) == (epsg is None)
+    assert report.figures["polygons"] == {f"{path}=9": {"polygons": 2, "points": int((found == 9).sum())}}
+    assert bool(report.notes) == (epsg is None)
 
 
 def test_other_classes_and_several_files_in_their_order(tmp_path):
@@ -117,7 +117,7 @@ def test_layers_of_a_file(tmp_path):
         run([f"{path}|layername=seas=9"], arrays)
     found, report = run([f"{path}|layername=islets=9"], arrays)
     assert np.array_equal(found == 9, inside(arrays, ISLET) & (arrays["Classification"] == 2))
-    assert list(report["polygons"]) == [f"{path}|layername=islets=9"]
+    assert list(report.figures["polygons"]) == [f"{path}|layername=islets=9"]
 
 
 def test_shapes_of_all_kinds(tmp_path):
@@ -138,7 +138,7 @@ def test_shapes_of_all_kinds(tmp_path):
     assert np.array_equal(found == 9, inside(arrays, *shapes) & (arrays["Classification"] == 2))
     found, report = run([f"{write(tmp_path / 'far.gpkg', [shapely.box(0, 0, 1, 1)])}=9"], arrays)
     assert np.array_equal(found, arrays["Classification"])
-    assert not next(iter(report["polygons"].values()))["points"]
+    assert not next(iter(report.figures["polygons"].values()))["points"]
 
 
 def test_points_on_an_edge_are_inside():

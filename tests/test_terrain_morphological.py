@@ -311,8 +311,8 @@ def test_a_roof_is_no_ground_whatever_its_width_and_steps():
 
 def test_ground_is_found_in_a_town_on_a_slope():
     x, y, z, height = town()
-    report = {}
-    found = filtered_ground(x, y, z, openings=(5, 17), slope_too=True, report=report)
+    figures = {}
+    found = filtered_ground(x, y, z, openings=(5, 17), slope_too=True, figures=figures)
     error = np.abs(found["HeightAboveGround"] - height)
     assert np.percentile(error[height == 0], 99) < 0.5
     assert np.median(error[height > 2]) < 0.5
@@ -320,8 +320,8 @@ def test_ground_is_found_in_a_town_on_a_slope():
     assert found["Ground"][height > 2].mean() < 0.02
     assert not found["Ground"][height < 0].any()
     assert np.median(found["Slope"]) == pytest.approx(np.degrees(np.arctan(0.2)), abs=3)
-    assert report["pits"] > 0 and report["without_terrain"] == 0
-    assert report["ground_points"] == found["Ground"].sum()
+    assert figures["pits"] > 0 and figures["without_terrain"] == 0
+    assert figures["ground_points"] == found["Ground"].sum()
     roofs = height == 7
     assert (
         np.median(found["HeightAboveOpening_5"][roofs]) < 1 < np.median(found["HeightAboveOpening_17"][roofs])
@@ -369,13 +369,13 @@ def test_a_tile_with_its_halo_gives_the_same_bits(origin):
 def test_pieces_and_threads_change_nothing(monkeypatch):
     x, y, z, _ = town(3, side=260, density=0.5)
     noise = np.random.default_rng(0).random(len(x)) < 0.05
-    whole, report = {}, {}
-    whole = filtered_ground(x, y, z, mask=~noise, threads=1, report=report, **SMALL)
+    whole, figures = {}, {}
+    whole = filtered_ground(x, y, z, mask=~noise, threads=1, figures=figures, **SMALL)
     monkeypatch.setattr(patches, "LARGEST", 1000)
     monkeypatch.setattr(patches, "SIDE", 64)
     again = {}
-    same(filtered_ground(x, y, z, mask=~noise, threads=2, report=again, **SMALL), whole)
-    assert again == report
+    same(filtered_ground(x, y, z, mask=~noise, threads=2, figures=again, **SMALL), whole)
+    assert again == figures
 
 
 @pytest.mark.parametrize("spacing", [40, 110, 160, 400])
@@ -397,8 +397,8 @@ def test_land_without_points_costs_nothing_and_changes_nothing(monkeypatch, spac
     monkeypatch.setattr(morphological, "pits", looked_at)
     monkeypatch.setattr(patches, "_FEW", 1 << 40)
     monkeypatch.setattr(patches, "LARGEST", 1 << 40)
-    report, again = {}, {}
-    whole = filtered_ground(x, y, z, report=report, **options)
+    figures, again = {}, {}
+    whole = filtered_ground(x, y, z, figures=figures, **options)
     assert len(shapes) == 1
     for few, largest, side in ((0, 1 << 40, 1024), (0, 20_000, 256)):
         shapes.clear()
@@ -406,8 +406,8 @@ def test_land_without_points_costs_nothing_and_changes_nothing(monkeypatch, spac
         monkeypatch.setattr(patches, "_EMPTY", 1)
         monkeypatch.setattr(patches, "LARGEST", largest)
         monkeypatch.setattr(patches, "SIDE", side)
-        same(filtered_ground(x, y, z, report=again, **options), whole)
-        assert again == report
+        same(filtered_ground(x, y, z, figures=again, **options), whole)
+        assert again == figures
         if spacing == 400:
             assert len(shapes) > 30
             assert sum(shapes) < 0.1 * 15**2 * spacing**2
@@ -437,14 +437,14 @@ def test_ignored_points_change_nothing_but_get_heights():
     x, y, z, _ = town(5, side=60)
     rng = np.random.default_rng(1)
     extra = rng.uniform(0, 60, (2, 50))
-    report = {}
+    figures = {}
     found = filtered_ground(
         np.append(x, extra[0]), np.append(y, extra[1]), np.append(z, np.full(50, -300.0)),
-        mask=np.arange(len(x) + 50) < len(x), report=report, **SMALL,
+        mask=np.arange(len(x) + 50) < len(x), figures=figures, **SMALL,
     )  # fmt: skip
     same({k: v[: len(x)] for k, v in found.items()}, filtered_ground(x, y, z, **SMALL))
     assert (found["HeightAboveGround"][len(x) :] < -350).all()
-    assert report["unused_points"] == 50
+    assert figures["unused_points"] == 50
 
 
 @pytest.mark.parametrize(
@@ -471,11 +471,11 @@ def test_nothing_not_finite_and_nothing_usable():
     found = filtered_ground([1.0, np.nan, 2.0], [1.0, 1.0, np.inf], [3.0, 4.0, 5.0])
     assert found["HeightAboveGround"][0] == 0 and np.isnan(found["HeightAboveGround"][1:]).all()
     assert found["Ground"].tolist() == [1, 0, 0]
-    report = {}
-    none = filtered_ground([1.0, 2.0], [1.0, 2.0], [3.0, 9.0], mask=[False, False], report=report)
-    assert none["HeightAboveGround"].tolist() == [0, 0] and report["without_terrain"] == 2
-    high = filtered_ground([1.0, 2.0], [1.0, 2.0], [3.0, 1e300], report=report)
-    assert high["HeightAboveGround"].tolist() == [0, 1e300] and report["unused_points"] == 1
+    figures = {}
+    none = filtered_ground([1.0, 2.0], [1.0, 2.0], [3.0, 9.0], mask=[False, False], figures=figures)
+    assert none["HeightAboveGround"].tolist() == [0, 0] and figures["without_terrain"] == 2
+    high = filtered_ground([1.0, 2.0], [1.0, 2.0], [3.0, 1e300], figures=figures)
+    assert high["HeightAboveGround"].tolist() == [0, 1e300] and figures["unused_points"] == 1
 
 
 def test_sizes_and_shapes_are_checked():

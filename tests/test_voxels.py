@@ -96,7 +96,7 @@ def test_members_get_the_same(model, how, tmp_path):
     points, place = few.members(np.arange(len(few.rows)))
     inside = where[points] & where[stands[place]]
     assert np.array_equal(found.reliability[points][inside], found.reliability[stands[place]][inside])
-    assert found.report["representatives"] == len(few.rows)
+    assert found.report.figures["representatives"] == len(few.rows)
     assert found.classified == where.sum()
     model.save(tmp_path / "m.model")
     again = load_model(tmp_path / "m.model")

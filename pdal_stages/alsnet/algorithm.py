@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from ..base import checks
 from ..base.errors import ModelError, OptionError, StageError
+from ..base.report import Report
 from ..base.threads import map_blocks, resolve_threads
 from ..classifier.algorithms import Block, Column, InputPlan, PredictRequest, PredictResult
 from ..classifier.arrays import ArrayRule
@@ -142,17 +143,18 @@ class AlsNet:
 
         Batches are computed side by side, as many as fit into the memory, at least one.
         """
-        values, notes = gather(
+        values, missing = gather(
             self.inputs,
             with_returns(self.inputs, request.xyz, request.dimensions, request.threads),
             len(request.xyz),
         )
-        report: dict[str, Any] = {name: number for name, number in notes.items() if number}
+        report = Report({name: number for name, number in missing.items() if number})
         if not request.count:
             return PredictResult((), report)
         mean, variance, counted = self._means(request, values)
         rows = slice(None) if request.rows is None else request.rows
-        return PredictResult([Block(rows, finish(mean), variance)], {**report, **counted})
+        report.figures |= counted
+        return PredictResult([Block(rows, finish(mean), variance)], report)
 
     def _means(
         self, request: PredictRequest, dimensions: Mapping[str, npt.ArrayLike]
@@ -203,12 +205,12 @@ class AlsNet:
         mean = total / np.maximum(count, 1)[:, None]
         variance = squares / np.maximum(count, 1) - (mean * mean).sum(axis=1)
         variance = np.where(count > 1, np.maximum(variance / self.n_classes, 0.0), 0.0)
-        report = {
+        counted = {
             "batches": len(numbers),
             "batches_per_point": {"mean": round(float(count.mean()), 2), "least": int(count.min())},
             "device": device,
         }
-        return mean, variance, report
+        return mean, variance, counted
 
 
 def _applied(net: AlsNet) -> tuple[Callable[[Pyramid], npt.NDArray[np.float64]], str]:

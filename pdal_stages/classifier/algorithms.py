@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError
 from ..base.outputs import Output
+from ..base.report import Report
 from ..features import FeaturePlan
 from .arrays import ArrayRule
 
@@ -84,7 +85,7 @@ class PredictResult:
     """Blocks that hold every point wanted once, and what was counted, complete when all blocks are read."""
 
     blocks: Iterable[Block]
-    report: dict[str, Any] = field(default_factory=dict)
+    report: Report = field(default_factory=Report)
 
 
 class Algorithm(Protocol):

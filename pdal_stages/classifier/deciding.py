@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base import checks
+from ..base.report import Report
 from .smoothing import FARTHEST
 
 #: The class of a rejected point where its old class is not known: ASPRS "Unclassified".
@@ -70,8 +71,8 @@ class Prediction:
         Variance of a class's probability over a network's batches, mean over the classes; 0 outside `where`.
     classified, rejected : int
         Points looked at, and those of them whose reliability was below `reject_below`.
-    report : dict
-        Counts for the metadata.
+    report : Report
+        Counts, notes and warnings for the metadata.
     """
 
     classification: npt.NDArray[np.uint8]
@@ -81,7 +82,7 @@ class Prediction:
     variance: npt.NDArray[np.float32] | None
     classified: int
     rejected: int
-    report: dict[str, Any]
+    report: Report
 
 
 class Decided(NamedTuple):
@@ -145,7 +146,7 @@ class Outcome:
         self.classification[rows] = np.where(low, instead, decided.code)
 
     def prediction(
-        self, rows: npt.NDArray[np.int64] | None, there: npt.NDArray[np.int64] | None, counted: dict[str, Any]
+        self, rows: npt.NDArray[np.int64] | None, there: npt.NDArray[np.int64] | None, counted: Report
     ) -> Prediction:
         """The result once all blocks are written.
 
@@ -156,15 +157,17 @@ class Outcome:
         count = n if rows is None else len(rows)
         given = self.classification if rows is None else self.classification[rows]
         code, number = np.unique(given, return_counts=True)
-        report = {
-            "points": n,
-            "classified": count - self.rejected,
-            "rejected": self.rejected,
-            "outside_where": n - ignored - count,
-            **({"ignored": ignored} if ignored else {}),
-            "classes": {str(int(c)): int(m) for c, m in zip(code, number, strict=True)},
-            **counted,
-        }
+        report = Report(
+            {
+                "points": n,
+                "classified": count - self.rejected,
+                "rejected": self.rejected,
+                "outside_where": n - ignored - count,
+                **({"ignored": ignored} if ignored else {}),
+                "classes": {str(int(c)): int(m) for c, m in zip(code, number, strict=True)},
+            }
+        )
+        report.merge(counted)
         return Prediction(
             self.classification, self.reliability, self.margin, self.probabilities, self.variance,
             count, self.rejected, report,

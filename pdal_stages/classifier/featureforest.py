@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError
+from ..base.report import Report
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.names import GROUPS, RELATIVE
 from .algorithms import Block, Column, PredictRequest, PredictResult
@@ -166,12 +168,12 @@ class CloudFeatures:
 
     def __init__(self, features: Features, request: PredictRequest) -> None:
         self.features, self._request = features, request
-        self.report: dict[str, Any] = {}
+        self.report = Report()
         self._engine: FeatureEngine | None = None
         names = features.plan.dimensions
         self._dimensions = with_returns(names, request.xyz, request.dimensions, request.threads)
-        _, notes = gather(names, self._dimensions, len(request.xyz), request.rows)
-        self.report.update({name: number for name, number in notes.items() if number})
+        _, counted = gather(names, self._dimensions, len(request.xyz), request.rows)
+        self.report.figures.update({name: number for name, number in counted.items() if number})
 
     def blocks(
         self,
@@ -193,7 +195,7 @@ class CloudFeatures:
             self._engine = self.features.engine(asked.xyz, asked.threads)
         engine = self._engine
         fed, _ = gather(self.features.plan.dimensions, self._dimensions, len(asked.xyz), rows)
-        before = {key: dict(value) for key, value in engine.report.items() if isinstance(value, dict)}
+        before = copy.deepcopy(engine.report)
         yield from engine.blocks(
             queries=rows,
             dimensions=fed,
@@ -203,11 +205,14 @@ class CloudFeatures:
             apply=apply,
         )
         if not counted:
-            engine.report.update(before)
+            engine.report = before
             return
-        for key in ("fewer_than_three", "beyond_halo"):
-            if any(engine.report.get(key, {}).values()):
-                self.report[key] = {token: number for token, number in engine.report[key].items() if number}
+        few = engine.report.figures["fewer_than_three"]
+        if any(few.values()):
+            self.report.figures["fewer_than_three"] = {
+                token: number for token, number in few.items() if number
+            }
+        self.report.beyond_halo.update(engine.report.beyond_halo)
 
 
 def check_names(plan: FeaturePlan, context: Sequence[str], entry: Mapping[str, Any]) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import DimensionError, ModelError, OptionError
+from ..base.report import Report
 from ..features import FeaturePlan
 from ..features.voxels import check_side, represent
 from . import modelfile, summary
@@ -270,35 +271,32 @@ class Model:
         if shares is not None and request.count:
             for part, p in _smoothed(xyz, asked, shares, how):
                 write(part, decide(p, codes, how))
-            predicted.report["smooth"] = how.smooth
+            predicted.report.figures["smooth"] = how.smooth
         if len(xyz) < count:
-            predicted.report["representatives"] = len(xyz)
-        predicted.report.update(self._density_report(xyz, request.count, predicted.report))
+            predicted.report.figures["representatives"] = len(xyz)
+        self._report_density(predicted.report, xyz, request.count)
         return outcome.prediction(rows, there, predicted.report)
 
-    def _density_report(
-        self, xyz: npt.NDArray[np.float64], count: int, report: Mapping[str, Any]
-    ) -> dict[str, Any]:
+    def _report_density(self, report: Report, xyz: npt.NDArray[np.float64], count: int) -> None:
         """How dense the cloud is; a warning where that is not what the model was trained for."""
         trained = self.info.get("densities")
         if trained is None or not count:
-            return {}
+            return
         found = density(xyz)
-        out: dict[str, Any] = {"density": round(found, 3)}
+        report.figures["density"] = round(found, 3)
         if out_of_range(found, trained):
             low, high = f"{trained['low']:.3g}", f"{trained['high']:.3g}"
-            lonely_in = report.get("fewer_than_three", {})
+            lonely_in = report.figures.get("fewer_than_three", {})
             token = max(lonely_in, key=lambda one: lonely_in[one], default="")
             lonely = (
                 f"; {100 * lonely_in[token] / count:.2g} % have fewer than three neighbors in {token}"
                 if lonely_in
                 else ""
             )
-            out["warning"] = (
+            report.warnings.append(
                 f"the cloud has {found:.3g} points/m2, the model was trained on "
                 f"{low if low == high else f'{low} to {high}'}{lonely}. Expect lower accuracy, or train with 'thin'"
             )
-        return out
 
 
 def load_model(path: str | os.PathLike) -> Model:

@@ -10,6 +10,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 import numpy.typing as npt
 
+from ..base.report import Report
 from .algorithms import Algorithm, Block, InputPlan, PredictRequest, PredictResult
 from .context import Context, around
 from .featureforest import CloudFeatures, Features
@@ -96,7 +97,7 @@ class PassRun:
     ) -> None:
         self._members, self._classes, self._request = members, classes, request
         self._factors = tuple(factors) or (None,) * len(members)
-        self.report: dict[str, Any] = {}
+        self.report = Report()
         rows = [request.rows]  # wanted of each pass
         for one in members[:0:-1]:
             rows.insert(0, around(request.xyz, rows[0], _context_of(one)))
@@ -112,7 +113,7 @@ class PassRun:
             if one.features is features or one.features.to_dict() == features.to_dict():
                 return one
         self._of_clouds.append(CloudFeatures(features, self._request))
-        self.report.update(self._of_clouds[-1].report)
+        self.report.merge(self._of_clouds[-1].report)
         return self._of_clouds[-1]
 
     def blocks(
@@ -129,8 +130,8 @@ class PassRun:
             if progress is not None:
                 progress.update(len(rows))
             yield rows, result
-        for one in self._of_clouds:
-            self.report.update(one.report)
+        for one in reversed(self._of_clouds):  # the last pass looks at what is asked for, others farther
+            self.report.merge(one.report)
 
     def _first(self) -> Iterator[Passed]:
         first = self._members[0]
@@ -142,7 +143,7 @@ class PassRun:
             every = np.arange(len(asked.xyz))
             for block in predicted.blocks:
                 yield Passed(every[block.rows], block.result, None)
-            self.report.update(predicted.report)
+            self.report.merge(predicted.report)
             return
         blocks = self._features_of(first.features).blocks(
             self._rows[0], self._handing_on(0), 1.0 - _KEPT, shown=False

@@ -150,17 +150,17 @@ class Run:
         self,
         compute: Callable[[tuple[int, int]], tuple[np.ndarray, Any, int, Tally]],
         progress: Any,
-        tell: Callable[[int, Tally], None],
+        count: Callable[[int, Tally], None],
     ) -> Iterator[tuple[np.ndarray, Any]]:
-        """Rows and results of the blocks as threads finish them; `tell` hears how many queries each had, and its tally."""
+        """Rows and results of the blocks as threads finish them; `count` gets the queries of each, and its tally."""
         blocks = list(zip(self.starts[:-1].tolist(), self.starts[1:].tolist(), strict=True))
         own = Progress(len(self.grid), "features") if progress is True else None
         bar = own if own is not None else progress or None
         try:
-            for rows, result, count, tally in map_blocks(compute, blocks, self.threads):
-                tell(count, tally)
+            for rows, result, number, tally in map_blocks(compute, blocks, self.threads):
+                count(number, tally)
                 if bar is not None:
-                    bar.update(count)
+                    bar.update(number)
                 yield rows, result
         finally:
             if own is not None:

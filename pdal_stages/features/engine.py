@@ -13,6 +13,7 @@ import numpy.typing as npt
 from ..base import checks
 from ..base.errors import OptionError, StageError, optional_import, suggest
 from ..base.progress import Progress
+from ..base.report import Report
 from ..base.threads import map_blocks, resolve_threads
 from .blocks import Fitted, Run, Tally, compile_once
 from .index import CellGrid, build_grid, check_xyz
@@ -46,11 +47,10 @@ class FeatureEngine:
     ----------
     bins, copt_threshold
         As given or fitted.
-    report : dict
-        Counts so far: ``points`` of the cloud, ``queries`` computed, ``fewer_than_three`` (by neighborhood,
-        queries whose neighborhood had fewer than three points, so that eigen-features are 0), ``beyond_halo``
-        (by neighborhood, queries whose k nearest reach farther than ``plan.halo``: in a tile with that
-        halo they may differ from the whole cloud).
+    report : Report
+        So far: ``points`` of the cloud, ``queries`` computed, ``fewer_than_three`` (by neighborhood, queries
+        whose neighborhood had fewer than three points, so that eigen-features are 0); and, beyond ``plan.halo``,
+        queries whose k nearest reach farther.
 
     Raises
     ------
@@ -88,9 +88,7 @@ class FeatureEngine:
         self._grid: CellGrid = build_grid(self._cloud, plan.cell)
         self._lock = threading.RLock()
         self._parts: tuple[FixedRadius, AdaptiveNeighborhoods | None] | None = None
-        self.report: dict[str, Any] = {"points": len(self._grid), "queries": 0, "fewer_than_three": {}}
-        if plan.unbounded:
-            self.report["beyond_halo"] = {}
+        self.report = Report({"points": len(self._grid), "queries": 0, "fewer_than_three": {}})
 
     def __len__(self) -> int:
         return len(self._grid)
@@ -211,7 +209,7 @@ class FeatureEngine:
             rows = positions if run.indices is None else run.indices[positions]
             return rows, values if apply is None else apply(values, rows), len(rows), tally
 
-        yield from run.iterate(compute, progress, self._tell)
+        yield from run.iterate(compute, progress, self._count)
 
     def table(
         self,
@@ -231,7 +229,7 @@ class FeatureEngine:
             values[positions] = part  # blocks are disjoint
             return positions, None, len(positions), tally
 
-        for _ in run.iterate(compute, progress, self._tell):
+        for _ in run.iterate(compute, progress, self._count):
             pass
         return FeatureTable(values, self.plan.names, self.bins, self.copt_threshold, self.report)
 
@@ -239,12 +237,13 @@ class FeatureEngine:
         threads = self.threads if threads is None else threads
         return Run(self.plan, self._cloud, self._grid, self._fitted, queries, dimensions, threads, memory_mb)
 
-    def _tell(self, count: int, tally: Tally) -> None:
+    def _count(self, count: int, tally: Tally) -> None:
         with self._lock:
-            self.report["queries"] += count
+            self.report.figures["queries"] += count
+            totals = {"beyond_halo": self.report.beyond_halo, **self.report.figures}
             for key, counts in tally.items():
                 for token, n in counts.items():
-                    self.report[key][token] = self.report[key].get(token, 0) + n
+                    totals[key][token] = totals[key].get(token, 0) + n
 
 
 @dataclass
@@ -258,7 +257,7 @@ class FeatureTable:
         Of the columns.
     bins, copt_threshold
         As given or fitted; hand them to another call to get comparable features.
-    report : dict
+    report : Report
         See :class:`FeatureEngine`.
     """
 
@@ -266,7 +265,7 @@ class FeatureTable:
     names: tuple[str, ...]
     bins: ShapeBins | None = None
     copt_threshold: float | None = None
-    report: dict[str, Any] = field(default_factory=dict)
+    report: Report = field(default_factory=Report)
 
     def __len__(self) -> int:
         return len(self.values)

@@ -146,7 +146,7 @@ class FeaturePlan:
 
         The largest reach and one cell. ``k50`` and ``kopt`` reach as far as their points lie, which no number
         bounds; for them at least 15 m are asked for, enough for 100 neighbors down to 0.15 points a square
-        meter. How many queries had to look farther is counted in ``FeatureEngine.report["beyond_halo"]``.
+        meter. How many queries had to look farther is counted in ``FeatureEngine.report.beyond_halo``.
         """
         reach = max((n.reach for n in self.neighborhoods if n.reach is not None), default=0.0)
         reach = max(reach, returns.reach(self.dimensions))

@@ -47,7 +47,7 @@ def consistent(
     mask: ArrayLike | None = None,
     change: ArrayLike | None = None,
     rules: Sequence[str] = RULES,
-    report: dict[str, Any] | None = None,
+    figures: dict[str, Any] | None = None,
 ) -> NDArray[np.uint8]:
     """Class codes without the contradictions that the rules know.
 
@@ -69,7 +69,7 @@ def consistent(
         2 m above the terrain is what its neighbors are. ``roofs``: vegetation in the plane of a roof is building.
         ``facades``: vegetation in the plane of a wall is building. ``lone``: one point against all its neighbors is of their
         class.
-    report : dict, optional
+    figures : dict, optional
         Receives the number of points that each rule changed.
 
     Returns
@@ -112,8 +112,8 @@ def consistent(
         other = work.kind != before
         # A mixture of vegetation classes: high vegetation is what the shipped models know.
         out[there[other]] = np.array([GROUND, VEGETATION[-1], BUILDING, 0], np.uint8)[work.kind[other]]
-    if report is not None:
-        report.update(counts)
+    if figures is not None:
+        figures.update(counts)
     return out
 
 

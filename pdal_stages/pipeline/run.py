@@ -16,6 +16,7 @@ from ..base.errors import InterruptedStage, PipelineError, StageError
 from ..base.files import whole_files
 from ..base.las import check_readable, odd_text, supersede_copc
 from ..base.outputs import Output, check_outputs
+from ..base.report import Report
 from ..base.shortage import check_limit
 from ..stages import registry
 from . import packing, runtime
@@ -73,7 +74,7 @@ class Pipeline:
         self.metadata: dict[str, Any] = {}
         self.arrays: list = []
         self.said: list[str] = []
-        self.reports: list[tuple[str, list[dict[str, Any]]]] = []
+        self.reports: list[tuple[str, list[Report]]] = []
         self.remarks: list[str] = []
         self._running = False
 
@@ -83,7 +84,7 @@ class Pipeline:
         by_text: dict[str, list[str]] = {}
         for place, reports in self.reports:
             for report in reports:
-                for text in (report[key] for key in ("warning", "note", "score") if report.get(key)):
+                for text in report.messages:
                     by_text.setdefault(text, []).append(place)
         by_text = {text: list(dict.fromkeys(places)) for text, places in by_text.items()}
         notes = [text if len(places) > 1 else f"{places[0]}: {text}" for text, places in by_text.items()]
@@ -265,16 +266,14 @@ _NO_STAGE = re.compile(r"Couldn't create (?:reader|filter|writer) stage")
 _NOT_UTF8 = re.compile(r"returned a result with an exception set|UnicodeDecodeError|codec can't decode")
 
 
-def _named_metadata(
-    metadata: dict[str, Any], reports: list[tuple[str, list[dict[str, Any]]]]
-) -> dict[str, Any]:
+def _named_metadata(metadata: dict[str, Any], reports: list[tuple[str, list[Report]]]) -> dict[str, Any]:
     """PDAL's metadata, with our stages under their own names instead of filters.python."""
     inner = metadata.get("metadata")
     if not isinstance(inner, dict):
         return metadata
     scripts = filter(None, _several(inner.pop("filters.python", None)))
     theirs = [s for s in scripts if not (isinstance(s, dict) and s.keys() & registry.stages().keys())]
-    named = [(name.partition(" ")[0], report) for name, views in reports for report in views]
+    named = [(name.partition(" ")[0], report.to_dict()) for name, views in reports for report in views]
     for kind, node in [*(("filters.python", node) for node in theirs), *named]:
         inner[kind] = [*_several(inner[kind]), node] if kind in inner else node
     return metadata

@@ -19,6 +19,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from ..base.errors import InterruptedStage, StageError
+from ..base.report import Report
 from ..base.shortage import is_short, shortage
 from ..stages import registry
 from ..stages.base import Stage
@@ -40,7 +41,7 @@ def stage(ins, outs):
 #: Around a stage's message in the name of the array that PDAL refuses.
 _OPENING, _CLOSING = "of a stage that failed:\n\n", "\n\n"
 
-_reports: dict[str, list[dict[str, Any]]] = {}
+_reports: dict[str, list[Report]] = {}
 _failures: dict[str, StageError] = {}
 _usual_stdout: Any = sys.__stdout__
 #: Stages made in this process by label, as long as someone holds them; in another process options are parsed anew.
@@ -123,7 +124,7 @@ def _made_again(arguments: Mapping[str, Any]) -> Stage:
 @interrupts.catches
 def run_on_view(
     stage: Stage, module: Mapping[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]
-) -> dict[str, Any]:
+) -> Report:
     """Run a stage on one view; its report. What it raises may be anything, Ctrl-C too."""
     interrupts.check()
     points = points_of(stage, module, ins)
@@ -140,8 +141,8 @@ def run_on_view(
     return points.report
 
 
-def run_on_nothing(stage: Stage, where: str) -> dict[str, Any]:
-    """What a stage says of no points at all."""
+def run_on_nothing(stage: Stage, where: str) -> Report:
+    """A stage's report on no points at all."""
     names = ("X", "Y", "Z", *stage.reads(), *stage.creates())
     points = stage.points({name: np.empty(0) for name in names})
     try:
@@ -191,9 +192,9 @@ def node(name: str, children: list[dict[str, Any]]) -> dict[str, Any]:
     return {"name": name, "value": "", "type": "", "description": "", "children": children}
 
 
-def leaves(report: Mapping[str, Any]) -> list[dict[str, Any]]:
+def leaves(report: Report) -> list[dict[str, Any]]:
     """A report as nodes of PDAL's metadata: every value as text, with its type."""
-    return [leaf(key, value) for key, value in report.items() if value is not None]
+    return [leaf(key, value) for key, value in report.to_dict().items() if value is not None]
 
 
 def leaf(name: str, value: Any) -> dict[str, Any]:
@@ -232,7 +233,7 @@ def _redirected() -> bool:
     return type(sys.stdout).__module__ == "redirector"  # PDAL's own type
 
 
-def collect(label: str) -> tuple[list[dict[str, Any]], StageError | None]:
+def collect(label: str) -> tuple[list[Report], StageError | None]:
     """Reports (one per point view) and the failure of a lowered stage, which are then forgotten."""
     return _reports.pop(label, []), _failures.pop(label, None)
 

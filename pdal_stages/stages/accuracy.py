@@ -162,7 +162,7 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
             write_whole(self.json, (json.dumps(accuracy.to_dict(), indent=1) + "\n").encode())
         if self.html:
             self._write_page(self.html, points, accuracy, rule, points.xyz[inside], reference, predicted)
-        points.report.update(
+        points.report.figures.update(
             {
                 "compared": accuracy.points,
                 "left_out": accuracy.left_out_points,

@@ -29,7 +29,7 @@ from .selection import UNWANTED, Selection
 #: The trainer's own options.
 _TRAINING = {field.name: field for field in fields(TrainingOptions)}
 #: The part of a model's description that fits in a pipeline's metadata.
-_TOLD = ("strategy", "classes", "accuracy", "parameters")
+_SHOWN = ("strategy", "classes", "accuracy", "parameters")
 #: Most files that a model names.
 _NAMED = 20
 #: The word for the dimensions that follow from what the points have.
@@ -260,32 +260,32 @@ holds the classes.
         if self._by_hand:
             model.info["by_hand"] = self._by_hand
         model.save(self.filename)
-        told = {key: model.info[key] for key in _TOLD if key in model.info}
-        points.report.update({"model": self.filename, **told, "seconds": model.seconds})
-        if scores := summary.scores(model.info):
-            points.report["score"] = scores[0]
+        report = points.report
+        shown = {key: model.info[key] for key in _SHOWN if key in model.info}
+        report.figures |= {"model": self.filename, **shown, "seconds": model.seconds}
         if gone := model.info["training"].get("contradicted"):
-            points.report["contradicted"] = gone
+            report.figures["contradicted"] = gone
         if telling := model.info["training"].get("telltale"):
             listed = ", ".join(f"{name} ({100 * share:.3g} %)" for name, share in telling.items())
-            said = (
+            report.warnings.append(
                 f"the classes follow from one dimension almost alone: {listed}. If it was made of the labels, or of what "
                 "unlabelled points do not have, leave it out of 'dimensions': the score is worth nothing"
             )
-            points.report["warning"] = ". ".join(filter(None, [points.report.get("warning"), said]))
         for code, (all_, held) in model.info["training"].get("held_by_base", {}).items():
-            said = (
+            report.warnings.append(
                 f"{held:,} of {all_:,} samples of class {code} are, to the base, of a class that no label has, and stay it: "
                 "label some of that class too, or find this one alone (strategy binary, target)"
             )
-            points.report["warning"] = ". ".join(filter(None, [points.report.get("warning"), said]))
         crossed = model.info["accuracy"]["cross_validation"] or {}
         if "instead" in crossed:
-            points.report["note"] = (
+            report.notes.append(
                 f"blocks are held out, not {summary.groups_word(self.groups)}: {crossed['instead']}"
             )
+        if scores := summary.scores(model.info):
+            report.figures["score"] = scores[0]
+            report.notes.append(scores[0])
         if self._trainer.reports_training:
-            points.report["training"] = model.info["training"]
+            report.figures["training"] = model.info["training"]
         return {}
 
     def _surveys(self, cloud: TrainingCloud, points: Points) -> list[TrainingCloud]:

@@ -78,7 +78,7 @@ feet of walls stay what they are: surveys label them building as often as ground
             for word, name in (("height", "HeightAboveGround"), ("ground", "Ground"))
         }
         if any(values is None for values in heights.values()) and (self.ground or self.islands):
-            points.report["warning"] = (
+            points.report.warnings.append(
                 "there is no HeightAboveGround or no Ground: the rules ground and islands did nothing"
             )
         before = points.class_codes
@@ -89,9 +89,9 @@ feet of walls stay what they are: surveys label them building as often as ground
             mask=~ignored,
             change=change,
             rules=[rule for rule in RULES if self.options[rule]],
-            report=points.report,
+            figures=points.report.figures,
         )
-        points.report["changed"] = int(np.count_nonzero(codes != before))
+        points.report.figures["changed"] = int(np.count_nonzero(codes != before))
         there = np.unique(np.concatenate([before[change], codes[change]]))
-        points.report["classes"] = {str(c): int(np.count_nonzero(codes[change] == c)) for c in there}
+        points.report.figures["classes"] = {str(c): int(np.count_nonzero(codes[change] == c)) for c in there}
         return {"Classification": points.with_codes(codes)}

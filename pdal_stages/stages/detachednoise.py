@@ -98,8 +98,8 @@ marks of the whole cloud. The counts are in the metadata as `low` and `high`.
         for name, code, given in zip(("low", "high"), NOISE, (self.low_class, self.high_class), strict=True):
             marked = found == code
             codes[marked] = given
-            points.report[name] = int(np.count_nonzero(marked))
-            if points.report[name]:
-                classes = points.report.setdefault("classes", {})
-                classes[str(given)] = classes.get(str(given), 0) + points.report[name]
+            points.report.figures[name] = int(np.count_nonzero(marked))
+            if points.report.figures[name]:
+                classes = points.report.figures.setdefault("classes", {})
+                classes[str(given)] = classes.get(str(given), 0) + points.report.figures[name]
         return {"Classification": points.with_codes(codes)}

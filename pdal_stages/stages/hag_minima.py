@@ -98,5 +98,5 @@ the unit of Z.
         wanted = points.wanting("HeightAboveGround", self.makes_again)
         height = np.array(points.arrays["HeightAboveGround"], np.float64)
         height[wanted] = (z[wanted] - terrain.at(x[wanted], y[wanted])) / points.units.vertical
-        points.report.update(terrain.report)
+        points.report.figures |= terrain.figures
         return {"HeightAboveGround": height}

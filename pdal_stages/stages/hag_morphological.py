@@ -156,7 +156,7 @@ of Z.
             openings=self.windows,
             slope_too=self.terrain_slope,
             threads=self.threads,
-            report=points.report,
+            figures=points.report.figures,
         )
         out = {}
         for name in self.creates():

@@ -226,7 +226,7 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
             return {}
         ignored, kept = points.ignored(self.ignore), points.chosen(self.keep)
         inside = points.inside
-        points.report["kept"] = int(np.count_nonzero(inside & kept & ~ignored))
+        points.report.figures["kept"] = int(np.count_nonzero(inside & kept & ~ignored))
         wanted = inside & ~ignored & ~kept
         self._refuse_codes_that_stay(points, wanted)
         with Progress(int(np.count_nonzero(wanted)), self.type) as progress:
@@ -269,8 +269,8 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
                 if name != "Classification":
                     values[name] = np.where(points.mask, values[name], points.arrays[name])
         values["Classification"] = points.with_codes(values["Classification"])
-        points.report.update({k: v for k, v in found.report.items() if k not in points.report})
-        points.report["outside_where"] = int(np.count_nonzero(~inside))
+        points.report.merge(found.report)
+        points.report.figures["outside_where"] = int(np.count_nonzero(~inside))
         return values
 
     def _split_vegetation(self, points: Points, found: Prediction, wanted: NDArray[np.bool_]) -> None:
@@ -282,7 +282,7 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         for code, limit in zip((MEDIUM, LOW), reversed(self.bands or ()), strict=True):
             codes[given & (height < limit)] = code
         there, number = np.unique(codes[wanted], return_counts=True)
-        found.report["classes"] = {str(int(c)): int(m) for c, m in zip(there, number, strict=True)}
+        found.report.figures["classes"] = {str(int(c)): int(m) for c, m in zip(there, number, strict=True)}
 
     def _refuse_codes_that_stay(self, points: Points, wanted: NDArray[np.bool_]) -> None:
         """Before any work: codes that points keep must fit the file, as those do that the model gives."""

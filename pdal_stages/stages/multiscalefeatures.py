@@ -210,14 +210,15 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
                     out["OptimalRadius"][rows] = radius / points.units.horizontal
         if self.bins and not Path(self.bins).exists():
             _write_bins(self.bins, engine)
-        points.report.update(
+        points.report.figures.update(
             {
                 "neighborhoods": len(plan.neighborhoods),
                 "features": len(names),
                 **({} if representatives is None else {"representatives": len(representatives.rows)}),
-                **engine.report,
+                **engine.report.figures,
             }
         )
+        points.report.merge(engine.report)
         return out
 
 

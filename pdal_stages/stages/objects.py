@@ -132,7 +132,7 @@ the tile is read wider. To write objects as polygons and points use `pdal-stages
             for name in ("ObjectVerdict", "ObjectHeight", "ObjectExtent"):
                 out[name] = np.array(points.arrays[name])
                 out[name][points.inside] = 0
-        points.report |= {name: one for name, one in found.summary().items() if one["objects"]}
+        points.report.figures |= {name: one for name, one in found.summary().items() if one["objects"]}
         refused = np.zeros(points.count, bool)
         for kind, (which, rows) in at.items():
             columns = found.tables[kind].columns
@@ -153,7 +153,7 @@ the tile is read wider. To write objects as polygons and points use `pdal-stages
             codes[refused] = self.refused_class
             ids[refused] = 0
             out["Classification"] = points.with_codes(codes)
-            points.report["refused_points"] = int(np.count_nonzero(refused))
+            points.report.figures["refused_points"] = int(np.count_nonzero(refused))
         out["ObjectID"] = ids.astype(np.uint64)
         if points.mask is not None:
             out["ObjectID"] = np.where(points.mask, out["ObjectID"], points.arrays["ObjectID"])

@@ -76,6 +76,6 @@ tell what is to be checked; beside other files lies a `.qml`. Needs the extra `v
         found = find_objects(self.cells(points), self.settings)
         layers = object_layers(found, straight=self.outlines == STRAIGHT, units=points.units)
         files = write_layers(self.filename, layers, points.wkt)
-        report: dict[str, Any] = {name: len(layer.shapes) for name, layer in layers.items()}
-        points.report |= report | {"files": [str(file) for file in files]}
+        counts: dict[str, Any] = {name: len(layer.shapes) for name, layer in layers.items()}
+        points.report.figures |= counts | {"files": [str(file) for file in files]}
         return {}

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import LEGACY_LIMIT, OVERLAP
 from ..base.errors import DimensionError, StageError
+from ..base.report import Report
 from ..base.units import Units, reprojection_cure, units_of_wkt
 from .selection import Selection
 from .where import Expression
@@ -65,15 +65,17 @@ class Points:
         self.wkt = wkt
         self.legacy_flags = legacy_flags
         self.count = len(arrays["X"]) if "X" in arrays else 0
-        self.report: dict[str, Any] = {"points": self.count}
+        self.report = Report({"points": self.count})
         self._units = units
         self.mask: NDArray[np.bool_] | None = None
         if where is not None:
             freed = {**arrays, "Classification": self.class_codes} if legacy_flags else arrays
             self.mask = where.evaluate(freed)
-            self.report["where"] = int(np.count_nonzero(self.mask))
-            if self.count and not self.report["where"]:
-                self.report["warning"] = f"'where' holds for none of the {self.count:,} points: {where.text}"
+            self.report.figures["where"] = int(np.count_nonzero(self.mask))
+            if self.count and not self.report.figures["where"]:
+                self.report.warnings.append(
+                    f"'where' holds for none of the {self.count:,} points: {where.text}"
+                )
 
     @property
     def inside(self) -> NDArray[np.bool_]:
@@ -87,9 +89,9 @@ class Points:
         place = (float(x[0]), float(y[0])) if self.count else None
         units = units_of_wkt(self.wkt, horizontal=self._units[0], vertical=self._units[1], place=place)
         if units.assumed and self.count:
-            self.report["note"] = "the points have no spatial reference: meters were assumed"
+            self.report.notes.append("the points have no spatial reference: meters were assumed")
             if np.abs(x).max() <= 180.0 and np.abs(y).max() <= 90.0 and max(np.ptp(x), np.ptp(y)) < 0.2:
-                self.report["warning"] = (
+                self.report.warnings.append(
                     f"coordinates look like degrees; if they are: {reprojection_cure(place=place)}"
                 )
         return units
@@ -195,7 +197,9 @@ class Points:
     def ignored(self, selection: Selection) -> NDArray[np.bool_]:
         """The same, counted in the report as ``ignored``, where they are inside `where`."""
         found = self.chosen(selection)
-        self.report["ignored"] = int(np.count_nonzero(found if self.mask is None else found & self.mask))
+        self.report.figures["ignored"] = int(
+            np.count_nonzero(found if self.mask is None else found & self.mask)
+        )
         return found
 
     def usable(self, ignored: Selection) -> NDArray[np.bool_]:

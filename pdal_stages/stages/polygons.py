@@ -79,9 +79,8 @@ class a point has.
             name = f"{overlay.file}|layername={overlay.layer}" if overlay.layer else overlay.file
             counts[f"{name}={overlay.code}"] = {"polygons": len(shapes), "points": len(found)}
             notes += [note] if note else []
-        points.report["polygons"] = counts
+        points.report.figures["polygons"] = counts
         there, number = np.unique(codes[change], return_counts=True)
-        points.report["classes"] = {str(int(c)): int(n) for c, n in zip(there, number, strict=True)}
-        if notes:
-            points.report["note"] = "; ".join(notes)
+        points.report.figures["classes"] = {str(int(c)): int(n) for c, n in zip(there, number, strict=True)}
+        points.report.notes += notes
         return {"Classification": points.with_codes(codes)}

@@ -57,7 +57,7 @@ def detached_noise(
     cluster: int = 60,
     gap: float = 2.5,
     depth: float = 1.0,
-    report: dict[str, Any] | None = None,
+    figures: dict[str, Any] | None = None,
 ) -> NDArray[np.uint8]:
     """Which points are noise: 7 below the ground, 18 above everything, 0 all others.
 
@@ -73,7 +73,7 @@ def detached_noise(
         How far above everything near high noise lies at least, meters; more in clouds below 3 points/m2.
     depth : float, default 1.0
         How far below the ground low noise lies at least, meters; more where that is rough.
-    report : dict, optional
+    figures : dict, optional
         Receives the counts ``low`` and ``high``.
 
     Returns
@@ -104,8 +104,8 @@ def detached_noise(
             marks = _judge(x[points], y[points], z[points], column[points], row[points], cluster, gap, depth)
             found[points if isinstance(points, slice) else points[own]] = marks[own]
         codes[inside] = found
-    if report is not None:
-        report["low"], report["high"] = (int(np.count_nonzero(codes == code)) for code in NOISE)
+    if figures is not None:
+        figures["low"], figures["high"] = (int(np.count_nonzero(codes == code)) for code in NOISE)
     return codes
 
 

@@ -37,7 +37,7 @@ class MinimaTerrain:
     resolution: float
     #: Counts: ``cells`` (with points), ``interpolated_cells`` (empty ones that were needed), ``farthest_fill`` (distance
     #: to the nearest filled cell, the worst case), ``unused_points`` (not finite, or excluded by the mask).
-    report: dict = field(default_factory=dict)
+    figures: dict = field(default_factory=dict)
     _keys: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64), repr=False)
     _minima: NDArray[np.float64] = field(default_factory=lambda: np.empty(0), repr=False)
 
@@ -67,7 +67,7 @@ class MinimaTerrain:
         terrain._keys = key[starts]
         if starts.size:
             terrain._minima = np.minimum.reduceat(z[usable][order], starts)
-        terrain.report = {
+        terrain.figures = {
             "cells": int(terrain._keys.size),
             "interpolated_cells": 0,
             "farthest_fill": 0.0,
@@ -131,8 +131,8 @@ class MinimaTerrain:
                 squared = ((filled_at[near] - center) ** 2).sum(axis=1)
                 weight = 1.0 / squared**2  # distance to the fourth power
                 values[at] = np.dot(weight, self._minima[near]) / weight.sum()
-            self.report["interpolated_cells"] = int(empty.size)
-            self.report["farthest_fill"] = float(nearest.max() * self.cell)
+            self.figures["interpolated_cells"] = int(empty.size)
+            self.figures["farthest_fill"] = float(nearest.max() * self.cell)
         return values
 
 

@@ -67,7 +67,7 @@ def filtered_ground(
     openings: Sequence[float] = (),
     slope_too: bool = False,
     threads: int | None = None,
-    report: dict[str, Any] | None = None,
+    figures: dict[str, Any] | None = None,
 ) -> dict[str, NDArray]:
     """Height of every point above the ground that a progressive morphological filter finds.
 
@@ -91,7 +91,7 @@ def filtered_ground(
         Whether the slope of the terrain is wanted.
     threads : int, optional
         None or 0: every available core.
-    report : dict, optional
+    figures : dict, optional
         Receives counts: ``ground_points``, ``pits`` (cells whose lowest point is a low outlier),
         ``without_terrain`` (points with no usable point near; their height is 0), ``unused_points``.
 
@@ -137,9 +137,9 @@ def filtered_ground(
             )  # fmt: skip
             for name, values in found.items():
                 out[name][points if isinstance(points, slice) else points[own]] = values[own]
-    if report is not None:
-        report["ground_points"] = int(np.count_nonzero(out["Ground"]))
-        report.update(counts, unused_points=int(len(finite) - np.count_nonzero(use)))
+    if figures is not None:
+        figures["ground_points"] = int(np.count_nonzero(out["Ground"]))
+        figures.update(counts, unused_points=int(len(finite) - np.count_nonzero(use)))
     if not all_finite:
         for name, values in out.items():
             whole = np.full(len(finite), 0 if name == "Ground" else np.nan, values.dtype)

@@ -201,7 +201,7 @@ def classify_file(
     count = pipeline.execute(arrays=False, loglevel=logging.WARNING)
     if metadata:
         write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
-    reports = [each[-1] for _, each in pipeline.reports if each]
+    reports = [each[-1].figures for _, each in pipeline.reports if each]
     classes = {int(code): n for one in reports for code, n in one.get("classes", {}).items()}
     counts = {key: one[key] for one in reports for key in LEFT_ALONE if one.get(key)}
     notes = [*(f"PDAL says: {line}" for line in pipeline.said), *pipeline.told]

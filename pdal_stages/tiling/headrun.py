@@ -97,8 +97,7 @@ def run_head(
         pipeline.execute(arrays=True)
     results = _collect(pipeline.arrays, cuts, plan.creates, marks)
     need = max((reach.need for reach in reaches.values()), default=0.0)
-    beyond = [report.get("beyond_halo") or {} for _, reports in pipeline.reports for report in reports]
-    far = any(number for one in beyond for number in one.values())
+    far = any(report.beyond_halo for _, reports in pipeline.reports for report in reports)
     if far and narrowed:
         return run_head(context, tile, cuts, everything, surroundings, narrowing=False)
     if far and not everything:

@@ -1,0 +1,58 @@
+"""What was found on the way: figures by name, notes and warnings for the user, and what lay beyond a tile's halo."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass
+class Report:
+    """What a stage, a prediction or a feature engine reports beside its results.
+
+    Attributes
+    ----------
+    figures : dict
+        Counts and other JSON-able values by name, e.g. ``points`` or ``classes``.
+    notes : list of str
+        What the user should know; nothing is wrong.
+    warnings : list of str
+        What is likely wrong, and the cure.
+    beyond_halo : dict of str to int
+        By neighborhood, the points whose nearest neighbors lay farther away than the halo: in a tile of that halo their
+        values may differ from those of the whole cloud.
+    """
+
+    figures: dict[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    beyond_halo: dict[str, int] = field(default_factory=dict)
+
+    def merge(self, other: Report) -> None:
+        """Take over what another has. Of figures of one name, its own stay; dicts are merged by their keys."""
+        _merge(self.figures, other.figures)
+        _merge(self.beyond_halo, other.beyond_halo)
+        for mine, theirs in ((self.notes, other.notes), (self.warnings, other.warnings)):
+            mine += [text for text in theirs if text not in mine]
+
+    @property
+    def messages(self) -> list[str]:
+        """Warnings, then notes."""
+        return [*self.warnings, *self.notes]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report as metadata: figures, and ``beyond_halo``, ``warning`` and ``note`` where there are any."""
+        texts = {"warning": self.warnings, "note": self.notes}
+        return (
+            self.figures
+            | ({"beyond_halo": self.beyond_halo} if self.beyond_halo else {})
+            | {name: ". ".join(lines) for name, lines in texts.items() if lines}
+        )
+
+
+def _merge(mine: dict[str, Any], theirs: dict[str, Any]) -> None:
+    for name, value in theirs.items():
+        if isinstance(value, dict) and isinstance(mine.get(name), dict):
+            mine[name] = {**value, **mine[name]}
+        else:
+            mine.setdefault(name, dict(value) if isinstance(value, dict) else value)
