@@ -201,6 +201,36 @@ def test_a_building_larger_than_any_block_and_its_margin():
     same(whole, find_objects(cells, block=100, progress=False))
 
 
+@pytest.mark.parametrize("slope", [0.0, 0.8])
+def test_a_roof_that_is_partly_called_leaves_is_whole(slope):
+    """A classifier gives a part of a shed's roof, and its chimney, to vegetation; a tree stands beside it."""
+    roof, codes = house(10, 10, 16, 15, 3.0)
+    roof[:, 2] += slope * (roof[:, 0] - 10)
+    codes[roof[:, 0] >= 13.4] = 5
+    rng = np.random.default_rng(1)
+    crown = np.column_stack([rng.uniform(16, 20, 400), rng.uniform(11, 15, 400), np.zeros(400)])
+    away = np.hypot(crown[:, 0] - 18, crown[:, 1] - 13) / 2
+    crown[:, 2] = 4.0 + 3.0 * np.sqrt(np.maximum(0, 1 - away**2)) * rng.uniform(0.5, 1, 400)
+    chimney, _ = house(12, 12, 13, 13.1, 3.4 + slope * 2, 0.3, 5)
+    parts = [(roof, codes), (crown, np.full(400, 5, np.uint8)), (chimney, np.full(len(chimney), 5, np.uint8))]
+    found = found_in(*scene(*parts))
+    columns = found.tables[Kind.BUILDING].columns
+    assert columns["area"].tolist() == pytest.approx([30.0], abs=3.0)
+    trees = found.tables[Kind.TREE].columns
+    assert len(trees["x"]) == 1 and abs(trees["x"][0] - 18) < 1.5
+
+
+def test_blocks_change_nothing_where_classes_are_wrong(town):
+    """Patches of buildings that are called vegetation, and of vegetation that is called a building."""
+    rng = np.random.default_rng(7)
+    codes = np.array(town.classification)
+    for x, y in rng.uniform(0, 150, (300, 2)) + town.xyz[:, :2].min(0):
+        near = np.hypot(town.xyz[:, 0] - x, town.xyz[:, 1] - y) < 2.5
+        codes[near] = np.where(codes[near] == 6, 5, np.where(codes[near] == 5, 6, codes[near]))
+    cells = Cells.of(*town.xyz.T, codes, 0.5)
+    same(find_objects(cells, progress=False), find_objects(cells, block=64, progress=False))
+
+
 def test_a_shift_by_whole_cells_shifts_the_objects(town):
     one = found_in(town.xyz, town.classification)
     two = found_in(town.xyz + np.array([1024.0, -512.0, 0.0]), town.classification)

@@ -25,6 +25,8 @@ from .rasters import GROUND_REACH, Window
 
 #: Meters around a place that decide about it, but for the extent of buildings, spans and decks.
 MARGIN = GROUND_REACH + 2 * crowns.REACH
+#: How far a roof goes on into what a classifier took for leaves, meters.
+GROWTH = 3.0
 #: Side of a block, cells.
 BLOCK = 2048
 #: Kinds that are found.
@@ -235,13 +237,17 @@ class _Layers:
     def __init__(self, cells: Cells, kind: Kind, window: Window, extent: Window) -> None:
         window = _common(window, extent)
         inside = window.of(cells, kind)
-        self.window = window
+        self.cells, self.window = cells, window
         self.high = window.dense(inside, "high", np.nan) / MM
         self.low = window.dense(inside, "low", np.nan) / MM
         self.count = window.dense(inside, "count", 0, np.int64)
         self.sure = window.dense(inside, "sure", 0.0)
         self.told = window.dense(inside, "told", 0, np.int64)
         self.ground = window.ground(cells)
+
+    def other(self, kind: Kind) -> NDArray[np.float64]:
+        """Height of the highest point of another kind in each cell, NaN where there is none."""
+        return self.window.dense(self.window.of(self.cells, kind), "high", np.nan) / MM
 
     def body(self, r: NDArray, c: NDArray, z: NDArray) -> Body:
         return Body(
@@ -295,11 +301,21 @@ def _whole(
         around += max(margin, around // 2)
 
 
+def _roofs_of(
+    high: NDArray, leaves: NDArray, ground: NDArray, chosen: ObjectSettings
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Cells of roofs, gone on into vegetation in their planes, and their heights."""
+    with np.errstate(invalid="ignore"):
+        leaves = np.where(leaves - ground < chosen.building_height, np.nan, leaves)
+    high = roofs.continued(high, leaves, chosen.cell, round(GROWTH / chosen.cell))
+    return roofs.roof_cells(high, ground, chosen.building_height)
+
+
 def _buildings(cells: Cells, extent: Window, chosen: ObjectSettings, core: Window, found: _Found) -> None:
     heights: list[NDArray] = []
 
     def masked(layers: _Layers) -> NDArray[np.bool_]:
-        mask, z = roofs.roof_cells(layers.high, layers.ground, chosen.building_height)
+        mask, z = _roofs_of(layers.high, layers.other(Kind.TREE), layers.ground, chosen)
         heights[:] = [z]
         return mask
 
@@ -355,6 +371,10 @@ def _spans(cells: Cells, extent: Window, chosen: ObjectSettings, core: Window, f
 def _trees(cells: Cells, extent: Window, chosen: ObjectSettings, core: Window, found: _Found) -> None:
     size = chosen.cell
     layers = _Layers(cells, Kind.TREE, _around(core, round(MARGIN / size)), extent)
+    mask, roof = _roofs_of(layers.other(Kind.BUILDING), layers.high, layers.ground, chosen)
+    with np.errstate(invalid="ignore"):
+        # Chimneys, gutters and walls that were taken for leaves are no trees.
+        layers.high[mask & (layers.high <= roof + 0.5)] = np.nan
     height = crowns.canopy(layers.high, layers.ground)
     s = crowns.smoothed(height, crowns.bell(chosen.smoothing / size))
     up = crowns.summits(s, min(1.5, chosen.tree_height / 2))

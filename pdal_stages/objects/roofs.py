@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 from ..base.jit import device, njit
 from ..base.unionfind import root as root_of
 
+#: Scatter of a roof's plane that is gone on from, and how near to it vegetation is of the roof, meters.
+PLANE, NEAR = 0.12, 0.2
+
 
 def roof_cells(
     high: NDArray, ground: NDArray, lowest: float
@@ -34,6 +37,70 @@ def roof_cells(
     for _ in range(2):
         high = _closed(high)
     return opened(~np.isnan(high)), high
+
+
+@device
+def _leaning(z, r, c, size, level):
+    """How far `level` lies from the plane through the five by five cells around a cell that lie within a meter of it,
+    meters; NaN where they are too few or scatter."""
+    n, x, y, h, xx, yy, xy, xh, yh, hh = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(max(r - 2, 0), min(r + 3, z.shape[0])):
+        for j in range(max(c - 2, 0), min(c + 3, z.shape[1])):
+            d = z[i, j] - level
+            if not abs(d) <= 1.0:
+                continue
+            u, v = (j - c) * size, (i - r) * size
+            n += 1
+            x += u
+            y += v
+            h += d
+            xx += u * u
+            yy += v * v
+            xy += u * v
+            xh += u * d
+            yh += v * d
+            hh += d * d
+    if n < 6:
+        return np.nan
+    xx, yy, xy = xx - x * x / n, yy - y * y / n, xy - x * y / n
+    xh, yh, hh = xh - x * h / n, yh - y * h / n, hh - h * h / n
+    det = xx * yy - xy * xy
+    if det < 1e-3 * n * n * size**4:  # all in a row
+        return np.nan
+    a, b = (xh * yy - yh * xy) / det, (yh * xx - xh * xy) / det
+    steep = a * a + b * b
+    # The highest point of a cell lies anywhere in it.
+    if (hh - a * xh - b * yh) / n > PLANE * PLANE + steep * (0.3 * size) ** 2 or steep > 4.0:
+        return np.nan
+    return max(0.0, abs(h - a * x - b * y) / n - 0.4 * size * np.sqrt(steep))
+
+
+@njit
+def continued(high: NDArray, leaves: NDArray, size: float, reach: int) -> NDArray:
+    """Heights of roofs, gone on into cells of vegetation that lie in their planes: what a classifier took for leaves.
+
+    Parameters
+    ----------
+    high, leaves : (r, c) float64
+        Height of the highest point of a roof, and of vegetation, in each cell; NaN where there is none.
+    size : float
+        Side of a cell, meters.
+    reach : int
+        How many cells far at most.
+    """
+    out = high.copy()
+    for _ in range(reach):
+        z = out.copy()
+        more = False
+        for r in range(z.shape[0]):
+            for c in range(z.shape[1]):
+                level = leaves[r, c]
+                if np.isnan(z[r, c]) and not np.isnan(level) and _leaning(z, r, c, size, level) <= NEAR:
+                    out[r, c] = level
+                    more = True
+        if not more:
+            break
+    return out
 
 
 def _closed(high: NDArray) -> NDArray[np.float64]:
