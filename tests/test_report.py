@@ -17,7 +17,7 @@ from PIL import Image
 from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.accuracy.text import percent
 from pdal_stages.base.errors import StageError
-from pdal_stages.reports import write_accuracy_report
+from pdal_stages.reports.accuracypage import write_accuracy_report
 from pdal_stages.reports.charts import percent_axis
 from pdal_stages.reports.maps import Scene, densest_line, heights_to_draw
 from pdal_stages.reports.runpage import run_page

@@ -1,6 +1,4 @@
-"""Pages and pictures for people: the accuracy page, the page about a model, maps of a cloud."""
+"""Pages and pictures for people: the accuracy page, the page about a model, maps of a cloud.
 
-from .accuracypage import write_accuracy_report
-from .modelpage import write_model_report
-
-__all__ = ["write_accuracy_report", "write_model_report"]
+Importing this package is light: what draws is loaded by the modules that draw.
+"""
