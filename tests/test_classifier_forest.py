@@ -41,7 +41,15 @@ def oracle(forest, values):
     return out / len(forest.tree_sizes)
 
 
-@pytest.mark.parametrize("n_rows", [0, 1, 15, 16, 17, 100, 1000])
+@pytest.fixture(params=["as this processor can", "without gathers"])
+def kernel(request, monkeypatch):
+    """Both kernels, where the processor has what the faster one needs."""
+    if request.param == "without gathers":
+        monkeypatch.setattr(walk, "gathers", lambda: False)
+
+
+@pytest.mark.usefixtures("kernel")
+@pytest.mark.parametrize("n_rows", [0, 1, 15, 16, 17, 63, 64, 65, 100, 1000])
 @pytest.mark.parametrize("kind", [RandomForestClassifier, ExtraTreesClassifier])
 def test_equals_sklearn_bit_for_bit(kind, n_rows):
     x, y = data()
@@ -84,7 +92,7 @@ def test_words_of_64_bits_and_a_leaf_table_with_repeats_give_the_same(monkeypatc
     trees = RandomForestClassifier(9, random_state=2).fit(x, y).estimators_
     usual = Forest.from_sklearn(trees, 17).predict_proba(x)
     with monkeypatch.context() as patch:  # as where a feature and a child need more than 32 bits
-        patch.setattr(walk, "WORDS", walk.WORDS[1:] * 2)
+        patch.setattr(forest_module, "WORDS", forest_module.WORDS[1:] * 2)
         wide = Forest.from_sklearn(trees, 17)
     with monkeypatch.context() as patch:  # as where two different leaves have one hash
         patch.setattr(forest_module, "hash_of", lambda columns, seed: np.zeros(columns.shape[1], np.uint64))
@@ -130,6 +138,21 @@ def test_float32_at_most():
     assert (np.nextafter(rounded, np.float32(np.inf)).astype(float) > values).all()
 
 
+@pytest.mark.parametrize("classes", [2, 3, 4, 5, 8, 9])
+def test_kernels_agree_on_any_number_of_classes_and_rows_of_any_width(classes, monkeypatch):
+    for features in (3, 200):  # narrow rows and wide ones go in groups of another size
+        x, y = data(900, features, classes)
+        trees = RandomForestClassifier(7, random_state=3).fit(x, y).estimators_
+        forest = Forest.from_sklearn(trees, features)
+        rows = data(2_500, features, classes, seed=7)[0]
+        usual = forest.predict_proba(rows)
+        with monkeypatch.context() as patch:
+            patch.setattr(walk, "gathers", lambda: False)
+            assert np.array_equal(forest.predict_proba(rows), usual)
+        assert np.allclose(usual[:50], oracle(forest, rows[:50]), atol=1e-12)
+
+
+@pytest.mark.usefixtures("kernel")
 def test_infinite_and_nan_values_do_not_break_the_walk():
     x, y = data()
     forest = Forest.from_sklearn(RandomForestClassifier(5, random_state=0).fit(x, y).estimators_, 17)

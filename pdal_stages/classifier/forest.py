@@ -16,14 +16,17 @@ import numpy.typing as npt
 from ..base.errors import ModelError
 from ..base.hashing import hash_of
 from ..base.runs import begins_run
-from . import walk as kernels
 from .arrays import ArrayRule
 
+#: Of 32 and 64 bits: the type of a node's two numbers, that of its threshold, and the bits of NaN that are free.
+WORDS: tuple[tuple[Any, Any, int], ...] = ((np.uint32, np.float32, 22), (np.uint64, np.float64, 51))
+#: Columns of the leaf table come in whole vectors of so many.
+SPAN = 4
 #: Levels below the root a tree may have.
 MAX_DEPTH = 10_000
-#: Bytes of feature values that pass over a tree before the next one's turn. Rows of up to so many bytes are read in one go
-#: from whatever memory, so many of them make a tree's nodes pay; wide ones, read here and there, had better fit the cache.
-_GROUP_BYTES, _NARROW, _WIDE_GROUP_BYTES = 1 << 22, 512, 1 << 20
+#: Bytes of feature values that pass over a tree before the next one's turn: they are read again for every tree, and stay
+#: in a core's own cache; of rows wider than so many bytes only a little is read.
+_GROUP_BYTES, _NARROW, _WIDE_GROUP_BYTES = 1 << 18, 512, 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,13 +169,20 @@ class Forest:
             raise ModelError(
                 f"the model takes {self.n_features} features per point", found=f"shape {values.shape}"
             )
-        out = np.zeros((len(values), self.n_classes))
+        from . import walk as kernels
+
+        *trees, table = self._walked  # type: ignore[attr-defined]
+        out = np.zeros((len(values), -(-self.n_classes // SPAN) * SPAN))
         width = 4 * self.n_features
         rows = (_GROUP_BYTES if width <= _NARROW else _WIDE_GROUP_BYTES) // width
-        rows = max(rows // kernels.LANES, 2) * kernels.LANES
-        kernels.walk(values.reshape(-1), *self._walked, rows, out)  # type: ignore[attr-defined]
-        out /= self.n_trees
-        return out
+        rows = max(rows // kernels.WIDE, 1) * kernels.WIDE
+        sizes, nodes, limits, *parts = trees
+        # Places in a group are counted in 32 bits.
+        if nodes.dtype == np.uint32 and kernels.WIDE * self.n_features < 2**31 and kernels.gathers():
+            kernels.walk_wide(values.reshape(-1), sizes, nodes, *parts, table, rows, out)
+        else:
+            kernels.walk(values.reshape(-1), sizes, nodes, limits, *parts, table, rows, out)
+        return out[:, : self.n_classes] / self.n_trees
 
 
 def _laid_out(
@@ -213,11 +223,11 @@ def _laid_out(
 
 
 def _walkable(sizes, feature, threshold, left, leaf_value, n_features: int) -> tuple[Any, ...]:
-    """Trees as :func:`walk.walk` takes them: in words of 32 bits where a feature and a child fit into one."""
+    """Trees as :func:`.walk.walk` takes them: in words of 32 bits where a feature and a child fit into one."""
     rows, table = _distinct(leaf_value)
     child_bits = int(sizes.max()).bit_length()
-    fits = (n_features - 1).bit_length() + child_bits <= 32 and len(table) <= 1 << kernels.WORDS[0][2]
-    word, real, free_bits = kernels.WORDS[0 if fits else 1]
+    fits = (n_features - 1).bit_length() + child_bits <= 32 and len(table) <= 1 << WORDS[0][2]
+    word, real, free_bits = WORDS[0 if fits else 1]
     leaf = feature < 0
     limits = np.empty((len(feature), 2), real)
     limits[:, 0] = np.where(leaf, np.nan, threshold)
@@ -226,7 +236,9 @@ def _walkable(sizes, feature, threshold, left, leaf_value, n_features: int) -> t
     nodes[:, 1] = np.where(leaf, 0, feature).astype(word) << word(child_bits) | left
     child, free = (word((1 << bits) - 1) for bits in (child_bits, free_bits))
     flat = nodes.reshape(-1), limits.reshape(-1)
-    return sizes.astype(np.int64), *flat, word(child_bits), child, free, table.reshape(-1)
+    padded = np.zeros((len(table), -(-table.shape[1] // SPAN) * SPAN))
+    padded[:, : table.shape[1]] = table
+    return sizes.astype(np.int64), *flat, word(child_bits), child, free, padded.reshape(-1)
 
 
 def _distinct(values: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
