@@ -5,7 +5,7 @@
     python benchmarks/alsnet.py --data DIR --forest                      # the forest on the same parts
     python benchmarks/alsnet.py --kernels                                # where a batch's time goes, memory
     python benchmarks/alsnet.py --train A.laz B.laz --test C.laz --classes '{"2": "Ground", "6": "Building"}' \
-        --network '{"configuration": "alsnet4"}'                         # any labelled clouds
+        --network '{"configuration": "alsnet4"}'                         # any labeled clouds
 
 DIR (or the environment variable PDAL_STAGES_DATA) is as for benchmarks/classification.py. Scores are over the test
 points of the classes trained. Nothing is fitted or chosen on test points: epochs are chosen on blocks of the
@@ -31,7 +31,7 @@ from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.alsnet import CONFIGURATIONS
 from pdal_stages.classifier import Model, TrainingCloud, TrainingOptions, train
 
-#: Side of the squares a tenth of which keeps its labels, metres.
+#: Side of the squares a tenth of which keeps its labels, meters.
 PATCH = 10.0
 
 
@@ -147,9 +147,9 @@ def trained(cloud: TrainingCloud, classes, network: dict, args, what: str) -> tu
         "epochs": notes["epochs"],
         "best_epoch": notes["best_epoch"],
         "held_out": notes["held_out"],
-        "labelled_points": notes["samples"],
+        "labeled_points": notes["samples"],
         "spacing": model.algorithm.spacing,
-        "halo": round(model.halo, 1),
+        "halo_m": round(model.halo_m, 1),
         "weights": model.algorithm.parameters()["weights"],
         "largest_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
     }
@@ -169,7 +169,7 @@ def kernels(configuration: str) -> dict:
 
     one = CONFIGURATIONS[configuration]
     random = np.random.default_rng(0)
-    side = (one.points / 15.0) ** 0.5  # 15 points a square metre
+    side = (one.points / 15.0) ** 0.5  # 15 points a square meter
     xyz = random.random((one.points, 3)) * [side, side, 10.0]
     build(xyz[:100], np.zeros((100, 1), np.float32), one)  # compile
     out: dict = {"configuration": configuration, "points": one.points}
@@ -184,9 +184,9 @@ def kernels(configuration: str) -> dict:
         order = timed("order", lambda: scramble(xyz))
         xyz = np.ascontiguousarray(xyz[order])
         level = one.levels[0]
-        centres = timed("first farthest points", lambda: farthest_points(xyz, level.centres))
-        timed("first balls", lambda: ball_query(xyz, centres, level.radius, level.samples))
-        timed("first three nearest", lambda: three_nearest(xyz, xyz[centres]))
+        centers = timed("first farthest points", lambda: farthest_points(xyz, level.centers))
+        timed("first balls", lambda: ball_query(xyz, centers, level.radius, level.samples))
+        timed("first three nearest", lambda: three_nearest(xyz, xyz[centers]))
         pyramid = timed("whole geometry", lambda: build(xyz, xyz[:, 2:].astype(np.float32), one))
         net = Folded(fresh(one, 1, 5, 0), one)
         timed("network applied", lambda: net(pyramid))
@@ -244,7 +244,7 @@ def main() -> None:
     )
     parser.add_argument("--forest", action="store_true", help="the forest instead")
     parser.add_argument("--kernels", nargs="*", metavar="CONFIGURATION", help="times of one batch instead")
-    parser.add_argument("--train", nargs="+", type=Path, help="labelled LAS or LAZ files instead of a scene")
+    parser.add_argument("--train", nargs="+", type=Path, help="labeled LAS or LAZ files instead of a scene")
     parser.add_argument("--test", nargs="+", type=Path)
     parser.add_argument("--classes", type=json.loads)
     parser.add_argument("--seed", type=int, default=0)

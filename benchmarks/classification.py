@@ -290,7 +290,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int)
     parser.add_argument("--tune", action="store_true")
     parser.add_argument("--folds", type=int, default=3)
-    parser.add_argument("--block", type=float, default=25.0, help="metres, for --tune")
+    parser.add_argument("--block", type=float, default=25.0, help="meters, for --tune")
     parser.add_argument("--quick", type=int, default=0, help="only the first so many trials of --tune")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--progress", action="store_true")

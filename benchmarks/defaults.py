@@ -90,7 +90,7 @@ THIRDS = {
 
 
 def cloud(files: list[Path], codes: tuple[int, ...], name: str) -> TrainingCloud:
-    """A labelled cloud with heights and return numbers."""
+    """A labeled cloud with heights and return numbers."""
     parts = [laspy.read(file) for file in files]
     xyz = np.concatenate([np.column_stack([p.x, p.y, p.z]) for p in parts]).astype(float)
     labels = np.concatenate([np.asarray(p.classification) for p in parts]).astype(np.uint8)

@@ -1,11 +1,11 @@
-"""Noise: how much of what is put into labelled clouds is found, and how many good points are marked.
+"""Noise: how much of what is put into labeled clouds is found, and how many good points are marked.
 
 python benchmarks/noise.py --data FOLDER
 python benchmarks/noise.py --data FOLDER --classify
 
 Noise as the field knows it is put into each cloud: points and clusters of 2 to 30 within a meter, half of them 1 to 30 m
-below the ground (the lowest of what is labelled ground, and of all points, near by), half 3 to 300 m above the highest point
-near by. `good` are labelled points other than noise; speed is in points per CPU second of one thread. With --classify, two
+below the ground (the lowest of what is labeled ground, and of all points, near by), half 3 to 300 m above the highest point
+near by. `good` are labeled points other than noise; speed is in points per CPU second of one thread. With --classify, two
 clouds are classified with the shipped model as they are, with 0.1 % of noise that nobody looks for, and with it marked.
 """
 

@@ -1,6 +1,6 @@
 """Heights above ground: filters.hag_morphological and filters.hag_minima beside PDAL's filters.smrf with its own heights.
 
-Two kinds of clouds with known ground: the ISPRS filter test samples (hand-made, 0.2 to 1 points/m2) and labelled
+Two kinds of clouds with known ground: the ISPRS filter test samples (hand-made, 0.2 to 1 points/m2) and labeled
 tiles of national surveys (training parts and single clouds, never test parts), these also thinned to 2 and 0.5
 points/m2. Nothing is read of the labels but noise (7, 18), which is left out for all. filters.smrf has its defaults,
 and its ground gives PDAL's filters.hag_nn and filters.hag_delaunay their heights; points whose return number is 0

@@ -39,7 +39,7 @@ def page(stage: type[Stage]) -> str:
             f"- Reads: X, Y, Z{''.join(f', {name}' for name in reads)}",
             f"- Writes: {', '.join(f'`{name}` ({kind})' for name, kind in list(creates.items())[:8]) or 'none'}"
             + (f" and {len(creates) - 8} more" if len(creates) > 8 else ""),
-            f"- Halo: {made.halo():g} m round a tile, with the example's options",
+            f"- Halo: {made.halo_m():g} m round a tile, with the example's options",
             "",
         ]
     elif stage.dimensions_help:

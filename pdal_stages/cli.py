@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from .base import kinds
 from .base.errors import OptionError, StageError, suggest
 from .base.outputs import Output, check_outputs
-from .base.plain import PlainStream, tell
+from .base.plain import PlainStream, print_messages
 from .base.runlog import LoggedStream, RunLog
 from .base.version import __version__
 from .pipeline.overrides import parse_overrides
@@ -31,7 +31,7 @@ _OVERRIDES = (
 
 _INPUTS = "Files that PDAL reads, folders, patterns, tile indexes, EPT sources"
 #: Lines of PDAL's log that are shown without -v.
-_SAID = 10
+_LOG_LINES = 10
 _VERBOSE = ("-v", "--verbose")
 _LEVELS = {0: logging.ERROR, 1: logging.WARNING, 2: logging.INFO}
 #: Commands that work long enough for a log and progress.
@@ -73,13 +73,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except KeyboardInterrupt:
         code = 130
-        tell("interrupted; nothing half-written was left")
+        print_messages("interrupted; nothing half-written was left")
         return code
     except Exception as error:
         code = 1
         if debug:
             raise
-        tell(str(error if isinstance(error, StageError) else _unforeseen(error)))
+        print_messages(str(error if isinstance(error, StageError) else _unforeseen(error)))
         return code
     finally:
         if log is not None:
@@ -263,8 +263,8 @@ def _parser() -> argparse.ArgumentParser:
 
     add("models", _models, "List the models that come with the package")
 
-    takes = add("train", _train, "Train a model on labelled clouds", overrides=True)
-    takes("inputs", nargs="+", metavar="input", help=f"Labelled: {_INPUTS[0].lower()}{_INPUTS[1:]}")
+    takes = add("train", _train, "Train a model on labeled clouds", overrides=True)
+    takes("inputs", nargs="+", metavar="input", help=f"Labeled: {_INPUTS[0].lower()}{_INPUTS[1:]}")
     takes("--model", required=True, help="The model file to write")
     takes(
         "--base", metavar="MODEL", help="A model to build on: standard, or a file; then few labels are enough"
@@ -363,32 +363,32 @@ def _pipeline(options: argparse.Namespace) -> int | None:
 
 
 def _run(options: argparse.Namespace, pipeline) -> int:
-    """Run a pipeline and tell what it has to say; the number of points."""
-    count, said = _ran(options, pipeline)
-    tell(*said)
+    """Run a pipeline and print its messages; the number of points."""
+    count, messages = _ran(options, pipeline)
+    print_messages(*messages)
     return count
 
 
 def _ran(options: argparse.Namespace, pipeline) -> tuple[int, list[str]]:
-    """Run a pipeline: the number of points, and what is to be told."""
+    """Run a pipeline: the number of points, and messages."""
     from .base.files import write_whole
     from .tiling.command import end_at_once
 
     metadata, verbose = getattr(options, "metadata", None), getattr(options, "verbose", 1)
     more = [Output(options.log, "log")] if getattr(options, "log", None) else []
     pipeline.check_outputs(*more, *([Output(metadata, "metadata", kinds.JSON)] if metadata else []))
-    before = list(pipeline.lowered.remarks)
-    tell(*before)
+    before = list(pipeline.lowered.warnings)
+    print_messages(*before)
     end_at_once(options)
     count = pipeline.execute(arrays=False, loglevel=_LEVELS.get(verbose, logging.DEBUG))
     # Warnings, and what PDAL calls an error although it goes on: a reader that sets what it cannot read to 0, say.
-    lines = pipeline.said
-    said = [f"PDAL says: {line}" for line in (lines if verbose > 1 else lines[:_SAID])]
-    if len(lines) > _SAID and verbose <= 1:
-        said.append(f"PDAL says {len(lines) - _SAID:,} more lines; -v shows them")
+    lines = pipeline.log_lines
+    messages = [f"PDAL says: {line}" for line in (lines if verbose > 1 else lines[:_LOG_LINES])]
+    if len(lines) > _LOG_LINES and verbose <= 1:
+        messages.append(f"PDAL says {len(lines) - _LOG_LINES:,} more lines; -v shows them")
     if metadata:
         write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
-    return count, said + [line for line in pipeline.told if line not in before]
+    return count, messages + [line for line in pipeline.messages if line not in before]
 
 
 def _expand(options: argparse.Namespace) -> None:
@@ -408,11 +408,11 @@ def _validate(options: argparse.Namespace) -> int:
     try:
         pipeline = _build(options)
         print(pipeline.validate())
-        tell(*pipeline.lowered.remarks)
+        print_messages(*pipeline.lowered.warnings)
     except StageError as error:
         verdict = {"valid": False, "error_detail": str(error), "streamable": False}
         print(json.dumps(verdict, indent=2))
-        tell(str(error))
+        print_messages(str(error))
         return 1
     return 0
 

@@ -1,4 +1,4 @@
-"""Small labelled scenes and untrained networks for the tests of alsNet. No PyTorch."""
+"""Small labeled scenes and untrained networks for the tests of alsNet. No PyTorch."""
 
 import numpy as np
 

@@ -1,7 +1,7 @@
 """Fixtures every test shares, and the rule on skipping.
 
 Fixtures
-    data_dir       folder of the real labelled clouds (skips where absent)
+    data_dir       folder of the real labeled clouds (skips where absent)
     pdal_program   path of a ``pdal`` program that has ``filters.python``
     pdal_module    python-pdal, imported
     random_cloud   function: ``random_cloud(n, seed=0, ...) -> (n, 3) float64``
@@ -147,7 +147,7 @@ def pytest_report_header() -> list[str]:
 
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
-    """Folder of the real labelled clouds (montpellier/, delft/, oakland/, isprs_filter/, units/)."""
+    """Folder of the real labeled clouds (montpellier/, delft/, oakland/, isprs_filter/, units/)."""
     folder, why = find_data()
     if folder is None:
         pytest.skip(why)

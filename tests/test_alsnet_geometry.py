@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.alsnet import CONFIGURATIONS, Circles, parse_configuration
-from pdal_stages.alsnet.circles import REACH, density, halo, spacing_for
+from pdal_stages.alsnet.circles import REACH, density, halo_m, spacing_for
 from pdal_stages.alsnet.farthest import ball_query, farthest_points, three_nearest
 from pdal_stages.alsnet.pyramid import build, scramble, stack
 from pdal_stages.base.errors import OptionError
@@ -25,9 +25,9 @@ def slow_farthest(p, count, start):
     return np.array(out)
 
 
-def slow_ball(p, centres, radius, samples):
+def slow_ball(p, centers, radius, samples):
     out = []
-    for c in centres:
+    for c in centers:
         inside = np.flatnonzero(((p - p[c]) ** 2).sum(axis=1) <= radius * radius)[:samples]
         out.append(np.concatenate([inside, np.full(samples - len(inside), inside[0])]))
     return np.array(out)
@@ -69,8 +69,8 @@ def test_farthest_points_refuse_more_than_there_are():
 @given(clouds, st.floats(0.01, 30.0), st.integers(1, 20), st.integers(0, 2**32))
 @settings(max_examples=60, deadline=None)
 def test_ball_query_equals_the_reference(p, radius, samples, seed):
-    centres = np.random.default_rng(seed).integers(0, len(p), min(len(p), 30))
-    assert np.array_equal(ball_query(p, centres, radius, samples), slow_ball(p, centres, radius, samples))
+    centers = np.random.default_rng(seed).integers(0, len(p), min(len(p), 30))
+    assert np.array_equal(ball_query(p, centers, radius, samples), slow_ball(p, centers, radius, samples))
 
 
 @given(clouds, st.integers(1, 10))
@@ -107,7 +107,7 @@ def test_every_point_is_in_a_batch_and_batches_are_the_nearest_points(seed, n, p
         xyz = np.floor(xyz / 20.0) * 20.0
     circles = Circles(xyz, points, spacing_for(points, n / 2400.0))
     seen = np.zeros(n, int)
-    for number, (x, y) in enumerate(circles.centres):
+    for number, (x, y) in enumerate(circles.centers):
         members = circles.members(number)
         assert len(members) <= circles.sizes[number]
         seen[members] += 1
@@ -150,7 +150,7 @@ def test_batches_do_not_depend_on_the_order_of_the_points(seed):
     inputs = random.integers(0, 3, (1500, 1))
     shuffled = random.permutation(len(xyz))
     one, other = Circles(xyz, 200, 5.0, inputs), Circles(xyz[shuffled], 200, 5.0, inputs[shuffled])
-    assert np.array_equal(one.centres, other.centres)
+    assert np.array_equal(one.centers, other.centers)
     for number in range(len(one)):
         a, b = one.members(number), shuffled[other.members(number)]
         assert np.array_equal(xyz[a], xyz[b])
@@ -167,7 +167,7 @@ def test_a_tile_with_its_halo_has_the_batches_of_the_whole():
     whole = Circles(xyz, 200, spacing)
     low, high = np.array([30.0, 30.0]), np.array([45.0, 50.0])
     own = ((xyz[:, :2] >= low) & (xyz[:, :2] < high)).all(axis=1)
-    around = ((xyz[:, :2] >= low - halo(spacing)) & (xyz[:, :2] < high + halo(spacing))).all(axis=1)
+    around = ((xyz[:, :2] >= low - halo_m(spacing)) & (xyz[:, :2] < high + halo_m(spacing))).all(axis=1)
     rows = np.flatnonzero(around)
     tile = Circles(xyz[rows], 200, spacing)
 
@@ -176,7 +176,7 @@ def test_a_tile_with_its_halo_has_the_batches_of_the_whole():
         for number in circles.needed(np.flatnonzero(mine)).tolist():
             members = circles.members(number)
             if mine[members].any():
-                out[tuple(circles.centres[number])] = back[members].tolist()
+                out[tuple(circles.centers[number])] = back[members].tolist()
         return out
 
     assert holding(whole, own, np.arange(len(xyz))) == holding(tile, own[rows], rows)
@@ -212,24 +212,24 @@ def test_pyramid_shapes_and_who_is_where():
     pyramid = build(local, np.zeros((256, 1), np.float32), TINY)
     n, rows = len(local), local
     for level, step in zip(TINY.levels, pyramid.steps, strict=True):
-        assert step.groups.shape == (level.centres, level.samples)
-        assert step.offsets.shape == (level.centres, level.samples, 3)
+        assert step.groups.shape == (level.centers, level.samples)
+        assert step.offsets.shape == (level.centers, level.samples, 3)
         assert step.near.shape == step.weights.shape == (n, 3)
         assert np.linalg.norm(step.offsets, axis=2).max() <= 1.0 + 1e-5
         np.testing.assert_allclose(step.weights.sum(axis=1), 1.0, rtol=1e-5)
-        # a centre is its own nearest coarse point
-        centre = rows[step.groups[0, 0]] - step.offsets[0, 0] * level.radius
-        assert np.linalg.norm(rows - centre, axis=1).min() < 1e-5
+        # a center is its own nearest coarse point
+        center = rows[step.groups[0, 0]] - step.offsets[0, 0] * level.radius
+        assert np.linalg.norm(rows - center, axis=1).min() < 1e-5
         own = farthest_points(
             rows,
-            level.centres,
+            level.centers,
             0 if step is not pyramid.steps[0] else int(np.argmin((rows[:, :2] ** 2).sum(axis=1))),
         )
-        assert np.array_equal(step.near[own, 0], np.arange(level.centres))
-        rows, n = rows[own], level.centres
+        assert np.array_equal(step.near[own, 0], np.arange(level.centers))
+        rows, n = rows[own], level.centers
 
 
-def test_pyramid_of_fewer_points_than_centres():
+def test_pyramid_of_fewer_points_than_centers():
     pyramid = build(np.random.default_rng(0).random((5, 3)), np.zeros((5, 1), np.float32), TINY)
     assert [len(step.groups) for step in pyramid.steps] == [5, 5]
     assert len(build(np.zeros((1, 3)), np.zeros((1, 1), np.float32), TINY).steps) == 2
@@ -269,7 +269,7 @@ def test_configurations_survive_json(name):
 def test_published_configuration():
     one = CONFIGURATIONS["alsnet4"]
     assert one.points == 200_000
-    assert [(v.centres, v.radius, v.samples) for v in one.levels] == [
+    assert [(v.centers, v.radius, v.samples) for v in one.levels] == [
         (8192, 1.0, 16), (4096, 2.0, 16), (2048, 5.0, 16), (512, 15.0, 32),
     ]  # fmt: skip
 
@@ -295,7 +295,7 @@ def test_bad_configurations(given, text):
 
 
 def test_published_configurations_have_the_published_widths():
-    """Of the authors' program: (centres, radius, samples, widths, widths back up) level by level."""
+    """Of the authors' program: (centers, radius, samples, widths, widths back up) level by level."""
     four, three = CONFIGURATIONS["alsnet4"], CONFIGURATIONS["alsnet3"]
     assert [level.mlp for level in three.levels] == [(128, 128, 128), (128, 128, 256), (128, 128, 256)]
     assert [level.up for level in three.levels] == [(128, 128), (256, 256), (256, 256)]

@@ -98,7 +98,7 @@ def test_averages_equal_a_hand_computation():
     each = [[] for _ in xyz]
     for number in range(len(circles)):
         members = circles.members(number)
-        order, pyramid = make_pyramid(xyz, columns, members, circles.centres[number], INPUTS, TINY)
+        order, pyramid = make_pyramid(xyz, columns, members, circles.centers[number], INPUTS, TINY)
         for row, p in zip(members[order], net.folded(pyramid), strict=True):
             each[row].append(p)
     assert [len(part) for part in each] == coverage(circles).tolist()
@@ -140,10 +140,10 @@ def test_a_tile_with_its_halo_gets_the_labels_of_the_whole():
     xyz, _, dimensions = scene(12_000, 60.0, origin=(620000.0, 6270000.0, 100.0))
     model = model_of(net_with())
     whole = model.predict(xyz, dimensions, probabilities=True, variance=True)
-    assert model.halo == pytest.approx((3.0 + 0.5**0.5) * 3.0)
+    assert model.halo_m == pytest.approx((3.0 + 0.5**0.5) * 3.0)
     low = xyz.min(axis=0)[:2] + 20.0
     own = ((xyz[:, :2] >= low) & (xyz[:, :2] < low + 12.0)).all(axis=1)
-    near = ((xyz[:, :2] >= low - model.halo) & (xyz[:, :2] < low + 12.0 + model.halo)).all(axis=1)
+    near = ((xyz[:, :2] >= low - model.halo_m) & (xyz[:, :2] < low + 12.0 + model.halo_m)).all(axis=1)
     tile = model.predict(
         xyz[near], {k: v[near] for k, v in dimensions.items()}, own[near], probabilities=True, variance=True
     )
@@ -189,7 +189,7 @@ def test_saved_and_loaded_gives_the_same_labels(tmp_path):
     again = load_model(tmp_path / "a.model")
     again.save(tmp_path / "b.model")
     assert (tmp_path / "a.model").read_bytes() == (tmp_path / "b.model").read_bytes()
-    assert isinstance(again.algorithm, AlsNet) and again.halo == model.halo
+    assert isinstance(again.algorithm, AlsNet) and again.halo_m == model.halo_m
     one, other = (m.predict(xyz, dimensions, probabilities=True) for m in (model, again))
     assert np.array_equal(one.probabilities, other.probabilities)
     assert (
@@ -241,7 +241,7 @@ def shallow(**changes):
 
 
 def greedy():
-    level = {**TINY.to_dict()["levels"][0], "centres": 10**6, "samples": 1024}
+    level = {**TINY.to_dict()["levels"][0], "centers": 10**6, "samples": 1024}
     return shallow(points=10**6, levels=[level, TINY.to_dict()["levels"][1]])
 
 

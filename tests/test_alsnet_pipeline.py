@@ -141,7 +141,7 @@ def test_stage_options(model, tmp_path):
     classifier, writer = registry.get("filters.modelclassifier"), registry.get(WRITER)
     made = classifier({"model": str(model), "variance": True})
     assert made.creates()["Variance"] == "float"
-    assert made.halo() == load_model(model).halo
+    assert made.halo_m() == load_model(model).halo_m
     given = {"filename": str(tmp_path / "m"), "algorithm": "alsnet", "alsnet": {"coordinates": "XYZ"}}
     assert writer(given).reads() == ["Classification", "HeightAboveGround"]
     with pytest.raises(OptionError, match="epochs"):

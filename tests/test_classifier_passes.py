@@ -55,8 +55,8 @@ def test_a_second_pass_sees_more_than_the_first(two, other):
     xyz, label, dimensions = other
     one = (learnt(1).predict(xyz, dimensions).classification == label).mean()
     assert 1 - (two.predict(xyz, dimensions).classification == label).mean() < 0.5 * (1 - one)
-    inner = max(two.passes[0].plan.halo + 8.0, two.passes[1].plan.halo)
-    assert two.halo == inner + two.voxel
+    inner = max(two.passes[0].plan.halo_m + 8.0, two.passes[1].plan.halo_m)
+    assert two.halo_m == inner + two.voxel
     assert two.required_dimensions == ("HeightAboveGround",)
     assert two.plan.most_neighbors == two.passes[0].plan.most_neighbors
 
@@ -100,7 +100,7 @@ def test_where_and_tiles_change_nothing(name, other, request):
     part = everything(model, xyz, dimensions, inner, current=np.full(len(xyz), 9))
     same(whole, part, inner, inner)
     assert (part.classification[~inner] == 9).all() and not part.reliability[~inner].any()
-    near = (np.abs(xyz[:, :2] - 30) < 8 + model.halo).all(axis=1)
+    near = (np.abs(xyz[:, :2] - 30) < 8 + model.halo_m).all(axis=1)
     assert not near.all()
     tile = everything(model, xyz[near], {k: v[near] for k, v in dimensions.items()}, inner[near])
     same(whole, tile, inner, inner[near])
@@ -148,7 +148,7 @@ def test_the_file_holds_all_passes(three, other, tmp_path):
     again.save(tmp_path / "n")
     assert (tmp_path / "m").read_bytes() == (tmp_path / "n").read_bytes()
     same(everything(three, xyz, dimensions), everything(again, xyz, dimensions))
-    assert again.halo == three.halo and str(again) == str(three)
+    assert again.halo_m == three.halo_m and str(again) == str(three)
     described = json.loads(json.dumps(again.describe()))
     assert [one["context"] for one in described["passes"]] == [
         [],

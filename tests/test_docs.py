@@ -69,7 +69,7 @@ def test_readme_pipelines_and_python_objects_run(tmp_path, monkeypatch, write_la
     block = (x > 15) & (y > 15)
     labels = np.where(block, 6, np.where(x < 8, 4, 2)).astype(np.uint8)
     z = np.where(block, 5.0, np.where(x < 8, rng.uniform(0, 4, 1500), 0.0)) + rng.normal(0, 0.02, 1500)
-    for name in ("labelled.laz", "raw.laz"):
+    for name in ("labeled.laz", "raw.laz"):
         write_las(tmp_path / name, {"X": x, "Y": y, "Z": z, "Classification": labels}, point_format=3)
     train, classify = blocks(ROOT / "README.md", "json")
     ps.run_pipeline(train)

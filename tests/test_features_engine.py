@@ -124,11 +124,11 @@ def test_refused_plan_dicts(data):
 
 
 def test_halo():
-    assert FeaturePlan.parse("c1,s5").halo == 6.0
-    assert FeaturePlan.parse("c50").halo == 54.0
-    assert FeaturePlan.parse("copt").halo == 4.0
-    assert FeaturePlan.parse("c1,kopt").halo == 16.0 and FeaturePlan.parse("c1,kopt").unbounded
-    assert FeaturePlan.parse("c0.2").halo < 0.5
+    assert FeaturePlan.parse("c1,s5").halo_m == 6.0
+    assert FeaturePlan.parse("c50").halo_m == 54.0
+    assert FeaturePlan.parse("copt").halo_m == 4.0
+    assert FeaturePlan.parse("c1,kopt").halo_m == 16.0 and FeaturePlan.parse("c1,kopt").unbounded
+    assert FeaturePlan.parse("c0.2").halo_m < 0.5
 
 
 # ---- the same bits -----------------------------------------------------------------------------------------
@@ -173,7 +173,7 @@ def test_tile_with_halo(cloud, whole):
     plan = FeaturePlan.parse(KINDS)
     low = cloud.min(axis=0)[:2] + 9.0
     inside = ((cloud[:, :2] >= low) & (cloud[:, :2] < low + 5.0)).all(axis=1)
-    near = ((cloud[:, :2] >= low - plan.halo) & (cloud[:, :2] < low + 5.0 + plan.halo)).all(axis=1)
+    near = ((cloud[:, :2] >= low - plan.halo_m) & (cloud[:, :2] < low + 5.0 + plan.halo_m)).all(axis=1)
     tile = cloud[near]
     assert 20 < inside.sum() < near.sum()
     part = again(whole, tile, np.flatnonzero(inside[near]))
@@ -184,7 +184,7 @@ def test_tile_smaller_than_the_cloud(cloud):
     """As above where the halo is a small part of the cloud, for neighborhoods with a radius."""
     spec = "c1,s1.5,ropt(0.5,1.5,0.25)"
     everything = compute_features(cloud, None, spec, "all")
-    halo = FeaturePlan.parse(spec).halo
+    halo = FeaturePlan.parse(spec).halo_m
     assert halo == 2.5
     low = cloud.min(axis=0)[:2] + 7.3
     inside = ((cloud[:, :2] >= low) & (cloud[:, :2] < low + 6.0)).all(axis=1)

@@ -46,7 +46,7 @@ def test_any_order_of_points_and_a_tile_with_its_halo_give_the_same_bits():
         returns.NAMES, xyz[order], {name: values[order] for name, values in dimensions.items()}
     )
     low, high = xyz[:, :2].min(axis=0) + 20, xyz[:, :2].min(axis=0) + 40
-    halo = FeaturePlan.parse("s1", "Linearity", returns.NAMES).halo
+    halo = FeaturePlan.parse("s1", "Linearity", returns.NAMES).halo_m
     near = ((xyz[:, :2] >= low - halo) & (xyz[:, :2] < high + halo)).all(axis=1)
     tile = returns.return_features(returns.NAMES, xyz[near], {k: v[near] for k, v in dimensions.items()})
     inside = ((xyz[near, :2] >= low) & (xyz[near, :2] < high)).all(axis=1)

@@ -90,13 +90,13 @@ def test_models_are_listed(capsys):
 def test_a_pipeline_with_other_heights_is_told(town):
     same = [str(town), *load_model(shipped()[STANDARD]).info["preparation"]]
     classify = {"type": "filters.modelclassifier", "model": STANDARD}
-    assert Pipeline([*same, classify]).lowered.remarks == []
+    assert Pipeline([*same, classify]).lowered.warnings == []
     other = [
         str(town),
         {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17], "window": 20},
     ]
-    (remark,) = Pipeline([*other, classify]).lowered.remarks
-    assert "trained on other heights" in remark and '"window": 20' in remark
+    (warning,) = Pipeline([*other, classify]).lowered.warnings
+    assert "trained on other heights" in warning and '"window": 20' in warning
 
 
 @pytest.mark.pdal

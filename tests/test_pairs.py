@@ -29,7 +29,7 @@ pytestmark = pytest.mark.pdal
 #: Rows that run without --all-pairs.
 FIRST = 30
 VALUES = {
-    "input": ["las 1.2", "las 1.4", "laz 1.4", "copc", "feet", "several", "gaps", "noise unlabelled"],
+    "input": ["las 1.2", "las 1.4", "laz 1.4", "copc", "feet", "several", "gaps", "noise unlabeled"],
     "door": ["classify", "pipeline", "objects", "stock"],
     "model": ["standard", "one pass", "two passes", "binary", "network"],
     "tiles": ["none", "no workers", "two workers, per tile", "two workers, per file", "resumed"],
@@ -171,7 +171,7 @@ def scenes(tmp_path_factory, write_las):
         "feet": [write_las(folder / "feet.laz", feet, wkt=FEET, minor_version=4, **modern)],
         "several": [write_las(folder / f"part{k}.laz", part((x > 25) == k), **plain) for k in (False, True)],
         "gaps": [write_las(folder / "gaps.laz", part((x < 12) | (x > 38) | (y < 10)), **modern)],
-        "noise unlabelled": [write_las(folder / "noise.laz", noisy, **plain)],
+        "noise unlabeled": [write_las(folder / "noise.laz", noisy, **plain)],
     }
     return {kind: [str(path) for path in paths] for kind, paths in found.items()}
 

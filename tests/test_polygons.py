@@ -160,7 +160,7 @@ def test_what_is_wrong_is_said_before_any_work(tmp_path, monkeypatch):
         Polygons({"polygons": [f"{lines}=9"]})
     path = write(tmp_path / "a.gpkg", [LAKE])
     stage = Polygons({"polygons": [f"{path}=9", f"{path}=65:9"]})
-    assert stage.largest_class() == 65 and stage.inputs() == [path, path] and stage.halo() == 0
+    assert stage.largest_class() == 65 and stage.inputs() == [path, path] and stage.halo_m() == 0
 
     def missing(name):
         raise DependencyError("polygons need pyogrio", cure="pip install 'pdal-stages[vector]'")

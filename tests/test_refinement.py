@@ -26,17 +26,17 @@ def shares(classes):
     )
 
 
-def by_hand(said, grown, before, labelled, trusted):
+def by_hand(said, grown, before, labeled, trusted):
     """The rule, point by point and class by class."""
-    codes = sorted({*before, *labelled})
+    codes = sorted({*before, *labeled})
     out = []
     for b, f in zip(said, grown, strict=True):
-        b, f = dict(zip(before, b, strict=True)), dict(zip(labelled, f, strict=True))
-        kept = sum(b[c] for c in before if c not in labelled)
-        shared = sum(b.get(c, 0.0) for c in labelled)
+        b, f = dict(zip(before, b, strict=True)), dict(zip(labeled, f, strict=True))
+        kept = sum(b[c] for c in before if c not in labeled)
+        shared = sum(b.get(c, 0.0) for c in labeled)
         row = []
         for c in codes:
-            if c not in labelled:
+            if c not in labeled:
                 row.append(b[c])
             else:
                 known = b.get(c, 0.0) / shared if shared > 0 else f[c]
@@ -46,12 +46,12 @@ def by_hand(said, grown, before, labelled, trusted):
 
 
 @given(shares(3), shares(2), st.sampled_from([(2, 6), (2, 17), (17, 64)]), st.floats(0.0, 1.0))
-def test_blended_equals_the_rule(said, grown, labelled, trusted):
-    got = blended(said, grown, BEFORE, labelled, trusted)
+def test_blended_equals_the_rule(said, grown, labeled, trusted):
+    got = blended(said, grown, BEFORE, labeled, trusted)
     assert np.allclose(got.sum(axis=1), 1.0, atol=1e-9) and (got >= 0).all()
-    assert np.allclose(got, by_hand(said, grown, BEFORE, labelled, trusted), atol=1e-9)
-    codes = sorted({*BEFORE, *labelled})
-    for code in set(BEFORE) - set(labelled):
+    assert np.allclose(got, by_hand(said, grown, BEFORE, labeled, trusted), atol=1e-9)
+    codes = sorted({*BEFORE, *labeled})
+    for code in set(BEFORE) - set(labeled):
         assert np.array_equal(got[:, codes.index(code)], said[:, BEFORE.index(code)])
 
 
@@ -99,7 +99,7 @@ def on_top(base, keep=None, n=40, **more):
 def test_a_file_holds_the_base(base, tmp_path):
     model = on_top(base)
     assert [one.name for one in model.passes] == ["random_forest", "random_forest", "refined_forest"]
-    assert model.voxel == base.voxel and model.halo > base.halo
+    assert model.voxel == base.voxel and model.halo_m > base.halo_m
     model.save(tmp_path / "m.model")
     again = load_model(tmp_path / "m.model")
     xyz, _, dimensions = scene(seed=7, n=4000)
@@ -193,7 +193,7 @@ def test_what_cannot_be_built_on(base):
     "change",
     [
         lambda p: p[-1]["parameters"].update(before=[2, 5]),
-        lambda p: p[-1]["parameters"].update(labelled=[6, 5]),
+        lambda p: p[-1]["parameters"].update(labeled=[6, 5]),
         lambda p: p[-1]["parameters"].update(trusted=2.0),
         lambda p: p[-1]["parameters"].update(target=5),
         lambda p: p[-1]["parameters"].pop("before"),

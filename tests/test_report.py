@@ -423,7 +423,7 @@ def tiled(**changes):
         "dropped": 0,
         "states": {"done": 1, "kept": 1, "failed": 1},
         "classes": {"2": 4000, "6": 1000},
-        "notes": [nasty],
+        "messages": [nasty],
         "failures": [{"what": nasty, "reason": nasty}],
         "tiles": [
             {"name": "770500_6277000", "tile": [1541, 12554], "state": "done", **done},
@@ -483,7 +483,7 @@ def test_noise_does_not_empty_a_section(share):
     assert high - low < 200
 
 
-def test_labelled_noise_does_not_empty_a_section(scene, accuracy):
+def test_labeled_noise_does_not_empty_a_section(scene, accuracy):
     xyz, reference, predicted, _ = scene
     rng = np.random.default_rng(0)
     noise = rng.random(len(xyz)) < 0.2

@@ -302,7 +302,7 @@ def test_a_map_of_many_tiles_shows_several_as_one_square():
     ]
     found = {"done": side * side - 1, "kept": 0, "failed": 1}
     run = {
-        "tile": 100.0, "tiles": tiles, "outputs": [], "notes": [], "failures": [], "states": found, "inputs": 1,
+        "tile": 100.0, "tiles": tiles, "outputs": [], "messages": [], "failures": [], "states": found, "inputs": 1,
         "per": "file", "points": 10 * side * side, "seconds": 5.0, "points_per_second": 2.0, "workers": 1,
         "peak_mb_of_a_worker": 1.0, "dropped": 0,
     }  # fmt: skip

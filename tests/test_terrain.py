@@ -55,7 +55,7 @@ def test_equals_the_slow_reference(seed, offset):
     assert np.allclose(got, slow_hag(x, y, z, 20.0, 0.5), atol=1e-9 * max(1, abs(offset) / 1e4))
 
 
-def test_a_plane_of_minima_is_reproduced_between_cell_centres():
+def test_a_plane_of_minima_is_reproduced_between_cell_centers():
     # One point at each cell center, on a plane: bilinear interpolation is exact on it.
     cx, cy = np.meshgrid(np.arange(10.0, 200, 20), np.arange(10.0, 200, 20))
     plane = 5 + 0.2 * cx - 0.1 * cy

@@ -519,8 +519,8 @@ def test_the_stage_declares_what_it_makes_and_how_far_it_looks():
         "HeightAboveOpening_16_5": "float",
     }
     assert HagMorphological({}).creates() == {"HeightAboveGround": "float"}
-    assert 500 < HagMorphological({}).halo() < 600
-    assert HagMorphological({"window": 20}).halo() < 500
+    assert 500 < HagMorphological({}).halo_m() < 600
+    assert HagMorphological({"window": 20}).halo_m() < 500
     with pytest.raises(
         StageError, match=r"filters\.hag_morphological.*'window' must not be more than 300 cells"
     ):

@@ -385,12 +385,12 @@ def test_sparse_points_widen_the_surroundings(tmp_path, random_cloud, write_las)
     ps.Pipeline(pipeline).execute(arrays=False)
     pipeline[-1] = {**pipeline[-1], "filename": str(tmp_path / "b.las")}
     run = run_tiled(pipeline, 60, workers=0)
-    assert not run.failures and not [note for note in run.notes if "meters were assumed" not in note]
+    assert not run.failures and not [note for note in run.messages if "meters were assumed" not in note]
     assert any(job.report["widened"] for job in run.tiles)
     clouds.same_points(tmp_path / "a.las", tmp_path / "b.las")
     pipeline[-1] = {**pipeline[-1], "filename": str(tmp_path / "c.las")}
     run = run_tiled(pipeline, 60, workers=0, most_points=50)  # no room to widen: said, not hidden
-    assert any("may differ" in note for note in run.notes)
+    assert any("may differ" in note for note in run.messages)
     assert any(job.report["short"] for job in run.tiles)
 
 
@@ -499,7 +499,7 @@ def test_only_seen_points_are_computed(tmp_path, town_file, model_file):
     plan = make_plan(ps.Pipeline(clouds.stages([town_file], tmp_path / "o.las", model_file)))
     assert plan.head[1]["where"] == "PdalStagesOutside < 0"
     assert [s["type"] for s in plan.tail] == ["writers.las"]
-    assert plan.halo_m == pytest.approx(4 * clouds.CELL + ps.load_model(model_file).halo)
+    assert plan.halo_m == pytest.approx(4 * clouds.CELL + ps.load_model(model_file).halo_m)
 
 
 # ---- tile indexes and EPT --------------------------------------------------------------------------------

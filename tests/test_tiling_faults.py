@@ -205,7 +205,7 @@ def test_unreadable_input(tmp_path, folder, expected):
     check_same(tmp_path, expected)
     (inputs / "east.laz").write_bytes(b"gone")
     run = run_tiled(stages, 20, workers=0)
-    assert any("not a LAS" in why for _, why in run.failures) and run.notes
+    assert any("not a LAS" in why for _, why in run.failures) and run.messages
     (inputs / "west.laz").write_bytes(b"gone")
     with pytest.raises(StageError, match="none of the inputs"):
         run_tiled(stages, 20, workers=0)

@@ -112,7 +112,7 @@ def test_members_get_the_same(model, how, tmp_path):
 def test_tile_is_the_whole(model):
     xyz = crowd(5, n=20_000, side=60.0, dense=25.0)
     whole = model.predict(xyz, {})
-    near = (xyz[:, 0] < 600_010.0 + model.halo) & (xyz[:, 1] < 5_000_010.0 + model.halo)
+    near = (xyz[:, 0] < 600_010.0 + model.halo_m) & (xyz[:, 1] < 5_000_010.0 + model.halo_m)
     core = (xyz[:, 0] < 600_010.0) & (xyz[:, 1] < 5_000_010.0)
     assert not near.all()
     tile = model.predict(xyz[near], {})

@@ -1,4 +1,4 @@
-"""Labelled clouds of the experiments, read from LAS or LAZ."""
+"""Labeled clouds of the experiments, read from LAS or LAZ."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pdal_stages.terrain.minima import hag_minima
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """A labelled cloud: (n, 3) coordinates in meters, (n,) class codes, and the points' own dimensions."""
+    """A labeled cloud: (n, 3) coordinates in meters, (n,) class codes, and the points' own dimensions."""
 
     name: str
     xyz: np.ndarray

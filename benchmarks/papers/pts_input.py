@@ -1,4 +1,4 @@
-"""Labelled ``.pts`` text, the format of clouds that may not be passed on (ISPRS Vaihingen, GML).
+"""Labeled ``.pts`` text, the format of clouds that may not be passed on (ISPRS Vaihingen, GML).
 
 One point a line, no header: X Y Z intensity return-number number-of-returns label, separated by blanks. Whoever holds
 such files puts them in DIR/NAME/train*.pts and test*.pts and runs

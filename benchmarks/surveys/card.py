@@ -29,7 +29,7 @@ def main() -> None:
     args = options.parse_args()
     model, scores = load_model(args.model), json.loads(args.scores.read_text())
     surveys = [
-        "| survey | what | labelled points | left out | samples per copy | license |",
+        "| survey | what | labeled points | left out | samples per copy | license |",
         "|---|---|---:|---:|---:|---|",
     ]
     runs = {run["cloud"]: run for run in scores["surveys"]}

@@ -1,4 +1,4 @@
-"""The open, labelled surveys that the shipped models are trained on, and copies of them that are thinner, steeper, or
+"""The open, labeled surveys that the shipped models are trained on, and copies of them that are thinner, steeper, or
 without return numbers.
 
 Labels become 2 ground, 5 vegetation, 6 building and 0, which is left out of training and scoring. Low vegetation (3) is

@@ -52,10 +52,10 @@ class LeaveOneOut:
                 np.save(path, features_of(cloud))
                 self.clouds.append(cloud)
                 self.tables.append(np.load(path, mmap_mode="r"))
-        labelled = label_classes(self.clouds, OPTIONS)
-        self.classes = list(zip(labelled.classes.codes, labelled.classes.names, strict=True))
+        labeled = label_classes(self.clouds, OPTIONS)
+        self.classes = list(zip(labeled.classes.codes, labeled.classes.names, strict=True))
         of = [cloud.flight for cloud in self.clouds]
-        self.samples = draw_samples(labelled, len(self.classes), OPTIONS.count, OPTIONS.seed, of)
+        self.samples = draw_samples(labeled, len(self.classes), OPTIONS.count, OPTIONS.seed, of)
         self.survey = np.array([self.names.index(name) for name in of])[self.samples.cloud]
         self.values = self.samples.take(self.tables)
         self._pair = cache(self._grown_without)

@@ -30,8 +30,8 @@ from .weights import Folded, Weights, check
 
 #: A network whose batch would need more megabytes is not loaded; the published ones need a few thousand.
 MOST_MB = 32_768
-#: Metres that become 1 where X, Y or Z is an input.
-METRES = 10.0
+#: Meters that become 1 where X, Y or Z is an input.
+METERS = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class AlsNet:
     inputs: tuple[str, ...]  #: their names
     mean: tuple[float, ...]  #: an input is (value - mean) / scale
     scale: tuple[float, ...]
-    spacing: float  #: of the batches' grid, metres
+    spacing: float  #: of the batches' grid, meters
     n_classes: int
 
     name: ClassVar[str] = "alsnet"
@@ -120,8 +120,8 @@ class AlsNet:
 
     @property
     def plan(self) -> InputPlan:
-        """Its inputs; X, Y and Z are taken from the batch's centre, and batches are cut by area."""
-        return InputPlan(self.inputs, self.inputs, circles_.halo(self.spacing))
+        """Its inputs; X, Y and Z are taken from the batch's center, and batches are cut by area."""
+        return InputPlan(self.inputs, self.inputs, circles_.halo_m(self.spacing))
 
     # ---- applying ------------------------------------------------------------------------------------------
 
@@ -182,7 +182,7 @@ class AlsNet:
         def one(number: int):
             members = circles.members(number)
             order, pyramid = make_pyramid(
-                xyz, columns, members, circles.centres[number], self.inputs, self.configuration
+                xyz, columns, members, circles.centers[number], self.inputs, self.configuration
             )
             return members[order], apply(pyramid)
 
@@ -256,7 +256,7 @@ def make_pyramid(
     xyz: npt.NDArray[np.float64],
     columns: npt.NDArray[np.float32],
     members: npt.NDArray[np.int64],
-    centre: npt.NDArray[np.float64],
+    center: npt.NDArray[np.float64],
     inputs: Sequence[str],
     configuration: Configuration,
     change: Any = None,
@@ -267,7 +267,7 @@ def make_pyramid(
     ----------
     members : (k,) int64
         Rows of the cloud in the canonical order.
-    centre : (2,) float64
+    center : (2,) float64
         Coordinates are taken from it, heights from the batch's first percentile: near its ground, whatever few
         strays lie below.
     change : function, optional
@@ -275,7 +275,7 @@ def make_pyramid(
     """
     z = xyz[members, 2]
     low = float(np.partition(z, len(z) // 100)[len(z) // 100])
-    local = xyz[members] - np.array([centre[0], centre[1], low])
+    local = xyz[members] - np.array([center[0], center[1], low])
     kept = None
     if change is not None:
         local, kept = change(local)
@@ -286,7 +286,7 @@ def make_pyramid(
     values = columns[members[order]]
     for k, name in enumerate(inputs):
         if name in ("X", "Y", "Z"):
-            values[:, k] = local[:, "XYZ".index(name)] / METRES
+            values[:, k] = local[:, "XYZ".index(name)] / METERS
     return order, build(local, values, configuration)
 
 

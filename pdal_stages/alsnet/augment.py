@@ -20,11 +20,11 @@ class Augmentation:
         self.options, self.random = options, random
 
     def shift(self, spacing: float) -> npt.NDArray[np.float64]:
-        """How far the batch's centre is moved, (2,) metres."""
+        """How far the batch's center is moved, (2,) meters."""
         return self.random.uniform(-1.0, 1.0, 2) * self.options.shift * spacing
 
     def __call__(self, xyz: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
-        """Coordinates from the batch's centre (n, 3) to changed ones (m, 3) and the rows kept (m,)."""
+        """Coordinates from the batch's center (n, 3) to changed ones (m, 3) and the rows kept (m,)."""
         options, random = self.options, self.random
         kept = np.arange(len(xyz))
         if options.thin > 0.0:

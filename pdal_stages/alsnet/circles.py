@@ -24,7 +24,7 @@ DEEPEST = 24
 
 
 def density(clouds: Sequence[npt.NDArray[np.float64]]) -> float:
-    """Points per square metre of the ground that is covered, over several clouds."""
+    """Points per square meter of the ground that is covered, over several clouds."""
     points, area = 0, 0.0
     for xyz in clouds:
         if not len(xyz):
@@ -39,18 +39,18 @@ def density(clouds: Sequence[npt.NDArray[np.float64]]) -> float:
 
 
 def spacing_for(points: int, per_square_metre: float) -> float:
-    """Spacing in metres at which circles of `points` points cover each point :data:`COVERAGE` times.
+    """Spacing in meters at which circles of `points` points cover each point :data:`COVERAGE` times.
 
-    A circle covers points / density square metres and each grid point stands for spacing^2 of them.
+    A circle covers points / density square meters and each grid point stands for spacing^2 of them.
     """
     return max(round(math.sqrt(points / (COVERAGE * per_square_metre)), 2), 0.05)
 
 
-def halo(spacing: float) -> float:
-    """Metres around a tile that its results depend on.
+def halo_m(spacing: float) -> float:
+    """Meters around a tile that its results depend on.
 
     A point's circles have their grid points within ``REACH`` spacings of it and take points as far again; which
-    grid points there are depends on the cell they were halved from, whose centre is up to half a cell's diagonal
+    grid points there are depends on the cell they were halved from, whose center is up to half a cell's diagonal
     away, and on what lies within reach of that.
     """
     return (2.0 * REACH + math.sqrt(0.5)) * spacing
@@ -65,17 +65,17 @@ class Circles:
     Parameters
     ----------
     xyz : (n, 3) float64
-        Coordinates in metres.
+        Coordinates in meters.
     points : int
         Points of a batch; a circle in sparse surroundings has fewer.
     spacing : float
-        Of the grid, metres.
+        Of the grid, meters.
     inputs : (n, c) array, optional
         Other values of the points, to tell points at the same place apart.
 
     Attributes
     ----------
-    centres : (m, 2) float64
+    centers : (m, 2) float64
         Grid points, in an order that follows from the coordinates.
     sizes : (m,) int64
         Points a circle may hold: `points`, but for more than `points` at one and the same place.
@@ -108,10 +108,10 @@ class Circles:
         self._rank = by_cell  # place in the canonical order
         self._row = canonical[by_cell]  # row of the cloud
         self._xy = np.ascontiguousarray(xyz[self._row, :2])
-        self.centres, self.sizes = self._place()
+        self.centers, self.sizes = self._place()
 
     def __len__(self) -> int:
-        return len(self.centres)
+        return len(self.centers)
 
     # ---- what is near --------------------------------------------------------------------------------------
 
@@ -152,13 +152,13 @@ class Circles:
 
     def members(self, number: int) -> npt.NDArray[np.int64]:
         """Rows of the points of a circle, in the canonical order."""
-        x, y = self.centres[number]
+        x, y = self.centers[number]
         return self.around(float(x), float(y), int(self.sizes[number]))
 
     # ---- where circles are ---------------------------------------------------------------------------------
 
     def _place(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
-        """Centres and sizes."""
+        """Centers and sizes."""
         found: list[tuple[float, float, int]] = []
         waiting = list(_parts(np.arange(len(self._xy)), self._xy, self.spacing))
         waiting = [(0, *part) for part in reversed(waiting)]
@@ -194,7 +194,7 @@ class Circles:
         wanted[rows] = True
         wanted = wanted[self._row]
         keep = []
-        for number, (x, y) in enumerate(self.centres):
+        for number, (x, y) in enumerate(self.centers):
             at = self._near(float(x), float(y), self.reach)
             at = at[wanted[at]]
             if len(at) and float(self._distance2(at, float(x), float(y)).min()) <= self.reach * self.reach:

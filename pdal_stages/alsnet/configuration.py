@@ -1,6 +1,6 @@
 """Network configurations as data: what a model file stores and an option names.
 
-A configuration lists the levels of set abstraction [WM19; Qi et al. 2017, PointNet++]: how many centres are
+A configuration lists the levels of set abstraction [WM19; Qi et al. 2017, PointNet++]: how many centers are
 sampled, the radius of the ball around each, how many points are taken from it, the widths of the shared
 perceptron that describes the ball, and the widths of the one that carries features back up to the level above.
 """
@@ -23,8 +23,8 @@ MAX_LAYERS = 60
 class Level:
     """One level of set abstraction and the feature propagation back from it."""
 
-    centres: int  #: points kept, by farthest point sampling; all where there are fewer
-    radius: float  #: of the ball around each centre, metres
+    centers: int  #: points kept, by farthest point sampling; all where there are fewer
+    radius: float  #: of the ball around each center, meters
     samples: int  #: points taken from a ball
     #: widths of the shared perceptron over a ball's points; the maximum over the points follows
     mlp: tuple[int, ...]
@@ -32,7 +32,7 @@ class Level:
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
-        set_(self, "centres", checks.whole("'centres'", self.centres, 1, 10**7))
+        set_(self, "centers", checks.whole("'centers'", self.centers, 1, 10**7))
         set_(self, "radius", checks.number("'radius'", self.radius, 1e-3, 1e4))
         set_(self, "samples", checks.whole("'samples'", self.samples, 1, 1024))
         set_(self, "mlp", _widths("mlp", self.mlp))
@@ -76,7 +76,7 @@ class Configuration:
         out: dict[str, tuple[int, int]] = {}
         width = [inputs]
         for number, level in enumerate(self.levels, 1):
-            before = width[-1] + 3  # the offset from the ball's centre
+            before = width[-1] + 3  # the offset from the ball's center
             for step, after in enumerate(level.mlp, 1):
                 out[f"sa{number}_{step}"] = (after, before + 4)
                 before = after
@@ -103,14 +103,14 @@ class Configuration:
         rows_above, width = self.points, [inputs]
         count = [self.points]
         for level in self.levels:
-            rows = min(level.centres, rows_above) * level.samples
+            rows = min(level.centers, rows_above) * level.samples
             before = width[-1] + 3
             for after in level.mlp:
                 most = max(most, rows * (before + 2 * after))
                 kept += rows * after * 3.0
                 before = after
             width.append(before)
-            rows_above = min(level.centres, rows_above)
+            rows_above = min(level.centers, rows_above)
             count.append(rows_above)
         below = width[-1]
         for number in range(len(self.levels), 0, -1):
@@ -142,7 +142,7 @@ def parse_configuration(
     Parameters
     ----------
     given : str, mapping or Configuration
-        A name of :data:`CONFIGURATIONS`, or a mapping with ``points``, ``levels`` (each ``centres``, ``radius``,
+        A name of :data:`CONFIGURATIONS`, or a mapping with ``points``, ``levels`` (each ``centers``, ``radius``,
         ``samples``, ``mlp``, ``up``) and optionally ``name``, ``head``, ``dropout``.
     points : int, optional
         Points of a batch, instead of the configuration's own.

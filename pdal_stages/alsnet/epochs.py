@@ -29,10 +29,10 @@ from .weights import Weights, check, fresh
 
 
 @dataclass(frozen=True, eq=False)
-class LabelledCloud:
+class LabeledCloud:
     """A cloud to train on."""
 
-    xyz: npt.NDArray[np.float64]  #: (n, 3) metres
+    xyz: npt.NDArray[np.float64]  #: (n, 3) meters
     position: npt.NDArray[Any]  #: (n,) place of each point's class; -1 is not trained on, but is a neighbor
     dimensions: dict[str, npt.NDArray[Any]]  #: name to (n,) values of the inputs that are dimensions
 
@@ -47,7 +47,7 @@ class Trained:
 
 
 def train_network(
-    clouds: Sequence[LabelledCloud],
+    clouds: Sequence[LabeledCloud],
     inputs: Sequence[str],
     classes: ClassMap,
     options: NetworkOptions,
@@ -214,16 +214,16 @@ class _Session:
         """(pyramid, labels) of a batch, changed as the options say."""
         change = Augmentation(self.options, np.random.default_rng([self.seed, epoch, 2, cloud, number]))
         circles = self.circles[cloud]
-        centre = circles.centres[number] + change.shift(self.spacing)
-        members = circles.around(float(centre[0]), float(centre[1]))
+        center = circles.centers[number] + change.shift(self.spacing)
+        members = circles.around(float(center[0]), float(center[1]))
         if not len(members):  # moved off the cloud's edge
-            centre, members = circles.centres[number], circles.members(number)
-        order, pyramid = self._pyramid(cloud, members, centre, change)
+            center, members = circles.centers[number], circles.members(number)
+        order, pyramid = self._pyramid(cloud, members, center, change)
         return pyramid, self.train_labels[cloud][members[order]]
 
-    def _pyramid(self, cloud: int, members, centre, change: Any = None):
+    def _pyramid(self, cloud: int, members, center, change: Any = None):
         xyz, columns, configuration = self.clouds[cloud].xyz, self.columns[cloud], self.options.configuration
-        return make_pyramid(xyz, columns, members, centre, self.inputs, configuration, change)
+        return make_pyramid(xyz, columns, members, center, self.inputs, configuration, change)
 
     def _step(self, pyramid, labels: npt.NDArray[np.int64]) -> float:
         from .network import tensors
@@ -256,7 +256,7 @@ class _Session:
         def prepare(batch):
             cloud, number = batch
             members = self.circles[cloud].members(number)
-            order, pyramid = self._pyramid(cloud, members, self.circles[cloud].centres[number])
+            order, pyramid = self._pyramid(cloud, members, self.circles[cloud].centers[number])
             return cloud, members[order], pyramid
 
         with torch.no_grad():
@@ -383,7 +383,7 @@ def _device(wanted: str, torch) -> str:
 
 
 def _statistics(clouds, inputs) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Mean and standard deviation of each input over the labelled points; 0 and 1 for coordinates."""
+    """Mean and standard deviation of each input over the labeled points; 0 and 1 for coordinates."""
     mean, scale = [], []
     for name in inputs:
         if name in ("X", "Y", "Z"):

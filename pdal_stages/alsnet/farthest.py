@@ -101,17 +101,17 @@ def _farthest(p, order, count, first):
 
 
 def ball_query(
-    xyz: npt.NDArray[np.float64], centres: npt.NDArray[np.int64], radius: float, samples: int
+    xyz: npt.NDArray[np.float64], centers: npt.NDArray[np.int64], radius: float, samples: int
 ) -> npt.NDArray[np.int32]:
-    """The first `samples` points, by index, within `radius` of each centre.
+    """The first `samples` points, by index, within `radius` of each center.
 
-    A centre is within its own ball, so none is empty. A ball with fewer points repeats its first one, which a
+    A center is within its own ball, so none is empty. A ball with fewer points repeats its first one, which a
     maximum over the ball does not notice (as PointNet++ does).
 
     Parameters
     ----------
     xyz : (n, 3) float64
-    centres : (m,) int64
+    centers : (m,) int64
         Rows of `xyz`.
     radius : float
         Points at exactly this distance count.
@@ -130,16 +130,16 @@ def ball_query(
     order = np.argsort(key, kind="stable")
     start = np.searchsorted(key[order], np.arange(width * height + 1))
     return _ball(
-        np.ascontiguousarray(xyz), centres, column, order, start, width, height, float(radius), samples
+        np.ascontiguousarray(xyz), centers, column, order, start, width, height, float(radius), samples
     )
 
 
 @njit
-def _ball(p, centres, column, order, start, width, height, radius, samples):
-    out = np.empty((len(centres), samples), np.int32)
+def _ball(p, centers, column, order, start, width, height, radius, samples):
+    out = np.empty((len(centers), samples), np.int32)
     limit = radius * radius
-    for m in range(len(centres)):
-        c = centres[m]
+    for m in range(len(centers)):
+        c = centers[m]
         count = 0
         cx, cy = column[c, 0], column[c, 1]
         row = out[m]

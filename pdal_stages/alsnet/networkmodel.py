@@ -1,4 +1,4 @@
-"""From labelled clouds to a model with a network in it: how ``alsnet`` is trained."""
+"""From labeled clouds to a model with a network in it: how ``alsnet`` is trained."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..classifier.model import Model
 from ..classifier.thinning import density_range
 from ..classifier.trainoptions import TrainingOptions
 from ..features.index import check_xyz
-from .epochs import LabelledCloud, train_network
+from .epochs import LabeledCloud, train_network
 from .networkoptions import NetworkOptions
 
 optional_inputs: dict[str, tuple[str, ...]] = {}
@@ -43,7 +43,7 @@ def own_options(given: Any) -> NetworkOptions:
 
 
 def inputs(options: TrainingOptions) -> tuple[str, ...]:
-    """The network's inputs: coordinates from the batch's centre, then dimensions; OptionError where there are none."""
+    """The network's inputs: coordinates from the batch's center, then dimensions; OptionError where there are none."""
     names = tuple(dict.fromkeys([*options.alsnet.coordinates, *options.dimensions]))
     if not names:
         raise OptionError(
@@ -61,17 +61,17 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     checked = [check_xyz(np.asarray(cloud.xyz), cloud.name) for cloud in clouds]
     known = label_classes(clouds, options)
     classes, positions = known.classes, [position for _, position in known]
-    labelled: list[LabelledCloud] = []
-    notes: dict[str, int] = {}
+    labeled: list[LabeledCloud] = []
+    counts: dict[str, int] = {}
     for cloud, xyz, position in zip(clouds, checked, positions, strict=True):
         values, counted = gather(
             names, with_returns(names, xyz, cloud.dimensions, options.threads), len(xyz), where=cloud.name
         )
         for name, number in counted.items():
-            notes[name] = notes.get(name, 0) + number
-        labelled.append(LabelledCloud(xyz, position, values))
+            counts[name] = counts.get(name, 0) + number
+        labeled.append(LabeledCloud(xyz, position, values))
     trained = train_network(
-        labelled,
+        labeled,
         names,
         classes,
         options.alsnet,
@@ -81,7 +81,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     )
     used = [np.bincount(p[p >= 0], minlength=len(classes.codes)) for p in positions]
     count = np.sum(used, axis=0)
-    low, high = zip(*(_range(name, labelled) for name in names), strict=True)
+    low, high = zip(*(_range(name, labeled) for name in names), strict=True)
     info: dict[str, Any] = {
         **known.described(
             options, ({"available": int(m), "samples": int(m), "duplicates": 0} for m in count)
@@ -93,7 +93,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
             "samples": int(count.sum()),
             **known.training_notes(options),
             **trained.notes,
-            **{name: number for name, number in notes.items() if number},
+            **{name: number for name, number in counts.items() if number},
         },
         "densities": density_range(checked),
         "voxel": options.voxel,
@@ -116,7 +116,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     return Model((trained.net,), list(zip(classes.codes, classes.names, strict=True)), info, seconds)
 
 
-def _range(name: str, clouds: Sequence[LabelledCloud]) -> tuple[float, float]:
+def _range(name: str, clouds: Sequence[LabeledCloud]) -> tuple[float, float]:
     """Smallest and largest value of an input; 0 and 0 for coordinates, which depend on the batch."""
     if name in ("X", "Y", "Z"):
         return 0.0, 0.0

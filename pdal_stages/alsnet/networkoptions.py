@@ -25,9 +25,9 @@ class NetworkOptions:
     points : int or None
         Points of a batch, instead of the configuration's.
     spacing : float or None
-        Of the batches' grid in metres. None: from the clouds' density, for four batches a point.
+        Of the batches' grid in meters. None: from the clouds' density, for four batches a point.
     coordinates : str
-        Which of X, Y and Z, from the batch's centre, are inputs: ``"Z"``, ``"XYZ"`` or ``""``. Offsets within a
+        Which of X, Y and Z, from the batch's center, are inputs: ``"Z"``, ``"XYZ"`` or ``""``. Offsets within a
         ball are inputs always.
     epochs : int
         At most; each sees every chosen batch once.
@@ -41,17 +41,17 @@ class NetworkOptions:
         Batches whose class shares have a standard deviation of this or more (per cent) are not trained on:
         they hold next to nothing but one class [WM19: 20 %]. 100: all are used.
     rotate : bool
-        Turn each batch about its centre by a random angle.
+        Turn each batch about its center by a random angle.
     shift : float
-        Move batch centres by up to this share of the spacing, anew in each epoch.
+        Move batch centers by up to this share of the spacing, anew in each epoch.
     jitter : float
-        Standard deviation of noise on coordinates, metres; cut at three times that.
+        Standard deviation of noise on coordinates, meters; cut at three times that.
     thin : float
         Most points a batch may lose; the share is drawn anew for each.
     validation : float
         Share of the ground held out, in whole blocks, to choose the best epoch; 0: none.
     block_size : float
-        Side of those blocks, metres.
+        Side of those blocks, meters.
     patience : int
         Epochs without a better mean F1 on the held out blocks after which training ends; 0: never.
     checkpoint : str or None

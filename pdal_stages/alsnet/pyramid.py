@@ -22,7 +22,7 @@ class Step:
     """From one level to the next coarser one, and back."""
 
     groups: npt.NDArray[np.int32]  #: (m, samples) points of each ball, as rows of the finer level
-    #: (m, samples, 3) their coordinates from the ball's centre, divided by the radius
+    #: (m, samples, 3) their coordinates from the ball's center, divided by the radius
     offsets: npt.NDArray[np.float32]
     near: npt.NDArray[np.int32]  #: (n, 3) for each point of the finer level, three rows of the coarser one
     weights: npt.NDArray[np.float32]  #: (n, 3) of those; they sum to 1
@@ -53,17 +53,17 @@ def build(
     Parameters
     ----------
     xyz : (n, 3) float64
-        Coordinates from the batch's centre, in the order of :func:`scramble`.
+        Coordinates from the batch's center, in the order of :func:`scramble`.
     inputs : (n, c) float32
     configuration : Configuration
     """
     start = int(np.argmin((xyz[:, :2] ** 2).sum(axis=1)))
     steps = []
     for level in configuration.levels:
-        centres = farthest_points(xyz, min(level.centres, len(xyz)), start)
-        groups = ball_query(xyz, centres, level.radius, level.samples)
-        offsets = (xyz[groups] - xyz[centres][:, None, :]) / level.radius
-        coarse = xyz[centres]
+        centers = farthest_points(xyz, min(level.centers, len(xyz)), start)
+        groups = ball_query(xyz, centers, level.radius, level.samples)
+        offsets = (xyz[groups] - xyz[centers][:, None, :]) / level.radius
+        coarse = xyz[centers]
         near, weights = three_nearest(xyz, coarse)
         steps.append(Step(groups, offsets.astype(np.float32), near, weights))
         xyz, start = coarse, 0

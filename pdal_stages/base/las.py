@@ -78,7 +78,7 @@ def holds_flags(path: str | os.PathLike) -> bool:
 
 
 def check_readable(path: str | os.PathLike) -> str | None:
-    """Refuse a LAS or LAZ file whose header cannot be right; a remark where it only looks odd.
+    """Refuse a LAS or LAZ file whose header cannot be right; a warning where it only looks odd.
 
     Raises
     ------

@@ -19,8 +19,8 @@ def one_line(text: str) -> str:
     return plain(text).replace("\n", "\\n")
 
 
-def tell(*lines: str) -> None:
-    """Say lines on standard error, as the command does."""
+def print_messages(*lines: str) -> None:
+    """Print messages for the user on standard error, as the command does."""
     for line in lines:
         print(f"pdal-stages: {line}", file=sys.stderr)
 

@@ -27,7 +27,7 @@ _SMALLEST, _LARGEST = 1e-6, 1e6
 
 @dataclass(frozen=True)
 class Units:
-    """Metres per unit of x and y (`horizontal`) and of z (`vertical`).
+    """Meters per unit of x and y (`horizontal`) and of z (`vertical`).
 
     `assumed` says that the cloud names no spatial reference and meters were assumed.
     """
@@ -38,7 +38,7 @@ class Units:
 
 
 def named_unit(name: str, option: str) -> float:
-    """Metres per unit of a unit's name; :class:`OptionError` where it is not known."""
+    """Meters per unit of a unit's name; :class:`OptionError` where it is not known."""
     try:
         return NAMED[name.strip().lower()]
     except KeyError:
@@ -146,7 +146,7 @@ class WktNode:
         return None
 
     def unit(self) -> float | None:
-        """Metres per unit of this coordinate system: its own unit, or its first axis's."""
+        """Meters per unit of this coordinate system: its own unit, or its first axis's."""
         for keyword in ("LENGTHUNIT", "UNIT"):
             for child in self.children:
                 if child.keyword == keyword:

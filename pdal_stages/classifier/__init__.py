@@ -1,4 +1,4 @@
-"""Classifiers: training on labelled clouds, the model file, classifying clouds. NumPy in and out; no PDAL."""
+"""Classifiers: training on labeled clouds, the model file, classifying clouds. NumPy in and out; no PDAL."""
 
 from .clouds import TrainingCloud
 from .deciding import Prediction

@@ -1,4 +1,4 @@
-"""Labelled clouds to train on: prepared, kept on disk where they need not fit in memory, and the classes they have."""
+"""Labeled clouds to train on: prepared, kept on disk where they need not fit in memory, and the classes they have."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .trainoptions import TrainingOptions
 
 @dataclass(frozen=True, eq=False)
 class TrainingCloud:
-    """A labelled cloud.
+    """A labeled cloud.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ def _mapped(cloud: TrainingCloud, folder: Path, number: int) -> TrainingCloud:
 
 
 @dataclass(frozen=True, eq=False)
-class Labelled:
+class Labeled:
     """For each cloud its coordinates and the place of each point's class, -1 where it is not used."""
 
     clouds: Sequence[TrainingCloud]
@@ -210,7 +210,7 @@ def contradicted(cloud: TrainingCloud, below: float) -> npt.NDArray[np.bool_] | 
     return np.isin(as_labels(cloud.labels, cloud.name), STANDING) & ground & low
 
 
-def label_classes(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> Labelled:
+def label_classes(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> Labeled:
     """The classes that the clouds' labels make."""
     number, left_out = np.zeros((2, MAX_LABEL + 1), np.int64)
     for cloud in clouds:
@@ -240,7 +240,7 @@ def label_classes(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> 
             cure=f"Labels {', '.join(map(str, UNINFORMATIVE))} are left out unless 'classes' names them",
         )
     counted = {str(label): int(left_out[label]) for label in np.flatnonzero(left_out)}
-    return Labelled(clouds, classes, options.contradicted_below, counted)
+    return Labeled(clouds, classes, options.contradicted_below, counted)
 
 
 def _checked_labels(cloud: TrainingCloud) -> npt.NDArray[Any]:

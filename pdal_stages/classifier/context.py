@@ -87,7 +87,7 @@ class Context:
 
     @property
     def reach(self) -> float:
-        """Metres, along x or y, to the farthest point that can matter."""
+        """Meters, along x or y, to the farthest point that can matter."""
         return 2.0 * max((scale.side for scale in self.scales), default=0.0)
 
     @property

@@ -95,7 +95,7 @@ def gather(
     Returns
     -------
     values : dict of name to (len(rows),) array
-    notes : dict
+    counts : dict
         What had to be counted: ``points_without_return_numbers`` (their ratio is taken as 1).
 
     Raises
@@ -128,7 +128,7 @@ def gather(
             )
         return values
 
-    notes: dict[str, int] = {}
+    counts: dict[str, int] = {}
     out = {}
     for name in names:
         if name in COORDINATES:
@@ -147,6 +147,6 @@ def gather(
                     where=where,
                     cure="Use a model trained without ReturnRatio",
                 )
-            notes["points_without_return_numbers"] = int(np.count_nonzero(~there))
+            counts["points_without_return_numbers"] = int(np.count_nonzero(~there))
             out[name] = np.where(there, number / np.maximum(total, 1), 1.0)
-    return out, notes
+    return out, counts

@@ -84,7 +84,7 @@ class PointClassifier(ClassifierMixin, BaseEstimator):
     def fit(
         self, X: npt.ArrayLike, y: npt.ArrayLike, dimensions: Mapping[str, npt.ArrayLike] | None = None
     ) -> PointClassifier:
-        """Train on a labelled cloud.
+        """Train on a labeled cloud.
 
         Parameters
         ----------

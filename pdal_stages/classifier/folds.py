@@ -57,18 +57,18 @@ class Folds:
         Raises
         ------
         OptionError
-            The labelled ground is too small to be cut.
+            The labeled ground is too small to be cut.
         """
         names = sorted(set(surveys))
         if len(names) >= SURVEYS:
-            labelled = dict.fromkeys(names, 0)
+            labeled = dict.fromkeys(names, 0)
             for (_, position), name in zip(clouds, surveys, strict=True):
-                labelled[name] += int(np.count_nonzero(position >= 0))
+                labeled[name] += int(np.count_nonzero(position >= 0))
             load = [0] * min(count, len(names))
             fold_of = {}
-            for name in sorted(names, key=lambda one: (-labelled[one], one)):
+            for name in sorted(names, key=lambda one: (-labeled[one], one)):
                 fold_of[name] = load.index(min(load))
-                load[fold_of[name]] += max(labelled[name], 1)
+                load[fold_of[name]] += max(labeled[name], 1)
             return cls(len(load), fold_of)
         width = WIDTH
         while width >= NARROWEST:
@@ -79,7 +79,7 @@ class Folds:
                 return cls(count, None, width)
             width /= 2.0
         raise OptionError(
-            f"the labelled ground is too small to be cut into {count} parts",
+            f"the labeled ground is too small to be cut into {count} parts",
             cure="Give more training data, or set passes to 1",
         )
 

@@ -21,7 +21,7 @@ from ..features.fitting import fit_clouds
 from ..features.returns import SOURCES
 from . import crossval
 from .algorithms import PredictRequest
-from .clouds import Labelled, TrainingCloud, label_classes
+from .clouds import Labeled, TrainingCloud, label_classes
 from .context import Context
 from .dimensions import WHERE_THERE, gather, required
 from .featureforest import FeatureForest, Features
@@ -70,10 +70,10 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     started = time.perf_counter()
     plan = feature_plan(options)
     groups = _groups(clouds, options)  # before any work: a dimension may be missing
-    labelled = label_classes(clouds, options)
-    classes = labelled.classes
+    labeled = label_classes(clouds, options)
+    classes = labeled.classes
     shares = [f"{cloud.flight} {cloud.copy}" for cloud in clouds] if options.balance else None
-    samples = draw_samples(labelled, len(classes.codes), options.count, options.seed, shares)
+    samples = draw_samples(labeled, len(classes.codes), options.count, options.seed, shares)
     base = options.base
     read = 0 if options.passes == 1 and base is None else len(classes.codes if base is None else base.classes)
     of_context = len(options.context) * read
@@ -82,7 +82,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     used = [cloud.xyz for cloud, n in zip(clouds, share, strict=True) if n]
     fitted = fit_clouds(used, plan, seed=options.seed, threads=options.threads)
     features = Features(plan, *fitted, options.seed)
-    values, notes = sample_features(clouds, samples, features, options, progress)
+    values, counted = sample_features(clouds, samples, features, options, progress)
     timed = {"features": time.perf_counter() - started}
     limits = percentiles(values, plan, options)
     below = None if base is None else Below(base, clouds, samples, options, progress)
@@ -98,25 +98,25 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
         progress,
     )
     started = time.perf_counter()
-    passes = _Passes(labelled, samples, values, features, chosen, options, progress, below)
+    passes = _Passes(labeled, samples, values, features, chosen, options, progress, below)
     passes.grow(*limits)
     left_out = passes.without_each_survey() if options.leave_one_survey_out else None
     timed["trees"] = time.perf_counter() - started
     info = {
-        **labelled.described(options, map(samples.counts, range(len(classes.codes)))),
+        **labeled.described(options, map(samples.counts, range(len(classes.codes)))),
         "training": {
             "clouds": [{"name": os.path.basename(c.name), "points": len(c.xyz)} for c in clouds],
             "count": options.count,
             "seed": options.seed,
             "samples": len(samples),
-            **labelled.training_notes(options),
+            **labeled.training_notes(options),
             "max_samples": options.max_samples,
             "max_features": options.max_features,
             "min_samples_leaf": chosen["min_samples_leaf"],
             "max_depth": chosen["max_depth"],
             **passes.notes,
             **({} if below is None or options.target is not None else _held(below, classes.codes)),
-            **notes,
+            **counted,
         },
         "priors": _priors(samples, len(classes.codes), options.prior_weight),
         "densities": density_range(cloud.xyz for cloud in clouds),
@@ -151,7 +151,7 @@ def _tree_options(options: TrainingOptions, max_depth: int | None, min_samples_l
 
 
 def _gap(plan: FeaturePlan, options: TrainingOptions) -> float:
-    """Metres between samples trained on and ground held out."""
+    """Meters between samples trained on and ground held out."""
     if options.gap is not None:
         return options.gap
     return max((one.reach or 0.0 for one in plan.neighborhoods), default=0.0)
@@ -235,7 +235,7 @@ class _Passes:
 
     def __init__(
         self,
-        labelled: Labelled,
+        labeled: Labeled,
         samples: Samples,
         values: npt.NDArray[np.float32],
         features: Features,
@@ -245,7 +245,7 @@ class _Passes:
         below: Below | None = None,
     ) -> None:
         self.below = below
-        self.clouds, self.codes = labelled.clouds, labelled.classes.codes
+        self.clouds, self.codes = labeled.clouds, labeled.classes.codes
         self.samples, self.values, self.features = samples, values, features
         self.chosen, self.options, self.progress = chosen, options, progress
         self.context = Context(tuple(options.context))
@@ -255,7 +255,7 @@ class _Passes:
         self.notes: dict[str, Any] = {}
         self.flights = [cloud.flight for cloud in self.clouds]
         if options.passes > 1 and below is None:
-            self.folds = Folds.of(labelled, self.flights, options.pass_folds)
+            self.folds = Folds.of(labeled, self.flights, options.pass_folds)
             self.notes["pass_folds"] = self.folds.count
 
     def grow(self, low: list[float], high: list[float]) -> None:

@@ -103,9 +103,9 @@ class Model:
         return float(self.info.get("voxel") or 0.0)
 
     @property
-    def halo(self) -> float:
-        """Metres around a tile whose points a tile's results depend on."""
-        return self.plan.halo + self.voxel
+    def halo_m(self) -> float:
+        """Meters around a tile whose points a tile's results depend on."""
+        return self.plan.halo_m + self.voxel
 
     @property
     def gives_variance(self) -> bool:
@@ -129,7 +129,7 @@ class Model:
 
     def describe(self) -> dict[str, Any]:
         """Everything about the model as plain data; ``str(model)`` is the same as text."""
-        more = {"required_dimensions": list(self.required_dimensions), "halo": self.halo}
+        more = {"required_dimensions": list(self.required_dimensions), "halo_m": self.halo_m}
         return summary.describe(
             {**self.manifest(), **more},
             [one.columns(codes) for one, codes in zip(self.passes, self.codes_of, strict=True)],

@@ -59,13 +59,13 @@ class Passes:
     def plan(self) -> InputPlan:
         """What all passes look at; the halo is the passes' own, one after the other."""
         plans = [one.plan for one in self.members]
-        halo = plans[0].halo
+        halo_m = plans[0].halo_m
         for one in self.members[1:]:
-            halo = max(one.plan.halo, halo + one.context.reach)
+            halo_m = max(one.plan.halo_m, halo_m + one.context.reach)
         return InputPlan(
             tuple(dict.fromkeys(name for plan in plans for name in plan.names)),
             tuple(dict.fromkeys(name for plan in plans for name in plan.dimensions)),
-            halo,
+            halo_m,
             max(plan.most_neighbors for plan in plans),
         )
 

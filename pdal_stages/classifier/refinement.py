@@ -18,14 +18,14 @@ from .context import OWN, Context
 from .featureforest import FeatureForest, Features, check_names
 from .forest import Forest
 
-#: As many labelled points of its rarest class count as much as the base.
+#: As many labeled points of its rarest class count as much as the base.
 EVEN = 30
 #: Most passes of a base.
 MOST_BELOW = 3
 
 
 def trust(labels: int) -> float:
-    """How far the forest is believed beside the base, 0 to 1, by the labelled points of its rarest class."""
+    """How far the forest is believed beside the base, 0 to 1, by the labeled points of its rarest class."""
     return labels / (labels + EVEN)
 
 
@@ -37,7 +37,7 @@ class RefinedForest(FeatureForest):
     ----------
     before : tuple of int
         The base's classes.
-    labelled : tuple of int
+    labeled : tuple of int
         Those the forest was trained on, in the order of its columns.
     trusted : float
         See :func:`trust`.
@@ -46,7 +46,7 @@ class RefinedForest(FeatureForest):
     """
 
     before: tuple[int, ...] = ()
-    labelled: tuple[int, ...] = ()
+    labeled: tuple[int, ...] = ()
     trusted: float = 1.0
     target: int | None = None
 
@@ -55,7 +55,7 @@ class RefinedForest(FeatureForest):
     @property
     def codes(self) -> list[int]:
         """The classes that come out."""
-        new = self.labelled if self.target is None else (self.target,)
+        new = self.labeled if self.target is None else (self.target,)
         return sorted({*self.before, *new})
 
     @classmethod
@@ -64,20 +64,20 @@ class RefinedForest(FeatureForest):
     ) -> RefinedForest:
         """Made from what a model file says of a pass, everything checked."""
         said = entry["parameters"]
-        before, labelled = _codes(said.get("before")), _codes(said.get("labelled"))
+        before, labeled = _codes(said.get("before")), _codes(said.get("labeled"))
         trusted, target = said.get("trusted"), said.get("target")
         if type(trusted) is not float or not 0.0 <= trusted <= 1.0:
             raise ModelError(
                 "'trusted' of a refined forest must be a number from 0 to 1", found=str(trusted)[:20]
             )
-        if target is not None and (target not in labelled or len(labelled) != 2):
+        if target is not None and (target not in labeled or len(labeled) != 2):
             raise ModelError(
                 "'target' of a refined forest must be one of its two classes", found=str(target)[:20]
             )
         features, context = Features.from_dict(entry), Context(tuple(entry["context"]))
         check_names(features.plan, context.names(before), entry)
-        forest = Forest.from_arrays(arrays, len(entry["feature_names"]), len(labelled))
-        made = cls(features, forest, context, before, labelled, trusted, target)
+        forest = Forest.from_arrays(arrays, len(entry["feature_names"]), len(labeled))
+        made = cls(features, forest, context, before, labeled, trusted, target)
         if made.codes != list(codes):
             raise ModelError(
                 "the classes of a refined forest do not add up to the model's", found=made.codes[:10]
@@ -87,7 +87,7 @@ class RefinedForest(FeatureForest):
     def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
         """What a model file says of it beside its arrays."""
         entry = super().to_file(codes)
-        own = {"before": list(self.before), "labelled": list(self.labelled), "trusted": self.trusted}
+        own = {"before": list(self.before), "labeled": list(self.labeled), "trusted": self.trusted}
         return {**entry, "parameters": {**entry["parameters"], **own, "target": self.target}}
 
     def classes_before(self, codes: Sequence[int]) -> list[int]:
@@ -103,7 +103,7 @@ class RefinedForest(FeatureForest):
         said = values[:, first : first + len(self.before)].astype(np.float64)
         said /= np.maximum(said.sum(axis=1, keepdims=True), 1e-9)
         return blended(
-            said, self.forest.predict_proba(values), self.before, self.labelled, self.trusted, self.target
+            said, self.forest.predict_proba(values), self.before, self.labeled, self.trusted, self.target
         )
 
 
@@ -111,7 +111,7 @@ def blended(
     said: npt.NDArray[np.float64],
     grown: npt.NDArray[np.float64],
     before: Sequence[int],
-    labelled: Sequence[int],
+    labeled: Sequence[int],
     trusted: float,
     target: int | None = None,
 ) -> npt.NDArray[np.float64]:
@@ -121,28 +121,28 @@ def blended(
     ----------
     said : (n, len(before)) float64
         The base's, rows summing to 1.
-    grown : (n, len(labelled)) float64
+    grown : (n, len(labeled)) float64
         The forest's.
-    before, labelled : sequence of int
+    before, labeled : sequence of int
         Their classes.
     trusted : float
-        0: the forest counts for nothing where the base knows the class; 1: the base for nothing among the labelled.
+        0: the forest counts for nothing where the base knows the class; 1: the base for nothing among the labeled.
     target : int, optional
-        The one class of `labelled` that counts; the other is everything else.
+        The one class of `labeled` that counts; the other is everything else.
 
     Returns
     -------
     (n, classes) float64, rows summing to 1; the classes of both, ascending.
 
-    Classes that only the base knows keep its probability. The rest is shared among the labelled ones.
+    Classes that only the base knows keep its probability. The rest is shared among the labeled ones.
     """
-    counted = list(labelled) if target is None else [target]
+    counted = list(labeled) if target is None else [target]
     codes = sorted({*before, *counted})
     out = np.zeros((len(said), len(codes)))
     out[:, np.searchsorted(codes, before)] = said
     at = np.searchsorted(codes, counted)
     if target is not None:
-        mine = grown[:, list(labelled).index(target)]
+        mine = grown[:, list(labeled).index(target)]
         if target in before:
             mine = trusted * mine + (1.0 - trusted) * out[:, at[0]]
         out[:, at[0]] = 0.0

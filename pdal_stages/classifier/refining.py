@@ -63,8 +63,8 @@ def on_top(base: Model, made: Model, trusted: float) -> Model:
     (forest,) = made.passes
     target = made.info["target"]
     shared = {field.name: getattr(forest, field.name) for field in fields(forest)}
-    before, labelled = tuple(base.codes.tolist()), tuple(made.codes.tolist())
-    refined = RefinedForest(**shared, before=before, labelled=labelled, trusted=trusted, target=target)
+    before, labeled = tuple(base.codes.tolist()), tuple(made.codes.tolist())
+    refined = RefinedForest(**shared, before=before, labeled=labeled, trusted=trusted, target=target)
     names, entries = dict(base.classes), {one["code"]: one for one in made.info["classes"]}
     names.update((code, name) for code, name in made.classes if code in refined.codes and code not in names)
     unseen = {"available": 0, "samples": 0, "duplicates": 0}
@@ -92,7 +92,7 @@ def on_top(base: Model, made: Model, trusted: float) -> Model:
 
 
 def held_by_base(below: Below, codes: Sequence[int]) -> dict[str, list[int]]:
-    """Labelled classes new to the base: [different samples, of these what it calls a class that the labels lack].
+    """Labeled classes new to the base: [different samples, of these what it calls a class that the labels lack].
 
     Such points stay what the base calls them.
     """

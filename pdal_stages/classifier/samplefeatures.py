@@ -50,7 +50,7 @@ def sample_features(
     """The (samples, features) float32 matrix, filled cloud by cloud, and what was counted."""
     names = features.plan.names
     values = np.empty((len(samples), len(names)), np.float32)
-    notes: dict[str, Any] = {}
+    counts: dict[str, Any] = {}
     with Progress(len(samples), "features of the samples", enabled=progress) as bar:
         for number, cloud in enumerate(clouds):
             at, rows = samples.of_cloud(number)
@@ -61,7 +61,7 @@ def sample_features(
             there = with_returns(own, cloud.xyz, cloud.dimensions, options.threads)
             fed, counted = gather(own, there, len(cloud.xyz), rows, cloud.name)
             for name, n in counted.items():
-                notes[name] = notes.get(name, 0) + n
+                counts[name] = counts.get(name, 0) + n
             for part, block in engine.blocks(
                 queries=rows,
                 dimensions=fed,
@@ -73,7 +73,7 @@ def sample_features(
     if not np.isfinite(values).all():
         column = int(np.argmin(np.isfinite(values).all(axis=0)))
         raise DimensionError(f"the feature {names[column]} is not finite for some samples")
-    return values, notes
+    return values, counts
 
 
 def percentiles(

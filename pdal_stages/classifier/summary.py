@@ -66,7 +66,7 @@ def text(info: Mapping[str, Any]) -> str:
             lines.append(f"context        {' '.join(one['context'])}")
     lines += [
         f"needs          {', '.join(info['required_dimensions']) or 'coordinates only'}",
-        f"halo           {info['halo']:g} m",
+        f"halo           {info['halo_m']:g} m",
     ]
     if info.get("priors"):
         lines.append(f"prior weight   {info['priors']['weight']:g}")

@@ -48,7 +48,7 @@ class AdaptiveNeighborhoods:
     """A tree over a grid's cloud, built by `threads`, and the adaptive neighborhoods of a plan."""
 
     def __init__(self, grid: CellGrid, plan: FeaturePlan, threads: int | None = None) -> None:
-        self.grid, self.halo, self.least = grid, plan.halo, plan.least_members
+        self.grid, self.halo_m, self.least = grid, plan.halo_m, plan.least_members
         fixed = ("cylinder", "sphere")
         self.specs = [_spec(c) for c in plan.layout if c.at and c.neighborhood.kind not in fixed]
         #: In the plan's order: what `few` and `far` of :meth:`fill` count for.
@@ -137,7 +137,7 @@ class AdaptiveNeighborhoods:
                 wanted = spec.shape_columns >= 0
                 out[:, spec.shape_columns[wanted]] = shapes.counts[:, wanted]
             if spec.unbounded:
-                far[number] += int(copies[reach > self.halo].sum())
+                far[number] += int(copies[reach > self.halo_m].sum())
 
     def _compute_nearest(
         self, qx: np.ndarray, qy: np.ndarray, qz: np.ndarray

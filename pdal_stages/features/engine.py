@@ -49,7 +49,7 @@ class FeatureEngine:
         As given or fitted.
     report : Report
         So far: ``points`` of the cloud, ``queries`` computed, ``fewer_than_three`` (by neighborhood, queries
-        whose neighborhood had fewer than three points, so that eigen-features are 0); and, beyond ``plan.halo``,
+        whose neighborhood had fewer than three points, so that eigen-features are 0); and, beyond ``plan.halo_m``,
         queries whose k nearest reach farther.
 
     Raises
@@ -60,7 +60,7 @@ class FeatureEngine:
     Notes
     -----
     A result is the same to the last bit for any order of the points, any queries asked beside it, any number of
-    threads, any block size, and in a tile whose surroundings are covered by ``plan.halo`` meters.
+    threads, any block size, and in a tile whose halo is ``plan.halo_m`` meters or more.
 
     Memory over the cloud's own: 28 bytes a point for the index (about 52 while it is being sorted), about 10 more with
     neighborhoods of k points, and the block budget of :meth:`blocks`.

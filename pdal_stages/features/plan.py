@@ -17,7 +17,7 @@ from .neighborhoods import LEAST_MEMBERS, Neighborhood, parse_neighborhoods, pre
 #: What is computed where nothing is asked for, by the function and the stage alike.
 DEFAULT_NEIGHBORHOODS = ("c1", "c2", "c3", "c5", "kopt")
 DEFAULT_FEATURES = ("covariance", "geometric")
-#: Halo of neighborhoods whose size is a number of points, meters: see :attr:`FeaturePlan.halo`.
+#: Halo of neighborhoods whose size is a number of points, meters: see :attr:`FeaturePlan.halo_m`.
 POINTS_HALO = 15.0
 
 
@@ -141,8 +141,8 @@ class FeaturePlan:
         return 1.0
 
     @cached_property
-    def halo(self) -> float:
-        """Metres of surroundings a tile needs for the same result as the whole cloud.
+    def halo_m(self) -> float:
+        """Meters of surroundings a tile needs for the same result as the whole cloud.
 
         The largest reach and one cell. ``k50`` and ``kopt`` reach as far as their points lie, which no number
         bounds; for them at least 15 m are asked for, enough for 100 neighbors down to 0.15 points a square

@@ -66,7 +66,7 @@ def parse(name: str) -> ReturnFeature | None:
 
 
 def reach(names: Iterable[str]) -> float:
-    """Metres, along x or y, to the farthest point that can matter to any of these dimensions."""
+    """Meters, along x or y, to the farthest point that can matter to any of these dimensions."""
     return max((2.0 * one.side for one in map(parse, names) if one is not None), default=0.0)
 
 

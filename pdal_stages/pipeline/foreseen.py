@@ -77,16 +77,16 @@ def _reader_may_have(name: str, stage: dict[str, Any]) -> bool:
 
 
 def unread_extra_dimensions(stages: Sequence[dict[str, Any]]) -> list[str]:
-    """A remark on each LAS 1.0-1.3 file whose extra dimensions PDAL does not read unless told."""
-    remarks = []
+    """A warning for each LAS 1.0-1.3 file whose extra dimensions PDAL does not read unless told."""
+    warnings = []
     for stage in stages:
         if str(stage.get("use_eb_vlr", "")).lower() == "true" or "extra_dims" in stage:
             continue
         for path in reader_files(stage, las=True):
             header, names = read_header(path), list(extra_dimensions(path))
             if header is not None and header.minor < 4 and names:
-                remarks.append(
+                warnings.append(
                     f"{path}: its extra dimensions are not read: {', '.join(names[:5])}{', ...' * (len(names) > 5)}. Of LAS "
                     f'1.{header.minor} PDAL reads them where the reader has "use_eb_vlr": true'
                 )
-    return remarks
+    return warnings

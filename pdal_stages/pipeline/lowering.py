@@ -48,7 +48,7 @@ class Lowered:
 
     stages: list[dict[str, Any]]
     ours: list[LoweredStage] = field(default_factory=list)
-    remarks: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
 
 
 def lower(source: PipelineSource, whole: bool = True) -> Lowered:
@@ -69,7 +69,7 @@ def lower(source: PipelineSource, whole: bool = True) -> Lowered:
     run = wiring.run_by_pdal(stages)
     if len(run) < len(stages):
         places = [source.where(number) for number in range(len(stages))]
-        out.remarks.append(wiring.remark_on(stages, run, places))
+        out.warnings.append(wiring.warning_of_ends(stages, run, places))
         stages = [stages[number] for number in run]
     check_copc(stages)
     check_vectors(stages)
@@ -101,21 +101,21 @@ def lower(source: PipelineSource, whole: bool = True) -> Lowered:
         out.ours.append(lowered)
         out.stages.append(lowered.plain)
     out.stages = extradims.settle(out.stages)
-    _tell_preparations(out)
+    _follow_preparations(out)
     check_writers(out.stages, [(ours.stage, ours.place, ours.index) for ours in out.ours])
     return out
 
 
-class Told(NamedTuple):
-    """What a stage was told of the stages before it."""
+class Upstream(NamedTuple):
+    """What the stages before one are to it."""
 
     preparation: list[dict[str, Any]]  #: those that made what it reads
     makes_again: bool  #: whether one makes what it makes too
-    remark: str | None  #: what the user should know
+    warning: str | None  #: for the user
 
 
-def tell(stage: Stage, before: Sequence[tuple[Mapping[str, Any], Mapping[str, str]]]) -> Told:
-    """Tell a stage which stages before it made what it reads.
+def settle_upstream(stage: Stage, before: Sequence[tuple[Mapping[str, Any], Mapping[str, str]]]) -> Upstream:
+    """Let a stage know which stages before it made what it reads.
 
     `before` are the stages before it in their order, as they are written, each with what :meth:`Stage.creates` says of it;
     for PDAL's own, :func:`heights_of`.
@@ -123,7 +123,7 @@ def tell(stage: Stage, before: Sequence[tuple[Mapping[str, Any], Mapping[str, st
     wanted = set(stage.reads()) - {"Classification"}  # which noise is marked in, too: it is no preparation
     made = [preparation.entry(given) for given, creates in before if wanted & set(creates)]
     stage.makes_again = bool({name for _, creates in before for name in creates} & set(stage.creates()))
-    return Told(made, stage.makes_again, stage.follows(made))
+    return Upstream(made, stage.makes_again, stage.follows(made))
 
 
 def heights_of(stage: Mapping[str, Any]) -> dict[str, str]:
@@ -131,8 +131,8 @@ def heights_of(stage: Mapping[str, Any]) -> dict[str, str]:
     return {"HeightAboveGround": "double"} if stage.get("type") in preparation.OF_PDAL else {}
 
 
-def _tell_preparations(lowered: Lowered) -> None:
-    """Each stage of ours hears which stages before it made what it reads."""
+def _follow_preparations(lowered: Lowered) -> None:
+    """Let each stage of ours know which stages before it made what it reads."""
     numbered = {ours.index: ours for ours in lowered.ours}
     before: list[tuple[Mapping[str, Any], Mapping[str, str]]] = []
     for index, plain in enumerate(lowered.stages):
@@ -140,13 +140,13 @@ def _tell_preparations(lowered: Lowered) -> None:
         if ours is None:
             before.append((plain, heights_of(plain)))
             continue
-        told = tell(ours.stage, before)
-        if told.makes_again:
+        upstream = settle_upstream(ours.stage, before)
+        if upstream.makes_again:
             ours.plain["pdalargs"]["makes_again"] = True
-        if told.preparation:
-            ours.plain["pdalargs"]["preparation"] = told.preparation
-        if told.remark is not None:
-            lowered.remarks.append(told.remark)
+        if upstream.preparation:
+            ours.plain["pdalargs"]["preparation"] = upstream.preparation
+        if upstream.warning is not None:
+            lowered.warnings.append(upstream.warning)
         before.append(({"type": ours.stage.type, **ours.given}, ours.stage.creates()))
 
 

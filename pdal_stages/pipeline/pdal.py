@@ -130,7 +130,7 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
         count = pipeline.execute()
     except (RuntimeError, ValueError, IndexError, OverflowError) as error:  # C++'s errors, as Python has them
         keep(stdout)
-        raise translate(str(error), said(_log(pipeline))[-3:]) from None
+        raise translate(str(error), log_lines(_log(pipeline))[-3:]) from None
     except MemoryError:
         raise PipelineError(
             "memory ran out", cure="Work in tiles (--tile), or read less, e.g. with filters.crop"
@@ -161,7 +161,7 @@ def keep(stdout: Any) -> None:
 _FAILED_WRITER = re.compile(r"(writers\.\w+) Error\) (GDAL failure.*)")
 
 
-def said(log: str) -> list[str]:
+def log_lines(log: str) -> list[str]:
     """Warnings and errors of a log, once each: ``filters.smrf: ...``."""
     lines = [_BY_PROGRAM.sub(r"\1: ", line.strip()) for line in str(log or "").splitlines()]
     return list(dict.fromkeys(line for line in lines if line))

@@ -17,7 +17,7 @@ from typing import Any
 
 from ..base import checks
 from ..base.errors import StageError
-from ..base.plain import tell
+from ..base.plain import print_messages
 from ..base.runlog import LoggedStream
 from ..base.shortage import check_limit
 from ..base.threads import available_threads
@@ -153,12 +153,14 @@ class _Worker:
         limit = lifesigns.END_AFTER if self.began else lifesigns.START_WITHIN
         if lifesigns.TELL_AFTER <= quiet < lifesigns.TELL_AFTER + lifesigns.LOOK:
             what = "shows no sign of life" if self.began else "has not begun to work"
-            tell(
+            print_messages(
                 f"worker process {self.process.pid} {what} since {quiet:.0f} s; it is replaced after {limit:.0f} s"
             )
         if quiet >= limit and not self.stuck:
             self.stuck = True
-            tell(f"worker process {self.process.pid} was ended: nothing came of it for {quiet:.0f} s")
+            print_messages(
+                f"worker process {self.process.pid} was ended: nothing came of it for {quiet:.0f} s"
+            )
             self.process.kill()
 
     def _hear(self, stream: Any) -> None:

@@ -73,22 +73,22 @@ class Pipeline:
         self.lowered: Lowered = lower(self.source, whole)
         self.metadata: dict[str, Any] = {}
         self.arrays: list = []
-        self.said: list[str] = []
+        self.log_lines: list[str] = []
         self.reports: list[tuple[str, list[Report]]] = []
-        self.remarks: list[str] = []
+        self.warnings: list[str] = []
         self._running = False
 
     @property
-    def told(self) -> list[str]:
-        """Remarks, and the notes and warnings of our stages: what several say is of the run, and said once."""
+    def messages(self) -> list[str]:
+        """Warnings of the pipeline, then warnings and notes of our stages; what several stages report comes once."""
         by_text: dict[str, list[str]] = {}
         for place, reports in self.reports:
             for report in reports:
                 for text in report.messages:
                     by_text.setdefault(text, []).append(place)
         by_text = {text: list(dict.fromkeys(places)) for text, places in by_text.items()}
-        notes = [text if len(places) > 1 else f"{places[0]}: {text}" for text, places in by_text.items()]
-        return [*self.remarks, *notes]
+        of_stages = [text if len(places) > 1 else f"{places[0]}: {text}" for text, places in by_text.items()]
+        return [*self.warnings, *of_stages]
 
     @property
     def json(self) -> str:
@@ -202,7 +202,7 @@ class Pipeline:
         names = {str(made): final for made, final in zip(partials, outputs, strict=True)}
         names |= {made: names.get(target, target) for made, target in packed.items()}
         self.metadata = _renamed(_named_metadata(result.metadata, self.reports), names)
-        self.arrays, self.said = result.arrays, pdal_env.said(result.log)
+        self.arrays, self.log_lines = result.arrays, pdal_env.log_lines(result.log)
         return result.count
 
     def _check_inputs(self) -> None:
@@ -215,8 +215,8 @@ class Pipeline:
                 raise PipelineError("the file cannot be read", where=path, found=error) from None
         check_start(self.lowered.stages)
         check_dimensions(self.lowered)
-        self.remarks = [*self.lowered.remarks, *unread_extra_dimensions(self.lowered.stages)]
-        self.remarks += [
+        self.warnings = [*self.lowered.warnings, *unread_extra_dimensions(self.lowered.stages)]
+        self.warnings += [
             r for path in readers_files(self.lowered.stages, las=True) if (r := check_readable(path))
         ]
         units = [ours.stage.horizontal_unit for ours in self.lowered.ours]

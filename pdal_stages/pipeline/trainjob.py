@@ -27,7 +27,7 @@ def stage(ins, outs):
 def train_pipeline(
     sources: Iterable[str], model: str, overrides: Iterable[Override] = (), **options: Any
 ) -> list[dict[str, Any]]:
-    """Read labelled files, give heights if wanted, train, write the model; of several files the score is by file."""
+    """Read labeled files, give heights if wanted, train, write the model; of several files the score is by file."""
     from ..stages.classifiermodel import ClassifierModel
 
     writer = {"type": "writers.classifiermodel", "filename": model, **options}

@@ -57,8 +57,8 @@ def run_by_pdal(stages: Sequence[dict[str, Any]]) -> list[int]:
     return sorted(found)
 
 
-def remark_on(stages: Sequence[dict[str, Any]], run: Sequence[int], where: Sequence[str]) -> str:
-    """What is said of stages that PDAL leaves out; `where` each stands.
+def warning_of_ends(stages: Sequence[dict[str, Any]], run: Sequence[int], where: Sequence[str]) -> str:
+    """The warning of stages that PDAL leaves out; `where` each stands.
 
     Raises
     ------

@@ -58,10 +58,10 @@ _one_at_a_time = threading.Lock()
 
 
 def _say(answers: BinaryIO, what: Any) -> None:
-    said = pickle.dumps(what)
+    answer = pickle.dumps(what)
     try:
         with _one_at_a_time:
-            answers.write(said)
+            answers.write(answer)
             answers.flush()
     except OSError:
         os._exit(0)

@@ -56,13 +56,13 @@ def arrive(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any])
 
 
 def _prepare(question: Mapping[str, Any]) -> list[_Leaf]:
-    stage, remark = _made(question)
+    stage, warning = _made(question)
     _prepared[question["label"]] = stage
     while len(_prepared) > _KEPT:
         _prepared.popitem(last=False)
     answer = [runtime.leaf("dimension", f"{name}={kind}") for name, kind in stage.creates().items()]
-    if remark is not None:
-        answer.append(runtime.leaf("pdal_stages_warning", remark))
+    if warning is not None:
+        answer.append(runtime.leaf("pdal_stages_warning", warning))
     return answer
 
 
@@ -88,8 +88,8 @@ def _made(question: Mapping[str, Any]) -> tuple[Stage, str | None]:
     given = settled({**kind.from_pipeline(texts, before), **_parsed(kind, texts)})
     where = runtime.place(kind.type, question.get("tag"))
     stage = kind({name: value for name, value in given.items() if name not in lowering.PDAL_OWN}, where)
-    remark = lowering.tell(stage, [(one, _creates(one)) for one in before]).remark
-    return stage, remark
+    warning = lowering.settle_upstream(stage, [(one, _creates(one)) for one in before]).warning
+    return stage, warning
 
 
 def _check_version(question: Mapping[str, Any]) -> None:

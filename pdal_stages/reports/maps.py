@@ -54,7 +54,7 @@ class Picture:
 class DrawnSection:
     """The vertical section in pictures."""
 
-    note: str
+    caption: str
     classes: list[Key]
     views: list[Picture]
 
@@ -65,7 +65,7 @@ class DrawnScene:
 
     points: int
     compared: int
-    note: str = ""
+    caption: str = ""
     classes: list[Key] | None = None
     verdicts: list[Key] | None = None
     maps: tuple[Picture, ...] = ()
@@ -163,17 +163,17 @@ def draw_scene(a: Accuracy, scene: Scene, unit: str = "m", section: Line | None 
         classes(scene.predicted, "Prediction", "predicted"),
         Picture.of(errors, "Errors", alt, **over),
     )
-    note = (
+    caption = (
         f"{len(x):,} points, {wide:,.0f} x {tall:,.0f} {unit}, north up; lower left corner: x "
         f"{frame.x0:.0f}, y {frame.y0:.0f}. Each pixel of {frame.pixel:.2g} {unit} shows its highest point; on the "
         "map of errors a wrong point lies above right ones."
     )
     if line is not None:
-        note += " The line marks the vertical section below."
+        caption += " The line marks the vertical section below."
     return DrawnScene(
         len(x),
         n,
-        note,
+        caption,
         _keys(a, scene.codes()),
         [(RIGHT, "right"), (WRONG, "wrong"), *([(IGNORED, "not compared")] if n < len(x) else [])],
         maps,
@@ -250,12 +250,12 @@ def draw_section(
     wrong = int(scene.wrong[drawn].sum())
     what = f"Vertical section, {length:.0f} {unit} long and {depth:.2g} {unit} deep"
     (x0, y0), (x1, y1) = line
-    note = f"{what}, from {x0:.0f}, {y0:.0f} to {x1:.0f}, {y1:.0f}; {int(drawn.sum()):,} points, heights not exaggerated."
+    caption = f"{what}, from {x0:.0f}, {y0:.0f} to {x1:.0f}, {y1:.0f}; {int(drawn.sum()):,} points, heights not exaggerated."
     if chosen:
-        note += f" It lies where {'the errors are densest' if scene.wrong.any() else 'most points are'}"
-        note += f"; {wrong:,} of its points {'is' if wrong == 1 else 'are'} wrong." if wrong else "."
+        caption += f" It lies where {'the errors are densest' if scene.wrong.any() else 'most points are'}"
+        caption += f"; {wrong:,} of its points {'is' if wrong == 1 else 'are'} wrong." if wrong else "."
     if hidden:
-        note += f" Not drawn: {hidden:,} point{'s' * (hidden > 1)} far above or below the others."
+        caption += f" Not drawn: {hidden:,} point{'s' * (hidden > 1)} far above or below the others."
     x, y, z = np.ascontiguousarray(scene.xyz[drawn].T)
 
     def view(codes: npt.NDArray[Any], heading: str, word: str) -> Picture:
@@ -268,7 +268,7 @@ def draw_section(
         view(scene.reference, "Reference", "reference"),
         view(scene.predicted, "Prediction", "predicted"),
     ]
-    return DrawnSection(note, _keys(a, scene.codes(drawn)), views)
+    return DrawnSection(caption, _keys(a, scene.codes(drawn)), views)
 
 
 def heights_to_draw(z: npt.NDArray[np.float64], length: float) -> tuple[float, float]:

@@ -66,16 +66,16 @@ def _scores(d: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     held = d["training"].get("held_out")
     crossed = d["accuracy"]["cross_validation"]
     if isinstance(held, dict) and held:
-        row, remark = held, "on ground held out, which chose the epoch"
+        row, detail = held, "on ground held out, which chose the epoch"
     elif crossed:
-        row, remark = crossed["chosen"], f"{held_out_by(crossed)}; classes weigh the same"
+        row, detail = crossed["chosen"], f"{held_out_by(crossed)}; classes weigh the same"
     elif d["passes"][-1]["out_of_bag"]:
-        row, remark = d["passes"][-1]["out_of_bag"], "out of bag, flattered by neighboring samples"
+        row, detail = d["passes"][-1]["out_of_bag"], "out of bag, flattered by neighboring samples"
     else:
         return []
     titles = {"overall_accuracy": "Overall accuracy", "kappa": "Kappa", "mean_f1": "Mean F1"}
     return [
-        (title, percent(checks.finite(row.get(key)), 1), "%", remark if key == "overall_accuracy" else "")
+        (title, percent(checks.finite(row.get(key)), 1), "%", detail if key == "overall_accuracy" else "")
         for key, title in titles.items()
     ]
 
@@ -115,7 +115,7 @@ def _curve(points: list[tuple[float, float]], title: str, is_share: bool) -> Cha
 
 
 def _settings(d: Mapping[str, Any]) -> dict[str, Any]:
-    keep = ("required_dimensions", "halo", "strategy", "target", "created_by")
+    keep = ("required_dimensions", "halo_m", "strategy", "target", "created_by")
     out = {key: d[key] for key in keep if d.get(key) is not None}
     for number, one in enumerate(d["passes"], 1):
         what = {key: one[key] for key in ("algorithm", "parameters", "features", "context") if one[key]}

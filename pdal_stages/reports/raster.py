@@ -66,7 +66,7 @@ class Surface:
     frame: Frame
     which: np.ndarray
     z: np.ndarray
-    spacing: float  # typical distance of neighbouring points in pixels, 1 at least
+    spacing: float  # typical distance of neighboring points in pixels, 1 at least
 
     def spread(self, values: np.ndarray, missing) -> np.ndarray:
         """Per-point values on the pixels."""

@@ -66,12 +66,12 @@ def _figures(run: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     rest = ", ".join(f"{states[k]:,} {text}" for k, text in named.items() if states.get(k))
     tiles = f"{states['done']:,}" if "done" in states else f"{len(run['tiles']):,}"
     kept = sum(t["points"] for t in run["tiles"] if t["state"] == "kept")
-    remarks = [f"{kept:,} more kept from an earlier run"] if kept else []
+    details = [f"{kept:,} more kept from an earlier run"] if kept else []
     if run.get("dropped"):
-        remarks.append(f"{run['dropped']:,} dropped by filters")
+        details.append(f"{run['dropped']:,} dropped by filters")
     points = run.get("points", 0)
     size, unit = (f"{points:,}", "") if points < 10_000_000 else (f"{points / 1e6:,.1f}", "million")
-    out = [("Tiles", tiles, "", rest), ("Points", size, unit, "; ".join(remarks))]
+    out = [("Tiles", tiles, "", rest), ("Points", size, unit, "; ".join(details))]
     if "seconds" in run:
         out.append(
             ("Time", duration(run["seconds"]), "", f"{run['workers']} worker{'s' * (run['workers'] != 1)}")

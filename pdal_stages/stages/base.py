@@ -101,8 +101,8 @@ class Stage(ABC):
         "string", "", "Unit of z, where the spatial reference does not say; otherwise that of x and y"
     )
 
-    #: In tiles: what :meth:`left_of` gave of points farther away than :meth:`near_halo`.
-    surroundings: NDArray[np.float64] | None = None
+    #: In tiles: what :meth:`left_of` gave of points farther away than :meth:`near_halo_m`.
+    far_points: NDArray[np.float64] | None = None
     #: Whether stages before it in the pipeline make what it makes too.
     makes_again: bool = False
     #: Set where a pipeline's writer cannot hold every class code.
@@ -149,19 +149,19 @@ class Stage(ABC):
         """Dimensions made or overwritten: name -> PDAL type (``double``, ``float``, ``uint8_t``)."""
         return {}
 
-    def halo(self) -> float:
+    def halo_m(self) -> float:
         """How far beyond a tile, in meters, points can change the tile's results."""
         return 0.0
 
-    def near_halo(self) -> float | None:
+    def near_halo_m(self) -> float | None:
         """The same where a tile is given :meth:`left_of` the points farther away; None where all points are needed."""
         return None
 
     def left_of(self, points: Points) -> NDArray[np.float64]:
-        """What the stage needs of points far away, for :attr:`surroundings`: coordinates (n, 3), meters."""
+        """What the stage needs of points far away, for :attr:`far_points`: coordinates (n, 3), meters."""
         raise NotImplementedError
 
-    def inner_reach(self) -> float:
+    def inner_halo_m(self) -> float:
         """How far apart, in meters, points use each other's results of this very stage; part of the halo."""
         return 0.0
 

@@ -1,4 +1,4 @@
-"""``writers.classifiermodel``: train a classifier on labelled points, write one model file [B16, W18]."""
+"""``writers.classifiermodel``: train a classifier on labeled points, write one model file [B16, W18]."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def trained(name: str, /, **other: Any) -> Any:
 
 class ClassifierModel(Stage):
     type = "writers.classifiermodel"
-    summary = "Train a classifier on the labelled points that reach it, and write one model file"
+    summary = "Train a classifier on the labeled points that reach it, and write one model file"
     source = "[B16] sections 3.3-4.2, [W18] section 4.3, [WM19] for alsnet"
     instead_of_tiles = "Train without --tile: only samples are computed, so memory goes to the points alone"
     where_help = "Samples are drawn from the points inside; all points are neighbors."
@@ -269,7 +269,7 @@ holds the classes.
             listed = ", ".join(f"{name} ({100 * share:.3g} %)" for name, share in telling.items())
             report.warnings.append(
                 f"the classes follow from one dimension almost alone: {listed}. If it was made of the labels, or of what "
-                "unlabelled points do not have, leave it out of 'dimensions': the score is worth nothing"
+                "unlabeled points do not have, leave it out of 'dimensions': the score is worth nothing"
             )
         for code, (all_, held) in model.info["training"].get("held_by_base", {}).items():
             report.warnings.append(

@@ -62,7 +62,7 @@ feet of walls stay what they are: surveys label them building as often as ground
     def creates(self) -> dict[str, str]:
         return {"Classification": "uint8_t"}
 
-    def halo(self) -> float:
+    def halo_m(self) -> float:
         return REACH
 
     def largest_class(self) -> int:

@@ -75,7 +75,7 @@ marks of the whole cloud. The counts are in the metadata as `low` and `high`.
     def creates(self) -> dict[str, str]:
         return {"Classification": "uint8_t"}
 
-    def halo(self) -> float:
+    def halo_m(self) -> float:
         return REACH
 
     def largest_class(self) -> int:

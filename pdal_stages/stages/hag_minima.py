@@ -78,7 +78,7 @@ the unit of Z.
     def creates(self) -> dict[str, str]:
         return {"HeightAboveGround": "float"}
 
-    def halo(self) -> float:
+    def halo_m(self) -> float:
         # The bilinear patch reaches one and a half cells, whole cells are needed, and an
         # empty cell is filled from the nearest ones with points.
         return 4.0 * self.cell

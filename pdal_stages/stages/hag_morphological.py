@@ -128,10 +128,10 @@ of Z.
             **dict.fromkeys(opening_names(self.windows), "float"),
         }
 
-    def halo(self) -> float:
+    def halo_m(self) -> float:
         return reach(cell=self.cell, window=self.window, openings=self.windows)
 
-    def near_halo(self) -> float:
+    def near_halo_m(self) -> float:
         return reach_of_points(self.cell)
 
     def left_of(self, points: Points) -> NDArray[np.float64]:
@@ -142,9 +142,9 @@ of Z.
         usable = points.usable(self.ignore)
         wanted = points.wanting("HeightAboveGround", self.makes_again)
         xyz, usable = points.xyz[wanted], usable[wanted]
-        if self.surroundings is not None:
-            xyz = np.concatenate([xyz, self.surroundings])
-            usable = np.concatenate([usable, np.ones(len(self.surroundings), bool)])
+        if self.far_points is not None:
+            xyz = np.concatenate([xyz, self.far_points])
+            usable = np.concatenate([usable, np.ones(len(self.far_points), bool)])
         found = filtered_ground(
             xyz,
             mask=usable,

@@ -200,10 +200,10 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
             out.update({f"Probability_{code}": "float" for code, _ in self.model.classes})
         return out
 
-    def halo(self) -> float:
-        return self.model.halo + self.inner_reach()
+    def halo_m(self) -> float:
+        return self.model.halo_m + self.inner_halo_m()
 
-    def inner_reach(self) -> float:
+    def inner_halo_m(self) -> float:
         return self.smooth + 0.001 if self.smooth else 0.0  # a distance rounds
 
     def largest_class(self) -> int:

@@ -145,8 +145,8 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
     def creates(self) -> dict[str, str]:
         return {**dict.fromkeys(self.columns, "float"), **(_OPTIMAL if self.optimal else {})}
 
-    def halo(self) -> float:
-        return self.plan.halo + self.voxel
+    def halo_m(self) -> float:
+        return self.plan.halo_m + self.voxel
 
     def most_neighbors(self) -> int:
         return self.plan.most_neighbors

@@ -92,7 +92,7 @@ the tile is read wider. To write objects as polygons and points use `pdal-stages
     def largest_class(self) -> int:
         return self.refused_class if self.refuse else 0
 
-    def halo(self) -> float:
+    def halo_m(self) -> float:
         return MARGIN + 4 * self.settings.cell
 
     def reach_of(self, points: Points, wanted: NDArray[np.bool_], box: Sequence[float]) -> float:
@@ -114,7 +114,7 @@ the tile is read wider. To write objects as polygons and points use `pdal-stages
                     (row.max() + 1) * size - north,
                 )
                 away = max(away, *beyond)
-        return float(away) + self.halo()
+        return float(away) + self.halo_m()
 
     def _found(self, points: Points) -> Objects:
         return find_objects(self.cells(points), self.settings, progress=False)

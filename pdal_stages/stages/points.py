@@ -84,7 +84,7 @@ class Points:
 
     @cached_property
     def units(self) -> Units:
-        """Metres per unit; refuses degrees. An assumption is put in the report."""
+        """Meters per unit; refuses degrees. An assumption is put in the report."""
         x, y = (self.arrays[axis] for axis in "XY") if self.count else (np.zeros(0), np.zeros(0))
         place = (float(x[0]), float(y[0])) if self.count else None
         units = units_of_wkt(self.wkt, horizontal=self._units[0], vertical=self._units[1], place=place)

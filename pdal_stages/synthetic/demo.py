@@ -123,8 +123,8 @@ def _work(folder: Path, size: float, density: float, seed: int) -> None:
         las("classified.laz"),
     ]
     standard = {"type": "filters.modelclassifier", "model": STANDARD}
-    unlabelled = [*classify[:4], standard, las("standard.laz")]
-    for name, stages in (("train", train), ("classify", classify), ("standard", unlabelled)):
+    unlabeled = [*classify[:4], standard, las("standard.laz")]
+    for name, stages in (("train", train), ("classify", classify), ("standard", unlabeled)):
         write_whole(folder / f"{name}.json", (json.dumps(stages, indent=4) + "\n").encode())
     with _step("training on the western half"):
         Pipeline(train).execute(arrays=False)
@@ -132,7 +132,7 @@ def _work(folder: Path, size: float, density: float, seed: int) -> None:
         job = Pipeline(classify)
         job.execute()
     with _step("classifying it with the model that comes with the package, which has never seen such a town"):
-        general = Pipeline(unlabelled)
+        general = Pipeline(unlabeled)
         general.execute()
     _results(folder, job.arrays[0], general.arrays[0])
 

@@ -33,7 +33,7 @@ class Written:
     points: int
     classes: dict[int, int]  #: number of points by code
     counts: dict[str, int] = field(default_factory=dict)  #: of points that got no class, by reason
-    notes: list[str] = field(default_factory=list)
+    messages: list[str] = field(default_factory=list)
     metadata: dict[str, Any] = field(default_factory=dict)  #: PDAL's
 
 
@@ -175,13 +175,13 @@ class ClassifyTask:
         more = [("metadata", self.metadata, kinds.JSON), ("log", self.log, "")]
         check_outputs([Output(name, what, kind) for what, name, kind in more if name], self.files)
 
-        def tell(job: TileJob | FileJob) -> None:
+        def finished_one(job: TileJob | FileJob) -> None:
             if finished is not None:
                 for path in (job.outputs or [])[:1]:
                     classes = {int(code): n for code, n in job.report.get("classes", {}).items()}
                     finished(Written(path, job.report.get("written", 0), classes))
 
-        return run_plan(plan, self.options, dry_run=dry_run, finished=tell)
+        return run_plan(plan, self.options, dry_run=dry_run, finished=finished_one)
 
 
 def _make_folder(folder: Path) -> None:
@@ -204,8 +204,8 @@ def classify_file(
     reports = [each[-1].figures for _, each in pipeline.reports if each]
     classes = {int(code): n for one in reports for code, n in one.get("classes", {}).items()}
     counts = {key: one[key] for one in reports for key in LEFT_ALONE if one.get(key)}
-    notes = [*(f"PDAL says: {line}" for line in pipeline.said), *pipeline.told]
-    return Written(target, count, classes, counts, notes, pipeline.metadata)
+    messages = [*(f"PDAL says: {line}" for line in pipeline.log_lines), *pipeline.messages]
+    return Written(target, count, classes, counts, messages, pipeline.metadata)
 
 
 #: Points that did not get a class from the classifier, or another one, by their names in reports.

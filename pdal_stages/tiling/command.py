@@ -17,7 +17,7 @@ from ..base.asprs import class_name
 from ..base.errors import OptionError, StageError
 from ..base.files import check_writable, write_whole
 from ..base.memory import parse_size
-from ..base.plain import one_line, tell
+from ..base.plain import one_line, print_messages
 from ..pipeline.ends import is_ept, is_folder, is_las
 from ..pipeline.read import PipelineSource
 from ..pipeline.run import Pipeline
@@ -148,7 +148,7 @@ def _end(options: argparse.Namespace, run: TiledRun, again: str) -> int:
     done = states["done"] + states["kept"]
     files = sum(out.state in ("done", "kept") for out in run.outputs)
     written = f"{files:,} of {_counted(len(run.outputs), 'file')} written, " if run.outputs else ""
-    tell(
+    print_messages(
         f"interrupted; nothing half-written was left. {written}{done:,} of {_counted(len(run.tiles), 'tile')} done. "
         f"For the rest: {again}"
     )
@@ -171,7 +171,7 @@ def classify(task: ClassifyTask, options: argparse.Namespace) -> int:
     if task.in_one_piece() and not options.report:
         end_at_once(options)
         written = task.run_whole()
-        tell(*written.notes)
+        print_messages(*written.messages)
         print(f"{written.points:,} points written to {written.path}")
         _print_classes([written], names)
         return 0
@@ -213,7 +213,7 @@ def _classify_each(task: ClassifyTask, options: argparse.Namespace, names: Mappi
                 found=next(name for name in task.files if not is_las(name) and not is_ept(name)),
                 cure="Convert them first: pdal translate INPUT input.laz",
             )
-    notes = _SaidOnce()
+    messages = _MessagesOnce()
     done: dict[str, Written] = {}
     failed: dict[str, str] = {}
     interrupted = False
@@ -224,13 +224,15 @@ def _classify_each(task: ClassifyTask, options: argparse.Namespace, names: Mappi
                 print(f"{what.path}: {what.points:,} points{_shares(what, names)}", flush=True)
             else:
                 failed[source] = what
-            for line in [what] if isinstance(what, str) else what.notes:
-                notes.say(source, line)
+            for line in [what] if isinstance(what, str) else what.messages:
+                messages.add(source, line)
     except KeyboardInterrupt:
         interrupted = True
-    notes.end()
+    messages.end()
     if len(task.files) > 1:
-        tell("each file was classified by itself: only LAS, LAZ, COPC and EPT inputs can be cut into tiles")
+        print_messages(
+            "each file was classified by itself: only LAS, LAZ, COPC and EPT inputs can be cut into tiles"
+        )
     _print_classes([done[source] for source in task.files if source in done], names)
     if options.metadata:
         files = [
@@ -242,10 +244,10 @@ def _classify_each(task: ClassifyTask, options: argparse.Namespace, names: Mappi
         text = json.dumps({"files": files}, indent=2, default=str)
         write_whole(options.metadata, (text + "\n").encode())
     if failed:
-        tell(f"{len(failed)} of {_counted(len(task.files), 'file')} failed")
+        print_messages(f"{len(failed)} of {_counted(len(task.files), 'file')} failed")
     if interrupted:
         left = [source for source in task.files if source not in done and source not in failed]
-        tell(
+        print_messages(
             f"interrupted; {len(done)} of {len(task.files)} files are finished and whole, of the others nothing was left. "
             f"Still to be done: {', '.join(left[:5])}{f' and {len(left) - 5:,} more' * (len(left) > 5)}"
         )
@@ -259,23 +261,23 @@ def end_at_once(options: argparse.Namespace) -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-class _SaidOnce:
-    """What is said of many files: at once for the first, and in the end which others it holds for."""
+class _MessagesOnce:
+    """Messages about many files: printed at once for the first, and in the end which others have it."""
 
     def __init__(self) -> None:
         self._files: dict[str, list[str]] = {}
 
-    def say(self, file: str, text: str) -> None:
+    def add(self, file: str, text: str) -> None:
         text = text.removeprefix(f"{file}: ")
         if text not in self._files:
-            tell(f"{file}: {text}")
+            print_messages(f"{file}: {text}")
         self._files.setdefault(text, []).append(file)
 
     def end(self) -> None:
         for text, (_, *others) in self._files.items():
             if others:
                 more = f" and {len(others) - 3:,} more" if len(others) > 3 else ""
-                tell(f"also {', '.join(others[:3])}{more}: {text}")
+                print_messages(f"also {', '.join(others[:3])}{more}: {text}")
 
 
 def _shares(written: Written, names: Mapping[int, str]) -> str:
@@ -336,18 +338,16 @@ def _print(run: TiledRun, unit: str = "") -> None:
     if s["dropped"]:
         print(f"{s['dropped']:,} points were dropped by filters of the pipeline")
     failures = run.failures
-    tell(*run.notes, *(f"{what}: {reason}" for what, reason in failures[:20]))
+    print_messages(*run.messages, *(f"{what}: {reason}" for what, reason in failures[:20]))
     if len(failures) > 20:
-        tell(f"and {len(failures) - 20} more; see --report")
+        print_messages(f"and {len(failures) - 20} more; see --report")
     if failures:
-        tell("run it again with --resume to try only what failed")
+        print_messages("run it again with --resume to try only what failed")
 
 
 def _print_dry(run: TiledRun) -> None:
     s = run.summary
-    print(
-        f"{_counted(len(run.tiles), 'tile')} of {s['tile']:g}, each read with {s['halo_m']:g} m of surroundings"
-    )
+    print(f"{_counted(len(run.tiles), 'tile')} of {s['tile']:g}, each read with {s['halo_m']:g} m around it")
     print(f"{_counted(s['inputs'], 'input')}, {s['points']:,} points; one output for each {s['per']}")
     print(
         f"about {s['points_read_by_a_tile']:,} points read for a tile, {s['points_of_largest_tile']:,} its own at most"
@@ -363,7 +363,7 @@ def _print_dry(run: TiledRun) -> None:
         print(f"  {job.name:24s} {job.points:>14,} points  {_counted(len(job.sources), 'input')}")
     if len(run.tiles) > 50:
         print(f"  and {len(run.tiles) - 50} more")
-    tell(*run.notes, *(f"{what}: {reason}" for what, reason in run.failures))
+    print_messages(*run.messages, *(f"{what}: {reason}" for what, reason in run.failures))
 
 
 def _counted(count: int, word: str) -> str:

@@ -126,7 +126,7 @@ def run_first_round(work: Worklist, store: Store, pool: Pool, retries: int, show
     store.forget_left([job.name for job in work.jobs])  # an earlier run may have had other inputs
     if first is None or len(work.jobs) == 1:
         return
-    grid, halo = survey.grid, first.halo_m / survey.unit
+    grid, halo_units = survey.grid, first.halo_m / survey.unit
     far = first.far_m / survey.unit
     by_tile = {job.tile: job for job in work.jobs}
     users: dict[tuple[int, int], list[TileJob]] = {}
@@ -136,7 +136,7 @@ def run_first_round(work: Worklist, store: Store, pool: Pool, retries: int, show
                 users.setdefault(tile, []).append(job)
     waiting: deque[_Item] = deque()
     for tile in users:
-        read = [s for s in survey.near(tile, halo) if s.path not in survey.unreadable]
+        read = [s for s in survey.near(tile, halo_units) if s.path not in survey.unreadable]
         mark = fingerprint(
             build(),
             work.plan.head[: first.at + 1],
@@ -154,7 +154,7 @@ def run_first_round(work: Worklist, store: Store, pool: Pool, retries: int, show
     context = work.context(store, pool.threads)
 
     def task_of(item: _Item) -> FirstRoundTask:
-        sources = [s for s in survey.near(item.job.tile, halo) if s.path not in survey.unreadable]
+        sources = [s for s in survey.near(item.job.tile, halo_units) if s.path not in survey.unreadable]
         with_index = [work.with_index(s) for s in sources]
         return FirstRoundTask(context, first, item.job.tile, with_index, str(store.left(item.job.name)))
 

@@ -11,9 +11,9 @@ from .sources import InputSource, las_extent, read_ept
 
 
 def fetch(
-    source: InputSource, grid: TileGrid, tile: tuple[int, int], halo: float, target: str
+    source: InputSource, grid: TileGrid, tile: tuple[int, int], halo_units: float, target: str
 ) -> CloudIndex | None:
-    """Read a tile and its surroundings into a LAS file; its index, None where it is empty.
+    """Read a tile and its halo into a LAS file; its index, None where it is empty.
 
     Scales and offsets are the source's, so coordinates stay what they are; other
     dimensions become extra dimensions.
@@ -31,5 +31,5 @@ def fetch(
             axis = dimension["name"].lower()
             writer[f"scale_{axis}"] = dimension.get("scale", 0.001)
             writer[f"offset_{axis}"] = dimension.get("offset", 0.0)
-    run = pdal_env.execute([source.within(grid.box(tile, halo)), writer], arrays=False)
+    run = pdal_env.execute([source.within(grid.box(tile, halo_units)), writer], arrays=False)
     return index_las(target, grid) if run.count and las_extent(target).count else None

@@ -8,7 +8,7 @@ from .survey import Survey
 from .tileplan import TilePlan, outputs_for
 
 #: For the estimate of a dry run, with the model that comes with the package: points of its own that a core does in a second,
-#: and points that it only reads, as surroundings (benchmarks/tiling.py).
+#: and points that it only reads, as halo (benchmarks/tiling.py).
 _RATE, _READ_RATE = 40_000, 250_000
 #: Bytes that a run keeps of a point until its output is written.
 _KEPT = 20
@@ -35,7 +35,7 @@ def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
     outputs_for(plan, names, survey.paths)
     count = sum(header.count for header in survey.extents.values())
     density = Density.of(survey.extents.values())
-    read = density.read_by(grid.size, survey.halo)
+    read = density.read_by(grid.size, survey.halo_units)
     held = worker_bytes(read, density.largest if survey.per == "file" else 0)
     summary = survey.figures(plan) | {
         "workers": options.local_workers,
@@ -49,7 +49,7 @@ def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
         "disk_gb": count * _KEPT / 1e9 if survey.per == "file" else 0.0,
         "states": {"waiting": len(listed)},
     }
-    return TiledRun(listed, [], survey.unreadable, [], survey.notes, summary)
+    return TiledRun(listed, [], survey.unreadable, [], survey.messages, summary)
 
 
 def _beside(tiles: list[TileJob], read: int) -> int:

@@ -63,21 +63,21 @@ def cut_all(
     grid: TileGrid,
     tile: tuple[int, int],
     sources: Sequence[tuple[InputSource, CloudIndex | None]],
-    halo: float,
+    halo_units: float,
     folder: str,
     cores: bool,
 ) -> list[Piece]:
     """A tile's points and their surroundings, out of every input; inputs that are alike are read as one.
 
-    `halo` is in the unit of the coordinates; `cores`: the tile's own points come in files of their own, too.
+    `halo_units` is in the unit of the coordinates; `cores`: the tile's own points come in files of their own, too.
     """
-    box = grid.box(tile, halo)
+    box = grid.box(tile, halo_units)
     alike: dict[tuple[bytes, str], list[Member]] = {}
     for number, (source, index) in enumerate(sources):
         path = source.path
         if source.kind == "ept":
             path = os.path.join(folder, f"fetched{number}.las")
-            index = fetch(source, grid, tile, halo, path)
+            index = fetch(source, grid, tile, halo_units, path)
         if index is None or not touching(index.boxes, box):
             continue
         reader = json.dumps(source.reader, sort_keys=True)
@@ -85,7 +85,7 @@ def cut_all(
     pieces = []
     for number, members in enumerate(alike.values()):
         core = os.path.join(folder, f"core{number}.las") if cores else ""
-        pieces.append(cut(members, grid, tile, halo, os.path.join(folder, f"piece{number}.las"), core))
+        pieces.append(cut(members, grid, tile, halo_units, os.path.join(folder, f"piece{number}.las"), core))
     return [piece for piece in pieces if piece is not None]
 
 
@@ -149,16 +149,16 @@ def cut(
     members: Sequence[Member],
     grid: TileGrid,
     tile: tuple[int, int],
-    halo: float,
+    halo_units: float,
     target: str,
     core: str = "",
 ) -> Piece | None:
-    """Cut a tile and its surroundings out of files that are alike (:func:`likeness`); None where they have no point there.
+    """Cut a tile and its halo out of files that are alike (:func:`likeness`); None where they have no point there.
 
-    `halo` is in the unit of the coordinates. A LAS file `target` is written, and a second one, `core`, for the tile's
+    `halo_units` is in the unit of the coordinates. A LAS file `target` is written, and a second one, `core`, for the tile's
     own points alone, where it is given.
     """
-    box = grid.box(tile, halo)
+    box = grid.box(tile, halo_units)
     rows_cut: list[NDArray[np.int64]] = []
     aways: list[NDArray[np.float64]] = []
     spans: list[tuple[InputSource, int, int]] = []

@@ -1,7 +1,7 @@
 """A round before the tiles: every point is read once, and what a far-reaching stage needs of it is kept.
 
 Filtered ground looks half a kilometer around a tile, but at points far away it needs the lowest ones of cells alone. So
-each tile's own points are read first, with the surroundings that the stages before need (noise is marked before heights
+each tile's own points are read first, with the halo that the stages before need (noise is marked before heights
 are made), and the lowest are written into a file. Then a tile reads the points near it, and is given those of the files.
 """
 
@@ -36,9 +36,7 @@ class FirstRoundTask:
     context: RunContext
     first: FirstRound
     tile: tuple[int, int]
-    sources: list[
-        tuple[InputSource, CloudIndex | None]
-    ]  #: inputs that may hold points of it or its surroundings
+    sources: list[tuple[InputSource, CloudIndex | None]]  #: inputs that may hold points of it or its halo
     target: str  #: file for what is left of its points
 
     def run(self) -> dict[str, Any]:

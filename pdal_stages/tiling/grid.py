@@ -46,14 +46,14 @@ class TileGrid:
         where += coordinate >= (where + 1.0) * self.size
         return where.astype(np.int64)
 
-    def box(self, tile: tuple[int, int], halo: float = 0.0) -> Box:
+    def box(self, tile: tuple[int, int], halo_units: float = 0.0) -> Box:
         """(min x, min y, max x, max y) of a tile, grown by as much on each side."""
         i, j = tile
         return (
-            i * self.size - halo,
-            j * self.size - halo,
-            (i + 1) * self.size + halo,
-            (j + 1) * self.size + halo,
+            i * self.size - halo_units,
+            j * self.size - halo_units,
+            (i + 1) * self.size + halo_units,
+            (j + 1) * self.size + halo_units,
         )
 
     def name(self, tile: tuple[int, int]) -> str:

@@ -1,4 +1,4 @@
-"""The head of a pipeline on a tile and its surroundings: points numbered, stages run, the tile's own results taken out."""
+"""The head of a pipeline on a tile and its halo: points numbered, stages run, the tile's own results taken out."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class RunContext:
     unit: float  #: meters per unit of the coordinates
     bounds: Box  #: of all inputs
     threads: int
-    most_points: int  #: a tile is not read with wider surroundings that hold more
+    most_points: int  #: a tile is not read with a wider halo that holds more
     scratch: str  #: folder for temporary files
 
 
@@ -46,8 +46,8 @@ class HeadRun:
     """What a run of the head gave."""
 
     results: list[PieceResults]
-    need: float  #: the meters of surroundings that it took
-    notes: list[str] = field(default_factory=list)  #: warnings and notes
+    need: float  #: the halo that it took, meters
+    messages: list[str] = field(default_factory=list)  #: warnings and notes
 
 
 def run_head(
@@ -55,12 +55,12 @@ def run_head(
     tile: tuple[int, int],
     cuts: list[Piece],
     everything: bool,
-    surroundings: NDArray[np.float64] | None = None,
+    far_points: NDArray[np.float64] | None = None,
     narrowing: bool = True,
 ) -> HeadRun:
     """Run the head once.
 
-    `everything`: all inputs were read, so nothing can lie farther away. `surroundings`: what the first round left of
+    `everything`: all inputs were read, so nothing can lie farther away. `far_points`: what the first round left of
     points farther away than those of `cuts`. With `narrowing`, stages after one that reaches far get the points alone
     that they can reach themselves. Where that turns out to be too few (the k nearest neighbors of sparse points), it is
     done again without.
@@ -91,7 +91,7 @@ def run_head(
         check_writers([*pipeline.lowered.stages, *plan.tail], ours_there)
         for ours in pipeline.lowered.ours:
             if ours.number == from_afar:
-                ours.stage.surroundings = surroundings
+                ours.stage.far_points = far_points
             if ours.number in reaches:
                 reaches[ours.number].stage = ours.stage
         pipeline.execute(arrays=True)
@@ -99,12 +99,12 @@ def run_head(
     need = max((reach.need for reach in reaches.values()), default=0.0)
     far = any(report.beyond_halo for _, reports in pipeline.reports for report in reports)
     if far and narrowed:
-        return run_head(context, tile, cuts, everything, surroundings, narrowing=False)
+        return run_head(context, tile, cuts, everything, far_points, narrowing=False)
     if far and not everything:
         most = max(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
         need = max(need, _far_neighbors(pipeline.arrays, most, context, tile))
-    notes = [*(f"PDAL says: {line}" for line in pipeline.said), *pipeline.told]
-    return HeadRun(results, need, notes)
+    messages = [*(f"PDAL says: {line}" for line in pipeline.log_lines), *pipeline.messages]
+    return HeadRun(results, need, messages)
 
 
 def run_first(context: RunContext, cuts: list[Piece], first: FirstRound) -> NDArray[np.float64]:
@@ -266,7 +266,7 @@ def _changed(result: PieceResults, name: str, original: Mapping[str, NDArray]) -
 
 
 def _far_neighbors(arrays: list[NDArray], most: int, context: RunContext, tile: tuple[int, int]) -> float:
-    """Metres around the tile within which the `most` nearest neighbors of all its points lie."""
+    """Meters around the tile within which the `most` nearest neighbors of all its points lie."""
     from scipy.spatial import cKDTree
 
     x0, y0, x1, y1 = (side * context.unit for side in context.grid.box(tile))

@@ -23,7 +23,7 @@ from ..base.errors import OptionError, StageError
 from ..base.files import write_whole
 from ..base.las import read_header
 from ..base.outputs import Output, check_outputs
-from ..base.plain import tell
+from ..base.plain import print_messages
 from ..base.progress import Progress
 from ..base.stamps import stamp
 from ..base.units import Units
@@ -173,7 +173,7 @@ def _tell_density(cells: Cells) -> None:
     roofs = cells.of_kind(Kind.BUILDING)
     if len(roofs) > 100 and float(roofs.columns["count"].mean()) < 1.6:
         mean = float(roofs.columns["count"].mean())
-        tell(
+        print_messages(
             f"cells of {cells.size:g} m hold {mean:.1f} points of buildings on average, so roofs may fall apart: "
             f"try --cell {2 * cells.size:g}"
         )

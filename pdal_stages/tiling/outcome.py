@@ -29,7 +29,7 @@ class TileJob(_Work):
     tile: tuple[int, int]
     name: str
     points: int  #: its own; 0 where not known before it is read
-    sources: list[InputSource]  #: inputs that may hold points of it or its surroundings
+    sources: list[InputSource]  #: inputs that may hold points of it or its halo
     outputs: list[str] | None = None  #: what the writers write, where each tile is an output
 
 
@@ -70,7 +70,7 @@ class TiledRun:
         Inputs that could not be read, and why.
     changed : list of str
         Files that changed while they were worked on.
-    notes : list of str
+    messages : list of str
         What the user should know.
     summary : dict
         Figures for people; see :meth:`to_dict`.
@@ -80,7 +80,7 @@ class TiledRun:
     outputs: list[FileJob]
     unreadable: dict[str, str]
     changed: list[str]
-    notes: list[str]
+    messages: list[str]
     summary: dict[str, Any]
 
     @property
@@ -109,7 +109,7 @@ class TiledRun:
         return {
             "pdal_stages": __version__,
             **self.summary,
-            "notes": self.notes,
+            "messages": self.messages,
             "failures": [{"what": what, "reason": reason} for what, reason in self.failures],
             "tiles": [
                 {"name": j.name, "tile": list(j.tile), "state": j.state, "tries": j.tries, "points": j.points}

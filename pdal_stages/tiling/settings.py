@@ -28,7 +28,7 @@ class TilingOptions:
         ``file`` writes one output for each input file, in that file's order of points; ``tile`` one for each
         tile; ``auto`` is ``file`` for LAS and LAZ inputs and ``tile`` for others.
     buffer : float, optional
-        Meters of surroundings each tile is read with, for PDAL filters that look at neighbors; it is added
+        Meters of halo each tile is read with, for PDAL filters that look at neighbors; it is added
         to what our stages ask for.
     memory : int, optional
         Bytes that all processes of this machine together may hold; of a run on a scheduler, each worker. Default: half of
@@ -38,7 +38,7 @@ class TilingOptions:
     retries : int
         How often a failed tile is tried again.
     most_points : int
-        A tile whose neighborhoods turn out to reach farther than its surroundings is read again with wider
+        A tile whose neighborhoods turn out to reach farther than its halo is read again with a wider
         ones, up to so many points.
     """
 

@@ -11,7 +11,7 @@ from ..base.memory import free_memory
 from .settings import TilingOptions
 from .sources import Extent
 
-#: Memory of a worker: programs and model, a point of a tile with its surroundings, a point of an output file that is put
+#: Memory of a worker: programs and model, a point of a tile with its halo, a point of an output file that is put
 #: together, and the `memory` option of our stages. See docs/large-areas.md.
 BASE, TILE_POINT, FILE_POINT, BLOCKS = 350 << 20, 350, 250, 512 << 20
 #: Of the process that hands out the work.
@@ -54,9 +54,9 @@ class Density:
                 break
         return cls(total, max((row[1] for row in rows), default=0), area, dense)
 
-    def read_by(self, side: float, halo: float) -> int:
+    def read_by(self, side: float, halo_units: float) -> int:
         """Points of a tile of this side with its surroundings."""
-        return min(self.points, math.ceil(self.each * (side + 2 * halo) ** 2))
+        return min(self.points, math.ceil(self.each * (side + 2 * halo_units) ** 2))
 
 
 def worker_bytes(points_read: float, largest_file: float) -> float:
@@ -69,8 +69,8 @@ def fits_whole(points: int, memory: int | None) -> bool:
     return BASE + BLOCKS + points * TILE_POINT <= (memory or free_memory() // 2)
 
 
-def settled(options: TilingOptions, density: Density, halo: float, per_file: bool) -> TilingOptions:
-    """The options with a side of tiles and a number of workers that the memory allows; `halo` in units of the coordinates.
+def settled(options: TilingOptions, density: Density, halo_units: float, per_file: bool) -> TilingOptions:
+    """The options with a side of tiles and a number of workers that the memory allows; the halo is in the coordinates' unit.
 
     Raises
     ------
@@ -84,16 +84,16 @@ def settled(options: TilingOptions, density: Density, halo: float, per_file: boo
     sides = [options.tile] if options.tile is not None else _sides(density)
     for workers in [local] if fixed else range(local, 0, -1):
         room = (whole - PARENT) / workers if workers else whole
-        fitting = [s for s in sides if worker_bytes(density.read_by(s, halo), largest) <= room]
+        fitting = [s for s in sides if worker_bytes(density.read_by(s, halo_units), largest) <= room]
         if not fitting:
             continue
         side = fitting[-1] if options.tile is not None else _enough(fitting, density, workers)
-        # Most of a small tile is surroundings, which cost as much: rather fewer workers.
-        if side >= halo or side == sides[-1] or fixed or workers == 1:
+        # Most of a small tile is halo, which costs as much: rather fewer workers.
+        if side >= halo_units or side == sides[-1] or fixed or workers == 1:
             return replace(options, tile=side, workers=options.workers if options.scheduler else workers)
     if options.memory is None and options.tile is not None:
         return options  # as it was asked for
-    least = worker_bytes(density.read_by(sides[0], halo), largest) * max(1, local if fixed else 1)
+    least = worker_bytes(density.read_by(sides[0], halo_units), largest) * max(1, local if fixed else 1)
     raise OptionError(
         "the memory does not suffice for tiles" + ("" if options.tile is None else " of this size"),
         found=f"{whole / 1e9:.1f} GB; about {(least + (PARENT if local else 0)) / 1e9:.1f} GB are needed",

@@ -33,7 +33,7 @@ class Survey:
 
     def __init__(self, plan: TilePlan, options: TilingOptions) -> None:
         self.started = time.strftime("%Y-%m-%d %H:%M")
-        self.notes = list(plan.notes)
+        self.messages = list(plan.messages)
         self._whole_names = plan.whole_names
         self.unreadable: dict[str, str] = {}  #: inputs by path that cannot be read, and why
         self.extents: dict[str, Extent] = {}  #: of inputs by path, where the header can be read
@@ -43,7 +43,7 @@ class Survey:
         #: What inputs, and other files that stages read, were like when the run began.
         self.stamps = {path: stamp(path) for path in [*self.paths, *others]}
         if any("t_srs" in reader for reader in plan.readers):
-            self.notes.append(
+            self.messages.append(
                 "readers.tindex: in tiles points keep the reference of their file, t_srs is left out"
             )
         self._read_headers()
@@ -53,10 +53,12 @@ class Survey:
         #: ``file`` or ``tile``: what one output is made of.
         self.per = options.per if options.per != "auto" else "file" if files else "tile"
         self.unit = self._unit(plan)  #: meters per unit of the coordinates
-        self.halo = plan.halo_m / self.unit  #: surroundings of a tile, in the unit of the coordinates
+        self.halo_units = plan.halo_m / self.unit  #: of a tile, in the unit of the coordinates
         self._place()
         #: With the tiles' side and the workers settled.
-        self.options = settled(options, Density.of(self.extents.values()), self.halo, self.per == "file")
+        self.options = settled(
+            options, Density.of(self.extents.values()), self.halo_units, self.per == "file"
+        )
         assert self.options.tile is not None
         self.grid = TileGrid(self.options.tile)
 
@@ -72,7 +74,7 @@ class Survey:
         lost = len(self.sources) - len(self.extents)
         if lost:
             which = "1 input has" if lost == 1 else f"{lost} inputs have"
-            self.notes.append(
+            self.messages.append(
                 f"{which} no readable header, so its place is not known: tiles beside it may lack neighbors. Once "
                 "it can be read, --resume runs those tiles again"
             )
@@ -83,7 +85,7 @@ class Survey:
         )
 
     def _unit(self, plan: TilePlan) -> float:
-        """Metres per unit of the coordinates, whose reference must be one for all inputs that stages see together."""
+        """Meters per unit of the coordinates, whose reference must be one for all inputs that stages see together."""
         needed = bool(plan.head and plan.halo_m)
         groups: dict[str, list[InputSource]] = {}
         for source in self.sources:
@@ -148,9 +150,9 @@ class Survey:
         """Inputs and other files that are not what they were when the run began."""
         return [path for path, then in self.stamps.items() if stamp(path) != then]
 
-    def near(self, tile: tuple[int, int], halo: float) -> list[InputSource]:
-        """Inputs that may hold points of a tile or its surroundings."""
-        return [self.placed[n] for n in touching(self._boxes, self.grid.box(tile, halo))]
+    def near(self, tile: tuple[int, int], halo_units: float) -> list[InputSource]:
+        """Inputs that may hold points of a tile or its halo."""
+        return [self.placed[n] for n in touching(self._boxes, self.grid.box(tile, halo_units))]
 
     def tiles(self) -> dict[tuple[int, int], int]:
         """Every tile that may have points of its own, row by row, and how many where that is known (else 0)."""

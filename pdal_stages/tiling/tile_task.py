@@ -20,7 +20,7 @@ from .headrun import HeadRun, RunContext, run_head
 from .results import PieceResults, class_counts, save
 from .sources import InputSource
 
-#: How often a tile is read again with wider surroundings.
+#: How often a tile is read again with a wider halo.
 _WIDENINGS = 3
 
 
@@ -30,7 +30,7 @@ class TileTask:
 
     context: RunContext
     tile: tuple[int, int]
-    #: Inputs that may hold points of it or its surroundings; EPT sources have no index.
+    #: Inputs that may hold points of it or its halo; EPT sources have no index.
     sources: list[tuple[InputSource, CloudIndex | None]]
     complete: float  #: meters around the tile up to which these are all the inputs there are
     result: str  #: file for the results, where outputs are put together from tiles
@@ -52,7 +52,7 @@ class TileTask:
 def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, Any]]:
     """Run the head with surroundings that suffice; results, and the report.
 
-    It has the ``points`` of the tile, those ``read`` with surroundings, the ``halo_m`` used, and whether that did not
+    It has the ``points`` of the tile, those ``read`` with its halo, the ``halo_m`` used, and whether that did not
     suffice (``short``).
     """
     context, tile, least_m = task.context, task.tile, task.context.plan.halo_m
@@ -96,7 +96,7 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
         "widened": halo_m > least_m,
         "dropped": own - sum(len(result.rows) for result in head.results),
         "classes": class_counts(head.results),
-        "notes": head.notes,
+        "messages": head.messages,
     }
     return head.results, report
 

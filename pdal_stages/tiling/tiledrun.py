@@ -118,27 +118,29 @@ def run_plan(
             sweep(folder)  # what workers left that were killed
     summary = survey.figures(plan) | {"workers": pool.slots, "threads_per_worker": pool.threads}
     summary |= summarize(work.jobs, work.outputs, time.monotonic() - started)
-    survey.notes += _notes_of_tiles(work)
+    survey.messages += _messages_of_tiles(work)
     short = [job.name for job in work.jobs if job.state == "done" and job.report.get("short")]
     if short:
-        survey.notes.append(
+        survey.messages.append(
             f"{len(short)} tiles have points whose neighborhoods or terrain reach farther than could be read within "
             f"{chosen.most_points:,} points; they may differ from an untiled run: " + ", ".join(short[:5])
         )
-    run = TiledRun(work.jobs, work.outputs, survey.unreadable, survey.changed(), survey.notes, summary)
+    run = TiledRun(work.jobs, work.outputs, survey.unreadable, survey.changed(), survey.messages, summary)
     if interrupted:
         raise InterruptedRun(run)
     return run
 
 
 #: Most different warnings of tiles that a run repeats.
-_MOST_NOTES = 20
+_MOST_MESSAGES = 20
 
 
-def _notes_of_tiles(work: Worklist) -> list[str]:
+def _messages_of_tiles(work: Worklist) -> list[str]:
     """Warnings and notes of tiles, once each, the most frequent first."""
-    told = Counter(
-        text for job in work.jobs if job.state == "done" for text in set(job.report.get("notes", ()))
+    found = Counter(
+        text for job in work.jobs if job.state == "done" for text in set(job.report.get("messages", ()))
     )
-    notes = [f"{text} ({n} tile{'s' * (n != 1)})" for text, n in told.most_common(_MOST_NOTES)]
-    return notes + ([f"and {len(told) - _MOST_NOTES} more; see --report"] if len(told) > _MOST_NOTES else [])
+    messages = [f"{text} ({n} tile{'s' * (n != 1)})" for text, n in found.most_common(_MOST_MESSAGES)]
+    return messages + (
+        [f"and {len(found) - _MOST_MESSAGES} more; see --report"] if len(found) > _MOST_MESSAGES else []
+    )

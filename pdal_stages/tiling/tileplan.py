@@ -47,7 +47,7 @@ class FirstRound:
     """What a stage that looks far is given of points far away, made in tiles before: see :mod:`.firstround`."""
 
     at: int  #: number of the stage in the head
-    halo_m: float  #: meters of surroundings that the stages before it need
+    halo_m: float  #: halo that the stages before it need
     far_m: float  #: meters around a tile within which it needs what is left of points
 
 
@@ -56,16 +56,16 @@ class TilePlan:
     """What a tiled run does to each tile."""
 
     readers: list[dict[str, Any]]  #: as given
-    head: list[dict[str, Any]]  #: stages that see neighbors: run on a tile and its surroundings
+    head: list[dict[str, Any]]  #: stages that see neighbors: run on a tile and its halo
     later: list[float]  #: meters outside the tile within which the results of each of them are still used
     #: Stages that look at single points, and the writers: run on the points of one output.
     tail: list[dict[str, Any]]
-    halo_m: float  #: meters of surroundings
+    halo_m: float  #: of each tile, meters
     sees_m: float  #: meters around a tile within which any point may matter
     #: Dimensions the head changes; None where PDAL's filters in it make that unknown.
     creates: list[str] | None
     unit: str  #: `horizontal_unit` of our stages, empty for the spatial reference's
-    notes: list[str]  #: what the user should know
+    messages: list[str]  #: what the user should know
     name: str  #: the pipeline's file, or what else its source is called
     #: Of the dimensions that stages make, those that LAS files get beside the input's own; None leaves it to the writer.
     beside: dict[str, str] | None = None
@@ -99,9 +99,9 @@ class _Step:
         return self.ours is not None or self.type not in _PER_POINT
 
     def reach(self, buffer: float | None) -> float:
-        """Metres around a point in which others change its result."""
+        """Meters around a point in which others change its result."""
         if self.ours is not None:
-            return self.ours.halo()
+            return self.ours.halo_m()
         return float(buffer or 0.0) if self.sees_neighbors else 0.0
 
 
@@ -140,9 +140,9 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
     later = [sum(reaches[n + 1 :]) for n in range(len(head))]
     stages = [step.ours for step in head if step.ours is not None]
     foreign = any(step.ours is None and step.type != "filters.merge" for step in head)
-    notes = list(pipeline.lowered.remarks)
+    messages = list(pipeline.lowered.warnings)
     if any(step.ours is None and step.sees_neighbors for step in head):
-        notes.append(
+        messages.append(
             "PDAL filters that look at neighbors were given --buffer; the result is seamless only if it is wide enough "
             "for them"
         )
@@ -158,7 +158,7 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
         if foreign
         else list(dict.fromkeys(name for stage in stages for name in stage.creates())),
         unit=next(filter(None, (stage.horizontal_unit for stage in stages)), ""),
-        notes=notes,
+        messages=messages,
         name=source.name,
     )
 
@@ -166,7 +166,7 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
 def _first_round(head: list[_Step], reaches: list[float]) -> FirstRound | None:
     """Find the one stage that needs little of points far away; it then reaches less far, and so do the tiles."""
     for at, step in enumerate(head):
-        near = None if step.ours is None else step.ours.near_halo()
+        near = None if step.ours is None else step.ours.near_halo_m()
         if near is not None:
             found = FirstRound(at, sum(reaches[:at]), sum(reaches[at:]))
             reaches[at] = min(near, reaches[at])
@@ -272,7 +272,7 @@ def _narrowed(step: _Step, later: float) -> dict[str, Any]:
             if name and (option.kind == "filename" or (option.kind == "model" and name not in shipped())):
                 stage[option.name] = str(Path(stage[option.name]).absolute())
         if ours.where_chooses:
-            seen_to = later + ours.inner_reach()
+            seen_to = later + ours.inner_halo_m()
             seen = f"{OUTSIDE} <= {seen_to!r}" if seen_to > 0 else f"{OUTSIDE} < 0"
             stage["where"] = f"({ours.where}) && ({seen})" if ours.where else seen
     return stage

@@ -59,7 +59,7 @@ class Worklist:
     def mark_of(self, job: TileJob, report: dict[str, Any]) -> str:
         """Fingerprint of all that decides a tile's result: of every input that was read for it too.
 
-        That is known from the report alone, as a tile may be read with wider surroundings.
+        That is known from the report alone, as a tile may be read with a wider halo.
         """
         survey = self.survey
         halo_m = max(float(report.get("halo_m", 0.0)), self.plan.sees_m)
@@ -136,7 +136,7 @@ class Worklist:
         """What all tiles have in common."""
         survey, scratch, most = self.survey, str(store.scratch), self.options.most_points
         if sum(header.count for header in survey.extents.values()) <= most:
-            most = 1 << 62  # wider surroundings never hold more than all there is, however far they reach
+            most = 1 << 62  # a wider halo never holds more than all there is, however far they reach
         run = replace(self.plan, readers=[])  # tasks travel, and there may be thousands
         return RunContext(run, survey.grid, survey.unit, survey.bounds, threads, most, scratch)
 
@@ -144,8 +144,8 @@ class Worklist:
         """A function that gives the task of a tile or an output."""
         plan, survey, scratch = self.plan, self.survey, str(store.scratch)
         context = self.context(store, threads)
-        # Farther inputs too: a tile may have to be read with wider surroundings.
-        far = max(4 * survey.halo, survey.halo + survey.grid.size)
+        # Farther inputs too: a tile may have to be read with a wider halo.
+        far = max(4 * survey.halo_units, survey.halo_units + survey.grid.size)
 
         def task_of(item: TileJob | FileJob) -> TileTask | FileTask:
             if isinstance(item, FileJob):

@@ -242,7 +242,7 @@ def network(data: bytes) -> str:
     started = time.process_time()
     try:
         model = load_model(path)
-        assert str(model) and model.halo >= 0
+        assert str(model) and model.halo_m >= 0
         shares = model.predict(
             xyz, {"Intensity": rng.uniform(0, 100, 200)}, threads=1, probabilities=True
         ).probabilities

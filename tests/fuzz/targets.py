@@ -144,7 +144,7 @@ def model(data: bytes) -> str:
         path.write_bytes(content)
         manifest, arrays = modelfile.read(path, lambda name: algorithm(name).rules)
         made = assemble(manifest, arrays)
-        assert str(made) and made.describe() and made.halo >= 0
+        assert str(made) and made.describe() and made.halo_m >= 0
         made.importances()
         codes = [code for code, _ in made.classes]
         for one in made.passes:

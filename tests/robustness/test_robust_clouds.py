@@ -389,7 +389,7 @@ def test_no_heights(cell, tmp_path):
 
 
 def test_deep_well_known_text():
-    """Metres are assumed, as where there is none."""
+    """Meters are assumed, as where there is none."""
     from pdal_stages.base.units import units_of_wkt
 
     for text in ("PROJCS[" * 5000, 'PROJCS["a",' + 'UNIT["m",' * 5000 + "1" + "]" * 5001):

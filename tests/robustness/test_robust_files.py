@@ -89,13 +89,13 @@ def test_files_that_are_written(tmp_path, cloud, model):
     found = watched(tmp_path, "train", raw, "--model", "own.model", *SMALL)
     assert found == inside("own.model")
     keep = {"type": "filters.ferry", "dimensions": "Classification=>Reference"}
-    labelled = job(
+    labeled = job(
         tmp_path,
         str(raw),
         keep,
         {"type": "writers.las", "filename": "r.las", "extra_dims": "all", "minor_version": 4},
     )
-    found = watched(tmp_path, "pipeline", labelled)
+    found = watched(tmp_path, "pipeline", labeled)
     assert found == inside("r.las")
     found = watched(tmp_path, "accuracy", "r.las", "--json", "a.json", "--html", "a.html")
     assert found == inside("a.json", "a.html")

@@ -229,7 +229,7 @@ def test_fewer_points_in_the_header(cell, tmp_path, good, model):
     damaged(good, header("count", 100))
     done = cell("LAS files", "LAS: fewer points in the header than in the file").runs(
         ["pipeline", pipeline(tmp_path, good, model, *STAGES)],
-        "the points of the header, and a remark on the bytes beyond",
+        "the points of the header, and a warning on the bytes beyond",
     )
     assert "bytes beyond the 100 points" in done.err
     assert len(laspy.read(tmp_path / "out.las")) == 100
