@@ -31,7 +31,7 @@ def scene(n=3000, side=24.0, seed=0, origin=(0.0, 0.0, 0.0)):
 
 
 def random_net(inputs=("Z",), classes=3, configuration=TINY, spacing=3.0, seed=0):
-    """A network whose weights are random, normalisations included."""
+    """A network whose weights are random, normalizations included."""
     random = np.random.default_rng(seed)
     weights = fresh(configuration, len(inputs), classes, seed)
     for name, array in weights.items():

@@ -49,7 +49,7 @@ def models(town, tmp_path_factory):
 
 def test_none_is_forgotten():
     tested = {
-        "noise", "normalise", "features", "features-for-viewers", "train", "train-binary", "classify",
+        "noise", "normalize", "features", "features-for-viewers", "train", "train-binary", "classify",
         "classify-with-rejection", "evaluate", "train-on-smrf-ground", "classify-on-smrf-ground", "tiles-to-tiles",
         "copc-to-tiles", "tile-index-to-tiles", "raw-to-footprints",
     }  # fmt: skip
@@ -76,9 +76,9 @@ def test_noise(town, tmp_path):
     )
 
 
-def test_normalise(town, tmp_path):
+def test_normalize(town, tmp_path):
     out = tmp_path / "o.laz"
-    run("normalise", f"--stage.input.filename={town}", f"--stage.output.filename={out}")
+    run("normalize", f"--stage.input.filename={town}", f"--stage.output.filename={out}")
     las = laspy.read(out)
     ground = np.asarray(las["HeightAboveGround"])[np.asarray(las.classification) == 2]
     assert np.median(np.abs(ground)) < 1.0

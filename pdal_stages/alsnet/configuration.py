@@ -70,7 +70,7 @@ class Configuration:
     def shapes(self, inputs: int, classes: int) -> dict[str, tuple[int, int]]:
         """Array name to shape, in the order of the computation.
 
-        A layer with batch normalisation is (out, in + 4): the weights, then per output the scale, shift, running
+        A layer with batch normalization is (out, in + 4): the weights, then per output the scale, shift, running
         mean and running variance. The last, ``scores``, is (classes, in + 1): weights, then bias.
         """
         out: dict[str, tuple[int, int]] = {}

@@ -21,7 +21,7 @@ MOMENTUM = 0.05
 
 
 class Shared(nn.Module):
-    """A perceptron applied to every row alike: linear, batch normalisation, ReLU, as often as it has widths."""
+    """A perceptron applied to every row alike: linear, batch normalization, ReLU, as often as it has widths."""
 
     def __init__(self, before: int, widths: tuple[int, ...]) -> None:
         super().__init__()
@@ -78,7 +78,7 @@ class Network(nn.Module):
     # ---- weights -------------------------------------------------------------------------------------------
 
     def _layers(self):
-        """(array name, linear, normalisation) of every layer but the last."""
+        """(array name, linear, normalization) of every layer but the last."""
         for number, shared in enumerate(self.down, 1):
             for step, pair in enumerate(zip(shared.linear, shared.norm, strict=True), 1):
                 yield f"sa{number}_{step}", *pair

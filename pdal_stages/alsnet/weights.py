@@ -18,12 +18,12 @@ from .pyramid import Pyramid
 
 Weights = dict[str, npt.NDArray[np.float32]]
 
-#: Added to the variance in batch normalisation.
+#: Added to the variance in batch normalization.
 EPSILON = 1e-5
 
 
 def fresh(configuration: Configuration, inputs: int, classes: int, seed: int) -> Weights:
-    """Untrained weights: He et al. 2015 for the linear layers, identity for the normalisations."""
+    """Untrained weights: He et al. 2015 for the linear layers, identity for the normalizations."""
     random = np.random.default_rng([seed, 0xA15])
     out: Weights = {}
     for name, (rows, columns) in configuration.shapes(inputs, classes).items():
@@ -61,7 +61,7 @@ def check(
 
 
 class Folded:
-    """A network for applying: weights that :func:`check` accepts, batch normalisation folded into the linear layers."""
+    """A network for applying: weights that :func:`check` accepts, batch normalization folded into the linear layers."""
 
     def __init__(self, weights: Mapping[str, npt.NDArray[np.float32]], configuration: Configuration) -> None:
         self.configuration = configuration

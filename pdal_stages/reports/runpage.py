@@ -25,7 +25,7 @@ _SETTINGS = {
     "bounds": "extent of the inputs",
     "tile": "side of the tiles",
     "halo_m": "surroundings, m",
-    "metres_per_unit": "meters per unit",
+    "meters_per_unit": "meters per unit",
     "per": "one output for each",
     "workers": "workers",
     "threads_per_worker": "threads of a worker",

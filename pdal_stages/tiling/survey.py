@@ -175,7 +175,7 @@ class Survey:
             "started": self.started,
             "tile": self.grid.size,
             "halo_m": plan.halo_m,
-            "metres_per_unit": self.unit,
+            "meters_per_unit": self.unit,
             "per": self.per,
             "inputs": len(self.sources),
             "bounds": list(self.bounds) if math.isfinite(self.bounds[0]) else None,
