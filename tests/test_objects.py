@@ -65,13 +65,13 @@ def town():
 def test_records_against_a_plain_twin():
     rng = np.random.default_rng(3)
     xyz = np.round(rng.uniform(-4, 4, (500, 3)), 3)
-    codes = rng.choice([1, 2, 5, 6, 14, 17], 500).astype(np.uint8)
+    codes = rng.choice([1, 2, 5, 6, 7, 14, 17], 500).astype(np.uint8)
     told = rng.uniform(0, 1, 500)
     cells = Cells.of(*xyz.T, codes, 0.5, reliability=told)
     twin: dict[int, list[int]] = {}
     for n, ((x, y, _), code) in enumerate(zip(xyz, codes, strict=True)):
-        kind = kind_of_code(CLASSES)[code]
-        if kind >= 0:
+        kind = kind_of_code(CLASSES)[code] if code != 1 else Kind.OTHER
+        if code != 7:
             wide = 1.0 if kind == Kind.GROUND else 0.5
             key = int(cell_keys(int(kind), np.floor(y / wide), np.floor(x / wide)))
             twin.setdefault(key, []).append(n)
@@ -218,6 +218,33 @@ def test_a_roof_that_is_partly_called_leaves_is_whole(slope):
     assert columns["area"].tolist() == pytest.approx([30.0], abs=3.0)
     trees = found.tables[Kind.TREE].columns
     assert len(trees["x"]) == 1 and abs(trees["x"][0] - 18) < 1.5
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.6])
+def test_a_roof_from_whose_inside_nothing_came_back(turned):
+    """Of a wet roof only the rim is there; of a courtyard the ground is, and of a third square cars."""
+    c, s = np.cos(turned), np.sin(turned)
+    ground, codes = house(-5, -5, 65, 45, 0.0, 0.4, 2)
+
+    def inside(xyz, x, rim):
+        u, v = np.array([[c, s], [-s, c]]) @ (xyz[:, :2] - [x, 20]).T
+        return np.maximum(abs(u), abs(v)) < 4 - rim
+
+    parts = []
+    for x in (10, 30, 50):
+        rim, _ = house(x - 8, 12, x + 8, 28, 3.0, 0.2)
+        rim = rim[inside(rim, x, 0) & ~inside(rim, x, 0.7)]
+        keep = ~inside(ground, x, 0) | (inside(ground, x, 1.0) & (x == 30))
+        ground, codes = ground[keep], codes[keep]
+        parts.append((rim, np.full(len(rim), 6, np.uint8)))
+    cars, ones = house(42, 12, 58, 28, 1.0, 0.4, 1)
+    keep = inside(cars, 50, 1.0)
+    parts.append((cars[keep], ones[keep]))
+    xyz = np.concatenate([ground, *(p for p, _ in parts)])
+    found = found_in(xyz, np.concatenate([codes, *(c for _, c in parts)])).tables[Kind.BUILDING]
+    area = {round(float(found.cells_of(n)[1].mean()) / 40): a for n, a in enumerate(found.columns["area"])}
+    assert area[0] == pytest.approx(64, abs=8)
+    assert all(area.get(n, 0) < 35 for n in (1, 2))
 
 
 def test_blocks_change_nothing_where_classes_are_wrong(town):

@@ -13,6 +13,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.asprs import NOISE
 from ..base.errors import StageError
 
 
@@ -25,6 +26,7 @@ class Kind(IntEnum):
     SPAN = 3
     DECK = 4
     TOWER = 5
+    OTHER = 6  # of no interest, but something was seen there
 
 
 #: ASPRS classes of each kind.
@@ -130,7 +132,7 @@ class Cells:
         x, y, z : (n,) float64
             Meters.
         codes : (n,) uint8
-            Class codes.
+            Class codes; noise (7, 18) is left out.
         size : float
             Side of a cell, meters.
         reliability : (n,) float, optional
@@ -139,6 +141,7 @@ class Cells:
             Class codes of each kind.
         """
         table = kind_of_code(classes)
+        table[(table < 0) & ~np.isin(np.arange(256), NOISE)] = Kind.OTHER
         kinds = table[codes]
         used = np.flatnonzero(kinds >= 0)
         if used.size == 0:

@@ -27,6 +27,8 @@ from .rasters import GROUND_REACH, Window
 MARGIN = GROUND_REACH + 2 * crowns.REACH
 #: How far a roof goes on into what a classifier took for leaves, meters.
 GROWTH = 3.0
+#: How far the cells of a roof from which nothing came back lie from its rim at most, meters.
+DARK = 6.0
 #: Side of a block, cells.
 BLOCK = 2048
 #: Kinds that are found.
@@ -245,9 +247,9 @@ class _Layers:
         self.told = window.dense(inside, "told", 0, np.int64)
         self.ground = window.ground(cells)
 
-    def other(self, kind: Kind) -> NDArray[np.float64]:
-        """Height of the highest point of another kind in each cell, NaN where there is none."""
-        return self.window.dense(self.window.of(self.cells, kind), "high", np.nan) / MM
+    def column(self, kind: Kind, name: str, empty: float, dtype=np.float64) -> NDArray:
+        """What cells of any kind hold, `empty` where there is none."""
+        return self.window.dense(self.window.of(self.cells, kind), name, empty, dtype)
 
     def body(self, r: NDArray, c: NDArray, z: NDArray) -> Body:
         return Body(
@@ -301,21 +303,24 @@ def _whole(
         around += max(margin, around // 2)
 
 
-def _roofs_of(
-    high: NDArray, leaves: NDArray, ground: NDArray, chosen: ObjectSettings
-) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Cells of roofs, gone on into vegetation in their planes, and their heights."""
+def _roofs_of(layers: _Layers, chosen: ObjectSettings) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Cells of roofs, gone on into vegetation in their planes and over gaps of sparse ones, and their heights."""
+    high, leaves = (layers.column(kind, "high", np.nan) / MM for kind in (Kind.BUILDING, Kind.TREE))
+    seen = layers.window.has_ground(layers.cells)
+    seen |= ~np.isnan(leaves) | (layers.column(Kind.OTHER, "count", 0.0) > 0)
     with np.errstate(invalid="ignore"):
-        leaves = np.where(leaves - ground < chosen.building_height, np.nan, leaves)
+        leaves = np.where(leaves - layers.ground < chosen.building_height, np.nan, leaves)
     high = roofs.continued(high, leaves, chosen.cell, round(GROWTH / chosen.cell))
-    return roofs.roof_cells(high, ground, chosen.building_height)
+    high = np.where(high - layers.ground < chosen.building_height, np.nan, high)
+    high = roofs.covered(high, seen, round(DARK / chosen.cell))
+    return roofs.roof_cells(high, layers.ground, chosen.building_height)
 
 
 def _buildings(cells: Cells, extent: Window, chosen: ObjectSettings, core: Window, found: _Found) -> None:
     heights: list[NDArray] = []
 
     def masked(layers: _Layers) -> NDArray[np.bool_]:
-        mask, z = _roofs_of(layers.high, layers.other(Kind.TREE), layers.ground, chosen)
+        mask, z = _roofs_of(layers, chosen)
         heights[:] = [z]
         return mask
 
@@ -371,7 +376,7 @@ def _spans(cells: Cells, extent: Window, chosen: ObjectSettings, core: Window, f
 def _trees(cells: Cells, extent: Window, chosen: ObjectSettings, core: Window, found: _Found) -> None:
     size = chosen.cell
     layers = _Layers(cells, Kind.TREE, _around(core, round(MARGIN / size)), extent)
-    mask, roof = _roofs_of(layers.other(Kind.BUILDING), layers.high, layers.ground, chosen)
+    mask, roof = _roofs_of(layers, chosen)
     with np.errstate(invalid="ignore"):
         # Chimneys, gutters and walls that were taken for leaves are no trees.
         layers.high[mask & (layers.high <= roof + 0.5)] = np.nan

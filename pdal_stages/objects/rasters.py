@@ -36,20 +36,35 @@ class Window:
         """The cells of a kind inside."""
         return cells.within(kind, self.row, self.column, self.rows, self.columns)
 
-    def ground(self, cells: Cells) -> NDArray[np.float64]:
-        """Height of the ground in each cell, meters; NaN where none is within reach."""
-        half = Window(
+    def has_ground(self, cells: Cells) -> NDArray[np.bool_]:
+        """Whether the ground was seen in the cell of the ground that each cell lies in."""
+        half = self._half()
+        count = half.dense(
+            cells.within(Kind.GROUND, half.row, half.column, half.rows, half.columns), "count", 0.0
+        )
+        return self._wide(count > 0)
+
+    def _half(self) -> Window:
+        """The same in cells of the ground."""
+        return Window(
             self.row // GROUND_CELLS,
             self.column // GROUND_CELLS,
             -(-self.rows // GROUND_CELLS),
             -(-self.columns // GROUND_CELLS),
         )
+
+    def _wide(self, values: NDArray) -> NDArray:
+        wide = np.repeat(np.repeat(values, GROUND_CELLS, axis=0), GROUND_CELLS, axis=1)
+        return wide[: self.rows, : self.columns]
+
+    def ground(self, cells: Cells) -> NDArray[np.float64]:
+        """Height of the ground in each cell, meters; NaN where none is within reach."""
+        half = self._half()
         inside = cells.within(Kind.GROUND, half.row, half.column, half.rows, half.columns)
         count = half.dense(inside, "count", 0.0)
         mean = np.where(count > 0, half.dense(inside, "sum", 0.0) / np.maximum(count, 1.0), np.nan) / MM
         filled = fill_gaps(mean, round(GROUND_REACH / (cells.size * GROUND_CELLS)))
-        wide = np.repeat(np.repeat(filled, GROUND_CELLS, axis=0), GROUND_CELLS, axis=1)
-        return wide[: self.rows, : self.columns]
+        return self._wide(filled)
 
 
 @njit

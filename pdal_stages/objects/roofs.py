@@ -12,6 +12,8 @@ from ..base.unionfind import root as root_of
 
 #: Scatter of a roof's plane that is gone on from, and how near to it vegetation is of the roof, meters.
 PLANE, NEAR = 0.12, 0.2
+#: Within how many meters the rim of a roof without points is at one height.
+LEVEL = 1.0
 
 
 def roof_cells(
@@ -101,6 +103,67 @@ def continued(high: NDArray, leaves: NDArray, size: float, reach: int) -> NDArra
         if not more:
             break
     return out
+
+
+@njit
+def covered(high: NDArray, seen: NDArray, reach: int) -> NDArray:
+    """Heights of roofs with the cells filled from which nothing came back, neither roof nor ground: dark or wet ones.
+
+    A cell is filled where, going out in eight directions, the first cell in which anything was seen is of the roof in at
+    least seven of them, at nearly one height.
+
+    Parameters
+    ----------
+    high : (r, c) float64
+        Height of the highest point of a building in each cell, NaN where there is none.
+    seen : (r, c) bool
+        Whether points of the ground or of vegetation lie in the cell.
+    reach : int
+        How many cells away at most.
+    """
+    rows, columns = high.shape
+    out = high.copy()
+    found = np.empty(8)
+    for r in range(rows):
+        for c in range(columns):
+            if seen[r, c] or not np.isnan(high[r, c]):
+                continue
+            n = 0
+            for way in range(8):
+                if n < way - 1:
+                    break
+                dr, dc = (0, 0, 1, -1, 1, -1, 1, -1)[way], (1, -1, 0, 0, 1, -1, -1, 1)[way]
+                level = _first_roof(high, seen, r, c, dr, dc, reach)
+                if not np.isnan(level):
+                    found[n] = level
+                    n += 1
+            if n < 7:
+                continue
+            level = np.median(found[:n])
+            if np.sum(np.abs(found[:n] - level) <= LEVEL) >= 7:
+                out[r, c] = level
+    return out
+
+
+@device
+def _first_roof(high, seen, r, c, dr, dc, reach):
+    """Height of the first roof from a cell in a direction, NaN where something else comes before.
+
+    The ground is known by cells twice as wide, so what is seen in the two cells before a roof may lie outside it.
+    """
+    left = reach
+    for k in range(1, reach + 1):
+        i, j = r + k * dr, c + k * dc
+        if i < 0 or j < 0 or i >= high.shape[0] or j >= high.shape[1]:
+            break
+        if not np.isnan(high[i, j]):
+            return high[i, j]
+        if dr != 0 and dc != 0 and not np.isnan(high[i - dr, j]) and not np.isnan(high[i, j - dc]):
+            return high[i - dr, j]  # through a corner
+        left = min(left - 1, 1 if seen[i, j] else left)
+        if left < 0:
+            break
+    return np.nan
 
 
 def _closed(high: NDArray) -> NDArray[np.float64]:

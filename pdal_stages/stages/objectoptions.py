@@ -109,7 +109,7 @@ def refuse_unclassified(cells: Cells, codes: Any) -> None:
     """An error for points without classes, and for points without ground."""
     if len(codes) == 0:
         return
-    if len(cells) == 0:
+    if len(cells) == len(cells.of_kind(Kind.OTHER)):
         raise StageError(
             "no point has a class that objects are made of, or that is ground",
             found="classes " + ", ".join(str(c) for c in sorted(set(codes.tolist()))),

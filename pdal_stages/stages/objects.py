@@ -51,7 +51,8 @@ the same id in every tile, in any order of points, and in the next run; below 2^
 **Buildings** are connected cells with points of a building at least `building_height` above the ground, roofs and facades
 together. Roofs whose heights differ by more than `step` along two thirds of their border are two buildings; small parts
 (dormers, chimneys) go with the roof around them. A roof goes on, up to 3 m, into vegetation in its plane, which a classifier
-took for leaves; those points keep their class. **Trees** are crowns: maxima of the smoothed canopy, none of which has a
+took for leaves; those points keep their class. Where nothing at all came back from inside a rim at one height, as of a wet
+roof, the roof is filled, up to 6 m from the rim. **Trees** are crowns: maxima of the smoothed canopy, none of which has a
 higher one within `window` (which grows with height) that only a shallow `saddle` parts from it, and the cells that climb to
 them. **Spans** are wires between towers or poles, **decks** those of bridges.
 

@@ -29,7 +29,7 @@ from ..base.stamps import stamp
 from ..base.units import Units
 from ..base.version import __version__
 from ..objects import Cells, Objects, ObjectSettings, find_objects
-from ..objects.cells import Kind, kind_of_code
+from ..objects.cells import Kind
 from ..pipeline import pdal as pdal_env
 from ..pipeline.ends import input_files, outputs_of
 from ..pipeline.overrides import Override
@@ -202,12 +202,10 @@ def read_cells(path: str, stage: ObjectsWriter, wkt: str, kept: str) -> list[int
     if not target.exists():
         seen = np.zeros(256, np.int64)
         parts = [Cells(stage.settings.cell)]
-        kind_of = kind_of_code(stage.classes)
         for arrays in _points_of(path):
             points = stage.points(arrays, wkt=wkt)
             seen += np.bincount(points.class_codes, minlength=256)
             usable = points.inside & ~points.chosen(stage.ignore)
-            usable &= kind_of[points.class_codes] >= 0
             x, y, z = points.xyz[usable].T
             told = arrays.get("Reliability")
             parts.append(
