@@ -197,6 +197,9 @@ def _parser() -> argparse.ArgumentParser:
     takes("stage", help="e.g. filters.hag_minima; for PDAL's stages pdal --options is asked")
     takes("--showjson", action="store_true", help="As JSON Schema")
 
+    takes = add("commands", _commands, "List commands with their arguments")
+    takes("--showjson", action="store_true", help="With stages, models and classes, as JSON: dialogs are made of it")
+
     add("doctor", _doctor, "Tell what is there on this machine, and the cure for what is not")
     add("plugin", _plugin, "Build our stages into PDAL itself, so that all that runs PDAL has them")
     from .plugin.command import add_arguments as add_plugin_arguments
@@ -421,6 +424,21 @@ def _drivers(options: argparse.Namespace) -> None:
     from .pipeline import describe
 
     print(describe.drivers(ours_only=options.ours, as_json=options.showjson), end="")
+
+
+def _commands(options: argparse.Namespace) -> None:
+    from .plugin.forms import forms
+
+    commands = _commands_of(_parser())
+    if options.showjson:
+        print(forms(commands), end="")
+        return
+    for name, parser in commands.items():
+        print(f"{name:12s} {parser.description}")
+
+
+def _commands_of(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    return next(dict(one.choices) for one in parser._actions if isinstance(one, argparse._SubParsersAction))
 
 
 def _doctor(options: argparse.Namespace) -> int:

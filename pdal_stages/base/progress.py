@@ -21,7 +21,8 @@ class Progress(AbstractContextManager):
 
     Silent until `delay` seconds have passed. On a terminal the line is redrawn; elsewhere
     (a log) a new line is written every 15 seconds. The environment variable
-    ``PDAL_STAGES_PROGRESS=0`` silences it.
+    ``PDAL_STAGES_PROGRESS=0`` silences it; ``PDAL_STAGES_PROGRESS=lines`` writes a line every second, for a program that
+    shows a bar of its own.
 
     Parameters
     ----------
@@ -41,14 +42,18 @@ class Progress(AbstractContextManager):
         self.total, self.label, self.unit = int(total), label, unit
         # filters.python redirects sys.stdout, never stderr: stderr is always the user's.
         self.stream = sys.__stderr__
-        silenced = enabled is False or os.environ.get("PDAL_STAGES_PROGRESS", "1") == "0"
+        wanted = os.environ.get("PDAL_STAGES_PROGRESS", "1")
+        silenced = enabled is False or wanted == "0"
         self.enabled = self.stream is not None and not silenced
         self.count = 0
         #: Seconds left, where they are known better than from what was done since the beginning.
         self.seconds_left: float | None = None
         self.started = time.monotonic()
         self._terminal = self.stream is not None and self.enabled and self.stream.isatty()
-        self._every = 0.2 if self._terminal else 15.0
+        if wanted == "lines":
+            self._terminal, self._every, self.delay = False, 1.0, 0.5
+        else:
+            self._every = 0.2 if self._terminal else 15.0
         self._next = self.started + self.delay
         self._shown = False
 

@@ -1,0 +1,425 @@
+"""The algorithms: which commands and pipelines they run, and what of it comes onto the map."""
+
+import json
+import os
+
+from qgis.core import (
+    QgsProcessingException,
+    QgsProcessingOutputHtml,
+    QgsProcessingOutputString,
+    QgsProcessingParameterBoolean,
+    QgsProcessingParameterEnum,
+    QgsProcessingParameterFileDestination,
+    QgsProcessingParameterFolderDestination,
+    QgsProcessingParameterNumber,
+    QgsProcessingParameterRasterDestination,
+    QgsProject,
+)
+
+from . import results
+from .base import CLOUDS, LAZ, Algorithm, written
+
+_MODELS = "Model files (*.model);;All files (*)"
+_SHOW = "Show the result on the map"
+NOT_NOISE = {"type": "filters.range", "limits": "Classification![7:7],Classification![18:18]"}
+_NO_CLOUDS = "This QGIS is built without support for LAS and LAZ files, so the point cloud is not shown: {}"
+
+
+class _Showing(Algorithm):
+    """Adds layers to the project when all is done, in the main thread."""
+
+    def add_show(self):
+        self.addParameter(QgsProcessingParameterBoolean("SHOW", _SHOW, defaultValue=True))
+
+    def prepareAlgorithm(self, parameters, context, feedback):
+        self.to_show = []
+        return True
+
+    def show_clouds(self, paths, parameters, context):
+        if self.parameterAsBool(parameters, "SHOW", context):
+            self.to_show += [("cloud", path) for path in paths]
+
+    def postProcessAlgorithm(self, context, feedback):
+        project = context.project() or QgsProject.instance()
+        for kind, path in self.to_show:
+            if kind == "objects":
+                layers = results.object_layers(path)
+            elif results.shows_point_clouds():
+                layers = [results.point_cloud(path, self.forms["classes"])]
+            else:
+                feedback.pushInfo(_NO_CLOUDS.format(path))
+                continue
+            for layer in layers:
+                if layer.isValid():
+                    project.addMapLayer(layer)
+                else:
+                    feedback.pushWarning(f"{path} cannot be shown")
+        return {}
+
+    def add_raster(self, key, label, help, optional=True, default=True):
+        made = QgsProcessingParameterRasterDestination(key, label, optional=optional, createByDefault=default)
+        made.setHelp(help)
+        self.addParameter(made)
+
+    def add_cell(self, label):
+        kind = QgsProcessingParameterNumber.Double
+        made = QgsProcessingParameterNumber("RESOLUTION", label, kind, 1.0, minValue=0.01)
+        made.setHelp("Side of a raster's cells in the unit of the coordinates")
+        self.addParameter(made)
+
+    def style(self, context, path, act):
+        """A style for a raster that QGIS will show."""
+        if context.willLoadLayerOnCompletion(path):
+            context.layerToLoadOnCompletionDetails(path).setPostProcessor(results.Style(act))
+
+
+class _Classifying(_Showing):
+    command = "classify"
+    listed = ("dimensions", "noise", "consistency", "polygons", "where")
+
+    def add_model(self):
+        name = self.forms["models"][0] if self.forms["models"] else ""
+        self.add_file(
+            "MODEL",
+            f"Model (empty: {name}, which comes with pdal-stages)",
+            "A model file that was trained on labels of your own; empty takes the shipped one",
+            _MODELS,
+            optional=True,
+        )
+
+    def model(self, parameters, context):
+        path = self.parameterAsFile(parameters, "MODEL", context)
+        return [f"--model={path}"] if path else []
+
+
+class ClassifyFile(_Classifying):
+    """One file."""
+
+    key, title = "classify", "Classify a point cloud"
+    about = (
+        "Gives each point of a raw airborne laser scan a class: ground, vegetation, building and more, with the model that "
+        "comes with pdal-stages or one of your own. Coordinates and return numbers are read; all other dimensions, the "
+        "header and the reference system stay as they are."
+    )
+    own = ("model", "objects", "report", "per", "resume", "metadata")
+
+    def initAlgorithm(self, configuration=None):
+        self.add_file("INPUT", "Point cloud", "A LAS, LAZ or COPC file, or any that PDAL reads")
+        self.add_model()
+        self.add_declared()
+        made = QgsProcessingParameterFileDestination("OUTPUT", "Classified point cloud", LAZ)
+        made.setHelp("The same points with classes")
+        self.addParameter(made)
+        self.add_raster(
+            "MAP", "Map of classes", "A picture of the result from above: the highest class code of each cell"
+        )
+        self.add_cell("Cell of the map")
+        self.add_show()
+
+    def processAlgorithm(self, parameters, context, feedback):
+        source = self.parameterAsFile(parameters, "INPUT", context)
+        target = written(self.parameterAsFileOutput(parameters, "OUTPUT", context))
+        chosen = self.arguments(parameters, context)
+        self.run(["classify", *chosen, *self.model(parameters, context), source, target], feedback)
+        self.show_clouds([target], parameters, context)
+        out = {"OUTPUT": target}
+        if parameters.get("MAP"):
+            out["MAP"] = written(self.parameterAsOutputLayer(parameters, "MAP", context))
+            side = self.parameterAsDouble(parameters, "RESOLUTION", context)
+            self.run(["pipeline", "--stdin"], feedback, json.dumps(class_map(target, out["MAP"], side)))
+            self.style(context, out["MAP"], results.classes_of(self.forms["classes"]))
+        return out
+
+
+class ClassifySurvey(_Classifying):
+    """Files and folders, in tiles."""
+
+    key, title = "classifysurvey", "Classify many point clouds"
+    about = (
+        "Classifies files and folders in tiles without seams, within a bound for memory: as many files come out as go in. "
+        "What an earlier run in the same folder finished can be kept, so a canceled run goes on where it stopped."
+    )
+    listed = ("memory", "resume", "dimensions", "noise", "consistency", "polygons", "where")
+    own = ("model", "objects", "report", "metadata")
+
+    def initAlgorithm(self, configuration=None):
+        self.add_inputs(self.help_of("inputs"))
+        self.add_model()
+        self.add_declared()
+        made = QgsProcessingParameterFolderDestination("OUTPUT", "Folder of classified point clouds")
+        self.addParameter(made)
+        made = QgsProcessingParameterFileDestination(
+            "REPORT", "Report", "Pages (*.html)", optional=True, createByDefault=False
+        )
+        made.setHelp(self.help_of("report"))
+        self.addParameter(made)
+        self.addParameter(QgsProcessingParameterBoolean("SHOW", _SHOW, defaultValue=False))
+
+    def processAlgorithm(self, parameters, context, feedback):
+        target = written(self.parameterAsString(parameters, "OUTPUT", context), folder=True)
+        more = [*self.arguments(parameters, context), *self.model(parameters, context)]
+        report = self.parameterAsFileOutput(parameters, "REPORT", context)
+        if report:
+            more.append(f"--report={report}")
+        before = set(os.listdir(target))
+        # A folder is named by its end, where it is not there yet
+        self.run(["classify", *more, *self.inputs(parameters, context), os.path.join(target, "")], feedback)
+        names = (
+            sorted(os.listdir(target)) if "RESUME" in parameters else sorted(set(os.listdir(target)) - before)
+        )
+        clouds = [os.path.join(target, name) for name in names if name.lower().endswith((".laz", ".las"))]
+        self.show_clouds(clouds, parameters, context)
+        return {"OUTPUT": target, **({"REPORT": report} if report else {})}
+
+
+class Heights(_Showing):
+    """The dimension HeightAboveGround."""
+
+    key, title, stage = "heights", "Heights above ground", "filters.hag_morphological"
+    about = (
+        "Finds the ground of a point cloud, classified or not, and writes the height of each point above it as the "
+        "dimension HeightAboveGround. Classes stay as they are."
+    )
+    command = "pipeline"
+    listed = ("cell", "slope", "window", "threshold", "ground")
+
+    def initAlgorithm(self, configuration=None):
+        self.add_file("INPUT", "Point cloud")
+        self.add_declared()
+        self.addParameter(QgsProcessingParameterFileDestination("OUTPUT", "Point cloud with heights", LAZ))
+        self.add_raster("MAP", "Map of heights above ground", "The highest of each cell")
+        self.add_cell("Cell of the map")
+        self.add_show()
+
+    def processAlgorithm(self, parameters, context, feedback):
+        target = written(self.parameterAsFileOutput(parameters, "OUTPUT", context))
+        stage = {"type": self.stage, **self.options(parameters, context)}
+        job = [reader(self.parameterAsFile(parameters, "INPUT", context)), stage, writer(target)]
+        out = {"OUTPUT": target}
+        if parameters.get("MAP"):
+            out["MAP"] = written(self.parameterAsOutputLayer(parameters, "MAP", context))
+            side = self.parameterAsDouble(parameters, "RESOLUTION", context)
+            job += [NOT_NOISE, raster(out["MAP"], side, "HeightAboveGround", "max")]
+        self.run(["pipeline", "--stdin"], feedback, json.dumps(job))
+        self.show_clouds([target], parameters, context)
+        if "MAP" in out:
+            self.style(context, out["MAP"], results.heights)
+        return out
+
+
+class TerrainModels(_Showing):
+    """Rasters of the ground and of what stands on it."""
+
+    key, title = "terrainmodels", "Terrain and surface model"
+    about = (
+        "Makes rasters of a point cloud: the terrain as a surface through the ground points (a triangulation, so buildings "
+        "are bridged), the surface as the highest point of each cell, and how far that is above the terrain."
+    )
+    command, stage = "pipeline", "filters.hag_morphological"
+    GROUND = ("Found by the filter", "Class 2 of the point cloud")
+    listed = ("slope", "window", "threshold")
+    own = ("ground", "openings", "terrain_slope", "where")
+
+    def initAlgorithm(self, configuration=None):
+        self.add_file("INPUT", "Point cloud")
+        made = QgsProcessingParameterEnum("GROUND_FROM", "Ground", list(self.GROUND), defaultValue=0)
+        made.setHelp(
+            "Which points the terrain goes through: those that the filter below finds, or those classified as ground"
+        )
+        self.addParameter(made)
+        self.add_cell("Cell")
+        self.add_declared()
+        self.add_raster("TERRAIN", "Terrain model", "Through the ground points")
+        self.add_raster(
+            "SURFACE", "Surface model", "The highest point of each cell; noise (7, 18) is left out"
+        )
+        self.add_raster(
+            "HEIGHTS",
+            "Heights above the terrain",
+            "The highest of each cell, above the terrain that the filter finds",
+            default=False,
+        )
+
+    def processAlgorithm(self, parameters, context, feedback):
+        chosen = {
+            key: written(self.parameterAsOutputLayer(parameters, key, context))
+            for key in ("TERRAIN", "SURFACE", "HEIGHTS")
+            if parameters.get(key)
+        }
+        if not chosen:
+            raise QgsProcessingException("No raster was asked for.")
+        side = self.parameterAsDouble(parameters, "RESOLUTION", context)
+        by_class = self.parameterAsEnum(parameters, "GROUND_FROM", context) == 1
+        stage = {"type": self.stage, **self.options(parameters, context), "ground": True}
+        source = reader(self.parameterAsFile(parameters, "INPUT", context))
+        # One line: of several ends PDAL runs only the first
+        job = [source, {"type": "filters.detachednoise"}, stage, NOT_NOISE]
+        if "SURFACE" in chosen:
+            job.append(raster(chosen["SURFACE"], side, "Z", "max"))
+        if "HEIGHTS" in chosen:
+            job.append(raster(chosen["HEIGHTS"], side, "HeightAboveGround", "max"))
+        if "TERRAIN" in chosen:
+            limits = "Classification[2:2]" if by_class else "Ground[1:1]"
+            job += [
+                {"type": "filters.range", "limits": limits},
+                {"type": "filters.delaunay"},
+                {"type": "filters.faceraster", "resolution": side},
+                {"type": "writers.raster", "filename": chosen["TERRAIN"], "gdaldriver": "GTiff"},
+            ]
+        self.run(["pipeline", "--stdin"], feedback, json.dumps(job))
+        for key, path in chosen.items():
+            self.style(context, path, results.heights if key == "HEIGHTS" else results.hillshade)
+        return chosen
+
+
+class Train(Algorithm):
+    """A model file from labels."""
+
+    key, title, command = "train", "Train a model", "train"
+    about = (
+        "Trains a model on labelled point clouds, from nothing or on top of a model that knows much already: then few "
+        "labels are enough. The model is scored on points that it has not seen, and the score is in the log."
+    )
+    listed = ("base", "classes", "count")
+    own = ("model",)
+
+    def initAlgorithm(self, configuration=None):
+        self.add_inputs(self.help_of("inputs"))
+        self.add_declared()
+        made = QgsProcessingParameterFileDestination("MODEL", "Model", _MODELS)
+        made.setHelp(self.help_of("model"))
+        self.addParameter(made)
+        made = QgsProcessingParameterFileDestination(
+            "PAGE", "Page about the model", "Pages (*.html)", optional=True, createByDefault=True
+        )
+        made.setHelp("Its scores, confusion matrix and what it goes by")
+        self.addParameter(made)
+        self.addOutput(QgsProcessingOutputHtml("HTML", "Page about the model"))
+
+    def processAlgorithm(self, parameters, context, feedback):
+        target = written(self.parameterAsFileOutput(parameters, "MODEL", context))
+        chosen = [*self.arguments(parameters, context), f"--model={target}"]
+        self.run(["train", *chosen, *self.inputs(parameters, context)], feedback)
+        page = self.parameterAsFileOutput(parameters, "PAGE", context)
+        if not page:
+            return {"MODEL": target}
+        self.run(["model", target, f"--html={written(page)}"], feedback, quiet=True)
+        return {"MODEL": target, "PAGE": page, "HTML": page}
+
+
+class Accuracy(Algorithm):
+    """A report."""
+
+    key, title, command = "accuracy", "Accuracy of a classified point cloud", "accuracy"
+    about = (
+        "Compares the classes of a point cloud with true ones: of another file with the same points, or of another "
+        "dimension. The report (tables, confusion matrix, maps of errors) is under Processing > Results Viewer."
+    )
+    listed = ("dimension", "reference_dimension")
+    own = ("reference", "json", "html", "objects", "area")
+
+    def initAlgorithm(self, configuration=None):
+        self.add_file("INPUT", "Classified point cloud")
+        self.add_file(
+            "REFERENCE", "The same points with true classes", self.help_of("reference"), CLOUDS, optional=True
+        )
+        self.add_declared()
+        made = QgsProcessingParameterFileDestination("PAGE", "Report", "Pages (*.html)")
+        self.addParameter(made)
+        made = QgsProcessingParameterFileDestination(
+            "JSON", "Figures", "JSON (*.json)", optional=True, createByDefault=False
+        )
+        made.setHelp(self.help_of("json"))
+        self.addParameter(made)
+        self.addOutput(QgsProcessingOutputHtml("HTML", "Report"))
+        self.addOutput(QgsProcessingOutputString("FIGURES", "Table"))
+
+    def processAlgorithm(self, parameters, context, feedback):
+        page = written(self.parameterAsFileOutput(parameters, "PAGE", context))
+        chosen = [*self.arguments(parameters, context), f"--html={page}"]
+        reference = self.parameterAsFile(parameters, "REFERENCE", context)
+        if reference:
+            chosen.append(f"--reference={reference}")
+        figures = self.parameterAsFileOutput(parameters, "JSON", context)
+        if figures:
+            chosen.append(f"--json={written(figures)}")
+        text = self.run(["accuracy", *chosen, self.parameterAsFile(parameters, "INPUT", context)], feedback)
+        return {"PAGE": page, "HTML": page, "FIGURES": text, **({"JSON": figures} if figures else {})}
+
+
+class Objects(_Showing):
+    """Vectors."""
+
+    key, title, command = "objects", "Buildings, trees, wires and bridges as vectors", "objects"
+    about = (
+        "Groups the points of classified point clouds into objects and writes them as layers: buildings with straight "
+        "outlines, heights and roofs, trees and crowns, wires, bridge decks, each with a verdict: sure, or to be checked "
+        "and why. Objects across the borders of files are whole."
+    )
+    listed = ("outlines", "cell")
+    own = ("metadata",)
+
+    def initAlgorithm(self, configuration=None):
+        self.add_inputs(self.help_of("inputs"))
+        self.add_declared()
+        made = QgsProcessingParameterFileDestination(
+            "OUTPUT",
+            "Objects",
+            "GeoPackage (*.gpkg);;GeoJSON (*.geojson);;FlatGeobuf (*.fgb);;Shapefiles (*.shp)",
+        )
+        made.setHelp(self.help_of("output"))
+        self.addParameter(made)
+        self.add_show()
+
+    def processAlgorithm(self, parameters, context, feedback):
+        target = written(self.parameterAsFileOutput(parameters, "OUTPUT", context))
+        self.run(
+            ["objects", *self.arguments(parameters, context), *self.inputs(parameters, context), target],
+            feedback,
+        )
+        if self.parameterAsBool(parameters, "SHOW", context):
+            self.to_show.append(("objects", target))
+        return {"OUTPUT": target}
+
+
+def writer(target):
+    """A writer that keeps everything."""
+    if target.lower().endswith((".las", ".laz")) and not target.lower().endswith(".copc.laz"):
+        return {"type": "writers.las", "filename": target, "forward": "all", "extra_dims": "all"}
+    return {"filename": target}
+
+
+def reader(source):
+    """A reader that sees extra dimensions of old LAS files too."""
+    if source.lower().endswith((".las", ".laz")) and not source.lower().endswith(".copc.laz"):
+        return {"type": "readers.las", "filename": source, "use_eb_vlr": True}
+    return {"filename": source}
+
+
+def raster(target, side, dimension, what):
+    """A writer of a GeoTIFF."""
+    return {
+        "type": "writers.gdal",
+        "filename": target,
+        "gdaldriver": "GTiff",
+        "resolution": side,
+        "dimension": dimension,
+        "output_type": what,
+        "radius": side * 0.5**0.5,
+        "window_size": 2,
+        "data_type": "float",
+    }
+
+
+def class_map(cloud, target, side):
+    """Classes from above."""
+    writes = {
+        **raster(target, side, "Classification", "max"),
+        "data_type": "uint8_t",
+        "nodata": 0,
+        "window_size": 1,
+    }
+    return [reader(cloud), NOT_NOISE, writes]
+
+
+ALGORITHMS = (ClassifyFile, ClassifySurvey, Heights, TerrainModels, Train, Accuracy, Objects)

@@ -1,0 +1,157 @@
+"""What all algorithms share: the program, its run, its arguments as parameters."""
+
+import os
+
+from qgis.core import (
+    QgsProcessing,
+    QgsProcessingAlgorithm,
+    QgsProcessingException,
+    QgsProcessingParameterFile,
+    QgsProcessingParameterMultipleLayers,
+)
+
+from . import environment, form, running
+
+CLOUDS = "Point clouds (*.laz *.las *.copc.laz *.LAZ *.LAS *.ply *.e57 *.bpf);;All files (*)"
+LAZ = "LAZ files (*.laz);;LAS files (*.las);;COPC files (*.copc.laz)"
+
+
+class Algorithm(QgsProcessingAlgorithm):
+    """An algorithm that runs commands of the program.
+
+    `command` names the command (or `stage` the stage) whose declarations give the parameters that `listed` and `advanced`
+    name; what a new version adds is found under "Advanced" by itself.
+    """
+
+    key = title = about = command = ""
+    stage = ""
+    listed = ()
+    #: Names of arguments that the algorithm has parameters of its own for.
+    own = ()
+
+    def __init__(self, forms):
+        super().__init__()
+        self.forms = forms
+        self.declared = {}
+
+    @classmethod
+    def available(cls, forms):
+        """Whether the program knows what is needed."""
+        return (not cls.command or cls.command in forms["commands"]) and (
+            not cls.stage or cls.stage in forms["stages"]
+        )
+
+    def createInstance(self):
+        return type(self)(self.forms)
+
+    def name(self):
+        return self.key
+
+    def displayName(self):
+        return self.title
+
+    def group(self):
+        return ""
+
+    def groupId(self):
+        return ""
+
+    def icon(self):
+        return self.provider().icon() if self.provider() else super().icon()
+
+    def shortHelpString(self):
+        lines = [f"<p>{self.about}</p>"]
+        for parameter in self.parameterDefinitions():
+            if parameter.help():
+                lines.append(f"<p><b>{parameter.description()}</b>: {_escaped(parameter.help())}</p>")
+        return "".join(lines)
+
+    def canExecute(self):
+        try:
+            self.provider().program()
+        except environment.Missing as error:
+            return False, str(error)
+        return True, ""
+
+    # ---- parameters ------------------------------------------------------------------------------------
+
+    def add_declared(self):
+        """The command's or stage's own arguments: those of `listed`, then all others as advanced."""
+        if self.stage:
+            declared = self.forms["stages"][self.stage]["options"]
+        else:
+            declared = self.forms["commands"][self.command]["arguments"]
+        by_name = {one["name"]: one for one in declared}
+        rest = [name for name in by_name if name not in (*self.listed, *self.own, *form.LEFT_OUT)]
+        for name in (*(name for name in self.listed if name in by_name), *rest):
+            self.add_one(by_name[name], name.upper(), advanced=name not in self.listed)
+
+    def add_one(self, declared, key, advanced=False, label=""):
+        self.declared[key] = declared
+        self.addParameter(form.parameter(declared, key, label, advanced))
+
+    def arguments(self, parameters, context):
+        """What was chosen, as words of a command line."""
+        out = []
+        for key, declared in self.declared.items():
+            out += form.words(self, declared, key, parameters, context)
+        return out
+
+    def options(self, parameters, context):
+        """What was chosen, as options of a stage."""
+        chosen = {
+            declared["name"]: form.value_of(self, declared, key, parameters, context)
+            for key, declared in self.declared.items()
+        }
+        return {name: value for name, value in chosen.items() if value is not None}
+
+    def help_of(self, name):
+        """The command's own help for one of its arguments."""
+        arguments = self.forms["commands"][self.command]["arguments"]
+        return next((one["help"] for one in arguments if one["name"] == name), "")
+
+    def add_file(self, key, label, help="", files=CLOUDS, optional=False):
+        made = QgsProcessingParameterFile(key, label, fileFilter=files, optional=optional)
+        made.setHelp(help)
+        self.addParameter(made)
+
+    def add_inputs(self, help=""):
+        """Files, a folder, or both."""
+        made = QgsProcessingParameterMultipleLayers(
+            "INPUTS", "Point clouds", QgsProcessing.TypeFile, optional=True
+        )
+        made.setHelp(help)
+        self.addParameter(made)
+        folder = QgsProcessingParameterFile(
+            "FOLDER", "Folder of point clouds", behavior=QgsProcessingParameterFile.Folder, optional=True
+        )
+        folder.setHelp("All point clouds in it, in addition to the files above")
+        self.addParameter(folder)
+
+    def inputs(self, parameters, context):
+        """Names of files and the folder."""
+        files = [one for one in self.parameterAsFileList(parameters, "INPUTS", context) if one]
+        folder = self.parameterAsFile(parameters, "FOLDER", context)
+        found = [*files, *([folder] if folder else [])]
+        if not found:
+            raise QgsProcessingException("No point cloud was given: add files, or name a folder.")
+        return found
+
+    # ---- running ---------------------------------------------------------------------------------------
+
+    def run(self, arguments, feedback, text=None, quiet=False):
+        """Run the program; QGIS's exception with its message where it fails."""
+        try:
+            return running.run(self.provider().program(), arguments, feedback, text, quiet)
+        except (running.Failed, environment.Missing) as error:
+            raise QgsProcessingException(str(error)) from None
+
+
+def written(path, folder=False):
+    """A destination whose folder is there."""
+    os.makedirs(path if folder else os.path.dirname(os.path.abspath(path)), exist_ok=True)
+    return path
+
+
+def _escaped(text):
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

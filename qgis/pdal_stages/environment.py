@@ -1,0 +1,167 @@
+"""The program ``pdal-stages``: where it is, how it is run, what it can do. No QGIS here."""
+
+import glob
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+#: Of the JSON of `pdal-stages commands --showjson`.
+FORMAT = 1
+OLDEST = "0.2.0"
+INSTALL = (
+    "Install pdal-stages into an environment of its own (conda create -n pdal-stages -c conda-forge python-pdal; pip "
+    "install 'pdal-stages[vector]' in it), then name its program: Settings > Options > Processing > Providers > pdal-stages"
+)
+_WINDOWS = sys.platform == "win32"
+_NAME = "pdal-stages.exe" if _WINDOWS else "pdal-stages"
+#: Variables that QGIS sets for its own Python, GDAL and PROJ, which another environment must not see.
+_OF_QGIS = (
+    "PYTHONHOME", "PYTHONPATH", "PYTHONEXECUTABLE", "VIRTUAL_ENV", "GDAL_DATA", "GDAL_DRIVER_PATH", "PROJ_LIB", "PROJ_DATA",
+)  # fmt: skip
+
+#: Folders of conda's kind in the user's own.
+_CONDA = ("miniforge3", "mambaforge", "miniconda3", "anaconda3", "micromamba", ".conda", ".virtualenvs")
+
+
+class Missing(Exception):
+    """The program is not there, or does not work; the text says what to do."""
+
+
+def find(setting=""):
+    """The program: the setting, ``PDAL_STAGES_PROGRAM``, PATH, then the environments of conda, pip and pipx.
+
+    Raises
+    ------
+    Missing
+        With all places that were looked at.
+    """
+    named = (setting or os.environ.get("PDAL_STAGES_PROGRAM", "")).strip()
+    if named:
+        path = Path(named).expanduser()
+        for one in (path, path / _folder() / _NAME, path / _NAME):
+            if one.is_file() and os.access(one, os.X_OK):
+                return str(one)
+        raise Missing(f"There is no program pdal-stages at {named}. {INSTALL}.")
+    found = shutil.which("pdal-stages")
+    if found:
+        return found
+    for folder in environments():
+        one = Path(folder, _folder(), _NAME)
+        if one.is_file() and os.access(one, os.X_OK):
+            return str(one)
+    raise Missing(f"The program pdal-stages was not found on PATH or in an environment of conda. {INSTALL}.")
+
+
+def _folder():
+    return "Scripts" if _WINDOWS else "bin"
+
+
+def environments():
+    """Folders of environments that may hold it, the likeliest first."""
+    home = Path.home()
+    known = home / ".conda" / "environments.txt"
+    listed = known.read_text(errors="replace").splitlines() if known.is_file() else []
+    usual = []
+    for root in _CONDA:
+        usual += [*sorted(glob.glob(str(home / root / "envs" / "*"))), str(home / root)]
+    usual += [str(home / ".local" / "share" / "pipx" / "venvs" / "pdal-stages"), str(home / ".local")]
+    usual += [str(home / name / ".venv") for name in ("pdal-stages", "pdal_stages")]
+    every = dict.fromkeys([*listed, *usual])
+    return sorted(every, key=lambda folder: "pdal" not in Path(folder).name.lower())
+
+
+def variables(program):
+    """The environment variables to run it with: as if its environment were activated, without QGIS's own."""
+    out = {name: value for name, value in os.environ.items() if name not in _OF_QGIS}
+    folder = Path(program).parent
+    prefix = folder.parent
+    first = [str(folder)]
+    if (prefix / "conda-meta").is_dir():
+        out["CONDA_PREFIX"] = str(prefix)
+        if _WINDOWS:
+            first += [str(prefix), str(prefix / "Library" / "bin")]
+            out["GDAL_DATA"] = str(prefix / "Library" / "share" / "gdal")
+            out["PROJ_DATA"] = str(prefix / "Library" / "share" / "proj")
+    out["PATH"] = os.pathsep.join([*first, out.get("PATH", "")])
+    out["PYTHONUNBUFFERED"] = "1"
+    out["PYTHONIOENCODING"] = "utf-8"
+    out["PDAL_STAGES_PROGRESS"] = "lines"
+    return out
+
+
+def without_window():
+    """Arguments of subprocess that keep Windows from opening a console."""
+    return (
+        {"creationflags": subprocess.CREATE_NO_WINDOW | subprocess.CREATE_NEW_PROCESS_GROUP}
+        if _WINDOWS
+        else {}
+    )
+
+
+def ask(program, *arguments, timeout=120):
+    """What it prints; :class:`Missing` where it fails."""
+    try:
+        done = subprocess.run(
+            [program, *arguments],
+            env=variables(program),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=timeout,
+            **without_window(),
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise Missing(f"{program} cannot be run: {error}. {INSTALL}.") from None
+    if done.returncode:
+        said = done.stderr.decode(errors="replace").strip().splitlines()[-1:]
+        raise Missing(
+            f"{program} {' '.join(arguments)} failed: {''.join(said)} (it must be {OLDEST} or newer). {INSTALL}."
+        )
+    return done.stdout.decode("utf-8", errors="replace")
+
+
+def forms(program, cache):
+    """What commands and stages take: asked once for each installation, kept in the folder `cache`."""
+    status = os.stat(program)
+    root = Path(program).resolve().parent.parent
+    # An upgrade in place leaves the program as it is, and changes the folder of packages
+    sites = [*root.glob("lib/python3*/site-packages"), *root.glob("Lib/site-packages")]
+    key = [FORMAT, str(program), status.st_mtime, status.st_size, *[site.stat().st_mtime for site in sites]]
+    kept = Path(cache, "commands.json")
+    try:
+        held = json.loads(kept.read_text(encoding="utf-8"))
+        if held["key"] == key:
+            return held["forms"]
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    answer = checked(ask(program, "commands", "--showjson"), program)
+    try:
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        part = kept.with_suffix(f".{os.getpid()}")
+        part.write_text(json.dumps({"key": key, "forms": answer}), encoding="utf-8")
+        part.replace(kept)
+    except OSError:
+        pass  # asked again the next time
+    return answer
+
+
+def checked(text, program):
+    """The JSON, if it is of the form that is known here."""
+    try:
+        answer = json.loads(text)
+        if answer["format"] == FORMAT:
+            return answer
+        said = (
+            f"the form {answer['format']} of its commands is not known here: update the plugin or pdal-stages"
+        )
+    except (ValueError, KeyError, TypeError):
+        said = "what it says about its commands cannot be read"
+    raise Missing(f"{program}: {said}.")
+
+
+def shipped():
+    """What commands and stages took when the plugin was packed, for dialogs before it is found; None in a checkout."""
+    path = Path(__file__).with_name("commands.json")
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None

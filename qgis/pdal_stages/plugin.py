@@ -1,0 +1,22 @@
+"""What QGIS loads and unloads; ``qgis_process`` too, which calls no initGui."""
+
+from qgis.core import QgsApplication
+
+from .provider import Provider
+
+
+class Plugin:
+    def __init__(self):
+        self.provider = None
+
+    def initProcessing(self):
+        self.provider = Provider()
+        QgsApplication.processingRegistry().addProvider(self.provider)
+
+    def initGui(self):
+        self.initProcessing()
+
+    def unload(self):
+        if self.provider is not None:
+            QgsApplication.processingRegistry().removeProvider(self.provider)
+            self.provider = None

@@ -1,0 +1,109 @@
+"""Outputs on the map, with styles. In the main thread only."""
+
+import os
+
+from qgis.core import (
+    QgsHillshadeRenderer,
+    QgsPalettedRasterRenderer,
+    QgsPointCloudCategory,
+    QgsPointCloudClassifiedRenderer,
+    QgsPointCloudLayer,
+    QgsProcessingLayerPostProcessorInterface,
+    QgsProviderRegistry,
+    QgsRasterBandStats,
+    QgsSingleBandPseudoColorRenderer,
+    QgsStyle,
+    QgsVectorLayer,
+)
+from qgis.PyQt.QtGui import QColor
+
+#: Layers of objects, the lowest on the map first.
+LAYERS = ("buildings", "decks", "crowns", "spans", "trees")
+
+
+def shows_point_clouds():
+    """Whether this QGIS reads LAS and LAZ files; Debian's does not."""
+    return "pdal" in QgsProviderRegistry.instance().providerList()
+
+
+def categories(classes):
+    """Classes as they are colored in all of pdal-stages' pictures."""
+    return [
+        QgsPointCloudCategory(int(code), QColor(*one["color"]), one["name"]) for code, one in classes.items()
+    ]
+
+
+def point_cloud(path, classes):
+    """A layer of a LAS or LAZ file, colored by class."""
+    layer = QgsPointCloudLayer(str(path), os.path.splitext(os.path.basename(path))[0], "pdal")
+    if layer.isValid():
+        layer.setRenderer(QgsPointCloudClassifiedRenderer("Classification", categories(classes)))
+    return layer
+
+
+def object_layers(path):
+    """The layers of a vector file of objects that hold any; their styles lie in the file or beside it."""
+    stem, ending = os.path.splitext(str(path))
+    layers = []
+    for name in LAYERS:
+        source = f"{path}|layername={name}" if ending.lower() == ".gpkg" else f"{stem}_{name}{ending}"
+        if ending.lower() != ".gpkg" and not os.path.exists(source):
+            continue
+        layer = QgsVectorLayer(source, name, "ogr")
+        if layer.isValid() and layer.featureCount():
+            if name == "crowns":
+                layer.setOpacity(0.5)
+            layers.append(layer)
+    return layers
+
+
+class Style(QgsProcessingLayerPostProcessorInterface):
+    """What is done to a raster once it is on the map."""
+
+    #: Processing holds no reference.
+    _kept = []
+
+    def __init__(self, act):
+        super().__init__()
+        self._act = act
+        Style._kept[:] = [*Style._kept[-20:], self]
+
+    def postProcessLayer(self, layer, context, feedback):
+        try:
+            self._act(layer)
+            layer.triggerRepaint()
+        except Exception as error:  # a style is no reason to lose a result
+            feedback.pushWarning(f"The style could not be set: {error}")
+
+
+def hillshade(layer):
+    layer.setRenderer(QgsHillshadeRenderer(layer.dataProvider(), 1, 315.0, 45.0))
+
+
+def heights(layer):
+    """Heights above ground, from 0 to where nearly all are below."""
+    provider = layer.dataProvider()
+    renderer = QgsSingleBandPseudoColorRenderer(provider, 1)
+    most = provider.cumulativeCut(1, 0.0, 0.99)[1]
+    renderer.setClassificationMin(0.0)
+    renderer.setClassificationMax(max(most, 1.0))
+    ramp = QgsStyle.defaultStyle().colorRamp("Viridis")
+    if ramp is not None:
+        renderer.createShader(ramp)
+    layer.setRenderer(renderer)
+
+
+def classes_of(classes):
+    """A style for a raster of class codes: those that are there."""
+
+    def act(layer):
+        provider = layer.dataProvider()
+        most = int(provider.bandStatistics(1, QgsRasterBandStats.Max).maximumValue)
+        shown = [
+            QgsPalettedRasterRenderer.Class(int(code), QColor(*one["color"]), f"{code} {one['name']}")
+            for code, one in classes.items()
+            if 1 <= int(code) <= most
+        ]
+        layer.setRenderer(QgsPalettedRasterRenderer(provider, 1, shown))
+
+    return act

@@ -1,0 +1,150 @@
+"""One run of the program, with progress, messages and cancel. No QGIS here."""
+
+import os
+import queue
+import re
+import signal
+import subprocess
+import sys
+import threading
+
+from . import environment
+
+#: `filters.modelclassifier: 1,234 of 5,678 points (22 %), ...`
+_PROGRESS = re.compile(r"^(?P<label>.+?): [\d,]+ of [\d,]+ .*?\((?P<percent>\d+) %\)")
+_WINDOWS = sys.platform == "win32"
+#: Seconds that a canceled run has to clean up, before it is ended by force.
+PATIENCE = 20.0
+
+
+class Failed(Exception):
+    """The program ended with an error; the text is its message."""
+
+
+def run(program, arguments, feedback, text=None, quiet=False):
+    """Run it to its end; what it printed on standard output.
+
+    Parameters
+    ----------
+    program : str
+    arguments : list of str
+    feedback
+        A QgsProcessingFeedback.
+    text : str, optional
+        For standard input.
+    quiet : bool
+        Leave what it prints on standard output out of the log.
+
+    Raises
+    ------
+    Failed
+        If it ends with an error, or was canceled.
+    """
+    feedback.pushCommandInfo(" ".join(_quoted(word) for word in ["pdal-stages", *arguments]))
+    own = {} if _WINDOWS else {"start_new_session": True}
+    try:
+        process = subprocess.Popen(
+            [program, *arguments],
+            env=environment.variables(program),
+            stdin=subprocess.PIPE if text is not None else subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            **own,
+            **environment.without_window(),
+        )
+    except OSError as error:
+        raise Failed(f"{program} cannot be run: {error}. {environment.INSTALL}.") from None
+    lines = queue.Queue()
+    readers = [
+        threading.Thread(target=_read, args=(stream, of, lines), daemon=True)
+        for stream, of in ((process.stdout, "out"), (process.stderr, "err"))
+    ]
+    for one in readers:
+        one.start()
+    if text is not None:
+        threading.Thread(target=_write, args=(process.stdin, text), daemon=True).start()
+    printed, said, open_streams, canceled = [], [], len(readers), False
+    waited = 0.0
+    while open_streams:
+        if feedback.isCanceled():
+            if not canceled:
+                canceled = True
+                feedback.pushInfo("Canceling: the run cleans up ...")
+                _interrupt(process)
+            elif waited >= PATIENCE:
+                _kill(process)
+            waited += 0.1
+        try:
+            of, line = lines.get(timeout=0.1)
+        except queue.Empty:
+            continue
+        if line is None:
+            open_streams -= 1
+        elif of == "out":
+            printed.append(line)
+            if not quiet:
+                feedback.pushInfo(line)
+        else:
+            _tell(line, said, feedback)
+    code = process.wait()
+    process.stdout.close()
+    process.stderr.close()
+    if canceled or feedback.isCanceled():
+        raise Failed("Canceled; nothing half-written was left.")
+    if code:
+        raise Failed(said[-1] if said else f"pdal-stages ended with exit code {code}.")
+    return "\n".join(printed)
+
+
+def _tell(line, said, feedback):
+    progress = _PROGRESS.match(line)
+    if progress:
+        feedback.setProgressText(progress["label"])
+        feedback.setProgress(float(progress["percent"]))
+        return
+    said.append(line.removeprefix("pdal-stages: "))
+    if line.startswith("pdal-stages: "):
+        feedback.pushWarning(line)
+    else:
+        feedback.pushInfo(line)
+
+
+def _read(stream, of, lines):
+    for raw in iter(stream.readline, b""):
+        line = raw.decode("utf-8", errors="replace").rstrip()
+        if line:
+            lines.put((of, line))
+    lines.put((of, None))
+
+
+def _write(stream, text):
+    try:
+        stream.write(text.encode("utf-8"))
+        stream.close()
+    except OSError:
+        pass  # it ended before it read everything, and says why
+
+
+def _interrupt(process):
+    """As Ctrl-C does, to its workers as well."""
+    try:
+        if _WINDOWS:
+            process.send_signal(signal.CTRL_BREAK_EVENT)
+        else:
+            os.killpg(process.pid, signal.SIGINT)
+    except OSError:
+        pass
+
+
+def _kill(process):
+    try:
+        if _WINDOWS:
+            process.kill()
+        else:
+            os.killpg(process.pid, signal.SIGKILL)
+    except OSError:
+        pass
+
+
+def _quoted(word):
+    return word if re.fullmatch(r"[\w@%+=:,./~#-]+", word) else "'" + word.replace("'", "'\\''") + "'"

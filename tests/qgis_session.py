@@ -1,0 +1,107 @@
+"""Run by QGIS's own Python, for what `qgis_process` cannot do: cancel, styles, parameters. Prints one JSON object.
+
+python3 qgis_session.py FOLDER_OF_THE_PLUGIN cancel|styles|parameters ARGUMENT...
+"""
+
+import json
+import sys
+import threading
+import time
+
+from qgis.core import QgsApplication, QgsProcessingContext, QgsProcessingFeedback, QgsProject
+
+sys.path.append("/usr/share/qgis/python/plugins")
+
+
+class Feedback(QgsProcessingFeedback):
+    def __init__(self):
+        super().__init__(False)
+        self.lines = []
+
+    def pushInfo(self, text):
+        self.lines.append(text)
+
+    pushCommandInfo = pushWarning = pushInfo
+
+    def setProgressText(self, text):
+        self.lines.append(f"progress: {text}")
+
+
+def start(folder):
+    app = QgsApplication([], False)
+    app.initQgis()
+    from processing.core.Processing import Processing
+
+    Processing.initialize()
+    sys.path.insert(0, folder)
+    import pdal_stages
+
+    plugin = pdal_stages.classFactory(None)
+    plugin.initProcessing()
+    return app, plugin
+
+
+def cancel(source, target):
+    """Begin to classify, cancel when the program works."""
+    algorithm = QgsApplication.processingRegistry().algorithmById("pdalstages:classify")
+    feedback, context = Feedback(), QgsProcessingContext()
+
+    def watch():
+        while not any(line.startswith("pdal-stages classify") for line in feedback.lines):
+            time.sleep(0.05)
+        time.sleep(2.0)
+        feedback.cancel()
+
+    threading.Thread(target=watch, daemon=True).start()
+    begun = time.monotonic()
+    _, good = algorithm.run({"INPUT": source, "OUTPUT": target, "MAP": None}, context, feedback)
+    return {"good": good, "seconds": time.monotonic() - begun, "lines": feedback.lines}
+
+
+def styles(objects, terrain, heights, classes):
+    """What results look like on the map."""
+    from qgis.core import QgsRasterLayer
+
+    from pdal_stages import results
+
+    forms = QgsApplication.processingRegistry().providerById("pdalstages").forms()
+    layers = {}
+    for name, path, act in (
+        ("terrain", terrain, results.hillshade),
+        ("heights", heights, results.heights),
+        ("classes", classes, results.classes_of(forms["classes"])),
+    ):
+        layer = QgsRasterLayer(path, name)
+        results.Style(act).postProcessLayer(layer, QgsProcessingContext(), Feedback())
+        layers[name] = layer.renderer().type()
+    for layer in results.object_layers(objects):
+        layers[layer.name()] = layer.renderer().type()
+        QgsProject.instance().addMapLayer(layer)
+    colors = {one.value(): one.color().getRgb()[:3] for one in results.categories(forms["classes"])}
+    return {"layers": layers, "building": colors[6]}
+
+
+def parameters(name):
+    """The parameters of an algorithm: name, description, whether advanced, default."""
+    algorithm = QgsApplication.processingRegistry().algorithmById(f"pdalstages:{name}")
+    ok, why = algorithm.canExecute()
+    return {
+        "can": [ok, why],
+        "parameters": {
+            one.name(): [
+                one.description(),
+                bool(one.flags() & one.FlagAdvanced),
+                str(one.defaultValue()),
+                one.help(),
+            ]
+            for one in algorithm.parameterDefinitions()
+        },
+    }
+
+
+if __name__ == "__main__":
+    folder, what, *rest = sys.argv[1:]
+    app, plugin = start(folder)
+    print(json.dumps({"cancel": cancel, "styles": styles, "parameters": parameters}[what](*rest)), flush=True)
+    plugin.unload()
+    app.exitQgis()

@@ -1,0 +1,540 @@
+"""The QGIS plugin: packed, installed into a profile of its own, run by `qgis_process` and QGIS's Python, without a screen.
+
+What needs no QGIS (finding the program, running and canceling it) is tested everywhere.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+
+from pdal_stages.base.version import __version__
+from pdal_stages.cli import main
+from pdal_stages.stages import registry
+from pdal_stages.synthetic import TownOptions, write_town
+
+ROOT = Path(__file__).resolve().parent.parent
+SOURCE = ROOT / "qgis" / "pdal_stages"
+#: Debian's wrapper hands on an option that the program does not know.
+PROCESS = next(filter(None, map(shutil.which, ("qgis_process.bin", "qgis_process"))), None)
+needs_qgis = pytest.mark.skipif(PROCESS is None, reason="QGIS is not installed (no qgis_process)")
+
+
+@pytest.fixture(scope="module")
+def package():
+    """The plugin's modules that need no QGIS."""
+    spec = importlib.util.spec_from_file_location(
+        "qgis_plugin", SOURCE / "__init__.py", submodule_search_locations=[str(SOURCE)]
+    )
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["qgis_plugin"] = module
+    spec.loader.exec_module(module)
+    yield module
+    for name in [name for name in sys.modules if name.startswith("qgis_plugin")]:
+        del sys.modules[name]
+
+
+@pytest.fixture(scope="module")
+def environment(package):
+    return importlib.import_module("qgis_plugin.environment")
+
+
+@pytest.fixture(scope="module")
+def running(package):
+    return importlib.import_module("qgis_plugin.running")
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory):
+    """This checkout's pdal-stages, as an environment of its own would hold it."""
+    path = tmp_path_factory.mktemp("environment") / "bin" / "pdal-stages"
+    path.parent.mkdir()
+    path.write_text(f'#!/bin/sh\nPYTHONPATH="{ROOT}" exec "{sys.executable}" -m pdal_stages.cli "$@"\n')
+    path.chmod(0o755)
+    return path
+
+
+@pytest.fixture(scope="module")
+def zipped(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("dist")
+    packing = {**os.environ, "PYTHON": sys.executable, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [ROOT / "scripts" / "qgis-plugin", folder], env=packing, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return Path(done.stdout.strip())
+
+
+class Feedback:
+    def __init__(self, cancel_after=None):
+        self.lines, self.progress = [], []
+        self.cancel_at = None if cancel_after is None else time.monotonic() + cancel_after
+
+    def isCanceled(self):
+        return self.cancel_at is not None and time.monotonic() > self.cancel_at
+
+    def pushInfo(self, text):
+        self.lines.append(text)
+
+    pushCommandInfo = pushWarning = setProgressText = pushInfo
+
+    def setProgress(self, value):
+        self.progress.append(value)
+
+
+def script(folder, text):
+    path = folder / "pdal-stages"
+    path.write_text(f"#!{sys.executable}\n{text}")
+    path.chmod(0o755)
+    return str(path)
+
+
+# ---- without QGIS ----------------------------------------------------------------------------------------
+
+
+def test_found_by_itself(environment, program, tmp_path, monkeypatch):
+    monkeypatch.delenv("PDAL_STAGES_PROGRAM", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("PATH", "/usr/bin")
+    with pytest.raises(environment.Missing, match=r"was not found.*Install pdal-stages"):
+        environment.find()
+    assert environment.find(str(program)) == str(program)
+    assert environment.find(str(program.parent.parent)) == str(program)  # the environment's folder
+    inside = tmp_path / "miniforge3" / "envs" / "lidar" / "bin"
+    inside.mkdir(parents=True)
+    shutil.copy(program, inside)
+    assert environment.find() == str(inside / "pdal-stages")
+    elsewhere = tmp_path / "elsewhere" / "bin"
+    elsewhere.mkdir(parents=True)
+    shutil.copy(program, elsewhere)
+    (tmp_path / ".conda").mkdir()
+    (tmp_path / ".conda" / "environments.txt").write_text(f"{tmp_path / 'gone'}\n{elsewhere.parent}\n")
+    assert environment.find() == str(elsewhere / "pdal-stages")
+    monkeypatch.setenv("PATH", str(program.parent))
+    assert environment.find() == str(program)
+    with pytest.raises(environment.Missing, match="no program pdal-stages at /nowhere"):
+        environment.find("/nowhere")
+
+
+def test_qgis_own_variables_stay_outside(environment, program, monkeypatch):
+    for name in ("PYTHONHOME", "PYTHONPATH", "PROJ_LIB", "GDAL_DATA"):
+        monkeypatch.setenv(name, "of QGIS")
+    given = environment.variables(str(program))
+    assert not {"PYTHONHOME", "PYTHONPATH", "PROJ_LIB", "GDAL_DATA"} & set(given)
+    assert given["PATH"].startswith(str(program.parent) + os.pathsep)
+
+
+def test_forms_are_asked_once(environment, program, tmp_path):
+    said = environment.forms(str(program), tmp_path)
+    assert said["version"] == __version__ and {"classify", "train", "objects", "accuracy"} <= set(
+        said["commands"]
+    )
+    assert set(said["stages"]) == set(registry.stages())
+    silent = script(tmp_path, "raise SystemExit(1)")
+    os.utime(silent, ns=(os.stat(program).st_atime_ns, os.stat(program).st_mtime_ns))
+    program_text = program.read_text()
+    try:
+        size, at = program.stat().st_size, program.stat().st_mtime_ns
+        program.write_text("#!/bin/sh\nexit 1\n".ljust(size, "#"))
+        os.utime(program, ns=(at, at))
+        assert environment.forms(str(program), tmp_path) == said  # kept
+    finally:
+        program.write_text(program_text)
+    with pytest.raises(environment.Missing, match="failed"):
+        environment.forms(silent, tmp_path)
+
+
+def test_forms_of_another_kind_are_refused(environment):
+    with pytest.raises(environment.Missing, match="update the plugin"):
+        environment.checked('{"format": 99}', "pdal-stages")
+    with pytest.raises(environment.Missing, match="cannot be read"):
+        environment.checked("no JSON", "pdal-stages")
+
+
+def test_forms_follow_the_command(capsys):
+    """Arguments stand in the JSON with the words of --help."""
+    assert main(["commands", "--showjson"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    arguments = {one["name"]: one for one in said["commands"]["classify"]["arguments"]}
+    assert (
+        arguments["inputs"]["many"] and arguments["inputs"]["flag"] == "" and arguments["inputs"]["required"]
+    )
+    assert arguments["noise"] | {"help": ""} == {
+        "name": "noise", "flag": "--noise", "off": "--no-noise", "kind": "boolean", "help": "", "default": True,
+        "choices": [], "required": False, "many": False, "value": "",
+    }  # fmt: skip
+    assert (
+        arguments["per"]["choices"] == ["auto", "file", "tile"] and arguments["retries"]["kind"] == "integer"
+    )
+    assert "(1.6 cm, 1.6 %)" in arguments["dimensions"]["help"]
+    options = {one["name"]: one for one in said["stages"]["filters.hag_morphological"]["options"]}
+    assert options["window"]["default"] == 75.0 and options["window"]["exclusive"]
+    assert main(["commands"]) == 0
+    assert "classify " in capsys.readouterr().out
+
+
+def test_run_tells_progress_and_messages(running, tmp_path):
+    program = script(
+        tmp_path,
+        "import sys\nprint('filters.x: 1,200 of 4,800 points (25 %), 10 points/s', file=sys.stderr)\n"
+        "print('pdal-stages: mind this', file=sys.stderr)\nprint(sys.stdin.read())\n",
+    )
+    feedback = Feedback()
+    assert running.run(program, ["a b"], feedback, "grüße") == "grüße"
+    assert feedback.progress == [25.0] and "filters.x" in feedback.lines
+    assert feedback.lines[0] == "pdal-stages 'a b'" and "pdal-stages: mind this" in feedback.lines
+
+
+def test_run_fails_with_the_message(running, tmp_path):
+    program = script(tmp_path, "import sys\nprint('pdal-stages: no such file', file=sys.stderr)\nsys.exit(1)")
+    with pytest.raises(running.Failed, match=r"^no such file$"):
+        running.run(program, [], Feedback())
+    with pytest.raises(running.Failed, match="exit code 3"):
+        running.run(script(tmp_path, "raise SystemExit(3)"), [], Feedback())
+    with pytest.raises(running.Failed, match="cannot be run"):
+        running.run(str(tmp_path / "gone"), [], Feedback())
+
+
+def test_cancel_ends_it_and_its_workers(running, tmp_path, monkeypatch):
+    monkeypatch.setattr(running, "PATIENCE", 1.0)
+    pid = tmp_path / "pid"
+    stubborn = (
+        "import signal, subprocess, sys, time\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+        "worker = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'])\n"
+        f"open({str(pid)!r}, 'w').write(str(worker.pid))\ntime.sleep(60)\n"
+    )
+    begun = time.monotonic()
+    with pytest.raises(running.Failed, match="Canceled"):
+        running.run(script(tmp_path, stubborn), [], Feedback(cancel_after=1.0))
+    assert time.monotonic() - begun < 20
+    worker = Path("/proc", pid.read_text(), "stat")
+    assert not worker.exists() or worker.read_text().split(")")[-1].split()[0] == "Z"
+
+
+def test_progress_in_lines(monkeypatch, capfd):
+    """The bars of a run, a line every second, where PDAL_STAGES_PROGRESS=lines asks for it."""
+    from pdal_stages.base.progress import Progress
+
+    monkeypatch.setenv("PDAL_STAGES_PROGRESS", "lines")
+    now = [100.0]
+    monkeypatch.setattr("pdal_stages.base.progress.time.monotonic", lambda: now[0])
+    with Progress(10, "work") as bar:
+        for _ in range(10):
+            now[0] += 0.5
+            bar.update()
+    lines = capfd.readouterr().err.splitlines()
+    assert (
+        len(lines) == 6 and lines[0].startswith("work: 1 of 10 points (10 %)") and "\r" not in "".join(lines)
+    )
+
+
+def test_zip_is_the_same_twice_and_complete(zipped):
+    with zipfile.ZipFile(zipped) as packed:
+        names = set(packed.namelist())
+        forms = json.loads(packed.read("pdal_stages/commands.json"))
+        about = packed.read("pdal_stages/metadata.txt").decode()
+    files = {f"pdal_stages/{path.name}" for path in SOURCE.iterdir() if path.is_file()}
+    assert names == files | {"pdal_stages/commands.json"}
+    assert "pdal_stages/LICENSE" in names and "pdal_stages/icon.svg" in names
+    assert forms["version"] == __version__ and f"version={__version__}\n" in about
+    assert "hasProcessingProvider=yes" in about and "qgisMinimumVersion=3.22" in about
+    before = zipped.read_bytes()
+    packing = {**os.environ, "PYTHON": sys.executable, "PYTHONPATH": str(ROOT)}
+    subprocess.run(
+        [ROOT / "scripts" / "qgis-plugin", zipped.parent], env=packing, check=True, capture_output=True
+    )
+    assert zipped.read_bytes() == before
+
+
+# ---- with QGIS -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def profile(zipped, tmp_path_factory):
+    """A profile of QGIS's with the plugin from the zip."""
+    folder = tmp_path_factory.mktemp("profile")
+    plugins = folder / "profiles" / "default" / "python" / "plugins"
+    plugins.mkdir(parents=True)
+    with zipfile.ZipFile(zipped) as packed:
+        packed.extractall(plugins)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def around(profile, program):
+    """QGIS's environment: a clean machine's, which knows where the program is."""
+    runtime = profile / "runtime"
+    runtime.mkdir(mode=0o700, exist_ok=True)
+    return {
+        "HOME": str(profile), "PATH": "/usr/bin:/bin", "LC_ALL": "C.UTF-8", "QT_QPA_PLATFORM": "offscreen",
+        "XDG_RUNTIME_DIR": str(runtime), "QGIS_CUSTOM_CONFIG_PATH": str(profile), "PDAL_STAGES_PROGRAM": str(program),
+    }  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def qgis(around):
+    """Run qgis_process; what it printed."""
+
+    def run(*words, code=0, **more):
+        done = subprocess.run(
+            [PROCESS, *map(str, words)],
+            env={**around, **more},
+            capture_output=True,
+            text=True,
+            timeout=500,
+            check=False,
+        )
+        said = done.stdout + done.stderr
+        assert (done.returncode == 0) == (code == 0), said
+        return said
+
+    run("plugins", "enable", "pdal_stages")
+    return run
+
+
+@pytest.fixture(scope="module")
+def session(around, profile):
+    """Run tests/qgis_session.py in QGIS's own Python."""
+
+    def run(*words, **more):
+        plugins = profile / "profiles/default/python/plugins"
+        done = subprocess.run(
+            ["/usr/bin/python3", ROOT / "tests" / "qgis_session.py", plugins, *map(str, words)],
+            env={**around, **more}, capture_output=True, text=True, timeout=500, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout.splitlines()[-1])
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory):
+    path = tmp_path_factory.mktemp("town") / "town.laz"
+    write_town(TownOptions(size=60.0, density=4.0, seed=3), path)
+    return path
+
+
+@needs_qgis
+def test_algorithms_are_listed(qgis):
+    said = qgis("list")
+    for name in (
+        "classify",
+        "classifysurvey",
+        "heights",
+        "terrainmodels",
+        "train",
+        "accuracy",
+        "objects",
+        "check",
+    ):
+        assert f"pdalstages:{name}\t" in said
+
+
+@needs_qgis
+def test_check_tells_what_is_there_and_what_is_missing(qgis):
+    said = qgis("run", "pdalstages:check")
+    assert f"VERSION:\t{__version__}" in said and "ok      shipped model" in said
+    said = qgis("run", "pdalstages:check", code=1, PDAL_STAGES_PROGRAM="/nowhere")
+    assert "no program pdal-stages at /nowhere" in said and "Install pdal-stages" in said
+
+
+@needs_qgis
+def test_without_the_program_dialogs_are_there_and_runs_refused(session, tmp_path):
+    found = session(
+        "parameters", "classify", PDAL_STAGES_PROGRAM="/nowhere", QGIS_CUSTOM_CONFIG_PATH=str(tmp_path)
+    )
+    assert found["can"][0] is False and "Install pdal-stages" in found["can"][1]
+    assert "DIMENSIONS" in found["parameters"]
+
+
+@needs_qgis
+def test_parameters_are_the_commands_own(session, capsys):
+    assert main(["commands", "--showjson"]) == 0
+    forms = json.loads(capsys.readouterr().out)
+    shown = session("parameters", "classifysurvey")["parameters"]
+    for one in forms["commands"]["classify"]["arguments"]:
+        if one["name"] in ("where", "memory", "workers", "polygons", "per"):
+            assert shown[one["name"].upper()][3] == one["help"]
+    assert shown["PER"][1] and not shown["MEMORY"][1]  # advanced, and not
+    heights = session("parameters", "heights")["parameters"]
+    assert heights["WINDOW"][2] == "75.0" and heights["WINDOW"][3].startswith("Radius of the largest window")
+
+
+@pytest.mark.pdal
+@needs_qgis
+def test_the_way_of_a_tile(qgis, session, town, tmp_path):
+    """Classified, with heights, as rasters, as objects, judged: the same bytes as the commands give."""
+    out = tmp_path / "with blanks ü"
+    out.mkdir()
+    said = qgis(
+        "run",
+        "pdalstages:classify",
+        "--",
+        f"INPUT={town}",
+        f"OUTPUT={out / 'c.laz'}",
+        f"MAP={out / 'c.tif'}",
+        "NOISE=0",
+    )
+    assert "pdal-stages classify --no-noise" in said and "6 Building" in said
+    assert main(["classify", str(town), str(tmp_path / "c.laz"), "--no-noise"]) == 0
+    assert (out / "c.laz").read_bytes() == (tmp_path / "c.laz").read_bytes()
+    qgis(
+        "run",
+        "pdalstages:heights",
+        "--",
+        f"INPUT={town}",
+        f"OUTPUT={out / 'h.laz'}",
+        f"MAP={out / 'h.tif'}",
+        "WINDOW=40",
+    )
+    job = [str(town), {"type": "filters.hag_morphological", "window": 40}, str(tmp_path / "h.laz")]
+    (tmp_path / "job.json").write_text(json.dumps(job))
+    assert (
+        main(
+            [
+                "pipeline",
+                str(tmp_path / "job.json"),
+                "--writers.las.extra_dims=all",
+                "--writers.las.forward=all",
+            ]
+        )
+        == 0
+    )
+    ours, theirs = (laspy.read(path)["HeightAboveGround"] for path in (tmp_path / "h.laz", out / "h.laz"))
+    assert np.array_equal(ours, theirs) and ours.max() > 3
+    qgis(
+        "run", "pdalstages:terrainmodels", "--", f"INPUT={out / 'c.laz'}", "GROUND_FROM=1", f"TERRAIN={out / 't.tif'}",
+        f"SURFACE={out / 's.tif'}", f"HEIGHTS={out / 'a.tif'}",
+    )  # fmt: skip
+    said = qgis(
+        "run",
+        "pdalstages:accuracy",
+        "--",
+        f"INPUT={out / 'c.laz'}",
+        f"REFERENCE={town}",
+        f"PAGE={out / 'a.html'}",
+    )
+    assert "Overall accuracy" in said and (out / "a.html").read_text().startswith("<!")
+    pytest.importorskip("pyogrio")
+    said = qgis("run", "pdalstages:objects", "--", f"INPUTS={out / 'c.laz'}", f"OUTPUT={out / 'o.gpkg'}")
+    assert " buildings, " in said
+    shown = session("styles", out / "o.gpkg", out / "t.tif", out / "h.tif", out / "c.tif")
+    assert shown["building"] == [214, 78, 60]
+    assert (
+        shown["layers"] | {"terrain": "hillshade", "heights": "singlebandpseudocolor", "classes": "paletted"}
+        == shown["layers"]
+    )
+    assert shown["layers"]["buildings"] == "categorizedSymbol"
+
+
+@pytest.mark.pdal
+@needs_qgis
+def test_rasters_of_terrain_and_surface(qgis, town, tmp_path):
+    """The terrain lies on the true ground, the surface on or above the terrain."""
+    rasters = {name: tmp_path / f"{name}.tif" for name in ("terrain", "surface")}
+    qgis(
+        "run", "pdalstages:terrainmodels", "--", f"INPUT={town}", f"TERRAIN={rasters['terrain']}",
+        f"SURFACE={rasters['surface']}", "RESOLUTION=2",
+    )  # fmt: skip
+    points = laspy.read(town)
+    ground = np.asarray(points.classification) == 2
+    info = subprocess.run(
+        ["gdalinfo", "-stats", "-json", rasters["terrain"]], capture_output=True, text=True, check=False
+    )
+    if info.returncode:
+        pytest.skip("no gdalinfo")
+    band = json.loads(info.stdout)["bands"][0]
+    z = np.asarray(points.z)[ground]
+    assert z.min() - 0.5 < band["minimum"] and band["maximum"] < z.max() + 0.5
+    assert abs(band["mean"] - z.mean()) < 0.5
+    info = subprocess.run(
+        ["gdalinfo", "-stats", "-json", rasters["surface"]], capture_output=True, text=True, check=True
+    )
+    assert json.loads(info.stdout)["bands"][0]["maximum"] == pytest.approx(points.z.max(), abs=1.0)
+
+
+@pytest.mark.pdal
+@needs_qgis
+def test_many_files_and_training(qgis, town, tmp_path):
+    second = tmp_path / "in" / "b.laz"
+    second.parent.mkdir()
+    shutil.copy(town, second)
+    shutil.copy(town, second.with_name("a.laz"))
+    said = qgis(
+        "run", "pdalstages:classifysurvey", "--", f"FOLDER={second.parent}", f"OUTPUT={tmp_path / 'out'}",
+        f"REPORT={tmp_path / 'r.html'}", "WORKERS=0",
+    )  # fmt: skip
+    assert sorted(path.name for path in (tmp_path / "out").glob("*.laz")) == ["a.laz", "b.laz"], said
+    assert (tmp_path / "r.html").is_file()
+    qgis(
+        "run", "pdalstages:train", "--", f"INPUTS={town}", "COUNT=50", "TREES=5", "NEIGHBORHOODS=k10",
+        f"MODEL={tmp_path / 'm.model'}", f"PAGE={tmp_path / 'm.html'}",
+    )  # fmt: skip
+    assert (tmp_path / "m.html").is_file()
+    qgis(
+        "run",
+        "pdalstages:classify",
+        "--",
+        f"INPUT={town}",
+        f"MODEL={tmp_path / 'm.model'}",
+        f"OUTPUT={tmp_path / 'm.laz'}",
+    )
+    assert (tmp_path / "m.laz").is_file()
+
+
+@pytest.mark.pdal
+@needs_qgis
+def test_errors_are_the_commands_own(qgis, tmp_path):
+    said = qgis(
+        "run",
+        "pdalstages:classify",
+        "--",
+        f"INPUT={tmp_path / 'gone.laz'}",
+        f"OUTPUT={tmp_path / 'c.laz'}",
+        code=1,
+    )
+    assert "gone.laz" in said and not (tmp_path / "c.laz").exists()
+    said = qgis("run", "pdalstages:objects", "--", f"OUTPUT={tmp_path / 'o.gpkg'}", code=1)
+    assert "No point cloud was given" in said
+
+
+@pytest.mark.pdal
+@needs_qgis
+def test_cancel_leaves_nothing(session, tmp_path):
+    large = tmp_path / "large.laz"
+    write_town(TownOptions(size=250.0, density=8.0, seed=3), large)
+    done = session("cancel", large, tmp_path / "out.laz")
+    assert not done["good"] and done["seconds"] < 40
+    assert any("Canceled" in line for line in done["lines"])
+    assert [path.name for path in tmp_path.iterdir()] == ["large.laz"]
+
+
+@pytest.mark.pdal
+@pytest.mark.data
+@needs_qgis
+def test_a_real_tile(qgis, data_dir, tmp_path):
+    source = data_dir / "montpellier" / "train_77055_627760.laz"
+    said = qgis("run", "pdalstages:classify", "--", f"INPUT={source}", f"OUTPUT={tmp_path / 'c.laz'}")
+    assert "points written" in said
+    said = qgis(
+        "run",
+        "pdalstages:accuracy",
+        "--",
+        f"INPUT={tmp_path / 'c.laz'}",
+        f"REFERENCE={source}",
+        f"PAGE={tmp_path / 'a.html'}",
+    )
+    overall = next(line for line in said.splitlines() if line.startswith("Overall accuracy"))
+    assert float(overall.split()[2]) > 90
