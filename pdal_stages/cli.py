@@ -198,7 +198,11 @@ def _parser() -> argparse.ArgumentParser:
     takes("--showjson", action="store_true", help="As JSON Schema")
 
     takes = add("commands", _commands, "List commands with their arguments")
-    takes("--showjson", action="store_true", help="With stages, models and classes, as JSON: dialogs are made of it")
+    takes(
+        "--showjson",
+        action="store_true",
+        help="With stages, models and classes, as JSON: dialogs are made of it",
+    )
 
     add("doctor", _doctor, "Tell what is there on this machine, and the cure for what is not")
     add("plugin", _plugin, "Build our stages into PDAL itself, so that all that runs PDAL has them")

@@ -23,6 +23,9 @@ class Feedback(QgsProcessingFeedback):
 
     pushCommandInfo = pushWarning = pushInfo
 
+    def reportError(self, error, fatalError=False):
+        self.lines.append(error)
+
     def setProgressText(self, text):
         self.lines.append(f"progress: {text}")
 

@@ -22,6 +22,7 @@ def test_one_version_everywhere():
     assert f'\nversion = "{__version__}"' in (ROOT / "native" / "pyproject.toml").read_text()
     assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text()
     assert f'\n  version: "{__version__}"\n' in (ROOT / "recipe" / "recipe.yaml").read_text()
+    assert f"\nversion={__version__}\n" in (ROOT / "qgis" / "pdal_stages" / "metadata.txt").read_text()
     assert f"\n## {__version__} " in (ROOT / "CHANGELOG.md").read_text()
 
 

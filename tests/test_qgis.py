@@ -537,4 +537,4 @@ def test_a_real_tile(qgis, data_dir, tmp_path):
         f"PAGE={tmp_path / 'a.html'}",
     )
     overall = next(line for line in said.splitlines() if line.startswith("Overall accuracy"))
-    assert float(overall.split()[2]) > 90
+    assert float(overall.split()[2]) > 80

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.asprs import class_color
 from ..base.errors import StageError
 from ..base.files import check_writable, whole_files
 from ..base.units import Units
@@ -147,7 +148,7 @@ def write_layers(path: str | Path, layers: dict[str, Layer], wkt: str = "") -> l
         styled = file.with_suffix(".qml")
         with whole_files(file, styled, what="objects") as (part, style):
             _write(part, name, layers[name], driver, wkt)
-            style.write_text(qml(layers[name].kind), encoding="utf-8")
+            style.write_text(qml(layers[name].kind, name), encoding="utf-8")
             _check_whole(part, {name: layers[name]}, driver)
     return list(names.values())
 
@@ -211,24 +212,33 @@ def _damage(path: Path, layers: dict[str, Layer]) -> str:
     return ", ".join(f"no index of {name}" for name in layers if name not in indexed)
 
 
-#: Fill of objects that are sure, and of those to be checked.
-_FILLS = {"sure": "214,78,60,140", CHECK: "250,190,20,200"}
+#: Class whose color a layer's sure objects have, with its opacity; those to be checked are yellow on every layer.
+_CLASSES = {
+    "buildings": (6, 140),
+    "trees": (5, 255),
+    "crowns": (5, 90),
+    "spans": (14, 255),
+    "decks": (17, 140),
+}
+_TO_CHECK = "255,225,0,200"
 
 
-def qml(kind: str) -> str:
+def qml(kind: str, name: str) -> str:
     """A style for QGIS that tells what is sure from what is to be checked."""
+    code, opacity = _CLASSES[name]
+    fills = {"sure": ",".join(map(str, (*class_color(code), opacity))), CHECK: _TO_CHECK}
     symbol, layer, fill = {
         "Point": ("marker", "SimpleMarker", "color"),
         "LineString Z": ("line", "SimpleLine", "line_color"),
     }.get(kind, ("fill", "SimpleFill", "color"))
     categories = "".join(
         f'<category value="{value}" symbol="{n}" label="{value}" render="true"/>'
-        for n, value in enumerate(_FILLS)
+        for n, value in enumerate(fills)
     )
     symbols = "".join(
         f'<symbol type="{symbol}" name="{n}" alpha="1"><layer class="{layer}" enabled="1" pass="0">'
         f'<Option type="Map"><Option type="QString" name="{fill}" value="{color}"/></Option></layer></symbol>'
-        for n, color in enumerate(_FILLS.values())
+        for n, color in enumerate(fills.values())
     )
     return (
         "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
@@ -258,7 +268,7 @@ def _write_styles(path: Path, layers: dict[str, Layer]) -> None:
                 "INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, "
                 "styleName, styleQML, styleSLD, useAsDefault, description, owner) "
                 "VALUES ('', '', ?, 'geom', ?, ?, '', 1, '', '')",
-                [(name, name, qml(layer.kind)) for name, layer in layers.items()],
+                [(name, name, qml(layer.kind, name)) for name, layer in layers.items()],
             )
     finally:
         base.close()

@@ -120,13 +120,13 @@ class ClassifyFile(_Classifying):
         source = self.parameterAsFile(parameters, "INPUT", context)
         target = written(self.parameterAsFileOutput(parameters, "OUTPUT", context))
         chosen = self.arguments(parameters, context)
-        self.run(["classify", *chosen, *self.model(parameters, context), source, target], feedback)
+        self.execute(["classify", *chosen, *self.model(parameters, context), source, target], feedback)
         self.show_clouds([target], parameters, context)
         out = {"OUTPUT": target}
         if parameters.get("MAP"):
             out["MAP"] = written(self.parameterAsOutputLayer(parameters, "MAP", context))
             side = self.parameterAsDouble(parameters, "RESOLUTION", context)
-            self.run(["pipeline", "--stdin"], feedback, json.dumps(class_map(target, out["MAP"], side)))
+            self.execute(["pipeline", "--stdin"], feedback, json.dumps(class_map(target, out["MAP"], side)))
             self.style(context, out["MAP"], results.classes_of(self.forms["classes"]))
         return out
 
@@ -163,7 +163,9 @@ class ClassifySurvey(_Classifying):
             more.append(f"--report={report}")
         before = set(os.listdir(target))
         # A folder is named by its end, where it is not there yet
-        self.run(["classify", *more, *self.inputs(parameters, context), os.path.join(target, "")], feedback)
+        self.execute(
+            ["classify", *more, *self.inputs(parameters, context), os.path.join(target, "")], feedback
+        )
         names = (
             sorted(os.listdir(target)) if "RESUME" in parameters else sorted(set(os.listdir(target)) - before)
         )
@@ -200,7 +202,7 @@ class Heights(_Showing):
             out["MAP"] = written(self.parameterAsOutputLayer(parameters, "MAP", context))
             side = self.parameterAsDouble(parameters, "RESOLUTION", context)
             job += [NOT_NOISE, raster(out["MAP"], side, "HeightAboveGround", "max")]
-        self.run(["pipeline", "--stdin"], feedback, json.dumps(job))
+        self.execute(["pipeline", "--stdin"], feedback, json.dumps(job))
         self.show_clouds([target], parameters, context)
         if "MAP" in out:
             self.style(context, out["MAP"], results.heights)
@@ -227,7 +229,7 @@ class TerrainModels(_Showing):
             "Which points the terrain goes through: those that the filter below finds, or those classified as ground"
         )
         self.addParameter(made)
-        self.add_cell("Cell")
+        self.add_cell("Cell of the rasters")
         self.add_declared()
         self.add_raster("TERRAIN", "Terrain model", "Through the ground points")
         self.add_raster(
@@ -266,7 +268,7 @@ class TerrainModels(_Showing):
                 {"type": "filters.faceraster", "resolution": side},
                 {"type": "writers.raster", "filename": chosen["TERRAIN"], "gdaldriver": "GTiff"},
             ]
-        self.run(["pipeline", "--stdin"], feedback, json.dumps(job))
+        self.execute(["pipeline", "--stdin"], feedback, json.dumps(job))
         for key, path in chosen.items():
             self.style(context, path, results.heights if key == "HEIGHTS" else results.hillshade)
         return chosen
@@ -299,11 +301,11 @@ class Train(Algorithm):
     def processAlgorithm(self, parameters, context, feedback):
         target = written(self.parameterAsFileOutput(parameters, "MODEL", context))
         chosen = [*self.arguments(parameters, context), f"--model={target}"]
-        self.run(["train", *chosen, *self.inputs(parameters, context)], feedback)
+        self.execute(["train", *chosen, *self.inputs(parameters, context)], feedback)
         page = self.parameterAsFileOutput(parameters, "PAGE", context)
         if not page:
             return {"MODEL": target}
-        self.run(["model", target, f"--html={written(page)}"], feedback, quiet=True)
+        self.execute(["model", target, f"--html={written(page)}"], feedback, quiet=True)
         return {"MODEL": target, "PAGE": page, "HTML": page}
 
 
@@ -343,7 +345,9 @@ class Accuracy(Algorithm):
         figures = self.parameterAsFileOutput(parameters, "JSON", context)
         if figures:
             chosen.append(f"--json={written(figures)}")
-        text = self.run(["accuracy", *chosen, self.parameterAsFile(parameters, "INPUT", context)], feedback)
+        text = self.execute(
+            ["accuracy", *chosen, self.parameterAsFile(parameters, "INPUT", context)], feedback
+        )
         return {"PAGE": page, "HTML": page, "FIGURES": text, **({"JSON": figures} if figures else {})}
 
 
@@ -373,7 +377,7 @@ class Objects(_Showing):
 
     def processAlgorithm(self, parameters, context, feedback):
         target = written(self.parameterAsFileOutput(parameters, "OUTPUT", context))
-        self.run(
+        self.execute(
             ["objects", *self.arguments(parameters, context), *self.inputs(parameters, context), target],
             feedback,
         )

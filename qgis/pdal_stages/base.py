@@ -139,7 +139,7 @@ class Algorithm(QgsProcessingAlgorithm):
 
     # ---- running ---------------------------------------------------------------------------------------
 
-    def run(self, arguments, feedback, text=None, quiet=False):
+    def execute(self, arguments, feedback, text=None, quiet=False):
         """Run the program; QGIS's exception with its message where it fails."""
         try:
             return running.run(self.provider().program(), arguments, feedback, text, quiet)

@@ -1,5 +1,7 @@
 """Parameters of a dialog, made of what the program says about an argument of a command or an option of a stage."""
 
+import re
+
 from qgis.core import (
     QgsProcessingParameterBoolean,
     QgsProcessingParameterDefinition,
@@ -22,9 +24,11 @@ LEFT_OUT = (
 )
 
 
-def label_of(name):
-    """``reference_dimension`` -> ``Reference dimension``"""
-    text = name.replace("_", " ")
+def label_of(declared):
+    """``reference_dimension`` -> ``Reference dimension``; of a checkbox what it does."""
+    if declared["kind"] == "boolean":
+        return re.split(r" \(|; |: ", declared["help"])[0]
+    text = declared["name"].replace("_", " ")
     return text[:1].upper() + text[1:]
 
 
@@ -33,7 +37,7 @@ def parameter(declared, key, label="", advanced=False):
 
     Where it is left empty the program's own default holds, so numbers without a default are optional.
     """
-    label = label or label_of(declared["name"])
+    label = label or label_of(declared)
     if declared.get("unit"):
         label += f" [{declared['unit']}]"
     default, kind = declared["default"], declared["kind"]
@@ -43,7 +47,7 @@ def parameter(declared, key, label="", advanced=False):
         index = choices.index(str(default)) if default is not None and str(default) in choices else None
         made = QgsProcessingParameterEnum(key, label, choices, defaultValue=index, optional=optional)
     elif kind == "boolean":
-        made = QgsProcessingParameterBoolean(key, label, defaultValue=bool(default), optional=optional)
+        made = QgsProcessingParameterBoolean(key, label, defaultValue=bool(default))
     elif kind in ("number", "integer"):
         made = QgsProcessingParameterNumber(
             key,
