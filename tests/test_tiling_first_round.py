@@ -143,6 +143,40 @@ def test_resume_makes_what_is_missing_alone(tmp_path, survey, monkeypatch):
 
 
 @pytest.mark.pdal
+@pytest.mark.parametrize("kind", ["first round", "tiles"])
+def test_killed_between_a_file_and_its_note(tmp_path, survey, monkeypatch, kind):
+    """A file that a run with other options made is not taken for that of the run before, whatever was noted of that."""
+    from pdal_stages.tiling import tiledrun
+    from pdal_stages.tiling.file_task import FileTask
+    from pdal_stages.tiling.store import Store
+
+    def stages(least):
+        return [{"type": "filters.range", "limits": f"Z[{least}:]"}, HEIGHTS]
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    folder = tmp_path / "out"
+    place, attribute = (tiledrun, "run_all") if kind == "first round" else (FileTask, "run")
+    with monkeypatch.context() as patch:
+        patch.setattr(place, attribute, stop)
+        with pytest.raises(KeyboardInterrupt):
+            in_tiles(survey, stages(60), folder)
+    notes = len(list((folder / ".pdal-stages" / "tiles").glob("*.json")))
+    assert notes >= 8
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "finish", stop)
+        if kind == "tiles":  # of which the first is made, as the first round is left out of the other run
+            patch.setattr(tiledrun, "run_first_round", lambda *_: None)
+        with pytest.raises(KeyboardInterrupt):
+            in_tiles(survey, stages(75), folder, resume=True)
+    assert not in_tiles(survey, stages(60), folder, resume=True).failures
+    whole = np.concatenate(ps.run_pipeline([*survey, *stages(60)]).arrays)
+    for name in MADE:
+        assert np.array_equal(of_files(folder, name), whole[name]), name
+
+
+@pytest.mark.pdal
 def test_what_is_left_of_an_input_that_is_gone_is_removed(tmp_path, survey, monkeypatch):
     from pdal_stages.tiling import tile_task
 

@@ -31,6 +31,8 @@ GROWTH = 3.0
 DARK = 6.0
 #: Side of a block, cells.
 BLOCK = 2048
+#: Cells of a window beyond which no more is looked at around a block: objects that reach farther are cut, and say so.
+MOST_CELLS = 64_000_000
 #: Kinds that are found.
 FOUND = (Kind.BUILDING, Kind.TREE, Kind.SPAN, Kind.DECK)
 
@@ -285,8 +287,11 @@ def _part(window: Window, part: Window) -> tuple[slice, slice]:
 
 def _whole(
     cells: Cells, extent: Window, kind: Kind, core: Window, masked: Callable[[_Layers], NDArray[np.bool_]]
-) -> tuple[_Layers, NDArray[np.bool_]]:
-    """A block's layers with as much around it as it takes for all that reaches into the block to be whole."""
+) -> tuple[_Layers, NDArray[np.bool_], Window]:
+    """A block's layers with as much around it as it takes for all that reaches into the block to be whole.
+
+    The last is the window within which they are: only objects larger than a window may be go beyond it.
+    """
     margin = round(MARGIN / cells.size)
     around = margin
     while True:
@@ -294,12 +299,13 @@ def _whole(
         layers = _Layers(cells, kind, seen, extent)
         mask = masked(layers)
         first = roofs.connected(roofs.dilated(mask), np.zeros(mask.shape), np.inf)
-        inside, sure = (_part(layers.window, part) for part in (core, _around(seen, -margin)))
+        sure = _around(seen, -margin)
+        inside = first[_part(layers.window, core)]
         rim = first.copy()
-        rim[sure] = -1
-        near = np.intersect1d(first[inside][first[inside] >= 0], rim[rim >= 0])
-        if near.size == 0 or around > 200 * margin:
-            return layers, mask
+        rim[_part(layers.window, sure)] = -1
+        near = np.intersect1d(inside[inside >= 0], rim[rim >= 0])
+        if near.size == 0 or mask.size > MOST_CELLS:
+            return layers, mask, sure
         around += max(margin, around // 2)
 
 
@@ -324,7 +330,7 @@ def _buildings(cells: Cells, extent: Window, chosen: ObjectSettings, core: Windo
         heights[:] = [z]
         return mask
 
-    layers, mask = _whole(cells, extent, Kind.BUILDING, core, masked)
+    layers, mask, sure = _whole(cells, extent, Kind.BUILDING, core, masked)
     area = chosen.cell**2
     number = roofs.building_parts(
         mask, heights[0], step=chosen.step, smallest=int(np.ceil(chosen.roof_part / area))
@@ -332,7 +338,7 @@ def _buildings(cells: Cells, extent: Window, chosen: ObjectSettings, core: Windo
     number = _without_small(number, chosen.building_area / area)
     # Points of a wall that stands out, and low ones beside it, belong to the building beside them.
     theirs = np.where(number < 0, _beside(number), number)
-    _keep(layers, number, theirs, heights[0], core, Kind.BUILDING, chosen, found, measure.building)
+    _keep(layers, number, theirs, heights[0], core, sure, Kind.BUILDING, chosen, found, measure.building)
 
 
 def _decks(cells: Cells, extent: Window, chosen: ObjectSettings, core: Window, found: _Found) -> None:
@@ -343,11 +349,11 @@ def _decks(cells: Cells, extent: Window, chosen: ObjectSettings, core: Window, f
         heights[:] = [z]
         return mask
 
-    layers, mask = _whole(cells, extent, Kind.DECK, core, masked)
+    layers, mask, sure = _whole(cells, extent, Kind.DECK, core, masked)
     number = roofs.building_parts(mask, heights[0], step=1.0, smallest=int(np.ceil(10.0 / chosen.cell**2)))
     number = _without_small(number, chosen.building_area / chosen.cell**2)
     theirs = np.where(number < 0, _beside(number), number)
-    _keep(layers, number, theirs, heights[0], core, Kind.DECK, chosen, found, measure.deck)
+    _keep(layers, number, theirs, heights[0], core, sure, Kind.DECK, chosen, found, measure.deck)
 
 
 def _spans(cells: Cells, extent: Window, chosen: ObjectSettings, core: Window, found: _Found) -> None:
@@ -361,7 +367,7 @@ def _spans(cells: Cells, extent: Window, chosen: ObjectSettings, core: Window, f
             mask = roofs.dilated(mask)
         return mask & ~tower
 
-    layers, mask = _whole(cells, extent, Kind.SPAN, core, masked)
+    layers, mask, sure = _whole(cells, extent, Kind.SPAN, core, masked)
     joined = roofs.connected(mask, np.zeros(mask.shape), np.inf)
     number = roofs.numbered(np.where(np.isnan(layers.high), -1, joined))
     number = _without_small(number, 4)
@@ -370,7 +376,7 @@ def _spans(cells: Cells, extent: Window, chosen: ObjectSettings, core: Window, f
         found.paths.append(measure.path_of(body, size))
         return measure.span(body, size)
 
-    _keep(layers, number, number, layers.high, core, Kind.SPAN, chosen, found, measured)
+    _keep(layers, number, number, layers.high, core, sure, Kind.SPAN, chosen, found, measured)
 
 
 def _trees(cells: Cells, extent: Window, chosen: ObjectSettings, core: Window, found: _Found) -> None:
@@ -413,6 +419,7 @@ def _keep(
     theirs: NDArray[np.int64],
     z: NDArray,
     core: Window,
+    sure: Window,
     kind: Kind,
     chosen: ObjectSettings,
     found: _Found,
@@ -426,7 +433,11 @@ def _keep(
             identity = int(object_id(kind, np.array(row), np.array(column)))
             identities[n] = identity
             body = layers.body(r, c, z)
-            _add(found, identity, dict(measured(body, chosen.cell)), body)
+            record = dict(measured(body, chosen.cell))
+            ends = ((body.row.min(), body.column.min()), (body.row.max(), body.column.max()))
+            if not all(_inside(sure, *map(int, end)) for end in ends):
+                record |= measure.judged([*filter(None, [record["reason"]]), measure.CUT])
+            _add(found, identity, record, body)
     for n, r, c in _bodies(np.where(np.isnan(layers.high), -1, theirs)):
         if n in identities:
             found.keys.append(cell_keys(kind, r + window.row, c + window.column))

@@ -12,10 +12,12 @@ from .cells import MM
 from .planes import roof_planes
 
 SURE, CHECK = "sure", "check"
+#: The reason of an object that is larger than what is looked at in one piece.
+CUT = "cut off"
 #: Why an object is to be checked.
 REASONS = (
     "no ground near", "small", "low", "rough roof", "unsure points", "no facade", "few points", "thin crown", "wide crown",
-    "short", "not straight",
+    "short", "not straight", CUT,
 )  # fmt: skip
 
 
@@ -56,8 +58,9 @@ class Body(NamedTuple):
         return float(np.median(known)) if known.size else math.nan
 
 
-def _judged(reasons: list[str]) -> dict[str, object]:
-    return {"verdict": CHECK if reasons else SURE, "reason": ", ".join(reasons)}
+def judged(reasons: list[object]) -> dict[str, object]:
+    """The verdict that follows from reasons to check."""
+    return {"verdict": CHECK if reasons else SURE, "reason": ", ".join(map(str, reasons))}
 
 
 def building(body: Body, size: float) -> dict[str, object]:
@@ -91,7 +94,7 @@ def building(body: Body, size: float) -> dict[str, object]:
         "planar": planar,
         "points": int(body.points.sum()),
         "reliab": body.reliability,
-        **_judged(reasons),
+        **judged(reasons),
     }
 
 
@@ -120,7 +123,7 @@ def tree(body: Body, top_row: int, top_column: int, size: float) -> dict[str, ob
         "ground": float(body.ground[highest]),
         "points": points,
         "reliab": body.reliability,
-        **_judged(reasons),
+        **judged(reasons),
     }
 
 
@@ -145,7 +148,7 @@ def span(body: Body, size: float) -> dict[str, object]:
         "sag": float(max(0.0, np.max(_chord(path) - path[:, 2]))),
         "points": int(body.points.sum()),
         "reliab": body.reliability,
-        **_judged(reasons),
+        **judged(reasons),
     }
 
 
@@ -198,5 +201,5 @@ def deck(body: Body, size: float) -> dict[str, object]:
         "ground": ground,
         "points": int(body.points.sum()),
         "reliab": body.reliability,
-        **_judged(reasons),
+        **judged(reasons),
     }

@@ -14,13 +14,15 @@ import itertools
 import math
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import DependencyError
+from ..base.errors import DependencyError, StageError
 from .find import Table
 
 #: Holes smaller than this are closed, m2.
@@ -47,6 +49,22 @@ def vector(name: str) -> Any:
             found=str(error),
             cure="Install the extra: pip install 'pdal-stages[vector]'",
         ) from None
+
+
+@contextmanager
+def reading(path: str) -> Iterator[None]:
+    """What GDAL, GEOS and PROJ raise over a file, as an error of ours."""
+    try:
+        yield
+    except (StageError, MemoryError):
+        raise
+    except Exception as error:  # each package has its own
+        raise StageError(
+            "the vector file cannot be read",
+            where=path,
+            found=f"{type(error).__name__}: {error}",
+            cure="See whether ogrinfo -al reads it; ogr2ogr -makevalid new.gpkg FILE often mends what can be mended",
+        ) from error
 
 
 #: A function of the C library that each of these packages brings.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import DependencyError, OptionError, StageError
-from .outlines import vector
+from .outlines import reading, vector
 
 #: Between a file and a layer of it, as QGIS writes them.
 _LAYER = "|layername="
@@ -109,18 +109,22 @@ def polygons_of(overlay: Overlay, wkt: str, box: tuple[float, float, float, floa
     pyogrio, shapely = vector("pyogrio"), vector("shapely")
     layer = overlay.check()
     note, forward = "", None
-    crs = pyogrio.read_info(overlay.file, layer=layer)["crs"]
+    with reading(overlay.file):
+        crs = pyogrio.read_info(overlay.file, layer=layer)["crs"]
     if crs and wkt:
         forward, box = _transform(overlay.file, crs, wkt, box)
     else:
         note = f"{overlay.file}: {'the points have' if crs else 'it has'} no reference system: the same was assumed"
-    _, _, geometry, _ = pyogrio.raw.read(overlay.file, layer=layer, columns=[], bbox=box)
-    shapes = shapely.from_wkb(geometry) if len(geometry) else np.empty(0, object)
-    shapes = shapely.force_2d(shapes[~shapely.is_missing(shapes)]) if len(shapes) else shapes
-    flat = [s for s in shapely.get_parts(shapely.get_parts(shapes)) if s.geom_type == "Polygon"]
-    if forward is not None:
-        flat = list(shapely.transform(np.array(flat, object), lambda x, y: forward(x, y), interleaved=False))
-    return [s if shapely.is_valid(s) else shapely.make_valid(s) for s in flat], note
+    with reading(overlay.file):
+        _, _, geometry, _ = pyogrio.raw.read(overlay.file, layer=layer, columns=[], bbox=box)
+        shapes = shapely.from_wkb(geometry) if len(geometry) else np.empty(0, object)
+        shapes = shapely.force_2d(shapes[~shapely.is_missing(shapes)]) if len(shapes) else shapes
+        flat = [s for s in shapely.get_parts(shapely.get_parts(shapes)) if s.geom_type == "Polygon"]
+        if forward is not None:
+            flat = list(
+                shapely.transform(np.array(flat, object), lambda x, y: forward(x, y), interleaved=False)
+            )
+        return [s if shapely.is_valid(s) else shapely.make_valid(s) for s in flat], note
 
 
 def _transform(file: str, crs: str, wkt: str, box: tuple[float, float, float, float]) -> tuple[Any, Any]:

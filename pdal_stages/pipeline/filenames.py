@@ -72,6 +72,8 @@ def _is_file(text: str) -> bool:
 def stage_files(stage: Stage) -> list[str]:
     """Files that a stage of ours reads."""
     written = {output.path for output in stage.outputs()}
+    if stage.type.startswith("writers."):  # whose outputs may be named after it
+        written.add(stage.options["filename"])
     given = [(o.kind, stage.options[o.name]) for o in stage.all_options() if o.kind in ("filename", "model")]
     found = [find(name) if kind == "model" else name for kind, name in given if name]
     return [name for name in [*found, *stage.inputs()] if name not in written]

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..base.errors import StageError
 from ..objects.compare import compare_buildings, compare_trees
-from ..objects.outlines import vector
+from ..objects.outlines import reading, vector
 from .page import render
 
 #: What columns of tree heights are called.
@@ -44,19 +44,20 @@ class Things:
             for what, wanted in _LAYERS.items():
                 if wanted not in str(kind) or (len(layers) > 1 and name != what):
                     continue
-                about, _, geometry, values = pyogrio.raw.read(path, layer=name)
-                shapes = shapely.force_2d(shapely.from_wkb(geometry))
-                shapes = shapes[~shapely.is_missing(shapes) & ~shapely.is_empty(shapes)]
+                with reading(path):
+                    about, _, geometry, values = pyogrio.raw.read(path, layer=name)
+                    shapes = shapely.force_2d(shapely.from_wkb(geometry))
+                    there = ~shapely.is_missing(shapes) & ~shapely.is_empty(shapes)
+                    places = shapely.get_coordinates(shapely.centroid(shapes[there]))
                 self.crs[what] = str(about["crs"] or "")
+                if not np.isfinite(places).all():
+                    raise StageError("coordinates are not finite (NaN or infinite)", where=path, found=name)
                 columns = {str(n).lower(): v for n, v in zip(about["fields"], values, strict=True)}
                 if what == "buildings":
-                    self.buildings = list(shapes)
-                else:
-                    height = next((columns[n] for n in HEIGHT_NAMES if n in columns), None)
-                    if height is None:
-                        height = np.full(len(shapes), np.nan)
-                    places = shapely.get_coordinates(shapely.centroid(shapes))
-                    self.trees = places, np.asarray(height, np.float64)
+                    self.buildings = list(shapes[there])
+                    continue
+                title = next((n for n in HEIGHT_NAMES if n in columns), "")
+                self.trees = places, _heights(path, title, columns[title] if title else there * np.nan)[there]
         if self.buildings is None and self.trees is None:
             raise StageError(
                 "the file holds neither buildings nor trees",
@@ -74,6 +75,22 @@ class Things:
         if self.trees is not None:
             inside = shapely.contains_xy(area, *self.trees[0].T)
             self.trees = self.trees[0][inside], self.trees[1][inside]
+
+
+def _heights(path: str, name: str, values: Any) -> np.ndarray:
+    """A column of heights as numbers, NaN where there is none; texts of numbers count as such."""
+    out = np.full(len(values), np.nan)
+    for n, value in enumerate(values.tolist()):
+        try:
+            out[n] = math.nan if value in (None, "") else float(value)
+        except (TypeError, ValueError):
+            raise StageError(
+                f"the column '{name}' must hold heights of trees, in meters",
+                where=path,
+                found=repr(value),
+                cure="Make it a number, or name it otherwise if it is something else",
+            ) from None
+    return out
 
 
 def area_of(path: str) -> Any:

@@ -25,6 +25,8 @@ DRIVERS = {
     ".fgb": ("FlatGeobuf", False),
     ".shp": ("ESRI Shapefile", False),
 }
+#: Layers of objects, in this order.
+LAYERS = ("buildings", "trees", "crowns", "spans", "decks")
 _F, _I, _S = np.float64, np.int64, np.str_
 _JUDGED = {"points": _I, "reliab": _F, "verdict": _S, "reason": _S}
 #: Columns of each layer, none longer than a shapefile's ten characters.
@@ -91,8 +93,7 @@ def object_layers(objects: Objects, *, straight: bool = True, units: Units | Non
     scale = np.array([across, across, up])
     lines = [shapely.LineString(path / scale) for path in objects.tables[Kind.SPAN].paths]
     layers["spans"] = Layer(lines, "LineString Z", _columns(objects, Kind.SPAN))
-    order = ("buildings", "trees", "crowns", "spans", "decks")
-    return {name: layers[name] for name in order}
+    return {name: layers[name] for name in LAYERS}
 
 
 def _columns(objects: Objects, kind: Kind) -> dict[str, NDArray]:
@@ -117,59 +118,61 @@ def check_target(path: str | Path) -> None:
         )
     vector("pyogrio")
     vector("shapely")
-    for name in _names(Path(path), ("buildings",)).values():
+    for name in target_files(path):
         check_writable(name, "objects")
 
 
-def _names(path: Path, layers: Any) -> dict[str, Path]:
-    """The file of each layer."""
-    many = DRIVERS[path.suffix.lower()][1]
-    return {name: path if many else path.with_name(f"{path.stem}_{name}{path.suffix}") for name in layers}
+def target_files(path: str | Path) -> list[Path]:
+    """The files that are written: one of all layers, or one of each, named after it."""
+    target = Path(path)
+    if DRIVERS.get(target.suffix.lower(), ("", True))[1]:
+        return [target]
+    return [target.with_name(f"{target.stem}_{name}{target.suffix}") for name in LAYERS]
 
 
 def write_layers(path: str | Path, layers: dict[str, Layer], wkt: str = "") -> list[Path]:
-    """Write layers; the files that were written.
+    """Write layers; the files that were written, all or none.
 
-    A GeoPackage holds all of them, with styles for QGIS; other formats get a file for each layer that has objects, named
-    after it, with a style beside it.
+    A GeoPackage holds all of them, with styles for QGIS; other formats get a file for each layer, named after it, with a
+    style beside it. A layer without objects is written too: what an earlier run found is not left there.
     """
     check_target(path)
-    target = Path(path)
-    driver, many = DRIVERS[target.suffix.lower()]
+    driver, many = DRIVERS[Path(path).suffix.lower()]
+    files = target_files(path)
     if many:
-        with whole_files(target, what="objects") as (part,):
+        with whole_files(*files, what="objects") as (part,):
             for name, layer in layers.items():
                 _write(part, name, layer, driver, wkt)
             _write_styles(part, layers)
             _check_whole(part, layers, driver)
-        return [target]
-    names = _names(target, [name for name, layer in layers.items() if layer.shapes])
-    for name, file in names.items():
-        styled = file.with_suffix(".qml")
-        with whole_files(file, styled, what="objects") as (part, style):
-            _write(part, name, layers[name], driver, wkt)
-            style.write_text(qml(layers[name].kind, name), encoding="utf-8")
-            _check_whole(part, {name: layers[name]}, driver)
-    return list(names.values())
+        return files
+    styles = [file.with_suffix(".qml") for file in files]
+    with whole_files(*files, *styles, what="objects") as parts:
+        for number, name in enumerate(LAYERS):
+            _write(parts[number], name, layers[name], driver, wkt)
+            parts[number + len(files)].write_text(qml(layers[name].kind, name), encoding="utf-8")
+            _check_whole(parts[number], {name: layers[name]}, driver)
+    return files
 
 
 def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
     pyogrio, shapely = vector("pyogrio"), vector("shapely")
     options = {"layer": name} if driver == "GPKG" else {}
-    warnings.filterwarnings("ignore", "'crs' was not provided")  # as the points have none
     try:
-        pyogrio.raw.write(
-            path,
-            np.array([shapely.to_wkb(shape) for shape in layer.shapes], object),
-            list(layer.columns.values()),
-            list(layer.columns),
-            driver=driver,
-            geometry_type=layer.kind,
-            crs=wkt or None,
-            promote_to_multi=False,
-            append=False,
-            **options,
-        )
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "'crs' was not provided")  # as the points have none
+            pyogrio.raw.write(
+                path,
+                np.array([shapely.to_wkb(shape) for shape in layer.shapes], object),
+                list(layer.columns.values()),
+                list(layer.columns),
+                driver=driver,
+                geometry_type=layer.kind,
+                crs=wkt or None,
+                promote_to_multi=False,
+                append=False,
+                **options,
+            )
     except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, pyogrio.errors.CRSError) as error:
         raise StageError("objects could not be written", found=str(error)) from None
 

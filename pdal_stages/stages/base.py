@@ -103,6 +103,8 @@ class Stage(ABC):
 
     #: In tiles: what :meth:`left_of` gave of points farther away than :meth:`near_halo_m`.
     far_points: NDArray[np.float64] | None = None
+    #: In tiles: a dimension below zero for points whose results are used; only they are counted in reports.
+    own_points: str = ""
     #: Whether stages before it in the pipeline make what it makes too.
     makes_again: bool = False
     #: Set where a pipeline's writer cannot hold every class code.
@@ -192,7 +194,8 @@ class Stage(ABC):
     def points(self, arrays: Mapping[str, NDArray], *, wkt: str = "", legacy_flags: bool = False) -> Points:
         """PDAL's arrays as this stage sees them: with its `where` and its units."""
         units = (self.horizontal_unit, self.vertical_unit)
-        return Points(arrays, wkt=wkt, where=self._condition, units=units, legacy_flags=legacy_flags)
+        own = arrays.get(self.own_points)
+        return Points(arrays, wkt=wkt, where=self._condition, units=units, legacy_flags=legacy_flags, own=own)
 
     def take(self, points: Points, name: str) -> NDArray:
         """A dimension the stage reads; an error for a missing one names the stage that makes it."""

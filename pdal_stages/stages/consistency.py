@@ -91,7 +91,7 @@ feet of walls stay what they are: surveys label them building as often as ground
             rules=[rule for rule in RULES if self.options[rule]],
             figures=points.report.figures,
         )
-        points.report.figures["changed"] = int(np.count_nonzero(codes != before))
+        points.report.figures["changed"] = points.counted(codes != before)
         there = np.unique(np.concatenate([before[change], codes[change]]))
         points.report.figures["classes"] = {str(c): int(np.count_nonzero(codes[change] == c)) for c in there}
         return {"Classification": points.with_codes(codes)}

@@ -226,7 +226,7 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
             return {}
         ignored, kept = points.ignored(self.ignore), points.chosen(self.keep)
         inside = points.inside
-        points.report.figures["kept"] = int(np.count_nonzero(inside & kept & ~ignored))
+        points.report.figures["kept"] = points.counted(inside & kept & ~ignored)
         wanted = inside & ~ignored & ~kept
         self._refuse_codes_that_stay(points, wanted)
         with Progress(int(np.count_nonzero(wanted)), self.type) as progress:
@@ -269,8 +269,11 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
                 if name != "Classification":
                     values[name] = np.where(points.mask, values[name], points.arrays[name])
         values["Classification"] = points.with_codes(values["Classification"])
+        if self.reject_below is not None:
+            low = wanted & (found.reliability < np.float32(self.reject_below))
+            points.report.figures["rejected"] = points.counted(low)
         points.report.merge(found.report)
-        points.report.figures["outside_where"] = int(np.count_nonzero(~inside))
+        points.report.figures["outside_where"] = points.counted(~inside)
         return values
 
     def _split_vegetation(self, points: Points, found: Prediction, wanted: NDArray[np.bool_]) -> None:

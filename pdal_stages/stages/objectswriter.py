@@ -61,7 +61,9 @@ tell what is to be checked; beside other files lies a `.qml`. Needs the extra `v
         check_target(self.filename)
 
     def outputs(self) -> list[Output]:
-        return [Output(self.filename, "objects")]
+        from ..reports.objectlayers import target_files
+
+        return [Output(str(file), "objects") for file in target_files(self.filename)]
 
     def reads(self) -> list[str]:
         return ["Classification"]

@@ -50,6 +50,8 @@ class Points:
         Names of the horizontal and the vertical unit; empty where the spatial reference says it.
     legacy_flags : bool
         True where the three flag bits of LAS 1.0-1.3 sit inside `Classification`.
+    own : (n,) ndarray, optional
+        Below zero for the points whose results are used: :meth:`counted` counts those alone.
     """
 
     def __init__(
@@ -60,6 +62,7 @@ class Points:
         where: Expression | None = None,
         units: tuple[str, str] = ("", ""),
         legacy_flags: bool = False,
+        own: NDArray | None = None,
     ) -> None:
         self.arrays = arrays
         self.wkt = wkt
@@ -67,6 +70,7 @@ class Points:
         self.count = len(arrays["X"]) if "X" in arrays else 0
         self.report = Report({"points": self.count})
         self._units = units
+        self._own = own
         self.mask: NDArray[np.bool_] | None = None
         if where is not None:
             freed = {**arrays, "Classification": self.class_codes} if legacy_flags else arrays
@@ -81,6 +85,10 @@ class Points:
     def inside(self) -> NDArray[np.bool_]:
         """The points inside `where`; all, where there is none."""
         return np.ones(self.count, bool) if self.mask is None else self.mask
+
+    def counted(self, points: NDArray[np.bool_]) -> int:
+        """How many points these are, for a report."""
+        return int(np.count_nonzero(points if self._own is None else points & (self._own < 0)))
 
     @cached_property
     def units(self) -> Units:
@@ -197,9 +205,7 @@ class Points:
     def ignored(self, selection: Selection) -> NDArray[np.bool_]:
         """The same, counted in the report as ``ignored``, where they are inside `where`."""
         found = self.chosen(selection)
-        self.report.figures["ignored"] = int(
-            np.count_nonzero(found if self.mask is None else found & self.mask)
-        )
+        self.report.figures["ignored"] = self.counted(found if self.mask is None else found & self.mask)
         return found
 
     def usable(self, ignored: Selection) -> NDArray[np.bool_]:

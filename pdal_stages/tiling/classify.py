@@ -18,7 +18,7 @@ from ..pipeline.classifying import ClassifyRequest
 from ..pipeline.ends import input_files, is_ept, is_folder, is_las, outputs_of
 from ..pipeline.processes import each_file
 from ..pipeline.run import Pipeline
-from .outcome import FileJob, TiledRun, TileJob
+from .outcome import FileJob, TiledRun, TileJob, left_alone
 from .settings import TilingOptions
 from .sizing import fits_whole
 from .tiledrun import run_plan
@@ -203,16 +203,6 @@ def classify_file(
         write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
     reports = [each[-1].figures for _, each in pipeline.reports if each]
     classes = {int(code): n for one in reports for code, n in one.get("classes", {}).items()}
-    counts = {key: one[key] for one in reports for key in LEFT_ALONE if one.get(key)}
+    counts = left_alone(reports)
     messages = [*(f"PDAL says: {line}" for line in pipeline.log_lines), *pipeline.messages]
     return Written(target, count, classes, counts, messages, pipeline.metadata)
-
-
-#: Points that did not get a class from the classifier, or another one, by their names in reports.
-LEFT_ALONE = {
-    "rejected": "rejected as unreliable",
-    "ignored": "left out: noise, withheld (ignore)",
-    "kept": "class kept (keep)",
-    "outside_where": "outside where",
-    "changed": "mended by rules (consistency)",
-}

@@ -21,8 +21,8 @@ from ..base.plain import one_line, print_messages
 from ..pipeline.ends import is_ept, is_folder, is_las
 from ..pipeline.read import PipelineSource
 from ..pipeline.run import Pipeline
-from .classify import LEFT_ALONE, ClassifyTask, Written
-from .outcome import InterruptedRun, TiledRun
+from .classify import ClassifyTask, Written
+from .outcome import LEFT_ALONE, InterruptedRun, TiledRun
 from .settings import PER, TilingOptions
 from .tiledrun import run_tiled
 from .tileplan import make_plan
@@ -161,6 +161,8 @@ def _end(options: argparse.Namespace, run: TiledRun, again: str) -> int:
 def classify(task: ClassifyTask, options: argparse.Namespace) -> int:
     """Run ``pdal-stages classify``; the exit code, 1 where anything failed."""
     _check_reports(options)
+    if not task.can_be_cut:
+        _refuse_tiles(task, options)
     names = {code: one_line(name) for code, name in task.request.loaded.classes}
     if options.dry_run and (task.in_one_piece() or not task.can_be_cut):
         task.request.pipeline(
@@ -193,7 +195,7 @@ def classify(task: ClassifyTask, options: argparse.Namespace) -> int:
         _print_dry(run)
     else:
         _print(run, "files" if run.outputs else "")
-        _print_classes(done, names)
+        _print_classes(done, names, run.summary["left_alone"])
     return _end(options, run, _again(options) if interrupted else "")
 
 
@@ -204,15 +206,24 @@ def _again(options: argparse.Namespace) -> str:
     return f"{same} --resume"
 
 
-def _classify_each(task: ClassifyTask, options: argparse.Namespace, names: Mapping[int, str]) -> int:
-    """Inputs of which parts cannot be read, one after the other."""
-    for flag in ("resume", "report", "scheduler"):
-        if getattr(options, flag):
+def _refuse_tiles(task: ClassifyTask, options: argparse.Namespace) -> None:
+    """Flags that mean nothing for inputs of which parts cannot be read."""
+    asked = {
+        flag: getattr(options, flag) not in (None, False, "", "auto", [])
+        for flag in ("tile", "memory", "per", "scheduler", "buffer", "resume", "report")
+    }
+    asked["tile"] = options.tile is not None  # auto is a wish as well
+    for flag, used in asked.items():
+        if used:
             raise OptionError(
                 f"--{flag} needs inputs that can be cut into tiles: LAS, LAZ, COPC or EPT",
                 found=next(name for name in task.files if not is_las(name) and not is_ept(name)),
-                cure="Convert them first: pdal translate INPUT input.laz",
+                cure=f"Convert them first: pdal translate INPUT input.laz; or leave --{flag} out",
             )
+
+
+def _classify_each(task: ClassifyTask, options: argparse.Namespace, names: Mapping[int, str]) -> int:
+    """Inputs of which parts cannot be read, one after the other."""
     messages = _MessagesOnce()
     done: dict[str, Written] = {}
     failed: dict[str, str] = {}
@@ -290,10 +301,12 @@ def _shares(written: Written, names: Mapping[int, str]) -> str:
     return f"; {', '.join(shares)}" if shares else ""
 
 
-def _print_classes(done: Sequence[Written], names: Mapping[int, str]) -> None:
-    """The points of each class in all files together."""
+def _print_classes(
+    done: Sequence[Written], names: Mapping[int, str], more: Mapping[str, int] | None = None
+) -> None:
+    """The points of each class in all files together, and of those that got none; `more` of these are of all tiles."""
     classes: Counter[int] = Counter()
-    counts: Counter[str] = Counter()
+    counts: Counter[str] = Counter(more)
     for written in done:
         classes.update(written.classes)
         counts.update(written.counts)

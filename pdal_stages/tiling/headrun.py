@@ -20,6 +20,7 @@ from ..stages import registry
 from ..stages.base import Stage
 from .extract import Piece
 from .grid import Box, TileGrid
+from .outcome import left_alone
 from .results import PieceResults
 from .tileplan import INPUT, OUTSIDE, ROW, FirstRound, TilePlan
 
@@ -48,6 +49,7 @@ class HeadRun:
     results: list[PieceResults]
     need: float  #: the halo that it took, meters
     messages: list[str] = field(default_factory=list)  #: warnings and notes
+    left_alone: dict[str, int] = field(default_factory=dict)  #: of the tile's own points, see :mod:`.outcome`
 
 
 def run_head(
@@ -90,6 +92,7 @@ def run_head(
         ours_there = [(ours.stage, ours.place, ours.index) for ours in pipeline.lowered.ours]
         check_writers([*pipeline.lowered.stages, *plan.tail], ours_there)
         for ours in pipeline.lowered.ours:
+            ours.stage.own_points = OUTSIDE
             if ours.number == from_afar:
                 ours.stage.far_points = far_points
             if ours.number in reaches:
@@ -104,7 +107,9 @@ def run_head(
         most = max(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
         need = max(need, _far_neighbors(pipeline.arrays, most, context, tile))
     messages = [*(f"PDAL says: {line}" for line in pipeline.log_lines), *pipeline.messages]
-    return HeadRun(results, need, messages)
+    return HeadRun(
+        results, need, messages, left_alone(each[-1].figures for _, each in pipeline.reports if each)
+    )
 
 
 def run_first(context: RunContext, cuts: list[Piece], first: FirstRound) -> NDArray[np.float64]:

@@ -35,7 +35,7 @@ from ..pipeline.ends import input_files, outputs_of
 from ..pipeline.overrides import Override
 from ..pipeline.processes import each_file
 from ..pipeline.references import Reference, check_one_reference, reference_of
-from ..reports.objectlayers import check_target, object_layers, write_layers
+from ..reports.objectlayers import check_target, object_layers, target_files, write_layers
 from ..stages.objectoptions import refuse_unclassified
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter
 from .classify import ClassifyTask
@@ -64,7 +64,10 @@ def run_command(options: argparse.Namespace) -> int:
     check_target(options.output)
     inputs = input_files(options.inputs)
     more = [Output(options.metadata, "metadata", kinds.JSON)] if options.metadata else []
-    check_outputs([Output(options.output, "objects"), *more], [*inputs, *options.inputs])
+    check_outputs(
+        [*(Output(str(file), "objects") for file in target_files(options.output)), *more],
+        [*inputs, *options.inputs],
+    )
     return _write(inputs, stage, options.workers, options.resume, options.metadata)
 
 

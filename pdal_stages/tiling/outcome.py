@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ..base.version import __version__
 from .sources import InputSource
+
+#: Points that did not get a class from the classifier, or another one, by their names in the reports of stages.
+LEFT_ALONE = {
+    "rejected": "rejected as unreliable",
+    "ignored": "left out: noise, withheld (ignore)",
+    "kept": "class kept (keep)",
+    "outside_where": "outside where",
+    "changed": "mended by rules (consistency)",
+}
+
+
+def left_alone(reports: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+    """Their numbers, as the last stage says that counts them."""
+    return {key: one[key] for one in reports for key in LEFT_ALONE if one.get(key)}
 
 
 @dataclass(kw_only=True)
@@ -152,4 +167,9 @@ def summarize(tiles: list[TileJob], outputs: list[FileJob], seconds: float) -> d
         "peak_mb_of_a_worker": max((report.get("peak_mb", 0.0) for report in reports), default=0.0),
         "states": {s: sum(job.state == s for job in tiles) for s in ("done", "kept", "failed")},
         "classes": dict(sorted(classes.items(), key=lambda item: int(item[0]))),
+        "left_alone": {
+            key: n
+            for key in LEFT_ALONE
+            if (n := sum(j.report.get("left_alone", {}).get(key, 0) for j in tiles))
+        },
     }

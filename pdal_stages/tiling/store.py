@@ -153,6 +153,10 @@ class Store:
         """Remember that a tile is done."""
         _keep(self._done(name), {**report, "fingerprint": mark}, "result")
 
+    def forget(self, name: str) -> None:
+        """A tile is to be done anew: what an earlier run noted of it must not be believed of a file made since."""
+        self._done(name).unlink(missing_ok=True)
+
     def finished(self, name: str) -> dict[str, Any] | None:
         """The report of a tile that is done, with its fingerprint; otherwise None."""
         return _read(self._done(name))

@@ -97,6 +97,7 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
         "dropped": own - sum(len(result.rows) for result in head.results),
         "classes": class_counts(head.results),
         "messages": head.messages,
+        "left_alone": head.left_alone,
     }
     return head.results, report
 
