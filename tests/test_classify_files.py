@@ -180,8 +180,51 @@ def test_the_same_is_said_once(folder, classify, tmp_path, workers):
     assert len(assumed) == 2 and assumed[1].startswith("pdal-stages: also ") and assumed[1].count(".txt") == 2
     assert files_in(tmp_path, "o_*") == ["o_t0.laz", "o_t1.laz", "o_t2.laz"]
     assert sum("o_t" in line for line in out.splitlines()) == 3
-    code, _, err = classify(tmp_path / "*.txt", tmp_path / "o_#.laz", "--resume")
-    assert code == 1 and "--resume needs inputs that can be cut" in err
+
+
+@pytest.mark.parametrize("many", [False, True])
+@pytest.mark.parametrize(
+    "words",
+    [
+        "--resume",
+        "--tile 50",
+        "--tile auto",
+        "--memory 1GB",
+        "--per tile",
+        "--report r.json",
+        "--tile 50 --dry-run",
+    ],
+)
+def test_flags_of_tiles_are_refused_where_nothing_can_be_cut(folder, classify, tmp_path, words, many):
+    rows = laspy.read(folder / "in" / "t0.laz").xyz
+    for number in range(1 + many):
+        np.savetxt(tmp_path / f"t{number}.txt", rows, delimiter=",", header="X,Y,Z", comments="")
+    code, _, err = classify(tmp_path / "*.txt", tmp_path / "o_#.laz", *words.split())
+    assert code == 1 and f"{words.split()[0]} needs inputs that can be cut" in err and "t0.txt" in err
+    assert "pdal translate" in err and not files_in(tmp_path, "o_*")
+
+
+def test_tiles_say_what_was_left_alone_as_one_piece_does(folder, classify, tmp_path, write_las):
+    """Points without a class from the model, or with one mended: each once, although tiles overlap."""
+    las = laspy.read(folder / "in" / "t0.laz")
+    codes = np.array(las.classification)
+    codes[::9], codes[1::11] = 7, 12
+    arrays = {"X": las.x, "Y": las.y, "Z": las.z, "Classification": codes}
+    source = write_las(tmp_path / "in.las", arrays, point_format=6)
+    options = ("--where", "X < 25", "--filters.modelclassifier.reject_below=0.97", "--no-noise")
+    said = []
+    for words in ((), ("--tile", "10"), ("--tile", "10", "--per", "tile")):
+        place = tmp_path / "out"
+        place.mkdir(exist_ok=True)
+        code, out, err = classify(source, place / ("#.laz" if words else "o.laz"), *options, *words)
+        assert code == 0, err
+        said.append(
+            [line for line in out.splitlines() if line.startswith("  ") and not line[:5].strip().isdecimal()]
+        )
+    assert said[0] == said[1] == said[2]
+    lines = "\n".join(said[0])
+    for text in ("rejected as unreliable", "left out: noise", "class kept (keep)", "outside where"):
+        assert text in lines, lines
 
 
 @pytest.mark.parametrize(

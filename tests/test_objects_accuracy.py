@@ -141,3 +141,59 @@ def test_delft_against_official_outlines(tmp_path, capsys, data_dir):
     figures = json.loads((tmp_path / "a.json").read_text())["buildings"]
     assert figures["covered"] >= 0.96 and figures["area"]["completeness"] >= 0.96
     assert figures["boundary"]["median"] <= 0.4
+
+
+def test_heights_of_trees_may_be_texts_of_numbers_or_missing(tmp_path):
+    from pdal_stages.reports.objectaccuracy import Things
+
+    spots = [shapely.Point(10 * n, 5) for n in range(4)]
+    path = write(
+        tmp_path / "t.gpkg", spots, "Point", "trees", height=np.array(["12.5", "", "nan", "7"], object)
+    )
+    np.testing.assert_array_equal(Things(path).trees[1], [12.5, np.nan, np.nan, 7])
+    path = write(tmp_path / "u.gpkg", spots, "Point", "trees", h_m=[1, 2, 3, 4])
+    assert np.isnan(Things(path).trees[1]).all()
+
+
+def test_a_tree_without_a_place_takes_its_height_along(tmp_path):
+    from pdal_stages.reports.objectaccuracy import Things
+
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"height": 3.0 * n},
+            "geometry": None if n == 1 else {"type": "Point", "coordinates": [n, n]},
+        }
+        for n in range(4)
+    ]
+    (tmp_path / "t.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    trees = Things(str(tmp_path / "t.geojson")).trees
+    np.testing.assert_array_equal(trees[0][:, 0], [0, 2, 3])
+    np.testing.assert_array_equal(trees[1], [0, 6, 9])
+
+
+@pytest.mark.parametrize("bad", ["12,5 m", "tall", "[1]"])
+def test_heights_that_are_none(tmp_path, capsys, bad):
+    spots = [shapely.Point(0, 0), shapely.Point(9, 9)]
+    one = write(tmp_path / "one.gpkg", spots, "Point", "trees", height=[4.0, 5.0])
+    two = write(tmp_path / "two.gpkg", spots, "Point", "trees", height=np.array(["5", bad], object))
+    assert cli.main(["accuracy", one, "--objects", two]) == 1
+    said = capsys.readouterr().err
+    assert "the column 'height' must hold heights" in said and bad in said and "two.gpkg" in said
+
+
+def test_a_damaged_file_of_objects_is_told(tmp_path, capsys):
+    shapes = [shapely.box(10 * n, 0, 10 * n + 8, 8) for n in range(400)]
+    good, bad = write(tmp_path / "good.gpkg", shapes), tmp_path / "bad.gpkg"
+    data = bytearray((tmp_path / "good.gpkg").read_bytes())
+    at = data.find(shapely.to_wkb(shapes[200])[:9])
+    assert at > 0
+    data[at + 1 : at + 5] = b"\xff\xff\xff\x7f"  # no kind of geometry
+    bad.write_bytes(data)
+    assert cli.main(["accuracy", good, "--objects", str(bad)]) in (0, 1)
+    said = capsys.readouterr().err
+    assert "Traceback" not in said and "report it" not in said
+    bad.write_bytes(data[: len(data) // 2])
+    assert cli.main(["accuracy", good, "--objects", str(bad)]) == 1
+    said = capsys.readouterr().err
+    assert "bad.gpkg" in said and "Traceback" not in said and "report it" not in said

@@ -221,3 +221,51 @@ def test_classify_goes_on_to_objects(folder, tmp_path, capsys):
     (tmp_path / "0.laz").unlink()
     assert cli.main([*command, "--objects", str(tmp_path / "town.txt")]) == 1
     assert "ends in .gpkg" in capsys.readouterr().err and not (tmp_path / "0.laz").exists()
+
+
+@pytest.mark.pdal
+@pytest.mark.parametrize("ending", ["geojson", "fgb", "shp"])
+def test_layers_are_written_all_or_none_and_nothing_older_is_left(folder, tmp_path, ending, capsys):
+    target, names = tmp_path / f"t.{ending}", [f"t_{name}.{ending}" for name in LAYERS]
+    old = tmp_path / f"t_decks.{ending}"
+    job = [str(folder / "parts" / "0.laz"), {"type": "writers.objects", "filename": str(target)}]
+    stage = Pipeline(job).lowered.ours[0].stage
+    assert [output.path for output in stage.outputs()] == [str(tmp_path / name) for name in names]
+    old.write_text("of an earlier run")
+    Pipeline(job).execute(arrays=False)
+    assert not capsys.readouterr().err
+    assert {path.name for path in tmp_path.glob(f"*.{ending}")} == set(names)
+    assert len(layer(old)[1]) == 0  # there are none here
+    kept = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    later = tmp_path / f"t_spans.{ending}"
+    later.unlink()
+    later.mkdir()
+    with pytest.raises(StageError, match="names a folder"):
+        Pipeline(job).execute(arrays=False)
+    assert cli.main(["objects", job[0], str(target)]) == 1
+    assert "names a folder" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in tmp_path.iterdir() if path != later} == {
+        path: data for path, data in kept.items() if path != later
+    }
+
+
+@pytest.mark.pdal
+def test_one_layer_that_fails_leaves_none(folder, tmp_path, monkeypatch):
+    from pdal_stages.reports import objectlayers
+
+    real = objectlayers._write
+
+    def failing(path, name, *rest):
+        if name == "spans":
+            raise StageError("objects could not be written", found="disk")
+        real(path, name, *rest)
+
+    monkeypatch.setattr(objectlayers, "_write", failing)
+    with pytest.raises(StageError, match="could not be written"):
+        Pipeline(
+            [
+                str(folder / "parts" / "0.laz"),
+                {"type": "writers.objects", "filename": str(tmp_path / "t.shp")},
+            ]
+        ).execute(arrays=False)
+    assert not list(tmp_path.iterdir())

@@ -203,3 +203,23 @@ def test_water_of_delft_on_the_command_line(tmp_path, capsys, data_dir):
     assert not (codes[~at] == 9).any() and not (codes[at] == 2).any()
     assert main([*words, "--where", "Classification == 1"]) == 1
     assert "--where by Classification cannot be combined with --polygons" in capsys.readouterr().err
+
+
+def test_what_cannot_be_read_after_the_check_is_an_error_of_ours(tmp_path, monkeypatch):
+    """A file that goes, or is damaged, between the check and the points; geometries that GEOS refuses."""
+    path = write(tmp_path / "lake.gpkg", [LAKE])
+    stage = Polygons({"polygons": [f"{path}=9"]})
+    points = stage.points(cloud(), wkt=pyproj.CRS(RD).to_wkt("WKT1_GDAL"))
+    real = overlays.vector("shapely").from_wkb
+
+    def broken(*_):
+        raise shapely.errors.GEOSException("ParseException: Unknown WKB type 99")
+
+    monkeypatch.setattr(shapely, "from_wkb", broken)
+    with pytest.raises(StageError, match=r"lake.gpkg: the vector file cannot be read.*GEOSException"):
+        stage.run(points)
+    monkeypatch.setattr(shapely, "from_wkb", real)
+    monkeypatch.setattr(Overlay, "check", lambda self: "lake")
+    (tmp_path / "lake.gpkg").write_bytes(b"no GeoPackage any more")
+    with pytest.raises(StageError, match=r"lake.gpkg: the vector file cannot be read"):
+        stage.run(points)

@@ -21,7 +21,7 @@ from .refinement import RefinedForest, trust
 from .sampling import Samples
 from .trainoptions import TrainingOptions
 
-__all__ = ["Below", "on_top", "trust"]
+__all__ = ["Below", "held_by_base", "on_top", "trust"]
 
 
 class Below:
@@ -44,7 +44,7 @@ class Below:
         context, o, samples = Context(tuple(self.options.context)), self.options, self.samples
         classes = [*map(len, self.base.codes_of), len(self.base.classes)]
         out = np.empty((len(samples), len(context.tokens) * len(self.base.classes)), np.float32)
-        factors = [*(array(one.get("factors")) for one in self.base.info["passes"]), None]
+        factors = [*(_array(one.get("factors")) for one in self.base.info["passes"]), None]
         factors[len(self.base.passes) - 1] = self.base.factors
         with Progress(len(samples), "what the base says", enabled=self._progress) as bar:
             for number, cloud in enumerate(self._clouds):
@@ -109,7 +109,7 @@ def held_by_base(below: Below, codes: Sequence[int]) -> dict[str, list[int]]:
     return out
 
 
-def array(given: Any) -> npt.NDArray[np.float64] | None:
+def _array(given: Any) -> npt.NDArray[np.float64] | None:
     """Numbers of a manifest, or None."""
     return None if given is None else np.array(given)
 

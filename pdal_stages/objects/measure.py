@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -58,7 +59,7 @@ class Body(NamedTuple):
         return float(np.median(known)) if known.size else math.nan
 
 
-def judged(reasons: list[object]) -> dict[str, object]:
+def judged(reasons: Sequence[object]) -> dict[str, object]:
     """The verdict that follows from reasons to check."""
     return {"verdict": CHECK if reasons else SURE, "reason": ", ".join(map(str, reasons))}
 

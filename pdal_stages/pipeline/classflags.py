@@ -32,15 +32,19 @@ _TAKE_OFF = f"""\
 import sys
 def stage(ins, outs):
     both = ins["Classification"]
-    waiting = sys.__dict__.setdefault("_pdal_stages_flags", {{}}).setdefault(pdalargs["pair"], [])
-    waiting.append(both & {0xFF ^ LEGACY_LIMIT} if pdalargs["wanted"] else None)
+    if pdalargs["wanted"]:
+        waiting = sys.__dict__.setdefault("_pdal_stages_flags", {{}}).setdefault(pdalargs["pair"], [])
+        waiting.append(both & {0xFF ^ LEGACY_LIMIT})
     outs["Classification"] = both & {LEGACY_LIMIT}
     return True
 """
 _PUT_BACK = """\
 import sys
 def stage(ins, outs):
-    outs["Classification"] = ins["Classification"] | sys._pdal_stages_flags[pdalargs["pair"]].pop(0)
+    waiting = sys._pdal_stages_flags[pdalargs["pair"]]
+    outs["Classification"] = ins["Classification"] | waiting.pop(0)
+    if not waiting:
+        del sys._pdal_stages_flags[pdalargs["pair"]]
     return True
 """
 _LABEL = "pdal_stages_class_flags"

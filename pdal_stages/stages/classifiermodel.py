@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
@@ -176,7 +177,7 @@ holds the classes.
         """The trainer's options."""
         values = {name: value for name, value in self.options.items() if name in _TRAINING}
         for name in ("trees", "max_depth", "min_samples_leaf"):
-            numbers = [int(v) if str(v).strip().lstrip("-").isdecimal() else v for v in values[name]]
+            numbers = [int(v) if re.fullmatch(r"\s*-?[0-9]+\s*", str(v)) else v for v in values[name]]
             values[name] = numbers[0] if len(numbers) == 1 else numbers
         values["max_features"] = _number(values["max_features"])
         if self.automatic:

@@ -40,7 +40,10 @@ def run_all(
         If the first tiles all fail for one reason.
     """
     jobs = work.jobs
-    waiting: deque[TileJob | FileJob] = deque(job for job in jobs if job.state == "waiting")
+    to_do = [job for job in jobs if job.state == "waiting"]
+    for job in to_do:
+        store.forget(job.name)
+    waiting: deque[TileJob | FileJob] = deque(to_do)
     done = good = sum(job.state == "kept" for job in jobs)
     failures: list[str] = []
     users: dict[tuple[int, int], list[FileJob]] = {}
@@ -150,6 +153,7 @@ def run_first_round(work: Worklist, store: Store, pool: Pool, retries: int, show
             or known["fingerprint"] != mark
             or not os.path.exists(store.left(by_tile[tile].name))
         ):
+            store.forget(_name(by_tile[tile].name))
             waiting.append(_Item(by_tile[tile], mark))
     context = work.context(store, pool.threads)
 

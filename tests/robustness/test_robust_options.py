@@ -97,6 +97,8 @@ WRONG = [
     ("unknown strategy", TRAIN, {"filename": "m", "strategy": "multi"}, ["must be one of", "Did you mean"]),
     ("no trees", TRAIN, {"filename": "m", "trees": 0}, ["'trees'", "0"]),
     ("half a tree", TRAIN, {"filename": "m", "trees": 1.5}, ["'trees'", "1.5"]),
+    ("trees less than none twice", TRAIN, {"filename": "m", "trees": "--5"}, ["'trees'", "--5"]),
+    ("depth in superscript", TRAIN, {"filename": "m", "max_depth": "\u00b2"}, ["'max_depth'"]),
     (
         "no samples",
         TRAIN,
