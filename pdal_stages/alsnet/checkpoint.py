@@ -1,97 +1,80 @@
-"""A training's state in one file of plain data: weights, the best ones, the optimizer's moments, the curve.
+"""A training's state in one file of PyTorch's own: tensors by name, and the rest as JSON text.
 
-A zip of one JSON member and ``.npy`` arrays. Nothing is unpickled; sizes are known from the network before
-anything is unpacked, and whatever does not fit them is refused.
+It is read with ``weights_only``: nothing in it is executed. Tensors are taken only where name, type and shape are those
+of the network at hand, and none of the file is compressed, so it cannot grow while it is read.
 """
 
 from __future__ import annotations
 
 import io
 import json
-import math
 import os
+import pickle
 import zipfile
-import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-import numpy.typing as npt
 
 from ..base import strictjson
 from ..base.errors import ModelError
 from ..base.files import write_whole
-from ..classifier.arrays import ArrayRule, from_bytes, to_bytes
 
-FORMAT = "pdal-stages alsnet checkpoint 1"
-STATE = "state.json"
-_STATE_LIMIT = 16 << 20
+FORMAT = "pdal-stages alsnet checkpoint 2"
 _CURE = "Delete the checkpoint to begin anew, or name another file"
 
 
-def save(path: str | os.PathLike, state: dict[str, Any], arrays: dict[str, npt.NDArray[np.float32]]) -> None:
+def save(path: str | os.PathLike, state: dict[str, Any], tensors: Mapping[str, Any]) -> None:
     """Write a checkpoint, whole or not at all; `state` can be written as JSON and has an ``identity``."""
+    import torch
+
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        members = {STATE: json.dumps({"format": FORMAT, **state}, allow_nan=False).encode()}
-        members |= {f"{name}.npy": to_bytes(array) for name, array in arrays.items()}
-        for name, data in members.items():
-            archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), data)
+    text = json.dumps(state, allow_nan=False)
+    torch.save({"format": FORMAT, "state": text, "tensors": dict(tensors)}, buffer)
     write_whole(path, buffer.getvalue())
 
 
 def load(
-    path: str | os.PathLike, identity: dict[str, Any], shapes: dict[str, tuple[int, ...]]
-) -> tuple[dict[str, Any], dict[str, npt.NDArray[np.float32]]]:
-    """Read a checkpoint of this very training: of the same options, classes and data, with arrays of these shapes.
+    path: str | os.PathLike, identity: dict[str, Any], like: Mapping[str, Any]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read a checkpoint of this very training: of the same options, classes and data, with tensors as those of `like`.
 
     Raises
     ------
     ModelError
         It is damaged, hostile, or of another training; the message says what differs.
     """
+    import torch
+
     try:
-        with zipfile.ZipFile(Path(path)) as archive:
-            infos = {info.filename: info for info in archive.infolist()}
-            expected = {STATE, *(f"{name}.npy" for name in shapes)}
-            if STATE not in infos or infos[STATE].file_size > _STATE_LIMIT:
-                raise ModelError("this is not a checkpoint")
-            state = strictjson.loads(_read(archive, infos[STATE]))
-            if not isinstance(state, dict) or state.get("format") != FORMAT:
-                raise ModelError("this is not a checkpoint of this release")
-            _same(state.get("identity"), identity)
-            if set(infos) != expected or len(archive.infolist()) != len(expected):
-                raise ModelError("the checkpoint's arrays are not the network's")
-            arrays = {}
-            for name, shape in shapes.items():
-                info = infos[f"{name}.npy"]
-                if info.file_size > 4 * math.prod(shape) + 1024:
-                    raise ModelError("an array is larger than the network's", found=name)
-                array = from_bytes(_read(archive, info), ArrayRule(("<f4",), len(shape)), name)
-                if array.shape != shape or not np.isfinite(array).all():
-                    raise ModelError(
-                        "an array of the checkpoint does not fit the network or is not finite",
-                        found=f"{name} {array.shape}",
-                    )
-                arrays[name] = array
+        data = Path(path).read_bytes()
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
+                raise ModelError("the checkpoint is compressed, as none of ours is")
+        found = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+        if not isinstance(found, dict) or found.get("format") != FORMAT:
+            raise ModelError("this is not a checkpoint of this release")
+        state = strictjson.loads(str(found["state"]).encode())
+        _same(state["identity"], identity)
+        tensors = found["tensors"]
+        if set(tensors) != set(like):
+            raise ModelError("the checkpoint's tensors are not the network's")
+        for name, wanted in like.items():
+            one = tensors[name]
+            fits = isinstance(one, torch.Tensor) and one.layout == torch.strided and one.dtype == wanted.dtype
+            if not (fits and one.shape == wanted.shape and bool(torch.isfinite(one).all())):
+                raise ModelError("a tensor does not fit the network or is not finite", found=name)
     except ModelError as error:
         error.cure = error.cure or _CURE
         raise error.at(str(path)) from None
-    except (zipfile.BadZipFile, OSError, ValueError, KeyError, RuntimeError, NotImplementedError, EOFError,
-            RecursionError, zlib.error) as error:  # fmt: skip
+    except (pickle.UnpicklingError, zipfile.BadZipFile, OSError, ValueError, KeyError, TypeError, AttributeError,
+            RuntimeError, NotImplementedError, EOFError, RecursionError, MemoryError) as error:  # fmt: skip
         raise ModelError(
             "the checkpoint cannot be read",
             where=str(path),
-            found=f"{type(error).__name__}: {error}"[:200],
+            found=f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"[:200],
             cure=_CURE,
         ) from error
-    return state, arrays
-
-
-def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
-    if info.compress_type != zipfile.ZIP_STORED:
-        raise ModelError("a member has an unsupported compression", found=repr(info.filename)[:60])
-    return archive.read(info)
+    return state, tensors
 
 
 def _same(found: Any, wanted: dict[str, Any]) -> None:

@@ -27,6 +27,9 @@ from .networkoptions import NetworkOptions
 from .pyramid import stack
 from .weights import Weights, check, fresh
 
+#: What Adam keeps of each parameter.
+_MOMENTS = ("step", "exp_avg", "exp_avg_sq")
+
 
 @dataclass(frozen=True, eq=False)
 class LabeledCloud:
@@ -136,7 +139,6 @@ class _Session:
         self.curve: list[dict[str, Any]] = []
         self.best: Weights = self.network.dump()
         self.best_epoch = 0
-        self.steps = 0
 
     # ---- the whole -----------------------------------------------------------------------------------------
 
@@ -242,7 +244,6 @@ class _Session:
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self.optimizer.step()
-        self.steps += 1
         return value
 
     def _validate(self, bar: Progress) -> dict[str, Any]:
@@ -294,60 +295,43 @@ class _Session:
             ],
         }
 
-    def _shapes(self) -> dict[str, tuple[int, ...]]:
-        shapes = self.options.configuration.shapes(len(self.inputs), self.n_classes)
-        out: dict[str, tuple[int, ...]] = {
-            f"{kind}.{name}": s for kind in ("now", "best") for name, s in shapes.items()
-        }
+    def _tensors(self) -> dict[str, Any]:
+        """All that training changes: the network, the best weights so far, the moments of Adam."""
+        torch = self.torch
+        out = {f"network.{name}": tensor for name, tensor in self.network.state_dict().items()}
+        out |= {f"best.{name}": torch.from_numpy(array) for name, array in self.best.items()}
         for name, parameter in self.network.named_parameters():
-            out[f"first.{name}"] = out[f"second.{name}"] = tuple(parameter.shape)
+            moments = self.optimizer.state.get(parameter) or {}
+            for key in _MOMENTS:
+                none = torch.tensor(0.0) if key == "step" else torch.zeros_like(parameter)
+                out[f"adam.{name}.{key}"] = moments.get(key, none).detach()
         return out
 
     def _save(self, path: str) -> None:
-        arrays = {f"now.{name}": array for name, array in self.network.dump().items()}
-        arrays |= {f"best.{name}": array for name, array in self.best.items()}
-        for name, parameter in self.network.named_parameters():
-            state = self.optimizer.state.get(parameter, {})
-            for kind, key in (("first", "exp_avg"), ("second", "exp_avg_sq")):
-                value = state.get(key, self.torch.zeros_like(parameter))
-                arrays[f"{kind}.{name}"] = value.detach().cpu().numpy()
-        state = {
-            "identity": self._identity(),
-            "curve": self.curve,
-            "best_epoch": self.best_epoch,
-            "steps": self.steps,
-        }
-        checkpoint.save(path, state, arrays)
+        state = {"identity": self._identity(), "curve": self.curve, "best_epoch": self.best_epoch}
+        checkpoint.save(path, state, self._tensors())
 
     def _resume(self, path: str) -> None:
-        state, arrays = checkpoint.load(path, self._identity(), self._shapes())
+        state, tensors = checkpoint.load(path, self._identity(), self._tensors())
         curve: Any = state.get("curve")
         best: Any = state.get("best_epoch")
-        steps: Any = state.get("steps")
         needed = {"epoch", "loss"} | ({"mean_f1"} if self.held_batches else set())
         good = isinstance(curve, list) and all(isinstance(row, dict) and needed <= set(row) for row in curve)
         good = good and all(isinstance(row[key], int | float | None) for row in curve for key in needed)
-        good = good and isinstance(steps, int) and steps >= 0
         if not (good and isinstance(best, int) and 0 <= best <= len(curve)):
             raise ModelError(
                 "the checkpoint's state is not right", where=path, cure="Delete it to begin anew"
             )
-        shapes = self.options.configuration.shapes(len(self.inputs), self.n_classes)
-        weights = {kind: {name: arrays[f"{kind}.{name}"] for name in shapes} for kind in ("now", "best")}
-        for part in weights.values():
-            check(part, self.options.configuration, len(self.inputs), self.n_classes)
-        self.network.load(weights["now"]).to(self.device)
-        self.best, self.best_epoch, self.steps, self.curve = weights["best"], best, steps, curve
+        self.network.load_state_dict({name: tensors[f"network.{name}"] for name in self.network.state_dict()})
+        self.best = {name: tensors[f"best.{name}"].numpy() for name in self.best}
+        for weights in (self.best, self.network.dump()):
+            check(weights, self.options.configuration, len(self.inputs), self.n_classes)
+        self.best_epoch, self.curve = best, curve
         for name, parameter in self.network.named_parameters():
-            if steps:
-                self.optimizer.state[parameter] = {
-                    "step": self.torch.tensor(float(steps)),
-                    "exp_avg": self._tensor(arrays[f"first.{name}"]),
-                    "exp_avg_sq": self._tensor(arrays[f"second.{name}"]),
-                }
-
-    def _tensor(self, array):
-        return self.torch.from_numpy(np.array(array)).to(self.device)
+            moments = {key: tensors[f"adam.{name}.{key}"] for key in _MOMENTS}
+            self.optimizer.state[parameter] = {
+                key: moment if key == "step" else moment.to(self.device) for key, moment in moments.items()
+            }
 
     # ---- for the manifest ----------------------------------------------------------------------------------
 

@@ -35,7 +35,7 @@ def kind_of(path: str | os.PathLike) -> str:
             return kind
     if head.startswith(b"PK\x03\x04"):
         first = head[30 : 30 + int.from_bytes(head[26:28], "little")]
-        return {b"manifest.json": MODEL, b"state.json": CHECKPOINT}.get(first, "a zip archive")
+        return {b"manifest.json": MODEL, b"archive/data.pkl": CHECKPOINT}.get(first, "a zip archive")
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip().lower()
     if text.startswith((b"<!doctype html", b"<html")):
         return HTML
