@@ -12,9 +12,8 @@ import importlib
 import importlib.util
 import itertools
 import math
-import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.apart import apart
 from ..base.errors import DependencyError, StageError
 from .find import Table
 
@@ -39,8 +39,7 @@ _SLACK = 2.5
 
 
 def vector(name: str) -> Any:
-    """shapely or pyogrio; an error says how to get it, or that this process is none for it."""
-    _check_process(name)
+    """shapely, pyogrio or pyproj; an error says how to get it."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -71,34 +70,24 @@ def reading(path: str) -> Iterator[None]:
 _SYMBOLS = {"shapely": ("GEOS", "GEOSversion"), "pyogrio": ("GDAL", "GDALVersionInfo")}
 
 
-def _check_process(name: str) -> None:
-    """Refuse a package with a library of its own in a program that is linked to another one.
+def with_vector(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function that uses the extra ``vector``, in a process apart where its libraries clash with the program's.
 
-    On Linux, what the program itself is linked to comes first for all that it loads: the package would call functions of
-    the program's library beside those of its own, and crash. Python is linked to neither, and what it loads sees its own.
+    On Linux, what the program itself is linked to comes first for all that it loads: a package with a GEOS or GDAL of its
+    own would call functions of the program's library beside those of its own, and crash. So it is in the program `pdal`;
+    Python is linked to neither, and what it loads sees its own.
     """
-    if name not in _SYMBOLS or not sys.platform.startswith("linux"):
-        return
+    return apart(function, *arguments) if any(map(_clashes, _SYMBOLS)) else function(*arguments)
+
+
+def _clashes(name: str) -> bool:
+    """Whether a package brings a library which the program is linked to as well."""
     library, symbol = _SYMBOLS[name]
-    if not hasattr(ctypes.CDLL(None), symbol):
-        return
+    if not sys.platform.startswith("linux") or not hasattr(ctypes.CDLL(None), symbol):
+        return False
     found = importlib.util.find_spec(name)
     places = found.submodule_search_locations if found is not None else None
-    own = [file for place in places or () for file in Path(place + ".libs").glob(f"lib{library.lower()}*")]
-    if own:
-        raise DependencyError(
-            f"{name} brings a {library} of its own, and this program has another one: together they crash",
-            found=f"{own[0].name} in {_program()}",
-            cure="Run the pipeline by pdal-stages pipeline, or from Python; of points that are written already, "
-            "pdal-stages objects makes objects",
-        )
-
-
-def _program() -> str:
-    try:
-        return os.readlink("/proc/self/exe")
-    except OSError:
-        return sys.executable
+    return any(any(Path(place + ".libs").glob(f"lib{library.lower()}*")) for place in places or ())
 
 
 def raw_outlines(table: Table, size: float, *, hole: float = SMALLEST_HOLE) -> list[Any]:

@@ -98,6 +98,18 @@ def _may_hold_polygons(kind: str | None) -> bool:
     )
 
 
+def inside_of(
+    overlay: Overlay,
+    wkt: str,
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    box: tuple[float, float, float, float],
+) -> tuple[NDArray[np.bool_], int, str]:
+    """Which points (n,) lie inside an overlay's polygons near a box, how many these are, and what the user should know."""
+    shapes, note = polygons_of(overlay, wkt, box)
+    return points_inside(x, y, shapes), len(shapes), note
+
+
 def polygons_of(overlay: Overlay, wkt: str, box: tuple[float, float, float, float]) -> tuple[list[Any], str]:
     """Polygons near a box, in the reference system of `wkt`, as the box is; and what the user should know.
 

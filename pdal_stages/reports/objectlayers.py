@@ -155,6 +155,15 @@ def write_layers(path: str | Path, layers: dict[str, Layer], wkt: str = "") -> l
     return files
 
 
+def write_objects(
+    path: str, objects: Objects, straight: bool, units: Units | None, wkt: str
+) -> dict[str, Any]:
+    """Write all layers; how many objects each has, and the ``files``."""
+    layers = object_layers(objects, straight=straight, units=units)
+    files = write_layers(path, layers, wkt)
+    return {**{name: len(layer.shapes) for name, layer in layers.items()}, "files": [str(f) for f in files]}
+
+
 def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
     pyogrio, shapely = vector("pyogrio"), vector("shapely")
     options = {"layer": name} if driver == "GPKG" else {}

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
 from ..base.outputs import Output
 from ..objects import find_objects
+from ..objects.outlines import with_vector
 from .base import Stage
 from .objectoptions import ObjectOptions
 from .options import option
@@ -58,7 +57,7 @@ tell what is to be checked; beside other files lies a `.qml`. Needs the extra `v
         from ..reports.objectlayers import check_target
 
         self.check_classes()
-        check_target(self.filename)
+        with_vector(check_target, self.filename)
 
     def outputs(self) -> list[Output]:
         from ..reports.objectlayers import target_files
@@ -73,11 +72,10 @@ tell what is to be checked; beside other files lies a `.qml`. Needs the extra `v
             raise StageError(
                 "there are no points", cure="Check the reader's file and the filters before this stage"
             )
-        from ..reports.objectlayers import object_layers, write_layers
+        from ..reports.objectlayers import write_objects
 
         found = find_objects(self.cells(points), self.settings)
-        layers = object_layers(found, straight=self.outlines == STRAIGHT, units=points.units)
-        files = write_layers(self.filename, layers, points.wkt)
-        counts: dict[str, Any] = {name: len(layer.shapes) for name, layer in layers.items()}
-        points.report.figures |= counts | {"files": [str(file) for file in files]}
+        straight = self.outlines == STRAIGHT
+        figures = with_vector(write_objects, self.filename, found, straight, points.units, points.wkt)
+        points.report.figures |= figures
         return {}

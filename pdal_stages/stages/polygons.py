@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import OVERLAP
-from ..objects.overlay import Overlay, points_inside, polygons_of
+from ..objects.outlines import with_vector
+from ..objects.overlay import Overlay, inside_of
 from .base import Stage
 from .options import option
 from .points import Points
@@ -52,7 +53,7 @@ class a point has.
     def check(self) -> None:
         self.overlays = [Overlay.parse(str(one)) for one in self.polygons]
         for overlay in self.overlays:
-            overlay.check()
+            with_vector(overlay.check)
 
     def inputs(self) -> list[str]:
         return [overlay.file for overlay in self.overlays if "://" not in overlay.file]
@@ -72,12 +73,12 @@ class a point has.
         codes = points.class_codes.copy()
         counts, notes = {}, []
         for overlay in self.overlays:
-            shapes, note = polygons_of(overlay, points.wkt, box)
             may = np.flatnonzero(change & np.isin(codes, overlay.over) if overlay.over else change)
-            found = may[points_inside(x[may], y[may], shapes)]
+            inside, polygons, note = with_vector(inside_of, overlay, points.wkt, x[may], y[may], box)
+            found = may[inside]
             codes[found] = overlay.code
             name = f"{overlay.file}|layername={overlay.layer}" if overlay.layer else overlay.file
-            counts[f"{name}={overlay.code}"] = {"polygons": len(shapes), "points": len(found)}
+            counts[f"{name}={overlay.code}"] = {"polygons": polygons, "points": len(found)}
             notes += [note] if note else []
         points.report.figures["polygons"] = counts
         there, number = np.unique(codes[change], return_counts=True)

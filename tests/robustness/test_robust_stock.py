@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +13,6 @@ from stage_message import message_of
 
 import pdal_stages as ps
 from pdal_stages.objects import outlines
-from pdal_stages.pipeline import pdal as pdal_env
 
 pytestmark = pytest.mark.pdal
 HAG = {"type": "filters.hag_minima"}
@@ -78,23 +77,10 @@ def test_arrays_of_python_pdal(pdal_module):
     assert pdal
 
 
-@pytest.mark.parametrize("kind", ["writers.objects", "filters.polygons"])
-def test_two_libraries_of_one_kind_are_refused(tmp_path, pdal_program, cloud, kind):
-    """PDAL's GEOS and GDAL in its program, and those that Shapely and pyogrio of pip bring: it crashed."""
-    site = Path(pytest.importorskip("pyogrio").__file__).parents[1]
-    if not list(site.glob("pyogrio.libs/libgdal*")) or pdal_env.version() >= (2, 3, 0):
-        pytest.skip("needs Debian's PDAL, whose GDAL is not pyogrio's")
-    lakes = tmp_path / "lakes.geojson"
-    lakes.write_text('{"type": "FeatureCollection", "features": []}')
-    options = {"filename": str(tmp_path / "o.gpkg")} if "writers" in kind else {"polygons": f"{lakes}=9:all"}
-    plain = ps.Pipeline([str(cloud), {"type": kind, **options}]).json
-    stock(pdal_program, tmp_path, plain, "brings a GDAL of its own", "pdal-stages pipeline")
-
-
 def test_one_library_for_both_is_taken(monkeypatch):
     """As conda has it: the program's library is that of the packages."""
     pytest.importorskip("shapely")
     monkeypatch.setattr(outlines.ctypes, "CDLL", lambda _: SimpleNamespace(GEOSversion=None))
     spec = SimpleNamespace(submodule_search_locations=["/nowhere/shapely"])
     monkeypatch.setattr(outlines.importlib.util, "find_spec", lambda _: spec)
-    assert outlines.vector("shapely").__name__ == "shapely"
+    assert outlines.with_vector(os.getpid) == os.getpid()
