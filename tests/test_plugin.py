@@ -270,7 +270,7 @@ def test_polygons_in_the_program(pipeline, town, tmp_path):
     assert_same(tmp_path / "stock.laz", tmp_path / "ours.laz")
     assert np.count_nonzero(laspy.read(tmp_path / "ours.laz").classification == 9) > 100
     wrong = [str(town), {"type": "filters.polygons", "polygons": [f"{tmp_path / 'gone.gpkg'}=9"]}]
-    said = pipeline(las(wrong, tmp_path / "o.laz"), code=1)
+    said = pipeline(las(wrong, tmp_path / "o.laz"), code=1).stderr
     assert "filters.polygons: " in said and "the file of polygons does not exist" in said
     assert not (tmp_path / "o.laz").exists()
 
