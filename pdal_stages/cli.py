@@ -249,6 +249,13 @@ def _parser() -> argparse.ArgumentParser:
         "pdal-stages objects does",
     )
     takes(
+        "--bridges",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="Find bridge decks (17), which leave ground and buildings (filters.bridges), with models whose heights "
+        "filters.hag_morphological makes",
+    )
+    takes(
         "--consistency",
         action=argparse.BooleanOptionalAction,
         default=True,
@@ -480,6 +487,7 @@ def _classify(options: argparse.Namespace) -> int:
         options.where,
         named,
         noise=options.noise,
+        bridges=options.bridges,
         consistency=options.consistency,
         polygons=tuple(options.polygons),
     )

@@ -194,6 +194,7 @@ def test_what_is_declared_is_what_the_stage_has():
 
 STAGES = {
     "accuracy": {"type": "filters.accuracy", "reference": "Classification", "print": False},
+    "bridges": {"type": "filters.bridges", "code": 18},
     "consistency": {"type": "filters.consistency", "lone": False},
     "detachednoise": {"type": "filters.detachednoise"},
     "hag_minima": {"type": "filters.hag_minima", "cell": 10, "resolution": 0.25, "ignore": ["7", "withheld"]},
@@ -218,8 +219,10 @@ def test_no_stage_is_forgotten():
 @pytest.mark.parametrize("where", [None, "X > 500030 && Classification != 6"])
 def test_a_stage_gives_the_same_bytes(pipeline, town, tmp_path, name, where):
     stage = {**STAGES[name], **({"where": where} if where else {})}
-    heights = [{"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]}]
-    stages = [str(town), *(heights if name in ("objects", "consistency") else []), stage]
+    heights = [
+        {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17], "decks": name == "bridges"}
+    ]
+    stages = [str(town), *(heights if name in ("bridges", "objects", "consistency") else []), stage]
     pipeline(las(stages, tmp_path / "stock.laz"))
     ps.Pipeline(las(stages, tmp_path / "ours.laz")).execute()
     assert_same(tmp_path / "stock.laz", tmp_path / "ours.laz")

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+from ..base.asprs import BRIDGE
 from ..base.errors import ModelError, OptionError, suggest
 from ..models import STANDARD
 from ..stages import preparation, registry
@@ -17,6 +18,9 @@ from .filenames import LAS_WRITERS
 from .lowering import lower_stage
 from .overrides import Override
 from .run import Pipeline
+
+#: What finds bridge decks along with the heights.
+_DECKS = "filters.hag_morphological"
 
 #: Dimensions that are written beside the input's own.
 WRITTEN = ("HeightAboveGround", "Reliability")
@@ -38,6 +42,8 @@ class ClassifyRequest:
         Which of the dimensions made on the way are written beside the input's own; ``all`` and ``none`` are known.
     noise : bool
         Whether low and high noise is marked first.
+    bridges : bool
+        Whether bridge decks are found, where heights are made by ``filters.hag_morphological``.
     consistency : bool
         Whether classes that contradict their surroundings are mended at the end.
     polygons : tuple of str
@@ -49,6 +55,7 @@ class ClassifyRequest:
     where: str | None = None
     dimensions: tuple[str, ...] = WRITTEN
     noise: bool = True
+    bridges: bool = True
     consistency: bool = True
     polygons: tuple[str, ...] = ()
 
@@ -92,15 +99,31 @@ class ClassifyRequest:
                 "filters.modelclassifier, and the writer",
             )
         prepared = self.loaded.info.get("preparation") or preparation_of(self.loaded.required_dimensions)
+        if self._with_bridges:
+            # The last one's heights and flags are those that stay.
+            at = max(n for n, stage in enumerate(prepared) if stage["type"] == _DECKS)
+            prepared = [{**stage, "decks": True} if n == at else stage for n, stage in enumerate(prepared)]
         noise = [{"type": "filters.detachednoise", **self._inside}] if self.noise else []
         return [*noise, *prepared, self._classifier, *self._mending]
+
+    @cached_property
+    def _with_bridges(self) -> bool:
+        """Whether decks are looked for: not where the model knows bridges itself, or heights are made otherwise."""
+        known = {code for code, _ in self.loaded.classes}
+        made = self.loaded.info.get("preparation") or preparation_of(self.loaded.required_dimensions)
+        there = any(stage["type"] == _DECKS for stage in made)
+        return self.bridges and there and known >= {2, 6} and BRIDGE not in known and not self._by_class
+
+    @property
+    def _by_class(self) -> bool:
+        """Whether `where` asks for classes, which are others after the classifier."""
+        return "Classification" in (self.where or "")
 
     @property
     def _mending(self) -> list[dict[str, Any]]:
         """The rules at the end, for models whose classes they are of, and polygons over all."""
         known = {code for code, _ in self.loaded.classes}
-        by_class = "Classification" in (self.where or "")  # which means another one by then
-        if by_class and self.polygons:
+        if self._by_class and self.polygons:
             raise OptionError(
                 "--where by Classification cannot be combined with --polygons: the classes are new by then",
                 found=self.where,
@@ -109,7 +132,8 @@ class ClassifyRequest:
         settled = overridden(self._classifier, self.overrides)
         taken: dict[str, Any] = {name: settled[name] for name in ("ignore", "keep") if name in settled}
         wanted = {
-            "filters.consistency": self.consistency and known >= {2, 6} and not by_class,
+            "filters.bridges": self._with_bridges,
+            "filters.consistency": self.consistency and known >= {2, 6} and not self._by_class,
             "filters.polygons": bool(self.polygons),
         }
         stages = [{"type": kind, **taken, **self._inside} for kind, chosen in wanted.items() if chosen]

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import OptionError
+from ..terrain.decks import level_points
 from ..terrain.lowpoints import lowest_of_cells
 from ..terrain.morphological import check_sizes, filtered_ground, reach, reach_of_points
 from ..terrain.profile import opening_names
@@ -82,6 +83,12 @@ class HagMorphological(Stage):
         "HeightAboveOpening_5, ...",
         may_be_empty=True,
     )
+    decks: bool = option(
+        "boolean",
+        False,
+        "Also find bridge decks, which then are no ground, and write Deck: 1 on a deck, 2 its parapets, flanks and what "
+        "stands on it, else 0",
+    )
     details = """
 The lowest point of every cell of a grid is taken, pits (low outliers) left out, and the grid opened with windows of
 growing radius: a cell that a window lowers by more than `slope` times its radius, or by 3.5 m, belongs to an object.
@@ -96,6 +103,10 @@ anchored to absolute coordinates: a tile with its halo (about 580 m, less with a
 the whole cloud, bit for bit. Large buildings are removed up to 200 m; what lies far from all ground, such as
 the middle of a large hall, is measured from the openings' level. A point with no usable point near has height 0;
 metadata counts these as `without_terrain`.
+
+`decks` are surfaces one can walk on, at most 60 m wide, that end at a drop (or at water) on both sides and lead on to
+the ground at two opposite ends, or at one and the rim of the cloud: raised in the profile across, level in the profile
+along. With it, the surface runs through the ground below. Clouds of less than 2 points/m2 show too little of them.
 
 `openings` are heights above what remains of the minimum grid when everything narrower than the window is removed. They
 need no threshold and tell a classifier what a point stands on: low above the narrow window and high above the wide one
@@ -126,17 +137,22 @@ of Z.
             **({"Ground": "uint8_t"} if self.ground else {}),
             **({"Slope": "float"} if self.terrain_slope else {}),
             **dict.fromkeys(opening_names(self.windows), "float"),
+            **({"Deck": "uint8_t"} if self.decks else {}),
         }
 
     def halo_m(self) -> float:
-        return reach(cell=self.cell, window=self.window, openings=self.windows)
+        return reach(cell=self.cell, window=self.window, openings=self.windows, decks=self.decks)
 
     def near_halo_m(self) -> float:
         return reach_of_points(self.cell)
 
     def left_of(self, points: Points) -> NDArray[np.float64]:
         x, y, z = points.xyz.T
-        return points.xyz[lowest_of_cells(x, y, z, points.usable(self.ignore), self.cell)]
+        usable = points.usable(self.ignore)
+        left = lowest_of_cells(x, y, z, usable, self.cell)
+        if self.decks:
+            left = np.union1d(left, level_points(x, y, z, usable))
+        return points.xyz[left]
 
     def run(self, points: Points) -> dict[str, NDArray]:
         usable = points.usable(self.ignore)
@@ -155,6 +171,7 @@ of Z.
             scalar=self.scalar,
             openings=self.windows,
             slope_too=self.terrain_slope,
+            decks=self.decks,
             threads=self.threads,
             figures=points.report.figures,
         )

@@ -25,8 +25,18 @@ OF_PDAL = (
 )
 
 #: Options that say where in a pipeline a stage stands, how it is run, or in what units the points at hand are; not what
-#: it makes.
-_ASIDE = ("tag", "inputs", "user_data", "log", "threads", "where_merge", "horizontal_unit", "vertical_unit")
+#: it makes; and decks, which whoever applies a model looks for or not.
+_ASIDE = (
+    "decks",
+    "tag",
+    "inputs",
+    "user_data",
+    "log",
+    "threads",
+    "where_merge",
+    "horizontal_unit",
+    "vertical_unit",
+)
 #: Most stages of a preparation.
 _MOST = 8
 #: What to do about a file that asks for more.

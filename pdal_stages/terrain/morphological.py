@@ -9,7 +9,7 @@ point is ground if it lies within `threshold` plus `scalar` times the terrain's 
 * windows grow to the size of large halls, and a drop of a few meters is enough there (:mod:`.progressive`);
 * holes are left open, not painted over; a pyramid of planes carries the surface across them (:mod:`.planes`);
 * ground that openings took from ridges, dams and the upper side of walls is regained where it continues the surface;
-* what is higher than all around it on every side is no ground (:mod:`.plateaus`);
+* what is higher than all around it on every side is no ground (:mod:`.plateaus`), nor are bridges (:mod:`.decks`);
 * low outliers are told from ground under a canopy (:mod:`.lowest`).
 
 [P13] Pingel, Clarke, McBride (2013): An improved simple morphological filter for the terrain classification of
@@ -29,6 +29,8 @@ from ..base.errors import OptionError, StageError
 from ..base.jit import njit
 from ..base.threads import map_blocks
 from .columns import columns
+from .decks import BESIDE, CELL, find_decks
+from .decks import REACH as DECKS_REACH
 from .lowest import COMPANY, SURROUNDINGS, cell_values, lowest_points, pits
 from .lowpoints import HIGHEST
 from .minima import cell_numbers
@@ -66,6 +68,7 @@ def filtered_ground(
     scalar: float = 1.25,
     openings: Sequence[float] = (),
     slope_too: bool = False,
+    decks: bool = False,
     threads: int | None = None,
     figures: dict[str, Any] | None = None,
 ) -> dict[str, NDArray]:
@@ -89,6 +92,8 @@ def filtered_ground(
         Windows, in meters, of openings of the minimum grid above which heights are wanted too.
     slope_too : bool
         Whether the slope of the terrain is wanted.
+    decks : bool
+        Whether bridge decks are looked for, which then are no ground.
     threads : int, optional
         None or 0: every available core.
     figures : dict, optional
@@ -99,7 +104,8 @@ def filtered_ground(
     -------
     dict of str to ndarray, shape (n,)
         ``HeightAboveGround`` (float64), ``Ground`` (uint8, 1 where the filter calls a point ground), ``Slope``
-        (float64, degrees) and ``HeightAboveOpening_<window>`` (float32) on request. NaN where a coordinate is not
+        (float64, degrees), ``HeightAboveOpening_<window>`` (float32) and ``Deck`` (uint8: see :func:`.decks.find_decks`) on
+        request. NaN where a coordinate is not
         finite.
 
     Raises
@@ -126,12 +132,13 @@ def filtered_ground(
         **({"Slope": np.zeros(len(x))} if slope_too else {}),
         **{name: np.zeros(len(x), np.float32) for name in opening_names(openings)},
     }
+    deck = find_decks(x, y, z, use) if decks else np.zeros(len(x), np.uint8)
     if len(x):
         column, row = cell_numbers(x, cell), cell_numbers(y, cell)
         around = math.ceil(reach(cell=cell, window=window, openings=openings) / cell)
         for points, own in patches(column, row, around, _link(cell, window, openings)):
             found = _filter(
-                x[points], y[points], z[points], use[points], column[points], row[points], own,
+                x[points], y[points], z[points], use[points], deck[points], column[points], row[points], own,
                 cell=cell, slope=slope, window=window, threshold=threshold, scalar=scalar, openings=openings,
                 slope_too=slope_too, threads=threads, counts=counts,
             )  # fmt: skip
@@ -140,15 +147,19 @@ def filtered_ground(
     if figures is not None:
         figures["ground_points"] = int(np.count_nonzero(out["Ground"]))
         figures.update(counts, unused_points=int(len(finite) - np.count_nonzero(use)))
+    if decks:
+        out["Deck"] = deck
     if not all_finite:
         for name, values in out.items():
-            whole = np.full(len(finite), 0 if name == "Ground" else np.nan, values.dtype)
+            whole = np.full(len(finite), 0 if name in ("Ground", "Deck") else np.nan, values.dtype)
             whole[finite] = values
             out[name] = whole
     return out
 
 
-def reach(*, cell: float = 1.0, window: float = 75.0, openings: Sequence[float] = ()) -> float:
+def reach(
+    *, cell: float = 1.0, window: float = 75.0, openings: Sequence[float] = (), decks: bool = False
+) -> float:
     """How far away, in meters, points can change a point's results: the halo a tile needs.
 
     An opening looks twice its radius away, a plateau as far as it is wide; low outliers are judged before, and surfaces
@@ -157,7 +168,10 @@ def reach(*, cell: float = 1.0, window: float = 75.0, openings: Sequence[float] 
     radius = _largest_radius(cell, window, openings)
     near, far = (planes_reach(_levels(block, cell)) for block in (_NEAR, _FAR))
     before = COMPANY + SURROUNDINGS + 2 * radius + plateau_reach(cell)
-    return (before + (_ROUNDS + 1) * near + far + 2) * cell
+    found = before + (_ROUNDS + 1) * near  # in which decks are found apart
+    if decks:
+        found = max(found, math.ceil((DECKS_REACH + (BESIDE + 1) * CELL) / cell) + near)
+    return (found + far + 2) * cell
 
 
 def reach_of_points(cell: float) -> float:
@@ -208,7 +222,7 @@ def _levels(block: float, cell: float) -> int:
 
 
 def _filter(
-    x, y, z, use, column, row, own, *,
+    x, y, z, use, deck, column, row, own, *,
     cell, slope, window, threshold, scalar, openings, slope_too, threads, counts,
 ):  # fmt: skip
     """All of it on one raster round the points."""
@@ -221,6 +235,7 @@ def _filter(
     bad = pits(raster, cell)
     counts["pits"] += int(np.count_nonzero(bad) if isinstance(own, slice) else own[lowest[bad]].sum())
     raster[bad] = HOLE
+    on_deck = (deck != 0)[lowest] & (lowest >= 0)
     del lowest, bad
     radii = [opening_radius(size, cell) for size in openings]
     objects, floor, opened = objects_of(raster, cell, slope, _radius(window, cell), radii)
@@ -229,6 +244,9 @@ def _filter(
         planes = surface(ground, place, floor, raster, left, bottom, _levels(_NEAR, cell))
         _regain(ground, raster, place, planes, cell, threshold, scalar)
     remove_plateaus(ground, floor, raster, cell)
+    # The terrain runs below: no level of a deck stands for it either.
+    ground &= ~on_deck
+    raster[on_deck] = HOLE
     planes = surface(ground, place, floor, raster, left, bottom, _levels(_NEAR, cell))
     height, gradient = np.empty((2, len(x)))
 
@@ -242,7 +260,7 @@ def _filter(
         _heights(x[span], y[span], z[span], cell, left, bottom, planes, height[span], gradient[span])
 
     each(above)
-    is_ground = use & (np.abs(height) <= threshold + scalar * gradient)  # NaN is not
+    is_ground = use & (deck == 0) & (np.abs(height) <= threshold + scalar * gradient)  # NaN is not
     _means(x, y, z, is_ground, column, row, cell, left, bottom, ground, place)
     planes = surface(ground, place, floor, raster, left, bottom, _levels(_FAR, cell))
     each(above)

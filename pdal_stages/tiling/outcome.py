@@ -16,6 +16,7 @@ LEFT_ALONE = {
     "ignored": "left out: noise, withheld (ignore)",
     "kept": "class kept (keep)",
     "outside_where": "outside where",
+    "decks": "put on bridge decks (bridges)",
     "changed": "mended by rules (consistency)",
 }
 

@@ -1,0 +1,76 @@
+"""``filters.bridges``: class of bridge decks, which leave ground and buildings."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.asprs import BRIDGE, OVERLAP
+from ..terrain.decks import PARTS, SURFACE
+from .base import Stage
+from .options import option
+from .points import Points
+from .selection import UNWANTED, Selection
+
+#: What parapets, flanks and cars are called where they are taken for something that stands on the ground.
+_MISTAKEN = (2, 6)
+
+
+class Bridges(Stage):
+    type = "filters.bridges"
+    summary = "Give bridge decks their class, which leave ground and buildings"
+    where_chooses = True
+    where_help = "Points outside keep their class."
+    code: int = option("integer", BRIDGE, "Class code of bridge decks", minimum=0, maximum=255)
+    ignore: Selection = option(
+        "selection",
+        UNWANTED,
+        "Points that keep their class: class codes, ranges such as Classification[7:7], or the word withheld",
+        may_be_empty=True,
+    )
+    keep: Selection = option(
+        "selection", (OVERLAP,), "The same: points that keep their class", may_be_empty=True
+    )
+    details = """
+Comes after a classification, and after `filters.hag_morphological` with `"decks": true`, which finds the decks by their
+shape: a classifier cannot know a deck from a road or a roof by what is near a point. All points of a deck's surface get the
+class; parapets, flanks and what stands on the deck get it where they are called ground or building. Vegetation, wires and
+lamps above keep theirs. The heights above ground are measured from the terrain below the bridge.
+
+Metadata count the points of decks (`decks`), of them those that rise or hang from it (`parts`), and the classes that
+they leave (`left`).
+"""
+    before = (
+        {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17], "decks": True},
+        {"type": "filters.modelclassifier", "model": "standard"},
+    )
+    after = ({"type": "writers.las", "filename": "output.laz", "forward": "all"},)
+    example = {"type": "filters.bridges"}
+
+    def reads(self) -> list[str]:
+        return ["Classification", "Deck"]
+
+    def creates(self) -> dict[str, str]:
+        return {"Classification": "uint8_t"}
+
+    def largest_class(self) -> int:
+        return self.code
+
+    def run(self, points: Points) -> dict[str, NDArray]:
+        if points.count == 0:
+            return {}
+        free = points.inside & ~points.ignored(self.ignore) & ~points.chosen(self.keep)
+        before, deck = points.class_codes, points.dimension("Deck")
+        parts = free & (deck == PARTS) & np.isin(before, _MISTAKEN)
+        found = parts | (free & (deck == SURFACE))
+        codes = before.copy()
+        codes[found] = self.code
+        figures = points.report.figures
+        figures["decks"], figures["parts"] = int(np.count_nonzero(found)), int(np.count_nonzero(parts))
+        left = found & (before != self.code)
+        figures["left"] = {
+            str(code): int(n) for code, n in zip(*np.unique(before[left], return_counts=True), strict=True)
+        }
+        there = np.unique(codes[free])
+        figures["classes"] = {str(code): int(np.count_nonzero(codes[free] == code)) for code in there}
+        return {"Classification": points.with_codes(codes)}
