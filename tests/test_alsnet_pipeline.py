@@ -9,7 +9,7 @@ import pytest
 from alsnet_scenes import TINY, model_of, random_net, scene
 
 import pdal_stages as ps
-from pdal_stages.base.errors import OptionError
+from pdal_stages.base.errors import DimensionError, OptionError
 from pdal_stages.classifier import load_model
 from pdal_stages.stages import registry
 
@@ -135,6 +135,46 @@ def test_one_word_trains_a_network(cloud, tmp_path, pdal_module):
     assert made.algorithm.name == "alsnet" and made.required_dimensions == ("HeightAboveGround",)
     assert len(made.info["training"]["curve"]) == 2
     assert "curve" in json.dumps(result.metadata, default=str)
+
+
+@pytest.mark.pdal
+@pytest.mark.skipif(
+    importlib.util.find_spec("torch") is None,
+    reason="PyTorch is not installed (extra 'deep'): training is not tested",
+)
+def test_color_and_echo_width_of_a_file_are_inputs(tmp_path, write_las, pdal_module):
+    """Color is LAS's own; echo width is an extra dimension, which the reader of LAS 1.4 gives by its name."""
+    laspy = pytest.importorskip("laspy")
+    xyz, labels, _ = scene(4000, 36.0, origin=(500_000.0, 5_400_000.0, 100.0))
+    arrays = {
+        **dict(zip("XYZ", xyz.T, strict=True)),
+        "Classification": labels,
+        "Red": (9000 * labels.astype(int)).astype(np.uint16),
+        "EchoWidth": (4.0 + labels).astype(np.float32),
+    }
+    path = write_las(tmp_path / "in.las", arrays, point_format=7)
+    reader = {"type": "readers.las", "filename": str(path), "use_eb_vlr": True}
+    made, out = str(tmp_path / "a.model"), str(tmp_path / "out.las")
+    network = {"configuration": TINY.to_dict(), "epochs": 12, "validation": 0, "learning_rate": 0.01}
+    writer = {"type": WRITER, "filename": made, "algorithm": "alsnet", "alsnet": network}
+    ps.run_pipeline([reader, {**writer, "dimensions": "Red,EchoWidth"}])
+    assert load_model(made).required_dimensions == ("Red", "EchoWidth")
+    ps.run_pipeline([reader, {"type": "filters.modelclassifier", "model": made}, out])
+    assert (np.asarray(laspy.read(out).classification) == labels).mean() > 0.95
+    with pytest.raises(DimensionError, match="EchoWidth"):
+        ps.run_pipeline(
+            [
+                str(cloud_without(tmp_path, write_las, arrays)),
+                {"type": "filters.modelclassifier", "model": made},
+            ]
+        )
+
+
+def cloud_without(tmp_path, write_las, arrays):
+    """The same points without the echo width."""
+    return write_las(
+        tmp_path / "bare.las", {k: v for k, v in arrays.items() if k != "EchoWidth"}, point_format=7
+    )
 
 
 def test_stage_options(model, tmp_path):

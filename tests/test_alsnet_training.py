@@ -22,7 +22,7 @@ from pdal_stages.alsnet.augment import Augmentation
 from pdal_stages.alsnet.pyramid import build
 from pdal_stages.alsnet.schedule import choose, class_weights, covering, hold_out, spread
 from pdal_stages.base import kinds
-from pdal_stages.base.errors import DependencyError, ModelError, OptionError
+from pdal_stages.base.errors import DependencyError, DimensionError, ModelError, OptionError
 from pdal_stages.base.kinds import kind_of
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, train
 
@@ -320,6 +320,29 @@ def test_variance_and_margin_mark_errors_on_real_data(data_dir):
 
     assert share_of_pairs(found.variance[known]) > 0.65
     assert share_of_pairs(-found.margin[known]) > 0.7
+
+
+@needs_torch
+def test_color_and_echo_width_are_inputs_like_any_dimension():
+    """Flat ground whose two halves differ in nothing but 16-bit color, and in echo width: with them it is learned."""
+    random = np.random.default_rng(5)
+    xyz = np.round(np.column_stack([random.random((2500, 2)) * 24.0, random.normal(0.0, 0.02, 2500)]), 3)
+    labels = np.where(np.floor(xyz[:, 0] / 6.0) % 2 == 0, 2, 3).astype(np.uint8)
+    values = {
+        "Red": (20_000 + 9_000 * (labels == 3) + random.integers(0, 3000, 2500)).astype(np.uint16),
+        "EchoWidth": 4.2 + 0.9 * (labels == 3) + random.normal(0, 0.2, 2500),
+        "HeightAboveGround": xyz[:, 2],
+    }
+    cloud = TrainingCloud(xyz, labels, values)
+    right = {}
+    for names in (("Red",), ("EchoWidth",), ("HeightAboveGround",)):
+        model = fit([cloud], dimensions=names, epochs=12, learning_rate=0.01, rotate=False)
+        assert model.required_dimensions == names
+        right[names[0]] = float((model.predict(xyz, values).classification == labels).mean())
+        if names == ("Red",):
+            with pytest.raises(DimensionError, match="the dimension Red is missing"):
+                model.predict(xyz, {"EchoWidth": values["EchoWidth"]})
+    assert min(right["Red"], right["EchoWidth"]) > 0.97 and right["HeightAboveGround"] < 0.8, right
 
 
 # ---- checkpoints that lie ------------------------------------------------------------------------------------
