@@ -38,6 +38,9 @@ class LasHeader:
     records_after: int
     after: int  #: where the records after the points begin
     count: int
+    by_return: int  #: the sum of its counts of points by their return number
+    waveforms: int  #: where waveforms inside the file begin, 0 where there are none
+    boxed: bool  #: whether its box is more than zeros
     scales: tuple[float, ...]
     offsets: tuple[float, ...]
     texts: dict[str, bytes]  #: the texts of the header
@@ -56,9 +59,13 @@ def read_header(path: str | os.PathLike) -> LasHeader | None:
     if len(head) < 227 or head[:4] != b"LASF":
         return None
     size, offset, records, kind, length, count = struct.unpack_from("<HIIBHI", head, 94)
-    minor, after, place = head[25], 0, 0
+    minor, after, place, waveforms = head[25], 0, 0, 0
+    by_return = sum(struct.unpack_from("<5I", head, 111))
+    if minor >= 3 and size >= 235 and len(head) >= 235:
+        (waveforms,) = struct.unpack_from("<Q", head, 227)
     if minor >= 4 and size >= 375 and len(head) >= 255:
         place, after, count = struct.unpack_from("<QIQ", head, 235)
+        by_return = sum(struct.unpack("<15Q", head[255:].ljust(120, b"\0")))
     numbers = struct.unpack_from("<6d", head, 131)
     x1, x0, y1, y0 = struct.unpack_from("<4d", head, 179)
     texts = {
@@ -66,8 +73,8 @@ def read_header(path: str | os.PathLike) -> LasHeader | None:
         "generating software": head[58:90].split(b"\0")[0],
     }
     return LasHeader(
-        minor, kind & 0x3F, length, bool(kind & 0xC0), size, offset, records, after, place, count,
-        numbers[:3], numbers[3:], texts, (x0, y0, x1, y1),
+        minor, kind & 0x3F, length, bool(kind & 0xC0), size, offset, records, after, place, count, by_return,
+        waveforms, any(struct.unpack_from("<6d", head, 179)), numbers[:3], numbers[3:], texts, (x0, y0, x1, y1),
     )  # fmt: skip
 
 
@@ -102,13 +109,33 @@ def check_readable(path: str | os.PathLike) -> str | None:
         )
     if wrong:
         raise StageError(f"the LAS file is damaged: {wrong[0]}", where=str(path), found=wrong[1], cure=_CURE)
-    beyond = size - header.end_of_points
-    if not header.compressed and header.minor <= 2 and beyond >= header.point_bytes:
+    beyond = _bytes_beyond(header, size)
+    if beyond >= header.point_bytes:
         return (
             f"{path}: the file holds {beyond:,} bytes beyond the {header.count:,} points that its header counts; "
             "they are not read"
         )
+    if header.count > 1 and not header.boxed:
+        return (
+            f"{path}: the box in its header is all zeros, as where a program ends while it writes the header; look whether "
+            "the points lie where they should"
+        )
     return None
+
+
+def _bytes_beyond(header: LasHeader, size: int) -> int:
+    """Bytes after the points of a file that is not compressed, and before what the header says comes then."""
+    ends = [header.after] if header.records_after else []
+    ends += [header.waveforms] if header.waveforms else []
+    if header.compressed or any(not header.end_of_points <= end <= size for end in ends):
+        return 0
+    return min([size, *ends]) - header.end_of_points
+
+
+#: Scales below and offsets above are no lengths, but bytes of a header that was written in part.
+_SMALLEST, _LARGEST = 1e-30, 1e15
+#: Bytes that a header has at least, by its version.
+_HEADER_BYTES = (227, 227, 227, 235, 375, 375)
 
 
 def _what_is_wrong(header: LasHeader, size: int, table: int) -> tuple[str, str] | None:
@@ -122,7 +149,10 @@ def _what_is_wrong(header: LasHeader, size: int, table: int) -> tuple[str, str] 
             "its points are shorter than their format",
             f"{header.point_bytes} bytes, format {header.point_format} has {least}",
         )
-    if header.header_bytes < 227 or not header.header_bytes <= header.offset:
+    if header.header_bytes < _HEADER_BYTES[header.minor]:
+        least = _HEADER_BYTES[header.minor]
+        return "its header is too short", f"{header.header_bytes} bytes, LAS 1.{header.minor} has {least}"
+    if header.header_bytes > min(header.offset, size):
         return (
             "its points begin inside the header",
             f"header of {header.header_bytes} bytes, points at {header.offset}",
@@ -132,8 +162,8 @@ def _what_is_wrong(header: LasHeader, size: int, table: int) -> tuple[str, str] 
             "it counts more records than there is room for",
             f"{header.records:,} records before the points",
         )
-    if not all(math.isfinite(v) and v != 0 for v in header.scales) or not all(
-        map(math.isfinite, header.offsets)
+    if not all(_SMALLEST <= abs(v) < math.inf for v in header.scales) or not all(
+        abs(v) <= _LARGEST for v in header.offsets
     ):
         return (
             "its scales or offsets are not valid numbers",
@@ -147,6 +177,13 @@ def _what_is_wrong(header: LasHeader, size: int, table: int) -> tuple[str, str] 
     elif header.end_of_points > size:
         held = max(0, size - header.offset) // header.point_bytes
         return "it is cut short", f"{held:,} whole points, its header counts {header.count:,}"
+    if header.count and header.minor >= 4 and header.by_return != header.count:
+        beyond = _bytes_beyond(header, size)
+        if beyond >= header.point_bytes:  # either alone may be the work of a careless program
+            return (
+                "its header counts fewer points than it holds, and others by return",
+                f"{header.count:,} points, {header.by_return:,} by return, {beyond:,} bytes after them",
+            )
     if not header.count:
         end = header.after if header.records_after else size
         if header.compressed and header.offset + 8 <= table <= size - 8:
@@ -305,10 +342,28 @@ def _wrong_chunks(
             point_bytes=header.point_bytes,
             chunk_points=of_chunk,
         )
+        if not wrong and header.point_format >= 6 and of_chunk is not None:
+            wrong = _wrong_last_chunk(file, header, of_chunk, number, data)
         if wrong or not Path(path).name.lower().endswith(".copc.laz"):
             return wrong
         listed = of_chunk is None and number <= chunks.MOST_DECODED
         return _wrong_octree(file, header, size, data if listed else b"")
+
+
+def _wrong_last_chunk(
+    file: BinaryIO, header: LasHeader, of_chunk: int, number: int, table: bytes
+) -> tuple[str, str] | None:
+    """What the last chunk of points of formats 6 to 10 says against the header: each begins with a point and its count."""
+    if not 0 < number <= chunks.MOST_DECODED:
+        return None
+    sizes, _ = chunks.decode(table, variable=False)
+    file.seek(header.offset + 8 + sum(sizes[:-1]) + header.point_bytes)
+    held = file.read(4)
+    counted = header.count - of_chunk * (number - 1)
+    if len(held) == 4 and struct.unpack("<I", held)[0] != counted:
+        found = of_chunk * (number - 1) + struct.unpack("<I", held)[0]
+        return "its header counts other points than it holds", f"{header.count:,} counted, {found:,} held"
+    return None
 
 
 def _coding(file: BinaryIO, header: LasHeader) -> bytes | None:

@@ -285,6 +285,15 @@ def zero(data):
         struct.pack_into("<q", data, struct.unpack_from("<I", data, 96)[0], -1)
 
 
+def torn(at):
+    """A header of which nothing was written from a place on, but zeros."""
+
+    def edit(data):
+        data[at:375] = bytes(375 - at)
+
+    return edit
+
+
 NEWER = [
     ("LAS 1.4: four billion records after the points", ".las", after(2**32 - 1), "not where it says"),
     ("LAS 1.4: records after the points at byte 0", ".las", after(place=0), "not where it says"),
@@ -294,6 +303,11 @@ NEWER = [
     ("LAZ 1.4: records after the points at 2^62", ".laz", after(place=2**62), "not where it says"),
     ("LAS 1.4: no points in the header, many in the file", ".las", zero, "counts no points, but holds some"),
     ("LAZ 1.4: no points in the header, many in the file", ".laz", zero, "counts no points, but holds some"),
+    ("LAS 1.4: a header torn in its count", ".las", torn(248), "counts fewer points than it holds"),
+    ("LAZ 1.4: a header torn in its count", ".laz", torn(248), "counts other points than it holds"),
+    ("LAZ 1.4: another count in the header", ".laz", lambda d: struct.pack_into("<Q", d, 247, 599), "599 counted, 600 held"),
+    ("LAS 1.4: the length of an older header", ".las", header("header", 227), "its header is too short"),
+    ("LAS 1.4: scales torn", ".las", lambda d: d.__setitem__(slice(149, 155), bytes(6)), "not valid numbers"),
 ]  # fmt: skip
 
 
@@ -310,6 +324,29 @@ def test_damaged_headers_of_las_1_4(cell, tmp_path, write_las, model, case, suff
     )
     done = it.command("pipeline", tiled, "--tile", 20, "--workers", 0)
     assert done.code == 1 and says in done.err
+
+
+@pytest.mark.parametrize("version", ["1.2", "1.4"])
+def test_a_header_torn_behind_its_count(cell, tmp_path, write_las, model, version):
+    """All points are there; what else is not is told: the box, and points beyond the count."""
+    point_format, at, end = (3, 179, 227) if version == "1.2" else (6, 255, 375)
+    source = write_las(tmp_path / "in.las", scene(), point_format=point_format)
+    source = damaged(source, lambda d: d.__setitem__(slice(at, end), bytes(end - at)))
+    done = cell("LAS files", f"LAS {version}: a header torn behind its count").runs(
+        ["pipeline", pipeline(tmp_path, source, model)], "all points, told where the box is missing"
+    )
+    assert ("its header is all zeros" in done.err) == (version == "1.2")
+    assert len(laspy.read(tmp_path / "out.las")) == 600
+
+
+def test_bytes_after_the_points_of_a_newer_file(cell, tmp_path, write_las, model):
+    counted = {**scene(), "ReturnNumber": np.ones(600, np.uint8), "NumberOfReturns": np.ones(600, np.uint8)}
+    source = write_las(tmp_path / "in.las", counted, point_format=6)
+    source = damaged(source, lambda d: d + bytes(30 * 7))
+    done = cell("LAS files", "LAS 1.4: points beyond the count").runs(
+        ["pipeline", pipeline(tmp_path, source, model)], "the points of the header, and a warning"
+    )
+    assert "210 bytes beyond the 600 points" in done.err
 
 
 def test_a_record_after_the_points(cell, tmp_path, write_las, model):
