@@ -323,7 +323,8 @@ def test_h17_thresholds_are_a_choice_between_two_tables(town):
 def test_h17_radii_by_dimensionality(town):
     """Against the definition, point by point; members, radius and features."""
     cloud = clouds.Cloud("town", town.xyz, town.labels)
-    made = h17_oakland.by_dimensionality(cloud, kit.Cache(None), 1)
+    both = h17_oakland.by_dimensionality(cloud, kit.Cache(None), 1)
+    made, regular = both[h17_oakland.BY_DIMENSIONALITY], both[h17_oakland.V_C_BY_DIMENSIONALITY]
     radii = np.round(np.arange(0.25, 2.001, 0.05), 9)
     fewest = []
     for i in np.random.default_rng(0).choice(len(town), 60, replace=False):
@@ -341,6 +342,9 @@ def test_h17_radii_by_dimensionality(town):
             assert entropies[chosen] == pytest.approx(min(entropies.values()), abs=1e-3)
         else:
             assert chosen == 2.0
+        within = {radius: entropy for radius, entropy in entropies.items() if radius >= 0.5}
+        other = round(float(regular[i, 6]), 2)
+        assert other == 2.0 if not within else within[other] == pytest.approx(min(within.values()), abs=1e-3)
         fewest.append((away <= chosen).sum())
         members = town.xyz[away <= chosen]
         assert made[i, 1] == pytest.approx(np.ptp(members[:, 2]), abs=1e-5)
@@ -376,9 +380,9 @@ def test_h17_score_and_report(town, monkeypatch):
             run = {"name": name, "seed": 0, "depth": None, "height": height, "threshold": 0.03}
             runs.append({**run, **h17_oakland.score(part, part, threads=1, **run)})
     assert np.sum(runs[0]["clouds"], axis=0).tolist() == runs[0]["matrix"]
-    name = h17_oakland.BY_DIMENSIONALITY
-    run = {"name": name, "seed": 0, "depth": None, "height": "range", "threshold": 0.03}
-    runs.append({**run, **h17_oakland.score(part, part, threads=1, **run)})
+    for name in (h17_oakland.BY_DIMENSIONALITY, h17_oakland.V_C_BY_DIMENSIONALITY):
+        run = {"name": name, "seed": 0, "depth": None, "height": "range", "threshold": 0.03}
+        runs.append({**run, **h17_oakland.score(part, part, threads=1, **run)})
     shares = {
         "pooled": h17_oakland.shares(*h17_oakland.pooled(part, part), 0.03),
         "test": h17_oakland.shares(part.labels, part.curvature, 0.03),

@@ -15,6 +15,7 @@ those of the regular kind, so any threshold is a choice between two tables.
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -48,8 +49,13 @@ SIX = ("Verticality", "HeightRange", "Linearity", "Planarity", "Scattering", "Su
 TOKENS = {"v_k": "kopt", "v_r": "ropt", "v_c": "copt"}
 #: v_r, its radius chosen by the entropy of dimensionality [Demantke et al. 2011] instead of the eigenentropy.
 BY_DIMENSIONALITY = "v_r by dimensionality"
+#: v_c, whose regular half is v_r within other radii, read the same way.
+V_C_BY_DIMENSIONALITY = "v_c by dimensionality"
+#: The smallest radius of v_c's regular half, meters.
+LEAST_REGULAR = 0.5
 #: What v_c takes for scattered and for regular points, each for all points.
 HALVES = {"scattered": "k in 10..50 within 3 m", "regular": "r in 0.5..2.0 m"}
+EVERY = {*TOKENS, BY_DIMENSIONALITY, V_C_BY_DIMENSIONALITY, *HALVES}
 #: Column 1 of the six, height difference, as ...; "range" is the paper's (trees see no difference between a height and
 #: its multiple), the others are departures.
 HEIGHTS = ("range", "range/diameter", "range of c1", "above ground", "none")
@@ -86,14 +92,16 @@ class Part:
     column: np.ndarray
     tables: dict[str, np.ndarray]
 
-    def adaptive(self, threshold: float) -> np.ndarray:
-        """The curvature-adaptive table at a threshold."""
+    def adaptive(self, threshold: float, regular: str = "regular") -> np.ndarray:
+        """The curvature-adaptive table at a threshold; `regular` names the table of regular points."""
         scattered = self.curvature >= threshold
-        return np.where(scattered[:, None], self.tables["scattered"], self.tables["regular"])
+        return np.where(scattered[:, None], self.tables["scattered"], self.tables[regular])
 
     def table(self, name: str, threshold: float) -> np.ndarray:
         """The table of v_k, v_r, v_c, or of one of v_c's halves."""
-        return self.adaptive(threshold) if name == "v_c" else self.tables[TOKENS.get(name, name)]
+        if name in ("v_c", V_C_BY_DIMENSIONALITY):
+            return self.adaptive(threshold, "regular" if name == "v_c" else name)
+        return self.tables[TOKENS.get(name, name)]
 
 
 def load(folder: Path, part: str) -> list[Cloud]:
@@ -103,12 +111,14 @@ def load(folder: Path, part: str) -> list[Cloud]:
     return [with_height(cloud.only(np.isin(cloud.labels, list(CLASSES)))) for cloud in clouds]
 
 
-def compute(clouds: list[Cloud], cache: Cache, threads: int | None) -> Part:
-    """The tables of Part, cloud by cloud."""
+def compute(clouds: list[Cloud], cache: Cache, threads: int | None, needed: set[str] = EVERY) -> Part:
+    """The tables of Part that some names of neighborhoods need, cloud by cloud."""
     words = (*SIX, "Radius")
+    tokens = {"v_k": ["kopt"], "v_r": ["ropt"], "v_c": ["copt"], "regular": ["copt"]}
+    wanted = sorted({token for name in needed for token in tokens.get(name, [])})
     # Without a threshold above 1/3 a point is regular, with one of 0 it is scattered.
     plans = {
-        "": (FeaturePlan.parse("s1,kopt,ropt,copt", (*words, "Density_s1")), 1.0),
+        "": (FeaturePlan.parse(["s1", *wanted], (*words, "Density_s1")), 1.0),
         "scattered": (FeaturePlan.parse("copt", words), 0.0),
     }
     parts: dict[str, list[np.ndarray]] = {}
@@ -121,15 +131,18 @@ def compute(clouds: list[Cloud], cache: Cache, threads: int | None) -> Part:
         curvature = first[:, names.index("SurfaceVariation_s1")]
         parts.setdefault("curvature", []).append(np.where(members < LEAST_MEMBERS, 1.0 / 3.0, curvature))
         for token, name in (("kopt", "kopt"), ("ropt", "ropt"), ("copt", "regular")):
-            columns = [names.index(f"{word}_{token}") for word in words]
-            parts.setdefault(name, []).append(np.array(first[:, columns]))
+            if token in wanted:
+                columns = [names.index(f"{word}_{token}") for word in words]
+                parts.setdefault(name, []).append(np.array(first[:, columns]))
         columns = [
             plans["scattered"][0].names.index(f"{word}_copt") for word in words
         ]  # a plan has its own order
         column = features(cloud, FeaturePlan.parse("c1", "HeightRange"), cache, threads=threads)
         parts.setdefault("column", []).append(np.array(column[:, 0]))
         parts.setdefault("scattered", []).append(np.array(second[:, columns]))
-        parts.setdefault(BY_DIMENSIONALITY, []).append(np.array(by_dimensionality(cloud, cache, threads)))
+        if needed & {BY_DIMENSIONALITY, V_C_BY_DIMENSIONALITY}:
+            for name, one in by_dimensionality(cloud, cache, threads).items():
+                parts.setdefault(name, []).append(one)
     joined = {name: np.concatenate(arrays) for name, arrays in parts.items()}
     return Part(
         np.concatenate([cloud.labels for cloud in clouds]),
@@ -141,11 +154,12 @@ def compute(clouds: list[Cloud], cache: Cache, threads: int | None) -> Part:
     )
 
 
-def by_dimensionality(cloud: Cloud, cache: Cache, threads: int | None) -> np.ndarray:
-    """The six features and the radius, (n, 7), of the radius of v_r whose entropy of dimensionality is the lowest.
+def by_dimensionality(cloud: Cloud, cache: Cache, threads: int | None) -> dict[str, np.ndarray]:
+    """The six features and the radius, (n, 7), of the radius whose entropy of dimensionality is the lowest.
 
-    With s1 >= s2 >= s3 the roots of the eigenvalues, that is the entropy of (s1 - s2, s2 - s3, s3) / s1 [Demantke et al.
-    2011]. Radii with fewer than LEAST_MEMBERS points are no candidates; where all are, the largest is taken.
+    By name: of v_r, and of those of its radii that v_c's regular half has. With s1 >= s2 >= s3 the roots of the
+    eigenvalues, that is the entropy of (s1 - s2, s2 - s3, s3) / s1 [Demantke et al. 2011]. Radii with fewer than
+    LEAST_MEMBERS points are no candidates; where all are, the largest is taken.
     """
     radii = radii_of(*ROPT_DEFAULT)
     plan = FeaturePlan.parse([f"s{radius:g}" for radius in radii], (*SIX, "Density"))
@@ -161,21 +175,25 @@ def by_dimensionality(cloud: Cloud, cache: Cache, threads: int | None) -> np.nda
         entropy = -(shares * np.log(np.maximum(shares, 1e-300))).sum(axis=0)
         members = np.rint(values[:, columns["Density"]] * volume)
         entropy[members < LEAST_MEMBERS] = np.inf
-        best = np.where(np.isinf(entropy).all(axis=1), len(radii) - 1, entropy.argmin(axis=1))
-        rows = np.arange(len(values))
-        made = [values[rows, np.array(columns[one])[best]] for one in SIX]
-        return np.column_stack([*made, radii[best]]).astype(np.float32)
+        rows, out = np.arange(len(values)), []
+        for least in (0.0, LEAST_REGULAR):
+            entropy[:, radii < least - 1e-9] = np.inf
+            best = np.where(np.isinf(entropy).all(axis=1), len(radii) - 1, entropy.argmin(axis=1))
+            out += [*(values[rows, np.array(columns[one])[best]] for one in SIX), radii[best]]
+        return np.column_stack(out).astype(np.float32)
 
     def make() -> np.ndarray:
         note(f"radii of {cloud.name} by dimensionality")
-        out = np.empty((len(cloud), len(SIX) + 1), np.float32)
+        out = np.empty((len(cloud), 2 * (len(SIX) + 1)), np.float32)
         for rows, made in FeatureEngine(cloud.xyz, plan, threads=threads).blocks(apply=apply):
             out[rows] = made
         return out
 
-    return cache.array(
-        {"what": "dimensionality", "cloud": fingerprint(cloud.xyz), "least": LEAST_MEMBERS}, make
+    both = cache.array(
+        {"what": "dimensionality twice", "cloud": fingerprint(cloud.xyz), "least": LEAST_MEMBERS}, make
     )
+    names = (BY_DIMENSIONALITY, V_C_BY_DIMENSIONALITY)
+    return {name: np.array(part) for name, part in zip(names, np.hsplit(both, 2), strict=True)}
 
 
 def matrix(part: Part, six: np.ndarray, height: str) -> np.ndarray:
@@ -292,7 +310,7 @@ def report(runs: list[dict[str, Any]], found: dict[str, Any]) -> str:
         f"{found['train']:.4f} (training cloud alone), {found['test']:.4f} (test clouds alone); published 0.03\n"
     ]
     rows = []
-    for name in (*PUBLISHED, BY_DIMENSIONALITY):
+    for name in (*PUBLISHED, BY_DIMENSIONALITY, V_C_BY_DIMENSIONALITY):
         if name in PUBLISHED:
             precision, recall, f1 = (
                 f"{v:.2f}" for v in PUBLISHED[name]
@@ -318,12 +336,12 @@ def report(runs: list[dict[str, Any]], found: dict[str, Any]) -> str:
         text.append(words + table(("", *SCORES), rows))
     for key in ("recall", "precision"):
         rows = []
-        for name in (*PUBLISHED, BY_DIMENSIONALITY):
+        for name in (*PUBLISHED, BY_DIMENSIONALITY, V_C_BY_DIMENSIONALITY):
             some = choose(runs, **main, name=name, depth=None)
             rows.append([name, *(spread(values(some, key, str(code))) for code in CLASSES)])
         text.append(f"Per-class {key}, unlimited depth\n\n" + table(("", *CLASSES.values()), rows))
     rows = []
-    for name in (*PUBLISHED, BY_DIMENSIONALITY):
+    for name in (*PUBLISHED, BY_DIMENSIONALITY, V_C_BY_DIMENSIONALITY):
         for depth in (2, None):
             some = choose(runs, **main, name=name, depth=depth)
             if some:
@@ -381,19 +399,8 @@ def report(runs: list[dict[str, Any]], found: dict[str, Any]) -> str:
     return "\n".join(text)
 
 
-def main() -> None:
-    options = parser(__doc__)
-    options.add_argument("--clouds", type=int, help="only the first so many test clouds")
-    options.add_argument("--curve-seeds", type=int, default=3)
-    options.add_argument("--other-seeds", type=int, default=3, help="of other trainings, heights and halves")
-    args = options.parse_args()
-    if args.data is None:
-        options.error("name the folder of the clouds: --data DIR, or PDAL_STAGES_DATA")
-    folder = Path(args.data) / "oakland"
-    train_clouds, test_clouds = load(folder, "train"), load(folder, "test")[: args.clouds]
-    context = {"data": fingerprint(*(c.xyz for c in (*train_clouds, *test_clouds))), "experiment": EXPERIMENT}
-    cache, results = opened(args, "h17", context)
-    train, test = (compute(clouds, cache, args.threads) for clouds in (train_clouds, test_clouds))
+def thresholds(train: Part, test: Part) -> dict[str, Any]:
+    """The curvature thresholds by 2-means, and which points are scattered by the pooled one."""
     found: dict[str, Any] = {
         "train": curvature_threshold(train.curvature.astype(float)),
         "test": curvature_threshold(test.curvature.astype(float)),
@@ -404,6 +411,40 @@ def main() -> None:
         "pooled": shares(labels, curvature, found["pooled"]),
         "test": shares(test.labels, test.curvature, found["pooled"]),
     }
+    return found
+
+
+def _key(run: Mapping[str, Any]) -> tuple[Any, ...]:
+    """What a run is, whatever came of it."""
+    return tuple(run.get(name) for name in ("name", "seed", "depth", "height", "sampling", "threshold"))
+
+
+def main() -> None:
+    options = parser(__doc__)
+    options.add_argument("--clouds", type=int, help="only the first so many test clouds")
+    options.add_argument("--curve-seeds", type=int, default=3)
+    options.add_argument("--other-seeds", type=int, default=3, help="of other trainings, heights and halves")
+    options.add_argument(
+        "--earlier", type=Path, help="results of an earlier command: only runs it lacks are made"
+    )
+    args = options.parse_args()
+    if args.data is None:
+        options.error("name the folder of the clouds: --data DIR, or PDAL_STAGES_DATA")
+    folder = Path(args.data) / "oakland"
+    train_clouds, test_clouds = load(folder, "train"), load(folder, "test")[: args.clouds]
+    context = {"data": fingerprint(*(c.xyz for c in (*train_clouds, *test_clouds))), "experiment": EXPERIMENT}
+    cache, results = opened(args, "h17", context)
+    known = json.loads(args.earlier.read_text()) if args.earlier else {"runs": []}
+    parts: list[Part] = []
+
+    def computed(names: set[str]) -> list[Part]:
+        if not parts:
+            parts.extend(
+                compute(clouds, cache, args.threads, names) for clouds in (train_clouds, test_clouds)
+            )
+        return parts
+
+    found: dict[str, Any] = known.get("found") or thresholds(*computed(EVERY))
     note(
         f"2-means threshold: {found['train']:.4f} on the training cloud, {found['test']:.4f} on the test clouds, "
         f"{found['pooled']:.4f} on both"
@@ -412,7 +453,7 @@ def main() -> None:
     todo: list[dict[str, Any]] = []
     for seed in range(args.seeds):
         for depth in (None, 2, 3)[: 2 if seed else 3]:
-            names = (*TOKENS, BY_DIMENSIONALITY)
+            names = (*TOKENS, BY_DIMENSIONALITY, V_C_BY_DIMENSIONALITY)
             todo += [{"name": n, "seed": seed, "depth": depth, "height": "range", **both} for n in names]
     more = {"depth": None, **both}
     for seed in range(args.other_seeds):
@@ -432,10 +473,16 @@ def main() -> None:
                 {"name": "v_c", "seed": seed, "depth": depth, "height": "range", "threshold": at}
                 for at in CURVE
             ]
-    runs = [
-        {**run, **results.get(run, lambda run=run: score(train, test, threads=args.threads, **run))}
-        for run in todo
-    ]
+    earlier = {_key(run): {"code": known["machine"]["code"], **run} for run in known["runs"]}
+    missing = {run["name"] for run in todo if _key(run) not in earlier}
+    runs = []
+    for run in todo:
+        if _key(run) in earlier:
+            runs.append(earlier[_key(run)])
+            continue
+        made = results.get(run, lambda run=run: score(*computed(missing), threads=args.threads, **run))
+        runs.append({**run, **made})
+    runs += [run for key, run in earlier.items() if key not in set(map(_key, todo))]
     finish(args, runs, "[H17] on Oakland", report(runs, found), found=found)
 
 

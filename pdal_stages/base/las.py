@@ -2,6 +2,9 @@
 
 PDAL reads a file that is cut short as if it were whole, giving points made of nothing, and some damaged headers
 end the process. What a header says is therefore held against the size of the file first.
+
+Not laspy's reader, which was tried: its import takes 0.15 CPU seconds of every start (NumPy apart), a header of 43 real
+files 240 microseconds on average against 10 here, and it reads all records before the size is held against them.
 """
 
 from __future__ import annotations
