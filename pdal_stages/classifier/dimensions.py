@@ -16,6 +16,8 @@ COORDINATES = ("X", "Y", "Z")
 #: What a model is trained on by default: always this, and these where points have them.
 ALWAYS = ("HeightAboveGround",)
 WHERE_THERE = ("Ground", "HeightAboveOpening_5", "HeightAboveOpening_17")
+#: 1 where a person has checked a point's class.
+CHECKED = "Checked"
 #: Derived here: ReturnNumber / NumberOfReturns, 1 for a last or only return.
 RETURN_RATIO = "ReturnRatio"
 

@@ -110,8 +110,12 @@ def inside_of(
     return points_inside(x, y, shapes), len(shapes), note
 
 
-def polygons_of(overlay: Overlay, wkt: str, box: tuple[float, float, float, float]) -> tuple[list[Any], str]:
+def polygons_of(
+    overlay: Overlay, wkt: str, box: tuple[float, float, float, float], where: str = ""
+) -> tuple[list[Any], str]:
     """Polygons near a box, in the reference system of `wkt`, as the box is; and what the user should know.
+
+    `where`: a condition on the file's columns, in SQL.
 
     Raises
     ------
@@ -128,7 +132,7 @@ def polygons_of(overlay: Overlay, wkt: str, box: tuple[float, float, float, floa
     else:
         note = f"{overlay.file}: {'the points have' if crs else 'it has'} no reference system: the same was assumed"
     with reading(overlay.file):
-        _, _, geometry, _ = pyogrio.raw.read(overlay.file, layer=layer, columns=[], bbox=box)
+        _, _, geometry, _ = pyogrio.raw.read(overlay.file, layer=layer, columns=[], bbox=box, where=where or None)
         shapes = shapely.from_wkb(geometry) if len(geometry) else np.empty(0, object)
         shapes = shapely.force_2d(shapes[~shapely.is_missing(shapes)]) if len(shapes) else shapes
         flat = [s for s in shapely.get_parts(shapely.get_parts(shapes)) if s.geom_type == "Polygon"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -108,8 +109,8 @@ def _columns(objects: Objects, kind: Kind) -> dict[str, NDArray]:
     return out
 
 
-def check_target(path: str | Path) -> None:
-    """Refuse a name with another ending, and what cannot be written."""
+def check_target(path: str | Path, layers: Sequence[str] = LAYERS) -> None:
+    """Refuse a name with another ending, and what cannot be written; `layers`: their names."""
     if Path(path).suffix.lower() not in DRIVERS:
         raise StageError(
             "objects are written to a vector file",
@@ -118,39 +119,42 @@ def check_target(path: str | Path) -> None:
         )
     vector("pyogrio")
     vector("shapely")
-    for name in target_files(path):
+    for name in target_files(path, layers):
         check_writable(name, "objects")
 
 
-def target_files(path: str | Path) -> list[Path]:
+def target_files(path: str | Path, layers: Sequence[str] = LAYERS) -> list[Path]:
     """The files that are written: one of all layers, or one of each, named after it."""
     target = Path(path)
     if DRIVERS.get(target.suffix.lower(), ("", True))[1]:
         return [target]
-    return [target.with_name(f"{target.stem}_{name}{target.suffix}") for name in LAYERS]
+    return [target.with_name(f"{target.stem}_{name}{target.suffix}") for name in layers]
 
 
-def write_layers(path: str | Path, layers: dict[str, Layer], wkt: str = "") -> list[Path]:
+def write_layers(
+    path: str | Path, layers: dict[str, Layer], wkt: str = "", styles: Mapping[str, str] | None = None
+) -> list[Path]:
     """Write layers; the files that were written, all or none.
 
     A GeoPackage holds all of them, with styles for QGIS; other formats get a file for each layer, named after it, with a
-    style beside it. A layer without objects is written too: what an earlier run found is not left there.
+    style beside it: those given, or those of objects. A layer without objects is written too: what an earlier run found is not left there.
     """
-    check_target(path)
+    check_target(path, list(layers))
     driver, many = DRIVERS[Path(path).suffix.lower()]
-    files = target_files(path)
+    files = target_files(path, list(layers))
+    styles = styles or {name: qml(layer.kind, name) for name, layer in layers.items()}
     if many:
         with whole_files(*files, what="objects") as (part,):
             for name, layer in layers.items():
                 _write(part, name, layer, driver, wkt)
-            _write_styles(part, layers)
+            _write_styles(part, styles)
             _check_whole(part, layers, driver)
         return files
-    styles = [file.with_suffix(".qml") for file in files]
-    with whole_files(*files, *styles, what="objects") as parts:
-        for number, name in enumerate(LAYERS):
+    beside = [file.with_suffix(".qml") for file in files]
+    with whole_files(*files, *beside, what="objects") as parts:
+        for number, name in enumerate(layers):
             _write(parts[number], name, layers[name], driver, wkt)
-            parts[number + len(files)].write_text(qml(layers[name].kind, name), encoding="utf-8")
+            parts[number + len(files)].write_text(styles[name], encoding="utf-8")
             _check_whole(parts[number], {name: layers[name]}, driver)
     return files
 
@@ -259,7 +263,7 @@ def qml(kind: str, name: str) -> str:
     )
 
 
-def _write_styles(path: Path, layers: dict[str, Layer]) -> None:
+def _write_styles(path: Path, styles: Mapping[str, str]) -> None:
     """The table of styles that QGIS looks for in a GeoPackage."""
     import sqlite3
 
@@ -280,7 +284,7 @@ def _write_styles(path: Path, layers: dict[str, Layer]) -> None:
                 "INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, "
                 "styleName, styleQML, styleSLD, useAsDefault, description, owner) "
                 "VALUES ('', '', ?, 'geom', ?, ?, '', 1, '', '')",
-                [(name, name, qml(layer.kind, name)) for name, layer in layers.items()],
+                [(name, name, style) for name, style in styles.items()],
             )
     finally:
         base.close()

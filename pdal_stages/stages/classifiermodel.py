@@ -19,7 +19,7 @@ from ..base.outputs import Output
 from ..classifier import TrainingCloud, TrainingOptions, summary, train
 from ..classifier.algorithms import ALGORITHMS, Trainer, trainer
 from ..classifier.classes import ClassMap
-from ..classifier.dimensions import ALWAYS, required, welcome
+from ..classifier.dimensions import ALWAYS, CHECKED, required, welcome
 from .base import Stage, files_read
 from .loading import digest_of, loaded_model
 from .options import option
@@ -99,6 +99,12 @@ class ClassifierModel(Stage):
         "string",
         "",
         "Dimension that tells surveys apart: points of another value are not neighbors, and surveys weigh alike",
+    )
+    checked_only: bool = option(
+        "boolean",
+        True,
+        f"Where points have the dimension {CHECKED} (of the command corrections), and it is not 0 everywhere, draw samples "
+        "only from those where it is 1",
     )
     balance: bool = trained("balance")
     thin: list = trained("thin", may_be_empty=True)
@@ -249,7 +255,7 @@ holds the classes.
             name=", ".join(Path(name).name for name in self.files[:_NAMED])
             + ", ..." * (len(self.files) > _NAMED)
             or "the points",
-            mask=points.mask,
+            mask=self._mask(points),
         )
         gone = points.ignored(replace(self.ignore, codes=()))  # the labels among them are left to the trainer
         if gone.any():
@@ -288,6 +294,27 @@ holds the classes.
         if self._trainer.reports_training:
             report.figures["training"] = model.info["training"]
         return {}
+
+    def _mask(self, points: Points) -> NDArray[np.bool_] | None:
+        """The points that samples are drawn from: those inside `where`, and where any was checked by a person, of these
+        the checked ones alone."""
+        if CHECKED not in points.arrays or not self.checked_only:
+            return points.mask
+        checked = np.asarray(points.arrays[CHECKED]) > 0
+        if not checked.any():
+            return points.mask
+        wanted = checked & points.inside
+        if not wanted.any():
+            raise StageError(
+                "no checked point lies inside 'where'", found=f"{int(checked.sum()):,} checked points"
+            )
+        points.report["checked"] = int(np.count_nonzero(wanted))
+        note = (
+            f"{int(np.count_nonzero(wanted)):,} of {points.count:,} points were checked by a person ({CHECKED}): samples "
+            "are drawn from these alone, the others are neighbors"
+        )
+        points.report["note"] = ". ".join(filter(None, [points.report.get("note"), note]))
+        return wanted
 
     def _surveys(self, cloud: TrainingCloud, points: Points) -> list[TrainingCloud]:
         """The points as one cloud, or one for each value of the dimension `survey`."""

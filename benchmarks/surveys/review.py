@@ -1,0 +1,239 @@
+"""How well `review` tells where the errors are, and the calibration that it comes with.
+
+    python benchmarks/surveys/leave_one_out.py --data DIR --save MODELS
+    python benchmarks/surveys/review.py --data DIR --models MODELS [--json FILE] [--out pdal_stages/review/standard.json]
+
+Each survey is classified, by the command, with the model that has not seen it, and then reviewed with a calibration
+learned from the other surveys alone. Figures: points expected wrong beside those that are; the share of the wrong points
+in the patches that come first, up to a tenth of the area, beside what reliability alone finds and what knowing the truth
+would. What is not ground, vegetation or building in the labels is not counted. --out writes the calibration learned from
+all surveys.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+from clouds import SURVEYS, VEGETATION
+
+from pdal_stages import cli
+from pdal_stages.review import Calibration, Outlook, Records, Settings, find_patches, side_for
+from pdal_stages.review.cells import BINS, GROUP_OF, PARTS, bins_of
+from pdal_stages.review.expected import binned, kinds_of, learned_factors, learned_rates, outlook
+from pdal_stages.review.signals import JUDGED, signals
+
+#: The part of the area that is looked at first.
+FIRST = 0.1
+
+
+@dataclass
+class Classified:
+    """A survey's points as a model that has not seen it classified them."""
+
+    name: str
+    xyz: np.ndarray
+    codes: np.ndarray
+    reliability: np.ndarray
+    height: np.ndarray
+    strip: np.ndarray
+    truth: np.ndarray
+
+    @property
+    def side(self) -> float:
+        cells = len(np.unique(np.floor(self.xyz[:, :2] / 4.0), axis=0))
+        return side_for(len(self.xyz), 16.0 * cells)
+
+    def histograms(self) -> tuple[np.ndarray, np.ndarray]:
+        """Wrong and known points in each bin of group, reliability and height."""
+        known = self.truth > 0
+        wrong = known & (GROUP_OF[self.truth] != GROUP_OF[self.codes])
+        bins = bins_of(self.codes, self.reliability, self.height)
+        size = 4 * BINS[0] * BINS[1]
+        return tuple(
+            np.bincount(bins[one], minlength=size).reshape(4, *BINS).astype(float) for one in (wrong, known)
+        )
+
+    def records(self, rates: np.ndarray) -> Records:
+        return Records.of(
+            self.xyz,
+            self.codes,
+            self.reliability,
+            self.height,
+            self.side,
+            rates,
+            strip=self.strip,
+            truth=self.truth,
+        )
+
+
+def slug(name: str) -> str:
+    """A survey's name in that of a file."""
+    return name.replace(" ", "-").replace("'", "")
+
+
+def classified(data: Path, name: str, model: Path, kept: Path) -> Classified:
+    """A survey's files, classified by the command; kept in a folder for the next time."""
+    path = kept / f"{slug(name)}.npz"
+    if not path.exists():
+        with tempfile.TemporaryDirectory() as folder:
+            np.savez(path, **_classify(data, name, model, Path(folder)))
+    with np.load(path) as held:
+        return Classified(name, **{key: held[key] for key in held.files})
+
+
+def _classify(data: Path, name: str, model: Path, folder: Path) -> dict[str, np.ndarray]:
+    survey = SURVEYS[name]
+    (folder / "raw").mkdir()
+    codes = []
+    for number, file in enumerate(survey.files):
+        las = laspy.read(data / file)
+        las.points = las.points[~np.isin(las.classification, survey.dropped)]
+        codes.append(np.asarray(las.classification).astype(np.uint8))
+        las.write(folder / "raw" / f"{number}.laz")
+    inputs = [str(path) for path in sorted((folder / "raw").iterdir())]
+    target = str(folder / "classified") + "/"
+    assert cli.main(["classify", *inputs, target, "--model", str(model), "--no-progress"]) == 0
+    found = [laspy.read(folder / "classified" / Path(one).name) for one in inputs]
+    label = np.concatenate(codes)
+    height = np.concatenate([np.asarray(las["HeightAboveGround"]) for las in found]).astype(np.float32)
+    truth = np.zeros(len(label), np.uint8)
+    for given, ours in survey.labels.items():
+        truth[label == given] = ours
+    for given, least in survey.tall.items():
+        if survey.tall_scored:
+            truth[(label == given) & (height >= least)] = VEGETATION
+    out = {
+        "xyz": np.concatenate([np.column_stack([las.x, las.y, las.z]) for las in found]).astype(float),
+        "codes": np.concatenate([np.asarray(las.classification) for las in found]).astype(np.uint8),
+        "reliability": np.concatenate([np.asarray(las["Reliability"]) for las in found]).astype(np.float32),
+        "height": height,
+        "strip": np.concatenate([np.asarray(las.point_source_id) for las in found]),
+        "truth": truth,
+    }
+    there = ~np.isin(out["codes"], (7, 18)) & (out["reliability"] > 0)  # overlap keeps its class
+    return {key: values[there] for key, values in out.items()}
+
+
+def learned(surveys: Sequence[Classified], about: dict[str, Any]) -> Calibration:
+    """The calibration of some surveys."""
+    counts = [one.histograms() for one in surveys]
+    wrong, known = (np.stack(part) for part in zip(*counts, strict=True))
+    weight = survey_weights(known.sum(axis=(1, 2, 3)))
+    rates = learned_rates(wrong, known, weight)
+    records = [one.records(rates) for one in surveys]
+    found = [signals(one) for one in records]
+    base, factors = [], []
+    for group in JUDGED:
+        bins = np.concatenate([binned(one, group) for one in found])
+        rate = np.concatenate([one.rate[:, group] for one in found])
+        bad = np.concatenate([one.wrong[:, group] for one in records]).astype(float)
+        all_ = np.concatenate([one.known[:, group] for one in records]).astype(float)
+        each = np.repeat(weight, [len(one) for one in records])
+        there = all_ > 0
+        b, f = learned_factors(bins[there], rate[there], bad[there], all_[there], each[there])
+        base.append(b)
+        factors.append(f)
+    kinds = np.concatenate([kinds_of(one) for one in found])
+    number, times = np.unique(kinds, return_counts=True)
+    return Calibration(rates, tuple(factors), np.array(base), frozenset(number[times >= 5].tolist()), about)
+
+
+def survey_weights(points: np.ndarray) -> np.ndarray:
+    """Of a point of each survey: between all points alike and all surveys alike."""
+    weight = 1.0 / np.sqrt(points)
+    return weight * points.sum() / (weight * points).sum()
+
+
+def judged(one: Classified, calibration: Calibration) -> dict[str, Any]:
+    """What the review of a survey finds, beside the truth."""
+    records = one.records(calibration.rates)
+    seen = outlook(records, calibration)
+    part = records.known[:, :3] / np.maximum(records.points[:, :3], 1)
+    expected = float((seen.errors * part).sum())
+    true = records.wrong[:, :3].sum(axis=1)
+    plain = records.expected[:, :3].sum(axis=1) / PARTS
+    return {
+        "survey": one.name,
+        "points": int(records.known[:, :3].sum()),
+        "wrong": int(true.sum()),
+        "expected": expected,
+        "by_reliability": float((records.expected[:, :3] / PARTS * part).sum()),
+        "found": _first(seen, true),
+        "found_by_reliability": _first(
+            Outlook(records, seen.found, plain[:, None] * [[1, 0, 0]], seen.unknown), true
+        ),
+        "best": _first(Outlook(records, seen.found, true[:, None] * [[1.0, 0, 0]], seen.unknown), true),
+    }
+
+
+def _first(seen: Outlook, true: np.ndarray) -> float:
+    """Share of the wrong points in the patches that come first, up to a tenth of the area; of the last as much as fits."""
+    patches = find_patches(seen, Settings(cell=seen.records.side))
+    held = np.bincount(patches.of_cell, true, len(patches))
+    area = np.cumsum(patches.area)
+    limit = FIRST * area[-1]
+    return float(np.interp(limit, np.append(0.0, area), np.append(0.0, np.cumsum(held))) / max(true.sum(), 1))
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """As Markdown."""
+    lines = [
+        "| survey | points judged | wrong | expected | expected / wrong | in the first 10 % | by reliability | at best |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|",
+    ]
+    for row in rows:
+        lines.append(
+            f"| {row['survey']} | {row['points']:,} | {row['wrong']:,} | {row['expected']:,.0f} | "
+            f"{row['expected'] / max(row['wrong'], 1):.2f} | {100 * row['found']:.0f} % | "
+            f"{100 * row['found_by_reliability']:.0f} % | {100 * row['best']:.0f} % |"
+        )
+    total = {key: sum(row[key] for row in rows) for key in ("points", "wrong", "expected")}
+    means = [np.average([row[key] for row in rows], weights=[row["wrong"] for row in rows])
+             for key in ("found", "found_by_reliability", "best")]  # fmt: skip
+    lines.append(
+        f"| **all** | {total['points']:,} | {total['wrong']:,} | {total['expected']:,.0f} | "
+        f"**{total['expected'] / max(total['wrong'], 1):.2f}** | "
+        + " | ".join(f"{'**' * (k == 0)}{100 * v:.0f} %{'**' * (k == 0)}" for k, v in enumerate(means))
+        + " |"
+    )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    options.add_argument("--data", type=Path, required=True, help="folder of the clouds")
+    options.add_argument(
+        "--models", type=Path, required=True, help="folder that leave_one_out.py --save filled"
+    )
+    options.add_argument(
+        "--kept", type=Path, help="folder for the classified surveys; default: that of the models"
+    )
+    options.add_argument("--surveys", nargs="+", default=list(SURVEYS), choices=list(SURVEYS))
+    options.add_argument("--json", type=Path, help="where the figures go")
+    options.add_argument("--out", type=Path, help="where the calibration of all surveys goes")
+    args = options.parse_args()
+    kept = args.kept or args.models
+    all_ = [classified(args.data, name, args.models / f"{slug(name)}.model", kept) for name in args.surveys]
+    rows = []
+    for one in all_:
+        others = learned([other for other in all_ if other is not one], {})
+        rows.append(judged(one, others))
+        print(json.dumps(rows[-1]), flush=True)
+    print(table(rows))
+    if args.json:
+        args.json.write_text(json.dumps(rows, indent=1) + "\n")
+    if args.out:
+        about = {"surveys": args.surveys, "command": "python benchmarks/surveys/review.py"}
+        args.out.write_text(learned(all_, about).to_json() + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,145 @@
+"""Classified points of a file, a part at a time where that can be: what review and corrections read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.asprs import NOISE
+from ..base.errors import StageError
+from ..base.las import read_header
+from ..stages.points import Points
+from . import pdal as pdal_env
+from .ends import reader_of
+from .references import Reference, reference_of
+
+#: Points read at a time.
+PART = 1_000_000
+#: Dimensions that review reads where they are there.
+WANTED = ("Reliability", "HeightAboveGround", "PointSourceId", "ReturnNumber", "NumberOfReturns")
+_LASPY = {
+    "PointSourceId": "point_source_id",
+    "ReturnNumber": "return_number",
+    "NumberOfReturns": "number_of_returns",
+    "GpsTime": "gps_time",
+}
+
+
+@dataclass
+class Part:
+    """Points that are neither noise nor withheld.
+
+    Attributes
+    ----------
+    xyz : (n, 3) float64
+        Meters.
+    codes : (n,) uint8
+    arrays : dict
+        What else they have; heights in meters.
+    """
+
+    xyz: NDArray[np.float64]
+    codes: NDArray[np.uint8]
+    arrays: dict[str, NDArray]
+
+    def __len__(self) -> int:
+        return len(self.codes)
+
+    @classmethod
+    def join(cls, parts: Sequence[Part]) -> Part:
+        """All points of several parts."""
+        if len(parts) == 1:
+            return parts[0]
+        return cls(
+            np.concatenate([part.xyz for part in parts]),
+            np.concatenate([part.codes for part in parts]),
+            {name: np.concatenate([part.arrays[name] for part in parts]) for name in parts[0].arrays},
+        )
+
+    def taken(self, chosen: NDArray[Any]) -> Part:
+        """Some of the points."""
+        return Part(
+            self.xyz[chosen], self.codes[chosen], {name: v[chosen] for name, v in self.arrays.items()}
+        )
+
+
+def reads_in_parts(path: str) -> bool:
+    """Whether parts of a file can be read: LAS, LAZ and COPC files."""
+    return Path(path).suffix.lower() in (".las", ".laz") and read_header(path) is not None
+
+
+def reference_and_wkt(path: str) -> tuple[Reference, str]:
+    """A file's reference, and its well-known text."""
+    reader: dict[str, Any] = {"filename": path}
+    if reads_in_parts(path):
+        reader |= {"type": "readers.las", "count": 1}
+    metadata = pdal_env.execute([reader], arrays=False).metadata.get("metadata", {})
+    name = next(key for key in metadata if key.startswith("readers."))
+    node = metadata[name]
+    srs = (node[0] if isinstance(node, list) else node).get("srs", {})
+    return reference_of({**reader, "type": name}), str(srs.get("horizontal") or srs.get("wkt") or "")
+
+
+def parts_of(path: str, wkt: str, more: Sequence[str] = ()) -> Iterator[Part]:
+    """The points of a file, in its order; `more`: dimensions beside :data:`WANTED` that are wanted where they are there.
+
+    Raises
+    ------
+    StageError
+        If it cannot be read to its end.
+    """
+    wanted = (*WANTED, *more)
+    if not reads_in_parts(path):
+        ran = pdal_env.execute([reader_of(path, "input")])
+        for array in ran.arrays:
+            flags = pdal_env.flags_inside_classification(array.dtype.names, ran.metadata)
+            names = [
+                n for n in ("X", "Y", "Z", "Classification", "Withheld", *wanted) if n in array.dtype.names
+            ]
+            yield _part(Points({n: np.asarray(array[n]) for n in names}, wkt=wkt, legacy_flags=flags), wanted)
+        return
+    for chunk in las_chunks(path):
+        arrays = {
+            "X": np.asarray(chunk.x),
+            "Y": np.asarray(chunk.y),
+            "Z": np.asarray(chunk.z),
+            "Classification": np.asarray(chunk.classification),
+            "Withheld": np.asarray(chunk.withheld),
+        }
+        there = set(chunk.point_format.dimension_names)
+        for name in wanted:
+            if (known := _LASPY.get(name, name)) in there:
+                arrays[name] = np.asarray(chunk[known])
+        yield _part(Points(arrays, wkt=wkt), wanted)
+
+
+def las_chunks(path: str) -> Iterator[Any]:
+    """The points of a LAS or LAZ file in parts, as laspy reads them."""
+    import laspy
+
+    count = 0
+    try:
+        with laspy.open(path) as reader:
+            for chunk in reader.chunk_iterator(PART):
+                count += len(chunk)
+                yield chunk
+            total = reader.header.point_count
+    except StageError:
+        raise
+    except Exception as error:  # laspy and the decompressor raise many types
+        found = error if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
+        raise StageError("the input cannot be read", where=path, found=found) from None
+    if count != total:
+        raise StageError("the input is cut short", where=path, found=f"{count:,} of {total:,} points")
+
+
+def _part(points: Points, wanted: Sequence[str]) -> Part:
+    codes = points.class_codes
+    kept = ~np.isin(codes, NOISE) & ~points.flag("Withheld").astype(bool)
+    arrays = {name: np.asarray(points.dimension(name))[kept] for name in wanted if name in points.arrays}
+    return Part(points.xyz[kept], codes[kept], arrays)

@@ -1,0 +1,212 @@
+"""``pdal-stages corrections``: what a person changed or looked at is marked, and training draws from it alone."""
+
+from __future__ import annotations
+
+import laspy
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pdal_stages as ps
+from pdal_stages import cli
+from pdal_stages.base.errors import StageError
+from pdal_stages.pipeline.correcting import CorrectionRequest, read_table, write_corrections
+from pdal_stages.review.matching import near_any, nearest_points, partners
+from pdal_stages.synthetic import write_town
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory):
+    path = tmp_path_factory.mktemp("corrections") / "before.laz"
+    write_town(ps.make_town(80.0, 4.0, seed=2, progress=False), path)
+    return path
+
+
+def changed_copy(town, path, seed=0, **how):
+    """The file with other classes in a corner, in another order; what was changed, in the order of the first."""
+    las, random = laspy.read(town), np.random.default_rng(seed)
+    xy = np.column_stack([las.x, las.y])
+    corner = ((xy - xy.min(axis=0)) < 20).all(axis=1) & (las.classification != 6)
+    las.classification[corner] = 6
+    order = random.permutation(len(las.points))
+    las.points = las.points[order]
+    if drop := how.get("drop"):
+        las.points = las.points[drop:]
+    if scale := how.get("scale"):
+        las.change_scaling(scales=[scale] * 3)
+    las.write(path)
+    return corner, order
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.integers(1, 60), st.integers(1, 6))
+def test_partners_are_the_points_themselves(seed, n, places):
+    random = np.random.default_rng(seed)
+    xyz = random.integers(0, places, (n, 3)) * 0.01 + 500_000.0
+    time = random.permutation(n).astype(float)
+    order = random.permutation(n)
+    found = partners(xyz, xyz[order], 0.01, [(time, time[order])])
+    assert np.array_equal(order[found], np.arange(n))
+    # Without anything that tells them apart: points of the same place, each taken once.
+    found = partners(xyz, xyz[order], 0.01)
+    assert sorted(found) == list(range(n))
+    assert np.abs(xyz[order][found] - xyz).max() < 1e-6
+
+
+def test_points_left_over_take_the_nearest():
+    before = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 0, 0]])
+    after = np.array([[2.004, 0, 0], [0.0, 0, 0], [1.006, 0, 0]])
+    assert partners(before, after, 0.001, apart=0.01).tolist() == [1, 2, 0, -1]
+    assert partners(before, after, 0.001, apart=0.005).tolist() == [1, -1, 0, -1]
+    assert partners(before, after, 0.001).tolist() == [1, -1, -1, -1]
+
+
+def test_near_any_is_what_distances_say():
+    random = np.random.default_rng(3)
+    xyz, chosen = random.random((300, 3)) * 10, random.random(300) < 0.02
+    far = np.linalg.norm(xyz[:, None] - xyz[chosen][None], axis=2).min(axis=1)
+    assert np.array_equal(near_any(xyz, chosen, 1.5), far <= 1.5)
+    assert np.array_equal(near_any(xyz, chosen, 0.0), chosen)
+    places = random.random((40, 3)) * 10
+    far = np.linalg.norm(xyz[:, None] - places[None], axis=2)
+    expected = np.where(far.min(axis=0) < 0.8, far.argmin(axis=0), -1)
+    assert np.array_equal(nearest_points(xyz, places, 0.8), expected)
+
+
+@pytest.mark.parametrize("how", [{}, {"drop": 30}, {"scale": 0.01}, {"scale": 0.0001}])
+def test_changes_are_found_in_any_order(town, tmp_path, how, capsys):
+    corner, _ = changed_copy(town, tmp_path / "after.laz", **how)
+    out = tmp_path / "checked.laz"
+    assert (
+        cli.main(["corrections", str(town), str(tmp_path / "after.laz"), "--out", str(out), "--around", "0"])
+        == 0
+    )
+    las, before = laspy.read(out), laspy.read(town)
+    assert np.array_equal(las.xyz, before.xyz)
+    same = las.classification != before.classification
+    lost = how.get("drop", 0)
+    assert np.count_nonzero(np.asarray(same) != corner) <= lost
+    assert np.count_nonzero((np.asarray(las["Checked"]) == 1) != corner) <= lost
+    assert ("missing" in capsys.readouterr().out) == bool(lost)
+    for name in before.point_format.dimension_names:
+        if name != "classification":
+            assert np.array_equal(las[name], before[name]), name
+
+
+def test_all_around_a_change_was_seen(town, tmp_path):
+    corner, _ = changed_copy(town, tmp_path / "after.laz")
+    write_corrections(
+        CorrectionRequest(str(town), str(tmp_path / "o.laz"), str(tmp_path / "after.laz"), around=2.0)
+    )
+    las = laspy.read(tmp_path / "o.laz")
+    assert np.array_equal(np.asarray(las["Checked"]) > 0, near_any(np.asarray(las.xyz), corner, 2.0))
+    # A second time adds to the first.
+    xyz = np.asarray(las.xyz)
+    rows = [*xyz[~corner][:5], *xyz[~corner][-1:]]
+    table = tmp_path / "points.csv"
+    table.write_text("East;North;Height;Class\n" + "\n".join(f"{x};{y};{z};21" for x, y, z in rows))
+    done = write_corrections(CorrectionRequest(str(tmp_path / "o.laz"), str(tmp_path / "p.laz"), str(table)))
+    second = laspy.read(tmp_path / "p.laz")
+    assert done.changed == len({tuple(r) for r in rows}) == np.count_nonzero(second.classification == 21)
+    assert (np.asarray(second["Checked"]) >= np.asarray(las["Checked"])).all()
+    assert (np.asarray(second["Checked"])[np.asarray(second.classification) == 21] == 1).all()
+
+
+@pytest.mark.filterwarnings("ignore:.crs. was not provided")
+def test_areas_that_were_looked_at(town, tmp_path):
+    shapely, pyogrio = pytest.importorskip("shapely"), pytest.importorskip("pyogrio")
+    xyz = np.asarray(laspy.read(town).xyz)
+    x, y = xyz[:, :2].min(axis=0)
+    shapes = np.array([shapely.to_wkb(shapely.box(x + k, y, x + k + 10, y + 10)) for k in (0, 40)], object)
+    area = tmp_path / "area.gpkg"
+    fields = {"done": np.array([1, 0], np.int32)}
+    pyogrio.raw.write(area, shapes, list(fields.values()), list(fields), driver="GPKG", layer="patches",
+                      geometry_type="Polygon", crs=None)  # fmt: skip
+    done = write_corrections(CorrectionRequest(str(town), str(tmp_path / "o.laz"), areas=(str(area),)))
+    inside = (xyz[:, 0] <= x + 10) & (xyz[:, 1] <= y + 10)
+    assert np.array_equal(np.asarray(laspy.read(tmp_path / "o.laz")["Checked"]) > 0, inside)
+    assert done.changed == 0 and done.checked == inside.sum()
+    none = tmp_path / "none.gpkg"
+    pyogrio.raw.write(none, shapes, [np.zeros(2, np.int32)], ["done"], driver="GPKG", layer="patches",
+                      geometry_type="Polygon", crs=None)  # fmt: skip
+    with pytest.raises(StageError, match="no patch is marked as looked at"):
+        write_corrections(CorrectionRequest(str(town), str(tmp_path / "x.laz"), areas=(str(none),)))
+    assert not (tmp_path / "x.laz").exists()
+
+
+@pytest.mark.filterwarnings("ignore:.crs. was not provided")
+def test_a_layer_of_points(town, tmp_path):
+    shapely, pyogrio = pytest.importorskip("shapely"), pytest.importorskip("pyogrio")
+    xyz = np.asarray(laspy.read(town).xyz)[:4]
+    shapes = np.array([shapely.to_wkb(shapely.Point(one)) for one in xyz], object)
+    pyogrio.raw.write(tmp_path / "p.gpkg", shapes, [np.array([9, 9, 2, 2])], ["class"], driver="GPKG",
+                      geometry_type="Point Z", crs=None)  # fmt: skip
+    places, codes = read_table(str(tmp_path / "p.gpkg"))
+    assert np.array_equal(places, xyz) and codes.tolist() == [9, 9, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("x,y,z\n1,2,3\n", "lacks a column"),
+        ("x,y,z,class\n1,2,3,tree\n", "no number"),
+        ("x,y,z,class\n1,2,3,2.5\n", "no point with a class code"),
+        ("x,y,z,class\n1,2,3,2\n4,5,6\n", "another number of values"),
+        ("x,y,z,class\n1,2,3,2\n", "no point of the cloud lies within"),
+        ("x,y,z,class\n", "holds no points"),
+    ],
+)
+def test_tables_that_cannot_be_right(town, tmp_path, text, what, capsys):
+    (tmp_path / "t.csv").write_text(text)
+    assert (
+        cli.main(["corrections", str(town), str(tmp_path / "t.csv"), "--out", str(tmp_path / "o.laz")]) == 1
+    )
+    assert what in capsys.readouterr().err
+    assert not (tmp_path / "o.laz").exists()
+
+
+def test_other_points_are_refused(town, tmp_path, capsys):
+    las = laspy.read(town)
+    las.x = np.asarray(las.x) + 5.0
+    las.write(tmp_path / "moved.laz")
+    assert (
+        cli.main(["corrections", str(town), str(tmp_path / "moved.laz"), "--out", str(tmp_path / "o.laz")])
+        == 1
+    )
+    assert "do not hold the same points" in capsys.readouterr().err
+    assert cli.main(["corrections", str(town), "--out", str(tmp_path / "o.laz")]) == 1
+    assert "nothing to mark" in capsys.readouterr().err
+    assert cli.main(["corrections", str(town), str(town), "--out", str(town)]) == 1
+
+
+def test_training_draws_from_checked_points_alone(town, tmp_path, capsys):
+    las = laspy.read(town)
+    truth = np.asarray(las.classification).copy()
+    xyz = np.asarray(las.xyz)
+    east = xyz[:, 0] > np.median(xyz[:, 0])
+    las.add_extra_dim(laspy.ExtraBytesParams("Checked", "uint8"))
+    las["Checked"] = (east & np.isin(truth, (2, 5, 6))).astype(np.uint8)
+    wrong = ~east
+    las.classification[wrong] = 2  # nobody looked at these
+    las.write(tmp_path / "checked.laz")
+    model = tmp_path / "m.model"
+    common = [
+        "train",
+        str(tmp_path / "checked.laz"),
+        "--base",
+        "standard",
+        "--classes",
+        "2,5,6",
+        "--model",
+        str(model),
+    ]
+    assert cli.main(common) == 0
+    said = capsys.readouterr()
+    assert "were checked by a person" in said.err + said.out
+    counts = {one["code"]: one["available"] for one in ps.load_model(str(model)).info["classes"]}
+    for code, available in counts.items():
+        assert 0 < available <= np.count_nonzero(east & (truth == code)), code
+    assert cli.main([*common, "--writers.classifiermodel.checked_only=false"]) == 0
+    more = {one["code"]: one["available"] for one in ps.load_model(str(model)).info["classes"]}
+    assert more[2] > counts[2]
