@@ -65,7 +65,7 @@ class Settings:
 
     cell: float = SIDE
     block: float = 32.0
-    getting_there: float = 10.0
+    getting_there: float = 5.0
     looking: float = 2.5
 
 

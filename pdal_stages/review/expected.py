@@ -222,8 +222,8 @@ def learned_factors(
     wrong: NDArray[np.float64],
     known: NDArray[np.float64],
     weight: NDArray[np.float64],
-    strength: float = 30.0,
-    rounds: int = 60,
+    strength: float = 300.0,
+    rounds: int = 25,
 ) -> tuple[float, tuple[NDArray[np.float64], ...]]:
     """The factor of each bin of each signal that makes expected and true numbers agree in all bins.
 

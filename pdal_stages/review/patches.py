@@ -22,9 +22,8 @@ REASONS = {
     "heights": "heights doubtful",
     "other": "like what was wrong elsewhere",
 }
-#: Share of the expected errors that the hottest cells hold. These are shown by themselves, the rest of a block is another
-#: patch.
-HOT = 0.8
+#: Share of the cells, those with most to expect, that are shown by themselves; the rest of a block is another patch.
+HOT = 0.1
 #: A patch has a reason if it holds for this share of its expected errors.
 ENOUGH = 0.25
 #: Ground is raised, and far from other ground, from so many meters on; a cell is at the edge below this share of neighbors;
@@ -108,12 +107,10 @@ def find_patches(seen: Outlook, settings: Settings) -> Patches:
 
 
 def _hot(errors: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """The cells that hold most of what is expected."""
+    """The cells that most is expected of."""
     if not len(errors):
         return np.zeros(0, bool)
-    falling = np.sort(errors)[::-1]
-    place = int(np.searchsorted(np.cumsum(falling), HOT * falling.sum()))
-    return errors >= falling[min(place, len(falling) - 1)]
+    return (errors > 0) & (errors >= np.quantile(errors, 1.0 - HOT))
 
 
 def _joined(
