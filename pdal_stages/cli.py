@@ -261,6 +261,13 @@ def _parser() -> argparse.ArgumentParser:
         default=True,
         help="Mend classes that contradict their surroundings at the end (filters.consistency)",
     )
+    takes(
+        "--keep-sure",
+        type=float,
+        metavar="SHARE",
+        help="Leave points unclassified (1) where the model is not sure enough for this share of each class to be right, "
+        "e.g. 0.98, as measured on ground it had not seen",
+    )
     takes("--where", help="Classify only the points for which this holds; the others serve as neighbors")
     takes("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
     add_arguments(commands.choices["classify"], survey=True)
@@ -558,7 +565,9 @@ def _classify(options: argparse.Namespace) -> int:
         bridges=options.bridges,
         consistency=options.consistency,
         polygons=tuple(options.polygons),
+        keep_sure=options.keep_sure,
     )
+    print_messages(*request.cost)
     files = {"metadata": options.metadata or "", "log": options.log or ""}
     task = ClassifyTask(tuple(options.inputs), options.output, request, options_of(options), **files)
     if not options.objects:

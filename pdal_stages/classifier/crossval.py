@@ -7,7 +7,7 @@ random for validation are therefore half known already, and the score says littl
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -103,11 +103,13 @@ def search(
     fold: npt.NDArray[np.int16] | None = None,
     threads: int | None = None,
     progress: bool = True,
+    heard: Callable[[int, int, npt.NDArray[np.int64], npt.NDArray[np.float64]], None] | None = None,
 ) -> list[dict[str, Any]]:
     """Score every candidate by spatial cross-validation.
 
     `fold` is of each sample, where these are not blocks of ground. One forest of the largest size is grown per fold and
-    candidate; smaller ones are its first trees.
+    candidate; smaller ones are its first trees. `heard` is called with the place of a candidate, a number of trees, the rows
+    that were held out and their probabilities.
 
     Returns
     -------
@@ -145,17 +147,21 @@ def search(
                     threads=threads,
                     progress=bar,
                 )
-                for t, best in _votes(trees, tree_counts, len(rows), len(codes)):
-                    np.add.at(sums[c, t][number], (label[rows], best), weight[rows])
+                for t, shares in _votes(trees, tree_counts, len(rows), len(codes)):
+                    np.add.at(sums[c, t][number], (label[rows], shares.argmax(axis=1)), weight[rows])
+                    if heard is not None:
+                        heard(c, t, rows, shares / np.maximum(shares.sum(axis=1, keepdims=True), 1e-300))
     return [_row(candidates[c], t, matrices, codes) for (c, t), matrices in sums.items()]
 
 
-def _votes(trees, counts: Sequence[int], n: int, classes: int) -> Iterator[tuple[int, npt.NDArray[np.int64]]]:
+def _votes(
+    trees, counts: Sequence[int], n: int, classes: int
+) -> Iterator[tuple[int, npt.NDArray[np.float64]]]:
     total = np.zeros((n, classes))
     for number, (_, _, shares) in enumerate(trees, 1):
         total += shares
         if number in counts:
-            yield number, total.argmax(axis=1)
+            yield number, total
 
 
 def _row(

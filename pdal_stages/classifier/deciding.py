@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -30,6 +31,8 @@ class PredictionOptions:
         Points less reliable than this are not given the winning class, and are counted.
     rejected_code : int, optional
         Class of rejected points, instead of their old one.
+    limits : mapping of int to float, optional
+        The same as `reject_below`, for points of each class; the larger one counts.
     smooth : float
         Meters, 0 for none: probabilities become half the point's own, half the mean over the classified
         points in a sphere of that radius around it. Classes, reliability and margin follow from these.
@@ -42,6 +45,7 @@ class PredictionOptions:
     variance: bool = False
     reject_below: float | None = None
     rejected_code: int | None = None
+    limits: Mapping[int, float] | None = None
     smooth: float = 0.0
 
     def __post_init__(self) -> None:
@@ -116,7 +120,9 @@ class Outcome:
         self, n: int, classes: int, current: npt.NDArray[np.uint8] | None, options: PredictionOptions
     ) -> None:
         self._current, self._options = current, options
-        self._least = np.float32(options.reject_below or 0.0)
+        self._least = np.full(256, options.reject_below or 0.0, np.float32)
+        for code, limit in (options.limits or {}).items():
+            self._least[code] = max(self._least[code], limit)
         self.rejected = 0
         self.classification = np.zeros(n, np.uint8) if current is None else current.copy()
         self.reliability = np.zeros(n, np.float32)
@@ -137,7 +143,9 @@ class Outcome:
             self.margin[rows] = decided.margin
         if self.probabilities is not None:
             self.probabilities[rows] = decided.probabilities
-        low = self.reliability[rows] < self._least  # as stored, so that users can find the same points
+        low = (
+            self.reliability[rows] < self._least[decided.code]
+        )  # as stored, so that users can find the same points
         self.rejected += int(np.count_nonzero(low))
         if self._options.rejected_code is not None:
             instead: Any = np.uint8(self._options.rejected_code)

@@ -29,9 +29,12 @@ from .folds import FoldForests, Folds, sample_context
 from .forest import Forest
 from .growing import TreeOptions, grow
 from .model import Model
+from .passes import weighed
+from .refinement import blended
 from .refining import Below, held_by_base, on_top, trust
 from .samplefeatures import must_fit, percentiles, sample_features
 from .sampling import Samples, draw_samples
+from .sureness import Sureness, counted
 from .thinning import density_range
 from .trainoptions import TrainingOptions
 
@@ -87,6 +90,8 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     limits = percentiles(values, plan, options)
     below = None if base is None else Below(base, clouds, samples, options, progress)
     xy = samples.take([cloud.xyz[:, :2] for cloud in clouds])
+    priors = _priors(samples, len(classes.codes), options.prior_weight)
+    heard = _Heard(samples, classes.codes, priors, below, options)
     chosen, validation = _validate(
         values if below is None else np.concatenate([values, below.columns], axis=1),
         samples,
@@ -96,6 +101,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
         plan,
         options,
         progress,
+        heard,
     )
     started = time.perf_counter()
     passes = _Passes(labeled, samples, values, features, chosen, options, progress, below)
@@ -118,7 +124,8 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
             **({} if below is None or options.target is not None else _held(below, classes.codes)),
             **counted,
         },
-        "priors": _priors(samples, len(classes.codes), options.prior_weight),
+        "priors": priors,
+        **heard.of(chosen, validation, below),
         "densities": density_range(cloud.xyz for cloud in clouds),
         "voxel": options.voxel,
         "accuracy": {"cross_validation": validation, "leave_one_survey_out": left_out},
@@ -178,6 +185,7 @@ def _validate(
     plan: FeaturePlan,
     options: TrainingOptions,
     progress: bool,
+    heard: _Heard,
 ) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """(chosen trees, depth, leaf size; the cross-validation for the manifest or None)."""
     counts, candidates = options.tree_counts(), options.candidates()
@@ -194,6 +202,7 @@ def _validate(
         ways.insert(0, ("groups" if options.groups else "surveys", folds, (index % folds).astype(np.int16)))
     asked = {"groups": options.groups} if options.groups else {}
     for by, folds, fold in ways:
+        heard.tables.clear()
         try:
             rows = crossval.search(
                 values,
@@ -210,6 +219,7 @@ def _validate(
                 fold=fold,
                 threads=options.threads,
                 progress=progress,
+                heard=heard,
             )
         except OptionError as error:  # too little ground, or a class in one place
             if not quick and by == "blocks":
@@ -228,6 +238,54 @@ def _validate(
             "chosen": chosen,
         }
     return as_given, None
+
+
+class _Heard:
+    """What forests said of ground they had not seen, for :class:`Sureness`: as the points lie, not as they were drawn."""
+
+    def __init__(
+        self,
+        samples: Samples,
+        codes: Sequence[int],
+        priors: Mapping[str, Any] | None,
+        below: Below | None,
+        options: TrainingOptions,
+    ) -> None:
+        self.samples, self.codes, self._below, self._options = samples, codes, below, options
+        self._factors = None if priors is None else np.array(priors["factors"])
+        drawn = np.bincount(samples.label, samples.weight, len(codes))
+        self._weight = samples.weight * (np.array(samples.available) / np.maximum(drawn, 1))[samples.label]
+        self.tables: dict[tuple[int, int], Sureness] = {}
+
+    def __call__(
+        self, candidate: int, trees: int, rows: npt.NDArray[np.int64], p: npt.NDArray[np.float64]
+    ) -> None:
+        """Rows of the samples, and their probabilities (rows, classes)."""
+        codes, o = self.codes, self._options
+        if self._below is not None and o.target is not None:
+            return  # what the others truly are is not known
+        if self._below is None:
+            p = weighed(p, self._factors)
+        else:
+            before = self._below.base.codes.tolist()
+            trusted = trust(int(np.bincount(self.samples.label).min()))
+            p = blended(self._below.own[rows], p, before, codes, trusted)
+            codes = sorted({*before, *codes})
+        true = np.asarray(self.codes)[self.samples.label[rows]]
+        counted(p, codes, true, self._weight[rows], self.tables.setdefault((candidate, trees), Sureness()))
+
+    def of(
+        self, chosen: Mapping[str, Any], validation: Mapping[str, Any] | None, below: Below | None
+    ) -> dict[str, Any]:
+        """What a manifest says, where anything was heard."""
+        if validation is None or not self.tables:
+            return {}
+        rows = validation["tried"]
+        place = rows.index(validation["chosen"])
+        found = list(self.tables.values())[place]
+        passes = "" if below is not None or self._options.passes == 1 else ", of the first pass"
+        found.about = f"{validation['by']} held out, forests of {validation['chosen']['trees']} trees{passes}"
+        return {"sureness": found.to_dict()}
 
 
 class _Passes:

@@ -57,6 +57,14 @@ class Below:
                 out[at] = context_of(run, rows, mine)
         return out
 
+    @property
+    def own(self) -> npt.NDArray[np.float64]:
+        """(samples, classes) the base's probabilities of the samples themselves."""
+        n = len(self.base.classes)
+        first = Context(tuple(self.options.context)).tokens.index(OWN) * n
+        said = self.columns[:, first : first + n].astype(np.float64)
+        return said / np.maximum(said.sum(axis=1, keepdims=True), 1e-9)
+
 
 def on_top(base: Model, made: Model, trusted: float) -> Model:
     """The model of the base's passes and the one pass of `made`, with the classes of both."""
@@ -98,8 +106,7 @@ def held_by_base(below: Below, codes: Sequence[int]) -> dict[str, list[int]]:
     """
     base, samples = below.base, below.samples
     before = base.codes.tolist()
-    own = Context(tuple(below.options.context)).tokens.index(OWN) * len(before)
-    said = np.array(before)[below.columns[:, own : own + len(before)].argmax(axis=1)]
+    said = np.array(before)[below.own.argmax(axis=1)]
     out = {}
     for place, code in enumerate(codes):
         mine = samples.label == place

@@ -48,6 +48,8 @@ class ClassifyRequest:
         Whether classes that contradict their surroundings are mended at the end.
     polygons : tuple of str
         Files of polygons and the class of what is inside, as ``filters.polygons`` takes them.
+    keep_sure : float, optional
+        Points keep their class only where this share of such points is right; see ``filters.modelclassifier``.
     """
 
     model: str = STANDARD
@@ -58,6 +60,7 @@ class ClassifyRequest:
     bridges: bool = True
     consistency: bool = True
     polygons: tuple[str, ...] = ()
+    keep_sure: float | None = None
 
     @property
     def _inside(self) -> dict[str, str]:
@@ -67,6 +70,8 @@ class ClassifyRequest:
     def _classifier(self) -> dict[str, Any]:
         stage: dict[str, Any] = {"type": "filters.modelclassifier", "model": self.model, **self._inside}
         stage["compact"] = True
+        if self.keep_sure is not None:
+            stage["keep_sure"] = self.keep_sure
         for option, name in (
             ("margin", "Margin"),
             ("variance", "Variance"),
@@ -75,6 +80,12 @@ class ClassifyRequest:
             if any(one.startswith(name) for one in self.dimensions):
                 stage[option] = True
         return stage
+
+    @property
+    def cost(self) -> list[str]:
+        """What `keep_sure` is expected to cost, in lines; none without it."""
+        stage: Any = lower_stage(overridden(self._classifier, self.overrides)).stage
+        return stage.cost()
 
     @cached_property
     def loaded(self) -> Any:

@@ -18,7 +18,7 @@ from ..base.errors import StageError
 from ..base.files import write_whole
 from ..base.las import read_header
 from ..base.outputs import Output, check_outputs
-from ..base.plain import tell
+from ..base.plain import print_messages
 from ..base.progress import Progress
 from ..base.version import __version__
 from ..models import STANDARD
@@ -256,7 +256,7 @@ def complete_parts(path: str, wkt: str, model: str = STANDARD, say: bool = True)
         if missing is None:
             missing = [n for n in ("Reliability", "HeightAboveGround") if n not in part.arrays]
             if missing and say:
-                tell(
+                print_messages(
                     f"{path} has no {' and no '.join(missing)}: made now"
                     + (
                         f" by the model {model}, which takes as long as classifying"

@@ -308,12 +308,11 @@ holds the classes.
             raise StageError(
                 "no checked point lies inside 'where'", found=f"{int(checked.sum()):,} checked points"
             )
-        points.report["checked"] = int(np.count_nonzero(wanted))
-        note = (
+        points.report.figures["checked"] = int(np.count_nonzero(wanted))
+        points.report.notes.append(
             f"{int(np.count_nonzero(wanted)):,} of {points.count:,} points were checked by a person ({CHECKED}): samples "
             "are drawn from these alone, the others are neighbors"
         )
-        points.report["note"] = ". ".join(filter(None, [points.report.get("note"), note]))
         return wanted
 
     def _surveys(self, cloud: TrainingCloud, points: Points) -> list[TrainingCloud]:

@@ -12,7 +12,10 @@ from ..base.asprs import OVERLAP
 from ..base.errors import DimensionError, OptionError
 from ..base.progress import Progress
 from ..classifier import Model, Prediction
+from ..classifier.deciding import UNCLASSIFIED
 from ..classifier.smoothing import FARTHEST
+from ..classifier.sureness import Limit, Sureness, said, sureness_of
+from ..models import find
 from .base import Stage
 from .loading import loaded_model
 from .options import option
@@ -62,6 +65,14 @@ class ModelClassifier(Stage):
         "Class code for rejected points; by default they keep the class they had",
         minimum=0,
         maximum=255,
+    )
+    keep_sure: float | None = option(
+        "number",
+        None,
+        "Only points sure enough keep their class, so that this share of those of each class is right, as it was on ground "
+        "that the model had not seen (0.98); the rest become rejected_code, by default 1",
+        minimum=0.5,
+        maximum=0.999,
     )
     ignore: Selection = option(
         "selection",
@@ -131,6 +142,7 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
                 cure="Use 'margin'",
             )
         self.bands  # noqa: B018  refused here where it means nothing
+        self.limits  # noqa: B018  and here where nothing is known of the model
 
     @cached_property
     def bands(self) -> tuple[float, float] | None:
@@ -160,6 +172,24 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
     def model(self) -> Model:
         """The loaded model."""
         return loaded_model(self.model_file)
+
+    @cached_property
+    def limits(self) -> dict[int, Limit] | None:
+        """How sure points of each class must be to keep it, with `keep_sure`."""
+        if self.keep_sure is None:
+            return None
+        return self.sureness.limits(self.keep_sure)
+
+    @property
+    def sureness(self) -> Sureness:
+        """How often the model was right where it was how sure."""
+        return sureness_of(self.model.info, find(self.model_file))
+
+    def cost(self) -> list[str]:
+        """What `keep_sure` is expected to cost, in lines; none without it."""
+        if self.limits is None or self.keep_sure is None:
+            return []
+        return said(self.limits, dict(self.model.classes), self.keep_sure, self.sureness.kept(self.limits))
 
     @property
     def preparation(self) -> list[dict[str, Any]]:
@@ -207,7 +237,13 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         return self.smooth + 0.001 if self.smooth else 0.0  # a distance rounds
 
     def largest_class(self) -> int:
-        return max([code for code, _ in self.model.classes] + [self.rejected_code or 0])
+        return max([code for code, _ in self.model.classes] + [self._rejected or 0])
+
+    @property
+    def _rejected(self) -> int | None:
+        """The class of rejected points, where they do not keep theirs."""
+        unsure = UNCLASSIFIED if self.keep_sure is not None else None
+        return unsure if self.rejected_code is None else self.rejected_code
 
     def _dimensions(self, points: Points) -> dict[str, NDArray]:
         """What the model reads."""
@@ -242,7 +278,10 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
                 margin=self.margin,
                 variance=self.variance,
                 reject_below=self.reject_below,
-                rejected_code=self.rejected_code,
+                rejected_code=self._rejected,
+                limits=None
+                if self.limits is None
+                else {c: one.reliability for c, one in self.limits.items()},
                 smooth=self.smooth,
                 progress=progress,
             )
@@ -291,7 +330,7 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         """Before any work: codes that points keep must fit the file, as those do that the model gives."""
         if self.code_limit is None:
             return
-        may_keep = self.reject_below is not None and self.rejected_code is None
+        may_keep = self.reject_below is not None and self._rejected is None
         codes = points.class_codes if may_keep else points.class_codes[~wanted]
         beyond, number = np.unique(codes[codes > self.code_limit.largest], return_counts=True)
         if beyond.size:

@@ -1,0 +1,169 @@
+"""How often a model was right where it said how sure it was, on ground that it had not seen; and what follows from it.
+
+From the counts comes, for each class, the reliability from which on its points are right as often as is wanted.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ..base.errors import ModelError, OptionError
+from ..base.plain import one_line
+
+#: Reliabilities are counted in so many bins from 0 to 1, the last of which holds 1.
+BINS = 64
+#: What the file beside a model's is called.
+SUFFIX = ".sureness.json"
+_FORMAT = "pdal-stages sureness"
+
+
+class Limit(NamedTuple):
+    """For a class: from which reliability on points keep it, the share of its points that do, and how many of these are
+    right."""
+
+    reliability: float
+    kept: float
+    right: float
+
+
+@dataclass
+class Sureness:
+    """Points by the class a model gave them and its reliability; weights are as the points lie.
+
+    Attributes
+    ----------
+    right, wrong : dict of int to (BINS,) float64
+    about : str
+        Where they were counted.
+    """
+
+    right: dict[int, npt.NDArray[np.float64]] = field(default_factory=dict)
+    wrong: dict[int, npt.NDArray[np.float64]] = field(default_factory=dict)
+    about: str = ""
+
+    def add(
+        self,
+        given: npt.NDArray[Any],
+        true: npt.NDArray[Any],
+        reliability: npt.NDArray[np.floating],
+        weight: npt.NDArray[np.floating] | None = None,
+    ) -> None:
+        """Count points: (n,) classes given, true classes, reliabilities, and how much each counts."""
+        place = np.clip(np.floor(np.asarray(reliability, np.float64) * BINS), 0, BINS - 1).astype(np.int64)
+        for code in np.unique(given).tolist():
+            for table, chosen in ((self.right, given == true), (self.wrong, given != true)):
+                mine = (given == code) & chosen
+                counted = np.bincount(place[mine], None if weight is None else weight[mine], BINS)
+                table[code] = table.get(code, np.zeros(BINS)) + counted
+
+    def limits(self, accuracy: float) -> dict[int, Limit]:
+        """The lowest reliability of each class from which on the share of right points is `accuracy`; above 1 where it never
+        is."""
+        out = {}
+        for code in sorted(self.right):
+            right, wrong = (table[code][::-1].cumsum()[::-1] for table in (self.right, self.wrong))
+            all_ = right + wrong
+            good = (all_ > 0) & (right >= accuracy * all_)
+            if not good.any():
+                out[code] = Limit(2.0, 0.0, 0.0)
+                continue
+            first = int(np.flatnonzero(good)[0])
+            out[code] = Limit(first / BINS, float(all_[first] / all_[0]), float(right[first] / all_[first]))
+        return out
+
+    def kept(self, limits: Mapping[int, Limit]) -> float:
+        """The share of all points that keep their class."""
+        count = {code: float((self.right[code] + self.wrong[code]).sum()) for code in self.right}
+        return sum(limits[code].kept * n for code, n in count.items()) / max(sum(count.values()), 1e-9)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for a manifest or a file."""
+
+        def short(values: npt.NDArray[np.float64]) -> list[float]:
+            return [float(f"{value:.4g}") for value in values]
+
+        classes = {
+            str(code): {"right": short(self.right[code]), "wrong": short(self.wrong[code])}
+            for code in sorted(self.right)
+        }
+        return {"about": self.about, "classes": classes}
+
+    @classmethod
+    def from_dict(cls, said: Mapping[str, Any]) -> Sureness:
+        """What :meth:`to_dict` gave.
+
+        Raises
+        ------
+        ModelError
+            If it is something else.
+        """
+        try:
+            tables: list[dict[int, npt.NDArray[np.float64]]] = [{}, {}]
+            for code, counted in said["classes"].items():
+                for table, name in zip(tables, ("right", "wrong"), strict=True):
+                    values = np.array(counted[name], np.float64)
+                    if values.shape != (BINS,) or not (values >= 0).all() or not np.isfinite(values).all():
+                        raise ValueError(name)
+                    table[int(code)] = values
+            return cls(tables[0], tables[1], one_line(str(said["about"])))
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise ModelError(
+                "the counts of right and wrong points by reliability are damaged", found=str(error)
+            ) from None
+
+
+def sureness_of(info: Mapping[str, Any], path: str) -> Sureness:
+    """What is known of a model: in its file, or in a file beside it.
+
+    Raises
+    ------
+    OptionError
+        If nothing is.
+    """
+    if info.get("sureness"):
+        return Sureness.from_dict(info["sureness"])
+    beside = Path(path).with_suffix(SUFFIX)
+    if beside.is_file():
+        return Sureness.from_dict(json.loads(beside.read_text(encoding="utf-8")))
+    raise OptionError(
+        "it is not known how sure this model must be to be right: it was never scored on ground it had not seen",
+        found=path,
+        cure="Train it with folds (the default), on labels that lie in more than one place; or set a limit by hand: "
+        "--filters.modelclassifier.reject_below=0.8",
+    )
+
+
+def said(limits: Mapping[int, Limit], names: Mapping[int, str], accuracy: float, kept: float) -> list[str]:
+    """What it costs, in lines."""
+    lines = [
+        f"to be right in {100 * accuracy:g} % of the points of each class, about {100 * (1 - kept):.1f} % of all points are "
+        "expected to become class 1 (unclassified):"
+    ]
+    for code, one in limits.items():
+        name = f"{code} {names.get(code, '')}".strip()
+        if one.reliability > 1.0:
+            lines.append(f"  {name}: never so sure, so none keeps it")
+        else:
+            lines.append(
+                f"  {name}: {100 * one.kept:.1f} % keep it, from reliability {one.reliability:.2f} on"
+            )
+    return lines
+
+
+def counted(
+    probabilities: npt.NDArray[np.floating],
+    codes: Sequence[int],
+    true: npt.NDArray[Any],
+    weight: npt.NDArray[np.floating],
+    into: Sureness,
+) -> None:
+    """Count points by their probabilities (n, classes) and true codes (n,)."""
+    given = np.asarray(codes)[probabilities.argmax(axis=1)]
+    into.add(given, true, probabilities.max(axis=1), weight)
