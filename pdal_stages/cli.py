@@ -369,6 +369,19 @@ def _parser() -> argparse.ArgumentParser:
     takes("--count", type=int, help="Samples of each class")
     takes("--trees", help="Number of trees; of several the best is found")
 
+    takes(
+        "--leave-one-survey-out",
+        action="store_true",
+        help="Score each survey by a model trained without it; each file is a survey, unless --surveys groups them",
+    )
+    takes(
+        "--surveys",
+        nargs="+",
+        metavar="NAME=PATTERN",
+        help="Files of one survey, e.g. north=north/*.laz; surveys do not see each other, weigh alike, and may have "
+        "different reference systems",
+    )
+
     commands.choices["train"].epilog = (
         "Of several files the score is by file. Of one file, --writers.classifiermodel.groups=PointSourceId makes it one by "
         "flight line (any dimension with a number for each group), and --writers.classifiermodel.survey=UserData says that "
@@ -632,8 +645,15 @@ def _train(options: argparse.Namespace) -> None:
 
     named = ("classes", "neighborhoods", "feature_set", "count", "trees", "base")
     extra = {name: value for name in named if (value := getattr(options, name)) is not None}
-    stages = train_pipeline(input_files(options.inputs), options.model, options.overrides, **extra)
-    _run(options, Pipeline(stages, options.overrides))
+    if options.leave_one_survey_out or options.surveys:
+        from .pipeline.surveyjob import surveys_of, train_surveys
+
+        surveys = surveys_of(input_files(options.inputs), options.surveys or ())
+        extra |= {"leave_one_survey_out": True} if options.leave_one_survey_out else {}
+        print_messages(*train_surveys(surveys, options.model, options.overrides, **extra))
+    else:
+        stages = train_pipeline(input_files(options.inputs), options.model, options.overrides, **extra)
+        _run(options, Pipeline(stages, options.overrides))
     if Path(options.model).is_file():  # not written into a pipe or device
         print(load_model(options.model))
 

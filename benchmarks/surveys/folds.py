@@ -7,9 +7,11 @@ without both, which serves where B is left out and A is read, too.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +26,7 @@ from pdal_stages.classifier.foresttraining import FOLD_TREES, feature_plan
 from pdal_stages.classifier.growing import TreeOptions, grow
 from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.classifier.smoothing import count_shares
+from pdal_stages.stages.loading import load_model
 
 FEATURES = Features(feature_plan(OPTIONS))
 CONTEXT = Context(tuple(OPTIONS.context))
@@ -87,4 +90,12 @@ class LeaveOneOut:
             around[at] = part
         second = self._grow(np.concatenate([self.values, around], axis=1), kept, self.trees)
         passes = FeatureForest(FEATURES, first), FeatureForest(FEATURES, second, CONTEXT)
-        return Model(passes, self.classes, {"voxel": OPTIONS.voxel})
+        # What is known of the shipped model, which is of the same make.
+        info = {**copy.deepcopy(load_model("standard").info), "training": self._training(name)}
+        return Model(passes, self.classes, {**info, "voxel": OPTIONS.voxel})
+
+    def _training(self, without: str) -> dict[str, Any]:
+        """What a model file says of its training."""
+        clouds = [{"name": c.name, "points": len(c.xyz)} for c in self.clouds if c.flight != without]
+        samples = int(np.count_nonzero(self.survey != self.names.index(without)))
+        return {"clouds": clouds, "count": OPTIONS.count, "seed": OPTIONS.seed, "samples": samples}

@@ -118,6 +118,7 @@ def main() -> None:
     options.add_argument(
         "--pictures", type=Path, help="folder for pictures of the surveys at their own density"
     )
+    options.add_argument("--save", type=Path, help="folder for the models")
     args = options.parse_args()
     runs: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
@@ -127,6 +128,8 @@ def main() -> None:
         for left_out in args.surveys:
             started = time.process_time()
             model, cloud = all_of_them.without(left_out), load(args.data, left_out)
+            if args.save:
+                model.save(args.save / f"{left_out.replace(' ', '-').replace(chr(39), '')}.model")
             for one in (cloud, thinned(cloud, 2.0), thinned(cloud, 0.5)):
                 if one is not None:
                     runs.append(score(model, one, args.pictures if one is cloud else None))

@@ -7,7 +7,7 @@ Each survey is classified, by the command, with the model that has not seen it, 
 learned from the other surveys alone. Figures: points expected wrong beside those that are; the share of the wrong points
 in the patches that come first, up to a tenth of the area, beside what reliability alone finds and what knowing the truth
 would. What is not ground, vegetation or building in the labels is not counted. --out writes the calibration learned from
-all surveys.
+all surveys, --sureness the counts of right and wrong points by reliability, for `classify --keep-sure`.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import numpy as np
 from clouds import SURVEYS, VEGETATION
 
 from pdal_stages import cli
+from pdal_stages.classifier.sureness import Sureness
 from pdal_stages.review import Calibration, Outlook, Records, Settings, find_patches, side_for
 from pdal_stages.review.cells import BINS, GROUP_OF, PARTS, bins_of
 from pdal_stages.review.expected import binned, kinds_of, learned_factors, learned_rates, outlook
@@ -146,6 +147,19 @@ def learned(surveys: Sequence[Classified], about: dict[str, Any]) -> Calibration
     return Calibration(rates, tuple(factors), np.array(base), frozenset(number[times >= 5].tolist()), about)
 
 
+def sureness(surveys: Sequence[Classified]) -> Sureness:
+    """How often the models were right where they were how sure, where the labels say what vegetation is."""
+    told = [one for one in surveys if not SURVEYS[one.name].tall]
+    out = Sureness(
+        about=f"{len(told)} surveys ({', '.join(one.name for one in told)}), each classified by a model that had not seen it"
+    )
+    weight = survey_weights(np.array([float(np.count_nonzero(one.truth)) for one in told]))
+    for one, of_point in zip(told, weight, strict=True):
+        known = (one.truth > 0) & np.isin(one.codes, (2, 5, 6))
+        out.add(one.codes[known], one.truth[known], one.reliability[known], np.full(known.sum(), of_point))
+    return out
+
+
 def survey_weights(points: np.ndarray) -> np.ndarray:
     """Of a point of each survey: between all points alike and all surveys alike."""
     weight = 1.0 / np.sqrt(points)
@@ -228,21 +242,28 @@ def main() -> None:
     options.add_argument("--surveys", nargs="+", default=list(SURVEYS), choices=list(SURVEYS))
     options.add_argument("--json", type=Path, help="where the figures go")
     options.add_argument("--out", type=Path, help="where the calibration of all surveys goes")
+    options.add_argument("--sureness", type=Path, help="where the counts behind --keep-sure go")
+    options.add_argument(
+        "--only-learn", action="store_true", help="no figures, only what --out and --sureness write"
+    )
     args = options.parse_args()
     kept = args.kept or args.models
     all_ = [classified(args.data, name, args.models / f"{slug(name)}.model", kept) for name in args.surveys]
     rows = []
-    for one in all_:
+    for one in [] if args.only_learn else all_:
         others = learned([other for other in all_ if other is not one], {})
         rows.append(judged(one, others))
         print(json.dumps({key: value for key, value in rows[-1].items() if key != "listed"}), flush=True)
-    print(table(rows))
+    if rows:
+        print(table(rows))
     if args.json:
         shown = [{key: value for key, value in row.items() if key != "listed"} for row in rows]
         args.json.write_text(json.dumps(shown, indent=1) + "\n")
     if args.out:
         about = {"surveys": args.surveys, "command": "python benchmarks/surveys/review.py"}
         args.out.write_text(learned(all_, about).to_json() + "\n")
+    if args.sureness:
+        args.sureness.write_text(json.dumps(sureness(all_).to_dict(), separators=(",", ":")) + "\n")
 
 
 if __name__ == "__main__":

@@ -37,6 +37,7 @@ from .sampling import Samples, draw_samples
 from .sureness import Sureness, counted
 from .thinning import density_range
 from .trainoptions import TrainingOptions
+from .unscored import why_unscored
 
 #: Trees of a forest that judges a fold, as a share of the final one's.
 FOLD_TREES = 0.25
@@ -121,6 +122,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
             "min_samples_leaf": chosen["min_samples_leaf"],
             "max_depth": chosen["max_depth"],
             **passes.notes,
+            **_unscored(heard, validation, xy, samples, labeled, options, _gap(plan, options)),
             **({} if below is None or options.target is not None else _held(below, classes.codes)),
             **counted,
         },
@@ -134,6 +136,21 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     }
     made = Model(tuple(passes.made), list(zip(classes.codes, classes.names, strict=True)), info, timed)
     return made if base is None else on_top(base, made, trust(int(np.bincount(samples.label).min())))
+
+
+def _unscored(
+    heard: _Heard,
+    validation: Any,
+    xy: npt.NDArray[np.float64],
+    samples: Samples,
+    labeled: Labeled,
+    options: TrainingOptions,
+    gap: float,
+) -> dict[str, str]:
+    if validation is not None or options.folds == 0:
+        return {}
+    named = list(zip(labeled.classes.codes, labeled.classes.names, strict=True))
+    return {"unscored": why_unscored(heard.errors, xy, samples.label, named, options.block_size, gap)}
 
 
 def _held(below: Below, codes: Sequence[int]) -> dict[str, Any]:
@@ -222,6 +239,7 @@ def _validate(
                 heard=heard,
             )
         except OptionError as error:  # too little ground, or a class in one place
+            heard.errors.append(error)
             if not quick and by == "blocks":
                 raise
             if options.groups and by == "groups":
@@ -256,6 +274,7 @@ class _Heard:
         drawn = np.bincount(samples.label, samples.weight, len(codes))
         self._weight = samples.weight * (np.array(samples.available) / np.maximum(drawn, 1))[samples.label]
         self.tables: dict[tuple[int, int], Sureness] = {}
+        self.errors: list[OptionError] = []
 
     def __call__(
         self, candidate: int, trees: int, rows: npt.NDArray[np.int64], p: npt.NDArray[np.float64]

@@ -135,6 +135,8 @@ def scores(info: Mapping[str, Any], held_out: dict[str, Any] | None = None) -> l
     for number, one in enumerate(info["passes"], 1):
         rows.append((f"out of bag{f' {number}' if len(info['passes']) > 1 else ''}", one["out_of_bag"]))
     lines += [_scored(label, row) for label, row in rows if row]
+    if unscored := info["training"].get("unscored"):
+        lines.append(f"not scored     {unscored}")
     if lines:
         lines.append("(classes weigh the same; out of bag is flattered by neighboring samples)")
         lines.append("")

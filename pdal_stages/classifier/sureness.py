@@ -65,14 +65,14 @@ class Sureness:
 
     def limits(self, accuracy: float) -> dict[int, Limit]:
         """The lowest reliability of each class from which on the share of right points is `accuracy`; above 1 where it never
-        is."""
+        is, and then the largest share there is."""
         out = {}
         for code in sorted(self.right):
             right, wrong = (table[code][::-1].cumsum()[::-1] for table in (self.right, self.wrong))
             all_ = right + wrong
             good = (all_ > 0) & (right >= accuracy * all_)
             if not good.any():
-                out[code] = Limit(2.0, 0.0, 0.0)
+                out[code] = Limit(2.0, 0.0, float(np.max(right / np.maximum(all_, 1e-12))))
                 continue
             first = int(np.flatnonzero(good)[0])
             out[code] = Limit(first / BINS, float(all_[first] / all_[0]), float(right[first] / all_[first]))
@@ -149,7 +149,9 @@ def said(limits: Mapping[int, Limit], names: Mapping[int, str], accuracy: float,
     for code, one in limits.items():
         name = f"{code} {names.get(code, '')}".strip()
         if one.reliability > 1.0:
-            lines.append(f"  {name}: never so sure, so none keeps it")
+            lines.append(
+                f"  {name}: none keeps it, as never more than {100 * one.right:.1f} % of the surest were right"
+            )
         else:
             lines.append(
                 f"  {name}: {100 * one.kept:.1f} % keep it, from reliability {one.reliability:.2f} on"

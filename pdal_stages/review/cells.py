@@ -36,7 +36,7 @@ _HALF = np.int64(1) << 30
 NONE = np.int32(2**31 - 1)
 #: Expected errors are whole numbers of this part of a point.
 PARTS = 65536
-_ADDED = ("points", "expected", "unsure", "doubtful", "contrary", "strips", "wrong", "known")
+_ADDED = ("points", "expected", "unsure", "doubtful", "contrary", "wrong", "known")
 
 
 def side_for(points: int, area: float) -> float:
@@ -106,8 +106,10 @@ class Records:
         Height of the lowest ground point, of the lowest and of the highest, mm; no ground: the largest number.
     tile, most : (n,) int32
         The number of the file most of its points are of, and how many these are.
-    strips : (n,) int32
-        Points that two flight lines disagree on.
+    strip : (n, 2) int64
+        The lowest and the highest number of a flight line; -1 where these are not known.
+    of_strip : (n, 2, 4) int32
+        Points of each group of these two.
     wrong, known : (n, 4) int32
         With true classes: points of another group than the true one, and points whose class is known.
     """
@@ -124,7 +126,8 @@ class Records:
     highest: NDArray[np.int32]
     tile: NDArray[np.int32]
     most: NDArray[np.int32]
-    strips: NDArray[np.int32]
+    strip: NDArray[np.int64]
+    of_strip: NDArray[np.int32]
     wrong: NDArray[np.int32]
     known: NDArray[np.int32]
 
@@ -198,7 +201,7 @@ class Records:
             highest,
             np.full(n, tile, np.int32),
             number.astype(np.int32),
-            _disagreeing(at, n, group, strip),
+            *_strips(at, n, group, strip),
             _by_group(at[wrong], group[wrong], n),
             _by_group(at[told], group[told], n),
         )
@@ -222,9 +225,28 @@ class Records:
         made |= {name: joined(name, np.maximum, -int(NONE)) for name in ("highest", "most")}
         tile, number = (np.concatenate([getattr(part, name) for part in parts]) for name in ("tile", "most"))
         largest = number == made["most"][at]
+        strip, counts = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("strip", "of_strip")
+        )
+        made["strip"], made["of_strip"] = np.full((n, 2), -1, np.int64), np.zeros((n, 2, 4), np.int32)
+        for end, sign in ((0, -1), (1, 1)):
+            best = np.full(n, -(1 << 40), np.int64)
+            np.maximum.at(best, at, sign * strip[:, end])
+            made["strip"][:, end] = sign * best
+            mine = strip[:, end] == sign * best[at]
+            np.add.at(made["of_strip"][:, end], at[mine], counts[mine, end])
         made["tile"] = np.full(n, NONE, np.int32)
         np.minimum.at(made["tile"], at[largest], tile[largest])  # the first of equals
         return cls(parts[0].side, key, **made)
+
+    @property
+    def disagreeing(self) -> NDArray[np.float64]:
+        """Points of each cell that its first and its last flight line disagree on: by how much shares of groups differ,
+        times the smaller number of points."""
+        number = self.of_strip.sum(axis=2, dtype=np.int64)
+        share = self.of_strip / np.maximum(number, 1)[:, :, None]
+        apart = 0.5 * np.abs(share[:, 0] - share[:, 1]).sum(axis=1)
+        return apart * number.min(axis=1) * (self.strip[:, 0] != self.strip[:, 1]) * (number.min(axis=1) >= 3)
 
     def taken(self, chosen: NDArray[np.bool_]) -> Records:
         """Some of the cells."""
@@ -236,27 +258,18 @@ def _by_group(at: NDArray[np.int64], group: NDArray[np.uint8], n: int) -> NDArra
     return np.bincount(at * 4 + group, minlength=4 * n).reshape(n, 4).astype(np.int32)
 
 
-def _disagreeing(
+def _strips(
     at: NDArray[np.int64], n: int, group: NDArray[np.uint8], strip: ArrayLike | None
-) -> NDArray[np.int32]:
-    """Points of each cell that strips disagree on: of two strips, by how much shares of classes differ, times the smaller
-    number of points; the largest of all pairs."""
-    out = np.zeros(n, np.int32)
-    if strip is None or not len(at):
-        return out
-    names, line = np.unique(np.asarray(strip), return_inverse=True)
-    if len(names) < 2 or len(names) > 2000:
-        return out
-    pair, of = np.unique(at * len(names) + line.reshape(-1), return_inverse=True)
-    share = np.bincount(of.reshape(-1) * 4 + group, minlength=4 * len(pair)).reshape(-1, 4).astype(np.float64)
-    number = share.sum(axis=1)
-    cell = pair // len(names)
-    share /= number[:, None]
-    for step in range(1, min(4, len(pair))):  # pairs of strips that follow one another in a cell
-        same = np.flatnonzero(
-            (cell[step:] == cell[:-step]) & (np.minimum(number[step:], number[:-step]) >= 3)
-        )
-        apart = 0.5 * np.abs(share[same + step] - share[same]).sum(axis=1)
-        fewer = np.minimum(number[same + step], number[same])
-        np.maximum.at(out, cell[same], np.rint(apart * fewer).astype(np.int32))
-    return out
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """The first and the last flight line of each cell, and the points of each group of these."""
+    ends, counts = np.full((n, 2), -1, np.int64), np.zeros((n, 2, 4), np.int32)
+    if strip is None:
+        return ends, counts
+    line = np.asarray(strip).astype(np.int64)
+    ends[:, 0] = 1 << 32
+    np.minimum.at(ends[:, 0], at, line)
+    np.maximum.at(ends[:, 1], at, line)
+    for end in (0, 1):
+        mine = line == ends[at, end]
+        counts[:, end] = _by_group(at[mine], group[mine], n)
+    return ends, counts

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from .cells import BUILDING, GROUND, Settings, rows_and_columns
 from .expected import Outlook
@@ -22,7 +21,7 @@ REASONS = {
     "heights": "heights doubtful",
     "other": "like what was wrong elsewhere",
 }
-#: Share of the cells, those with most to expect, that are shown by themselves; the rest of a block is another patch.
+#: Share of the cells, those with most to expect, that make patches of their own.
 HOT = 0.1
 #: A patch has a reason if it holds for this share of its expected errors.
 ENOUGH = 0.25
@@ -67,7 +66,7 @@ class Patches:
 
 
 def find_patches(seen: Outlook, settings: Settings) -> Patches:
-    """The patches of all cells: hot ones that touch within a block, and the rest of each block."""
+    """The patches of all cells. What is hot in a block is seen at a glance, so it is one patch, and the rest another."""
     records = seen.records
     row, column = rows_and_columns(records.key)
     of_cell = _joined(row, column, _hot(seen.total), max(1, round(settings.block / records.side)))
@@ -116,27 +115,9 @@ def _hot(errors: NDArray[np.float64]) -> NDArray[np.bool_]:
 def _joined(
     row: NDArray[np.int64], column: NDArray[np.int64], hot: NDArray[np.bool_], across: int
 ) -> NDArray[np.int64]:
-    """(n,) the patch of each cell, numbered from 0 without gaps."""
+    """(n,) the patch of each cell, numbered from 0 without gaps: the hot cells of a block, and its others."""
     block = np.stack([row // across, column // across, hot], axis=1)
-    blocks, at = np.unique(block, axis=0, return_inverse=True)
-    at = at.reshape(-1)
-    out = np.empty(len(row), np.int64)
-    order = np.argsort(at, kind="stable")
-    ends = np.searchsorted(at[order], np.arange(len(blocks) + 1))
-    count = 0
-    for number, (_, _, is_hot) in enumerate(blocks.tolist()):
-        mine = order[ends[number] : ends[number + 1]]
-        if not is_hot:
-            out[mine], count = count, count + 1
-            continue
-        grid = np.zeros((across, across), bool)
-        place = row[mine] % across, column[mine] % across
-        grid[place] = True
-        # Cells with one between them are seen at the same glance.
-        label, _ = ndimage.label(ndimage.binary_dilation(grid, np.ones((3, 3))), np.ones((3, 3)))
-        used, name = np.unique(label[place], return_inverse=True)
-        out[mine], count = count + name.reshape(-1), count + len(used)
-    return out
+    return np.unique(block, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def _reasons(seen: Outlook, of_cell: NDArray[np.int64], n: int) -> list[tuple[str, ...]]:

@@ -114,7 +114,7 @@ def signals(records: Records) -> Signals:
         relief,
         (records.highest.astype(np.float64) - records.lowest) / MM,
         total / side**2,
-        records.strips * share,
+        records.disagreeing * share,
         records.doubtful * share,
         records.unsure * share,
         records.contrary * share,

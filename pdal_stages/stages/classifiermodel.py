@@ -16,7 +16,8 @@ from ..base import kinds
 from ..base.errors import ModelError, OptionError, StageError
 from ..base.files import check_writable
 from ..base.outputs import Output
-from ..classifier import TrainingCloud, TrainingOptions, summary, train
+from ..base.report import Report
+from ..classifier import Model, TrainingCloud, TrainingOptions, summary, train
 from ..classifier.algorithms import ALGORITHMS, Trainer, trainer
 from ..classifier.classes import ClassMap
 from ..classifier.dimensions import ALWAYS, CHECKED, required, welcome
@@ -208,7 +209,7 @@ holds the classes.
         names = required(self.training.inputs)
         return (*names, *self._trainer.optional_inputs) if self.automatic else names
 
-    def _training_on(self, points: Points) -> TrainingOptions:
+    def training_on(self, points: Points) -> TrainingOptions:
         """The trainer's options, with the dimensions that the points have."""
         if not self.automatic:
             return self.training
@@ -243,7 +244,12 @@ holds the classes.
                 "there are no points to train on",
                 cure="Check the reader's file and the filters before this stage",
             )
-        training = self._training_on(points)
+        training = self.training_on(points)
+        self.finish(train(self._surveys(self.cloud_of(points, training), points), training), points.report)
+        return {}
+
+    def cloud_of(self, points: Points, training: TrainingOptions) -> TrainingCloud:
+        """The points as a cloud to train on, all of one survey."""
         cloud = TrainingCloud(
             xyz=points.xyz,
             labels=points.codes_of(self.label),
@@ -258,16 +264,16 @@ holds the classes.
             mask=self._mask(points),
         )
         gone = points.ignored(replace(self.ignore, codes=()))  # the labels among them are left to the trainer
-        if gone.any():
-            cloud = cloud.part(np.flatnonzero(~gone))
-        model = train(self._surveys(cloud, points), training)
+        return cloud.part(np.flatnonzero(~gone)) if gone.any() else cloud
+
+    def finish(self, model: Model, report: Report) -> None:
+        """Write the model, and report what is to be known of it."""
         model.info["preparation"] = self._preparation
         if self.base is not None:
             model.info["base"] = {"name": Path(self.base).stem, "sha256": digest_of(self.base)}
         if self._by_hand:
             model.info["by_hand"] = self._by_hand
         model.save(self.filename)
-        report = points.report
         shown = {key: model.info[key] for key in _SHOWN if key in model.info}
         report.figures |= {"model": self.filename, **shown, "seconds": model.seconds}
         if gone := model.info["training"].get("contradicted"):
@@ -283,6 +289,8 @@ holds the classes.
                 f"{held:,} of {all_:,} samples of class {code} are, to the base, of a class that no label has, and stay it: "
                 "label some of that class too, or find this one alone (strategy binary, target)"
             )
+        if unscored := model.info["training"].get("unscored"):
+            report.warnings.append(unscored)
         crossed = model.info["accuracy"]["cross_validation"] or {}
         if "instead" in crossed:
             report.notes.append(
@@ -293,7 +301,6 @@ holds the classes.
             report.notes.append(scores[0])
         if self._trainer.reports_training:
             report.figures["training"] = model.info["training"]
-        return {}
 
     def _mask(self, points: Points) -> NDArray[np.bool_] | None:
         """The points that samples are drawn from: those inside `where`, and where any was checked by a person, of these

@@ -1,0 +1,89 @@
+"""`train` with surveys: each file by itself, whatever its reference system, and what is said where there is no score."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_training_scores import QUICK_WORDS, scene
+
+import pdal_stages as ps
+from pdal_stages.base.errors import OptionError
+from pdal_stages.classifier.unscored import why_unscored
+from pdal_stages.cli import main
+from pdal_stages.pipeline.surveyjob import surveys_of
+
+
+def test_surveys_are_files_or_groups_of_them():
+    files = ["a/1.laz", "a/2.laz", "b/1.laz", "c.laz"]
+    assert surveys_of(files) == {"1": ["a/1.laz"], "2": ["a/2.laz"], "b/1.laz": ["b/1.laz"], "c": ["c.laz"]}
+    assert surveys_of(files, ["north=a/*"]) == {"north": files[:2], "1": ["b/1.laz"], "c": ["c.laz"]}
+    assert surveys_of(files, ["n=a/*,b/*", "s=c.laz"]) == {"n": files[:3], "s": files[3:]}
+    for wrong in (["a/*"], ["n=x/*"], ["n=a/*", "s=a/1.laz"], ["=a/*"]):
+        with pytest.raises(OptionError):
+            surveys_of(files, wrong)
+
+
+@pytest.mark.pdal
+def test_surveys_of_two_reference_systems_are_left_out_in_turn(tmp_path, write_las, capsys):
+    pyproj = pytest.importorskip("pyproj")
+    # The same coordinates in different systems: as one cloud they would lie in one another.
+    for number, epsg in enumerate((2154, 28992, 25830)):
+        write_las(
+            tmp_path / f"t{number}.laz",
+            scene(number),
+            point_format=6,
+            wkt=pyproj.CRS(epsg).to_wkt("WKT1_GDAL"),
+        )
+    words = ["train", *(str(tmp_path / f"t{k}.laz") for k in range(3)), "--model", str(tmp_path / "m.model")]
+    telling = ["--feature-set", "HeightAboveLowest", "--neighborhoods", "s12"]
+    assert main([*words, *QUICK_WORDS, *telling, "--leave-one-survey-out"]) == 0
+    out = capsys.readouterr().out
+    assert "survey left out" in out.splitlines()[0]
+    info = ps.load_model(tmp_path / "m.model").info
+    found = info["accuracy"]["leave_one_survey_out"]
+    assert [one["name"] for one in found["surveys"]] == ["t0", "t1", "t2"]
+    assert found["overall_accuracy"] > 0.9
+    assert [one["name"] for one in info["training"]["clouds"]] == ["t0", "t1", "t2"]
+
+    grouped = [
+        *words,
+        *QUICK_WORDS,
+        "--leave-one-survey-out",
+        "--surveys",
+        f"one={tmp_path}/t0.laz,{tmp_path}/t1.laz",
+    ]
+    assert main(grouped) == 1  # of one survey must be of one reference system
+    assert "reference systems" in capsys.readouterr().err
+    assert main([*words[:2], *words[-2:], *QUICK_WORDS, "--leave-one-survey-out"]) == 1
+    assert "at least two surveys" in capsys.readouterr().err
+
+
+@pytest.mark.pdal
+def test_it_is_said_that_there_is_no_score_and_what_to_label_next(tmp_path, write_las, capsys):
+    points = scene(1)
+    building = points["Classification"] == 6
+    corner = (points["X"] > 20) | (points["Y"] > 20)
+    points["Classification"][building & corner] = 1
+    write_las(tmp_path / "a.laz", points, point_format=1)
+    assert main(["train", str(tmp_path / "a.laz"), "--model", str(tmp_path / "m.model"), *QUICK_WORDS]) == 0
+    said = capsys.readouterr()
+    assert "there is no score on ground held out" in said.err and "6 Building" in said.err
+    assert "Label next" in said.err and "not scored" in said.out
+    info = ps.load_model(tmp_path / "m.model").info
+    assert info["accuracy"]["cross_validation"] is None and "sureness" not in info
+    assert main(["train", str(tmp_path / "a.laz"), "--model", str(tmp_path / "m.model"), *QUICK_WORDS,
+                 "--writers.classifiermodel.folds=0"]) == 0  # fmt: skip
+    assert "no score" not in capsys.readouterr().err
+
+
+def test_the_classes_that_stand_in_one_place_are_named():
+    random = np.random.default_rng(0)
+    label = np.repeat([0, 1], 200)
+    xy = np.where(label[:, None] == 1, random.uniform(100, 110, (400, 2)), random.uniform(0, 400, (400, 2)))
+    error = OptionError("without fold 1 a class has no samples left", found="class 6")
+    said = why_unscored([error], xy, label, [(2, "Ground"), (6, "Building")], 25.0, 5.0)
+    assert (
+        "6 Building, all within 10 x 10 m at 105, 105" in said
+        and "2 Ground" not in said
+        and "30 m away" in said
+    )
