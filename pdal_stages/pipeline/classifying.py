@@ -84,7 +84,10 @@ class ClassifyRequest:
     @property
     def cost(self) -> list[str]:
         """What `keep_sure` is expected to cost, in lines; none without it."""
-        stage: Any = lower_stage(overridden(self._classifier, self.overrides)).stage
+        given = overridden(self._classifier, self.overrides)
+        if given.get("keep_sure") is None:
+            return []
+        stage: Any = lower_stage(given).stage
         return stage.cost()
 
     @cached_property
