@@ -132,7 +132,9 @@ def polygons_of(
     else:
         note = f"{overlay.file}: {'the points have' if crs else 'it has'} no reference system: the same was assumed"
     with reading(overlay.file):
-        _, _, geometry, _ = pyogrio.raw.read(overlay.file, layer=layer, columns=[], bbox=box, where=where or None)
+        _, _, geometry, _ = pyogrio.raw.read(
+            overlay.file, layer=layer, columns=[], bbox=box, where=where or None
+        )
         shapes = shapely.from_wkb(geometry) if len(geometry) else np.empty(0, object)
         shapes = shapely.force_2d(shapes[~shapely.is_missing(shapes)]) if len(shapes) else shapes
         flat = [s for s in shapely.get_parts(shapely.get_parts(shapes)) if s.geom_type == "Polygon"]

@@ -45,6 +45,8 @@ from .references import check_one_reference
 
 #: Classes by which a model's own class is known under another code.
 _SAME = {3: 5, 4: 5}
+#: What is written, in this order.
+LAYERS = ("patches", "tiles")
 #: Meters of surroundings in a picture.
 _MARGIN = 6.0
 
@@ -299,7 +301,7 @@ def completed(points: Part, model: str) -> Part:
 
 def write_review(request: ReviewRequest) -> Review:
     """Review files, and write what is asked for."""
-    check_target(request.output)
+    check_target(request.output, LAYERS)
     outputs = [Output(request.output, "review")]
     outputs += [Output(request.html, "html", kinds.HTML)] if request.html else []
     outputs += [Output(request.json, "json", kinds.JSON)] if request.json else []

@@ -137,7 +137,8 @@ def write_layers(
     """Write layers; the files that were written, all or none.
 
     A GeoPackage holds all of them, with styles for QGIS; other formats get a file for each layer, named after it, with a
-    style beside it: those given, or those of objects. A layer without objects is written too: what an earlier run found is not left there.
+    style beside it. A layer without objects is written too: what an earlier run found is not left there. `styles` are by
+    layer; by default those of objects.
     """
     check_target(path, list(layers))
     driver, many = DRIVERS[Path(path).suffix.lower()]
