@@ -40,15 +40,19 @@ def _without_pits(height: NDArray) -> NDArray:
     around = np.empty(8)
     for r in range(1, rows - 1):
         for c in range(1, columns - 1):
-            n = 0
+            higher, n = 0, 0
+            for i in range(-1, 2):
+                for j in range(-1, 2):
+                    higher += height[r, c] < 0.5 * height[r + i, c + j]
+            if higher < 4:
+                continue
             for i in range(-1, 2):
                 for j in range(-1, 2):
                     if i != 0 or j != 0:
                         around[n] = height[r + i, c + j]
                         n += 1
             around.sort()
-            if height[r, c] < 0.5 * around[4]:
-                out[r, c] = around[4]
+            out[r, c] = around[4]
     return out
 
 

@@ -240,29 +240,34 @@ class _Layers:
 
     def __init__(self, cells: Cells, kind: Kind, window: Window, extent: Window) -> None:
         window = _common(window, extent)
-        inside = window.of(cells, kind)
-        self.cells, self.window = cells, window
-        self.high = window.dense(inside, "high", np.nan) / MM
-        self.low = window.dense(inside, "low", np.nan) / MM
-        self.count = window.dense(inside, "count", 0, np.int64)
-        self.sure = window.dense(inside, "sure", 0.0)
-        self.told = window.dense(inside, "told", 0, np.int64)
+        self.cells, self.window, self.kind = cells, window, kind
+        self._inside = window.of(cells, kind)
+        self.high = window.dense(self._inside, "high", np.nan) / MM
         self.ground = window.ground(cells)
 
     def column(self, kind: Kind, name: str, empty: float, dtype=np.float64) -> NDArray:
         """What cells of any kind hold, `empty` where there is none."""
-        return self.window.dense(self.window.of(self.cells, kind), name, empty, dtype)
+        inside = self._inside if kind == self.kind else self.window.of(self.cells, kind)
+        return self.window.dense(inside, name, empty, dtype)
 
     def body(self, r: NDArray, c: NDArray, z: NDArray) -> Body:
+        row, column, known = r + self.window.row, c + self.window.column, self._inside
+        key = cell_keys(self.kind, row, column)
+        at = np.minimum(np.searchsorted(known.key, key), len(known) - 1)
+        there = known.key[at] == key
+
+        def held(name: str, empty: float) -> NDArray:
+            return np.where(there, known.columns[name][at], empty)
+
         return Body(
-            r + self.window.row,
-            c + self.window.column,
+            row,
+            column,
             z[r, c],
-            self.low[r, c],
+            held("low", np.nan) / MM,
             self.ground[r, c],
-            self.count[r, c],
-            self.sure[r, c],
-            self.told[r, c],
+            held("count", 0).astype(np.int64),
+            held("sure", 0.0),
+            held("told", 0).astype(np.int64),
         )
 
 

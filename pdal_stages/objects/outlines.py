@@ -237,7 +237,8 @@ def _rings(shapely: Any, shape: Any) -> list[Any]:
 
 
 def _likeness(a: Any, b: Any) -> float:
-    return a.intersection(b).area / max(a.union(b).area, 1e-9)
+    shared = a.intersection(b).area
+    return shared / max(a.area + b.area - shared, 1e-9)
 
 
 def _polygon(shapely: Any, shell: NDArray | None, holes: list[NDArray | None]) -> Any:
@@ -249,13 +250,12 @@ def _polygon(shapely: Any, shell: NDArray | None, holes: list[NDArray | None]) -
 
 def _middles(ring: Any) -> NDArray[np.float64]:
     """Middles of the unit steps of a boundary along cells (n, 2)."""
-    corners = np.rint(np.array(ring.coords)).astype(np.int64)
-    out = []
-    for (x0, y0), (x1, y1) in itertools.pairwise(corners):
-        n = max(abs(x1 - x0), abs(y1 - y0))
-        t = (np.arange(n) + 0.5)[:, None] / n
-        out.append(np.array([x0, y0]) + t * np.array([x1 - x0, y1 - y0]))
-    return np.concatenate(out)
+    corners = np.rint(np.array(ring.coords))
+    away = np.diff(corners, axis=0)
+    many = np.abs(away).max(axis=1).astype(np.int64)
+    edge = np.repeat(np.arange(len(many)), many)
+    step = np.arange(len(edge)) - np.repeat(np.cumsum(many) - many, many)
+    return corners[edge] + ((step + 0.5) / many[edge])[:, None] * away[edge]
 
 
 def main_direction(places: NDArray) -> float:

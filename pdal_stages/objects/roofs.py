@@ -91,17 +91,17 @@ def continued(high: NDArray, leaves: NDArray, size: float, reach: int) -> NDArra
         How many cells far at most.
     """
     out = high.copy()
+    rows, columns = np.nonzero(np.isnan(high) & ~np.isnan(leaves))
+    added = np.empty(len(rows), np.bool_)
     for _ in range(reach):
-        z = out.copy()
-        more = False
-        for r in range(z.shape[0]):
-            for c in range(z.shape[1]):
-                level = leaves[r, c]
-                if np.isnan(z[r, c]) and not np.isnan(level) and _leaning(z, r, c, size, level) <= NEAR:
-                    out[r, c] = level
-                    more = True
-        if not more:
+        for n in range(len(rows)):
+            level = leaves[rows[n], columns[n]]
+            added[n] = _leaning(out, rows[n], columns[n], size, level) <= NEAR
+        if not added.any():
             break
+        for n in np.flatnonzero(added):
+            out[rows[n], columns[n]] = leaves[rows[n], columns[n]]
+        rows, columns, added = rows[~added], columns[~added], added[~added]
     return out
 
 
@@ -166,18 +166,28 @@ def _first_roof(high, seen, r, c, dr, dc, reach):
     return np.nan
 
 
-def _closed(high: NDArray) -> NDArray[np.float64]:
+@njit
+def _closed(high: NDArray) -> NDArray:
     """Heights with those of empty cells that have at least seven neighbors: the mean of them."""
-    wide = np.pad(high, 1, constant_values=np.nan)
-    total, count = np.zeros(high.shape), np.zeros(high.shape, np.int8)
-    for r in range(3):
-        for c in range(3):
-            beside = wide[r : r + high.shape[0], c : c + high.shape[1]]
-            there = ~np.isnan(beside)
-            total += np.where(there, beside, 0.0)
-            count += there
-    fill = np.isnan(high) & (count >= 7)
-    return np.where(fill, total / np.maximum(count, 1), high)
+    rows, columns = high.shape
+    out = high.copy()
+    for r in range(rows):
+        for c in range(columns):
+            if not np.isnan(high[r, c]):
+                continue
+            total, count, missing = 0.0, 0, 0
+            for i in range(r - 1, r + 2):
+                for j in range(c - 1, c + 2):
+                    if i < 0 or j < 0 or i >= rows or j >= columns or np.isnan(high[i, j]):
+                        missing += 1  # the cell itself is one
+                    else:
+                        total += high[i, j]
+                        count += 1
+                if missing > 2:
+                    break
+            if count >= 7:
+                out[r, c] = total / count
+    return out
 
 
 def dilated(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
