@@ -246,7 +246,7 @@ def _parser() -> argparse.ArgumentParser:
         "--objects",
         metavar="FILE",
         help="Then write buildings, trees, spans and decks of all outputs to this vector file (.gpkg, ...), as "
-        "pdal-stages objects does",
+        "pdal-stages objects does; its options too: --writers.objects.tree_height=5",
     )
     takes(
         "--bridges",
@@ -567,11 +567,17 @@ def _classify(options: argparse.Namespace) -> int:
     from .tiling.classify import ClassifyTask
     from .tiling.command import classify, options_of
 
+    own, others = [], list(options.overrides)
+    if options.objects:
+        from .tiling.objects import OPTIONS_OF
+
+        own = [one for one in others if not one.by_tag and one.selector in OPTIONS_OF]
+        others = [one for one in others if one not in own]
     listed = options.dimensions
     named = WRITTEN if listed is None else tuple(name.strip() for name in listed.split(",") if name.strip())
     request = ClassifyRequest(
         options.model,
-        tuple(options.overrides),
+        tuple(others),
         options.where,
         named,
         noise=options.noise,
@@ -585,11 +591,11 @@ def _classify(options: argparse.Namespace) -> int:
     task = ClassifyTask(tuple(options.inputs), options.output, request, options_of(options), **files)
     if not options.objects:
         return classify(task, options)
-    from .tiling.objects import objects_of_outputs, refuse_tiles
+    from .tiling.objects import objects_of_outputs, refuse_tiles, writer
 
+    stage = writer(options.objects, own)
     refuse_tiles(task, options.objects)
-    code = classify(task, options)
-    return code if code or options.dry_run else objects_of_outputs(task, options.objects)
+    return classify(task, options, lambda: objects_of_outputs(task, stage))
 
 
 def _objects(options: argparse.Namespace) -> int:

@@ -270,3 +270,37 @@ def test_one_layer_that_fails_leaves_none(folder, tmp_path, monkeypatch):
             ]
         ).execute(arrays=False)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.pdal
+def test_classify_of_many_files_with_options_workers_report_and_resume(folder, tmp_path, capsys, monkeypatch):
+    from pdal_stages.tiling import objects
+
+    parts = [str(folder / "parts" / f"{n}.laz") for n in (0, 1)]
+    target, out, html = tmp_path / "town.gpkg", tmp_path / "out", tmp_path / "run.html"
+    command = ["classify", *parts, f"{out}/", "--objects", str(target), "--workers", "2"]
+    more = ["--writers.objects.tree_height=6", "--report", str(html), "--report", str(tmp_path / "run.json")]
+    assert cli.main([*command, "--writers.objects.tree_hight=6"]) == 1
+    assert "tree_height" in capsys.readouterr().err and not out.exists()
+
+    def broken(*_, **__):
+        raise StageError("the disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(objects, "write_layers", broken)
+        assert cli.main([*command, *more]) == 1
+    assert "the disk is full" in capsys.readouterr().err
+    assert html.exists() and not target.exists() and len(list(out.glob("*.laz"))) == 2
+    assert cli.main([*command, *more, "--resume"]) == 0
+    assert cli.main(["objects", str(out), str(tmp_path / "two.gpkg"), "--filters.objects.tree_height=6"]) == 0
+    for name in ("buildings", "trees"):
+        one, shapes, _ = layer(target, name)
+        two, others, _ = layer(tmp_path / "two.gpkg", name)
+        np.testing.assert_array_equal(one["object_id"], two["object_id"])
+        assert len(shapes) and all(shapely.equals_exact(shapes, others))
+    assert one["height"].min() >= 6
+    told = json.loads((tmp_path / "run.json").read_text())["objects"]
+    assert told["trees"]["objects"] == len(shapes) and told["files"] == [str(target)]
+    page = html.read_text()
+    assert "To be checked" in page and "data:image/png" in page and f"<td>{len(shapes)}</td>" in page
+    assert not list(tmp_path.glob(".town*"))

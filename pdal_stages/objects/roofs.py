@@ -99,8 +99,8 @@ def continued(high: NDArray, leaves: NDArray, size: float, reach: int) -> NDArra
             added[n] = _leaning(out, rows[n], columns[n], size, level) <= NEAR
         if not added.any():
             break
-        for n in np.flatnonzero(added):
-            out[rows[n], columns[n]] = leaves[rows[n], columns[n]]
+        for k in np.flatnonzero(added):
+            out[rows[k], columns[k]] = leaves[rows[k], columns[k]]
         rows, columns, added = rows[~added], columns[~added], added[~added]
     return out
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import base64
 import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..base.asprs import class_name
 from ..base.files import write_whole
@@ -35,13 +39,15 @@ _SETTINGS = {
 }
 
 
-def write_run_report(path: str | os.PathLike[str], run: Mapping[str, Any]) -> Path:
+def write_run_report(
+    path: str | os.PathLike[str], run: Mapping[str, Any], objects: NDArray[np.uint8] | None = None
+) -> Path:
     """Write the page of :func:`run_page`, whole or not at all; StageError if it cannot be written."""
-    return write_whole(path, run_page(run).encode())
+    return write_whole(path, run_page(run, objects).encode())
 
 
-def run_page(run: Mapping[str, Any]) -> str:
-    """The page about a tiled run, of which `run` is what ``TiledRun.to_dict`` gives."""
+def run_page(run: Mapping[str, Any], objects: NDArray[np.uint8] | None = None) -> str:
+    """The page about a tiled run, of which `run` is what ``TiledRun.to_dict`` gives, and `objects` a map of those found."""
     done = sorted((t for t in run["tiles"] if t["state"] == "done"), key=lambda t: -t["seconds"])
     classes = run.get("classes") or {}
     pipeline = f"{Path(run['pipeline']).name}, " if run.get("pipeline") else ""
@@ -56,7 +62,30 @@ def run_page(run: Mapping[str, Any]) -> str:
         classes=[(int(code), class_name(int(code)), count) for code, count in classes.items()],
         slowest=[(t, _corner(t["tile"], run["tile"])) for t in done[:ROWS]],
         done=len(done),
+        objects=_objects(run.get("objects") or {}),
+        object_map=None if objects is None else _embedded(objects),
     )
+
+
+def _objects(objects: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Of each kind that was found: how many, how many are to be checked, and why."""
+    kinds = [(kind, one) for kind, one in objects.items() if kind != "files" and one["objects"]]
+    return [
+        {
+            "kind": kind,
+            "found": one["objects"],
+            "check": one["to_be_checked"],
+            "reasons": ", ".join(f"{reason} {count:,}" for reason, count in one["reasons"].items()),
+        }
+        for kind, one in kinds
+    ]
+
+
+def _embedded(picture: NDArray[np.uint8]) -> dict[str, Any]:
+    from .pictures import png
+
+    data = base64.b64encode(png(picture, palette=True)).decode("ascii")
+    return {"base64": data, "tall": picture.shape[0], "wide": picture.shape[1]}
 
 
 def _figures(run: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:

@@ -8,7 +8,7 @@ import shlex
 import signal
 import threading
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
@@ -22,7 +22,7 @@ from ..pipeline.ends import is_ept, is_folder, is_las
 from ..pipeline.read import PipelineSource
 from ..pipeline.run import Pipeline
 from .classify import ClassifyTask, Written
-from .outcome import LEFT_ALONE, InterruptedRun, TiledRun
+from .outcome import LEFT_ALONE, FoundObjects, InterruptedRun, TiledRun
 from .settings import PER, TilingOptions
 from .tiledrun import run_tiled
 from .tileplan import make_plan
@@ -158,8 +158,10 @@ def _end(options: argparse.Namespace, run: TiledRun, again: str) -> int:
 # ---- classify --------------------------------------------------------------------------------------------
 
 
-def classify(task: ClassifyTask, options: argparse.Namespace) -> int:
-    """Run ``pdal-stages classify``; the exit code, 1 where anything failed."""
+def classify(
+    task: ClassifyTask, options: argparse.Namespace, then: Callable[[], FoundObjects] | None = None
+) -> int:
+    """Run ``pdal-stages classify``; the exit code, 1 where anything failed. `then`: what is done with whole outputs."""
     _check_reports(options)
     if not task.can_be_cut:
         _refuse_tiles(task, options)
@@ -176,9 +178,14 @@ def classify(task: ClassifyTask, options: argparse.Namespace) -> int:
         print_messages(*written.messages)
         print(f"{written.points:,} points written to {written.path}")
         _print_classes([written], names)
+        if then is not None:
+            then()
         return 0
     if not task.can_be_cut:
-        return _classify_each(task, options, names)
+        code = _classify_each(task, options, names)
+        if then is not None and code == 0:
+            then()
+        return code
     done: list[Written] = []
 
     def finished(written: Written) -> None:
@@ -196,6 +203,12 @@ def classify(task: ClassifyTask, options: argparse.Namespace) -> int:
     else:
         _print(run, "files" if run.outputs else "")
         _print_classes(done, names, run.summary["left_alone"])
+        if then is not None and not interrupted and not run.failures:
+            try:
+                run.objects = then()
+            except StageError:
+                _end(options, run, "")
+                raise
     return _end(options, run, _again(options) if interrupted else "")
 
 
@@ -389,7 +402,7 @@ def _write_report(name: str, run: TiledRun) -> None:
         return
     from ..reports.runpage import write_run_report
 
-    write_run_report(name, run.to_dict())
+    write_run_report(name, run.to_dict(), run.objects.picture if run.objects else None)
 
 
 def _write_json(name: str, run: TiledRun, flag: str) -> None:

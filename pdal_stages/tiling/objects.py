@@ -40,7 +40,10 @@ from ..stages.objectoptions import refuse_unclassified
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter
 from .classify import ClassifyTask
 from .cloudindex import BLOCK, open_las, read_block
+from .outcome import FoundObjects
 
+#: Whose options the commands take for objects.
+OPTIONS_OF = ("writers.objects", "filters.objects")
 #: Blocks of points read at a time.
 _BLOCKS = 20
 
@@ -68,7 +71,8 @@ def run_command(options: argparse.Namespace) -> int:
         [*(Output(str(file), "objects") for file in target_files(options.output)), *more],
         [*inputs, *options.inputs],
     )
-    return _write(inputs, stage, options.workers, options.resume, options.metadata)
+    _write(inputs, stage, options.workers, options.resume, options.metadata)
+    return 0
 
 
 def refuse_tiles(task: ClassifyTask, output: str) -> None:
@@ -82,9 +86,12 @@ def refuse_tiles(task: ClassifyTask, output: str) -> None:
     check_outputs([Output(output, "objects")], task.files)
 
 
-def objects_of_outputs(task: ClassifyTask, output: str) -> int:
+def objects_of_outputs(task: ClassifyTask, stage: ObjectsWriter) -> FoundObjects:
     """What ``classify --objects`` does when all is classified."""
-    return _write(outputs_of(task.files, task.output), ObjectsWriter({"filename": output}))
+    chosen = task.options
+    return _write(
+        outputs_of(task.files, task.output), stage, max(1, chosen.local_workers), chosen.resume, draw=True
+    )
 
 
 def _write(
@@ -93,8 +100,9 @@ def _write(
     workers: int = 1,
     resume: bool = False,
     metadata: str | None = None,
-) -> int:
-    """Find objects, write them, say what was found."""
+    draw: bool = False,
+) -> FoundObjects:
+    """Find objects, write them, say what was found; `draw`: also a map."""
     found, reference = objects_of_files(inputs, stage, workers=workers, resume=resume)
     layers = object_layers(found, straight=stage.outlines == STRAIGHT, units=reference[0])
     files = write_layers(stage.filename, layers, reference[1])
@@ -114,13 +122,18 @@ def _write(
             "objects": summary,
         }
         write_whole(metadata, (json.dumps(about, indent=1) + "\n").encode(), "metadata")
-    return 0
+    picture = None
+    if draw:
+        from ..reports.objectmap import object_map
+
+        picture = object_map(layers)
+    return FoundObjects([str(file) for file in files], summary, picture)
 
 
 def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> ObjectsWriter:
     """The stage whose options the command follows: those of ``--writers.objects.NAME=``, or ``--filters.objects.NAME=``."""
     for one in overrides:
-        if one.by_tag or one.selector not in ("writers.objects", "filters.objects"):
+        if one.by_tag or one.selector not in OPTIONS_OF:
             raise OptionError(
                 "objects takes options of writers.objects and filters.objects alone", found=one.flag
             )

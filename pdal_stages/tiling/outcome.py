@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..base.version import __version__
 from .sources import InputSource
 
@@ -73,6 +76,15 @@ class InterruptedRun(KeyboardInterrupt):
         self.run = run
 
 
+@dataclass(frozen=True)
+class FoundObjects:
+    """Objects that were found in the outputs: the files they were written to, counts by kind, and a map (h, w, 3)."""
+
+    files: list[str]
+    kinds: dict[str, dict[str, Any]]
+    picture: NDArray[np.uint8] | None = None
+
+
 @dataclass
 class TiledRun:
     """What a tiled run did.
@@ -90,6 +102,8 @@ class TiledRun:
         What the user should know.
     summary : dict
         Figures for people; see :meth:`to_dict`.
+    objects : FoundObjects, optional
+        Those of the outputs, where they were asked for.
     """
 
     tiles: list[TileJob]
@@ -98,6 +112,7 @@ class TiledRun:
     changed: list[str]
     messages: list[str]
     summary: dict[str, Any]
+    objects: FoundObjects | None = None
 
     @property
     def failures(self) -> list[tuple[str, str]]:
@@ -143,6 +158,7 @@ class TiledRun:
                 }
                 for o in self.outputs
             ],
+            **({"objects": {"files": self.objects.files, **self.objects.kinds}} if self.objects else {}),
         }
 
 
