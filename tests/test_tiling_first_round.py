@@ -10,8 +10,10 @@ from test_terrain_morphological import town
 import pdal_stages as ps
 from pdal_stages.stages.hag_morphological import HagMorphological
 from pdal_stages.terrain import filtered_ground
+from pdal_stages.terrain.decks import level_points
+from pdal_stages.terrain.groundcells import BLOCK_SIDE, FilterOptions, GroundCells, cells_of_block
 from pdal_stages.terrain.lowpoints import lowest_of_cells
-from pdal_stages.terrain.morphological import reach, reach_of_points
+from pdal_stages.terrain.morphological import reach, reach_of_cells, reach_of_points
 from pdal_stages.tiling import run_tiled
 
 HEIGHTS = {"type": "filters.hag_morphological", "window": 8, "ground": True, "openings": [5, 9]}
@@ -98,7 +100,7 @@ def test_tiles_are_the_same_bits_and_read_few_points(tmp_path, survey, before):
     own = sum(job.report["points"] for job in run.tiles)
     near = reach_of_points(1.0) + (120 if before and "noise" in before[0]["type"] else 0)
     assert read < own * (1 + 2 * near / TILE) ** 2
-    assert not list((tmp_path / "out" / ".pdal-stages" / "tiles").glob("*.npy"))
+    assert not list((tmp_path / "out" / ".pdal-stages" / "tiles").glob("*.np[yz]"))
 
 
 @pytest.mark.pdal
@@ -132,7 +134,7 @@ def test_resume_makes_what_is_missing_alone(tmp_path, survey, monkeypatch):
     assert len(in_tiles(survey, [HEIGHTS], folder, retries=0).failures) >= 1
     assert len(made) == len(set(made)) == 16
     left = folder / ".pdal-stages" / "tiles"
-    assert len(list(left.glob("*.npy"))) == 16
+    assert len(list(left.glob("*.np[yz]"))) == 16
     monkeypatch.setattr(tile_task, "run_head", refused)
     (left / "0_0.first.npy").unlink()
     made.clear()
@@ -239,3 +241,78 @@ def test_what_fails_in_the_first_round_is_said_of_the_tiles_that_need_it(tmp_pat
     monkeypatch.setattr(FirstRoundTask, "run", lambda self: (_ for _ in ()).throw(ps.StageError("no luck")))
     with pytest.raises(ps.StageError, match="all tiles failed for one reason"):
         in_tiles(survey, [small], tmp_path / "other", retries=0)
+
+
+def blocks_of(points, options, near):
+    """The cells of all blocks that points need, each made of the lowest points that it may look at."""
+    cell = options.cell
+    low = points[:, lowest_of_cells(*points, np.ones(points.shape[1], bool), cell)]
+    side, around = BLOCK_SIDE * cell, (options.reach + 1) * cell
+    found = []
+    for i in range(int(near[0] // side), int(near[2] // side) + 1):
+        for j in range(int(near[1] // side), int(near[3] // side) + 1):
+            box = i * side - around, j * side - around, (i + 1) * side + around, (j + 1) * side + around
+            seen = (low[0] >= box[0]) & (low[0] <= box[2]) & (low[1] >= box[1]) & (low[1] <= box[3])
+            found.append(cells_of_block(*low[:, seen], (i, j), options))
+    return GroundCells.joined(found, len(options.openings))
+
+
+@pytest.mark.parametrize(
+    ("origin", "cell", "window", "strays"),
+    [
+        ((0.0, 0.0), 1.0, 8.0, False),
+        ((770_500.0, 6_277_550.0), 1.0, 30.0, True),
+        ((1000.0, 2000.0), 0.5, 5.0, False),
+    ],
+)
+def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, strays):
+    x, y, z, _ = town(4, side=900, density=0.5, origin=origin)
+    if strays:  # far from all else, and a hole in the middle
+        away = np.random.default_rng(1).uniform(0, 60, (2, 400))
+        x, y, z = (
+            np.append(x, origin[0] + 4000 + away[0]),
+            np.append(y, origin[1] - 3000 + away[1]),
+            np.append(z, z[:400]),
+        )
+        kept = np.hypot(x - origin[0] - 450, y - origin[1] - 450) > 90
+        x, y, z = x[kept], y[kept], z[kept]
+    options = {"window": window, "openings": (5, 9), "slope_too": True, "cell": cell}
+    whole = filtered_ground(x, y, z, **options)
+    made = FilterOptions(cell=cell, window=window, openings=(5, 9))
+    u, v = x - origin[0], y - origin[1]
+    for box in ((430, 410, 520, 560), (-10, 830, 60, 910), *([(4000, -3000, 4050, -2950)] if strays else [])):
+        away = np.maximum(np.maximum(box[0] - u, u - box[2]), np.maximum(box[1] - v, v - box[3]))
+        near = away <= reach_of_points(cell)
+        wide = reach_of_points(cell) + reach_of_cells(cell)
+        around = [box[0] - wide, box[1] - wide, box[2] + wide, box[3] + wide]
+        around = [side + origin[n % 2] for n, side in enumerate(around)]
+        cells = blocks_of(np.array([x, y, z]), made, around).within(*(int(side // cell) for side in around))
+        some = filtered_ground(x[near], y[near], z[near], cells=cells, **options)
+        core = away[near] < 0
+        assert core.any()
+        for name, values in some.items():
+            assert np.array_equal(values[core], whole[name][near][core]), (box, name)
+
+
+def test_a_block_without_points_has_no_cells():
+    none = cells_of_block(*np.empty((3, 0)), (3, -4), FilterOptions(openings=(5,)))
+    assert none.column.size == 0 and none.opened.shape == (1, 0)
+
+
+@pytest.mark.parametrize("name", ["viaduct", "river"])
+def test_decks_of_blocks_are_those_of_the_whole(name):
+    from bridge_scenes import SCENES, scan
+
+    xyz, _ = scan(SCENES[name](), 3.0)
+    x, y, z = (xyz + [1024.0 - xyz[:, 0].mean(), 2048.0 - xyz[:, 1].mean(), 0]).T  # where four blocks meet
+    use = np.random.default_rng(0).random(len(x)) < 0.95
+    options = {"decks": True, "openings": (5,)}
+    whole = filtered_ground(x, y, z, mask=use, **options)
+    assert np.count_nonzero(whole["Deck"]) > 500
+    left = np.union1d(lowest_of_cells(x, y, z, use, 1.0), level_points(x, y, z, use))
+    made = FilterOptions(openings=(5,), decks=True)
+    parts = [cells_of_block(x[left], y[left], z[left], (i, j), made) for i in (0, 1) for j in (1, 2)]
+    assert all(len(part.decks) for part in parts)
+    some = filtered_ground(x, y, z, mask=use, cells=GroundCells.joined(parts, 1), **options)
+    for key, values in some.items():
+        assert np.array_equal(values, whole[key]), key

@@ -38,6 +38,14 @@ class CodeLimit(NamedTuple):
     cure: str
 
 
+class Blocks(NamedTuple):
+    """Squares for which a stage makes once, of points far around, what tiles need of it; meters."""
+
+    side: float
+    reach: float  #: how far around a block points matter
+    around: float  #: how far beyond the points that are read a tile needs blocks
+
+
 class Stage(ABC):
     """Base of all stages; a subclass in a module of this package is a stage of the product.
 
@@ -101,8 +109,8 @@ class Stage(ABC):
         "string", "", "Unit of z, where the spatial reference does not say; otherwise that of x and y"
     )
 
-    #: In tiles: what :meth:`left_of` gave of points farther away than :meth:`near_halo_m`.
-    far_points: NDArray[np.float64] | None = None
+    #: In tiles: what :meth:`made_of_blocks` gave.
+    from_blocks: Any = None
     #: In tiles: a dimension below zero for points whose results are used; only they are counted in reports.
     own_points: str = ""
     #: Whether stages before it in the pipeline make what it makes too.
@@ -156,11 +164,23 @@ class Stage(ABC):
         return 0.0
 
     def near_halo_m(self) -> float | None:
-        """The same where a tile is given :meth:`left_of` the points farther away; None where all points are needed."""
+        """The same where a tile is given :attr:`from_blocks`, made before out of all points; None where that cannot be."""
         return None
 
+    def blocks(self) -> Blocks:
+        """How far the rounds before the tiles reach, for a stage with a :meth:`near_halo_m`."""
+        raise NotImplementedError
+
     def left_of(self, points: Points) -> NDArray[np.float64]:
-        """What the stage needs of points far away, for :attr:`far_points`: coordinates (n, 3), meters."""
+        """First, what blocks need of points: coordinates (n, 3), meters."""
+        raise NotImplementedError
+
+    def block_of(self, left: NDArray[np.float64], block: tuple[int, int]) -> dict[str, NDArray]:
+        """Then, of a block (column, row) of a grid anchored at zero, what tiles need; from what is left around it (n, 3)."""
+        raise NotImplementedError
+
+    def made_of_blocks(self, blocks: Sequence[Mapping[str, NDArray]], box: Sequence[float]) -> Any:
+        """At last, :attr:`from_blocks` in a box (min x, min y, max x, max y), meters, out of the blocks that it touches."""
         raise NotImplementedError
 
     def inner_halo_m(self) -> float:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import OptionError
 from ..terrain.decks import level_points
+from ..terrain.groundcells import BLOCK_SIDE, FilterOptions, GroundCells, cells_of_block
 from ..terrain.lowpoints import lowest_of_cells
-from ..terrain.morphological import check_sizes, filtered_ground, reach, reach_of_points
+from ..terrain.morphological import check_sizes, filtered_ground, reach, reach_of_cells, reach_of_points
 from ..terrain.profile import opening_names
 from . import carried
-from .base import HEIGHTS_OUTSIDE, Stage
+from .base import HEIGHTS_OUTSIDE, Blocks, Stage
 from .options import option
 from .points import Points
 from .selection import UNWANTED, Selection
@@ -146,6 +151,22 @@ of Z.
     def near_halo_m(self) -> float:
         return reach_of_points(self.cell)
 
+    def blocks(self) -> Blocks:
+        around = reach_of_cells(self.cell)
+        return Blocks(BLOCK_SIDE * self.cell, (self._filter.reach + 1) * self.cell, around)
+
+    @cached_property
+    def _filter(self) -> FilterOptions:
+        return FilterOptions(
+            self.cell,
+            self.slope,
+            self.window,
+            self.threshold,
+            self.scalar,
+            tuple(self.windows),
+            self.decks,
+        )
+
     def left_of(self, points: Points) -> NDArray[np.float64]:
         x, y, z = points.xyz.T
         usable = points.usable(self.ignore)
@@ -154,16 +175,22 @@ of Z.
             left = np.union1d(left, level_points(x, y, z, usable))
         return points.xyz[left]
 
+    def block_of(self, left: NDArray[np.float64], block: tuple[int, int]) -> dict[str, NDArray]:
+        x, y, z = left.T
+        return cells_of_block(x, y, z, block, self._filter).arrays()
+
+    def made_of_blocks(self, blocks: Sequence[Mapping[str, NDArray]], box: Sequence[float]) -> GroundCells:
+        sides = [math.floor(side / self.cell) for side in box]
+        parts = [GroundCells(**block).within(*sides) for block in blocks]
+        return GroundCells.joined(parts, len(self.windows))
+
     def run(self, points: Points) -> dict[str, NDArray]:
         usable = points.usable(self.ignore)
         wanted = points.wanting("HeightAboveGround", self.makes_again)
-        xyz, usable = points.xyz[wanted], usable[wanted]
-        if self.far_points is not None:
-            xyz = np.concatenate([xyz, self.far_points])
-            usable = np.concatenate([usable, np.ones(len(self.far_points), bool)])
+        all_wanted = bool(wanted.all())
         found = filtered_ground(
-            xyz,
-            mask=usable,
+            points.xyz if all_wanted else points.xyz[wanted],
+            mask=usable if all_wanted else usable[wanted],
             cell=self.cell,
             slope=self.slope,
             window=self.window,
@@ -173,6 +200,7 @@ of Z.
             slope_too=self.terrain_slope,
             decks=self.decks,
             threads=self.threads,
+            cells=self.from_blocks,
             figures=points.report.figures,
         )
         out = {}
@@ -181,5 +209,5 @@ of Z.
             if name.startswith("HeightAbove") and points.units.vertical != 1.0:
                 values = values / points.units.vertical
             out[name] = np.array(points.arrays[name], values.dtype)
-            out[name][wanted] = values[: np.count_nonzero(wanted)]
+            out[name][wanted] = values
         return out

@@ -106,20 +106,99 @@ def _raster(column, row):
     return left, bottom, int(row.max()) + 1 - bottom, int(column.max()) + 1 - left
 
 
-def _find(z, use, column, row) -> NDArray[np.uint8]:
+def levels_near_decks(
+    x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64], use: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """All that :func:`decks_of_levels` needs, of the points :func:`level_points` at least, and what these are numbers of.
+
+    Levels in cells up to BESIDE from a deck (n, 5): column, row, height, whether it is a deck's, whether it is solid; and
+    the numbers of the points that are their lowest.
+    """
+    rows, numbers = [np.empty((0, 5))], [np.empty(0, np.int64)]
+    if len(x):
+        column, row = cell_numbers(x, CELL), cell_numbers(y, CELL)
+        for points, own in patches(column, row, int(REACH), FAR + AHEAD):
+            at = np.arange(len(x))[points]
+            mine = np.ones(len(at), bool)[own] if isinstance(own, slice) else own
+            found = _deck_levels(z[at], use[at], column[at], row[at])
+            if found is None:
+                continue
+            *_, heights, lowest, start, kind, deck = found
+            near = near_decks(start, *found[2:4], deck) & mine[lowest]
+            point = at[lowest[near]]
+            rows.append(
+                np.column_stack([column[point], row[point], heights[near], deck[near], kind[near] == SOLID])
+            )
+            numbers.append(point)
+    return np.concatenate(rows), np.concatenate(numbers)
+
+
+def decks_of_levels(
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    z: NDArray[np.float64],
+    use: NDArray[np.bool_],
+    table: NDArray[np.float64],
+) -> NDArray[np.uint8]:
+    """What :func:`find_decks` says of points, from the levels that :func:`levels_near_decks` found before."""
+    out = np.zeros(len(x), np.uint8)
+    if not len(table) or not len(x):
+        return out
+    column, row = cell_numbers(x, CELL), cell_numbers(y, CELL)
+    columns, rows = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
+    for part, _own in patches(columns, rows, 0, 2 * BESIDE + 1):
+        mine = np.arange(len(table))[part]
+        mine = mine[np.lexsort((table[mine, 2], columns[mine], rows[mine]))]
+        left, bottom, h, w = _raster(columns[mine], rows[mine])
+        left, bottom, h, w = left - BESIDE, bottom - BESIDE, h + 2 * BESIDE, w + 2 * BESIDE
+        near = np.flatnonzero((column >= left) & (column < left + w) & (row >= bottom) & (row < bottom + h))
+        place = (rows[mine] - bottom) * w + columns[mine] - left
+        start = np.searchsorted(place, np.arange(h * w + 1))
+        found = np.zeros(len(near), np.uint8)
+        kind = np.where(table[mine, 4] != 0, SOLID, SOLID + 1).astype(np.int8)
+        _mark(
+            z[near], use[near], column[near], row[near], left, bottom, h, w,
+            np.ascontiguousarray(table[mine, 2]), start, kind, table[mine, 3] != 0, found,
+        )  # fmt: skip
+        out[near] = np.where(found != 0, found, out[near])
+    return out
+
+
+@njit
+def near_decks(start, h, w, deck):
+    """Levels (n,) in cells up to BESIDE from one with a deck."""
+    out = np.zeros(len(deck), np.bool_)
+    for j in range(h):
+        for i in range(w):
+            for n in range(start[j * w + i], start[j * w + i + 1]):
+                if deck[n]:
+                    for b in range(max(j - BESIDE, 0), min(j + BESIDE + 1, h)):
+                        for a in range(max(i - BESIDE, 0), min(i + BESIDE + 1, w)):
+                            out[start[b * w + a] : start[b * w + a + 1]] = True
+    return out
+
+
+def _deck_levels(z, use, column, row):
+    """The raster round points, its levels, and which of them are of decks; None where none is."""
     left, bottom, h, w = _raster(column, row)
-    heights, _, start = levels(z, use, column, row, left, bottom, h, w)
-    out = np.zeros(len(z), np.uint8)
+    heights, lowest, start = levels(z, use, column, row, left, bottom, h, w)
     kind = surfaces(heights, start, h, w)
     way, end = ways(heights, start, h, w, kind, int(WIDEST / CELL) * STRAIGHT)
     deck = between_drops(way, int(WIDEST / CELL) * STRAIGHT)
     if not deck.any():
-        return out
+        return None
     for _ in range(_FILLS):
         deck = filled(heights, start, h, w, kind, deck)
     number, sums, box = parts(heights, start, h, w, deck)
     judged(heights, start, h, w, kind, end, number, sums, box, left, bottom, deck)
-    if deck.any():
+    return (left, bottom, h, w, heights, lowest, start, kind, deck) if deck.any() else None
+
+
+def _find(z, use, column, row) -> NDArray[np.uint8]:
+    out = np.zeros(len(z), np.uint8)
+    found = _deck_levels(z, use, column, row)
+    if found is not None:
+        left, bottom, h, w, heights, _, start, kind, deck = found
         _mark(z, use, column, row, left, bottom, h, w, heights, start, kind, deck, out)
     return out
 

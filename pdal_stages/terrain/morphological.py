@@ -18,8 +18,7 @@ airborne LIDAR data. ISPRS Journal of Photogrammetry and Remote Sensing 77, 21-3
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,24 +28,15 @@ from ..base.errors import OptionError, StageError
 from ..base.jit import njit
 from ..base.threads import map_blocks
 from .columns import columns
-from .decks import BESIDE, CELL, find_decks
-from .decks import REACH as DECKS_REACH
-from .lowest import COMPANY, SURROUNDINGS, cell_values, lowest_points, pits
+from .decks import decks_of_levels, find_decks
+from .groundcells import FAR, NEAR, FilterOptions, GroundCells, GroundRaster, ground_raster
 from .lowpoints import HIGHEST
 from .minima import cell_numbers
-from .openings import HOLE
 from .patches import patches
 from .planes import blend, surface
 from .planes import reach as planes_reach
-from .plateaus import reach as plateau_reach
-from .plateaus import remove_plateaus
-from .profile import above_opening, opening_names, opening_radius
-from .progressive import objects_of
+from .profile import above_opening, opening_names
 
-#: Blocks, in meters, from which the surface is made: that for telling ground, and that of the heights.
-_NEAR, _FAR = 8.0, 32.0
-#: How often ground is regained.
-_ROUNDS = 3
 #: The most cells a window's radius may have.
 _MOST_CELLS = 300
 #: Points handed to a thread at a time.
@@ -71,6 +61,7 @@ def filtered_ground(
     decks: bool = False,
     threads: int | None = None,
     figures: dict[str, Any] | None = None,
+    cells: GroundCells | None = None,
 ) -> dict[str, NDArray]:
     """Height of every point above the ground that a progressive morphological filter finds.
 
@@ -100,6 +91,10 @@ def filtered_ground(
         Receives counts: ``ground_points``, ``pits`` (cells whose lowest point is a low outlier),
         ``without_terrain`` (points with no usable point near; their height is 0), ``unused_points``.
 
+    cells : GroundCells, optional
+        Cells whose ground was found before (:func:`.groundcells.cells_of_block`), all within :func:`reach_of_cells` of the
+        points. The points then are those within :func:`reach_of_points` of the ones whose results are used.
+
     Returns
     -------
     dict of str to ndarray, shape (n,)
@@ -125,22 +120,28 @@ def filtered_ground(
     if not all_finite:
         x, y, z, use = x[finite], y[finite], z[finite], use[finite]
     use &= np.abs(z) < HIGHEST
-    counts = {"pits": 0, "without_terrain": 0}
+    counts = {"without_terrain": 0} if cells is not None else {"pits": 0, "without_terrain": 0}
     out: dict[str, NDArray] = {
         "HeightAboveGround": np.zeros(len(x)),
         "Ground": np.zeros(len(x), np.uint8),
         **({"Slope": np.zeros(len(x))} if slope_too else {}),
         **{name: np.zeros(len(x), np.float32) for name in opening_names(openings)},
     }
-    deck = find_decks(x, y, z, use) if decks else np.zeros(len(x), np.uint8)
+    options = FilterOptions(cell, slope, window, threshold, scalar, openings, decks)
+    deck = np.zeros(len(x), np.uint8)
+    if decks:
+        deck = find_decks(x, y, z, use) if cells is None else decks_of_levels(x, y, z, use, cells.decks)
     if len(x):
         column, row = cell_numbers(x, cell), cell_numbers(y, cell)
-        around = math.ceil(reach(cell=cell, window=window, openings=openings) / cell)
-        for points, own in patches(column, row, around, _link(cell, window, openings)):
-            found = _filter(
+        pieces = (
+            _found(x, y, z, use, deck, column, row, options, counts)
+            if cells is None
+            else _given(cells, column, row, options)
+        )
+        for points, own, raster in pieces:
+            found = _measured(
                 x[points], y[points], z[points], use[points], deck[points], column[points], row[points], own,
-                cell=cell, slope=slope, window=window, threshold=threshold, scalar=scalar, openings=openings,
-                slope_too=slope_too, threads=threads, counts=counts,
+                raster, options, slope_too=slope_too, threads=threads, counts=counts,
             )  # fmt: skip
             for name, values in found.items():
                 out[name][points if isinstance(points, slice) else points[own]] = values[own]
@@ -157,37 +158,62 @@ def filtered_ground(
     return out
 
 
+def _found(
+    x, y, z, use, deck, column, row, options: FilterOptions, counts: dict[str, int]
+) -> Iterator[tuple[Any, Any, GroundRaster]]:
+    """Pieces of the points, which of each are its own, and the ground found there."""
+    around = options.reach + sum(planes_reach(options.levels(block)) for block in (NEAR, FAR))
+    for points, own in patches(column, row, around, options.link):
+        raster, pits = ground_raster(
+            x[points], y[points], z[points], use[points], deck[points], column[points], row[points], options
+        )
+        counts["pits"] += len(pits) if isinstance(own, slice) else int(np.count_nonzero(own[pits]))
+        yield points, own, raster
+
+
+def _given(
+    cells: GroundCells, column, row, options: FilterOptions
+) -> Iterator[tuple[Any, Any, GroundRaster]]:
+    """The same with the ground that was found before, as cells."""
+    number = len(column)
+    columns = np.concatenate([column, cells.column])
+    rows = np.concatenate([row, cells.row])
+    around = planes_reach(options.levels(NEAR)) + planes_reach(options.levels(FAR)) + 4
+    for members, own in patches(columns, rows, around, options.link):
+        if isinstance(members, slice):
+            members = np.arange(len(columns))
+        mine = members < number
+        points = members[mine]
+        if not points.size:
+            continue
+        left, bottom = int(columns[members].min()) - 1, int(rows[members].min()) - 1
+        shape = int(rows[members].max()) + 2 - bottom, int(columns[members].max()) + 2 - left
+        raster = cells[members[~mine] - number].raster(left, bottom, shape, options.opening_radii)
+        yield points, own if isinstance(own, slice) else own[mine], raster
+
+
 def reach(
     *, cell: float = 1.0, window: float = 75.0, openings: Sequence[float] = (), decks: bool = False
 ) -> float:
     """How far away, in meters, points can change a point's results: the halo a tile needs.
 
-    An opening looks twice its radius away, a plateau as far as it is wide; low outliers are judged before, and surfaces
-    led through ground after it.
+    Beyond what decides which cells are ground come the surfaces through it: that for telling ground, and the last.
     """
-    radius = _largest_radius(cell, window, openings)
-    near, far = (planes_reach(_levels(block, cell)) for block in (_NEAR, _FAR))
-    before = COMPANY + SURROUNDINGS + 2 * radius + plateau_reach(cell)
-    found = before + (_ROUNDS + 1) * near  # in which decks are found apart
-    if decks:
-        found = max(found, math.ceil((DECKS_REACH + (BESIDE + 1) * CELL) / cell) + near)
-    return (found + far + 2) * cell
+    options = FilterOptions(cell=cell, window=window, openings=openings, decks=decks)
+    surfaces = sum(planes_reach(options.levels(block)) for block in (NEAR, FAR))
+    return (options.reach + surfaces) * cell
 
 
 def reach_of_points(cell: float) -> float:
-    """How far away, in meters, more than the lowest points of cells matters: those of :func:`.lowpoints.lowest_of_cells`
-    are enough beyond.
+    """How far away, in meters, more than the lowest points of cells matters: those of :func:`.lowpoints.lowest_of_cells`,
+    or the ground of cells that was made of them, are enough beyond.
     """
-    return (planes_reach(_levels(_FAR, cell)) + 4) * cell
+    return (planes_reach(FilterOptions(cell).levels(FAR)) + 4) * cell
 
 
-def _link(cell: float, window: float, openings: Sequence[float]) -> int:
-    """How far one step looks, in cells: no step of the filter sees from a point to another across more empty land."""
-    return max(COMPANY, _largest_radius(cell, window, openings), planes_reach(_levels(_FAR, cell))) + 2
-
-
-def _largest_radius(cell: float, window: float, openings: Sequence[float]) -> int:
-    return max([_radius(window, cell), *(opening_radius(size, cell) for size in openings)])
+def reach_of_cells(cell: float) -> float:
+    """How far away from points, in meters, cells of the ground matter that was found before."""
+    return (planes_reach(FilterOptions(cell).levels(NEAR)) + 4) * cell
 
 
 def check_sizes(
@@ -213,41 +239,26 @@ def check_sizes(
             raise OptionError(f"'{name}' must not be negative", found=value)
 
 
-def _radius(window: float, cell: float) -> int:
-    return max(1, round(window / cell))
-
-
-def _levels(block: float, cell: float) -> int:
-    return max(1, round(math.log2(block / cell)))
-
-
-def _filter(
-    x, y, z, use, deck, column, row, own, *,
-    cell, slope, window, threshold, scalar, openings, slope_too, threads, counts,
-):  # fmt: skip
-    """All of it on one raster round the points."""
-    # One empty cell on every side: points blend the four cells round them.
-    left, bottom = int(column.min()) - 1, int(row.min()) - 1
-    shape = int(row.max()) + 2 - bottom, int(column.max()) + 2 - left
-    lowest = np.empty(shape, np.int64)
-    lowest_points(z, x, y, use, column, row, left, bottom, lowest)
-    place, raster = cell_values(x, y, z, cell, lowest)
-    bad = pits(raster, cell)
-    counts["pits"] += int(np.count_nonzero(bad) if isinstance(own, slice) else own[lowest[bad]].sum())
-    raster[bad] = HOLE
-    on_deck = (deck != 0)[lowest] & (lowest >= 0)
-    del lowest, bad
-    radii = [opening_radius(size, cell) for size in openings]
-    objects, floor, opened = objects_of(raster, cell, slope, _radius(window, cell), radii)
-    ground = np.isfinite(raster) & ~objects
-    for _ in range(_ROUNDS):
-        planes = surface(ground, place, floor, raster, left, bottom, _levels(_NEAR, cell))
-        _regain(ground, raster, place, planes, cell, threshold, scalar)
-    remove_plateaus(ground, floor, raster, cell)
-    # The terrain runs below: no level of a deck stands for it either.
-    ground &= ~on_deck
-    raster[on_deck] = HOLE
-    planes = surface(ground, place, floor, raster, left, bottom, _levels(_NEAR, cell))
+def _measured(
+    x,
+    y,
+    z,
+    use,
+    deck,
+    column,
+    row,
+    own,
+    raster: GroundRaster,
+    options: FilterOptions,
+    *,
+    slope_too,
+    threads,
+    counts,
+):
+    """Heights of points above the ground of a raster, and what they say of that themselves."""
+    cell, left, bottom = options.cell, raster.left, raster.bottom
+    ground, place = raster.ground, raster.place
+    planes = surface(ground, place, raster.floor, raster.lowest, left, bottom, options.levels(NEAR))
     height, gradient = np.empty((2, len(x)))
 
     spans = [slice(start, start + _SPAN) for start in range(0, len(x), _SPAN)]
@@ -260,9 +271,11 @@ def _filter(
         _heights(x[span], y[span], z[span], cell, left, bottom, planes, height[span], gradient[span])
 
     each(above)
-    is_ground = use & (deck == 0) & (np.abs(height) <= threshold + scalar * gradient)  # NaN is not
+    is_ground = (
+        use & (deck == 0) & (np.abs(height) <= options.threshold + options.scalar * gradient)
+    )  # NaN is not
     _means(x, y, z, is_ground, column, row, cell, left, bottom, ground, place)
-    planes = surface(ground, place, floor, raster, left, bottom, _levels(_FAR, cell))
+    planes = surface(ground, place, raster.floor, raster.lowest, left, bottom, options.levels(FAR))
     each(above)
     nowhere = np.isnan(height)
     counts["without_terrain"] += int(np.count_nonzero(nowhere[own]))
@@ -270,28 +283,15 @@ def _filter(
     found = {"HeightAboveGround": height, "Ground": is_ground.view(np.uint8)}
     if slope_too:
         found["Slope"] = np.degrees(np.arctan(gradient))
-    for name, radius in zip(opening_names(openings), radii, strict=True):
+    for name, radius in zip(opening_names(options.openings), options.opening_radii, strict=True):
         values = found[name] = np.empty(len(x), np.float32)
-        opening = opened[radius]
+        opening = raster.opened[radius]
 
         def over(span, opening=opening, values=values):
             above_opening(x[span], y[span], z[span], cell, left, bottom, opening, height[span], values[span])
 
         each(over)
     return found
-
-
-@njit
-def _regain(ground, raster, place, planes, cell, threshold, scalar):
-    """Make ground what lies near the surface of the ground found so far."""
-    for j in range(ground.shape[0]):
-        for i in range(ground.shape[1]):
-            if not ground[j, i] and raster[j, i] != HOLE:
-                height, across, along = planes[j, i, 0], planes[j, i, 1], planes[j, i, 2]
-                x, y, z = place[j, i, 0], place[j, i, 1], place[j, i, 2]
-                gradient = np.sqrt(across * across + along * along) / cell
-                if abs(z - height - x * across - y * along) <= threshold + scalar * gradient:
-                    ground[j, i] = True
 
 
 @njit

@@ -36,12 +36,26 @@ def patches(column: NDArray[np.int64], row: NDArray[np.int64], reach: int, link:
             yield group, slice(None)
             continue
         for near, mine in _squares(c, r, reach):
-            if not _is_empty(_cells(c[near], r[near]), len(near)):
-                yield group[near], mine
-                continue
-            for part in _groups(c[near], r[near], link):
-                if mine[part].any():
-                    yield group[near[part]], mine[part]
+            for part, own in connected(c[near], r[near], mine, link):
+                yield group[near[part]], own
+
+
+def connected(
+    column: NDArray[np.int64], row: NDArray[np.int64], mine: NDArray[np.bool_], link: int
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.bool_]]]:
+    """Yield (points, own) of a piece and its surroundings, whose own points are `mine`.
+
+    All in one, or where that would be a raster of empty land, in groups without a chain of points between them; groups
+    without a point of its own are left out.
+    """
+    if not mine.any():
+        return
+    if not _is_empty(_cells(column, row), len(column)):
+        yield np.arange(len(column)), mine
+        return
+    for part in _groups(column, row, link):
+        if mine[part].any():
+            yield part, mine[part]
 
 
 def _cells(column: NDArray[np.int64], row: NDArray[np.int64]) -> int:

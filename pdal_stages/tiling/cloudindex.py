@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..base.errors import StageError
 from .grid import Box, TileGrid, check_number
@@ -70,8 +71,24 @@ def index_las(path: str, grid: TileGrid) -> CloudIndex:
             points = read_block(reader, path, start, total)
             x, y = np.asarray(points.x), np.asarray(points.y)
             boxes.append((float(x.min()), float(y.min()), float(x.max()), float(y.max())))
-            rows = np.column_stack([grid.index(x), grid.index(y)])
-            pairs, counts = np.unique(rows, axis=0, return_counts=True)
-            tiles.update(dict(zip(map(tuple, pairs.tolist()), counts.tolist(), strict=True)))
+            for i, j, number in counted(grid.index(x), grid.index(y)):
+                tiles[i, j] += number
             check_number(len(tiles), f"{path}, tiles of {grid.size:g}")
     return CloudIndex(total, boxes, [(i, j, n) for (i, j), n in sorted(tiles.items())])
+
+
+def counted(column: NDArray[np.int64], row: NDArray[np.int64]) -> list[tuple[int, int, int]]:
+    """Every pair of a column and a row (n,) that there is, row by row, and how often."""
+    if not column.size:
+        return []
+    left, bottom = int(column.min()), int(row.min())
+    across, along = int(column.max()) - left + 1, int(row.max()) - bottom + 1
+    if across * along <= 4 * len(column):
+        counts = np.bincount((row - bottom) * across + (column - left))
+        at = np.flatnonzero(counts)
+        pairs = np.column_stack([at % across + left, at // across + bottom])
+        counts = counts[at]
+    else:  # strays
+        pairs, counts = np.unique(np.column_stack([row, column]), axis=0, return_counts=True)
+        pairs = pairs[:, ::-1]
+    return [(i, j, n) for (i, j), n in zip(pairs.tolist(), counts.tolist(), strict=True)]

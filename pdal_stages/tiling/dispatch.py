@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 from collections import deque
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 from ..base.errors import StageError
 from ..base.progress import Progress
 from ..base.version import build
-from .firstround import FirstRoundTask
-from .grid import TileGrid
+from ..pipeline.work import Task, TaskResult
+from .firstround import BlockTask, FirstRoundTask, block_grid, blocks_around, blocks_of, tiles_around
+from .grid import Box
 from .outcome import FileJob, TileJob
 from .pace import Pace
 from .pool import Pool, last_tries
-from .store import Store, fingerprint
+from .store import Store, block_file, fingerprint, left_file
 from .worklist import Worklist
 
 #: A run stops when so many tiles failed for one reason and none succeeded.
@@ -110,10 +111,13 @@ def _make_ready(out: FileJob, waiting: deque) -> None:
 
 @dataclass
 class _Item:
-    """A tile of the round, to be done."""
+    """A tile or a block of the rounds before, to be made."""
 
-    job: TileJob
+    at: tuple[int, int]
+    name: str  #: of its file
     mark: str
+    task: Callable[[], Task]
+    points: int = 0
     tries: int = 0
 
 
@@ -126,74 +130,95 @@ def run_first_round(work: Worklist, store: Store, pool: Pool, retries: int, show
         If all fail for one reason.
     """
     first, survey = work.plan.first, work.survey
-    store.forget_left([job.name for job in work.jobs])  # an earlier run may have had other inputs
     if first is None or len(work.jobs) == 1:
+        store.forget_left()
         return
-    grid, halo_units = survey.grid, first.halo_m / survey.unit
-    far = first.far_m / survey.unit
+    grid, unit = survey.grid, survey.unit
     by_tile = {job.tile: job for job in work.jobs}
-    users: dict[tuple[int, int], list[TileJob]] = {}
-    for job in work.jobs:
-        if job.state == "waiting":
-            for tile in _around(grid, job.tile, far, by_tile):
-                users.setdefault(tile, []).append(job)
-    waiting: deque[_Item] = deque()
-    for tile in users:
-        read = [s for s in survey.near(tile, halo_units) if s.path not in survey.unreadable]
-        mark = fingerprint(
-            build(),
-            work.plan.head[: first.at + 1],
-            survey.stamps_of(work.plan.head[: first.at + 1]),
-            [tile, grid.size, first.halo_m, survey.unit],
-            [[s.path, survey.stamps[s.path], s.reader] for s in read],
-        )
-        known = store.finished(_name(by_tile[tile].name))
-        if (
-            known is None
-            or known["fingerprint"] != mark
-            or not os.path.exists(store.left(by_tile[tile].name))
-        ):
-            store.forget(_name(by_tile[tile].name))
-            waiting.append(_Item(by_tile[tile], mark))
-    context = work.context(store, pool.threads)
+    blocks = blocks_of(first, grid, unit, by_tile)
+    # An earlier run may have had other inputs.
+    store.forget_left([job.name for job in work.jobs], blocks)
+    running = [job for job in work.jobs if job.state == "waiting"]
+    around = work.farthest * unit + first.blocks.around
+    needed = {
+        block
+        for job in running
+        for block in blocks_around(first, grid.box(job.tile), unit, around)
+        if block in blocks
+    }
+    near = {block: list(tiles_around(first, grid, unit, block, by_tile)) for block in needed}
+    tiles = [by_tile[tile] for tile in sorted({tile for found in near.values() for tile in found})]
 
-    def task_of(item: _Item) -> FirstRoundTask:
-        sources = [s for s in survey.near(item.job.tile, halo_units) if s.path not in survey.unreadable]
+    def fail(box: Box, around_m: float, reason: str) -> None:
+        for job in running:
+            wide = grid.box(job.tile, around_m / unit)
+            apart = wide[0] > box[2] or wide[2] < box[0] or wide[1] > box[3] or wide[3] < box[1]
+            if job.state == "waiting" and not apart:
+                job.state, job.reason = "failed", reason
+
+    def first_task(job: TileJob) -> FirstRoundTask:
+        sources = [s for s in survey.near(job.tile, halo) if s.path not in survey.unreadable]
         with_index = [work.with_index(s) for s in sources]
-        return FirstRoundTask(context, first, item.job.tile, with_index, str(store.left(item.job.name)))
+        return FirstRoundTask(context, first, job.tile, with_index, str(store.left(job.name)))
 
+    def block_task(block: tuple[int, int]) -> BlockTask:
+        left = [str(store.left(by_tile[t].name)) for t in near[block] if t not in failed]
+        return BlockTask(context.plan, block, left, str(store.block(block)))
+
+    halo = first.halo_m / unit
+    context = work.context(store, pool.threads)
+    before = work.plan.head[: first.at + 1]
+    marks: dict[tuple[int, int], str] = {}
+    items = []
+    for job in tiles:
+        sources = [s for s in survey.near(job.tile, halo) if s.path not in survey.unreadable]
+        marks[job.tile] = fingerprint(
+            build(),
+            before,
+            survey.stamps_of(before),
+            [job.tile, grid.size, first.halo_m, unit, first.kept],
+            [[s.path, survey.stamps[s.path], s.reader] for s in sources],
+        )
+        items.append(
+            _Item(job.tile, left_file(job.name), marks[job.tile], partial(first_task, job), job.points)
+        )
+    failed: set[tuple[int, int]] = set()
+    for item, answer in _made(items, store, pool, retries, "lowest points of cells", show):
+        if answer.reason:
+            failed.add(item.at)
+            fail(grid.box(item.at), first.far_m, answer.reason)
+        else:
+            work.messages_before.append(answer.result["messages"])
+    items = []
+    for block, found in sorted(near.items()):
+        made_of = [marks[tile] for tile in found if tile not in failed]
+        mark = fingerprint(build(), before[-1], unit, block, made_of)
+        items.append(_Item(block, block_file(block), mark, partial(block_task, block)))
+    for item, answer in _made(items, store, pool, retries, "ground of blocks", show):
+        if answer.reason:
+            x0, y0, x1, y1 = (side / unit for side in block_grid(first).box(item.at))
+            fail((x0, y0, x1, y1), context.plan.halo_m + first.blocks.around, answer.reason)
+
+
+def _made(
+    items: list[_Item], store: Store, pool: Pool, retries: int, what: str, show: bool | None
+) -> Iterator[tuple[_Item, TaskResult]]:
+    """Do what is not there from an earlier run, and yield it; StageError where all fail for one reason."""
+    waiting: deque[_Item] = deque()
+    for item in items:
+        known = store.finished(item.name)
+        if known is None or known["fingerprint"] != item.mark or not os.path.exists(store.tiles / item.name):
+            store.forget(item.name)
+            waiting.append(item)
     count, failures = len(waiting), []
-    with Progress(
-        sum(item.job.points for item in waiting), "lowest points of cells", enabled=show
-    ) as progress:
-        for item, answer in last_tries(pool, waiting, task_of, retries):
-            progress.update(item.job.points)
+    with Progress(sum(item.points for item in waiting) or count, what, enabled=show) as progress:
+        for item, answer in last_tries(pool, waiting, lambda item: item.task(), retries):
+            progress.update(item.points or 1)
             if answer.reason:
                 failures.append(answer.reason)
-                for job in users[item.job.tile]:
-                    if job.state == "waiting":
-                        job.state, job.reason = "failed", answer.reason
-                continue
-            with contextlib.suppress(StageError, OSError):  # no room: a later run does it again
-                store.finish(_name(item.job.name), item.mark, {})
+            else:
+                with contextlib.suppress(StageError, OSError):  # no room: a later run does it again
+                    store.finish(item.name, item.mark, {})
+            yield item, answer
     if count and len(failures) == count and len(set(failures)) == 1:
         raise StageError("all tiles failed for one reason, so the run was stopped", found=failures[0])
-
-
-def _name(tile: str) -> str:
-    """What the store calls what is left of a tile."""
-    return f"{tile}.first"
-
-
-def _around(
-    grid: TileGrid, tile: tuple[int, int], far: float, known: Collection[tuple[int, int]]
-) -> Iterator[tuple[int, int]]:
-    """The known tiles that a tile with surroundings of `far` touches."""
-    reach = math.ceil(far / grid.size)
-    if (2 * reach + 1) ** 2 > len(known):
-        yield from (t for t in known if max(abs(t[0] - tile[0]), abs(t[1] - tile[1])) <= reach)
-        return
-    for j in range(tile[1] - reach, tile[1] + reach + 1):
-        for i in range(tile[0] - reach, tile[0] + reach + 1):
-            if (i, j) in known:
-                yield i, j

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..base import las
 from ..base.errors import StageError
-from .cloudindex import BLOCK, CloudIndex, open_las, read_block
+from .cloudindex import BLOCK, CloudIndex, counted, open_las, read_block
 from .ept import fetch
 from .grid import Box, TileGrid, touching
 from .sources import InputSource
@@ -47,6 +47,7 @@ class Piece:
     #: (n,) how far it lies outside the tile, in the unit of the coordinates; -1 inside
     away: NDArray[np.float64]
     spans: list[tuple[InputSource, int, int]]  #: whose points are the rows from one number to another
+    tiles: set[tuple[int, int]]  #: that its points belong to
 
     @cached_property
     def own(self) -> NDArray[np.int64]:
@@ -162,6 +163,7 @@ def cut(
     rows_cut: list[NDArray[np.int64]] = []
     aways: list[NDArray[np.float64]] = []
     spans: list[tuple[InputSource, int, int]] = []
+    tiles: set[tuple[int, int]] = set()
     cores = found = 0
     head, tail = plain_header(members[0].path)
     (width,) = struct.unpack_from("<H", head, 105)
@@ -176,7 +178,8 @@ def cut(
                     rows = np.flatnonzero((x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3]))
                     if not rows.size:
                         continue
-                    away = outside(x[rows], y[rows], grid, tile)
+                    away, others = outside(x[rows], y[rows], grid, tile)
+                    tiles |= others
                     raw = points.array[rows]
                     if raw.dtype.itemsize != width:
                         raise StageError(
@@ -202,7 +205,7 @@ def cut(
         if core:
             os.unlink(core)
         return None
-    return Piece(target, core, np.concatenate(rows_cut), np.concatenate(aways), spans)
+    return Piece(target, core, np.concatenate(rows_cut), np.concatenate(aways), spans, tiles)
 
 
 class _Points(NamedTuple):
@@ -237,9 +240,13 @@ def _small(path: str, count: int, changed: int, size: int) -> _Points:
         return _Points(points.array, np.array(points.x), np.array(points.y))
 
 
-def outside(x: NDArray, y: NDArray, grid: TileGrid, tile: tuple[int, int]) -> NDArray[np.float64]:
-    """Distance of points from a tile along the farther axis; -1 for its own points."""
+def outside(
+    x: NDArray, y: NDArray, grid: TileGrid, tile: tuple[int, int]
+) -> tuple[NDArray[np.float64], set[tuple[int, int]]]:
+    """Distance of points from a tile along the farther axis, -1 for its own points; and all tiles they belong to."""
     x0, y0, x1, y1 = grid.box(tile)
     away = np.maximum(np.maximum(x0 - x, x - x1), np.maximum(y0 - y, y - y1))
-    mine = (grid.index(x) == tile[0]) & (grid.index(y) == tile[1])
-    return np.where(mine, -1.0, np.maximum(away, 0.0))
+    column, row = grid.index(x), grid.index(y)
+    mine = (column == tile[0]) & (row == tile[1])
+    tiles = {(int(i), int(j)) for i, j, _ in counted(column, row)}
+    return np.where(mine, -1.0, np.maximum(away, 0.0)), tiles

@@ -1,13 +1,16 @@
-"""A round before the tiles: every point is read once, and what a far-reaching stage needs of it is kept.
+"""Rounds before the tiles: what a far-reaching stage needs of points is made once, and tiles put it together.
 
-Filtered ground looks half a kilometer around a tile, but at points far away it needs the lowest ones of cells alone. So
-each tile's own points are read first, with the halo that the stages before need (noise is marked before heights
-are made), and the lowest are written into a file. Then a tile reads the points near it, and is given those of the files.
+Filtered ground looks half a kilometer around a tile, but all that looks farther than a hundred meters is done on a raster of
+the lowest points. So each tile's own points are read first, with the surroundings that the stages before need (noise is
+marked before heights are made); the lowest are written into a file, and what the stages before changed. Then blocks of the
+raster are made, each out of the files of its surroundings. At last a tile reads the points near it, gives them what the
+stages before changed, and takes the raster from the blocks.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -17,16 +20,18 @@ from numpy.typing import NDArray
 
 from ..base.errors import StageError
 from ..base.files import whole_files
+from ..stages import registry
+from ..stages.base import Stage
 from .cloudindex import CloudIndex
-from .extract import cut_all
+from .extract import Piece, cut_all
 from .grid import Box, TileGrid
-from .headrun import RunContext, run_first
+from .headrun import FirstResults, RunContext, run_first
 from .sources import InputSource
-from .store import left_file
-from .tileplan import FirstRound
+from .store import block_file, left_file
+from .tileplan import FirstRound, TilePlan
 
-#: Of what is read for a tile, so much is given from the files too, in meters: the same points, and so no harm.
-_OVERLAP = 0.01
+#: Cells at the edge of what is needed may begin outside, in meters.
+_MARGIN = 2.0
 
 
 @dataclass(frozen=True)
@@ -40,44 +45,149 @@ class FirstRoundTask:
     target: str  #: file for what is left of its points
 
     def run(self) -> dict[str, Any]:
-        """Write what is left of the tile's own points."""
+        """Write what is left of the tile's own points, and what the stages before the one that wants it changed."""
         context = self.context
         with TemporaryDirectory(prefix="first-", dir=context.scratch, ignore_cleanup_errors=True) as folder:
             cuts = cut_all(
                 context.grid, self.tile, self.sources, self.first.halo_m / context.unit, folder, False
             )
-            left = run_first(context, cuts, self.first) if cuts else np.empty((0, 3))
-        with whole_files(self.target, what="result") as (partial,), open(partial, "wb") as file:
-            np.save(file, left)
+            found = run_first(context, cuts, self.first) if cuts else FirstResults(np.empty((0, 3)), {}, [])
+        arrays: dict[str, NDArray] = {"left": found.left}
+        for key, (index, values) in found.changed.items():
+            arrays[f"{key}/index"] = index
+            arrays |= {f"{key}/{name}": column for name, column in values.items()}
+        _save(self.target, arrays)
+        return {"result_bytes": os.path.getsize(self.target), "messages": found.messages}
+
+
+@dataclass(frozen=True)
+class BlockTask:
+    """A block of the raster that is made once of what is left around it."""
+
+    plan: TilePlan
+    block: tuple[int, int]
+    tiles: list[str]  #: files of what is left of the tiles around, as far as these were done
+    target: str
+
+    def run(self) -> dict[str, Any]:
+        """Write what tiles need of the block."""
+        assert self.plan.first is not None
+        stage = stage_of(self.plan)
+        parts = [_load(path)["left"] for path in self.tiles]
+        _save(self.target, stage.block_of(np.concatenate([np.empty((0, 3)), *parts]), self.block))
         return {"result_bytes": os.path.getsize(self.target)}
 
 
-def left_around(
-    folder: str, grid: TileGrid, tile: tuple[int, int], unit: float, read_m: float, far_m: float
-) -> NDArray[np.float64]:
-    """What is left of points up to `far_m` meters around a tile and not within the `read_m` that are read: (n, 3)."""
-    box = grid.box(tile)
-    found = [np.empty((0, 3))]
-    for other in grid.covering(grid.box(tile, far_m / unit)):
-        path = os.path.join(folder, left_file(grid.name(other)))
-        if not os.path.exists(path):
-            continue  # a tile without points
-        try:
-            points = np.load(path, allow_pickle=False).reshape(-1, 3)
-        except (ValueError, EOFError) as error:
-            os.unlink(path)
-            raise StageError(
-                "what the first round left of a tile cannot be read back, and was removed",
-                found=f"{path}: {error}",
-                cure="Run it again with --resume",
-            ) from error
-        away = _outside(points, box, unit)
-        found.append(points[(away > read_m - _OVERLAP) & (away <= far_m)])
-    return np.concatenate(found)
+def stage_of(plan: TilePlan) -> Stage:
+    """The stage that the rounds before the tiles are for."""
+    assert plan.first is not None
+    given = plan.head[plan.first.at]
+    options = {name: value for name, value in given.items() if name not in ("type", "tag", "inputs")}
+    return registry.get(given["type"])(options)
 
 
-def _outside(points: NDArray[np.float64], box: Box, unit: float) -> NDArray[np.float64]:
-    """How far points (n, 3), in meters, lie outside a box in the unit of the coordinates, along the farther axis."""
+def block_grid(first: FirstRound) -> TileGrid:
+    """The grid of blocks, in meters."""
+    return TileGrid(first.blocks.side)
+
+
+def blocks_around(first: FirstRound, box: Box, unit: float, around_m: float) -> list[tuple[int, int]]:
+    """The blocks that a box with surroundings touches, in units of the coordinates and in meters."""
     x0, y0, x1, y1 = (side * unit for side in box)
-    x, y = points[:, 0], points[:, 1]
-    return np.maximum(np.maximum(x0 - x, x - x1), np.maximum(y0 - y, y - y1))
+    return block_grid(first).covering((x0 - around_m, y0 - around_m, x1 + around_m, y1 + around_m))
+
+
+@dataclass(frozen=True)
+class Before:
+    """What the rounds before left for a tile."""
+
+    folder: str
+    context: RunContext
+    first: FirstRound
+
+    def from_blocks(self, tile: tuple[int, int], read_m: float) -> Any:
+        """What the far-reaching stage needs around a tile that is read with so many meters of surroundings."""
+        first, context = self.first, self.context
+        around = read_m + first.blocks.around + _MARGIN
+        x0, y0, x1, y1 = (side * context.unit for side in context.grid.box(tile))
+        box = (x0 - around, y0 - around, x1 + around, y1 + around)
+        paths = [os.path.join(self.folder, block_file(block)) for block in block_grid(first).covering(box)]
+        found = (_load(path) for path in paths if os.path.exists(path))  # others have no points
+        return stage_of(context.plan).made_of_blocks(list(found), box)
+
+    def changed(self, piece: Piece) -> dict[str, tuple[NDArray[np.int64], NDArray]]:
+        """New values of a piece's points that the stages before the far-reaching one gave: rows and values by dimension."""
+        found: dict[str, list[tuple[NDArray[np.int64], NDArray]]] = {
+            name: [] for name in self.first.kept or ()
+        }
+        for tile in sorted(piece.tiles):
+            path = os.path.join(self.folder, left_file(self.context.grid.name(tile)))
+            kept = _load(path)
+            for source, first, end in piece.spans:
+                index = kept.get(f"{source.key}/index")
+                if index is None:
+                    continue
+                rows = np.searchsorted(piece.index[first:end], index)
+                rows[rows == end - first] = 0
+                there = piece.index[first:end][rows] == index
+                for name, parts in found.items():
+                    parts.append((rows[there] + first, kept[f"{source.key}/{name}"][there]))
+        return {
+            name: tuple(np.concatenate(part) for part in zip(*parts, strict=True))  # type: ignore[misc]
+            for name, parts in found.items()
+            if parts
+        }
+
+
+def blocks_of(
+    first: FirstRound, grid: TileGrid, unit: float, tiles: Collection[tuple[int, int]]
+) -> set[tuple[int, int]]:
+    """All blocks that have points."""
+    return {block for tile in tiles for block in blocks_around(first, grid.box(tile), unit, 0.0)}
+
+
+def tiles_around(
+    first: FirstRound, grid: TileGrid, unit: float, block: tuple[int, int], known: Collection[tuple[int, int]]
+) -> Iterator[tuple[int, int]]:
+    """The known tiles whose points may matter for a block."""
+    x0, y0, x1, y1 = (side / unit for side in block_grid(first).box(block, first.blocks.reach + _MARGIN))
+    low, high = np.array([x0, y0]), np.array([x1, y1])
+    (i0, j0), (i1, j1) = grid.index(low).tolist(), grid.index(high).tolist()
+    if (i1 - i0 + 1) * (j1 - j0 + 1) > len(known):
+        yield from (t for t in known if i0 <= t[0] <= i1 and j0 <= t[1] <= j1)
+        return
+    for j in range(j0, j1 + 1):
+        for i in range(i0, i1 + 1):
+            if (i, j) in known:
+                yield i, j
+
+
+def _save(path: str, arrays: dict[str, NDArray]) -> None:
+    with whole_files(path, what="result") as (partial,), open(partial, "wb") as file:
+        np.savez(file, **arrays, names=np.array(sorted(arrays)))  # type: ignore[arg-type]
+
+
+def _load(path: str) -> dict[str, NDArray]:
+    """The arrays of a file; one that cannot be read is removed, so that a later run makes it anew."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            found = {name: file[name] for name in file.files if name != "names"}
+            if sorted(found) != file["names"].tolist():
+                raise ValueError("its members have other names")
+            return found
+    except FileNotFoundError:
+        raise StageError(
+            "what the first round left of a tile is not there any more",
+            found=path,
+            cure="Run it again with --resume",
+        ) from None
+    except Exception as error:  # zipfile and numpy raise many types
+        if isinstance(error, MemoryError):
+            raise
+        if os.path.exists(path):
+            os.unlink(path)
+        raise StageError(
+            "what the first round left of a tile cannot be read back, and was removed",
+            found=f"{path}: {error}",
+            cure="Run it again with --resume",
+        ) from error

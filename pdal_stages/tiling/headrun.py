@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,18 +52,26 @@ class HeadRun:
     left_alone: dict[str, int] = field(default_factory=dict)  #: of the tile's own points, see :mod:`.outcome`
 
 
+class FromBefore(NamedTuple):
+    """What the rounds before the tiles made for a tile."""
+
+    from_blocks: Any  #: for the far-reaching stage
+    #: Of each piece, new values that the stages before it gave: rows and values by dimension.
+    changed: list[dict[str, tuple[NDArray[np.int64], NDArray]]]
+
+
 def run_head(
     context: RunContext,
     tile: tuple[int, int],
     cuts: list[Piece],
     everything: bool,
-    far_points: NDArray[np.float64] | None = None,
+    before: FromBefore | None = None,
     narrowing: bool = True,
 ) -> HeadRun:
     """Run the head once.
 
-    `everything`: all inputs were read, so nothing can lie farther away. `far_points`: what the first round left of
-    points farther away than those of `cuts`. With `narrowing`, stages after one that reaches far get the points alone
+    `everything`: all inputs were read, so nothing can lie farther away. `before`: what is taken from the rounds before.
+    With `narrowing`, stages after one that reaches far get the points alone
     that they can reach themselves. Where that turns out to be too few (the k nearest neighbors of sparse points), it is
     done again without.
     """
@@ -71,15 +79,22 @@ def run_head(
     if not plan.head:
         return HeadRun([PieceResults(piece, piece.own, {}) for piece in cuts], 0.0)
     marks = _marks(cuts, context)
+    begin = 0
+    if before is not None and plan.first is not None and plan.first.kept is not None:
+        begin = plan.first.at
+        for mark, changed in zip(marks, before.changed, strict=True):
+            mark.changed = changed
     reaches: dict[int, _Reach] = {}
     narrowed = False
     from_afar = None
     with Callbacks() as callbacks:
         stages = _marked(callbacks, cuts, marks)
         for number, (given, later) in enumerate(zip(plan.head, plan.later, strict=True)):
+            if number < begin:
+                continue
             stage = _with_threads(given, context.threads)
-            stages.append(stage if number else {**stage, **_after(marks)})
-            if plan.first is not None and number == plan.first.at:
+            stages.append(stage if number > begin else {**stage, **_after(marks)})
+            if before is not None and plan.first is not None and number == plan.first.at:
                 from_afar = len(stages) - 1
             kind = registry.stages().get(stage["type"])
             if kind is not None and kind.open_ended and not everything:
@@ -94,7 +109,8 @@ def run_head(
         for ours in pipeline.lowered.ours:
             ours.stage.own_points = OUTSIDE
             if ours.number == from_afar:
-                ours.stage.far_points = far_points
+                assert before is not None
+                ours.stage.from_blocks = before.from_blocks
             if ours.number in reaches:
                 reaches[ours.number].stage = ours.stage
         pipeline.execute(arrays=True)
@@ -102,7 +118,7 @@ def run_head(
     need = max((reach.need for reach in reaches.values()), default=0.0)
     far = any(report.beyond_halo for _, reports in pipeline.reports for report in reports)
     if far and narrowed:
-        return run_head(context, tile, cuts, everything, far_points, narrowing=False)
+        return run_head(context, tile, cuts, everything, before, narrowing=False)
     if far and not everything:
         most = max(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
         need = max(need, _far_neighbors(pipeline.arrays, most, context, tile))
@@ -112,22 +128,60 @@ def run_head(
     )
 
 
-def run_first(context: RunContext, cuts: list[Piece], first: FirstRound) -> NDArray[np.float64]:
-    """What the first round leaves of a tile's own points, after the stages before the one that wants it: (n, 3), meters."""
-    marks = _marks(cuts, context)
+class FirstResults(NamedTuple):
+    """What the first round leaves of a tile's own points."""
+
+    left: NDArray[np.float64]  #: (n, 3) what the far-reaching stage needs of them, meters
+    #: New values that the stages before it gave: by inputs' keys, the points' numbers and values by dimension.
+    changed: dict[str, tuple[NDArray[np.int64], dict[str, NDArray]]]
+    messages: list[str]
+
+
+def run_first(context: RunContext, cuts: list[Piece], first: FirstRound) -> FirstResults:
+    """Run the stages before the one that looks far, on a tile and the surroundings that they need."""
+    marks = _marks(cuts, context, first.kept or () if first.at else ())
     with Callbacks() as callbacks:
         stages = _marked(callbacks, cuts, marks)
         head = [_with_threads(given, context.threads) for given in context.plan.head[: first.at + 1]]
         head[0] |= _after(marks)
         wanting = Pipeline([*stages, *head], whole=False).lowered.ours[-1].stage
-        left = _Left(wanting)
+        left = _Left(wanting, marks)
         run = callbacks.filter(left, **(_after(marks) if first.at == 0 else {}))
-        Pipeline([*stages, *head[:-1], run], whole=False).execute(arrays=False)
-    return np.concatenate(left.found) if left.found else np.empty((0, 3))
+        pipeline = Pipeline([*stages, *head[:-1], run], whole=False)
+        pipeline.execute(arrays=False)
+    messages = [*(f"PDAL says: {line}" for line in pipeline.log_lines), *pipeline.messages]
+    points = np.concatenate(left.found) if left.found else np.empty((0, 3))
+    return FirstResults(points, _changes(left.values, marks), messages)
 
 
-def _marks(cuts: list[Piece], context: RunContext) -> list[_Mark]:
-    marks = [_Mark(number, piece, context) for number, piece in enumerate(cuts)]
+def _changes(
+    found: list[tuple[int, NDArray[np.int64], dict[str, NDArray]]], marks: list[_Mark]
+) -> dict[str, tuple[NDArray[np.int64], dict[str, NDArray]]]:
+    """Of the values that pieces' rows have, those that differ from what was read, input by input."""
+    out: dict[str, tuple[NDArray[np.int64], dict[str, NDArray]]] = {}
+    for number, mark in enumerate(marks):
+        mine = [(rows, values) for piece, rows, values in found if piece == number]
+        if not mine or not mark.keep:
+            continue
+        rows = np.concatenate([each for each, _ in mine])
+        order = np.argsort(rows, kind="stable")
+        rows = rows[order]
+        values = {name: np.concatenate([v[name] for _, v in mine])[order] for name in mark.keep}
+        mark.put_flags_back(rows, values)
+        at = np.searchsorted(mark.piece.own, rows)
+        new = np.zeros(len(rows), bool)
+        for name, column in values.items():
+            new |= column != mark.original[name][at]
+        for source, first, end in mark.piece.spans:
+            these = new & (rows >= first) & (rows < end)
+            if these.any():
+                chosen = {name: column[these] for name, column in values.items()}
+                out[source.key] = (mark.piece.index[rows[these]], chosen)
+    return out
+
+
+def _marks(cuts: list[Piece], context: RunContext, keep: Collection[str] = ()) -> list[_Mark]:
+    marks = [_Mark(number, piece, context, keep) for number, piece in enumerate(cuts)]
     old = [mark.old_format for mark in marks]
     for mark in marks:
         mark.mixed = any(old) and not all(old)
@@ -156,17 +210,25 @@ def _with_threads(given: dict[str, Any], threads: int) -> dict[str, Any]:
 
 
 class _Left:
-    """Keeps what a stage would need of a tile's own points if they were far away."""
+    """Keeps what a stage would need of a tile's own points if they were far away, and what the stages before changed."""
 
-    def __init__(self, stage: Stage) -> None:
-        self.stage = stage
+    def __init__(self, stage: Stage, marks: list[_Mark]) -> None:
+        self.stage, self.marks = stage, marks
         self.found: list[NDArray[np.float64]] = []  # one for each view
+        self.values: list[
+            tuple[int, NDArray[np.int64], dict[str, NDArray]]
+        ] = []  # a piece's rows and their values
 
     def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
         mine = ins[OUTSIDE] < 0
         if mine.any():
             points = points_of(self.stage, module, {name: values[mine] for name, values in ins.items()})
             self.found.append(self.stage.left_of(points))
+        for number, mark in enumerate(self.marks):
+            if mark.keep:
+                at = np.flatnonzero(mine & (ins[INPUT] == number))
+                values = {name: np.array(ins[name][at]) for name in mark.keep}
+                self.values.append((number, ins[ROW][at].astype(np.int64), values))
 
 
 class _Mark:
@@ -176,8 +238,10 @@ class _Mark:
     stages could not tell: the bits then go where those are, and back into the results.
     """
 
-    def __init__(self, number: int, piece: Piece, context: RunContext) -> None:
-        self.number, self.piece, self.keep = number, piece, context.plan.creates is None
+    def __init__(self, number: int, piece: Piece, context: RunContext, keep: Collection[str] = ()) -> None:
+        self.number, self.piece, self.keep = number, piece, list(keep)
+        self.keep_all = context.plan.creates is None
+        self.changed: dict[str, tuple[NDArray[np.int64], NDArray]] = {}  # given by the rounds before
         self.away = np.where(piece.away < 0, -1.0, piece.away * context.unit)
         header = read_header(piece.path)
         self.old_format = header is not None and header.point_format <= 5  # one of LAS 1.0 to 1.3
@@ -193,16 +257,22 @@ class _Mark:
         outs[ROW] = np.arange(count, dtype=np.uint32)
         outs[INPUT] = np.full(count, self.number, np.uint32)
         outs[OUTSIDE] = self.away
-        if self.keep:
+        if self.keep_all:
             self.original = {name: v[self.piece.own] for name, v in ins.items() if name not in _MARK_TYPES}
+        else:
+            self.original = {name: ins[name][self.piece.own] for name in self.keep}
+        given: dict[str, NDArray] = {}
+        for name, (rows, values) in self.changed.items():
+            given[name] = outs[name] = np.array(ins[name])
+            given[name][rows] = values
         self.holds_flags = self.old_format and not {"Synthetic", "Withheld"} & set(ins)
         if self.holds_flags and self.mixed:
-            codes = ins["Classification"]
+            codes = given.get("Classification", ins["Classification"])
             self._flags = codes[self.piece.own] & ~np.uint8(LEGACY_LIMIT)
             outs["Classification"] = codes & np.uint8(LEGACY_LIMIT)
             if "ClassFlags" in ins:
                 outs["ClassFlags"] = codes >> np.uint8(LEGACY_LIMIT.bit_length())
-                if self.keep:
+                if self.keep_all:
                     self.original["ClassFlags"] = outs["ClassFlags"][self.piece.own]
 
     def put_flags_back(self, rows: NDArray[np.int64], values: dict[str, NDArray]) -> None:

@@ -31,7 +31,12 @@ def fingerprint(*parts: Any) -> str:
 
 def left_file(tile: str) -> str:
     """The name of the file of what the first round left of a tile."""
-    return f"{tile}.first.npy"
+    return f"{tile}.first.npz"
+
+
+def block_file(block: tuple[int, int]) -> str:
+    """The name of the file of a block that is made of what is left."""
+    return f"{block[0]}_{block[1]}.block.npz"
 
 
 class Store:
@@ -135,10 +140,14 @@ class Store:
         """The file of what the first round left of a tile."""
         return self.tiles / left_file(name)
 
-    def forget_left(self, but: Collection[str] = ()) -> None:
-        """Remove what the first round left, of all tiles but these."""
-        kept = {left_file(name) for name in but}
-        for path in self.tiles.glob(left_file("*")):
+    def block(self, block: tuple[int, int]) -> Path:
+        """The file of a block that is made of what is left."""
+        return self.tiles / block_file(block)
+
+    def forget_left(self, but: Collection[str] = (), but_blocks: Collection[tuple[int, int]] = ()) -> None:
+        """Remove what the first rounds left, of all tiles and blocks but these."""
+        kept = {left_file(name) for name in but} | {block_file(block) for block in but_blocks}
+        for path in [*self.tiles.glob("*.first.npz"), *self.tiles.glob("*.block.npz")]:
             if path.name not in kept:
                 path.unlink(missing_ok=True)
 

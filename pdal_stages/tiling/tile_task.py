@@ -8,15 +8,14 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.errors import NoTerrainError
 from .cloudindex import CloudIndex
-from .extract import cut_all
+from .extract import Piece, cut_all
 from .file_task import write_tile
-from .firstround import left_around
+from .firstround import Before
 from .grid import inside
-from .headrun import HeadRun, RunContext, run_head
+from .headrun import FromBefore, HeadRun, RunContext, run_head
 from .results import PieceResults, class_counts, save
 from .sources import InputSource
 
@@ -35,7 +34,7 @@ class TileTask:
     complete: float  #: meters around the tile up to which these are all the inputs there are
     result: str  #: file for the results, where outputs are put together from tiles
     outputs: list[str] | None  #: otherwise: what each of the writers writes
-    afar: str  #: the folder of what the first round left
+    before: str  #: the folder of what the rounds before made; empty where there were none
 
     def run(self) -> dict[str, Any]:
         """Run the head; write its results, or the outputs. The report says which."""
@@ -68,7 +67,7 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
             break
         everything = inside(context.bounds, context.grid.box(tile, halo_m / context.unit))
         try:
-            head = run_head(context, tile, cuts, everything, _beyond(task, halo_m))
+            head = run_head(context, tile, cuts, everything, _before(task, cuts, halo_m))
             need = head.need
         except NoTerrainError:
             if everything:
@@ -102,9 +101,10 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
     return head.results, report
 
 
-def _beyond(task: TileTask, halo_m: float) -> NDArray[np.float64] | None:
-    """What the first round left of points farther away than those that are read."""
-    context = task.context
-    if context.plan.first is None:
+def _before(task: TileTask, cuts: list[Piece], halo_m: float) -> FromBefore | None:
+    """What the rounds before made for a tile that is read with so many meters of surroundings."""
+    first = task.context.plan.first
+    if first is None or not task.before:
         return None
-    return left_around(task.afar, context.grid, task.tile, context.unit, halo_m, context.plan.first.far_m)
+    before = Before(task.before, task.context, first)
+    return FromBefore(before.from_blocks(task.tile, halo_m), [before.changed(piece) for piece in cuts])

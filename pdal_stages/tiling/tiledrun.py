@@ -140,6 +140,7 @@ def _messages_of_tiles(work: Worklist) -> list[str]:
     found = Counter(
         text for job in work.jobs if job.state == "done" for text in set(job.report.get("messages", ()))
     )
+    found.update(text for messages in work.messages_before for text in set(messages))
     messages = [f"{text} ({n} tile{'s' * (n != 1)})" for text, n in found.most_common(_MOST_MESSAGES)]
     return messages + (
         [f"and {len(found) - _MOST_MESSAGES} more; see --report"] if len(found) > _MOST_MESSAGES else []

@@ -14,7 +14,7 @@ from ..base.outputs import Output, check_outputs
 from ..models import shipped
 from ..pipeline.filenames import writes_las
 from ..pipeline.run import Pipeline
-from ..stages.base import Stage
+from ..stages.base import Blocks, Stage
 
 #: Dimensions that follow a point through a tile's pipeline.
 ROW, INPUT, OUTSIDE = "PdalStagesRow", "PdalStagesInput", "PdalStagesOutside"
@@ -44,11 +44,15 @@ _DRIVERS |= {".laz": "las", ".txt": "text", ".csv": "text", ".tif": "gdal"}
 
 @dataclass(frozen=True)
 class FirstRound:
-    """What a stage that looks far is given of points far away, made in tiles before: see :mod:`.firstround`."""
+    """What is made before the tiles for a stage that looks far: see :mod:`.firstround`."""
 
     at: int  #: number of the stage in the head
     halo_m: float  #: halo that the stages before it need
-    far_m: float  #: meters around a tile within which it needs what is left of points
+    far_m: float  #: meters around a tile within which any point matters to the stages from it on
+    blocks: Blocks
+    #: Dimensions that the stages before it change, kept for the tiles, which then leave these stages out; None where they
+    #: have to run in each tile again.
+    kept: list[str] | None
 
 
 @dataclass(frozen=True)
@@ -136,11 +140,11 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
             )
     reaches = [step.reach(buffer) for step in head]
     sees_m = sum(reaches)
-    first = _first_round(head, reaches)
+    first, wider = _first_round(readers, head, reaches)
     later = [sum(reaches[n + 1 :]) for n in range(len(head))]
     stages = [step.ours for step in head if step.ours is not None]
     foreign = any(step.ours is None and step.type != "filters.merge" for step in head)
-    messages = list(pipeline.lowered.warnings)
+    messages = [*pipeline.lowered.warnings, *([wider] if wider else [])]
     if any(step.ours is None and step.sees_neighbors for step in head):
         messages.append(
             "PDAL filters that look at neighbors were given --buffer; the result is seamless only if it is wide enough "
@@ -163,17 +167,46 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
     )
 
 
-def _first_round(head: list[_Step], reaches: list[float]) -> FirstRound | None:
-    """Find the one stage that needs little of points far away; it then reaches less far, and so do the tiles."""
+def _first_round(
+    readers: list[_Step], head: list[_Step], reaches: list[float]
+) -> tuple[FirstRound | None, str]:
+    """Find the one stage that needs little of points far away; it then reaches less far, and so do the tiles.
+
+    Where tiles are read wider than it would take, the reason is given, too.
+    """
     for at, step in enumerate(head):
         near = None if step.ours is None else step.ours.near_halo_m()
         if near is not None:
-            found = FirstRound(at, sum(reaches[:at]), sum(reaches[at:]))
+            assert step.ours is not None
+            before = sum(reaches[:at])
+            kept = _kept(readers, head[:at])
+            found = FirstRound(at, before, sum(reaches[at:]), step.ours.blocks(), kept)
             reaches[at] = min(near, reaches[at])
-            return found
+            if kept is not None:
+                reaches[:at] = [0.0] * at
+                return found, ""
+            blame = next((s.type for s in head[:at] if s.ours is None), "readers.ept")
+            more = f"tiles are read with {before:g} m more of surroundings: {blame} stands before {step.type}"
+            return found, more if before else ""
         if step.ours is not None and step.ours.open_ended:
-            return None  # it may have to read farther
-    return None
+            far = next(
+                (s for s in head[at:] if s.ours is not None and s.ours.near_halo_m() is not None), None
+            )
+            return None, "" if far is None else (
+                f"tiles are read with all the surroundings of {far.type}: {step.type}, which stands before it, may look as "
+                "far as it likes"
+            )
+    return None, ""
+
+
+def _kept(readers: list[_Step], before: list[_Step]) -> list[str] | None:
+    """The dimensions that stages change, where it is enough to keep these."""
+    if any(step.ours is None and step.type != "filters.merge" for step in before):
+        return None  # which may drop points
+    if before and any(step.type == "readers.ept" for step in readers):
+        return None  # whose points have no numbers
+    made = {name for step in before if step.ours is not None for name in step.ours.creates()}
+    return sorted(made) if made <= {"Classification"} else None
 
 
 def _object(stage: Any, index: int, count: int) -> dict[str, Any]:

@@ -35,6 +35,7 @@ class Worklist:
             self.options.most_points,
             self._tail if survey.per == "tile" else [],
         )
+        self.messages_before: list[list[str]] = []  #: warnings and notes of the tasks of the rounds before
         self.jobs = self._jobs()  #: tiles with points of their own, row by row
         #: One for each input file; empty where each tile is an output.
         self.outputs = self._outputs() if survey.per == "file" else []
@@ -132,6 +133,11 @@ class Worklist:
         else:
             store.finish(item.name, self.mark_of(item, item.report), item.report)
 
+    @property
+    def farthest(self) -> float:
+        """How far around a tile inputs are at hand: it may have to be read with wider surroundings."""
+        return max(4 * self.survey.halo_units, self.survey.halo_units + self.survey.grid.size)
+
     def context(self, store: Store, threads: int) -> RunContext:
         """What all tiles have in common."""
         survey, scratch, most = self.survey, str(store.scratch), self.options.most_points
@@ -144,8 +150,8 @@ class Worklist:
         """A function that gives the task of a tile or an output."""
         plan, survey, scratch = self.plan, self.survey, str(store.scratch)
         context = self.context(store, threads)
-        # Farther inputs too: a tile may have to be read with a wider halo.
-        far = max(4 * survey.halo_units, survey.halo_units + survey.grid.size)
+        far = self.farthest
+        before = str(store.tiles) if plan.first is not None and len(self.jobs) > 1 else ""
 
         def task_of(item: TileJob | FileJob) -> TileTask | FileTask:
             if isinstance(item, FileJob):
@@ -160,7 +166,7 @@ class Worklist:
                 math.inf if len(sources) == len(survey.placed) else far * survey.unit,
                 str(store.result(item.name)),
                 item.outputs,
-                str(store.tiles),
+                before,
             )
 
         return task_of

@@ -1,0 +1,294 @@
+"""Which cells of a minimum grid are ground: of all the points there are, or of a block of cells and what lies around it.
+
+All of a progressive morphological filter that looks far away is done here, on a raster; see :mod:`.morphological`. In tiles
+it is done once for each block of a grid of blocks, out of the lowest points of cells, and tiles put the blocks together.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.jit import njit
+from .decks import BESIDE, CELL, decks_of_levels, levels_near_decks
+from .decks import REACH as DECKS_REACH
+from .lowest import COMPANY, SURROUNDINGS, cell_values, lowest_points, pits
+from .minima import cell_numbers
+from .openings import HOLE
+from .patches import SIDE, connected
+from .planes import reach as planes_reach
+from .planes import surface
+from .plateaus import reach as plateau_reach
+from .plateaus import remove_plateaus
+from .profile import opening_radius
+from .progressive import objects_of
+
+#: Blocks, in meters, from which the surface is made: that for telling ground, and that of the heights.
+NEAR, FAR = 8.0, 32.0
+#: How often ground is regained.
+ROUNDS = 3
+#: Cells along the side of a block.
+BLOCK_SIDE = SIDE
+
+
+@dataclass(frozen=True)
+class FilterOptions:
+    """Of :func:`.morphological.filtered_ground`; lengths in meters."""
+
+    cell: float = 1.0
+    slope: float = 0.15
+    window: float = 75.0
+    threshold: float = 0.5
+    scalar: float = 1.25
+    openings: Sequence[float] = ()
+    decks: bool = False
+
+    @property
+    def radius(self) -> int:
+        """Of the largest window, in cells."""
+        return max(1, round(self.window / self.cell))
+
+    @property
+    def opening_radii(self) -> list[int]:
+        """Of the openings that are wanted, in cells."""
+        return [opening_radius(size, self.cell) for size in self.openings]
+
+    @property
+    def largest_radius(self) -> int:
+        """Of windows and openings, in cells."""
+        return max([self.radius, *self.opening_radii])
+
+    def levels(self, block: float) -> int:
+        """How often cells are put together until they are blocks of so many meters."""
+        return max(1, round(math.log2(block / self.cell)))
+
+    @property
+    def reach(self) -> int:
+        """How far away, in cells, lowest points can change which cells are ground, and how high.
+
+        An opening looks twice its radius away, a plateau as far as it is wide; low outliers are judged before, and surfaces
+        led through ground between.
+        """
+        surfaces = ROUNDS * planes_reach(self.levels(NEAR))
+        found = COMPANY + SURROUNDINGS + 2 * self.largest_radius + plateau_reach(self.cell) + surfaces + 2
+        return max(found, self.reach_of_decks) if self.decks else found
+
+    @property
+    def reach_of_decks(self) -> int:
+        """How far away, in cells, points can change what is a bridge deck, which is found apart."""
+        return math.ceil((DECKS_REACH + (BESIDE + 1) * CELL) / self.cell)
+
+    @property
+    def link(self) -> int:
+        """How far one step looks, in cells: no step of the filter sees from a point to another across more empty land."""
+        return max(COMPANY, self.largest_radius, planes_reach(self.levels(FAR))) + 2
+
+
+class GroundRaster(NamedTuple):
+    """A minimum grid and what was found on it."""
+
+    left: int  #: number of the first column
+    bottom: int  #: of the first row
+    lowest: NDArray[
+        np.float32
+    ]  #: (h, w) heights of the lowest points, meters; HOLE where there is none, or a pit
+    place: NDArray[
+        np.float64
+    ]  #: (h, w, 3) where ground is in its cell, from the middle, in cells; its height
+    ground: NDArray[np.bool_]  #: (h, w)
+    floor: NDArray[np.float32]  #: (h, w) what lies below objects
+    opened: Mapping[int, NDArray[np.float32]]  #: (h, w) openings by their radius
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.ground.shape
+
+
+def ground_raster(
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    z: NDArray[np.float64],
+    use: NDArray[np.bool_],
+    deck: NDArray[np.uint8],
+    column: NDArray[np.int64],
+    row: NDArray[np.int64],
+    options: FilterOptions,
+    margin: int = 1,
+) -> tuple[GroundRaster, NDArray[np.int64]]:
+    """What the raster round points tells of the ground, and the numbers of points (n,) that are pits.
+
+    Points have coordinates in meters, and columns and rows of their cells; those of `use` may be ground, but not those of a
+    `deck`. On every side are
+    `margin` empty cells, one at least: points blend the four cells round them.
+    """
+    left, bottom = int(column.min()) - margin, int(row.min()) - margin
+    shape = int(row.max()) + margin + 1 - bottom, int(column.max()) + margin + 1 - left
+    lowest = np.empty(shape, np.int64)
+    lowest_points(z, x, y, use, column, row, left, bottom, lowest)
+    cell = options.cell
+    place, raster = cell_values(x, y, z, cell, lowest)
+    bad = pits(raster, cell)
+    pit_points = lowest[bad]
+    raster[bad] = HOLE
+    on_deck = (deck != 0)[lowest] & (lowest >= 0)
+    del lowest, bad
+    objects, floor, opened = objects_of(raster, cell, options.slope, options.radius, options.opening_radii)
+    ground = np.isfinite(raster) & ~objects
+    levels = options.levels(NEAR)
+    for _ in range(ROUNDS):
+        planes = surface(ground, place, floor, raster, left, bottom, levels)
+        _regain(ground, raster, place, planes, cell, options.threshold, options.scalar)
+    remove_plateaus(ground, floor, raster, cell)
+    # The terrain runs below: no level of a deck stands for it either.
+    ground &= ~on_deck
+    raster[on_deck] = HOLE
+    return GroundRaster(left, bottom, raster, place, ground, floor, opened), pit_points
+
+
+@njit
+def _regain(ground, raster, place, planes, cell, threshold, scalar):
+    """Make ground what lies near the surface of the ground found so far."""
+    for j in range(ground.shape[0]):
+        for i in range(ground.shape[1]):
+            if not ground[j, i] and raster[j, i] != HOLE:
+                height, across, along = planes[j, i, 0], planes[j, i, 1], planes[j, i, 2]
+                x, y, z = place[j, i, 0], place[j, i, 1], place[j, i, 2]
+                gradient = np.sqrt(across * across + along * along) / cell
+                if abs(z - height - x * across - y * along) <= threshold + scalar * gradient:
+                    ground[j, i] = True
+
+
+@dataclass(frozen=True)
+class GroundCells:
+    """Cells of :class:`GroundRaster`, one by one: all with a height, or an opening."""
+
+    column: NDArray[np.int64]  #: (n,)
+    row: NDArray[np.int64]  #: (n,)
+    lowest: NDArray[np.float32]  #: (n,)
+    floor: NDArray[np.float32]  #: (n,)
+    ground: NDArray[np.bool_]  #: (n,)
+    place: NDArray[np.float64]  #: (number of ground cells, 3), in their order
+    opened: NDArray[np.float32]  #: (number of openings, n)
+    decks: NDArray[
+        np.float64
+    ]  #: (number of levels near bridge decks, 5): see :func:`.decks.levels_near_decks`
+
+    def arrays(self) -> dict[str, NDArray]:
+        """All by name, for files."""
+        return vars(self).copy()
+
+    def within(self, west: int, south: int, east: int, north: int) -> GroundCells:
+        """The cells of these columns and rows, the last ones included."""
+        mine = (self.column >= west) & (self.column <= east) & (self.row >= south) & (self.row <= north)
+        return self[mine]
+
+    def __getitem__(self, mine: NDArray) -> GroundCells:
+        """Some of the cells: a mask, or numbers in their order."""
+        chosen = np.zeros(len(self.column), bool)
+        chosen[mine] = True
+        places = self.place[chosen[self.ground]]
+        return GroundCells(
+            self.column[chosen],
+            self.row[chosen],
+            self.lowest[chosen],
+            self.floor[chosen],
+            self.ground[chosen],
+            places,
+            self.opened[:, chosen],
+            self.decks,
+        )
+
+    @staticmethod
+    def joined(parts: Iterable[GroundCells], openings: int) -> GroundCells:
+        """The cells of parts that share none; with so many openings."""
+        given = [_no_cells(openings), *parts]
+        names = list(vars(given[0]))
+        axes = {name: 1 if name == "opened" else 0 for name in names}
+        return GroundCells(**{n: np.concatenate([getattr(g, n) for g in given], axis=axes[n]) for n in names})
+
+    def raster(self, left: int, bottom: int, shape: tuple[int, int], radii: Sequence[int]) -> GroundRaster:
+        """The cells on a raster that holds them all."""
+        j, i = self.row - bottom, self.column - left
+        lowest, floor = np.full(shape, HOLE, np.float32), np.full(shape, HOLE, np.float32)
+        lowest[j, i], floor[j, i] = self.lowest, self.floor
+        ground, place = np.zeros(shape, bool), np.zeros((*shape, 3))
+        ground[j, i] = self.ground
+        place[j[self.ground], i[self.ground]] = self.place
+        opened = {}
+        for radius, values in zip(radii, self.opened, strict=True):
+            opened[radius] = np.full(shape, -np.inf, np.float32)
+            opened[radius][j, i] = values
+        return GroundRaster(left, bottom, lowest, place, ground, floor, opened)
+
+
+def _no_cells(openings: int) -> GroundCells:
+    n, f = np.empty(0, np.int64), np.empty(0, np.float32)
+    return GroundCells(
+        n, n, f, f, np.empty(0, bool), np.empty((0, 3)), np.empty((openings, 0), np.float32), np.empty((0, 5))
+    )
+
+
+def cells_of_block(
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    z: NDArray[np.float64],
+    block: tuple[int, int],
+    options: FilterOptions,
+) -> GroundCells:
+    """The cells of a block, column and row of a grid of blocks of :data:`BLOCK_SIDE` cells.
+
+    The points are the lowest of cells, in meters: all within `options.reach` cells of the block, and as many more as you
+    like.
+    """
+    column, row = cell_numbers(x, options.cell), cell_numbers(y, options.cell)
+    west, south = (BLOCK_SIDE * number for number in block)
+    east, north = west + BLOCK_SIDE - 1, south + BLOCK_SIDE - 1
+    margin = max([*options.opening_radii, 0]) + 2
+    around = options.reach
+    near = (column >= west - around) & (column <= east + around)
+    near &= (row >= south - around) & (row <= north + around)
+    x, y, z, column, row = x[near], y[near], z[near], column[near], row[near]
+    levels, deck = np.empty((0, 5)), np.zeros(len(x), np.uint8)
+    if options.decks:
+        far = options.reach_of_decks + margin
+        seen = (column >= west - far) & (column <= east + far) & (row >= south - far) & (row <= north + far)
+        levels, lowest = levels_near_decks(x[seen], y[seen], z[seen], np.ones(np.count_nonzero(seen), bool))
+        deck[seen] = decks_of_levels(x[seen], y[seen], z[seen], np.ones(np.count_nonzero(seen), bool), levels)
+        columns, rows = column[seen][lowest], row[seen][lowest]
+        levels = levels[(columns >= west) & (columns <= east) & (rows >= south) & (rows <= north)]
+    # Openings reach into cells without points.
+    mine = (column >= west - margin) & (column <= east + margin)
+    mine &= (row >= south - margin) & (row <= north + margin)
+    found = []
+    for part, _own in connected(column, row, mine, options.link):
+        use = np.ones(len(part), bool)
+        raster, _ = ground_raster(
+            x[part], y[part], z[part], use, deck[part], column[part], row[part], options, margin
+        )
+        found.append(_cells_of(raster, options).within(west, south, east, north))
+    return replace(GroundCells.joined(found, len(options.openings)), decks=levels)
+
+
+def _cells_of(raster: GroundRaster, options: FilterOptions) -> GroundCells:
+    opened = [raster.opened[radius] for radius in options.opening_radii]
+    there = np.isfinite(raster.lowest)
+    for values in opened:
+        there |= np.isfinite(values)
+    j, i = np.nonzero(there)
+    ground = raster.ground[there]
+    return GroundCells(
+        i + raster.left,
+        j + raster.bottom,
+        raster.lowest[there],
+        raster.floor[there],
+        ground,
+        raster.place[there][ground],
+        np.array([values[there] for values in opened], np.float32).reshape(len(opened), len(j)),
+        np.empty((0, 5)),
+    )
