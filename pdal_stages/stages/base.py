@@ -44,6 +44,7 @@ class Blocks(NamedTuple):
     side: float
     reach: float  #: how far around a block points matter
     around: float  #: how far beyond the points that are read a tile needs blocks
+    spill: float  #: how far beyond all points blocks hold something
 
 
 class Stage(ABC):

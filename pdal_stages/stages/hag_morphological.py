@@ -152,8 +152,8 @@ of Z.
         return reach_of_points(self.cell)
 
     def blocks(self) -> Blocks:
-        around = reach_of_cells(self.cell)
-        return Blocks(BLOCK_SIDE * self.cell, (self._filter.reach + 1) * self.cell, around)
+        cell = self.cell
+        return Blocks(BLOCK_SIDE * cell, (self._filter.reach + 2) * cell, reach_of_cells(cell), 2 * cell)
 
     @cached_property
     def _filter(self) -> FilterOptions:

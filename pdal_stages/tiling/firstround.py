@@ -30,9 +30,6 @@ from .sources import InputSource
 from .store import block_file, left_file
 from .tileplan import FirstRound, TilePlan
 
-#: Cells at the edge of what is needed may begin outside, in meters.
-_MARGIN = 2.0
-
 
 @dataclass(frozen=True)
 class FirstRoundTask:
@@ -108,7 +105,7 @@ class Before:
     def from_blocks(self, tile: tuple[int, int], read_m: float) -> Any:
         """What the far-reaching stage needs around a tile that is read with so many meters of surroundings."""
         first, context = self.first, self.context
-        around = read_m + first.blocks.around + _MARGIN
+        around = read_m + first.blocks.around + first.blocks.spill
         x0, y0, x1, y1 = (side * context.unit for side in context.grid.box(tile))
         box = (x0 - around, y0 - around, x1 + around, y1 + around)
         paths = [os.path.join(self.folder, block_file(block)) for block in block_grid(first).covering(box)]
@@ -142,15 +139,16 @@ class Before:
 def blocks_of(
     first: FirstRound, grid: TileGrid, unit: float, tiles: Collection[tuple[int, int]]
 ) -> set[tuple[int, int]]:
-    """All blocks that have points."""
-    return {block for tile in tiles for block in blocks_around(first, grid.box(tile), unit, 0.0)}
+    """All blocks that hold anything."""
+    spill = first.blocks.spill
+    return {block for tile in tiles for block in blocks_around(first, grid.box(tile), unit, spill)}
 
 
 def tiles_around(
     first: FirstRound, grid: TileGrid, unit: float, block: tuple[int, int], known: Collection[tuple[int, int]]
 ) -> Iterator[tuple[int, int]]:
     """The known tiles whose points may matter for a block."""
-    x0, y0, x1, y1 = (side / unit for side in block_grid(first).box(block, first.blocks.reach + _MARGIN))
+    x0, y0, x1, y1 = (side / unit for side in block_grid(first).box(block, first.blocks.reach))
     low, high = np.array([x0, y0]), np.array([x1, y1])
     (i0, j0), (i1, j1) = grid.index(low).tolist(), grid.index(high).tolist()
     if (i1 - i0 + 1) * (j1 - j0 + 1) > len(known):
@@ -170,7 +168,7 @@ def _save(path: str, arrays: dict[str, NDArray]) -> None:
 def _load(path: str) -> dict[str, NDArray]:
     """The arrays of a file; one that cannot be read is removed, so that a later run makes it anew."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
             found = {name: file[name] for name in file.files if name != "names"}
             if sorted(found) != file["names"].tolist():
                 raise ValueError("its members have other names")
