@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+import os
+from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,17 +77,66 @@ def save(path: str | Path, results: Iterable[PieceResults]) -> None:
         np.savez(partial, **content)  # type: ignore[arg-type]
 
 
+class _Results:
+    """The file of a tile's results, opened."""
+
+    def __init__(self, name: str) -> None:
+        with contextlib.ExitStack() as stack:
+            self._arrays = stack.enter_context(
+                np.load(stack.enter_context(open(name, "rb")), allow_pickle=False)
+            )
+            if sorted({*self._arrays.files} - {"names"}) != self._arrays["names"].tolist():
+                raise ValueError("its members have other names")
+            self._dimensions: dict[str, list[str]] = {}
+            for member in self._arrays.files:
+                source, _, rest = member.partition("/")
+                if rest:
+                    self._dimensions.setdefault(source, [])
+                if rest.startswith("dim/"):
+                    self._dimensions[source].append(rest.removeprefix("dim/"))
+            self.close = stack.pop_all().close
+
+    def __contains__(self, source: str) -> bool:
+        """Whether it holds points of an input."""
+        return source in self._dimensions
+
+    def points(self, source: str) -> tuple[NDArray[np.int64], int]:
+        """Numbers of an input's points that came out, ascending, and how many are the tile's own."""
+        return self._arrays[f"{source}/index"], int(self._arrays[f"{source}/core"])
+
+    def values(self, source: str) -> Iterator[tuple[str, NDArray]]:
+        """Dimensions of an input's points."""
+        for name in self._dimensions[source]:
+            yield name, self._arrays[f"{source}/dim/{name}"]
+
+
+#: Files that were opened last, by name and what tells whether they are still the same: the outputs of hundreds of small inputs
+#: are read from one after the other.
+_open: OrderedDict[tuple[str, int, int], _Results] = OrderedDict()
+_MOST_OPEN = 8
+
+
+@atexit.register
+def _close(but: int = 0) -> None:
+    while len(_open) > but:
+        _open.popitem(last=False)[1].close()
+
+
 @contextlib.contextmanager
-def _opened(name: str) -> Iterator[Any]:
+def _opened(name: str) -> Iterator[_Results]:
     """The results in a file; one that cannot be read is removed, so that a later run makes it anew."""
     try:
-        with open(name, "rb") as file, np.load(file, allow_pickle=False) as tile:
-            if sorted({*tile.files} - {"names"}) != tile["names"].tolist():
-                raise ValueError("its members have other names")
-            yield tile
+        status = os.stat(name)
+        key = (name, status.st_mtime_ns, status.st_ino)
+        if key not in _open:
+            _open[key] = _Results(name)
+        _open.move_to_end(key)
+        _close(_MOST_OPEN)
+        yield _open[key]
     except StageError:
         raise
     except Exception as error:  # zipfile and numpy raise many types
+        _close()
         Path(name).unlink(missing_ok=True)
         raise StageError(
             "the results of a tile cannot be read back, and were removed",
@@ -101,25 +153,23 @@ def read_range(tiles: Iterable[str], source: InputSource, count: int, start: int
     StageError
         If the tiles do not hold each of the file's points once.
     """
-    prefix = f"{source.key}/"
     kept = np.zeros(end - start, bool)
     seen = 0
     columns: dict[str, list[tuple[NDArray, NDArray]]] = {}
     for name in tiles:
         with _opened(name) as tile:
-            if f"{prefix}index" not in tile:
+            if source.key not in tile:
                 continue
-            index = tile[f"{prefix}index"]  # ascending
-            seen += int(tile[f"{prefix}core"])
+            index, own = tile.points(source.key)
+            seen += own
             first, last = np.searchsorted(index, (start, end))
             mine = index[first:last] - start
             if (index.size and index[-1] >= count) or kept[mine].any():
                 raise StageError("internal: two tiles hold the same point", where=source.path, found=name)
             kept[mine] = True
-            for key in tile.files:
-                if key.startswith(f"{prefix}dim/"):
-                    part = tile[key][first:last].copy() if last - first < index.size else tile[key]
-                    columns.setdefault(key.removeprefix(f"{prefix}dim/"), []).append((mine, part))
+            for dimension, column in tile.values(source.key):
+                part = column[first:last].copy() if last - first < index.size else column
+                columns.setdefault(dimension, []).append((mine, part))
     if seen != count:
         raise StageError(
             "the tiles do not hold all points of the file: it changed while it was worked on",
