@@ -9,7 +9,6 @@ from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,8 +109,8 @@ class _Results:
             yield name, self._arrays[f"{source}/dim/{name}"]
 
 
-#: Files that were opened last, by name and what tells whether they are still the same: the outputs of hundreds of small inputs
-#: are read from one after the other.
+#: Files that were opened last, by name and what tells whether they are still the same: the outputs of hundreds of small
+#: inputs are read from one after the other.
 _open: OrderedDict[tuple[str, int, int], _Results] = OrderedDict()
 _MOST_OPEN = 8
 
