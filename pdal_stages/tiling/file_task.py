@@ -14,7 +14,9 @@ from ..base.asprs import LEGACY_LIMIT
 from ..pipeline.beside import extra_dims_option
 from ..pipeline.filenames import LAS_WRITERS
 from . import sizing
+from .grid import Box
 from .inparts import HeadersDifferError, write_in_parts
+from .rasters import on_one_grid
 from .results import NewValues, PieceResults, of_own_points, read_range
 from .sources import InputSource
 from .tail import run_tail
@@ -63,11 +65,14 @@ class FileTask:
             except HeadersDifferError:  # such as automatic offsets: written at once
                 pass
         reader = {**self.source.reader, "filename": self.source.path}
+        header = las.read_header(self.source.path)
+        if header is not None and header.count:
+            tail = on_one_grid(tail, header.box, half_open=False)
         return run_tail([reader], [new_values(0, self.count)], tail, self.outputs)
 
 
-def write_tile(results: list[PieceResults], plan: TilePlan, outputs: list[str]) -> dict[str, Any]:
-    """Write one tile's own points, from the files that were cut for it."""
+def write_tile(results: list[PieceResults], plan: TilePlan, outputs: list[str], box: Box) -> dict[str, Any]:
+    """Write one tile's own points, from the files that were cut for it; `box`: where it lies."""
     mine = [result for result in results if result.piece.own.size]
     tail = with_beside(
         plan.tail, plan.beside, [source.path for result in mine for source, *_ in result.piece.spans]
@@ -75,6 +80,7 @@ def write_tile(results: list[PieceResults], plan: TilePlan, outputs: list[str]) 
     if not mine:
         return {"outputs": []}
     readers = [{**result.piece.reader, "filename": result.piece.core} for result in mine]
+    tail = on_one_grid(tail, box, half_open=True)
     return run_tail(readers, [of_own_points(result) for result in mine], tail, outputs)
 
 

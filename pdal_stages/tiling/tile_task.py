@@ -43,7 +43,9 @@ class TileTask:
         ) as folder:
             results, report = _settle(self, folder)
             if self.outputs is not None:
-                return report | write_tile(results, self.context.plan, self.outputs)
+                return report | write_tile(
+                    results, self.context.plan, self.outputs, self.context.grid.box(self.tile)
+                )
             save(self.result, results)
         return report | {"result_bytes": os.path.getsize(self.result)}
 

@@ -19,6 +19,7 @@ from .dispatch import run_all, run_first_round
 from .estimate import estimate
 from .outcome import FileJob, InterruptedRun, TiledRun, TileJob, summarize
 from .pool import open_pool
+from .rasters import remarks
 from .settings import TilingOptions
 from .store import Store
 from .survey import Survey
@@ -92,6 +93,7 @@ def run_plan(
     chosen = survey.options
     if survey.per == "tile":  # whose outputs have points of all readers
         classflags.parting([*plan.readers, *plan.tail], with_ours=True)
+    survey.messages += remarks(plan.tail, chosen.tile if survey.per == "tile" else None)
     if dry_run:
         return estimate(plan, survey)
     if not folder.is_dir():
