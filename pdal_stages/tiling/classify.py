@@ -164,9 +164,13 @@ class ClassifyTask:
         return str(Path(self.output) / ("#.laz" if tiles else "#"))
 
     def run_tiles(
-        self, *, dry_run: bool = False, finished: Callable[[Written], None] | None = None
+        self,
+        *,
+        dry_run: bool = False,
+        finished: Callable[[Written], None] | None = None,
+        brief: bool = False,
     ) -> TiledRun:
-        """Classify all inputs in tiles; `finished` hears of every output that was written."""
+        """Classify all inputs in tiles; `finished` hears of every output that was written; `brief`: see :func:`run_plan`."""
         if self.options.per != "tile" and not any(map(is_ept, self.files)):
             outputs_of(self.files, self.output)  # which says what is wrong with names
         plan = self.plan()
@@ -181,7 +185,7 @@ class ClassifyTask:
                     classes = {int(code): n for code, n in job.report.get("classes", {}).items()}
                     finished(Written(path, job.report.get("written", 0), classes))
 
-        return run_plan(plan, self.options, dry_run=dry_run, finished=finished_one)
+        return run_plan(plan, self.options, dry_run=dry_run, finished=finished_one, brief=brief)
 
 
 def _make_folder(folder: Path) -> None:

@@ -120,11 +120,16 @@ def run_command(options: argparse.Namespace, source: Path | PipelineSource) -> i
     interrupted = False
     with _terminated_as_interrupted():
         try:
-            run = run_tiled(pipeline, chosen, dry_run=options.dry_run)
+            run = run_tiled(pipeline, chosen, dry_run=options.dry_run, brief=_brief(options))
         except InterruptedRun as stopped:
             run, interrupted = stopped.run, True
     _print_dry(run) if options.dry_run else _print(run)
     return _end(options, run, "run it again with --resume" if interrupted else "")
+
+
+def _brief(options: argparse.Namespace) -> bool:
+    """Whether nobody asks for the tiles of a run of which nothing is left to be done."""
+    return not options.report and not options.metadata
 
 
 def _check_reports(options: argparse.Namespace) -> None:
@@ -195,7 +200,7 @@ def classify(
     interrupted = False
     with _terminated_as_interrupted():
         try:
-            run = task.run_tiles(dry_run=options.dry_run, finished=finished)
+            run = task.run_tiles(dry_run=options.dry_run, finished=finished, brief=_brief(options))
         except InterruptedRun as stopped:
             run, interrupted = stopped.run, True
     if options.dry_run:

@@ -127,6 +127,19 @@ class Store:
             _remove(path)
         _keep(path, {"tile": side}, "result")
 
+    def keep_complete(self, run: dict[str, Any]) -> None:
+        """Remember a run of which all is done."""
+        with contextlib.suppress(StageError, OSError):  # no room: the next run looks into everything
+            _keep(self.folder / "complete.json", run, "result")
+
+    def complete(self) -> dict[str, Any] | None:
+        """What was remembered of a run of which all was done."""
+        return _read(self.folder / "complete.json")
+
+    def forget_complete(self) -> None:
+        """Something is to be done, or may be."""
+        (self.folder / "complete.json").unlink(missing_ok=True)
+
     def side(self) -> float | None:
         """The side of the last run's tiles, where it is known."""
         known = _read(self.folder / "run.json")

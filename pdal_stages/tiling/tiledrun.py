@@ -15,12 +15,14 @@ from ..base.files import sweep
 from ..pipeline import classflags
 from ..pipeline.overrides import Override
 from ..pipeline.run import Pipeline
+from .complete import remember, told_again
 from .dispatch import run_all, run_first_round
 from .estimate import estimate
 from .outcome import FileJob, InterruptedRun, TiledRun, TileJob, summarize
 from .pool import open_pool
 from .rasters import remarks
 from .settings import TilingOptions
+from .store import FOLDER as STORE
 from .store import Store
 from .survey import Survey
 from .tileplan import TilePlan, make_plan, outputs_for
@@ -34,6 +36,7 @@ def run_tiled(
     *,
     dry_run: bool = False,
     progress: bool | None = None,
+    brief: bool = False,
     **options: Any,
 ) -> TiledRun:
     """Run a pipeline in tiles.
@@ -49,6 +52,8 @@ def run_tiled(
         Only find the tiles; nothing is read but headers, nothing written.
     progress : bool, optional
         Whether to show progress on stderr.
+    brief : bool
+        With `resume`, where nothing is left to be done: say that, quickly, without the tiles.
     **options
         The other fields of :class:`TilingOptions`.
 
@@ -73,7 +78,9 @@ def run_tiled(
     """
     chosen = tile if isinstance(tile, TilingOptions) else TilingOptions(tile, **options)
     pipeline = source if isinstance(source, Pipeline) else Pipeline(source, overrides, whole=False)
-    return run_plan(make_plan(pipeline, chosen.buffer), chosen, dry_run=dry_run, progress=progress)
+    return run_plan(
+        make_plan(pipeline, chosen.buffer), chosen, dry_run=dry_run, progress=progress, brief=brief
+    )
 
 
 def run_plan(
@@ -83,12 +90,22 @@ def run_plan(
     dry_run: bool = False,
     progress: bool | None = None,
     finished: Callable[[TileJob | FileJob], None] | None = None,
+    brief: bool = False,
 ) -> TiledRun:
-    """Run what was planned; see :func:`run_tiled`. `finished` hears of every output that was written."""
+    """Run what was planned; see :func:`run_tiled`. `finished` hears of every output that was written.
+
+    `brief`: where an earlier run did everything and nothing has changed since, it is enough to say so, without its tiles.
+    """
     started = time.monotonic()
     folder = Path(plan.writers[0]["filename"]).absolute().parent
+    if brief and chosen.resume and not dry_run and (folder / STORE).is_dir():
+        with Store(folder) as store:
+            told = told_again(store, plan, chosen)
+        if told is not None:
+            return told
     if chosen.resume and chosen.tile is None:  # the free memory may be another today
         chosen = replace(chosen, tile=Store(folder).side())
+    asked = chosen
     survey = Survey(plan, chosen)
     chosen = survey.options
     if survey.per == "tile":  # whose outputs have points of all readers
@@ -103,6 +120,7 @@ def run_plan(
     with Store(folder) as store:
         if not chosen.resume:
             store.clear()
+        store.forget_complete()
         store.keep_side(survey.grid.size)
         try:
             with open_pool(chosen, str(store.folder)) as pool:
@@ -116,6 +134,7 @@ def run_plan(
                     run_all(work, store, pool, chosen.retries, progress, finished)
                     interrupted = False
                     work.forget_results(store)
+            changed = remember(store, plan, asked, work)
         finally:
             sweep(folder)  # what workers left that were killed
     summary = survey.figures(plan) | {"workers": pool.slots, "threads_per_worker": pool.threads}
@@ -127,7 +146,7 @@ def run_plan(
             f"{len(short)} tiles have points whose neighborhoods or terrain reach farther than could be read within "
             f"{chosen.most_points:,} points; they may differ from an untiled run: " + ", ".join(short[:5])
         )
-    run = TiledRun(work.jobs, work.outputs, survey.unreadable, survey.changed(), survey.messages, summary)
+    run = TiledRun(work.jobs, work.outputs, survey.unreadable, changed, survey.messages, summary)
     if interrupted:
         raise InterruptedRun(run)
     return run
