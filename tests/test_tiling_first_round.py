@@ -59,7 +59,7 @@ def test_lowest_points_are_enough_beyond_the_reach_of_points(origin):
 
 def test_a_stage_is_given_what_it_left(write_las):
     stage = HagMorphological({"openings": "5"})
-    assert stage.near_halo_m() < stage.halo_m() and stage.far_points is None
+    assert stage.near_halo_m() < stage.halo_m() and stage.from_blocks is None
 
 
 @pytest.fixture(scope="module")
