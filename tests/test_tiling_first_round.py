@@ -306,7 +306,8 @@ def test_decks_of_blocks_are_those_of_the_whole(name):
     from bridge_scenes import SCENES, scan
 
     xyz, _ = scan(SCENES[name](), 3.0)
-    x, y, z = (xyz + [1024.0 - xyz[:, 0].mean(), 2048.0 - xyz[:, 1].mean(), 0]).T  # where four blocks meet
+    middle = np.array([xyz[:, 0].mean() - 1024.0, xyz[:, 1].mean() - 2048.0, 0.0])  # where four blocks meet
+    x, y, z = (xyz - middle).T
     use = np.random.default_rng(0).random(len(x)) < 0.95
     options = {"decks": True, "openings": (5,)}
     whole = filtered_ground(x, y, z, mask=use, **options)
