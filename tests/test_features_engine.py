@@ -18,7 +18,7 @@ from pdal_stages.features import FeatureEngine, FeaturePlan, ShapeBins, compute_
 from pdal_stages.features.names import ALL_FEATURES, GROUPS, describe
 
 #: Every kind of neighborhood, small enough for small clouds.
-KINDS = "c1,c2.5,s1.5,s4,k8,kopt(5,30),ropt(0.5,1.5,0.25),copt"
+TOKENS = "c1,c2.5,s1.5,s4,k8,kopt(5,30),ropt(0.5,1.5,0.25),copt"
 MOMENTS = "covariance,Density,Verticality,HeightRange,HeightStd,HeightAboveLowest"
 
 
@@ -37,10 +37,10 @@ def cloud():
 @pytest.fixture(scope="module")
 def whole(cloud):
     """All features of all kinds for every point, with fitted bins and threshold."""
-    return compute_features(cloud, None, KINDS, "all", threads=1)
+    return compute_features(cloud, None, TOKENS, "all", threads=1)
 
 
-def again(whole, cloud, queries=None, neighborhoods=KINDS, feature_set="all", **options):
+def again(whole, cloud, queries=None, neighborhoods=TOKENS, feature_set="all", **options):
     options = {"threads": 1, **options}
     return compute_features(
         cloud,
@@ -142,7 +142,7 @@ def test_any_order_threads_and_blocks(cloud, whole):
 
 
 def test_fitting_does_not_depend_on_order(cloud, whole):
-    other = compute_features(cloud[::-1], [0], KINDS, "all", threads=2)
+    other = compute_features(cloud[::-1], [0], TOKENS, "all", threads=2)
     assert other.bins == whole.bins and other.copt_threshold == whole.copt_threshold
     assert np.array_equal(other.values[0], whole.values[-1])
 
@@ -164,13 +164,13 @@ def test_any_other_neighborhoods(cloud, whole, part):
     "feature_set", ["Planarity", "HeightRange,A3_5", "D2", "Radius", "SurfaceVariation_s4,D4_9_c1"]
 )
 def test_any_other_features(cloud, whole, feature_set):
-    table = again(whole, cloud, None, KINDS, feature_set)
+    table = again(whole, cloud, None, TOKENS, feature_set)
     for name in table.names:
         assert np.array_equal(table[name], whole[name]), name
 
 
 def test_tile_with_halo(cloud, whole):
-    plan = FeaturePlan.parse(KINDS)
+    plan = FeaturePlan.parse(TOKENS)
     low = cloud.min(axis=0)[:2] + 9.0
     inside = ((cloud[:, :2] >= low) & (cloud[:, :2] < low + 5.0)).all(axis=1)
     near = ((cloud[:, :2] >= low - plan.halo_m) & (cloud[:, :2] < low + 5.0 + plan.halo_m)).all(axis=1)
@@ -230,7 +230,7 @@ def test_many_copies_are_not_quadratic():
 
 
 def test_blocks_cover_every_query_once(cloud, whole):
-    plan = FeaturePlan.parse(KINDS)
+    plan = FeaturePlan.parse(TOKENS)
     engine = FeatureEngine(cloud, plan, bins=whole.bins, copt_threshold=whole.copt_threshold)
     for queries, count in ((None, len(cloud)), (np.arange(500, 900), 400)):
         seen = []
@@ -401,12 +401,12 @@ def test_other_number_types(kind):
 def test_few_points(count):
     xyz = np.random.default_rng(0).uniform(0, 2, (count, 3))
     if count == 0:
-        assert compute_features(xyz, None, KINDS, MOMENTS).values.shape == (
+        assert compute_features(xyz, None, TOKENS, MOMENTS).values.shape == (
             0,
-            len(FeaturePlan.parse(KINDS, MOMENTS).names),
+            len(FeaturePlan.parse(TOKENS, MOMENTS).names),
         )
         return
-    table = compute_features(xyz, None, KINDS, "all")
+    table = compute_features(xyz, None, TOKENS, "all")
     assert np.isfinite(table.values).all() and len(table) == count
 
 

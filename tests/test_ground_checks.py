@@ -13,7 +13,7 @@ from pdal_stages.base.errors import StageError
 from pdal_stages.pipeline import pdal as pdal_env
 
 pytestmark = pytest.mark.pdal
-KINDS = ("filters.hag_nn", "filters.hag_delaunay")
+TYPES = ("filters.hag_nn", "filters.hag_delaunay")
 
 
 def write(path, codes):
@@ -30,7 +30,7 @@ def stages(source, kind, target, **more):
             {"type": "writers.las", "filename": str(target), "extra_dims": "all", "minor_version": 4}]  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", TYPES)
 @pytest.mark.parametrize("more", [{}, {"inputs": ["in"]}], ids=["", "inputs"])
 def test_no_ground_is_an_error(tmp_path, kind, more):
     if not pdal_env.crashes_without_ground():
@@ -48,7 +48,7 @@ def test_no_ground_is_an_error(tmp_path, kind, more):
     assert len(run.failures) >= 4 and "no ground was found" in run.failures[0][1]
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", TYPES)
 @pytest.mark.parametrize("codes", [[2] * 50 + [1] * 50, [2] * 100])
 def test_heights_are_those_of_pdal(tmp_path, kind, codes, pdal_program):
     source = write(tmp_path / "a.las", codes)

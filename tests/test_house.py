@@ -28,3 +28,13 @@ def test_house(path):
                 one.name for one in node.names if one.name.startswith("_") and one.name != "__version__"
             ]
             assert room == own or not private, f"line {node.lineno}: {private} of {room}"
+
+
+def test_one_class_one_name():
+    """No two public classes of the package have one name, so that a name means one thing in any room."""
+    found: dict[str, str] = {}
+    for path in sorted(ROOT.rglob("*.py")):
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                own = str(path.relative_to(ROOT))
+                assert found.setdefault(node.name, own) == own, f"{node.name} in {found[node.name]} and {own}"

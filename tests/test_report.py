@@ -19,7 +19,7 @@ from pdal_stages.accuracy.text import percent
 from pdal_stages.base.errors import StageError
 from pdal_stages.reports.accuracypage import write_accuracy_report
 from pdal_stages.reports.charts import percent_axis
-from pdal_stages.reports.maps import Scene, densest_line, heights_to_draw
+from pdal_stages.reports.maps import MapScene, densest_line, heights_to_draw
 from pdal_stages.reports.runpage import run_page
 
 VOID = {"meta", "img", "br"}
@@ -273,7 +273,7 @@ def test_error_map_shows_the_errors(full):
 
 def test_section_lies_where_the_errors_are(scene, accuracy):
     xyz, reference, predicted, _ = scene
-    line = densest_line(Scene.of(accuracy, xyz, reference, predicted), depth=2.77)
+    line = densest_line(MapScene.of(accuracy, xyz, reference, predicted), depth=2.77)
     (x0, y0), (x1, y1) = np.subtract(line, (770_600, 6_277_500))
     assert abs(y0 - 12.5) < 1.5
     assert y0 == y1

@@ -21,7 +21,7 @@ GROUND, VEGETATION, BUILDING = 2, 5, 6
 
 
 @dataclass(frozen=True)
-class Survey:
+class LabeledSurvey:
     """One flight.
 
     Attributes
@@ -60,7 +60,7 @@ _ARRANGED = ", as arranged for IGNF's open tools"
 _AHN = "AHN, open data of the Dutch government"
 CLASSES = {2: GROUND, 4: VEGETATION, 5: VEGETATION, 6: BUILDING}
 SURVEYS = {
-    "Montpellier": Survey(
+    "Montpellier": LabeledSurvey(
         (
             "montpellier/train_77050_627755.laz",
             "montpellier/train_77050_627760.laz",
@@ -71,7 +71,7 @@ SURVEYS = {
         "French city, campus with trees",
         _LIDARHD,
     ),
-    "Delft": Survey(
+    "Delft": LabeledSurvey(
         ("delft/train.laz",),
         {2: GROUND, 6: BUILDING, 9: GROUND},
         "Dutch old town with canals (AHN3)",
@@ -79,15 +79,15 @@ SURVEYS = {
         dropped=(7, 18, 26),
         tall={1: 2.0},
     ),
-    "Seville": Survey(
+    "Seville": LabeledSurvey(
         ("seville/plazanueva.laz",),
         CLASSES,
         "Spanish old town, closed blocks (PNOA)",
         "Instituto Geografico Nacional de Espana, PNOA, CC BY 4.0",
         returns=False,
     ),
-    "hamlet": Survey(("rural/lidarhd_57ppm2.laz",), CLASSES, "French hamlet on a slope", _LIDARHD),
-    "farm": Survey(
+    "hamlet": LabeledSurvey(("rural/lidarhd_57ppm2.laz",), CLASSES, "French hamlet on a slope", _LIDARHD),
+    "farm": LabeledSurvey(
         ("rural/lidarhd_11ppm2.laz",),
         {2: GROUND, 6: BUILDING},
         "French farm",
@@ -96,7 +96,7 @@ SURVEYS = {
         tall={1: 0.5},
         tall_scored=True,
     ),
-    "power line": Survey(
+    "power line": LabeledSurvey(
         ("rural/ahn4_powerline.laz",),
         {2: GROUND, 5: VEGETATION, 9: GROUND},
         "Dutch meadows and woods under a power line (AHN4)",
@@ -105,7 +105,7 @@ SURVEYS = {
         returns=False,
         samples=300,
     ),
-    "bank": Survey(
+    "bank": LabeledSurvey(
         ("rural/lidarhd_bank.laz",),
         CLASSES,
         "French steep wooded bank and a house",
@@ -113,7 +113,7 @@ SURVEYS = {
         dropped=(7, 18, 65),
         samples=150,
     ),
-    "town's edge": Survey(
+    "town's edge": LabeledSurvey(
         ("rural/ign_0p3ppm2.laz",),
         CLASSES,
         "French town's edge with large halls, at 0.3 points/m²",
@@ -121,7 +121,7 @@ SURVEYS = {
         dropped=(7, 18, 64, 65, 66, 67),
         samples=200,
     ),
-    "bridges": Survey(
+    "bridges": LabeledSurvey(
         ("bridge/ign_0299_6802.laz",),
         CLASSES,
         "French river, fields and bridges, at 0.3 points/m²",
@@ -129,7 +129,7 @@ SURVEYS = {
         dropped=(7, 18, 66, 67),
         samples=200,
     ),
-    "meadows": Survey(
+    "meadows": LabeledSurvey(
         ("rural/ahn3_achterhoek.laz",),
         {2: GROUND, 6: BUILDING, 9: GROUND},
         "Dutch meadows, rows of trees and farms (AHN3)",
@@ -138,7 +138,7 @@ SURVEYS = {
         tall_scored=True,
         samples=150,
     ),
-    "pines": Survey(
+    "pines": LabeledSurvey(
         ("forest/neon_osbs.laz",),
         {2: GROUND, 5: VEGETATION},
         "Open pine forest in Florida (NEON)",

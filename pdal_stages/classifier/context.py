@@ -24,7 +24,7 @@ from ..features.neighborhoods import SIDES
 
 
 @dataclass(frozen=True)
-class Kind:
+class ContextKind:
     """What a word of a context token means: cells in space or columns of them, probabilities or votes."""
 
     axes: int
@@ -34,10 +34,10 @@ class Kind:
 
 #: Word of a token, which the side of a cell in meters follows.
 CELLS = {
-    "box": Kind(3, False, "mean probabilities of the points in 3 x 3 x 3 cells around the point's"),
-    "column": Kind(2, False, "mean probabilities of the points in 3 x 3 columns, of any height, around the point's"),
-    "boxvotes": Kind(3, True, "share of the points in 3 x 3 x 3 cells whose most probable class it is"),
-    "columnvotes": Kind(2, True, "share of the points in 3 x 3 columns whose most probable class it is"),
+    "box": ContextKind(3, False, "mean probabilities of the points in 3 x 3 x 3 cells around the point's"),
+    "column": ContextKind(2, False, "mean probabilities of the points in 3 x 3 columns, of any height, around the point's"),
+    "boxvotes": ContextKind(3, True, "share of the points in 3 x 3 x 3 cells whose most probable class it is"),
+    "columnvotes": ContextKind(2, True, "share of the points in 3 x 3 columns whose most probable class it is"),
 }  # fmt: skip
 
 #: The token of the point's own probabilities.
@@ -50,7 +50,7 @@ class Scale:
 
     token: str
     side: float
-    kind: Kind
+    kind: ContextKind
 
 
 @dataclass(frozen=True)

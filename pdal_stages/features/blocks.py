@@ -1,4 +1,4 @@
-"""One pass of an engine over queries: sorted like the cloud, cut into blocks, computed by threads."""
+"""One run of an engine over queries: sorted like the cloud, cut into blocks, computed by threads."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Fitted:
 
 
 class Run:
-    """One pass over queries: sorted like the cloud, cut into blocks.
+    """One run over queries: sorted like the cloud, cut into blocks.
 
     `grid` is the index of the `cloud`; `fit` gives what was fitted, and is called once the queries are found to be right;
     all else is as for ``FeatureEngine.blocks``.

@@ -14,7 +14,7 @@ from ..accuracy.measures import Accuracy
 from ..accuracy.text import percent
 from ..base.files import write_whole
 from .charts import Chart, percent_axis
-from .maps import Line, Scene, draw_scene
+from .maps import Line, MapScene, draw_scene
 from .page import render
 
 #: A chart, the titles of the table of its figures, and the rows.
@@ -74,7 +74,7 @@ def write_accuracy_report(
     """
     scene = None
     if xyz is not None or reference is not None or predicted is not None:
-        scene = draw_scene(accuracy, Scene.of(accuracy, xyz, reference, predicted), unit, section)
+        scene = draw_scene(accuracy, MapScene.of(accuracy, xyz, reference, predicted), unit, section)
     ordered = sorted((importances or {}).items(), key=lambda item: (-item[1], item[0]))
     page = render(
         "accuracy.html",

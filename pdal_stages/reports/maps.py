@@ -74,7 +74,7 @@ class DrawnScene:
 
 
 @dataclass(frozen=True)
-class Scene:
+class MapScene:
     """Points with merged classes, and which of them are compared and wrong."""
 
     xyz: npt.NDArray[np.float64]  #: (n, 3)
@@ -84,7 +84,7 @@ class Scene:
     wrong: npt.NDArray[np.bool_]  #: (n,)
 
     @classmethod
-    def of(cls, a: Accuracy, xyz: Any, reference: Any, predicted: Any) -> Scene:
+    def of(cls, a: Accuracy, xyz: Any, reference: Any, predicted: Any) -> MapScene:
         """Arrays that fit together and are finite, or a StageError, with classes merged as the accuracy did."""
         given = {"xyz": xyz, "reference": reference, "predicted": predicted}
         missing = [name for name, values in given.items() if values is None]
@@ -125,7 +125,7 @@ class Scene:
         return sorted({int(c) for side in (self.reference, self.predicted) for c in np.unique(side[chosen])})
 
 
-def draw_scene(a: Accuracy, scene: Scene, unit: str = "m", section: Line | None = None) -> DrawnScene:
+def draw_scene(a: Accuracy, scene: MapScene, unit: str = "m", section: Line | None = None) -> DrawnScene:
     """Maps of reference, prediction and errors, and a vertical section, by default where the errors are densest.
 
     The accuracy names the classes; `unit` is that of the coordinates.
@@ -206,7 +206,7 @@ def _path_over(frame: Frame, line: Line) -> str:
 # ---- in section ------------------------------------------------------------------------------------------
 
 
-def densest_line(scene: Scene, depth: float) -> Line | None:
+def densest_line(scene: MapScene, depth: float) -> Line | None:
     """Ends of the section of a given depth with most errors (most points, where all are right)."""
     low, high = scene.xyz[:, :2].min(axis=0), scene.xyz[:, :2].max(axis=0)
     marked = scene.wrong if scene.wrong.any() else scene.compared
@@ -234,7 +234,7 @@ def densest_line(scene: Scene, depth: float) -> Line | None:
 
 
 def draw_section(
-    a: Accuracy, scene: Scene, unit: str, line: Line, depth: float, *, chosen: bool
+    a: Accuracy, scene: MapScene, unit: str, line: Line, depth: float, *, chosen: bool
 ) -> DrawnSection:
     """The section in pictures; `chosen` tells that the line was not given by the user."""
     inside, length = _slice(scene.xyz, line, depth)

@@ -84,7 +84,7 @@ class Town:
         return heights(local @ plan.turn, plan) + self.options.origin[2]
 
 
-class Survey:
+class FlownTown:
     """One town's plan, things and flight, ready to be cast part by part."""
 
     def __init__(self, options: TownOptions) -> None:
@@ -142,10 +142,10 @@ def town_chunks(options: TownOptions, *, threads: int | None = None, progress: b
     The pieces joined are exactly what :func:`make_town` gives for the same options.
     """
     with CompilationNote():
-        survey = Survey(options)
-    total, parts = int(options.density * options.size**2), survey.flight.parts(PULSES_PER_CHUNK)
+        flown = FlownTown(options)
+    total, parts = int(options.density * options.size**2), flown.flight.parts(PULSES_PER_CHUNK)
     with Progress(total, "synthetic", enabled=progress) as line:
-        for piece in map_blocks(lambda part: survey.town(survey.flight, *part), parts, threads):
+        for piece in map_blocks(lambda part: flown.town(flown.flight, *part), parts, threads):
             line.update(len(piece))
             yield piece
 

@@ -38,8 +38,8 @@ class TilingOptions:
     retries : int
         How often a failed tile is tried again.
     most_points : int
-        A tile whose neighborhoods turn out to reach farther than its halo is read again with a wider
-        ones, up to so many points.
+        A tile whose neighborhoods turn out to reach farther than its halo is read again with a
+        wider one, up to so many points.
     """
 
     tile: float | None = None

@@ -31,7 +31,7 @@ WKT = (
 )
 FOREST = {"neighborhoods": "c1", "feature_set": "covariance", "dimensions": [], "count": 50, "trees": 2}
 #: Ways of failing, by the numbers that faulty.c knows them by; the last writes a part first.
-KINDS = {"short write": (1,), "disk full": (2,), "disk full once": (3, 5), "I/O error once": (4,)}
+FAULTS = {"short write": (1,), "disk full": (2,), "disk full once": (3, 5), "I/O error once": (4,)}
 OLDER = {".json": b'{"older": 1}\n', ".html": b"<!DOCTYPE html>\n<p>older</p>\n"}
 
 
@@ -236,7 +236,7 @@ def main() -> None:
         good = attempt(0, 0, False)
         size = len(good["content"] or "") // 2
         print(json.dumps({"case": name, "kind": "", "exact": case.exact, **good}), file=answers, flush=True)
-        for kind, number in ((kind, number) for kind, numbers in KINDS.items() for number in numbers):
+        for kind, number in ((kind, number) for kind, numbers in FAULTS.items() for number in numbers):
             for after in sorted({0, size // 2, max(0, size - 1)}):
                 result = attempt(number, after, kind == "disk full")
                 print(
