@@ -397,6 +397,7 @@ def _parser() -> argparse.ArgumentParser:
         help="The same points, in the same order, with true classes: a file, a folder or a pattern, paired by name; "
         "may be repeated",
     )
+    takes("--model", help="Score this model on labeled files: a model file, or a shipped model's name")
     takes("--dimension", default="Classification", help="Classes to judge")
     takes("--reference-dimension", help="Dimension with the true classes")
     takes(
@@ -666,6 +667,7 @@ def _train(options: argparse.Namespace) -> None:
 
 def _accuracy(options: argparse.Namespace) -> None:
     from .pipeline.comparing import accuracy_pipeline, compare_files
+    from .pipeline.ends import input_files
     from .pipeline.run import Pipeline
 
     reference_dimension = options.reference_dimension or (
@@ -677,14 +679,22 @@ def _accuracy(options: argparse.Namespace) -> None:
         return
     if options.area:
         raise StageError("--area needs --objects", found=options.area)
-    if options.reference:
-        compare_files(
-            options.inputs,
-            options.reference,
-            options.dimension,
-            reference_dimension,
-            options.overrides,
-            **outputs,
+    several = len(input_files(options.inputs)) > 1
+    if options.reference or options.model or several:
+        if options.reference and options.model:
+            raise StageError("--reference and --model exclude each other", found=options.model)
+        if options.model:
+            reference_dimension = options.reference_dimension or "Classification"
+        print_messages(
+            *compare_files(
+                options.inputs,
+                options.reference or (),
+                options.dimension,
+                reference_dimension,
+                options.overrides,
+                options.model or "",
+                **outputs,
+            )
         )
         return
     stages = accuracy_pipeline(options.inputs, options.dimension, reference_dimension, **outputs)

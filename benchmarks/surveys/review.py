@@ -162,7 +162,7 @@ def sureness(surveys: Sequence[Classified]) -> Sureness:
 
 def survey_weights(points: np.ndarray) -> np.ndarray:
     """Of a point of each survey: between all points alike and all surveys alike."""
-    weight = 1.0 / np.sqrt(points)
+    weight = points**-0.25
     return weight * points.sum() / (weight * points).sum()
 
 

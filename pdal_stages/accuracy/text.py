@@ -19,6 +19,37 @@ def percent(share: float | None, digits: int = 2) -> str:
     return "-" if share is None else f"{100 * share:.{digits}f}"
 
 
+def summary(accuracy: Any) -> dict[str, Any]:
+    """The figures of an ``Accuracy`` that one line holds."""
+    names = ("points", "overall_accuracy", "kappa", "mean_f1")
+    return {
+        name: getattr(accuracy, name) if accuracy.points else 0 if name == "points" else None
+        for name in names
+    }
+
+
+def by_file(names: Sequence[str], each: Sequence[Any]) -> str:
+    """A line for each file, the worst first."""
+    rows = [(name, summary(one)) for name, one in zip(names, each, strict=True)]
+    rows.sort(key=lambda row: (row[1]["overall_accuracy"] is None, row[1]["overall_accuracy"] or 0.0, row[0]))
+    header = ["", "File", "Points", "Accuracy %", "Kappa %", "Mean F1 %"]
+    return (
+        _aligned(
+            header,
+            [
+                [
+                    "",
+                    name,
+                    f"{d['points']:,}",
+                    *(percent(d[key]) for key in ("overall_accuracy", "kappa", "mean_f1")),
+                ]
+                for name, d in rows
+            ],
+        )
+        + "\n"
+    )
+
+
 def table(figures: Mapping[str, Any], confusion: str, name: Callable[[int], str]) -> str:
     """What ``accuracy-1.json`` describes as aligned text, in percent; `confusion` is one of :data:`CONFUSIONS`."""
     blocks = [_headline(figures, name), _classes(figures)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from ..base.errors import DimensionError, StageError
 from ..base.outputs import check_outputs
+from ..base.progress import Progress
+from ..base.report import Report
 from ..stages.accuracy import AccuracyStage
 from ..stages.points import Points
 from . import pdal as pdal_env
@@ -39,38 +41,82 @@ def compare_files(
     references: Sequence[str],
     dimension: str,
     reference_dimension: str,
-    overrides: Iterable[Override] = (),
+    overrides: Sequence[Override] = (),
+    model: str = "",
     **outputs: str,
-) -> None:
-    """Compare files with others that hold the same points in the same order, in pairs of the same name.
+) -> list[str]:
+    """Compare files with others that hold the same points in the same order, in pairs of the same name; what is to be told.
 
-    Both are files, folders or patterns; `outputs` are options of ``filters.accuracy``.
+    Both are files, folders or patterns; `outputs` are options of ``filters.accuracy``. Without references the true classes
+    are another dimension of the files; with a `model` its classes are judged, and the files' own are the truth.
 
     Raises
     ------
     StageError
         If a file has no partner, or two do not hold the same points.
     """
-    pairs = paired(input_files(sources), input_files(references))
-    listed = {"files": [name for pair in pairs for name in pair]}
+    files = input_files(sources)
+    pairs = paired(files, input_files(references)) if references else [(file, "") for file in files]
+    listed = {"files": [name for pair in pairs for name in pair if name]}
     wanted: dict[str, Any] = {"type": "filters.accuracy", **listed, **outputs}
-    (given,) = apply_overrides([wanted], overrides)
+    own = [one for one in overrides if not model or one.selector == AccuracyStage.type]
+    if model:
+        wanted["model"] = model
+    (given,) = apply_overrides([wanted], own)
     renamed = {"dimension": "Classification", "reference": "Reference"}
     stage = cast(AccuracyStage, lower_stage({**given, **renamed}).stage)
     check_outputs(stage.outputs(), [*listed["files"], *stage_files(stage)])
-    parts, wkt = [], ""
-    for source, reference in pairs:
-        mine, wkt, withheld = _points_of(source, dimension)
-        true, _, _ = _points_of(reference, reference_dimension)
-        _refuse_other_points(mine, true, source, reference)
-        named = [span.dimension for span in stage.ignore.spans] if stage.ignore else []
-        kept = [n for n in ("X", "Y", "Z", "Reliability", "Margin", *named) if n in mine.dtype.names]
-        part = {name: mine[name] for name in kept}
-        codes = {"Classification": mine[dimension], "Reference": true[reference_dimension]}
-        parts.append({"Withheld": withheld, **part, **codes})
-    shared = [name for name in parts[0] if all(name in part for part in parts)]
-    arrays = {name: np.concatenate([part[name] for part in parts]) for name in shared}
-    stage.run(stage.points(arrays, wkt=wkt))
+    others = tuple(one for one in overrides if one not in own)
+    parts = []
+    named = [span.dimension for span in stage.ignore.spans] if stage.ignore else []
+    with Progress(len(pairs), "reading" if not model else "classifying", "files") as bar:
+        for source, reference in pairs:
+            if model:
+                mine, wkt, withheld = _classified(source, model, reference_dimension, others)
+                true, reference_name = mine, _TRUTH
+            else:
+                mine, wkt, withheld = _points_of(source, dimension)
+                true, reference_name = mine, reference_dimension
+            if reference:
+                true, _, _ = _points_of(reference, reference_dimension)
+                _refuse_other_points(mine, true, source, reference)
+            elif reference_name not in (true.dtype.names or ()):
+                raise DimensionError(
+                    f"the dimension '{reference_name}' is missing",
+                    where=source,
+                    found=", ".join(true.dtype.names or ()),
+                )
+            kept = [n for n in ("X", "Y", "Z", "Reliability", "Margin", *named) if n in mine.dtype.names]
+            judged = mine["Classification" if model else dimension]
+            codes = {"Classification": judged, "Reference": true[reference_name]}
+            arrays = {"Withheld": withheld, **{name: mine[name] for name in kept}, **codes}
+            parts.append((Path(source).name, stage.points(arrays, wkt=wkt)))
+            bar.update(1)
+    if not any(points.count for _, points in parts):
+        raise StageError("there are no points to compare", found=", ".join(files[:3]))
+    shared = set.intersection(*(set(points.arrays) for _, points in parts))
+    for _, points in parts:
+        points.arrays = {name: values for name, values in points.arrays.items() if name in shared}
+    report = Report()
+    stage.compare([part for part in parts if part[1].count], report)
+    for _, points in parts:
+        report.merge(points.report)
+    return report.messages
+
+
+#: Where the files' own classes are kept while a model gives others.
+_TRUTH = "TrueClass"
+
+
+def _classified(
+    source: str, model: str, truth: str, overrides: Sequence[Override]
+) -> tuple[Any, str, NDArray]:
+    """A file's points as a model classifies them, its true classes in another dimension; reference, withheld flags."""
+    from .classifying import ClassifyRequest
+
+    request = ClassifyRequest(model, tuple(overrides))
+    ferry = {"type": "filters.ferry", "dimensions": f"{truth}=>{_TRUTH}"}
+    return _read([reader_of(source, "input"), ferry, *request.stages], overrides, source, "Classification")
 
 
 def paired(sources: Sequence[str], references: Sequence[str]) -> list[tuple[str, str]]:
@@ -104,7 +150,13 @@ def paired(sources: Sequence[str], references: Sequence[str]) -> list[tuple[str,
 
 def _points_of(name: str, dimension: str) -> tuple[Any, str, NDArray]:
     """All points of a file with class codes freed of flag bits, its spatial reference, and the withheld flags."""
-    pipeline = Pipeline([reader_of(name, "input")])
+    return _read([reader_of(name, "input")], (), name, dimension)
+
+
+def _read(
+    stages: list[dict[str, Any]], overrides: Sequence[Override], name: str, dimension: str
+) -> tuple[Any, str, NDArray]:
+    pipeline = Pipeline(stages, overrides)
     pipeline.execute()
     array: Any = np.concatenate(pipeline.arrays) if pipeline.arrays else np.empty(0)
     names = array.dtype.names or ()

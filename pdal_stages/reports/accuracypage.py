@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
 from ..accuracy.confidence import Grading
@@ -14,11 +16,55 @@ from ..accuracy.measures import Accuracy
 from ..accuracy.text import percent
 from ..base.files import write_whole
 from .charts import Chart, percent_axis
-from .maps import Line, MapScene, draw_scene
+from .maps import DrawnScene, Line, MapScene, draw_scene
 from .page import render
 
+#: Files within so many meters share a map, and places that are drawn at most.
+TOGETHER, DRAWN = 1000.0, 12
 #: A chart, the titles of the table of its figures, and the rows.
 Charted = tuple[Chart, list[str], list[list[str]]]
+
+
+@dataclass(frozen=True)
+class Place:
+    """Points of a file, or of several that lie together, with both classifications as they were before any merge."""
+
+    name: str
+    xyz: npt.NDArray[np.float64]
+    reference: npt.NDArray[Any]
+    predicted: npt.NDArray[Any]
+
+
+def places(files: Sequence[Place], systems: Sequence[str] = ()) -> list[Place]:
+    """Files that lie within :data:`TOGETHER` of one another, in one reference system, joined: a map of each."""
+    left = [k for k, one in enumerate(files) if len(one.xyz)]
+    boxes = {k: (files[k].xyz[:, :2].min(axis=0), files[k].xyz[:, :2].max(axis=0)) for k in left}
+    out = []
+    while left:
+        group, waiting = [left.pop(0)], left
+        for one in group:  # grows
+            near = [k for k in waiting if _together(boxes[one], boxes[k]) and _same(systems, one, k)]
+            group += near
+            waiting = [k for k in waiting if k not in near]
+        left = waiting
+        group.sort()
+        names = [files[k].name for k in group]
+        listed = ", ".join(names[:3]) + f" and {len(names) - 3:,} more" * (len(names) > 3)
+        joined = (
+            np.concatenate([getattr(files[k], side) for k in group])
+            for side in ("xyz", "reference", "predicted")
+        )
+        out.append(Place(listed, *joined))
+    return out
+
+
+def _together(one: Any, other: Any) -> bool:
+    apart = np.maximum(np.maximum(one[0] - other[1], other[0] - one[1]), 0.0)
+    return bool(np.hypot(*apart) <= TOGETHER)
+
+
+def _same(systems: Sequence[str], one: int, other: int) -> bool:
+    return not systems or systems[one] == systems[other]
 
 
 def write_accuracy_report(
@@ -28,6 +74,7 @@ def write_accuracy_report(
     xyz: npt.ArrayLike | None = None,
     reference: npt.ArrayLike | None = None,
     predicted: npt.ArrayLike | None = None,
+    places: Sequence[Place] = (),
     title: str = "Classification accuracy",
     subtitle: str = "",
     importances: Mapping[str, float] | None = None,
@@ -49,6 +96,8 @@ def write_accuracy_report(
         millions of points do not make the page large.
     reference, predicted : (n,) arrays, optional
         Class codes of those points, as they were before any merge; needed with `xyz`.
+    places : sequence of Place, optional
+        Instead of the three: each gets maps of its own, the first :data:`DRAWN` at most.
     title, subtitle : str
         The page's heading and the line below it.
     importances : mapping of name to share, optional
@@ -72,9 +121,13 @@ def write_accuracy_report(
     StageError
         Arrays of different lengths, coordinates that are not numbers, or a file that cannot be written.
     """
-    scene = None
+    scenes: list[tuple[str, DrawnScene]] = []
     if xyz is not None or reference is not None or predicted is not None:
-        scene = draw_scene(accuracy, MapScene.of(accuracy, xyz, reference, predicted), unit, section)
+        scene = MapScene.of(accuracy, xyz, reference, predicted)
+        scenes = [("", draw_scene(accuracy, scene, unit, section))]
+    for one in places[:DRAWN]:
+        scene = MapScene.of(accuracy, one.xyz, one.reference, one.predicted)
+        scenes.append((one.name if len(places) > 1 else "", draw_scene(accuracy, scene, unit, section)))
     ordered = sorted((importances or {}).items(), key=lambda item: (-item[1], item[0]))
     page = render(
         "accuracy.html",
@@ -82,7 +135,8 @@ def write_accuracy_report(
         title=title,
         subtitle=subtitle,
         a=accuracy,
-        scene=scene,
+        scenes=scenes,
+        hidden=max(0, len(places) - DRAWN),
         matrix_width=_matrix_width(accuracy),
         confidence=_confidence(accuracy),
         importances=[(name, float(share)) for name, share in ordered],

@@ -6,19 +6,21 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..accuracy.labels import Merge
 from ..accuracy.measures import Accuracy
+from ..accuracy.text import by_file, summary
 from ..base import kinds
 from ..base.asprs import UNINFORMATIVE
 from ..base.errors import StageError
 from ..base.files import check_writable, write_whole
 from ..base.outputs import Output
 from ..base.plain import plain
+from ..base.report import Report
 from ..base.units import name_of_wkt
 from .base import Stage, files_read
 from .loading import loaded_model
@@ -26,6 +28,18 @@ from .modelclassifier import ModelClassifier
 from .options import option
 from .points import Points
 from .selection import Selection
+
+#: Vegetation in ASPRS's codes: low and medium, and the code that stands for all of it.
+LOWER, HIGH = (3, 4), 5
+
+
+class Sides(NamedTuple):
+    """Classes of points on both sides, confidences, and which of the given points these are."""
+
+    reference: NDArray
+    predicted: NDArray
+    confidence: dict[str, Any]
+    inside: NDArray
 
 
 class AccuracyStage(Stage):
@@ -145,51 +159,96 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
                 "there are no points to compare",
                 cure="Check the reader's file and the filters before this stage",
             )
+        self.compare([("", points)], points.report)
+        return {}
+
+    def compare(self, parts: Sequence[tuple[str, Points]], report: Report) -> None:
+        """Compare the points of several files by one rule: a table of each, and one of all together."""
+        sides = [self._sides(points) for _, points in parts]
+        rule = self._rule(sides, report)
+        each = [
+            Accuracy.from_labels(reference, predicted, **rule, **confidence, allow_empty=len(parts) > 1)
+            for reference, predicted, confidence, _ in sides
+        ]
+        accuracy = each[0] if len(each) == 1 else sum(each[1:], each[0])
+        if not accuracy.points:
+            raise StageError("no point to compare: every reference point of all files is left out")
+        if self.print_table:
+            out = sys.__stdout__ or sys.stdout
+            if len(each) > 1:
+                print(plain(by_file([name for name, _ in parts], each)), file=out)
+            print(plain(accuracy.table()), file=out)
+        if self.json:
+            written = accuracy.to_dict()
+            if len(each) > 1:
+                written["files"] = [
+                    {"name": name, **summary(one)} for (name, _), one in zip(parts, each, strict=True)
+                ]
+            write_whole(self.json, (json.dumps(written, indent=1) + "\n").encode())
+        if self.html:
+            self._write_page(self.html, parts, sides, accuracy, rule)
+        report.figures.update(
+            {
+                "compared": accuracy.points,
+                "left_out": accuracy.left_out_points,
+                **{name: value for name, value in summary(accuracy).items() if name != "points"},
+                "mean_class_recall": accuracy.mean_class_recall,
+                "mean_class_precision": accuracy.mean_class_precision,
+            }
+        )
+
+    def _sides(self, points: Points) -> Sides:
+        """What is compared of some points."""
         chosen = Selection.parse(["withheld"], "ignore") if self.ignore is None else self.ignore
         inside = points.usable(replace(chosen, codes=()))  # codes are of the reference
-        reference = points.codes_of(self.reference)[inside]
-        predicted = points.codes_of(self.dimension)[inside]
         confidence: dict[str, Any] = {
             name.lower(): np.asarray(points.arrays[name])[inside]
             for name in ("Reliability", "Margin")
             if name in points.arrays
         }
+        reference, predicted = (points.codes_of(name)[inside] for name in (self.reference, self.dimension))
+        return Sides(reference, predicted, confidence, inside)
+
+    def _rule(self, sides: Sequence[Sides], report: Report) -> dict[str, Any]:
+        """What :meth:`scored` says, with vegetation as one class where only one was predicted."""
         rule = self.scored()
-        accuracy = Accuracy.from_labels(reference, predicted, **rule, **confidence)
-        if self.print_table:
-            print(plain(accuracy.table()), file=sys.__stdout__ or sys.stdout)
-        if self.json:
-            write_whole(self.json, (json.dumps(accuracy.to_dict(), indent=1) + "\n").encode())
-        if self.html:
-            self._write_page(self.html, points, accuracy, rule, points.xyz[inside], reference, predicted)
-        points.report.figures.update(
-            {
-                "compared": accuracy.points,
-                "left_out": accuracy.left_out_points,
-                "overall_accuracy": accuracy.overall_accuracy,
-                "kappa": accuracy.kappa,
-                "mean_class_recall": accuracy.mean_class_recall,
-                "mean_class_precision": accuracy.mean_class_precision,
-                "mean_f1": accuracy.mean_f1,
-            }
+        if self.merge is not None or self.classes:
+            return rule
+        true, given = (
+            np.unique(np.concatenate([np.unique(getattr(one, side)) for one in sides])).tolist()
+            for side in ("reference", "predicted")
         )
-        return {}
+        known = (
+            [c["code"] for c in loaded_model(self.model_file).info["classes"]] if self.model_file else given
+        )
+        merged = Merge.parse(rule["merge"]).target_of
+        if HIGH not in known or {*LOWER} & {*known, *given} or merged[HIGH] != HIGH:
+            return rule
+        parts = [code for code in LOWER if code in true and merged[code] == code]
+        if parts:
+            rule["merge"] = {**(rule["merge"] or {}), HIGH: sorted({HIGH, *LOWER})}
+            listed = " and ".join(map(str, parts))
+            report.notes.append(
+                f"vegetation is one class, 5, in what is judged: of the reference {listed} count as 5, too. To compare "
+                "them as they are: --filters.accuracy.merge='{}'"
+            )
+        return rule
 
     def _write_page(
         self,
         path: str,
-        points: Points,
+        parts: Sequence[tuple[str, Points]],
+        sides: Sequence[Sides],
         accuracy: Accuracy,
         rule: Mapping[str, Any],
-        xyz: NDArray,
-        reference: NDArray,
-        predicted: NDArray,
     ) -> None:
-        from ..reports.accuracypage import write_accuracy_report
+        from ..reports.accuracypage import Place, places, write_accuracy_report
 
         about = {
             "files": self.files,
-            "reference system": name_of_wkt(points.wkt) or "none given",
+            "reference system": ", ".join(
+                dict.fromkeys(name_of_wkt(points.wkt) or "none given" for _, points in parts)
+            ),
             "model": self.model_file,
         }
         how = {k: self.options[k] for k in ("dimension", "reference", "where") if self.options[k]}
@@ -201,9 +260,13 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
         write_accuracy_report(
             path,
             accuracy,
-            xyz=xyz,
-            reference=reference,
-            predicted=predicted,
+            places=places(
+                [
+                    Place(name, points.xyz[one.inside], one.reference, one.predicted)
+                    for (name, points), one in zip(parts, sides, strict=True)
+                ],
+                [points.wkt for _, points in parts],
+            ),
             title=self.title,
             subtitle="; ".join(
                 str(v) for v in (*self.files[:3], about["reference system"], self.model_file) if v
