@@ -1,0 +1,99 @@
+"""`accuracy` of several files: a table by file, a map by place, vegetation as one class, a model scored by one option."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from test_training_scores import QUICK_WORDS, scene
+
+from pdal_stages.cli import main
+from pdal_stages.reports.accuracypage import Place, places
+
+
+def place(name, x, n=50):
+    xyz = np.random.default_rng(0).random((n, 3)) * 10 + [x, 0, 0]
+    return Place(name, xyz, np.full(n, 2), np.full(n, 2))
+
+
+def test_files_near_one_another_share_a_map():
+    files = [place("a", 0), place("b", 600_000), place("c", 900), place("d", 1800)]
+    found = places(files)
+    assert [one.name for one in found] == ["a, c, d", "b"]
+    assert [len(one.xyz) for one in found] == [150, 50]
+    # Of another reference system, they lie elsewhere.
+    assert [one.name for one in places(files, ["x", "x", "y", "y"])] == ["a", "b", "c, d"]
+
+
+@pytest.mark.pdal
+def test_each_file_has_its_line_and_each_place_its_map(tmp_path, write_las, capfd):
+    for name, x0, wrong in (("a", 0.0, 0.1), ("b", 60.0, 0.4), ("far", 300_000.0, 0.0)):
+        points = scene(1, x0)
+        points["Reference"] = points["Classification"].copy()
+        points["Classification"] = np.where(
+            np.random.default_rng(2).random(len(points["X"])) < wrong, 6, points["Reference"]
+        ).astype("u1")
+        write_las(tmp_path / f"{name}.laz", points, point_format=6)
+    page, figures = tmp_path / "a.html", tmp_path / "a.json"
+    words = [
+        *(str(tmp_path / f"{n}.laz") for n in ("a", "b", "far")),
+        "--html",
+        str(page),
+        "--json",
+        str(figures),
+    ]
+    assert main(["accuracy", *words]) == 0
+    lines = capfd.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[2:5]] == ["b.laz", "a.laz", "far.laz"]
+    said = json.loads(figures.read_text())
+    by_name = {one["name"]: one for one in said["files"]}
+    assert by_name["far.laz"]["overall_accuracy"] == 1.0 > by_name["a.laz"]["overall_accuracy"]
+    assert said["points"] == sum(one["points"] for one in said["files"])
+    right = sum(one["points"] * one["overall_accuracy"] for one in said["files"])
+    assert np.isclose(said["overall_accuracy"], right / said["points"])
+    text = page.read_text()
+    assert text.count("<h2>Maps") == 2 and "Maps: far.laz" in text
+
+
+@pytest.mark.pdal
+@pytest.mark.parametrize("several", [False, True])
+def test_vegetation_is_one_class_where_one_was_predicted(tmp_path, write_las, capsys, several):
+    points = scene(3)
+    points["Reference"] = np.where(
+        points["Classification"] == 6, np.arange(len(points["X"])) % 3 + 3, 2
+    ).astype("u1")
+    points["Classification"] = np.where(points["Classification"] == 6, 5, 2).astype("u1")
+    write_las(tmp_path / "a.laz", points, point_format=6)
+    write_las(tmp_path / "b.laz", {**points, "X": points["X"] + 100}, point_format=6)
+    files = [str(tmp_path / f"{name}.laz") for name in ("a", "b")[: 1 + several]]
+    assert main(["accuracy", *files, "--json", str(tmp_path / "a.json")]) == 0
+    assert "of the reference 3 and 4 count as 5" in capsys.readouterr().err
+    said = json.loads((tmp_path / "a.json").read_text())
+    assert said["overall_accuracy"] == 1.0 and said["merged"] == {"3": 5, "4": 5}
+    assert main(["accuracy", *files, "--filters.accuracy.merge={}"]) == 0
+    assert "count as 5" not in capsys.readouterr().err
+
+
+@pytest.mark.pdal
+def test_a_model_is_scored_by_one_option(tmp_path, write_las, capsys):
+    for number in range(2):
+        write_las(tmp_path / f"t{number}.laz", scene(number, 100.0 * number), point_format=6)
+    model = str(tmp_path / "m.model")
+    telling = ["--feature-set", "HeightAboveLowest", "--neighborhoods", "s12"]
+    assert main(["train", str(tmp_path / "t0.laz"), "--model", model, *QUICK_WORDS, *telling]) == 0
+    capsys.readouterr()
+    assert (
+        main(["accuracy", str(tmp_path / "t1.laz"), "--model", model, "--json", str(tmp_path / "a.json")])
+        == 0
+    )
+    said = json.loads((tmp_path / "a.json").read_text())
+    assert said["points"] > 800 and said["overall_accuracy"] > 0.9
+    assert [one["code"] for one in said["classes"]] == [2, 6]
+    assert (
+        main(
+            ["accuracy", str(tmp_path / "t1.laz"), "--model", model, "--reference", str(tmp_path / "t0.laz")]
+        )
+        == 1
+    )
+    assert "exclude each other" in capsys.readouterr().err

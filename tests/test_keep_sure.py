@@ -1,0 +1,117 @@
+"""`--keep-sure`: limits that follow from what was right on ground held out, and points below them left unclassified."""
+
+from __future__ import annotations
+
+import json
+
+import laspy
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pdal_stages as ps
+from pdal_stages.base.errors import ModelError, OptionError
+from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
+from pdal_stages.classifier.sureness import BINS, Sureness, said, sureness_of
+from pdal_stages.cli import main
+from pdal_stages.pipeline.classifying import ClassifyRequest
+from pdal_stages.synthetic import write_town
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.integers(1, 300), st.sampled_from([0.5, 0.8, 0.95, 0.99]))
+def test_limits_are_the_lowest_that_hold(seed, n, accuracy):
+    random = np.random.default_rng(seed)
+    given_, true = random.choice([2, 6], (2, n))
+    reliability = np.round(random.random(n), 3)
+    known = Sureness()
+    half = n // 2  # counted in parts
+    known.add(given_[:half], true[:half], reliability[:half])
+    known.add(given_[half:], true[half:], reliability[half:])
+    bins = np.minimum(np.floor(reliability * BINS), BINS - 1)
+    for code, limit in known.limits(accuracy).items():
+        mine = given_ == code
+        shares = {}
+        for k in range(BINS):
+            kept = mine & (bins >= k)
+            if kept.any():
+                shares[k] = float((true[kept] == code).mean())
+        good = [k for k, share in shares.items() if share >= accuracy - 1e-12]
+        if good:
+            assert limit.reliability == min(good) / BINS
+            assert np.isclose(limit.kept, (mine & (bins >= min(good))).sum() / mine.sum())
+            assert np.isclose(limit.right, shares[min(good)])
+        else:
+            assert limit.reliability > 1 and limit.kept == 0 and np.isclose(limit.right, max(shares.values()))
+    again = Sureness.from_dict(json.loads(json.dumps(known.to_dict())))
+    assert again.limits(accuracy) == known.limits(accuracy)
+    assert 0 <= known.kept(known.limits(accuracy)) <= 1
+
+
+def test_what_is_damaged_or_not_there_is_refused(tmp_path):
+    for wrong in (
+        {},
+        {"about": "", "classes": {"2": {"right": [1], "wrong": [1]}}},
+        {"about": "", "classes": 3},
+    ):
+        with pytest.raises(ModelError):
+            Sureness.from_dict(wrong)
+    with pytest.raises(OptionError, match="never scored on ground"):
+        sureness_of({}, str(tmp_path / "m.model"))
+
+
+def test_the_shipped_model_says_what_it_costs():
+    lines = ClassifyRequest(keep_sure=0.95).cost
+    assert lines[0].startswith("to be right in 95 % of the points of each class, about ")
+    assert any("6 Building" in line for line in lines) and ClassifyRequest().cost == []
+    known = Sureness()
+    known.add(np.array([6, 6]), np.array([6, 2]), np.array([0.9, 0.9]))
+    assert "none keeps it" in said(known.limits(0.9), {}, 0.9, 0.0)[1]
+
+
+def blocks(seed, n=6000):
+    """Two classes that overlap in height, so that a forest is unsure of some."""
+    random = np.random.default_rng(seed)
+    xyz = random.random((n, 3)) * [200, 200, 0]
+    label = np.where((xyz[:, 0] // 20 + xyz[:, 1] // 20) % 2 > 0, 6, 2).astype(np.uint8)
+    xyz[:, 2] = np.where(label == 6, 2.0, 0.0) + random.normal(0, 1.2, n)
+    return xyz, label
+
+
+def test_a_model_knows_from_cross_validation_how_sure_it_must_be():
+    xyz, label = blocks(0)
+    options = TrainingOptions(neighborhoods="k6", feature_set="HeightRange", dimensions=("HeightAboveGround",), trees=20,
+                              count=1500, passes=1)  # fmt: skip
+    heights = {"HeightAboveGround": xyz[:, 2]}
+    model = train([TrainingCloud(xyz, label, heights)], options, progress=False)
+    known = Sureness.from_dict(model.info["sureness"])
+    assert "held out" in known.about and set(known.right) == {2, 6}
+    # As many as the labels, not as the samples.
+    assert np.isclose(sum((known.right[c] + known.wrong[c]).sum() for c in (2, 6)), len(xyz), rtol=0.02)
+    limits = known.limits(0.9)
+    other, truth = blocks(1)
+    found = model.predict(other, {"HeightAboveGround": other[:, 2]},
+                          limits={c: one.reliability for c, one in limits.items()}, rejected_code=1)  # fmt: skip
+    plain = model.predict(other, {"HeightAboveGround": other[:, 2]})
+    kept = found.classification != 1
+    assert 0 < found.rejected == np.count_nonzero(~kept) < len(other)
+    assert np.array_equal(found.classification[kept], plain.classification[kept])
+    for code in (2, 6):
+        mine = kept & (found.classification == code)
+        all_ = plain.classification == code
+        assert (truth[mine] == code).mean() > 0.87 > (truth[all_] == code).mean() - 0.02
+        assert (plain.reliability[all_ & ~kept] < limits[code].reliability).all()
+
+
+@pytest.mark.pdal
+def test_classify_keeps_only_what_is_sure(tmp_path, capsys):
+    write_town(ps.make_town(70.0, 4.0, seed=2, progress=False), tmp_path / "town.laz")
+    out = [str(tmp_path / "town.laz"), str(tmp_path / "out.laz")]
+    assert main(["classify", *out, "--keep-sure", "0.95"]) == 0
+    text = capsys.readouterr()
+    assert "expected to become class 1" in text.err and "rejected as unreliable" in text.out
+    las = laspy.read(tmp_path / "out.laz")
+    codes, reliability = np.asarray(las.classification), np.asarray(las["Reliability"])
+    assert np.count_nonzero(codes == 1) > 0 and reliability[codes == 1].max() < 1.0
+    assert main(["classify", *out, "--keep-sure", "1.5"]) == 1
