@@ -34,8 +34,9 @@ from pdal_stages.base.version import __version__
 from pdal_stages.classifier import Forest, load_model
 from pdal_stages.classifier import context as contexts
 from pdal_stages.features import blocks as feature_blocks
+from pdal_stages.objects.consistency import consistent
 from pdal_stages.synthetic import make_town, write_town
-from pdal_stages.terrain import filtered_ground
+from pdal_stages.terrain import detached_noise, filtered_ground
 
 CLASSES = '{"2":2,"3":3,"4":4,"5":5,"6":6}'
 
@@ -139,8 +140,14 @@ def parts(cloud: Path, model_file: str) -> dict[str, float]:
     spent["start and import"] = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
     las = timed("reading", laspy.read)(cloud)
     xyz = np.column_stack([las.x, las.y, las.z])
-    heights = timed("heights", filtered_ground)
-    dimensions = heights(*np.ascontiguousarray(xyz.T), openings=(5, 17), threads=1)
+    axes = np.ascontiguousarray(xyz.T)
+    some = axes[:, :2000]  # kernels
+    kinds = np.full(some.shape[1], 6)
+    detached_noise(*some)
+    few = filtered_ground(*some, openings=(5, 17), threads=1)
+    consistent(some.T, kinds, height=few["HeightAboveGround"], ground=few["Ground"])
+    timed("noise", detached_noise)(*axes)
+    dimensions = timed("heights", filtered_ground)(*axes, openings=(5, 17), threads=1)
     dimensions["ReturnNumber"] = np.asarray(las.return_number)
     dimensions["NumberOfReturns"] = np.asarray(las.number_of_returns)
     model = load_model(model_file)
@@ -155,7 +162,10 @@ def parts(cloud: Path, model_file: str) -> dict[str, float]:
         finally:
             Forest.predict_proba, contexts.cell_means = forest, around  # type: ignore[method-assign]
             feature_blocks.Run.compute = compute  # type: ignore[method-assign]
-        las.classification = found.classification
+        ground, height = dimensions["Ground"], dimensions["HeightAboveGround"]
+        las.classification = timed("consistency", consistent)(
+            xyz, found.classification, height=height, ground=ground
+        )
         timed("writing", las.write)(Path(folder, "out.laz"))
     inside = ("features", "forests", "context")
     spent["the rest of classification"] = spent.pop("classification") - sum(spent.get(k, 0.0) for k in inside)

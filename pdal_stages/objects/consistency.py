@@ -8,6 +8,7 @@ of voxels of an absolute grid, their sums whole numbers, so neither the order of
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -122,18 +123,24 @@ class _Neighborhoods:
 
     def __init__(self, xyz: NDArray[np.float64], kind: NDArray[np.uint8]) -> None:
         self.xyz, self.kind = xyz, kind
-        cell = np.floor(xyz * (1.0 / SIDE)).astype(np.int64)
-        self.left, self.bottom = cell[:, 0].min() - 2, cell[:, 1].min() - 2
-        self.width = int(cell[:, 0].max() - self.left + 3)
-        column, row, level = (np.ascontiguousarray(one) for one in cell.T)
+        place = np.empty((3, len(xyz)), np.int64)
+        self.part = np.empty((len(xyz), 3), np.int16)
+        _split(xyz, place, self.part)
+        column, row, level = place
+        self.left, self.bottom = column.min() - 2, row.min() - 2
+        self.width = int(column.max() - self.left + 3)
         self.voxel, self.keys, _, self.table = voxels(column, row, level, self.left, self.bottom, self.width)
-        self.part = np.rint((xyz - cell * SIDE) * _PARTS).astype(np.int16)
 
-    def shares(self) -> NDArray[np.int64]:
-        """Points of each kind in the cube of 3 x 3 x 3 voxels round each voxel, (voxels, 4)."""
-        own = np.bincount(self.voxel * 4 + self.kind, minlength=4 * len(self.keys)).reshape(-1, 4)
-        sums = np.empty_like(own)
-        _add_round(self.keys, self.table, self.width, 1, own, sums)
+    def counts(self) -> NDArray[np.int64]:
+        """Points of each kind in each voxel, (voxels, 4)."""
+        own = np.zeros((len(self.keys), 4), np.int64)
+        _count(self.voxel, self.kind, own)
+        return own
+
+    def shares(self, own: NDArray[np.int64], wanted: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Points of each kind in the cube of 3 x 3 x 3 voxels round each wanted voxel, (voxels, 4); 0 for the others."""
+        sums = np.zeros_like(own)
+        _add_round(self.keys, self.table, self.width, own, wanted, sums)
         return sums
 
     def beside(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -146,7 +153,7 @@ class _Neighborhoods:
 
     def in_planes(self, levels: int, upright: bool) -> NDArray[np.bool_]:
         """Vegetation in planes of buildings near: leaning ones of roofs, or `upright` ones of walls."""
-        own = np.bincount(self.voxel * 4 + self.kind, minlength=4 * len(self.keys)).reshape(-1, 4)
+        own = self.counts()
         moments = np.zeros((len(self.keys), 10), np.int64)
         _add_moments(self.voxel, self.kind, self.part, moments)
         planes = np.full((len(self.keys), 4), np.nan)
@@ -173,7 +180,10 @@ def _islands(work: _Neighborhoods, height, flat) -> NDArray[np.uint8]:
     wrong = (work.kind == _GROUND) & ~flat & (height > HIGH)
     if not wrong.any():
         return work.kind
-    vegetation, building = work.shares()[work.voxel][:, [_VEGETATION, _BUILDING]].T
+    wanted = np.zeros(len(work.keys), bool)
+    wanted[work.voxel[wrong]] = True
+    sums = work.shares(work.counts(), wanted)[:, [_VEGETATION, _BUILDING]]
+    vegetation, building = sums[work.voxel].T
     new = np.where(building >= vegetation, _BUILDING, _VEGETATION).astype(np.uint8)
     return np.where(wrong & (building + vegetation > 0), new, work.kind)
 
@@ -187,14 +197,10 @@ def _facades(work: _Neighborhoods, height, flat) -> NDArray[np.uint8]:
 
 
 def _lone(work: _Neighborhoods, height, flat) -> NDArray[np.uint8]:
-    near = work.shares()[work.voxel]
-    n = near.sum(axis=1)
-    rows = np.arange(len(n))
-    most = near.argmax(axis=1).astype(np.uint8)
-    alone = (near[rows, work.kind] == 1) & (n > ENOUGH) & (near[rows, most] >= ALL * n) & (most != _OTHER)
-    # Ground under leaves, and leaves above ground, are alone and right.
-    alone &= (work.kind != _GROUND) & (most != _GROUND)
-    return np.where(alone, most, work.kind)
+    new, own = work.kind.copy(), work.counts()
+    alone = (own[:, [_VEGETATION, _BUILDING]] == 1).any(axis=1)
+    _take_sides(work.voxel, work.kind, work.shares(own, alone), new)
+    return new
 
 
 _RULES = {"ground": _ground, "islands": _islands, "roofs": _roofs, "facades": _facades, "lone": _lone}
@@ -204,14 +210,46 @@ _RULES = {"ground": _ground, "islands": _islands, "roofs": _roofs, "facades": _f
 
 
 @njit
-def _add_round(keys, table, w, levels, own, sums):
-    """Fill `sums` with those of the voxels of 3 x 3 columns and so many levels up and down."""
+def _split(xyz, place, part):
+    """Fill `place` (3, n) with voxels' columns, rows and levels, `part` (n, 3) with coordinates within these."""
+    for p in range(len(xyz)):
+        for axis in range(3):
+            number = math.floor(xyz[p, axis] * (1.0 / SIDE))
+            place[axis, p] = number
+            part[p, axis] = np.int16(np.rint((xyz[p, axis] - number * SIDE) * _PARTS))
+
+
+@njit
+def _count(voxel, kind, own):
+    for p in range(len(voxel)):
+        own[voxel[p], kind[p]] += 1
+
+
+@njit
+def _take_sides(voxel, kind, sums, new):
+    """Give points that are alone against all their neighbors these ones' kind; `sums` are those round each voxel."""
+    for p in range(len(voxel)):
+        near = sums[voxel[p]]
+        # Ground under leaves, and leaves above ground, are alone and right.
+        if near[kind[p]] != 1 or kind[p] == _GROUND:
+            continue
+        n, most = 0, 0
+        for k in range(4):
+            n += near[k]
+            most = k if near[k] > near[most] else most
+        if n > ENOUGH and near[most] >= ALL * n and most != _OTHER and most != _GROUND:
+            new[p] = most
+
+
+@njit
+def _add_round(keys, table, w, own, wanted, sums):
+    """Fill `sums` of the wanted voxels with those of the cubes of 3 x 3 x 3 voxels round them."""
     for k in range(len(keys)):
-        for c in range(own.shape[1]):
-            sums[k, c] = 0
+        if not wanted[k]:
+            continue
         for dj in range(-1, 2):
             for di in range(-1, 2):
-                for dl in range(-levels, levels + 1):
+                for dl in range(-1, 2):
                     q = find(table, keys, keys[k] + ((dj * w + di) << BITS) + dl)
                     if q >= 0:
                         for c in range(own.shape[1]):
