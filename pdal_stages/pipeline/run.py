@@ -98,12 +98,16 @@ class Pipeline:
     def validate(self) -> str:
         """Check outputs and let PDAL check its own stages' options, without reading points; PDAL's answer, as JSON."""
         self.check_outputs()
+        self.prepare()
+        return json.dumps({"valid": True, "error_detail": "", "streamable": False}, indent=2)
+
+    def prepare(self) -> None:
+        """Let PDAL check its own stages' options and dimensions, without reading points; outputs are not looked at."""
         try:
             self._check_inputs()
             pdal_env.validate(self.lowered.stages)
         except StageError as error:
             raise self._located(error) from None
-        return json.dumps({"valid": True, "error_detail": "", "streamable": False}, indent=2)
 
     def check_outputs(self, *more: Output) -> None:
         """Refuse outputs that cannot be written, that are inputs, or that replace files of another kind.

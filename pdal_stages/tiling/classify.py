@@ -117,14 +117,9 @@ class ClassifyTask:
 
     # ---- in tiles ----------------------------------------------------------------------------------------
 
-    def plan(self) -> TilePlan:
-        """What is done to each tile.
-
-        Raises
-        ------
-        StageError
-            For whatever is wrong with model or options, before any point is read.
-        """
+    @cached_property
+    def _pipeline(self) -> Pipeline:
+        """What is done, of one input of each kind."""
         readers = {("readers.ept" if is_ept(name) else "readers.las"): name for name in reversed(self.files)}
         heads: list[dict[str, Any]] = [
             {"type": kind, "filename": name, "tag": "input"} for kind, name in readers.items()
@@ -138,11 +133,24 @@ class ClassifyTask:
         # In a folder '#' may stand for a name with its suffix: always that of a LAS file.
         named = "x.laz" if self._in_folder else target
         writer = {**self.request.writer(named), "filename": target}
-        pipeline = Pipeline([*heads, *self.request.stages, writer], self.request.overrides, whole=False)
+        return Pipeline([*heads, *self.request.stages, writer], self.request.overrides, whole=False)
+
+    def plan(self) -> TilePlan:
+        """What is done to each tile.
+
+        Raises
+        ------
+        StageError
+            For whatever is wrong with model or options, before any point is read.
+        """
+        pipeline = self._pipeline
         plan = make_plan(pipeline, self.options.buffer)
         beside = self.request.beside
         tail_only = len(plan.tail) == 1 and beside is not None
-        files = {kind: [n for n in self.files if is_ept(n) == (kind == "readers.ept")] for kind in readers}
+        kinds_of_readers = {reader["type"] for reader in plan.readers}
+        files = {
+            kind: [n for n in self.files if is_ept(n) == (kind == "readers.ept")] for kind in kinds_of_readers
+        }
         return replace(
             plan,
             readers=[{**reader, "filename": files[reader["type"]]} for reader in plan.readers],
@@ -185,7 +193,14 @@ class ClassifyTask:
                     classes = {int(code): n for code, n in job.report.get("classes", {}).items()}
                     finished(Written(path, job.report.get("written", 0), classes))
 
-        return run_plan(plan, self.options, dry_run=dry_run, finished=finished_one, brief=brief)
+        return run_plan(
+            plan,
+            self.options,
+            dry_run=dry_run,
+            finished=finished_one,
+            brief=brief,
+            source=self._pipeline.source,
+        )
 
 
 def _make_folder(folder: Path) -> None:

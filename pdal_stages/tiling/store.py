@@ -177,7 +177,10 @@ class Store:
 
     def forget(self, name: str) -> None:
         """A tile is to be done anew: what an earlier run noted of it must not be believed of a file made since."""
-        self._done(name).unlink(missing_ok=True)
+        path = self._done(name)
+        if path.is_dir():
+            _remove(path)
+        path.unlink(missing_ok=True)
 
     def finished(self, name: str) -> dict[str, Any] | None:
         """The report of a tile that is done, with its fingerprint; otherwise None."""

@@ -14,6 +14,7 @@ from ..base.errors import StageError
 from ..base.files import sweep
 from ..pipeline import classflags
 from ..pipeline.overrides import Override
+from ..pipeline.read import PipelineSource
 from ..pipeline.run import Pipeline
 from .complete import remember, told_again
 from .dispatch import run_all, run_first_round
@@ -21,6 +22,7 @@ from .estimate import estimate
 from .outcome import FileJob, InterruptedRun, TiledRun, TileJob, summarize
 from .pool import open_pool
 from .rasters import remarks
+from .rehearsal import rehearse
 from .settings import TilingOptions
 from .store import FOLDER as STORE
 from .store import Store
@@ -79,7 +81,12 @@ def run_tiled(
     chosen = tile if isinstance(tile, TilingOptions) else TilingOptions(tile, **options)
     pipeline = source if isinstance(source, Pipeline) else Pipeline(source, overrides, whole=False)
     return run_plan(
-        make_plan(pipeline, chosen.buffer), chosen, dry_run=dry_run, progress=progress, brief=brief
+        make_plan(pipeline, chosen.buffer),
+        chosen,
+        dry_run=dry_run,
+        progress=progress,
+        brief=brief,
+        source=pipeline.source,
     )
 
 
@@ -91,10 +98,12 @@ def run_plan(
     progress: bool | None = None,
     finished: Callable[[TileJob | FileJob], None] | None = None,
     brief: bool = False,
+    source: PipelineSource | None = None,
 ) -> TiledRun:
     """Run what was planned; see :func:`run_tiled`. `finished` hears of every output that was written.
 
-    `brief`: where an earlier run did everything and nothing has changed since, it is enough to say so, without its tiles.
+    `source`: the pipeline as the user gave it, which is tried on an input first. `brief`: where an earlier run did
+    everything and nothing has changed since, it is enough to say so, without its tiles.
     """
     started = time.monotonic()
     folder = Path(plan.writers[0]["filename"]).absolute().parent
@@ -111,6 +120,9 @@ def run_plan(
     if survey.per == "tile":  # whose outputs have points of all readers
         classflags.parting([*plan.readers, *plan.tail], with_ours=True)
     survey.messages += remarks(plan.tail, chosen.tile if survey.per == "tile" else None)
+    if source is not None:
+        readable = [each for each in survey.sources if each.path not in survey.unreadable]
+        rehearse(source, readable, len(plan.readers))
     if dry_run:
         return estimate(plan, survey)
     if not folder.is_dir():
