@@ -21,7 +21,6 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
-import sys
 import tempfile
 import threading
 from collections.abc import Callable
@@ -30,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from .errors import DependencyError
+from .progress import Progress
 
 #: Flags that allow sums to be reordered and contracted, but keep NaN and infinity meaningful.
 FAST = frozenset({"reassoc", "contract", "nsz", "arcp"})
@@ -118,6 +118,9 @@ def _numba() -> Any:
             found=str(error),
             cure="Look for environment variables that begin with NUMBA_",
         ) from None
+    import numba.core.event
+
+    Compiling.listen(numba.core.event)
     return numba
 
 
@@ -184,60 +187,34 @@ def _stamp(kernel: Any, function: Callable) -> None:
     _stamps[kernel] = frozenset(parts)
 
 
-class CompilationNote:
-    """Say on stderr, once in a process, that kernels are being compiled, where that takes long.
+class Compiling:
+    """Says on stderr how many kernels were compiled so far, where that takes longer than two seconds.
 
-    After `delay` seconds the note is written if numba is compiling at that moment, else it is looked again
-    every second: work that merely takes long is no reason to claim compilation.
+    numba compiles a kernel when a job first calls it, so these are the job's own. It tells the beginning and the end
+    of each, with those of the functions that it calls in between.
     """
 
-    _said = False
-
-    def __init__(self, delay: float = 3.0) -> None:
-        self._delay = delay
-        self._end = threading.Event()
-
-    def _watch(self) -> None:
-        wait = self._delay
-        while not self._end.wait(wait):
-            wait = 1.0
-            if _is_compiling():
-                self._say()
-                return
+    #: Whether this process says it, whatever PDAL_STAGES_PROGRESS is.
+    enabled: bool | None = None
+    _bar: Progress | None = None
+    _inside = threading.local()
 
     @classmethod
-    def _say(cls) -> None:
-        stream = sys.__stderr__
-        if stream is None or cls._said:
-            return
-        cls._said = True
-        try:
-            stream.write("pdal_stages: compiling for this processor, once (less than a minute)...\n")
-            stream.flush()
-        except (OSError, ValueError):  # a closed stderr must not stop the work
-            pass
+    def listen(cls, event: Any) -> None:
+        """Hear of what numba compiles from now on."""
+        if cls._bar is None:
+            listener = type("Listener", (event.Listener,), {"on_start": cls._start, "on_end": cls._end})
+            event.register("numba:compile", listener())
+            cls._bar = Progress(0, "compiling for this processor, once", "kernels", enabled=cls.enabled)
+            if cls.enabled:
+                cls._bar.enabled = cls._bar.stream is not None
 
-    @classmethod
-    def leave_out(cls) -> None:
-        """Write no such note in this process."""
-        cls._said = True
+    @staticmethod
+    def _start(_: Any, event: Any) -> None:
+        Compiling._inside.depth = getattr(Compiling._inside, "depth", 0) + 1
 
-    def __enter__(self) -> CompilationNote:
-        threading.Thread(target=self._watch, daemon=True).start()
-        return self
-
-    def __exit__(self, *exc) -> None:
-        self._end.set()
-
-
-def _is_compiling() -> bool:
-    """Whether another thread holds numba's compiler lock."""
-    from numba.core.compiler_lock import global_compiler_lock
-
-    lock = getattr(global_compiler_lock, "_lock", None)
-    if lock is None:
-        return True
-    if lock.acquire(blocking=False):
-        lock.release()
-        return False
-    return True
+    @staticmethod
+    def _end(_: Any, event: Any) -> None:
+        Compiling._inside.depth = getattr(Compiling._inside, "depth", 1) - 1
+        if Compiling._inside.depth == 0 and Compiling._bar is not None:
+            Compiling._bar.update()

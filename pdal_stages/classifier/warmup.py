@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..base.jit import CompilationNote
+from ..base.jit import Compiling
 from ..features import compute_features
 from ..terrain import detached_noise, filtered_ground, hag_minima
 from .clouds import TrainingCloud
@@ -37,8 +37,7 @@ def warmup() -> None:
 def compile_part(part: Callable[[], None]) -> None:
     """Call one of the parts in a process that does nothing else."""
     gc.disable()  # a seventh of the time would go into looking for garbage
-    if part is not features_part:
-        CompilationNote.leave_out()  # the other process writes it
+    Compiling.enabled = part is features_part  # of two processes one says it
     part()
 
 

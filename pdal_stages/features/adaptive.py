@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..base.jit import CompilationNote, njit
+from ..base.jit import njit
 from ..base.threads import map_blocks
 from .bins import ShapeBins
 from .index import CellGrid
@@ -63,9 +63,8 @@ class AdaptiveNeighborhoods:
         self._nearest = nearest
         self._tree: KdTree | None = None
         if len(grid):
-            with CompilationNote():
-                self._tree = build_tree(grid.x, grid.y, grid.z, lambda f, b: list(map_blocks(f, b, threads)))
-                self._touch()
+            self._tree = build_tree(grid.x, grid.y, grid.z, lambda f, b: list(map_blocks(f, b, threads)))
+            self._touch()
 
     def __len__(self) -> int:
         return len(self.specs)

@@ -230,14 +230,11 @@ _compile_lock = threading.Lock()
 
 
 def compile_once(what: str) -> None:
-    """Load or compile a set of kernels on next to no data, saying so on stderr where it takes long."""
+    """Load or compile a set of kernels on next to no data, before threads want them."""
     with _compile_lock:
         if what in _compiled:
             return
-        from ..base.jit import CompilationNote
-
-        with CompilationNote():
-            _COMPILERS[what]()
+        _COMPILERS[what]()
         _compiled.add(what)
 
 

@@ -103,7 +103,7 @@ def _check_version(question: Mapping[str, Any]) -> None:
 
 
 def _stages(text: str) -> list[dict[str, Any]]:
-    """The pipeline up to the stage itself, as PDAL writes it: every value is text."""
+    """The pipeline up to the stage itself, as PDAL writes it."""
     try:
         found = json.loads(text)["pipeline"]
     except (ValueError, KeyError):  # `user_data` that is not JSON
@@ -112,10 +112,10 @@ def _stages(text: str) -> list[dict[str, Any]]:
 
 
 def _typed(stage: Mapping[str, Any]) -> dict[str, Any]:
-    """A stage of PDAL's serialized pipeline, its values as one writes them in JSON."""
+    """A stage of PDAL's serialized pipeline, its values as one writes them in JSON; before PDAL 2.9 all of them are text."""
     if stage.get("type") in registry.stages():
         kind = registry.get(stage["type"])
-        own = {name: [value] for name, value in stage.items() if name not in ("type", "inputs")}
+        own = {name: _texts(value) for name, value in stage.items() if name not in ("type", "inputs")}
         return {"type": kind.type, **settled(_parsed(kind, own))}
     return {name: _number(value) if isinstance(value, str) else value for name, value in stage.items()}
 
@@ -136,6 +136,11 @@ def _parsed(kind: type[Stage], texts: Mapping[str, list[str]]) -> dict[str, Any]
     """Options as text, one for each time they were given, as one writes them in JSON."""
     known = {option.name: option for option in kind.all_options()}
     return {name: _value(known.get(name), values) for name, values in texts.items()}
+
+
+def _texts(value: Any) -> list[str]:
+    values = value if isinstance(value, list) else [value]
+    return [one if isinstance(one, str) else json.dumps(one) for one in values]
 
 
 def _value(option: Option | None, texts: list[str]) -> Any:

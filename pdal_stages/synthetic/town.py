@@ -11,7 +11,6 @@ import numpy as np
 
 from ..base import checks
 from ..base.errors import OptionError, suggest
-from ..base.jit import CompilationNote
 from ..base.progress import Progress
 from ..base.threads import map_blocks
 from .districts import fill
@@ -141,8 +140,7 @@ def town_chunks(options: TownOptions, *, threads: int | None = None, progress: b
 
     The pieces joined are exactly what :func:`make_town` gives for the same options.
     """
-    with CompilationNote():
-        flown = FlownTown(options)
+    flown = FlownTown(options)
     total, parts = int(options.density * options.size**2), flown.flight.parts(PULSES_PER_CHUNK)
     with Progress(total, "synthetic", enabled=progress) as line:
         for piece in map_blocks(lambda part: flown.town(flown.flight, *part), parts, threads):
