@@ -32,6 +32,10 @@
 #include <pdal/io/BufferReader.hpp>
 #include <pdal/util/ProgramArgs.hpp>
 
+#ifndef _WIN32
+#include <dlfcn.h>
+#endif
+
 #include "declarations.hpp"
 
 namespace
@@ -96,6 +100,35 @@ std::string quoted(const std::string& text)
     }
     return out + "\"";
 }
+
+// Keeps GDAL quiet while it lives. From 2.9 on PDAL asks GDAL of every option that it writes down whether it is a spatial
+// reference, and shows the answer as an error. GDAL's functions are looked up: it is PDAL that is linked to it.
+class QuietGdal
+{
+public:
+    QuietGdal()
+    {
+#ifndef _WIN32
+        const auto push = reinterpret_cast<void (*)(void *)>(dlsym(RTLD_DEFAULT, "CPLPushErrorHandler"));
+        void *quiet = dlsym(RTLD_DEFAULT, "CPLQuietErrorHandler");
+        m_pop = reinterpret_cast<void (*)()>(dlsym(RTLD_DEFAULT, "CPLPopErrorHandler"));
+        if (push && quiet && m_pop)
+            push(quiet);
+        else
+            m_pop = nullptr;
+#endif
+    }
+    ~QuietGdal()
+    {
+        if (m_pop)
+            m_pop();
+    }
+    QuietGdal(const QuietGdal&) = delete;
+    QuietGdal& operator=(const QuietGdal&) = delete;
+
+private:
+    void (*m_pop)() = nullptr;
+};
 
 std::string newLabel(const std::string& type)
 {
@@ -381,7 +414,10 @@ private:
     std::string described()
     {
         std::ostringstream before;
-        PipelineWriter::writePipeline(this, before);
+        {
+            QuietGdal quiet;
+            PipelineWriter::writePipeline(this, before);
+        }
         std::ostringstream out;
         out << "\"stage\":" << quoted(getName()) << ",\"label\":" << quoted(m_label) << ",\"tag\":" <<
             quoted(this->tag()) << ",\"version\":" << quoted(declared::VERSION) << ",\"digest\":" <<

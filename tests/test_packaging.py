@@ -22,6 +22,7 @@ def test_one_version_everywhere():
     assert f'\nversion = "{__version__}"' in (ROOT / "native" / "pyproject.toml").read_text()
     assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text()
     assert f'\n  version: "{__version__}"\n' in (ROOT / "recipe" / "recipe.yaml").read_text()
+    assert f'\n  version: "{__version__}"\n' in (ROOT / "recipe" / "plugin" / "recipe.yaml").read_text()
     assert f"\nversion={__version__}\n" in (ROOT / "qgis" / "pdal_stages" / "metadata.txt").read_text()
     assert f"\n## {__version__} " in (ROOT / "CHANGELOG.md").read_text()
 
@@ -34,6 +35,21 @@ def test_conda_asks_for_what_pip_asks_for(file):
     assert len(wanted) >= 9
     for name, bound in wanted:
         assert f"- {_CONDA.get(name, name)} >={bound}\n" in text, name
+
+
+@pytest.mark.parametrize("name", ["recipe/recipe.yaml", "recipe/plugin/recipe.yaml"])
+def test_recipes_are_rendered(name):
+    """By the program that builds conda-forge's packages, which refuses fields that it does not know."""
+    built = pytest.importorskip("rattler_build")
+    variants = built.VariantConfig.from_yaml(
+        "python_min: ['3.10']\npython: ['3.12.*']\ncxx_compiler: [gxx]\nc_stdlib: [sysroot]\nc_stdlib_version: ['2.17']\n"
+    )
+    (rendered,) = built.Stage0Recipe.from_file(str(ROOT / name)).render(variants)
+    recipe = rendered.recipe
+    assert str(recipe.package.version) == __version__
+    assert any(str(one).startswith("python-pdal >=3.5") for one in recipe.requirements.run)
+    with pytest.raises(Exception, match="unknown top-level field"):
+        built.Stage0Recipe.from_yaml((ROOT / name).read_text() + "requirments: {}\n")
 
 
 @pytest.mark.slow

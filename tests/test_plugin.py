@@ -608,6 +608,18 @@ def test_objects_of_python_pdal(python, town):
     assert "coarse" in said
 
 
+def test_pipelines_of_newer_pdal_have_numbers():
+    """PDAL 2.9 writes a stage's options as numbers, truths and lists, older PDAL all as text."""
+    text = {"cell": "10", "ignore": "7,withheld", "tag": "h"}
+    newer = {"cell": 10, "ignore": [7, "withheld"], "tag": "h"}
+    kind = "filters.hag_minima"
+    assert arrival._typed({"type": kind, **newer}) == arrival._typed({"type": kind, **text})
+    assert arrival._typed({"type": "filters.hag_morphological", "ground": True})["ground"] is True
+    assert arrival._typed({"type": "filters.smrf", "cell": 1.5, "window": "18"}) == {
+        "type": "filters.smrf", "cell": 1.5, "window": 18,
+    }  # fmt: skip
+
+
 def test_a_notebook_survives_failures(python, town):
     """Fifty failures, each an ordinary exception with our message, then a run that succeeds."""
     said = python(
