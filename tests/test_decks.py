@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pdal_stages as ps
+import pdal_stages.synthetic
 from pdal_stages.cli import main
 from pdal_stages.stages.bridges import Bridges
 from pdal_stages.stages.hag_morphological import HagMorphological
@@ -253,6 +254,23 @@ def test_wires_side_by_side_are_no_deck():
         for k in range(8)
     ]
     assert not found(np.vstack([ground, *wires])).any()
+
+
+@pytest.mark.parametrize("density", [5.0, 16.0])
+def test_a_town_of_roofs_and_wires_has_no_false_decks(density):
+    """Its own bridges lie 1.4 m above the water, which is no drop."""
+    town = ps.synthetic.make_town(240.0, density, 1, progress=False)
+    assert (found(town.xyz) > 0)[town.classification != DECK].sum() <= 0.0005 * len(town.xyz)
+
+
+def test_a_hall_of_300_meters_is_no_viaduct():
+    def terrain(s, t):
+        return 0.1 * np.sin(s / 9), np.full(len(s), GROUND)
+
+    slabs = [Slab(-150, 150, -25, 25, lambda s: 9.0 + 0 * s, 9.0, 6)]
+    slabs.append(Slab(-150, -149.8, -60, -25, lambda s: 9.0 + 0 * s, 0.1, 14))  # a wire that hangs on to it
+    xyz, _ = scan(Scene(terrain, slabs, [], 0.2, 360.0, 120.0), 6.0)
+    assert not found(xyz).any()
 
 
 def test_a_deck_that_the_rim_of_the_cloud_cuts():

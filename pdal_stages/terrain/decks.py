@@ -3,8 +3,9 @@
 A deck is found as a whole, by the way one can walk (:mod:`.walkable`): to both sides, at most `WIDEST` meters apart, the
 way ends at a drop, or at water. Such cells that hang together are a deck if their rim is drops for the most part, and if at
 two ends, opposite each other, one walks on to land whose own rim is no drop, as a roof's is. Of what is longer than
-`LONGEST`, such as a viaduct, each stretch is judged by its rim alone. The rule of Sithole and Vosselman [S06], raised in a
-profile across and level with the ground in the profile along, is applied to the surface instead of to profiles.
+`LONGEST`, such as a viaduct, each stretch is judged by its rim, and land at one end is enough (:mod:`.longdecks`). The rule
+of Sithole and Vosselman [S06], raised in a profile across and level with the ground in the profile along, is applied to
+the surface instead of to profiles.
 
 The grid is anchored to absolute coordinates, all reaches are bounded (:data:`REACH`) and counts are whole numbers: the order
 of points does not matter, and a tile with its surroundings finds the decks of the whole cloud.
@@ -18,9 +19,26 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.jit import device, njit
+from ..base.jit import njit
 from ..base.unionfind import root as root_of
+from .deckrims import (
+    AWAY,
+    JOIN,
+    LINK,
+    NEAR,
+    OUTWARD,
+    OUTWARD_ACROSS,
+    RIM,
+    SECTORS,
+    SMALLEST,
+    WALLS,
+    first_land,
+    is_land,
+    rims,
+    spread,
+)  # fmt: skip
 from .levels import levels
+from .longdecks import BLOCK, FAR_ENDS, stretches
 from .minima import cell_numbers
 from .patches import patches
 from .walkable import (
@@ -42,30 +60,19 @@ from .walkable import (
 #: Side of the cells, meters: what is said of cells below is said of meters.
 CELL = 1.0
 #: The widest deck, and the longest that is judged as a whole.
-WIDEST, LONGEST = 60, 200
-#: Cells across which one walks on from a deck, and across which its parts belong together.
-LINK, JOIN = 2, 4
+WIDEST, LONGEST = 60, 250
+#: Of 5 x 5 cells, so many are of something broad.
+BROAD = 18
 #: How often what is walked on between deck cells becomes deck as well.
 _FILLS = 2
-#: The smallest deck and the smallest land at its ends, in cells, and how far land is looked for.
-SMALLEST, LAND, AWAY = 20, 100, 40
-#: For each cell of a deck's rim at a drop, at most so many that lead on; for each way that ends at a drop, so many that end
-#: at something else, and so many at nothing.
-OUTWARD, WALLS, RIM = 1.75, 0.7, 0.3
-#: The most of the ways over land that end at a drop, at any drop, at nothing.
-_LAND_DROPS = (0.15, 0.35, 0.3)
 #: A deck that the rim of the cloud cuts is so large and has for each cell that leads on so many at a drop.
 CUT, CUT_RIM = 60, 3
-#: Directions from a deck's middle; an end has the sectors so near.
-SECTORS, NEAR = 16, 2
-#: Blocks in which long decks are judged, cells.
-BLOCK = 64
 #: How far from the deck's surface its points lie, meters: on it; parapets and cars above; its flank below.
 ON_DECK, PARAPET, FLANK = 0.4, 1.6, 2.0
 #: Cells beyond those that were found, to the deck's edge and under its cars.
 BESIDE = 2
 #: How far away points matter, in meters: cells of a deck, its rim, and land at its ends, which all look around.
-REACH = (LONGEST + LINK + AWAY + AHEAD + FAR + 4 + WIDEST + 2 * _FILLS) * CELL
+REACH = (BLOCK * (FAR_ENDS + 1) + LINK + AWAY + AHEAD + FAR + 8 + WIDEST + 2 * _FILLS) * CELL
 #: What points are: of a deck's surface, of its parapets and flanks, or of none.
 SURFACE, PARTS = 1, 2
 
@@ -189,9 +196,16 @@ def _deck_levels(z, use, column, row):
         return None
     for _ in range(_FILLS):
         deck = filled(heights, start, h, w, kind, deck)
-    number, sums, box = parts(heights, start, h, w, deck)
-    judged(heights, start, h, w, kind, end, number, sums, box, left, bottom, deck)
-    return (left, bottom, h, w, heights, lowest, start, kind, deck) if deck.any() else None
+    raster = heights, start, h, w, kind, end
+    number, sums, box = parts(heights, start, h, w, deck, np.zeros(len(deck), bool))
+    long = np.append(_extent(box) > LONGEST / CELL, False)[number]
+    found = whole_decks(raster, number, sums, box)
+    if long.any():  # wires may join roofs to something long
+        number, sums, box = parts(heights, start, h, w, long, broad(heights, start, h, w, long))
+        found |= whole_decks(raster, number, sums, box)
+        long = np.append(_extent(box) > LONGEST / CELL, False)[number]
+        found |= stretches(*raster, long, left, bottom)
+    return (left, bottom, h, w, heights, lowest, start, kind, found) if found.any() else None
 
 
 def _find(z, use, column, row) -> NDArray[np.uint8]:
@@ -234,8 +248,34 @@ def filled(z, start, h, w, kind, deck):
 
 
 @njit
-def parts(z, start, h, w, deck):
-    """Number the parts that hang together (n,), -1 elsewhere; their size and sums of rows and columns; their boxes."""
+def broad(z, start, h, w, deck):
+    """Levels (n,) of what may be deck that is broad, at least near: no wires that join roofs."""
+    core, out = np.zeros(len(z), np.bool_), np.zeros(len(z), np.bool_)
+    for again in range(2):
+        for j in range(h):
+            for i in range(w):
+                for n in range(start[j * w + i], start[j * w + i + 1]):
+                    if not deck[n]:
+                        continue
+                    count = 0
+                    for b in range(max(j - 2, 0), min(j + 3, h)):
+                        for a in range(max(i - 2, 0), min(i + 3, w)):
+                            for m in range(start[b * w + a], start[b * w + a + 1]):
+                                if deck[m] and walkable(z[m] - z[n], distance(a - i, b - j)):
+                                    count += 1
+                                    out[n] |= core[m]
+                                    break
+                    if again == 0:
+                        core[n] = count >= BROAD
+    return out
+
+
+@njit
+def parts(z, start, h, w, deck, wide):
+    """Number the parts that hang together (n,), -1 elsewhere; their size and sums of rows and columns; their boxes.
+
+    What is broad hangs together with nothing else.
+    """
     parent = np.arange(len(z))
     for j in range(h):
         for i in range(w):
@@ -248,7 +288,7 @@ def parts(z, start, h, w, deck):
                             continue
                         k = (j + b) * w + i + a
                         for m in range(start[k], start[k + 1]):
-                            if deck[m] and walkable(z[m] - z[n], distance(a, b)):
+                            if deck[m] and wide[m] == wide[n] and walkable(z[m] - z[n], distance(a, b)):
                                 one, other = root_of(parent, n), root_of(parent, m)
                                 parent[max(one, other)] = min(one, other)
     number = np.full(len(z), -1, np.int64)
@@ -276,99 +316,17 @@ def parts(z, start, h, w, deck):
     return number, sums, box
 
 
-@device
-def _sector(j, i, sums):
-    # From the middle, times the size: whole numbers, the same wherever the array begins.
-    turn = np.arctan2(float(j * sums[0] - sums[1]), float(i * sums[0] - sums[2])) / (2 * np.pi) + 1.0
-    return int(turn * SECTORS) % SECTORS
-
-
-@device
-def _leads_on(z, start, h, w, kind, number, j, i, n):
-    """Whether one can walk on from a level of a part to what is of none."""
-    for b in range(max(j - LINK, 0), min(j + LINK + 1, h)):
-        for a in range(max(i - LINK, 0), min(i + LINK + 1, w)):
-            for m in range(start[b * w + a], start[b * w + a + 1]):
-                if number[m] < 0 and kind[m] == SOLID and walkable(z[m] - z[n], distance(a - i, b - j)):
-                    return True
-    return False
-
-
-@njit
-def rims(z, start, h, w, kind, end, number, sums):
-    """Of each part, by sector: cells that lead on, and ways that end at nothing; cells at a drop, and how its ways end."""
-    outward, cut = np.zeros((len(sums), SECTORS), np.int64), np.zeros((len(sums), SECTORS), np.int64)
-    drops, ends = np.zeros(len(sums), np.int64), np.zeros((len(sums), 5), np.int64)
-    for j in range(h):
-        for i in range(w):
-            for n in range(start[j * w + i], start[j * w + i + 1]):
-                k = number[n]
-                if k < 0:
-                    continue
-                drop = False
-                for d in range(8):
-                    ends[k, end[n, d]] += 1
-                    drop |= end[n, d] == DOWN or end[n, d] == ACROSS
-                    if end[n, d] == NOTHING:
-                        cut[k, _sector(j, i, sums[k])] += 1
-                drops[k] += drop
-                if _leads_on(z, start, h, w, kind, number, j, i, n):
-                    outward[k, _sector(j, i, sums[k])] += 1
-    return outward, cut, drops, ends
-
-
-@njit
-def land(z, start, h, w, kind, end, number, sums, box, part, sector, stamp, seen, queue, place, ends):
-    """How many cells of land one walks to from a part's end in some sectors, up to AWAY cells, and how its ways end."""
-    length = 0
-    low_j, high_j, low_i, high_i = h, -1, w, -1
-    at = -1
-    # First what the part leads on to, then what that does.
-    for j in range(box[0], box[1] + 1):
-        for i in range(box[2], box[3] + 1):
-            for n in range(start[j * w + i], start[j * w + i + 1]):
-                if number[n] != part or not sector[_sector(j, i, sums)]:
-                    continue
-                for b in range(max(j - LINK, 0), min(j + LINK + 1, h)):
-                    for a in range(max(i - LINK, 0), min(i + LINK + 1, w)):
-                        for m in range(start[b * w + a], start[b * w + a + 1]):
-                            if number[m] >= 0 or kind[m] != SOLID or seen[m] == stamp:
-                                continue
-                            if walkable(z[m] - z[n], distance(a - i, b - j)):
-                                seen[m] = stamp
-                                queue[length], place[length, 0], place[length, 1] = m, b, a
-                                length += 1
-                                low_j, high_j = min(low_j, b), max(high_j, b)
-                                low_i, high_i = min(low_i, a), max(high_i, a)
-    while at + 1 < length:
-        at += 1
-        n, j, i = queue[at], place[at, 0], place[at, 1]
-        for d in range(8):
-            ends[end[n, d]] += 1
-        for b in range(max(j - LINK, 0, low_j - AWAY), min(j + LINK + 1, h, high_j + AWAY + 1)):
-            for a in range(max(i - LINK, 0, low_i - AWAY), min(i + LINK + 1, w, high_i + AWAY + 1)):
-                for m in range(start[b * w + a], start[b * w + a + 1]):
-                    if number[m] == part or kind[m] != SOLID or seen[m] == stamp:
-                        continue
-                    if walkable(z[m] - z[n], distance(a - i, b - j)):
-                        seen[m] = stamp
-                        queue[length], place[length, 0], place[length, 1] = m, b, a
-                        length += 1
-    return length
-
-
-def judged(z, start, h, w, kind, end, number, sums, box, left, bottom, deck) -> None:
-    """Leave in `deck` (n,) the parts that are decks."""
+def whole_decks(raster, number, sums, box) -> NDArray[np.bool_]:
+    """Levels (n,) of the parts that are decks, but for those that are too long to be judged as a whole."""
+    z, start, h, w, kind, end = raster
     outward, cut, drops, ends = rims(z, start, h, w, kind, end, number, sums)
-    seen, queue = np.full(len(z), -1, np.int64), np.empty(len(z), np.int64)
-    place = np.empty((len(z), 2), np.int64)
-    good = np.zeros(len(sums), bool)
-    extent = np.maximum(box[:, 1] - box[:, 0], box[:, 3] - box[:, 2]) + 1
-    long = extent > LONGEST / CELL
+    land, seen = np.empty((len(z), 3), np.int64), np.full(len(z), -1, np.int64)
+    good = np.zeros(len(sums) + 1, bool)
     stamp = 0
-    for k in np.flatnonzero((sums[:, 0] >= SMALLEST) & ~long):
+    for k in np.flatnonzero((sums[:, 0] >= SMALLEST) & (_extent(box) <= LONGEST / CELL)):
         down = ends[k, DOWN] + ends[k, ACROSS]
-        if outward[k].sum() > OUTWARD * drops[k] or ends[k, WALLED] > WALLS * down:
+        most = OUTWARD_ACROSS if ends[k, ACROSS] > ends[k, DOWN] else OUTWARD
+        if outward[k].sum() > most * drops[k] or ends[k, WALLED] > WALLS * down:
             continue
         opposite = _opposite(outward[k], outward[k])
         whole = opposite is not None and ends[k, NOTHING] <= RIM * down
@@ -379,37 +337,18 @@ def judged(z, start, h, w, kind, end, number, sums, box, left, bottom, deck) -> 
             if opposite is None:
                 continue
         assert opposite is not None
+        good[k] = True
         for sectors in opposite if whole else opposite[:1]:
-            ways_end = np.zeros(5, np.int64)
-            cells = land(
-                z,
-                start,
-                h,
-                w,
-                kind,
-                end,
-                number,
-                sums[k],
-                box[k],
-                k,
-                sectors,
-                stamp,
-                seen,
-                queue,
-                place,
-                ways_end,
-            )
+            over = np.zeros(5, np.int64)
+            cells = first_land(z, start, h, w, kind, number, sums[k], box[k], k, sectors, land, seen, stamp)
+            cells = spread(z, start, h, w, kind, end, number, k, land, seen, stamp, cells, over)
             stamp += 1
-            if not _is_land(cells, ways_end):
-                break
-        else:
-            good[k] = True
-    if long.any():
-        deck &= np.append(good, False)[number] | stretches(
-            start, h, w, kind, end, number, np.append(long, False), left, bottom, z
-        )
-    else:
-        deck &= np.append(good, False)[number]
+            good[k] &= is_land(cells, over)
+    return good[number]
+
+
+def _extent(box: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.maximum(box[:, 1] - box[:, 0], box[:, 3] - box[:, 2]) + 1
 
 
 def _opposite(
@@ -427,52 +366,6 @@ def _opposite(
         )
         if score > best and score[0] > 0:
             best, found = score, (here, there)
-    return found
-
-
-def _is_land(cells: int, ends: NDArray[np.int64]) -> bool:
-    over = max(int(ends[1:].sum()), 1)
-    down, any_down, nothing = ends[DOWN] / over, (ends[DOWN] + ends[ACROSS]) / over, ends[NOTHING] / over
-    return (
-        cells >= LAND and down <= _LAND_DROPS[0] and any_down <= _LAND_DROPS[1] and nothing <= _LAND_DROPS[2]
-    )
-
-
-@njit
-def stretches(start, h, w, kind, end, number, long, left, bottom, z):
-    """Levels (n,) of long parts whose rim, in the 3 x 3 blocks around, is drops."""
-    low_a, low_b = left // BLOCK - 1, bottom // BLOCK - 1
-    across, along = (left + w) // BLOCK + 2 - low_a, (bottom + h) // BLOCK + 2 - low_b
-    sums = np.zeros((along, across, 4), np.int64)
-    for j in range(h):
-        for i in range(w):
-            for n in range(start[j * w + i], start[j * w + i + 1]):
-                if number[n] < 0 or not long[number[n]]:
-                    continue
-                own = sums[(j + bottom) // BLOCK - low_b, (i + left) // BLOCK - low_a]
-                drop = False
-                for d in range(8):
-                    if end[n, d] == DOWN or end[n, d] == ACROSS:
-                        own[0] += 1
-                        drop = True
-                    elif end[n, d] == WALLED:
-                        own[1] += 1
-                own[2] += drop
-                own[3] += _leads_on(z, start, h, w, kind, number, j, i, n)
-    good = np.zeros((along, across), np.bool_)
-    for b in range(1, along - 1):
-        for a in range(1, across - 1):
-            near = np.zeros(4, np.int64)
-            for v in range(b - 1, b + 2):
-                for u in range(a - 1, a + 2):
-                    near += sums[v, u]
-            good[b, a] = near[0] > 0 and near[1] <= WALLS * near[0] and near[3] <= OUTWARD / 2 * near[2]
-    found = np.zeros(len(number), np.bool_)
-    for j in range(h):
-        for i in range(w):
-            for n in range(start[j * w + i], start[j * w + i + 1]):
-                if number[n] >= 0 and long[number[n]]:
-                    found[n] = good[(j + bottom) // BLOCK - low_b, (i + left) // BLOCK - low_a]
     return found
 
 

@@ -1,0 +1,120 @@
+"""Where what may be a deck ends: its rim, and the land that one walks on to from it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.jit import device, njit
+from .walkable import ACROSS, DOWN, NOTHING, SOLID, distance, walkable
+
+#: Cells across which one walks on from a deck, and across which its parts belong together.
+LINK, JOIN = 2, 4
+#: The smallest deck and the smallest land at its ends, in cells, and how far land is looked for.
+SMALLEST, LAND, AWAY = 20, 100, 40
+#: For each cell of a deck's rim at a drop, at most so many that lead on, and across water, where bridges are short; for each
+#: way that ends at a drop, so many that end at something else, and so many at nothing.
+OUTWARD, OUTWARD_ACROSS, WALLS, RIM = 0.7, 1.75, 0.7, 0.3
+#: The most of the ways over land that end at a drop, at any drop, at nothing.
+_LAND_DROPS = (0.15, 0.35, 0.3)
+#: Directions from a deck's middle; an end has the sectors so near.
+SECTORS, NEAR = 16, 2
+
+
+@device
+def sector_of(j, i, sums):
+    # From the middle, times the size: whole numbers, the same wherever the array begins.
+    turn = np.arctan2(float(j * sums[0] - sums[1]), float(i * sums[0] - sums[2])) / (2 * np.pi) + 1.0
+    return int(turn * SECTORS) % SECTORS
+
+
+@device
+def leads_on(z, start, h, w, kind, number, j, i, n):
+    """Whether one can walk on from a level of a part to what is of none."""
+    for b in range(max(j - LINK, 0), min(j + LINK + 1, h)):
+        for a in range(max(i - LINK, 0), min(i + LINK + 1, w)):
+            for m in range(start[b * w + a], start[b * w + a + 1]):
+                if number[m] < 0 and kind[m] == SOLID and walkable(z[m] - z[n], distance(a - i, b - j)):
+                    return True
+    return False
+
+
+@njit
+def rims(z, start, h, w, kind, end, number, sums):
+    """Of each part, by sector: cells that lead on, and ways that end at nothing; cells at a drop, and how its ways end."""
+    outward, cut = np.zeros((len(sums), SECTORS), np.int64), np.zeros((len(sums), SECTORS), np.int64)
+    drops, ends = np.zeros(len(sums), np.int64), np.zeros((len(sums), 5), np.int64)
+    for j in range(h):
+        for i in range(w):
+            for n in range(start[j * w + i], start[j * w + i + 1]):
+                k = number[n]
+                if k < 0:
+                    continue
+                drop = False
+                for d in range(8):
+                    ends[k, end[n, d]] += 1
+                    drop |= end[n, d] == DOWN or end[n, d] == ACROSS
+                    if end[n, d] == NOTHING:
+                        cut[k, sector_of(j, i, sums[k])] += 1
+                drops[k] += drop
+                if leads_on(z, start, h, w, kind, number, j, i, n):
+                    outward[k, sector_of(j, i, sums[k])] += 1
+    return outward, cut, drops, ends
+
+
+@njit
+def first_land(z, start, h, w, kind, number, sums, box, part, sector, land, seen, stamp):
+    """Put what a part leads on to in some sectors into `land` (number, row, column); returns how many cells that are."""
+    length = 0
+    for j in range(box[0], box[1] + 1):
+        for i in range(box[2], box[3] + 1):
+            for n in range(start[j * w + i], start[j * w + i + 1]):
+                if number[n] == part and sector[sector_of(j, i, sums)]:
+                    length = step_on(z, start, h, w, kind, number, -1, j, i, n, land, seen, stamp, length)
+    return length
+
+
+@device
+def step_on(z, start, h, w, kind, number, only, j, i, n, land, seen, stamp, length):
+    """Add the land that one can walk on to: of no part, or, where `only` is none, of all but this one."""
+    for b in range(max(j - LINK, 0), min(j + LINK + 1, h)):
+        for a in range(max(i - LINK, 0), min(i + LINK + 1, w)):
+            for m in range(start[b * w + a], start[b * w + a + 1]):
+                if (
+                    kind[m] != SOLID
+                    or seen[m] == stamp
+                    or (number[m] >= 0 and (only < 0 or number[m] == only))
+                ):
+                    continue
+                if walkable(z[m] - z[n], distance(a - i, b - j)):
+                    seen[m] = stamp
+                    land[length, 0], land[length, 1], land[length, 2] = m, b, a
+                    length += 1
+    return length
+
+
+@njit
+def spread(z, start, h, w, kind, end, number, part, land, seen, stamp, length, ends):
+    """Add all one walks on to from there, up to AWAY cells, and count how its ways end; returns how many cells that are."""
+    low_j, high_j, low_i, high_i = h, -1, w, -1
+    for q in range(length):
+        low_j, high_j = min(low_j, land[q, 1]), max(high_j, land[q, 1])
+        low_i, high_i = min(low_i, land[q, 2]), max(high_i, land[q, 2])
+    at = 0
+    while at < length:
+        n, j, i = land[at, 0], land[at, 1], land[at, 2]
+        at += 1
+        if j < low_j - AWAY or j > high_j + AWAY or i < low_i - AWAY or i > high_i + AWAY:
+            continue
+        for d in range(8):
+            ends[end[n, d]] += 1
+        length = step_on(z, start, h, w, kind, number, part, j, i, n, land, seen, stamp, length)
+    return length
+
+
+def is_land(cells: int, ends: NDArray[np.int64]) -> bool:
+    over = max(int(ends[1:].sum()), 1)
+    down, any_down, nothing = ends[DOWN] / over, (ends[DOWN] + ends[ACROSS]) / over, ends[NOTHING] / over
+    return (
+        cells >= LAND and down <= _LAND_DROPS[0] and any_down <= _LAND_DROPS[1] and nothing <= _LAND_DROPS[2]
+    )
