@@ -77,7 +77,7 @@ def styles(objects, terrain, heights, classes):
         layer = QgsRasterLayer(path, name)
         results.Style(act).postProcessLayer(layer, QgsProcessingContext(), Feedback())
         layers[name] = layer.renderer().type()
-    for layer in results.object_layers(objects):
+    for layer in results.vector_layers(objects):
         layers[layer.name()] = layer.renderer().type()
         QgsProject.instance().addMapLayer(layer)
     colors = {one.value(): one.color().getRgb()[:3] for one in results.categories(forms["classes"])}

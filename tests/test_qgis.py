@@ -336,6 +336,7 @@ def test_algorithms_are_listed(qgis):
         "terrainmodels",
         "train",
         "accuracy",
+        "review",
         "objects",
         "check",
     ):
@@ -437,6 +438,9 @@ def test_the_way_of_a_tile(qgis, session, town, tmp_path):
         == shown["layers"]
     )
     assert shown["layers"]["buildings"] == "categorizedSymbol"
+    review = [f"INPUTS={out / 'c.laz'}", f"OUTPUT={out / 'r.gpkg'}", f"PAGE={out / 'r.html'}"]
+    said = qgis("run", "pdalstages:review", "--", *review)
+    assert (out / "r.gpkg").is_file() and (out / "r.html").is_file(), said
 
 
 @pytest.mark.pdal

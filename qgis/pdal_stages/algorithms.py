@@ -19,6 +19,7 @@ from qgis.core import (
 from . import results
 from .base import CLOUDS, LAZ, Algorithm, written
 
+_VECTORS = "GeoPackage (*.gpkg);;GeoJSON (*.geojson);;FlatGeobuf (*.fgb);;Shapefiles (*.shp)"
 _MODELS = "Model files (*.model);;All files (*)"
 _SHOW = "Show the result on the map"
 NOT_NOISE = {"type": "filters.range", "limits": "Classification![7:7],Classification![18:18]"}
@@ -42,8 +43,8 @@ class _Showing(Algorithm):
     def postProcessAlgorithm(self, context, feedback):
         project = context.project() or QgsProject.instance()
         for kind, path in self.to_show:
-            if kind == "objects":
-                layers = results.object_layers(path)
+            if kind == "vector":
+                layers = results.vector_layers(path)
             elif results.shows_point_clouds():
                 layers = [results.point_cloud(path, self.forms["classes"])]
             else:
@@ -369,7 +370,7 @@ class Objects(_Showing):
         made = QgsProcessingParameterFileDestination(
             "OUTPUT",
             "Objects",
-            "GeoPackage (*.gpkg);;GeoJSON (*.geojson);;FlatGeobuf (*.fgb);;Shapefiles (*.shp)",
+            _VECTORS,
         )
         made.setHelp(self.help_of("output"))
         self.addParameter(made)
@@ -382,7 +383,7 @@ class Objects(_Showing):
             feedback,
         )
         if self.parameterAsBool(parameters, "SHOW", context):
-            self.to_show.append(("objects", target))
+            self.to_show.append(("vector", target))
         return {"OUTPUT": target}
 
 
@@ -391,6 +392,40 @@ def writer(target):
     if target.lower().endswith((".las", ".laz")) and not target.lower().endswith(".copc.laz"):
         return {"type": "writers.las", "filename": target, "forward": "all", "extra_dims": "all"}
     return {"filename": target}
+
+
+class Review(_Showing):
+    """Where to look."""
+
+    key, title, command = "review", "Where to look: likely errors of a classified point cloud", "review"
+    about = (
+        "Lists where a person should look in classified point clouds, worst first, as patches with the number of errors "
+        "expected in each, and as a page with pictures. What is right or was corrected can be learned from: pdal-stages "
+        "corrections."
+    )
+    listed = ("share",)
+    own = ("html", "json")
+
+    def initAlgorithm(self, configuration=None):
+        self.add_inputs(self.help_of("inputs"))
+        self.add_declared()
+        made = QgsProcessingParameterFileDestination("OUTPUT", "Patches", _VECTORS)
+        made.setHelp(self.help_of("output"))
+        self.addParameter(made)
+        made = QgsProcessingParameterFileDestination("PAGE", "Page", "Pages (*.html)")
+        made.setHelp("The patches with pictures; under Processing > Results Viewer")
+        self.addParameter(made)
+        self.addOutput(QgsProcessingOutputHtml("HTML", "Page"))
+        self.add_show()
+
+    def processAlgorithm(self, parameters, context, feedback):
+        target = written(self.parameterAsFileOutput(parameters, "OUTPUT", context))
+        page = written(self.parameterAsFileOutput(parameters, "PAGE", context))
+        chosen = [*self.arguments(parameters, context), f"--html={page}"]
+        self.execute(["review", *chosen, *self.inputs(parameters, context), target], feedback)
+        if self.parameterAsBool(parameters, "SHOW", context):
+            self.to_show.append(("vector", target))
+        return {"OUTPUT": target, "PAGE": page, "HTML": page}
 
 
 def reader(source):
@@ -426,4 +461,4 @@ def class_map(cloud, target, side):
     return [reader(cloud), NOT_NOISE, writes]
 
 
-ALGORITHMS = (ClassifyFile, ClassifySurvey, Heights, TerrainModels, Train, Accuracy, Objects)
+ALGORITHMS = (ClassifyFile, ClassifySurvey, Heights, TerrainModels, Train, Accuracy, Review, Objects)

@@ -17,8 +17,8 @@ from qgis.core import (
 )
 from qgis.PyQt.QtGui import QColor
 
-#: Layers of objects, the lowest on the map first.
-LAYERS = ("buildings", "decks", "crowns", "spans", "trees")
+#: Layers of objects and of what is to be reviewed, the lowest on the map first.
+LAYERS = ("tiles", "patches", "buildings", "decks", "crowns", "spans", "trees")
 
 
 def shows_point_clouds():
@@ -41,8 +41,8 @@ def point_cloud(path, classes):
     return layer
 
 
-def object_layers(path):
-    """The layers of a vector file of objects that hold any; their styles lie in the file or beside it."""
+def vector_layers(path):
+    """The layers of a vector file that hold anything; their styles lie in the file or beside it."""
     stem, ending = os.path.splitext(str(path))
     layers = []
     for name in LAYERS:
