@@ -14,7 +14,7 @@ from pdal_stages.stages.hag_morphological import HagMorphological
 from pdal_stages.terrain import filtered_ground, morphological, patches
 from pdal_stages.terrain.lowest import pits
 from pdal_stages.terrain.morphological import reach
-from pdal_stages.terrain.openings import opening_radii, square_steps
+from pdal_stages.terrain.openings import HOLE, opening_radii, square_steps
 from pdal_stages.terrain.planes import surface
 from pdal_stages.terrain.plateaus import remove_plateaus
 from pdal_stages.terrain.progressive import LARGEST_DROP, objects_of
@@ -136,7 +136,7 @@ def test_a_plane_is_carried_across_a_hole():
     place = np.zeros((h, w, 3))
     place[..., 2] = level
     floor = level.astype(np.float32)
-    planes = surface(ground, place, floor, floor, left, bottom, 5)
+    planes = surface(ground, place, floor, floor, left, bottom, 5, np.ones_like(ground))
     # Held a little by the level planes the coarsest blocks start from.
     assert np.abs(planes[..., 0] - level).max() < 0.25
     assert np.array_equal(planes[ground, 0], level[ground])
@@ -195,7 +195,7 @@ def test_planes_equal_the_slow_reference():
     floor = rng.normal(0, 5, (h, w)).astype(np.float32)
     raster = np.where(rng.random((h, w)) < 0.5, floor, np.float32(np.inf))
     raster[ground] = floor[ground]
-    planes = surface(ground, place, floor, raster, left, bottom, 5)
+    planes = surface(ground, place, floor, raster, left, bottom, 5, np.ones_like(ground))
     cells = {
         (i + left, j + bottom): (place[j, i, :2], place[j, i, 2])
         for j, i in zip(*np.nonzero(ground), strict=True)
@@ -567,3 +567,51 @@ def test_feet_in_feet_out(data_dir):
     ground = array["Classification"] == 2
     assert array["Ground"][ground].mean() > 0.99
     assert np.abs(array["HeightAboveGround"][ground]).mean() < 0.25  # feet
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_openings_from_cell_to_cell_are_those_of_the_raster(seed, monkeypatch):
+    """Where few cells were measured, only these are looked at: the same objects, floors and openings."""
+    from pdal_stages.terrain import progressive
+
+    rng = np.random.default_rng(seed)
+    h, w = rng.integers(1, 90, 2)
+    raster = np.full((h, w), HOLE)
+    few = rng.random((h, w)) < [0.3, 0.05, 0.01, 0.002, 0.0][seed]
+    raster[few] = np.round(rng.normal(0, 4, few.sum()), 2).astype(np.float32)
+    raster[0, 0] = 1
+    cases = [(1.0, 0.15, 40, (2, 8)), (0.5, 0.3, 6, (20,)), (2.0, 0.0, 1, ())]
+    for case in cases:
+        monkeypatch.setattr(progressive, "are_few", lambda *_: False)
+        whole = progressive.objects_of(raster, *case)
+        monkeypatch.setattr(progressive, "are_few", lambda *_: True)
+        some = progressive.objects_of(raster, *case)
+        assert np.array_equal(whole[0], some[0]) and np.array_equal(whole[1], some[1])
+        assert whole[2].keys() == some[2].keys()
+        for radius in case[3]:
+            assert np.array_equal(whole[2][radius], some[2][radius]), (case, radius)
+
+
+@pytest.mark.parametrize("spacing", [40, 90])
+def test_the_cost_of_sparse_points_is_that_of_their_surroundings(spacing, monkeypatch):
+    """The raster between them is not gone over: the same bits, whichever way, and empty land is left alone."""
+    from pdal_stages.terrain import planes, progressive
+
+    rng = np.random.default_rng(spacing)
+    x, y = rng.uniform(0, 6 * spacing, (2, 36))
+    z = np.round(rng.normal(0, 3, 36) + 0.01 * x, 2)
+    options = {"openings": (5, 17), "slope_too": True}
+    asked = []
+    real = planes._from_parents
+
+    def counted(*arguments):
+        asked.append(arguments[-2].mean())
+        real(*arguments)
+
+    monkeypatch.setattr(planes, "_from_parents", counted)
+    some = filtered_ground(x, y, z, **options)
+    assert min(asked) < 20 / spacing**2
+    monkeypatch.setattr(progressive, "are_few", lambda *_: False)
+    whole = filtered_ground(x, y, z, **options)
+    for name, values in whole.items():
+        assert np.array_equal(values, some[name]), name

@@ -780,8 +780,8 @@ def dask_setup(worker):
 """
 
 
-def test_a_worker_of_another_version_that_joins(tmp_path, folder, expected, cluster):
-    """It gets no tiles, as there is a good one."""
+def test_a_worker_of_another_version_that_joins(tmp_path, folder, expected, cluster, capsys):
+    """It gets no tiles, as there is a good one; the user hears of it, once."""
     begun, joined, preload = (tmp_path / name for name in ("begun", "joined", "preload.py"))
     preload.write_text(_JOINER.format(str(joined)))
     words = [sys.executable, "-m", "distributed.cli.dask_worker", cluster[0], "--no-nanny", "--nthreads", "1"]
@@ -806,6 +806,9 @@ def test_a_worker_of_another_version_that_joins(tmp_path, folder, expected, clus
         others[0].kill()
         others[0].wait()
     assert joined.exists() and not run.failures
+    said = capsys.readouterr().err
+    assert said.count("it joined and gets no tiles: a worker of the scheduler has other versions") == 1
+    assert "0.0.9" in said and "on all hosts" in said
     check_same(tmp_path, expected)
 
 

@@ -140,9 +140,9 @@ def ground_raster(
     del lowest, bad
     objects, floor, opened = objects_of(raster, cell, options.slope, options.radius, options.opening_radii)
     ground = np.isfinite(raster) & ~objects
-    levels = options.levels(NEAR)
+    levels, measured = options.levels(NEAR), np.isfinite(raster)
     for _ in range(ROUNDS):
-        planes = surface(ground, place, floor, raster, left, bottom, levels)
+        planes = surface(ground, place, floor, raster, left, bottom, levels, measured)
         _regain(ground, raster, place, planes, cell, options.threshold, options.scalar)
     remove_plateaus(ground, floor, raster, cell)
     # The terrain runs below: no level of a deck stands for it either.

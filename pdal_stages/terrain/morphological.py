@@ -258,7 +258,8 @@ def _measured(
     """Heights of points above the ground of a raster, and what they say of that themselves."""
     cell, left, bottom = options.cell, raster.left, raster.bottom
     ground, place = raster.ground, raster.place
-    planes = surface(ground, place, raster.floor, raster.lowest, left, bottom, options.levels(NEAR))
+    needed = _around(column, row, left, bottom, raster.shape)
+    planes = surface(ground, place, raster.floor, raster.lowest, left, bottom, options.levels(NEAR), needed)
     height, gradient = np.empty((2, len(x)))
 
     spans = [slice(start, start + _SPAN) for start in range(0, len(x), _SPAN)]
@@ -275,7 +276,7 @@ def _measured(
         use & (deck == 0) & (np.abs(height) <= options.threshold + options.scalar * gradient)
     )  # NaN is not
     _means(x, y, z, is_ground, column, row, cell, left, bottom, ground, place)
-    planes = surface(ground, place, raster.floor, raster.lowest, left, bottom, options.levels(FAR))
+    planes = surface(ground, place, raster.floor, raster.lowest, left, bottom, options.levels(FAR), needed)
     each(above)
     nowhere = np.isnan(height)
     counts["without_terrain"] += int(np.count_nonzero(nowhere[own]))
@@ -292,6 +293,15 @@ def _measured(
 
         each(over)
     return found
+
+
+def _around(column, row, left, bottom, shape) -> NDArray[np.bool_]:
+    """Cells at which a surface is asked for: those of points, and all round them, whose planes points blend."""
+    needed = np.zeros(shape, bool)
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            needed[row - bottom + down, column - left + right] = True
+    return needed
 
 
 @njit

@@ -43,8 +43,8 @@ def _add(total, m, dx, dy, weight):
 
 
 @njit
-def _moments_of_cells(ground, place, left, bottom, out, out_left, out_bottom):
-    """n, x, y, xx, xy, yy, z, xz, yz of the ground of each block of 2 x 2 cells, about its center."""
+def _moments_of_cells(ground, place, left, bottom, out, held, out_left, out_bottom):
+    """n, x, y, xx, xy, yy, z, xz, yz of the ground of each block of 2 x 2 cells, about its center; which hold any."""
     one = np.ones(9)
     for j in range(ground.shape[0]):
         for i in range(ground.shape[1]):
@@ -54,16 +54,20 @@ def _moments_of_cells(ground, place, left, bottom, out, out_left, out_bottom):
                 one[6], one[7], one[8] = z, x * z, y * z
                 column, row = i + left, j + bottom
                 target = out[(row >> 1) - out_bottom, (column >> 1) - out_left]
+                held[(row >> 1) - out_bottom, (column >> 1) - out_left] = True
                 _add(target, one, (column & 1) - 0.5, (row & 1) - 0.5, 1.0)
 
 
 @njit
-def _moments_of_blocks(fine, left, bottom, size, out, out_left, out_bottom):
+def _moments_of_blocks(fine, held_fine, left, bottom, size, out, held, out_left, out_bottom):
     """The same of blocks of twice the `size`, from their four parts."""
     for j in range(fine.shape[0]):
         for i in range(fine.shape[1]):
+            if not held_fine[j, i]:
+                continue
             column, row = i + left, j + bottom
             target = out[(row >> 1) - out_bottom, (column >> 1) - out_left]
+            held[(row >> 1) - out_bottom, (column >> 1) - out_left] = True
             _add(target, fine[j, i], ((column & 1) - 0.5) * size, ((row & 1) - 0.5) * size, 1.0)
 
 
@@ -120,12 +124,14 @@ def _coarsest(floor, raster, left, bottom, level, out, out_left, out_bottom):
 
 
 @njit
-def _fit(moments, size, planes):
-    """Correct the planes (given: what the coarser level says) by the ground of 3 x 3 blocks."""
+def _fit(moments, size, needed, planes):
+    """Correct the needed planes (given: what the coarser level says) by the ground of 3 x 3 blocks."""
     h, w = planes.shape[:2]
     m = np.empty(9)
     for j in range(h):
         for i in range(w):
+            if not needed[j, i]:
+                continue
             height, across, along = planes[j, i, 0], planes[j, i, 1], planes[j, i, 2]
             if np.isnan(height):
                 continue
@@ -156,10 +162,24 @@ def _fit(moments, size, planes):
 
 
 @njit
-def _from_parents(parents, parents_left, parents_bottom, size, left, bottom, planes):
-    """What the planes of blocks of twice the `size` say at the centers of blocks of `size`."""
+def _needed_parents(needed, left, bottom, out, out_left, out_bottom):
+    """Mark the blocks of twice the size whose planes are asked for those of the needed ones."""
+    for j in range(needed.shape[0]):
+        for i in range(needed.shape[1]):
+            if needed[j, i]:
+                before, below = ((i + left + 1) >> 1) - 1 - out_left, ((j + bottom + 1) >> 1) - 1 - out_bottom
+                for b in range(max(below, 0), min(below + 2, out.shape[0])):
+                    for a in range(max(before, 0), min(before + 2, out.shape[1])):
+                        out[b, a] = True
+
+
+@njit
+def _from_parents(parents, parents_left, parents_bottom, size, left, bottom, needed, planes):
+    """What the planes of blocks of twice the `size` say at the centers of the needed blocks of `size`."""
     for j in range(planes.shape[0]):
         for i in range(planes.shape[1]):
+            if not needed[j, i]:
+                continue
             # A left child lies 3/4 of the way from the block before its parent's, a right one 1/4 beyond its parent.
             column, row = i + left, j + bottom
             s, t = 0.25 + 0.5 * (1 - (column & 1)), 0.25 + 0.5 * (1 - (row & 1))
@@ -188,13 +208,14 @@ def surface(
     left: int,
     bottom: int,
     levels: int,
+    needed: np.ndarray,
 ) -> np.ndarray:
     """Planes at the centers of all cells (h, w, 3): height, gradient per cell; NaN beyond the reach of all measured cells.
 
     `ground` (h, w) says which cells hold ground, `place` (h, w, 3) where it is: from the cell's center, in cells, and its
     height; `floor` (h, w) is the level to take where no ground is near, `raster` (h, w) is not finite where nothing was
     measured. `left` and `bottom` number the first column and row from the origin of the coordinates. There are
-    `levels` coarser levels, at least 1.
+    `levels` coarser levels, at least 1. `needed` (h, w) says at which cells planes are wanted; elsewhere stands none.
     """
     h, w = ground.shape
     spans = [(left, bottom, w, h)]
@@ -202,25 +223,33 @@ def surface(
         a, b, w, h = spans[-1]
         low_a, low_b = (a >> 1) - 1, (b >> 1) - 1
         spans.append((low_a, low_b, ((a + w - 1) >> 1) + 2 - low_a, ((b + h - 1) >> 1) + 2 - low_b))
-    moments = []
+    wanted = [needed]
+    for level in range(1, levels + 1):
+        a, b, w, h = spans[level]
+        wanted.append(np.zeros((h, w), bool))
+        _needed_parents(wanted[-2], *spans[level - 1][:2], wanted[-1], a, b)
+    # Memory that is zero and never touched costs nothing: empty land is not gone over with all its numbers.
+    moments, held = [], []
     for level in range(1, levels + 1):
         a, b, w, h = spans[level]
         moments.append(np.zeros((h, w, 9)))
+        held.append(np.zeros((h, w), bool))
         before = spans[level - 1][:2]
         if level == 1:
-            _moments_of_cells(ground, place, *before, moments[-1], a, b)
+            _moments_of_cells(ground, place, *before, moments[-1], held[-1], a, b)
         else:
-            _moments_of_blocks(moments[-2], *before, 2.0 ** (level - 1), moments[-1], a, b)
+            size = 2.0 ** (level - 1)
+            _moments_of_blocks(moments[-2], held[-2], *before, size, moments[-1], held[-1], a, b)
     planes = np.empty((0, 0, 3))
     for level in range(levels, -1, -1):
         a, b, w, h = spans[level]
-        coarser, planes = planes, np.empty((h, w, 3))
+        coarser, planes = planes, np.zeros((h, w, 3))
         if level == levels:
             _coarsest(floor, raster, left, bottom, level, planes, a, b)
         else:
-            _from_parents(coarser, *spans[level + 1][:2], 2.0**level, a, b, planes)
+            _from_parents(coarser, *spans[level + 1][:2], 2.0**level, a, b, wanted[level], planes)
         if level == 0:
             _through_ground(ground, place, planes)
         else:
-            _fit(moments[level - 1], 2.0**level, planes)
+            _fit(moments[level - 1], 2.0**level, wanted[level], planes)
     return planes

@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping
 import numpy as np
 
 from ..base.jit import njit
+from .fewcells import are_few, objects_among
 from .openings import HOLE, dilate, erode_step, opening_radii, square_steps
 
 #: Drops beyond this are objects however large the window: halls are not higher for being wider.
@@ -39,6 +40,12 @@ def objects_of(
     }  # a window of that radius holds all of the raster
     keep = set(wanted.values())
     largest = min(max(radii.union(keep)), h + w)
+    drops = {radius: np.float32(min(slope * radius * cell, LARGEST_DROP)) for radius in sorted(radii)}
+    if are_few(int(np.count_nonzero(raster != HOLE)), h, w, largest):
+        objects, floor, openings = objects_among(
+            raster, {r: d for r, d in drops.items() if r <= largest}, keep
+        )
+        return objects, floor, {radius: openings[held] for radius, held in wanted.items()}
     eroded, other = raster.copy(), np.empty_like(raster)
     before, after = raster.copy(), np.empty_like(raster)
     objects, floor = np.zeros((h, w), bool), raster.copy()
@@ -54,6 +61,6 @@ def objects_of(
         if radius in keep:
             openings[radius] = after.copy()
         if radius in radii:
-            _mark(before, after, raster, np.float32(min(slope * radius * cell, LARGEST_DROP)), objects, floor)
+            _mark(before, after, raster, drops[radius], objects, floor)
             before, after = after, before
     return objects, floor, {radius: openings[held] for radius, held in wanted.items()}

@@ -13,6 +13,7 @@ from concurrent.futures import CancelledError
 from typing import Any
 
 from ..base.errors import StageError, optional_import
+from ..base.plain import print_messages
 from ..base.version import build
 from ..pipeline import pdal as pdal_env
 from ..pipeline.work import Task, TaskResult, perform
@@ -33,6 +34,7 @@ class OnDask:
         self._stack = contextlib.ExitStack()
         self._unfit: dict[str, str] = {}  # why workers that joined later get no tasks, by their address
         self._asked: set[str] = set()
+        self._told: set[str] = set()
         self._chosen: list[str] = []
 
     def __enter__(self) -> OnDask:
@@ -69,7 +71,7 @@ class OnDask:
             found = self._client.run(at_hand, self.folder)
         except Exception as error:
             raise StageError(
-                "a worker of the scheduler cannot say which pdal-stages it has",
+                _MUTE,
                 found=f"{type(error).__name__}: {error}",
                 cure=_SAME,
             ) from None
@@ -91,12 +93,19 @@ class OnDask:
                 if isinstance(answer, OSError):  # gone again, or not yet there
                     self._asked.discard(worker)
                 elif isinstance(answer, BaseException):
-                    self._unfit[worker] = f"{worker} cannot say what it has: {answer}"
+                    self._leave_out(worker, _MUTE, f"{worker}: {answer}", _SAME)
                 elif answer[0] != versions():
-                    self._unfit[worker] = f"{_OTHER} ({_difference(worker, answer[0], versions())}). {_SAME}"
+                    self._leave_out(worker, _OTHER, _difference(worker, answer[0], versions()), _SAME)
                 elif not answer[2]:
-                    self._unfit[worker] = f"{_APART} (found no {self.folder} on {answer[1]}). {_SHARE}"
+                    self._leave_out(worker, _APART, f"no {self.folder} on {answer[1]}", _SHARE)
         return [worker for worker in there if worker not in self._unfit]
+
+    def _leave_out(self, worker: str, what: str, found: str, cure: str) -> None:
+        """Give a worker that joined no tasks; of several that are unfit for one reason the first is told."""
+        self._unfit[worker] = f"{what} (found {found}). {cure}"
+        if what not in self._told:
+            self._told.add(what)
+            print_messages(f"it joined and gets no tiles: {self._unfit[worker]}")
 
     def run(self, waiting: deque, task_of: Callable[[Any], Task]) -> Iterator[tuple[Any, TaskResult]]:
         """Yield (item, answer) for every item; see :meth:`pdal_stages.pipeline.processes.Processes.run`.
@@ -210,6 +219,7 @@ _KILLED = "it killed its worker each time it was tried: too little memory, or a 
 _LOST = "the Dask scheduler cannot be reached any more"
 _OTHER = "a worker of the scheduler has other versions than this program"
 _SAME = "Install the same versions of pdal-stages and PDAL on all hosts"
+_MUTE = "a worker of the scheduler cannot say which pdal-stages it has"
 _APART = "a worker of the scheduler does not see the output folder"
 _SHARE = "Inputs, model and outputs must be there under the same paths on all hosts"
 
