@@ -138,7 +138,7 @@ class Store:
 
     def forget_complete(self) -> None:
         """Something is to be done, or may be."""
-        (self.folder / "complete.json").unlink(missing_ok=True)
+        _forget(self.folder / "complete.json")
 
     def side(self) -> float | None:
         """The side of the last run's tiles, where it is known."""
@@ -177,10 +177,7 @@ class Store:
 
     def forget(self, name: str) -> None:
         """A tile is to be done anew: what an earlier run noted of it must not be believed of a file made since."""
-        path = self._done(name)
-        if path.is_dir():
-            _remove(path)
-        path.unlink(missing_ok=True)
+        _forget(self._done(name))
 
     def finished(self, name: str) -> dict[str, Any] | None:
         """The report of a tile that is done, with its fingerprint; otherwise None."""
@@ -255,6 +252,13 @@ def _remove(folder: Path) -> None:
     if folder.is_symlink():
         folder.unlink()
     shutil.rmtree(folder, ignore_errors=True)
+
+
+def _forget(path: Path) -> None:
+    """Remove a note, whatever lies in its place."""
+    if path.is_dir():
+        _remove(path)
+    path.unlink(missing_ok=True)
 
 
 def _open_own(path: Path) -> TextIO:
