@@ -21,7 +21,7 @@ class CloudIndex:
     """Where the points of a file lie."""
 
     count: int
-    boxes: list[Box]  #: of each block of 50,000 points
+    boxes: NDArray[np.float64]  #: (n, 4) of each block of 50,000 points: a country has millions of them
     tiles: list[tuple[int, int, int]]  #: column, row and number of points of each tile
 
 
@@ -74,7 +74,9 @@ def index_las(path: str, grid: TileGrid) -> CloudIndex:
             for i, j, number in counted(grid.index(x), grid.index(y)):
                 tiles[i, j] += number
             check_number(len(tiles), f"{path}, tiles of {grid.size:g}")
-    return CloudIndex(total, boxes, [(i, j, n) for (i, j), n in sorted(tiles.items())])
+    return CloudIndex(
+        total, np.array(boxes, np.float64).reshape(-1, 4), [(i, j, n) for (i, j), n in sorted(tiles.items())]
+    )
 
 
 def counted(column: NDArray[np.int64], row: NDArray[np.int64]) -> list[tuple[int, int, int]]:

@@ -94,10 +94,10 @@ def inside(a: Box, b: Box) -> bool:
     return a[0] >= b[0] and a[1] >= b[1] and a[2] <= b[2] and a[3] <= b[3]
 
 
-def union(boxes: list[Box]) -> Box:
+def union(boxes: list[Box] | NDArray[np.float64]) -> Box:
     """The box around boxes."""
-    if not boxes:
+    if not len(boxes):
         return (math.inf, math.inf, -math.inf, -math.inf)
-    low = np.array(boxes)[:, :2].min(axis=0)
-    high = np.array(boxes)[:, 2:].max(axis=0)
+    low = np.asarray(boxes)[:, :2].min(axis=0)
+    high = np.asarray(boxes)[:, 2:].max(axis=0)
     return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))

@@ -11,9 +11,10 @@ import socket
 import stat
 import time
 from collections.abc import Collection
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TextIO
+
+import numpy as np
 
 from ..base import strictjson
 from ..base.errors import StageError
@@ -218,12 +219,16 @@ class Store:
     def index(self, mark: str) -> CloudIndex | None:
         """The index of an input that is still the same."""
         known = _read(self.indexes / f"{mark}.json")
-        return CloudIndex(**known) if known else None
+        if known is None:
+            return None
+        boxes = np.array(known["boxes"], np.float64).reshape(-1, 4)
+        return CloudIndex(int(known["count"]), boxes, [(i, j, n) for i, j, n in known["tiles"]])
 
     def keep_index(self, mark: str, index: CloudIndex) -> None:
         """Keep the index of an input, where there is room."""
         with contextlib.suppress(StageError, OSError):
-            _keep(self.indexes / f"{mark}.json", asdict(index), "index")
+            known = {"count": index.count, "boxes": index.boxes.tolist(), "tiles": index.tiles}
+            _keep(self.indexes / f"{mark}.json", known, "index")
 
 
 # ---- files that nobody else put there ----------------------------------------------------------------------
