@@ -51,7 +51,7 @@ def test_none_is_forgotten():
     tested = {
         "noise", "normalize", "features", "features-for-viewers", "train", "train-binary", "classify",
         "classify-with-rejection", "evaluate", "train-on-smrf-ground", "classify-on-smrf-ground", "tiles-to-tiles",
-        "copc-to-tiles", "tile-index-to-tiles", "raw-to-footprints",
+        "copc-to-tiles", "tile-index-to-tiles", "raw-to-footprints", "terrain-and-surface",
     }  # fmt: skip
     assert {f.stem for f in FILES} == tested
     listed = (FOLDER.parent / "docs" / "how-to.md").read_text()
@@ -246,3 +246,42 @@ def test_raw_to_footprints(town, tmp_path):
     names = [name for name, _ in pyogrio.list_layers(tmp_path / "o.gpkg")]
     assert names[:5] == ["buildings", "trees", "crowns", "spans", "decks"]
     assert pyogrio.read_info(tmp_path / "o.gpkg", layer="buildings")["features"] > 0
+
+
+def test_terrain_and_surface_of_a_survey_show_no_tiles(town, tmp_path):
+    las = laspy.read(town)
+    west = np.asarray(las.x) < np.asarray(las.x).min() + 30
+    for name, mine in (("west", west), ("east", ~west)):
+        part = laspy.LasData(las.header)
+        part.points = las.points[mine]
+        part.write(tmp_path / f"{name}.laz")
+    (tmp_path / "classified").mkdir()
+    writer = {"type": "writers.las", "filename": "", "forward": "all", "extra_dims": "all"}
+    heights = {"type": "filters.hag_morphological", "window": 20}
+    writer["filename"] = str(tmp_path / "classified" / "#.laz")
+    assert not run_tiled([str(tmp_path / "*.laz"), heights, writer], 25, workers=0, progress=False).failures
+    writer["filename"] = str(tmp_path / "whole.laz")
+    Pipeline([str(town), heights, writer]).execute()
+    rasters = {}
+    for kind, source in (("files", tmp_path / "classified" / "*.laz"), ("whole", tmp_path / "whole.laz")):
+        words = [f"--stage.input.filename={source}"]
+        for model in ("surface", "terrain"):
+            place = {"resolution": 1, "origin_x": 499_995, "origin_y": 5_399_995, "width": 70, "height": 70}
+            place["filename"] = tmp_path / f"{model}_{kind}.tif"
+            words += [f"--stage.{model}.{name}={value}" for name, value in place.items()]
+        run("terrain-and-surface", *words)
+        for model in ("surface", "terrain"):
+            reader = {
+                "type": "readers.gdal",
+                "filename": str(tmp_path / f"{model}_{kind}.tif"),
+                "header": "Z",
+            }
+            reading = Pipeline([reader])
+            reading.execute()
+            rasters[model, kind] = reading.arrays[0]["Z"].reshape(70, 70)
+    for model in ("surface", "terrain"):
+        assert np.allclose(rasters[model, "files"], rasters[model, "whole"], atol=1e-9)
+        assert (rasters[model, "files"][10:60, 10:60] != -9999).all()
+    inside = np.s_[10:60, 10:60]
+    above = (rasters["surface", "files"] - rasters["terrain", "files"])[inside]
+    assert above.max() > 4 and np.quantile(above, 0.1) < 1.5
