@@ -323,12 +323,11 @@ def test_a_ready_pipeline_gives_the_same_bytes(pipeline, environment, town, halv
     assert written
     for file in written:
         stock, ours = (tmp_path / door / file for door in ("stock", "ours"))
-        if name == "copc-to-tiles" and pdal_env.version() < (
-            2,
-            4,
-            0,
-        ):  # whose record of the octree ours leaves out
-            np.testing.assert_array_equal(laspy.read(stock).points.array, laspy.read(ours).points.array)
+        if name == "copc-to-tiles":  # PDAL 2.2 keeps the octree's record, newer PDAL no order of points
+            one, other = laspy.read(stock).points.array, laspy.read(ours).points.array
+            if pdal_env.writes_copc():
+                one, other = np.sort(one), np.sort(other)
+            np.testing.assert_array_equal(one, other)
         else:
             assert_same(stock, ours)
 
