@@ -31,6 +31,7 @@ _WHERE = {
     "hag_minima": "terrain",
     "load_model": "stages.loading",
     "make_town": "synthetic",
+    "object_frames": "reports.objectlayers",
     "object_layers": "reports.objectlayers",
     "parse_neighborhoods": "features.neighborhoods",
     "run_pipeline": "pipeline",
@@ -54,7 +55,7 @@ if TYPE_CHECKING:
     from .pipeline import Pipeline, run_pipeline
     from .pipeline.native import Filter, Writer
     from .reports.accuracypage import write_accuracy_report
-    from .reports.objectlayers import object_layers
+    from .reports.objectlayers import object_frames, object_layers
     from .stages.loading import load_model
     from .synthetic import make_town
     from .terrain import detached_noise, filtered_ground, hag_minima

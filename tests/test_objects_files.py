@@ -304,3 +304,36 @@ def test_classify_of_many_files_with_options_workers_report_and_resume(folder, t
     page = html.read_text()
     assert "To be checked" in page and "data:image/png" in page and f"<td>{len(shapes)}</td>" in page
     assert not list(tmp_path.glob(".town*"))
+
+
+def test_frames_in_one_call(folder):
+    geopandas = pytest.importorskip("geopandas")
+    las = laspy.read(folder / "town.laz")
+    frames = ps.object_frames(las.xyz, las.classification, crs="EPSG:25832")
+    cells = ps.Cells.of(*las.xyz.T, np.asarray(las.classification), 0.5)
+    layers = ps.object_layers(ps.find_objects(cells, progress=False))
+    assert list(frames) == list(layers)
+    for name, frame in frames.items():
+        assert isinstance(frame, geopandas.GeoDataFrame) and frame.crs.to_epsg() == 25832
+        assert frame["object_id"].tolist() == layers[name].columns["object_id"].tolist()
+        assert all(shapely.equals_exact(np.array(frame.geometry), np.array(layers[name].shapes)))
+
+
+def test_frames_of_what_cannot_be(monkeypatch):
+    pytest.importorskip("geopandas")
+    xyz = np.zeros((3, 3))
+    with pytest.raises(StageError, match="no point has a class"):
+        ps.object_frames(xyz, np.ones(3, int))
+    with pytest.raises(StageError, match="there is no ground"):
+        ps.object_frames(xyz, np.full(3, 6))
+    with pytest.raises(StageError, match="one row per point"):
+        ps.object_frames(xyz, np.ones(4, int))
+    with pytest.raises(StageError, match="0 to 255"):
+        ps.object_frames(xyz, np.full(3, 300))
+    with pytest.raises(StageError, match="finite"):
+        ps.object_frames(xyz * np.nan, np.full(3, 2))
+    frames = ps.object_frames(xyz, np.full(3, 2))
+    assert all(len(frame) == 0 for frame in frames.values())
+    monkeypatch.setitem(__import__("sys").modules, "geopandas", None)
+    with pytest.raises(StageError, match="pip install geopandas"):
+        ps.object_frames(xyz, np.full(3, 2))

@@ -221,3 +221,21 @@ def point_keys(x: NDArray, y: NDArray, kinds: NDArray, size: float) -> NDArray[n
             cure="Drop stray points first, or give a larger 'cell'",
         )
     return np.asarray(cell_keys(0, row, column) | (kinds.astype(np.int64) << _KIND))
+
+
+def refuse_unclassified(cells: Cells, codes: NDArray[np.uint8]) -> None:
+    """An error for points without classes, and for points without ground."""
+    if len(codes) == 0:
+        return
+    if len(cells) == len(cells.of_kind(Kind.OTHER)):
+        raise StageError(
+            "no point has a class that objects are made of, or that is ground",
+            found="classes " + ", ".join(str(c) for c in sorted(set(codes.tolist()))),
+            cure="Classify the points first (pdal-stages classify), or say what is what: 'buildings', 'trees', ...",
+        )
+    if len(cells.of_kind(Kind.GROUND)) == 0:
+        raise StageError(
+            "there is no ground: objects' heights are measured from points of its classes",
+            found="classes " + ", ".join(str(c) for c in sorted(set(codes.tolist()))),
+            cure="Classify the ground first (pdal-stages classify, or filters.smrf), or name its classes in 'ground'",
+        )

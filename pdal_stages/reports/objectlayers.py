@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import class_color
-from ..base.errors import StageError
+from ..base.errors import DependencyError, StageError
 from ..base.files import check_writable, whole_files
 from ..base.units import Units
-from ..objects import Objects
-from ..objects.cells import Kind
+from ..objects import Cells, Objects, ObjectSettings, find_objects
+from ..objects.cells import CLASSES, Kind, refuse_unclassified
 from ..objects.measure import CHECK
 from ..objects.outlines import crown_outlines, raw_outlines, straight_outlines, vector
 
@@ -95,6 +95,67 @@ def object_layers(objects: Objects, *, straight: bool = True, units: Units | Non
     lines = [shapely.LineString(path / scale) for path in objects.tables[Kind.SPAN].paths]
     layers["spans"] = Layer(lines, "LineString Z", _columns(objects, Kind.SPAN))
     return {name: layers[name] for name in LAYERS}
+
+
+def object_frames(
+    xyz: NDArray,
+    classification: NDArray,
+    *,
+    reliability: NDArray | None = None,
+    settings: ObjectSettings | None = None,
+    classes: Mapping[Kind, Sequence[int]] = CLASSES,
+    straight: bool = True,
+    crs: Any = None,
+) -> dict[str, Any]:
+    """Objects of a cloud as GeoDataFrames (needs geopandas): ``buildings``, ``trees``, ``crowns``, ``spans``, ``decks``.
+
+    Parameters
+    ----------
+    xyz : (n, 3) float64
+        Meters.
+    classification : (n,) integers
+        ASPRS class codes; points that were withheld or are noise are better left out.
+    reliability : (n,) float, optional
+        0 to 1.
+    settings : ObjectSettings, optional
+    classes : mapping of Kind to codes, optional
+        Which codes are what.
+    straight : bool
+        Outlines of buildings and decks along walls, instead of along cells.
+    crs : optional
+        Reference system, as geopandas takes it: ``"EPSG:25832"``.
+
+    Raises
+    ------
+    StageError
+        Where arrays do not fit each other, no point has a class of any kind, or none is ground.
+    """
+    try:
+        import geopandas
+    except ImportError as error:
+        raise DependencyError(
+            "frames of objects need geopandas",
+            found=str(error),
+            cure="pip install geopandas; without it find_objects and object_layers give plain geometries",
+        ) from None
+    xyz, codes = np.asarray(xyz, np.float64), np.asarray(classification)
+    told = None if reliability is None else np.asarray(reliability)
+    shapes = [xyz.shape, codes.shape, *([] if told is None else [told.shape])]
+    if xyz.shape != (len(codes), 3) or any(shape != codes.shape for shape in shapes[1:]):
+        raise StageError("arrays must have one row per point", found=shapes)
+    if codes.size and not (codes.min() >= 0 and codes.max() <= 255):
+        raise StageError("class codes are 0 to 255", found=f"{codes.min()} to {codes.max()}")
+    if not np.isfinite(xyz).all():
+        raise StageError("coordinates must be finite", cure="Leave out rows of NaN or infinity")
+    codes, chosen = codes.astype(np.uint8), settings or ObjectSettings()
+    x, y, z = xyz.T
+    cells = Cells.of(x, y, z, codes, chosen.cell, reliability=told, classes=classes)
+    refuse_unclassified(cells, codes)
+    layers = object_layers(find_objects(cells, chosen, progress=False), straight=straight)
+    return {
+        name: geopandas.GeoDataFrame(layer.columns, geometry=layer.shapes, crs=crs)
+        for name, layer in layers.items()
+    }
 
 
 def _columns(objects: Objects, kind: Kind) -> dict[str, NDArray]:

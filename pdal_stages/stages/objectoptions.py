@@ -6,9 +6,8 @@ from dataclasses import fields
 from functools import cached_property
 from typing import Any
 
-from ..base.errors import StageError
 from ..objects import Cells, ObjectSettings
-from ..objects.cells import CLASSES, Kind, kind_of_code
+from ..objects.cells import CLASSES, Kind, kind_of_code, refuse_unclassified
 from .options import option
 from .points import Points
 from .selection import UNWANTED, Selection
@@ -103,21 +102,3 @@ class ObjectOptions:
         )
         refuse_unclassified(cells, codes)
         return cells
-
-
-def refuse_unclassified(cells: Cells, codes: Any) -> None:
-    """An error for points without classes, and for points without ground."""
-    if len(codes) == 0:
-        return
-    if len(cells) == len(cells.of_kind(Kind.OTHER)):
-        raise StageError(
-            "no point has a class that objects are made of, or that is ground",
-            found="classes " + ", ".join(str(c) for c in sorted(set(codes.tolist()))),
-            cure="Classify the points first (pdal-stages classify), or say what is what: 'buildings', 'trees', ...",
-        )
-    if len(cells.of_kind(Kind.GROUND)) == 0:
-        raise StageError(
-            "there is no ground: objects' heights are measured from points of its classes",
-            found="classes " + ", ".join(str(c) for c in sorted(set(codes.tolist()))),
-            cure="Classify the ground first (pdal-stages classify, or filters.smrf), or name its classes in 'ground'",
-        )

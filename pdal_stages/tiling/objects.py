@@ -29,14 +29,13 @@ from ..base.stamps import stamp
 from ..base.units import Units
 from ..base.version import __version__
 from ..objects import Cells, Objects, ObjectSettings, find_objects
-from ..objects.cells import Kind
+from ..objects.cells import Kind, refuse_unclassified
 from ..pipeline import pdal as pdal_env
 from ..pipeline.ends import input_files, outputs_of
 from ..pipeline.overrides import Override
 from ..pipeline.processes import each_file
 from ..pipeline.references import Reference, check_one_reference, reference_of
 from ..reports.objectlayers import check_target, object_layers, target_files, write_layers
-from ..stages.objectoptions import refuse_unclassified
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter
 from .classify import ClassifyTask
 from .cloudindex import BLOCK, open_las, read_block
