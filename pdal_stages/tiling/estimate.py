@@ -12,6 +12,8 @@ from .tileplan import TilePlan, outputs_for
 _RATE, _READ_RATE = 40_000, 250_000
 #: Bytes that a run keeps of a point until its output is written.
 _KEPT = 20
+#: Bytes that the rounds before the tiles keep of a cell of a raster of 1,024 x 1,024, until all tiles are done.
+_KEPT_OF_CELL = 82
 
 
 def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
@@ -46,10 +48,18 @@ def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
         "memory_mb_of_a_worker": held / 2**20,
         "assumed_points_per_core_second": _RATE,
         "core_hours": (count / _RATE + _beside(listed, read) / _READ_RATE) / 3600,
-        "disk_gb": count * _KEPT / 1e9 if survey.per == "file" else 0.0,
+        "disk_gb": (
+            _kept_of_cells(plan, density.area * survey.unit**2) + count * _KEPT * (survey.per == "file")
+        )
+        / 1e9,
         "states": {"waiting": len(listed)},
     }
     return TiledRun(listed, [], survey.unreadable, [], survey.messages, summary)
+
+
+def _kept_of_cells(plan: TilePlan, area: float) -> float:
+    """Bytes that the rounds before the tiles keep of so many square meters."""
+    return 0.0 if plan.first is None else area / (plan.first.blocks.side / 1024) ** 2 * _KEPT_OF_CELL
 
 
 def _beside(tiles: list[TileJob], read: int) -> int:
