@@ -256,6 +256,12 @@ def _parser() -> argparse.ArgumentParser:
         "filters.hag_morphological makes",
     )
     takes(
+        "--wires",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="Find wires (14), whatever they were called (filters.wires); tiles are read with 60 m more around them",
+    )
+    takes(
         "--consistency",
         action=argparse.BooleanOptionalAction,
         default=True,
@@ -583,6 +589,7 @@ def _classify(options: argparse.Namespace) -> int:
         named,
         noise=options.noise,
         bridges=options.bridges,
+        wires=options.wires,
         consistency=options.consistency,
         polygons=tuple(options.polygons),
         keep_sure=options.keep_sure,

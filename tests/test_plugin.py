@@ -199,6 +199,7 @@ STAGES = {
     "detachednoise": {"type": "filters.detachednoise"},
     "hag_minima": {"type": "filters.hag_minima", "cell": 10, "resolution": 0.25, "ignore": ["7", "withheld"]},
     "hag_morphological": {"type": "filters.hag_morphological", "ground": True, "openings": [5, 9]},
+    "wires": {"type": "filters.wires", "code": 13},
     "objects": {"type": "filters.objects", "refuse": ["low", "small"]},
     "multiscalefeatures": {
         "type": "filters.multiscalefeatures",
@@ -222,7 +223,7 @@ def test_a_stage_gives_the_same_bytes(pipeline, town, tmp_path, name, where):
     heights = [
         {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17], "decks": name == "bridges"}
     ]
-    stages = [str(town), *(heights if name in ("bridges", "objects", "consistency") else []), stage]
+    stages = [str(town), *(heights if name in ("bridges", "objects", "consistency", "wires") else []), stage]
     pipeline(las(stages, tmp_path / "stock.laz"))
     ps.Pipeline(las(stages, tmp_path / "ours.laz")).execute()
     assert_same(tmp_path / "stock.laz", tmp_path / "ours.laz")

@@ -44,6 +44,8 @@ class ClassifyRequest:
         Whether low and high noise is marked first.
     bridges : bool
         Whether bridge decks are found, where heights are made by ``filters.hag_morphological``.
+    wires : bool
+        Whether wires are found, where heights are made.
     consistency : bool
         Whether classes that contradict their surroundings are mended at the end.
     polygons : tuple of str
@@ -58,6 +60,7 @@ class ClassifyRequest:
     dimensions: tuple[str, ...] = WRITTEN
     noise: bool = True
     bridges: bool = True
+    wires: bool = False
     consistency: bool = True
     polygons: tuple[str, ...] = ()
     keep_sure: float | None = None
@@ -147,6 +150,7 @@ class ClassifyRequest:
         taken: dict[str, Any] = {name: settled[name] for name in ("ignore", "keep") if name in settled}
         wanted = {
             "filters.bridges": self._with_bridges,
+            "filters.wires": self.wires and not self._by_class,
             "filters.consistency": self.consistency and known >= {2, 6} and not self._by_class,
             "filters.polygons": bool(self.polygons),
         }

@@ -20,6 +20,7 @@ LEFT_ALONE = {
     "kept": "class kept (keep)",
     "outside_where": "outside where",
     "decks": "put on bridge decks (bridges)",
+    "wires": "found to be wires (wires)",
     "changed": "mended by rules (consistency)",
 }
 

@@ -1,0 +1,93 @@
+"""Bridge decks and wires: how many of their points are found, and how many others are taken for them.
+
+python benchmarks/bridges.py --data FOLDER
+
+Decks of scenes (tests/bridge_scenes.py: viaducts, rivers, an overpass, a footbridge, a canal; 16 points/m2), of the
+generated town and of the labeled clouds; wires of the town and of those clouds. Cars, lamps and what was never labeled count
+neither way. `false` is the share of all points that are wrongly taken; seconds are of one process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import laspy
+import numpy as np
+
+from pdal_stages.synthetic import make_town
+from pdal_stages.terrain.decks import find_decks
+from pdal_stages.terrain.morphological import filtered_ground
+from pdal_stages.terrain.wires import find_wires
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from bridge_scenes import SCENES, scan
+
+CLOUDS = (
+    "bridge/ign_0299_6802.laz", "delft/train.laz", "forest/neon_osbs.laz", "isprs_filter/samp11.laz",
+    "isprs_filter/samp12.laz", "isprs_filter/samp21.laz", "isprs_filter/samp31.laz",
+    "isprs_filter/samp41.laz", "isprs_filter/samp51.laz",
+    "isprs_filter/samp54.laz", "isprs_filter/samp61.laz", "montpellier/train_77050_627755.laz",
+    "montpellier/train_77050_627760.laz", "montpellier/train_77055_627755.laz", "montpellier/train_77055_627760.laz",
+    "rural/ahn3_achterhoek.laz", "rural/ahn4_powerline.laz", "rural/ign_0p3ppm2.laz", "rural/lidarhd_11ppm2.laz",
+    "rural/lidarhd_57ppm2.laz", "rural/lidarhd_bank.laz", "seville/plazanueva.laz",
+)  # fmt: skip
+#: Codes that are not real: noise, what was added by computer.
+DROPPED = (7, 18, 64, 65, 66, 67)
+
+
+def row(
+    name: str, what: str, found: np.ndarray, true: np.ndarray, either: np.ndarray, seconds: float
+) -> None:
+    """Print a row of the table; points that may be `either` are not judged."""
+    known = ~either | true
+    right, wrong = int((found & true).sum()), int((found & ~true & known).sum())
+    score = 2 * right / max(2 * right + wrong + int((true & ~found).sum()), 1)
+    words = f"{100 * score:.1f}" if true.any() else "–"
+    print(
+        f"| {name} | {what} | {int(true.sum()):,} | {words} | {100 * wrong / len(found):.3f} | {seconds:.1f} |",
+        flush=True,
+    )
+
+
+def decks(name: str, xyz: np.ndarray, use: np.ndarray, true: np.ndarray, either: np.ndarray) -> None:
+    begin = time.process_time()
+    found = find_decks(*(np.ascontiguousarray(axis) for axis in xyz.T), use) > 0
+    row(name, "deck", found, true, either, time.process_time() - begin)
+
+
+def wires(name: str, xyz: np.ndarray, use: np.ndarray, true: np.ndarray, either: np.ndarray) -> None:
+    height = filtered_ground(xyz, mask=use)["HeightAboveGround"]
+    begin = time.process_time()
+    row(name, "wire", find_wires(xyz, height, use), true, either, time.process_time() - begin)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True, help="folder of the labeled clouds")
+    folder = parser.parse_args().data
+    print("| cloud | what | points | F1 % | false % | CPU s |")
+    print("|---|---|---:|---:|---:|---:|")
+    for name, make in SCENES.items():
+        xyz, codes = scan(make())
+        decks(name, xyz, np.ones(len(xyz), bool), codes == 17, codes == 1)
+    for seed, density in ((1, 16.0), (2, 7.0)):
+        town = make_town(300.0, density, seed, progress=False)
+        true, use = town.classification, town.classification != 7
+        decks(f"town {seed}, {density:g} points/m2", town.xyz, use, true == 17, true == 1)
+        wires(f"town {seed}, {density:g} points/m2", town.xyz, use, true == 14, true == 15)
+    for name in CLOUDS:
+        las = laspy.read(folder / name)
+        codes = np.asarray(las.classification)
+        use = ~np.isin(codes, DROPPED)
+        bridge = codes == (26 if name.startswith("delft") else 17)
+        if "powerline" in name:
+            use &= codes != 26
+        decks(name, las.xyz, use, bridge, codes == 1)
+        wires(name, las.xyz, use, codes == 14, codes == 15)
+
+
+if __name__ == "__main__":
+    main()

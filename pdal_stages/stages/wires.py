@@ -1,0 +1,77 @@
+"""``filters.wires``: class of wires, long thin lines that hang in the air."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.asprs import OVERLAP, WIRE
+from ..terrain.wires import REACH, find_wires
+from .base import Stage
+from .options import option
+from .points import Points
+from .selection import UNWANTED, Selection
+
+
+class Wires(Stage):
+    type = "filters.wires"
+    summary = "Give wires their class: long thin lines that hang in the air"
+    where_chooses = True
+    where_help = "Points outside keep their class but still serve as neighbors."
+    code: int = option("integer", WIRE, "Class code of wires", minimum=0, maximum=255)
+    ignore: Selection = option(
+        "selection",
+        UNWANTED,
+        "Points that are as good as not there, and keep their class: class codes, ranges such as Classification[7:7], "
+        "or the word withheld",
+        may_be_empty=True,
+    )
+    keep: Selection = option(
+        "selection", (OVERLAP,), "Points that are neighbors but keep their class", may_be_empty=True
+    )
+    details = """
+Finds wires by their shape, whatever their class was: points more than 4 m above the ground on a straight line of 24 m
+that is filled and around which the air is empty, or of some lines side by side; lines that hang together over 30 m. What
+goes on along the line is of it, up to 6 m into a tree or a tower. Towers and poles keep their class.
+
+Put it after the classifier. Nothing depends on the order of points, and the grid is anchored to absolute coordinates: a
+tile with its halo gets the wires of the whole cloud. The count is in the metadata as `wires`, the classes that they leave
+as `left`.
+"""
+    before = (
+        {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]},
+        {"type": "filters.modelclassifier", "model": "standard"},
+    )
+    after = ({"type": "writers.las", "filename": "output.laz", "forward": "all"},)
+    example = {"type": "filters.wires"}
+
+    def reads(self) -> list[str]:
+        return ["Classification", "HeightAboveGround"]
+
+    def creates(self) -> dict[str, str]:
+        return {"Classification": "uint8_t"}
+
+    def halo_m(self) -> float:
+        return REACH
+
+    def largest_class(self) -> int:
+        return self.code
+
+    def run(self, points: Points) -> dict[str, NDArray]:
+        if points.count == 0:
+            return {}
+        ignored = points.ignored(self.ignore)
+        height = np.asarray(points.dimension("HeightAboveGround"), np.float64)
+        found = find_wires(points.xyz, height, ~ignored)
+        found &= points.inside & ~ignored & ~points.chosen(self.keep)
+        before = points.class_codes
+        codes = before.copy()
+        codes[found] = self.code
+        figures = points.report.figures
+        figures["wires"] = int(np.count_nonzero(found))
+        left = np.unique(before[found & (before != self.code)], return_counts=True)
+        figures["left"] = {str(code): int(n) for code, n in zip(*left, strict=True)}
+        figures["classes"] = {
+            str(c): int(np.count_nonzero(codes[points.inside] == c)) for c in np.unique(codes[points.inside])
+        }
+        return {"Classification": points.with_codes(codes)}

@@ -1,0 +1,150 @@
+"""Wires: what must hold whatever the points, a scene, the generated town, real clouds, the stage."""
+
+from __future__ import annotations
+
+import functools
+
+import laspy
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pdal_stages as ps
+import pdal_stages.synthetic
+from pdal_stages.stages.wires import Wires
+from pdal_stages.terrain import wires
+from pdal_stages.terrain.morphological import filtered_ground
+from pdal_stages.terrain.wires import find_wires
+
+
+def f1(found, true):
+    return 2 * (found & true).sum() / max(found.sum() + true.sum(), 1)
+
+
+@functools.cache
+def scene(seed=0, density=8.0, side=150):
+    """Two spans of three conductors between towers, trees, a house with a straight ridge and gutters, lamps, a crane."""
+    rng = np.random.default_rng(seed)
+    n = int(side * side * density)
+    ground = np.column_stack([rng.uniform(0, side, (2, n)).T, rng.normal(0, 0.03, n)])
+    parts, codes = [ground], [np.full(n, 2)]
+
+    def add(points, code):
+        parts.append(points)
+        codes.append(np.full(len(points), code))
+
+    for k in range(3):
+        s = np.sort(rng.uniform(0, side, int(side * 4)))
+        z = (
+            14 + 3 * k + 0.0009 * (np.abs(s - 75) - 75) ** 2 * -1 + 0.0009 * 75**2
+        )  # lowest between the towers
+        add(
+            np.column_stack(
+                [s, 30 + 0.4 * s + 0.3 * k + rng.normal(0, 0.03, len(s)), z + rng.normal(0, 0.03, len(s))]
+            ),
+            14,
+        )
+    for x, y in ((40, 110), (60, 115), (120, 20), (100, 15)):
+        m = 1500
+        p = rng.normal(0, 1, (m, 3))
+        p *= (rng.random(m) ** (1 / 3) / np.linalg.norm(p, axis=1))[:, None]
+        add(p * (4, 4, 5) + (x, y, 9), 5)
+    u, v = rng.uniform(-15, 15, 3000), rng.uniform(-6, 6, 3000)
+    add(np.column_stack([90 + u, 125 + v, 9 - 0.6 * np.abs(v)]), 6)
+    jib = np.linspace(0, 25, 200)
+    add(np.column_stack([10 + 0.3 * jib, 100 + 0.6 * jib, 3 + 0.8 * jib]), 26)
+    for x in range(10, 140, 12):
+        add(np.column_stack([np.full(20, x), np.full(20, 8.0), np.linspace(0, 8, 20)]), 1)
+    return np.round(np.vstack(parts), 3), np.concatenate(codes)
+
+
+def found(xyz, use=None):
+    return find_wires(xyz, xyz[:, 2], np.ones(len(xyz), bool) if use is None else use)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_wires_are_found_and_nothing_else(seed):
+    xyz, codes = scene(seed)
+    wire = found(xyz)
+    assert f1(wire, codes == 14) > 0.95
+    assert (wire & (codes != 14)).sum() < 0.0005 * len(xyz)
+    left = codes != 14
+    assert not found(xyz[left]).any()
+
+
+@settings(max_examples=5, deadline=None)
+@given(st.integers(0, 100), st.tuples(st.integers(-3000, 3000), st.integers(-3000, 3000)))
+def test_order_and_shifts_by_whole_cells_change_nothing(seed, cells):
+    xyz, _ = scene(seed % 2, 2.0)
+    xyz = np.floor(xyz * 1024) / 1024
+    wire = found(xyz)
+    order = np.random.default_rng(seed).permutation(len(xyz))
+    assert np.array_equal(found(xyz[order]), wire[order])
+    shifted = xyz + np.array([*cells, 0])
+    assert np.array_equal(find_wires(shifted, xyz[:, 2], np.ones(len(xyz), bool)), wire)
+
+
+def test_a_tile_with_its_surroundings_gets_what_the_whole_gets():
+    xyz, _ = scene(0)
+    whole = found(xyz)
+    for low in (62.0, 75.5):
+        core = (xyz[:, 0] >= low) & (xyz[:, 0] < low + 20)
+        near = (xyz[:, 0] >= low - wires.REACH) & (xyz[:, 0] < low + 20 + wires.REACH)
+        assert near.sum() < len(xyz) and whole[core].any()
+        assert np.array_equal(found(xyz[near])[core[near]], whole[core])
+
+
+def test_degenerate_clouds_and_points_left_out():
+    for xyz in (
+        np.empty((0, 3)),
+        np.zeros((1, 3)),
+        np.full((50, 3), 9.0),
+        np.random.default_rng(0).normal(0, 50, (500, 3)),
+    ):
+        assert not found(xyz).any()
+    xyz, codes = scene(0)
+    assert not found(xyz, codes != 14).any()
+
+
+def test_a_street_of_poles_in_the_town():
+    town = ps.synthetic.make_town(200.0, 8.0, 4, progress=False)
+    wire = find_wires(town.xyz, town.height_above_ground.astype(float), town.classification != 7)
+    assert f1(wire, town.classification == 14) > 0.85
+    assert (wire & ~np.isin(town.classification, (14, 15))).sum() < 0.0005 * len(wire)
+
+
+def test_the_stage_gives_wires_their_class():
+    xyz, codes = scene(0)
+    before = np.where(codes == 14, 5, codes).astype(np.uint8)
+    before[np.flatnonzero(codes == 14)[:5]] = 12
+    arrays = dict(zip("XYZ", xyz.T.copy(), strict=True)) | {
+        "Classification": before,
+        "HeightAboveGround": xyz[:, 2].copy(),
+    }
+    stage = Wires({})
+    points = stage.points(arrays)
+    after = stage.run(points)["Classification"]
+    wire = found(xyz) & (before != 12)
+    assert np.array_equal(after, np.where(wire, 14, before))
+    assert points.report.figures["wires"] == wire.sum()
+    assert stage.halo_m() == wires.REACH < 65 and stage.largest_class() == 14
+
+
+def test_a_corridor(data_dir):
+    las = laspy.read(data_dir / "rural/ahn4_powerline.laz")
+    codes = np.asarray(las.classification)
+    real = codes != 26  # cranes that were added by computer
+    height = filtered_ground(las.xyz, mask=real)["HeightAboveGround"]
+    wire = find_wires(las.xyz, height, real)
+    assert f1(wire, codes == 14) > 0.9
+    assert (wire & ~np.isin(codes, (14, 15))).sum() < 0.001 * len(codes)
+
+
+@pytest.mark.parametrize(
+    "name", ["montpellier/train_77055_627755.laz", "forest/neon_osbs.laz", "rural/lidarhd_57ppm2.laz"]
+)
+def test_clouds_without_wires(name, data_dir):
+    las = laspy.read(data_dir / name)
+    height = filtered_ground(las.xyz)["HeightAboveGround"]
+    assert find_wires(las.xyz, height, np.ones(len(las), bool)).sum() <= 0.001 * len(las)
