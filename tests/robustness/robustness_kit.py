@@ -17,6 +17,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import audit
+
 ROOT = Path(__file__).resolve().parents[2]
 GROUPS = ("Options", "Pipeline JSON", "Clouds", "LAS files", "Models", "Outputs", "Environment")
 
@@ -51,26 +53,42 @@ class Cell:
 
         self.before = self.files()
         self.capture.readouterr()
+        watch = audit.Watch(words, Path.cwd(), self._log)
+        usual = {name: os.environ.get(name) for name in ("PYTHONPATH", "PDAL_STAGES_AUDIT")}
+        _set({name: watch.environment(dict(usual))[name] for name in usual})
         try:
-            code = main([str(word) for word in words])
+            with watch:
+                code = main([str(word) for word in words])
         except SystemExit as end:  # wrong usage, said by argparse
             code = int(end.code or 0)
+        finally:
+            _set(usual)
         out, err = self.capture.readouterr()
+        assert not watch.beyond, watch.beyond
         return Done(code, out, err)
+
+    @property
+    def _log(self) -> Path:
+        """What watched processes report; beside the folder, whose files are counted."""
+        return self.folder.with_name(f"{self.folder.name}.audit")
 
     def process(self, *words: object, **options) -> Done:
         """Run it in a process of its own."""
         self.before = self.files()
         environment = {**os.environ, **options.pop("env", {})}
         command = options.pop("command", [sys.executable, "-m", "pdal_stages.cli"])
-        done = subprocess.run(
-            [*command, *map(str, words)],
-            capture_output=True,
-            env={k: v for k, v in environment.items() if v is not None},
-            cwd=options.pop("cwd", self.folder),
-            timeout=options.pop("timeout", 300),
-            **options,
-        )
+        folder = Path(options.pop("cwd", self.folder))
+        watch = audit.Watch(words, folder, self._log)
+        with watch:
+            done = subprocess.run(
+                [*command, *map(str, words)],
+                capture_output=True,
+                env={k: v for k, v in watch.environment(environment).items() if v is not None},
+                cwd=folder,
+                timeout=options.pop("timeout", 300),
+                **options,
+            )
+        assert not watch.beyond, watch.beyond
         return Done(
             done.returncode, done.stdout.decode(errors="replace"), done.stderr.decode(errors="replace")
         )
@@ -101,6 +119,14 @@ class Cell:
         assert "Traceback" not in done.out + done.err
         assert not list(self.folder.rglob(".pdal-stages-partial-*"))
         return done
+
+
+def _set(variables: dict[str, str | None]) -> None:
+    for name, value in variables.items():
+        if value is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = value
 
 
 def job(path: Path, *stages: object, name: str = "job.json") -> Path:

@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from audit import OWN
 from robustness_kit import job
 
 pytestmark = [
@@ -27,12 +28,6 @@ _CHANGED = re.compile(
     r"\b(rename\w*|link\w*|symlink\w*|truncate|chmod|fchmodat|chown|fchownat|mknod\w*|unlink\w*|mkdir\w*|rmdir)\((.*)\) = 0"
 )
 _WRITES = {"O_WRONLY", "O_RDWR", "O_CREAT", "O_TRUNC", "O_APPEND"}
-#: Ours: hidden folders beside outputs, notes of tiled runs, compiled kernels, temporary folders; and the system's.
-_OWN = (
-    r"/\.pdal-stages-partial-[^/]+(/|$)", r"/\.pdal-stages(/|$)", r"\.nb[ic](\.tmp\.\w+)?$", r"/__pycache__(/|$)",
-    r"^/(tmp|var/tmp)/pdal-stages-[^/]+(/|$)", r"^/dev/(null|tty|shm/(sem\.)?[\w.-]+)$", r"^/proc/self/",
-    r"\.nb[ic]", r"^/tmp/tmp\w+(/|$)", r"^/tmp/[a-z0-9_]{8}$",
-)  # fmt: skip
 
 
 def changed_files(log: str, folder: Path) -> set[str]:
@@ -72,7 +67,7 @@ def watched(folder: Path, *words: object) -> set[str]:
         pytest.skip(f"nothing may be traced here: {done.stderr[:200]}")
     assert done.returncode == 0, done.stderr[-2000:]
     names = changed_files(log.read_text(errors="replace"), folder)
-    own = [re.compile(pattern) for pattern in _OWN]
+    own = [re.compile(pattern) for pattern in OWN]
     return {name for name in names if not any(pattern.search(name) for pattern in own)}
 
 
@@ -116,3 +111,37 @@ def test_what_the_watch_sees():
 1 rename("d", "/e") = 0
 1 unlink("/f") = -1 ENOENT (No such file or directory)"""
     assert changed_files(log, Path("/here")) == {"/here/b", "/here/d", "/e"}
+
+
+def test_what_the_hook_sees(cell, tmp_path, monkeypatch):
+    """A command that wrote what it was not asked for, in this process, in one that it starts, or through a program, is caught."""
+    from pdal_stages import cli
+
+    stray, asked = tmp_path / "stray", tmp_path / "asked"
+    code = f"open({str(stray)!r}, 'w').close()"
+    program = [sys.executable, "-c", code]
+
+    def writes(path):
+        def main(words):
+            path.write_text("")
+            return 0
+
+        return main
+
+    def starts(words):
+        return subprocess.run(program).returncode
+
+    it = cell("Environment", "the watch over the files of every case")
+    for main, found in ((writes(stray), stray), (starts, stray), (writes(asked), None)):
+        monkeypatch.setattr(cli, "main", main)
+        if found is None:
+            assert it.command("pipeline", asked).code == 0
+        else:
+            with pytest.raises(AssertionError, match="stray"):
+                it.command("pipeline", asked)
+        stray.unlink(missing_ok=True)
+    with pytest.raises(AssertionError, match="stray"):
+        it.process(command=program)
+    monkeypatch.setattr(cli, "main", lambda words: subprocess.run(["true"]).returncode)
+    with pytest.raises(AssertionError, match="program true"):
+        it.command("pipeline", asked)
