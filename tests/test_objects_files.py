@@ -337,3 +337,43 @@ def test_frames_of_what_cannot_be(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "geopandas", None)
     with pytest.raises(StageError, match="pip install geopandas"):
         ps.object_frames(xyz, np.full(3, 2))
+
+
+def cloud(path, xyz, codes, epsg=25832):
+    pyproj = pytest.importorskip("pyproj")
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales = [1e-7, 1e-7, 0.01] if epsg == 4326 else [0.01] * 3
+    header.offsets = np.floor(xyz.min(axis=0))
+    header.add_crs(pyproj.CRS(epsg))
+    las = laspy.LasData(header)
+    las.xyz = xyz
+    las.classification = codes
+    las.write(path)
+
+
+@pytest.mark.pdal
+@pytest.mark.parametrize(
+    ("codes", "epsg", "text"),
+    [
+        ((2, 5, 6), 4326, "degrees"),
+        ((0,), 25832, "no point has a class"),
+        ((6,), 25832, "there is no ground"),
+        ((5,), 25832, "there is no ground"),
+        ((2,), 25832, ""),
+        ((2, 2, 2, 2, 2, 2, 2, 2, 2, 5, 6, 14, 17), 25832, ""),
+    ],
+)
+def test_bad_clouds_give_an_error_or_a_whole_file(tmp_path, codes, epsg, text, capsys):
+    """Degrees, no classes, one class only, objects of one point each."""
+    rng = np.random.default_rng(1)
+    xyz = rng.uniform(0, 1, (400, 3)) * ([1e-3, 1e-3, 10] if epsg == 4326 else [400, 400, 10])
+    xyz += [8, 50, 0] if epsg == 4326 else [500_000, 5_400_000, 0]
+    cloud(tmp_path / "in.laz", xyz, rng.choice(codes, 400).astype(np.uint8), epsg)
+    target = tmp_path / "out.gpkg"
+    code = cli.main(["objects", str(tmp_path / "in.laz"), str(target)])
+    said = capsys.readouterr().err
+    if text:
+        assert code == 1 and text in said and not target.exists()
+    else:
+        assert code == 0
+        assert all(not len(layer(target, name)[1]) for name in ("buildings", "trees", "decks"))
