@@ -281,6 +281,15 @@ def test_importing_the_package_is_light():
     assert done.returncode == 0, done.stderr
 
 
+def test_a_command_starts_without_what_only_some_need():
+    code = (
+        "import sys; from pdal_stages.cli import main\ntry:\n    main(['classify', '--help'])\nexcept SystemExit:\n    pass\n"
+        "heavy = {'numba', 'sklearn', 'pdal', 'scipy', 'torch', 'PIL', 'jinja2'} & set(sys.modules); sys.exit(f'{heavy}' if heavy else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_what_is_asked_of_one_command_ends_with_it(cloud, tmp_path, capsys, monkeypatch):
     monkeypatch.delenv("PDAL_STAGES_PROGRESS", raising=False)
     (tmp_path / "job.json").write_text(json.dumps([str(cloud)]))
