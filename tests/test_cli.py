@@ -283,8 +283,10 @@ def test_importing_the_package_is_light():
 
 def test_a_command_starts_without_what_only_some_need():
     code = (
-        "import sys; from pdal_stages.cli import main\ntry:\n    main(['classify', '--help'])\nexcept SystemExit:\n    pass\n"
-        "heavy = {'numba', 'sklearn', 'pdal', 'scipy', 'torch', 'PIL', 'jinja2'} & set(sys.modules); sys.exit(f'{heavy}' if heavy else 0)"
+        "import sys; from pdal_stages.cli import main\n"
+        "try:\n    main(['classify', '--help'])\nexcept SystemExit:\n    pass\n"
+        "heavy = {'numba', 'sklearn', 'pdal', 'scipy', 'torch', 'PIL', 'jinja2'} & set(sys.modules)\n"
+        "sys.exit(f'{heavy}' if heavy else 0)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
