@@ -39,7 +39,7 @@ _WHERE = {
     "run_tiled": "tiling",
     "TilingOptions": "tiling.settings",
     "train": "classifier",
-    "write_accuracy_report": "reports",
+    "write_accuracy_report": "reports.accuracypage",
 }
 
 __all__ = [*_WHERE, "__version__"]

@@ -132,3 +132,7 @@ def test_every_public_name_is_on_the_api_page():
     page = (ROOT / "docs" / "api.md").read_text()
     missing = [name for name in ps.__all__ if f".{name}\n" not in page and name != "__version__"]
     assert not missing
+
+
+def test_every_public_name_is_there():
+    assert all(getattr(ps, name) is not None for name in ps.__all__)
