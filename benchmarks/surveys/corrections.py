@@ -1,7 +1,7 @@
 """What corrections are worth: a simulated operator on surveys that the model has not seen.
 
     python benchmarks/surveys/leave_one_out.py --data DIR --save MODELS
-    python benchmarks/surveys/corrections.py --data DIR --models MODELS [--surveys hamlet Seville] [--json FILE]
+    python benchmarks/surveys/corrections.py --data DIR --models MODELS [--surveys Seville Delft] [--json FILE]
 
 Three times he reviews the classified file, corrects the five worst patches to the true classes (which he knows), marks
 them as looked at, and trains on top of the model with all that he has checked so far; then the file is classified again.
@@ -22,9 +22,10 @@ from clouds import SURVEYS, VEGETATION
 from review import slug
 
 from pdal_stages import cli
-from pdal_stages.objects.outlines import vector
 from pdal_stages.objects.overlay import points_inside
+from pdal_stages.pipeline.parts import reference_and_wkt
 from pdal_stages.pipeline.reviewing import ReviewRequest, review_files, review_layers
+from pdal_stages.reports.objectlayers import Layer, write_layers
 from pdal_stages.review.patches import REASONS
 
 ROUNDS, PATCHES = 3, 5
@@ -79,8 +80,8 @@ def rounds(data: Path, name: str, model: Path, folder: Path) -> dict[str, Any]:
         codes[mine] = np.where(truth[mine] > 0, truth[mine], 1)
         after.classification = codes
         after.write(folder / "after.laz")
-        area = folder / f"area{number}.geojson"
-        _write_area(area, [shapes[k] for k in chosen])
+        area = folder / f"area{number}.gpkg"
+        write_area(area, [shapes[k] for k in chosen], reference_and_wkt(str(before))[1])
         checked = folder / f"checked{number}.laz"
         run(
             "corrections", checked_file, folder / "after.laz", "--area", area, "--around", 0, "--out", checked
@@ -100,15 +101,10 @@ def rounds(data: Path, name: str, model: Path, folder: Path) -> dict[str, Any]:
     }
 
 
-def _write_area(path: Path, shapes: list[Any]) -> None:
-    collection = {
-        "type": "FeatureCollection",
-        "features": [
-            {"type": "Feature", "properties": {}, "geometry": json.loads(vector("shapely").to_geojson(shape))}
-            for shape in shapes
-        ],
-    }
-    path.write_text(json.dumps(collection))
+def write_area(path: Path, shapes: list[Any], wkt: str) -> None:
+    """The patches that were looked at."""
+    done = {"done": np.ones(len(shapes), np.int32)}
+    write_layers(path, {"patches": Layer(shapes, "MultiPolygon", done)}, wkt, {})
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -131,7 +127,7 @@ def main() -> None:
         "--models", type=Path, required=True, help="folder that leave_one_out.py --save filled"
     )
     one_file = [name for name, survey in SURVEYS.items() if len(survey.files) == 1]
-    options.add_argument("--surveys", nargs="+", default=["hamlet", "Seville"], choices=one_file)
+    options.add_argument("--surveys", nargs="+", default=["Seville", "Delft"], choices=one_file)
     options.add_argument("--json", type=Path, help="where the figures go")
     args = options.parse_args()
     rows = []

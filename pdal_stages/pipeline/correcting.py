@@ -338,6 +338,13 @@ def _inside(area: str, xyz: NDArray[np.float64], wkt: str, notes: list[str]) -> 
             where=area,
             cure=f"Set '{_DONE}' to 1 where all that is wrong was corrected, e.g. in the table of attributes of QGIS",
         )
+    if not shapes:
+        raise StageError(
+            "no polygon of the area lies over the points",
+            where=area,
+            found=note or "none in the box of the points",
+            cure="Check its reference system; GeoJSON without one is in degrees",
+        )
     inside = points_inside(x, y, shapes)
     notes += [note] if note else []
     notes.append(

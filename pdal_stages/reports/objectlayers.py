@@ -204,7 +204,7 @@ def write_layers(
     check_target(path, list(layers))
     driver, many = DRIVERS[Path(path).suffix.lower()]
     files = target_files(path, list(layers))
-    styles = styles or {name: qml(layer.kind, name) for name, layer in layers.items()}
+    styles = styles if styles is not None else {name: qml(layer.kind, name) for name, layer in layers.items()}
     if many:
         with whole_files(*files, what="objects") as (part,):
             for name, layer in layers.items():
