@@ -244,7 +244,7 @@ def run(row, files, model, folder):
     by_tile = row["tiles"] != "none" or several
     target = str(folder / (f"o_#.{suffix}" if by_tile else f"o.{suffix}"))
     last = [{**writer, "filename": target}] if writer else []
-    if row["writer"] == "ogr" and row["door"] in ("objects", "stock"):
+    if row["writer"] == "ogr" and row["door"] == "objects":
         last[0]["measure_dim"] = "Z"  # else PDAL 2.2 takes one from its memory, and crashes
     words = {
         "none": [],

@@ -20,6 +20,8 @@ def test_it_gets_a_measure_where_nobody_names_one(monkeypatch):
     monkeypatch.setattr(pdal_env, "version", lambda: (2, 2, 0))
     for writer in ({"type": "writers.ogr", "filename": "a.gml"}, {"filename": "a.shp"}):
         assert pdal_env.adapted([FAUX, writer])[-1]["measure_dim"] == "Z"
+        expanded = json.loads(Pipeline([FAUX, {"type": "filters.hag_minima"}, writer]).json)["pipeline"]
+        assert expanded[-1]["measure_dim"] == "Z"
     own = {"type": "writers.ogr", "filename": "a.shp", "measure_dim": "Intensity"}
     assert pdal_env.adapted([FAUX, own])[-1] == own
     assert "measure_dim" not in pdal_env.adapted([FAUX, {"filename": "a.las"}])[-1]

@@ -331,6 +331,14 @@ def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return out
 
 
+def with_measures(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Stages whose ``writers.ogr`` is told the dimension of its measure, which PDAL before 2.4 takes from anywhere."""
+    if version() >= (2, 4, 0):
+        return stages
+    many = len(stages) > 1
+    return [{"measure_dim": "Z", **s} if _writes_ogr(s, many and s is stages[-1]) else s for s in stages]
+
+
 def _writes_ogr(stage: dict[str, Any], last: bool) -> bool:
     by_name = last and str(stage.get("filename", "")).lower().endswith((".shp", ".geojson"))
     return stage.get("type") == "writers.ogr" or (by_name and not stage.get("type"))

@@ -93,7 +93,7 @@ class Pipeline:
     @property
     def json(self) -> str:
         """The lowered pipeline, which stock ``pdal pipeline`` runs."""
-        return json.dumps({"pipeline": self.lowered.stages}, indent=2)
+        return json.dumps({"pipeline": pdal_env.with_measures(self.lowered.stages)}, indent=2)
 
     def validate(self) -> str:
         """Check outputs and let PDAL check its own stages' options, without reading points; PDAL's answer, as JSON."""
