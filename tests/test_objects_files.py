@@ -377,3 +377,15 @@ def test_bad_clouds_give_an_error_or_a_whole_file(tmp_path, codes, epsg, text, c
     else:
         assert code == 0
         assert all(not len(layer(target, name)[1]) for name in ("buildings", "trees", "decks"))
+
+
+@pytest.mark.pdal
+def test_what_a_run_keeps_is_not_kept_where_a_link_leads(folder, tmp_path, capsys):
+    victim = tmp_path / "victim"
+    victim.mkdir()
+    (tmp_path / ".t.gpkg.cells").symlink_to(victim)
+    command = ["objects", str(folder / "parts" / "0.laz"), str(tmp_path / "t.gpkg")]
+    for more in ([], ["--resume"]):
+        assert cli.main([*command, *more]) == 1
+        assert "is a link or a file" in capsys.readouterr().err
+    assert not list(victim.iterdir()) and not (tmp_path / "t.gpkg").exists()

@@ -40,6 +40,7 @@ from ..stages.objectswriter import STRAIGHT, ObjectsWriter
 from .classify import ClassifyTask
 from .cloudindex import BLOCK, open_las, read_block
 from .outcome import FoundObjects
+from .store import make_own
 
 #: Whose options the commands take for objects.
 OPTIONS_OF = ("writers.objects", "filters.objects")
@@ -151,7 +152,7 @@ def objects_of_files(
     folder = _kept(stage.filename)
     if not resume:
         shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(exist_ok=True)
+    make_own(folder)
     what = json.dumps({k: str(v) for k, v in sorted(stage.options.items())})
     parts, failed, seen = [], [], np.zeros(256, bool)
     work = []

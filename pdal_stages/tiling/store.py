@@ -66,7 +66,7 @@ class Store:
     def __enter__(self) -> Store:
         try:
             for folder in (self.folder, self.tiles, self.indexes):
-                _make_own(folder)
+                make_own(folder)
             self._take()
             _remove(self.scratch)
             self.scratch.mkdir()
@@ -234,7 +234,7 @@ class Store:
 # ---- files that nobody else put there ----------------------------------------------------------------------
 
 
-def _make_own(folder: Path) -> None:
+def make_own(folder: Path) -> None:
     """Make a folder, or take one that is there: no link, and not another user's in a folder that all may write to."""
     with contextlib.suppress(FileExistsError):
         folder.mkdir()
