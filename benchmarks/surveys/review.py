@@ -153,7 +153,9 @@ def sureness(surveys: Sequence[Classified]) -> Sureness:
     out = Sureness(
         about=f"{len(told)} surveys ({', '.join(one.name for one in told)}), each classified by a model that had not seen it"
     )
-    weight = survey_weights(np.array([float(np.count_nonzero(one.truth)) for one in told]))
+    # Between all points alike and all surveys alike: limits should hold in a survey, not in the sum of all.
+    points = np.array([float(np.count_nonzero(one.truth)) for one in told])
+    weight = points**-0.25 * points.sum() / (points**0.75).sum()
     for one, of_point in zip(told, weight, strict=True):
         known = (one.truth > 0) & np.isin(one.codes, (2, 5, 6))
         out.add(one.codes[known], one.truth[known], one.reliability[known], np.full(known.sum(), of_point))
@@ -161,9 +163,8 @@ def sureness(surveys: Sequence[Classified]) -> Sureness:
 
 
 def survey_weights(points: np.ndarray) -> np.ndarray:
-    """Of a point of each survey: between all points alike and all surveys alike."""
-    weight = points**-0.25
-    return weight * points.sum() / (weight * points).sum()
+    """Of a point of each survey: all alike, so that sums are right over all surveys together."""
+    return np.ones(len(points))
 
 
 def judged(one: Classified, calibration: Calibration) -> dict[str, Any]:
