@@ -761,10 +761,11 @@ def _demo(options: argparse.Namespace) -> None:
 def _warmup(options: argparse.Namespace) -> None:
     from .base.threads import available_threads
     from .classifier.warmup import compile_part, features_part, other_part, warmup
+    from .objects.warmup import objects_part
     from .pipeline.processes import each_file
     from .synthetic.demo import compile_kernels
 
-    parts = [(part,) for part in (features_part, other_part, compile_kernels)]
+    parts = [(part,) for part in (features_part, other_part, objects_part, compile_kernels)]
     for _, answer in each_file(compile_part, parts, min(2, available_threads())):
         if answer.reason:
             raise StageError("the kernels cannot be compiled", found=answer.reason)

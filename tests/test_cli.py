@@ -14,6 +14,7 @@ import pytest
 
 from pdal_stages.classifier import modelfile
 from pdal_stages.classifier.featureforest import shared_features
+from pdal_stages.classifier.warmup import _bridge
 from pdal_stages.cli import main
 from pdal_stages.features import FeaturePlan
 from pdal_stages.pipeline import Pipeline
@@ -300,7 +301,7 @@ def test_what_is_asked_of_one_command_ends_with_it(cloud, tmp_path, capsys, monk
 
 
 @pytest.mark.slow
-def test_after_warmup_the_demo_and_the_defaults_compile_nothing(tmp_path):
+def test_after_warmup_the_demo_and_the_defaults_compile_nothing(tmp_path, write_las):
     """The demo makes a town, trains, classifies with its model and the shipped one, compares, and draws."""
     cache = tmp_path / "cache"
 
@@ -318,6 +319,10 @@ def test_after_warmup_the_demo_and_the_defaults_compile_nothing(tmp_path):
     there = compiled("warmup")
     assert len(there) > 20
     assert compiled("demo", tmp_path / "demo", "--size", 60, "--density", 4) == there
+    xyz = dict(zip("XYZ", _bridge().T, strict=True))
+    bridge = write_las(tmp_path / "bridge.las", {**xyz, "NumberOfReturns": np.ones(len(xyz["X"]), np.uint8)})
+    assert compiled("classify", bridge, tmp_path / "out.las") == there
+    assert np.count_nonzero(laspy.read(tmp_path / "out.las").classification == 17) > 500
 
 
 def test_a_mistyped_flag_is_named_with_its_command(capsys):

@@ -63,9 +63,16 @@ def _cloud() -> np.ndarray:
     return np.random.default_rng(0).uniform(0.0, 12.0, (400, 3))
 
 
+def _bridge() -> np.ndarray:
+    """A deck over a valley, with land at both of its ends: what is asked of decks is asked only where one may be."""
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-120.0, 120.0), np.arange(-80.0, 80.0)))
+    return np.column_stack([x, y, np.where(abs(y) <= 4.0, 6.0, np.clip((abs(x) - 15.0) / 7.5, 0.0, 6.0))])
+
+
 def _heights(xyz: np.ndarray) -> dict[str, np.ndarray]:
     axes = np.ascontiguousarray(xyz.T)
     detached_noise(*axes)
+    filtered_ground(*np.ascontiguousarray(_bridge().T), openings=(5,), decks=True, threads=1)
     dimensions = filtered_ground(*axes, openings=(5,), threads=1)
     dimensions["HeightAboveGround"] = hag_minima(*axes)
     return dimensions
