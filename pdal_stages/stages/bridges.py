@@ -9,7 +9,7 @@ from ..base.asprs import BRIDGE, OVERLAP
 from ..terrain.decks import PARTS, SURFACE
 from .base import Stage
 from .options import option
-from .points import Points
+from .points import Points, class_counts
 from .selection import UNWANTED, Selection
 
 #: What parapets, flanks and cars are called where they are taken for something that stands on the ground.
@@ -68,9 +68,6 @@ they leave (`left`).
         figures = points.report.figures
         figures["decks"], figures["parts"] = int(np.count_nonzero(found)), int(np.count_nonzero(parts))
         left = found & (before != self.code)
-        figures["left"] = {
-            str(code): int(n) for code, n in zip(*np.unique(before[left], return_counts=True), strict=True)
-        }
-        there = np.unique(codes[free])
-        figures["classes"] = {str(code): int(np.count_nonzero(codes[free] == code)) for code in there}
+        figures["left"] = class_counts(before[left])
+        figures["classes"] = class_counts(codes[free])
         return {"Classification": points.with_codes(codes)}

@@ -19,7 +19,7 @@ from ..models import find
 from .base import Stage
 from .loading import loaded_model
 from .options import option
-from .points import Points
+from .points import Points, class_counts
 from .preparation import as_json, same
 from .selection import UNWANTED, Selection
 
@@ -323,8 +323,7 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
             given &= found.reliability >= np.float32(self.reject_below)
         for code, limit in zip((MEDIUM, LOW), reversed(self.bands or ()), strict=True):
             codes[given & (height < limit)] = code
-        there, number = np.unique(codes[wanted], return_counts=True)
-        found.report.figures["classes"] = {str(int(c)): int(m) for c, m in zip(there, number, strict=True)}
+        found.report.figures["classes"] = class_counts(codes[wanted])
 
     def _refuse_codes_that_stay(self, points: Points, wanted: NDArray[np.bool_]) -> None:
         """Before any work: codes that points keep must fit the file, as those do that the model gives."""

@@ -232,3 +232,8 @@ class Points:
                 cure="Convert the input to LAS 1.4 first (minor_version 4, dataformat_id 6)",
             )
         return codes | flags
+
+
+def class_counts(codes: NDArray[np.integer]) -> dict[str, int]:
+    """Points of each class code, for metadata."""
+    return {str(code): int(n) for code, n in zip(*np.unique(codes, return_counts=True), strict=True)}

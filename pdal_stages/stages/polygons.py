@@ -10,7 +10,7 @@ from ..objects.outlines import with_vector
 from ..objects.overlay import Overlay, inside_of
 from .base import Stage
 from .options import option
-from .points import Points
+from .points import Points, class_counts
 from .selection import UNWANTED, Selection
 
 
@@ -81,7 +81,6 @@ class a point has.
             counts[f"{name}={overlay.code}"] = {"polygons": polygons, "points": len(found)}
             notes += [note] if note else []
         points.report.figures["polygons"] = counts
-        there, number = np.unique(codes[change], return_counts=True)
-        points.report.figures["classes"] = {str(int(c)): int(n) for c, n in zip(there, number, strict=True)}
+        points.report.figures["classes"] = class_counts(codes[change])
         points.report.notes += notes
         return {"Classification": points.with_codes(codes)}

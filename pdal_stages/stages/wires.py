@@ -9,7 +9,7 @@ from ..base.asprs import OVERLAP, WIRE
 from ..terrain.wires import REACH, find_wires
 from .base import Stage
 from .options import option
-from .points import Points
+from .points import Points, class_counts
 from .selection import UNWANTED, Selection
 
 
@@ -70,9 +70,6 @@ as `left`.
         codes[found] = self.code
         figures = points.report.figures
         figures["wires"] = int(np.count_nonzero(found))
-        left = np.unique(before[found & (before != self.code)], return_counts=True)
-        figures["left"] = {str(code): int(n) for code, n in zip(*left, strict=True)}
-        figures["classes"] = {
-            str(c): int(np.count_nonzero(codes[points.inside] == c)) for c in np.unique(codes[points.inside])
-        }
+        figures["left"] = class_counts(before[found & (before != self.code)])
+        figures["classes"] = class_counts(codes[points.inside])
         return {"Classification": points.with_codes(codes)}
