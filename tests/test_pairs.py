@@ -209,9 +209,12 @@ def columns(x, y, z, codes):
     return out[np.lexsort(out.T[::-1])]
 
 
-def expected(row, files, model):
-    """The points of a plain run, without tiles or writer."""
-    key = (row["input"], row["model"], row["option"])
+def expected(row, files, model, old=False):
+    """The points of a plain run, without tiles or writer; `old`: as files before LAS 1.4 say it.
+
+    Class 12 of these is class 0 with the flag Overlap to newer PDAL, which writes 12 into such files again.
+    """
+    key = (row["input"], row["model"], row["option"], old)
     if key not in _plain:
         run = ps.Pipeline([*map(reader, files), *stages(model, row)])
         run.execute()
@@ -219,6 +222,8 @@ def expected(row, files, model):
         codes = a["Classification"]
         if "ClassFlags" not in a.dtype.names and "Withheld" not in a.dtype.names:
             codes = codes & 31  # flags of old files, as PDAL 2.2 reads them
+        if old and "Overlap" in a.dtype.names:
+            codes = np.where(a["Overlap"] == 1, np.uint8(12), codes)
         _plain[key] = columns(a["X"], a["Y"], a["Z"], codes)
     return _plain[key]
 
@@ -343,7 +348,8 @@ def test_row(number, request, scenes, models, tmp_path, capfd):
     assert bool(outputs) == (row["writer"] != "none"), said
     found = read_back(row, outputs)
     if found is not None:
-        wanted = expected(row, files, model)
+        old = row["writer"].startswith("la") and laspy.read(outputs[0]).point_format.id < 6
+        wanted = expected(row, files, model, old)
         if row["door"] == "objects" and not pdal_env.splits_class_flags():
             found[:, 3] = found[:, 3].astype(int) & 31  # there PDAL 2.2 writes flags as it reads them
         assert np.array_equal(np.bincount(found[:, 3].astype(int)), np.bincount(wanted[:, 3].astype(int)))

@@ -337,6 +337,7 @@ def test_algorithms_are_listed(qgis):
         "train",
         "accuracy",
         "review",
+        "corrections",
         "objects",
         "check",
     ):
@@ -369,6 +370,8 @@ def test_parameters_are_the_commands_own(session, capsys):
         if one["name"] in ("where", "memory", "workers", "polygons", "per"):
             assert shown[one["name"].upper()][3] == one["help"]
     assert shown["PER"][1] and not shown["MEMORY"][1]  # advanced, and not
+    for name in ("BRIDGES", "WIRES"):
+        assert name in shown and not shown[name][1]
     heights = session("parameters", "heights")["parameters"]
     assert heights["WINDOW"][2] == "75.0" and heights["WINDOW"][3].startswith("Radius of the largest window")
 
@@ -441,6 +444,14 @@ def test_the_way_of_a_tile(qgis, session, town, tmp_path):
     review = [f"INPUTS={out / 'c.laz'}", f"OUTPUT={out / 'r.gpkg'}", f"PAGE={out / 'r.html'}"]
     said = qgis("run", "pdalstages:review", "--", *review)
     assert (out / "r.gpkg").is_file() and (out / "r.html").is_file(), said
+    marked = [f"BEFORE={out / 'c.laz'}", f"AFTER={town}", f"OUTPUT={out / 'k.laz'}", "AROUND=2"]
+    said = qgis("run", "pdalstages:corrections", "--", *marked, f"AREA={out / 'r.gpkg'}", code=1)
+    assert "no patch is marked as looked at" in said and not (out / "k.laz").exists()
+    said = qgis("run", "pdalstages:corrections", "--", *marked)
+    words = ["corrections", str(out / "c.laz"), str(town), "--around", "2"]
+    assert main([*words, "--out", str(tmp_path / "k.laz")]) == 0
+    assert (out / "k.laz").read_bytes() == (tmp_path / "k.laz").read_bytes()
+    assert np.count_nonzero(laspy.read(out / "k.laz")["Checked"]), said
 
 
 @pytest.mark.pdal

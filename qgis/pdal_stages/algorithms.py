@@ -20,6 +20,8 @@ from . import results
 from .base import CLOUDS, LAZ, Algorithm, written
 
 _VECTORS = "GeoPackage (*.gpkg);;GeoJSON (*.geojson);;FlatGeobuf (*.fgb);;Shapefiles (*.shp)"
+_AREAS = "Polygons (*.gpkg *.geojson *.fgb *.shp);;All files (*)"
+_CORRECTED = "Point clouds, tables, layers (*.laz *.las *.csv *.gpkg *.geojson *.fgb *.shp);;All files (*)"
 _MODELS = "Model files (*.model);;All files (*)"
 _SHOW = "Show the result on the map"
 NOT_NOISE = {"type": "filters.range", "limits": "Classification![7:7],Classification![18:18]"}
@@ -76,7 +78,7 @@ class _Showing(Algorithm):
 
 class _Classifying(_Showing):
     command = "classify"
-    listed = ("dimensions", "noise", "consistency", "polygons", "where")
+    listed = ("dimensions", "noise", "bridges", "wires", "consistency", "polygons", "where")
 
     def add_model(self):
         name = self.forms["models"][0] if self.forms["models"] else ""
@@ -140,7 +142,7 @@ class ClassifySurvey(_Classifying):
         "Classifies files and folders in tiles without seams, within a bound for memory: as many files come out as go in. "
         "What an earlier run in the same folder finished can be kept, so a canceled run goes on where it stopped."
     )
-    listed = ("memory", "resume", "dimensions", "noise", "consistency", "polygons", "where")
+    listed = ("memory", "resume", *_Classifying.listed)
     own = ("model", "objects", "report", "metadata")
 
     def initAlgorithm(self, configuration=None):
@@ -400,8 +402,7 @@ class Review(_Showing):
     key, title, command = "review", "Where to look: likely errors of a classified point cloud", "review"
     about = (
         "Lists where a person should look in classified point clouds, worst first, as patches with the number of errors "
-        "expected in each, and as a page with pictures. What is right or was corrected can be learned from: pdal-stages "
-        "corrections."
+        "expected in each, and as a page with pictures. What is right or was corrected can be learned from: see Corrections."
     )
     listed = ("share",)
     own = ("html", "json")
@@ -426,6 +427,39 @@ class Review(_Showing):
         if self.parameterAsBool(parameters, "SHOW", context):
             self.to_show.append(("vector", target))
         return {"OUTPUT": target, "PAGE": page, "HTML": page}
+
+
+class Corrections(_Showing):
+    """What a person has looked at, for training."""
+
+    key, title, command = "corrections", "Corrections: mark what was looked at", "corrections"
+    about = (
+        "Marks the points whose classes a person has corrected, or looked at and found right, in the dimension Checked: "
+        "training then learns from these points alone."
+    )
+    listed = ("around", "within")
+    own = ("before", "after", "out", "area")
+
+    def initAlgorithm(self, configuration=None):
+        self.add_file("BEFORE", "Point cloud as it was classified", self.help_of("before"))
+        self.add_file("AFTER", "Corrected", self.help_of("after"), _CORRECTED, optional=True)
+        self.add_file("AREA", "What was looked at", self.help_of("area"), _AREAS, optional=True)
+        self.add_declared()
+        made = QgsProcessingParameterFileDestination("OUTPUT", "Checked point cloud", LAZ)
+        made.setHelp(self.help_of("out"))
+        self.addParameter(made)
+        self.add_show()
+
+    def processAlgorithm(self, parameters, context, feedback):
+        target = written(self.parameterAsFileOutput(parameters, "OUTPUT", context))
+        before, after, area = (
+            self.parameterAsFile(parameters, key, context) for key in ("BEFORE", "AFTER", "AREA")
+        )
+        chosen = [*self.arguments(parameters, context), f"--out={target}"]
+        chosen += [f"--area={area}"] if area else []
+        self.execute(["corrections", *chosen, before, *([after] if after else [])], feedback)
+        self.show_clouds([target], parameters, context)
+        return {"OUTPUT": target}
 
 
 def reader(source):
@@ -461,4 +495,14 @@ def class_map(cloud, target, side):
     return [reader(cloud), NOT_NOISE, writes]
 
 
-ALGORITHMS = (ClassifyFile, ClassifySurvey, Heights, TerrainModels, Train, Accuracy, Review, Objects)
+ALGORITHMS = (
+    ClassifyFile,
+    ClassifySurvey,
+    Heights,
+    TerrainModels,
+    Train,
+    Accuracy,
+    Review,
+    Corrections,
+    Objects,
+)

@@ -10,6 +10,8 @@ from qgis.core import (
     QgsProcessingParameterString,
 )
 
+#: One of several: blanks in it stand between quotes.
+_WORDS = re.compile(r'(?:"[^"]*"|[^\s"])+')
 #: Settings of a terminal, of a batch system, or that a dialog has its own widgets for.
 LEFT_OUT = (
     "log",
@@ -100,5 +102,5 @@ def words(algorithm, declared, key, parameters, context):
         return []
     if declared["kind"] == "boolean":
         return [declared["flag"] if value else declared["off"] or declared["flag"]]
-    several = value.split() if declared["many"] else [value]
+    several = [one.replace('"', "") for one in _WORDS.findall(value)] if declared["many"] else [value]
     return [f"{declared['flag']}={one}" for one in several]
