@@ -527,13 +527,17 @@ def test_errors_are_the_commands_own(qgis, tmp_path):
 
 @pytest.mark.pdal
 @needs_qgis
-def test_cancel_leaves_nothing(session, tmp_path):
+def test_cancel_leaves_nothing(session, program, town, tmp_path):
     large = tmp_path / "large.laz"
     write_town(TownOptions(size=250.0, density=8.0, seed=3), large)
     done = session("cancel", large, tmp_path / "out.laz")
     assert not done["good"] and done["seconds"] < 40
     assert any("Canceled" in line for line in done["lines"])
-    assert [path.name for path in tmp_path.iterdir()] == ["large.laz"]
+    left = [path.name for path in tmp_path.iterdir() if not path.name.startswith(".pdal-stages-partial-")]
+    assert left == ["large.laz"]
+    # What a run has left that was ended in PDAL's midst goes with the next one there
+    subprocess.run([program, "classify", town, tmp_path / "out.laz"], check=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["large.laz", "out.laz"]
 
 
 @pytest.mark.pdal

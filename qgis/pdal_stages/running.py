@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 
 from . import environment
 
@@ -63,17 +64,15 @@ def run(program, arguments, feedback, text=None, quiet=False):
         one.start()
     if text is not None:
         threading.Thread(target=_write, args=(process.stdin, text), daemon=True).start()
-    printed, said, open_streams, canceled = [], [], len(readers), False
-    waited = 0.0
+    printed, said, open_streams, canceled = [], [], len(readers), None
     while open_streams:
         if feedback.isCanceled():
-            if not canceled:
-                canceled = True
+            if canceled is None:
+                canceled = time.monotonic()
                 feedback.pushInfo("Canceling: the run cleans up ...")
                 _interrupt(process)
-            elif waited >= PATIENCE:
+            elif time.monotonic() - canceled >= PATIENCE:
                 _kill(process)
-            waited += 0.1
         try:
             of, line = lines.get(timeout=0.1)
         except queue.Empty:
@@ -90,7 +89,9 @@ def run(program, arguments, feedback, text=None, quiet=False):
     process.stdout.close()
     process.stderr.close()
     if canceled or feedback.isCanceled():
-        raise Failed("Canceled; nothing half-written was left.")
+        raise Failed(
+            "Canceled; no output was written. A hidden folder that may be left is removed by the next run there."
+        )
     if code:
         raise Failed(said[-1] if said else f"pdal-stages ended with exit code {code}.")
     return "\n".join(printed)
