@@ -4,8 +4,9 @@
 
 Delft keeps the labels of one in a hundred squares of 5 m of its training part, drawn at random; all other points are
 neighbors. The town has Delft's density and classes (ground, building, all else). Forests: from the few labels, from the
-town, from both as two surveys, and on top of the town's (`base`). Networks: from the few labels, from the town, and from
-the town on (`start_from`). All of Delft's test part is scored, nothing is chosen by it.
+town, from both as two surveys, and on top of the town's (`base`). Networks: from the town, from the town on (`start_from`),
+and from the few labels alone, with the epochs that the latter had on Delft and with those of the town as well. All of
+Delft's test part is scored, nothing is chosen by it.
 """
 
 from __future__ import annotations
@@ -118,8 +119,9 @@ def main() -> None:
             score("alsnet", "town", None, network, [simulated], 0, before).save(start)
             for seed in range(options.seeds):
                 labeled = [few(parts["train"], seed)]
-                score("alsnet", "1 %", seed, network, labeled, seed, after)
                 score("alsnet", "town, then 1 %", seed, network, labeled, seed, after, start_from=start)
+                score("alsnet", "1 %, epochs of both", seed, network, labeled, seed, before + after)
+                score("alsnet", "1 %", seed, network, labeled, seed, after)
 
 
 if __name__ == "__main__":

@@ -722,7 +722,7 @@ def _compare_objects(options: argparse.Namespace) -> None:
     pages = {"json": kinds.JSON, "html": kinds.HTML}
     outputs = [Output(path, k, kind) for k, kind in pages.items() if (path := getattr(options, k))]
     check_outputs(outputs, [found, reference, *([options.area] if options.area else [])])
-    figures, one, two = objectaccuracy.compare_files(found, reference, options.area)
+    figures, one, two = objectaccuracy.compare_objects(found, reference, options.area)
     print(objectaccuracy.table(figures), end="")
     if options.json:
         text = json.dumps(objectaccuracy.to_json(figures), indent=1) + "\n"

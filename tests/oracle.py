@@ -161,7 +161,7 @@ def kopt(xyz, q, k_min=10, k_max=100, cap=math.inf):
 
 
 def ropt_radii(r_min=0.25, r_max=2.0, step=0.05):
-    """The radii tried: r_min, r_min + step, ... up to r_max, rounded to nanometres."""
+    """The radii tried: r_min, r_min + step, ... up to r_max, rounded to nanometers."""
     count = math.floor((r_max - r_min) / step + 1e-9) + 1
     return [round(r_min + i * step, 9) for i in range(count)]
 

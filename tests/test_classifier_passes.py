@@ -20,7 +20,7 @@ FEW = {
 }
 
 
-def learnt(passes=2, **more):
+def learned(passes=2, **more):
     xyz, label, dimensions = scene()
     options = TrainingOptions(**{**FEW, **more}, passes=passes)
     return train([TrainingCloud(xyz, label, dimensions, "a.laz")], options, progress=False)
@@ -28,12 +28,12 @@ def learnt(passes=2, **more):
 
 @pytest.fixture(scope="module")
 def two():
-    return learnt()
+    return learned()
 
 
 @pytest.fixture(scope="module")
 def three():
-    return learnt(3, context=["own", "columnvotes2"])
+    return learned(3, context=["own", "columnvotes2"])
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def everything(model, xyz, dimensions, where=None, **more):
 
 def test_a_second_pass_sees_more_than_the_first(two, other):
     xyz, label, dimensions = other
-    one = (learnt(1).predict(xyz, dimensions).classification == label).mean()
+    one = (learned(1).predict(xyz, dimensions).classification == label).mean()
     assert 1 - (two.predict(xyz, dimensions).classification == label).mean() < 0.5 * (1 - one)
     inner = max(two.passes[0].plan.halo_m + 8.0, two.passes[1].plan.halo_m)
     assert two.halo_m == inner + two.voxel
@@ -135,7 +135,7 @@ def test_smoothing_rejection_and_empty_clouds(two, other):
 
 
 def test_binary():
-    model = learnt(strategy="binary", target=6)
+    model = learned(strategy="binary", target=6)
     xyz, label, dimensions = scene(seed=3)
     found = model.predict(xyz, dimensions).classification
     assert set(np.unique(found)) == {1, 6} and (found == np.where(label == 6, 6, 1)).mean() > 0.9

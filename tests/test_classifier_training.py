@@ -133,7 +133,7 @@ def test_training_does_not_depend_on_order_or_threads(trained, tmp_path):
     )
     trained.save(tmp_path / "a")
     again.save(tmp_path / "b")
-    # The samples come in another order, so only what is learnt from them as a set is equal ...
+    # The samples come in another order, so only what is learned from them as a set is equal ...
     assert (
         again.algorithm.features.bins == trained.algorithm.features.bins
         and again.info["classes"] == trained.info["classes"]

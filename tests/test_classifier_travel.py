@@ -25,7 +25,7 @@ def clouds(n=3, **more):
     ]
 
 
-def learnt(these, **more):
+def learned(these, **more):
     return train(these, TrainingOptions(**{**FEW, **more}), progress=False)
 
 
@@ -63,7 +63,7 @@ def test_a_copy_has_its_density_in_any_order_and_tile(seed, wanted):
 
 def test_copies_are_trained_on_as_clouds_of_the_same_survey():
     one = clouds(1)
-    model = learnt(one, thin=[0.3, 0.1, 50.0], passes=2, context=["own"])
+    model = learned(one, thin=[0.3, 0.1, 50.0], passes=2, context=["own"])
     names = [(c["name"], c["points"]) for c in model.info["training"]["clouds"]]
     assert [name for name, _ in names] == [
         "0.laz",
@@ -74,12 +74,12 @@ def test_copies_are_trained_on_as_clouds_of_the_same_survey():
     assert model.info["densities"]["low"] < 0.5 < model.info["densities"]["high"]
     assert "0.25 to " in str(model) and "points/m2" in str(model)
     by_hand = [one[0], *(one[0].part(thinned(one[0].xyz, d), f"thinned to {d:g} per m2") for d in (0.3, 0.1))]
-    again = learnt(by_hand, passes=2, context=["own"])
+    again = learned(by_hand, passes=2, context=["own"])
     assert np.array_equal(again.passes[1].forest.threshold, model.passes[1].forest.threshold)
 
 
 def test_a_cloud_of_another_density_is_told(tmp_path):
-    model = learnt(clouds(1))
+    model = learned(clouds(1))
     xyz, _, dimensions = scene(5, 3000)
     report = model.predict(xyz, dimensions).report
     assert not report.warnings and report.figures["density"] == pytest.approx(3000 / 3600, rel=0.3)
@@ -130,12 +130,12 @@ def test_surveys_weigh_alike():
     one = draw_samples(inputs, 3, 60, 0, ["a", "a"])  # tiles of one survey are one
     for name in ("cloud", "row", "label", "weight"):
         assert np.array_equal(getattr(one, name), getattr(alike, name))
-    proportional = learnt(pair, balance=False)
+    proportional = learned(pair, balance=False)
     assert not np.array_equal(
-        proportional.passes[0].forest.threshold, learnt(pair).passes[0].forest.threshold
+        proportional.passes[0].forest.threshold, learned(pair).passes[0].forest.threshold
     )
-    swapped = learnt(pair[::-1])
-    assert np.array_equal(swapped.passes[0].forest.threshold, learnt(pair).passes[0].forest.threshold)
+    swapped = learned(pair[::-1])
+    assert np.array_equal(swapped.passes[0].forest.threshold, learned(pair).passes[0].forest.threshold)
 
 
 def test_more_points_than_are_put_in_order_at_a_time(monkeypatch):
@@ -164,7 +164,7 @@ def test_each_survey_left_out(passes, tmp_path):
     three[2] = TrainingCloud(
         odd.xyz, np.vectorize(wrong.get)(odd.labels), odd.dimensions, name="odd.laz", survey="the odd one"
     )
-    model = learnt(three, leave_one_survey_out=True, passes=passes, context=["own", "box1"])
+    model = learned(three, leave_one_survey_out=True, passes=passes, context=["own", "box1"])
     found = model.info["accuracy"]["leave_one_survey_out"]
     by_name = {row["name"]: row["overall_accuracy"] for row in found["surveys"]}
     assert set(by_name) == {"flight 0", "flight 1", "the odd one"}
@@ -177,18 +177,18 @@ def test_each_survey_left_out(passes, tmp_path):
     assert load_model(tmp_path / "m").info["accuracy"]["leave_one_survey_out"] == json.loads(
         json.dumps(found)
     )
-    plain = learnt(three, passes=passes, context=["own", "box1"])
+    plain = learned(three, passes=passes, context=["own", "box1"])
     assert np.array_equal(plain.passes[-1].forest.threshold, model.passes[-1].forest.threshold)
 
 
 def test_a_survey_left_out_equals_a_model_without_it():
     """One pass: the forest grown with the others' samples alone."""
     three = clouds(3)
-    model = learnt(three, leave_one_survey_out=True, scale=False)
+    model = learned(three, leave_one_survey_out=True, scale=False)
     row = model.info["accuracy"]["leave_one_survey_out"]["surveys"][0]
     assert 0.7 < row["overall_accuracy"] < 1.0 and set(row["f1"]) == {"2", "5", "6"}
     with pytest.raises(OptionError, match="at least two surveys"):
-        learnt(three[:1], leave_one_survey_out=True)
+        learned(three[:1], leave_one_survey_out=True)
 
 
 # ---- noise, one at a time ------------------------------------------------------------------------------
@@ -201,14 +201,14 @@ def test_noise_is_not_even_a_neighbor(tmp_path):
     noisy = np.vstack([xyz, extra])
     labels = np.concatenate([label, np.full(500, 7)])
     more = {"HeightAboveGround": noisy[:, 2]}
-    clean = learnt([TrainingCloud(xyz, label, {"HeightAboveGround": xyz[:, 2]}, "a")])
-    with_noise = learnt([TrainingCloud(noisy, labels, more, "a")])
+    clean = learned([TrainingCloud(xyz, label, {"HeightAboveGround": xyz[:, 2]}, "a")])
+    with_noise = learned([TrainingCloud(noisy, labels, more, "a")])
     assert written(clean, tmp_path, "a") == written(with_noise, tmp_path, "b")
-    kept = learnt([TrainingCloud(noisy, labels, more, "a")], ignore=())
+    kept = learned([TrainingCloud(noisy, labels, more, "a")], ignore=())
     assert kept.info["training"]["clouds"][0]["points"] == len(noisy)
-    named = learnt([TrainingCloud(noisy, labels, more, "a")], classes=[2, 5, 6, 7])
+    named = learned([TrainingCloud(noisy, labels, more, "a")], classes=[2, 5, 6, 7])
     assert [code for code, _ in named.classes] == [2, 5, 6, 7]
-    overlap = learnt([TrainingCloud(noisy, np.where(labels == 7, 12, labels), more, "a")])
+    overlap = learned([TrainingCloud(noisy, np.where(labels == 7, 12, labels), more, "a")])
     assert overlap.info["classes"] == clean.info["classes"]  # 12 gives no samples ...
     assert not np.array_equal(
         overlap.passes[0].forest.threshold, clean.passes[0].forest.threshold
@@ -242,7 +242,7 @@ def test_noise_is_not_even_a_neighbor(tmp_path):
 
 
 def test_clouds_made_one_at_a_time(tmp_path):
-    at_hand = learnt(clouds(3), passes=2, context=["own", "box1"], thin=[0.3])
+    at_hand = learned(clouds(3), passes=2, context=["own", "box1"], thin=[0.3])
     alive = []
 
     def maker(number):
@@ -252,14 +252,14 @@ def test_clouds_made_one_at_a_time(tmp_path):
 
         return make
 
-    later = learnt([maker(k) for k in range(3)], passes=2, context=["own", "box1"], thin=[0.3])
+    later = learned([maker(k) for k in range(3)], passes=2, context=["own", "box1"], thin=[0.3])
     assert alive == [0, 1, 2]  # each made once
-    streamed = learnt((cloud for cloud in clouds(3)), passes=2, context=["own", "box1"], thin=[0.3])
+    streamed = learned((cloud for cloud in clouds(3)), passes=2, context=["own", "box1"], thin=[0.3])
     assert (
         written(at_hand, tmp_path, "a") == written(later, tmp_path, "b") == written(streamed, tmp_path, "c")
     )
     with pytest.raises(OptionError, match="no training cloud"):
-        learnt(iter(()))
+        learned(iter(()))
 
 
 def test_options():

@@ -52,7 +52,7 @@ def test_random_cloud(random_cloud):
     check(xyz, np.arange(0, 2500, 40), radii=(0.5, 1.0, 2.5, 5.0))
 
 
-def test_utm_coordinates_with_millimetres(random_cloud, rng):
+def test_utm_coordinates_with_millimeters(random_cloud, rng):
     xyz = random_cloud(1500, seed=2, extent=(15, 15, 0.02), origin=(500_000, 6_000_000, 4000))
     check(xyz, np.arange(0, 1500, 50), radii=(0.7, 3.0), atol=1e-8)
 

@@ -63,7 +63,7 @@ def test_png_holds_the_pixels(rgb, palette):
     assert np.array_equal(pixels(png(rgb, palette)), rgb)  # 144 colors at most, so a palette holds them
 
 
-def test_a_palette_is_close_and_keeps_rare_colours():
+def test_a_palette_is_close_and_keeps_rare_colors():
     shades = np.zeros((256, 256, 3), np.uint8)
     shades[..., 0] = np.arange(256)
     shades[..., 1] = np.arange(256)[:, None] // 64
@@ -153,7 +153,7 @@ def test_points_that_are_not_finite_are_left_out():
         assert np.array_equal(clean, dirty)
 
 
-def test_values_take_the_ramp_and_nan_is_grey(even_light):
+def test_values_take_the_ramp_and_nan_is_gray(even_light):
     x, y, z = block()
     value = np.where(x > 10, 1.0, 0.0)
     value[0] = np.nan

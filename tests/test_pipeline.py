@@ -456,11 +456,11 @@ def test_feet_are_converted(tmp_path, write_las):
             "feature_set": "Density,HeightRange",
         },
     ]
-    in_metres = ps.run_pipeline([str(a), *stages]).arrays[0]
+    in_meters = ps.run_pipeline([str(a), *stages]).arrays[0]
     in_feet = ps.run_pipeline([str(b), *stages]).arrays[0]
-    near = np.abs(in_feet["HeightAboveGround"] * foot - in_metres["HeightAboveGround"]) < 0.01
+    near = np.abs(in_feet["HeightAboveGround"] * foot - in_meters["HeightAboveGround"]) < 0.01
     assert near.mean() > 0.99  # points on cell edges may fall on the other side
-    assert np.mean(np.isclose(in_feet["Density_c2"], in_metres["Density_c2"], rtol=1e-3)) > 0.97
+    assert np.mean(np.isclose(in_feet["Density_c2"], in_meters["Density_c2"], rtol=1e-3)) > 0.97
 
 
 @pytest.mark.data

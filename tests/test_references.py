@@ -69,7 +69,7 @@ def test_units_of_two_kinds(tmp_path, inputs, one, two):
 
 
 @pytest.mark.parametrize("references", [(METERS, DEGREES), (DEGREES, METERS)])
-def test_degrees_beside_metres(tmp_path, inputs, references):
+def test_degrees_beside_meters(tmp_path, inputs, references):
     for way in ways(tmp_path, inputs(*references)):
         with pytest.raises(StageError, match=r"degrees") as caught:
             way()

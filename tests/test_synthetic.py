@@ -18,7 +18,7 @@ from pdal_stages.base.errors import OptionError
 from pdal_stages.synthetic import Town, TownOptions, make_town, town_chunks, write_town
 from pdal_stages.synthetic.raycast import first_hit
 from pdal_stages.synthetic.solids import BUILDING, COUNT, FIRST, VEGETATION, Site, build_scene
-from pdal_stages.synthetic.townplan import make_plan
+from pdal_stages.synthetic.townplan import plan_town
 
 COLUMNS = [f.name for f in dataclasses.fields(Town) if f.name != "options"]
 
@@ -173,7 +173,7 @@ def scene_of(site: Site):
 
 
 def test_first_hit_equals_marching_through_all_things():
-    rng, site = np.random.default_rng(4), Site(make_plan(1), 0, 0)
+    rng, site = np.random.default_rng(4), Site(plan_town(1), 0, 0)
     for _ in range(25):
         a, b, z = *rng.uniform(0, 30, 2), rng.uniform(0, 10)
         half, up = rng.uniform(0.3, 4), rng.uniform(0.5, 6)
@@ -199,7 +199,7 @@ def test_first_hit_equals_marching_through_all_things():
 
 @pytest.mark.parametrize("extinction", [0.2, 0.6, 1.5])
 def test_leaves_follow_beer_and_lambert(extinction):
-    rng, site = np.random.default_rng(0), Site(make_plan(1), 0, 0)
+    rng, site = np.random.default_rng(0), Site(plan_town(1), 0, 0)
     site.box(0, 0, 0, 30, 30, 0, 4.0, VEGETATION, "leaf", leafy=extinction)
     scene, passed = scene_of(site), 0
     tested = np.full(1, -1)

@@ -328,7 +328,7 @@ def test_ground_is_found_in_a_town_on_a_slope():
     )
 
 
-def test_a_hall_of_150_metres_and_a_ridge():
+def test_a_hall_of_150_meters_and_a_ridge():
     rng = np.random.default_rng(0)
     x, y = rng.uniform(0, 300, (2, 90_000))
     hall = np.maximum(np.abs(x - 150), np.abs(y - 150)) < 75

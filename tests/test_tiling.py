@@ -145,7 +145,7 @@ def test_one_file_comes_back_bit_for_bit(tmp_path, town_file, model_file, whole)
     assert len(run.tiles) == 11  # the hole's tile has no points
     x, y = (np.asarray(v) for v in (laspy.read(town_file).x, laspy.read(town_file).y))
     assert np.count_nonzero(x == 500_040.0) > 10 and np.count_nonzero(y == 5_400_030.0) > 10
-    assert any(job.report["read"] < run.summary["points"] for job in run.tiles)  # some were really cut
+    assert any(job.record["read"] < run.summary["points"] for job in run.tiles)  # some were really cut
     clouds.same_points(whole, tmp_path / "out.laz")
     counted = np.bincount(np.asarray(laspy.read(whole).classification), minlength=7)
     assert run.summary["classes"] == {str(c): int(counted[c]) for c in np.flatnonzero(counted)}
@@ -386,12 +386,12 @@ def test_sparse_points_widen_the_surroundings(tmp_path, random_cloud, write_las)
     pipeline[-1] = {**pipeline[-1], "filename": str(tmp_path / "b.las")}
     run = run_tiled(pipeline, 60, workers=0)
     assert not run.failures and not [note for note in run.messages if "meters were assumed" not in note]
-    assert any(job.report["widened"] for job in run.tiles)
+    assert any(job.record["widened"] for job in run.tiles)
     clouds.same_points(tmp_path / "a.las", tmp_path / "b.las")
     pipeline[-1] = {**pipeline[-1], "filename": str(tmp_path / "c.las")}
     run = run_tiled(pipeline, 60, workers=0, most_points=50)  # no room to widen: said, not hidden
     assert any("may differ" in note for note in run.messages)
-    assert any(job.report["short"] for job in run.tiles)
+    assert any(job.record["short"] for job in run.tiles)
 
 
 def test_sparse_points_widen_the_surroundings_of_a_model(tmp_path, random_cloud, write_las):
@@ -402,7 +402,7 @@ def test_sparse_points_widen_the_surroundings_of_a_model(tmp_path, random_cloud,
     assert len(ps.load_model(model_file).passes) == 2
     ps.Pipeline(clouds.stages([path], tmp_path / "a.las", model_file)).execute(arrays=False)
     run = run_tiled(clouds.stages([path], tmp_path / "b.las", model_file), 60, workers=0)
-    assert not run.failures and any(job.report["widened"] for job in run.tiles)
+    assert not run.failures and any(job.record["widened"] for job in run.tiles)
     clouds.same_points(tmp_path / "a.las", tmp_path / "b.las")
 
 
@@ -639,5 +639,5 @@ def test_points_far_away_do_not_stop_a_tile(tmp_path, random_cloud, write_las):
     ps.Pipeline(stages).execute(arrays=False)
     stages[-1] = {**stages[-1], "filename": str(tmp_path / "b.las")}
     run = run_tiled(stages, 100, workers=0)
-    assert not run.failures and not any(job.report["short"] for job in run.tiles)
+    assert not run.failures and not any(job.record["short"] for job in run.tiles)
     clouds.same_points(tmp_path / "a.las", tmp_path / "b.las")

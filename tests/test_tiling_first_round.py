@@ -96,8 +96,8 @@ def test_tiles_are_the_same_bits_and_read_few_points(tmp_path, survey, before):
     whole = np.concatenate(ps.run_pipeline([*survey, *before, HEIGHTS]).arrays)
     for name in MADE:
         assert np.array_equal(of_files(tmp_path / "out", name), whole[name]), name
-    read = sum(job.report["read"] for job in run.tiles)
-    own = sum(job.report["points"] for job in run.tiles)
+    read = sum(job.record["read"] for job in run.tiles)
+    own = sum(job.record["points"] for job in run.tiles)
     near = reach_of_points(1.0)  # what noise marked is kept
     assert read < own * (1 + 2 * near / TILE) ** 2
     assert not list((tmp_path / "out" / ".pdal-stages" / "tiles").glob("*.np[yz]"))

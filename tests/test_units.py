@@ -24,7 +24,7 @@ WKT2 = (
 )
 
 
-def test_metres_and_feet():
+def test_meters_and_feet():
     assert units_of_wkt(METERS) == Units()
     feet = units_of_wkt(FEET)
     assert feet.horizontal == pytest.approx(1200 / 3937)
@@ -40,7 +40,7 @@ def test_wkt2_units_may_sit_on_axes():
     assert units_of_wkt(WKT2).horizontal == 0.3048
 
 
-def test_no_reference_means_metres_and_says_so():
+def test_no_reference_means_meters_and_says_so():
     assert units_of_wkt("").assumed
     assert not units_of_wkt(METERS).assumed
 

@@ -38,12 +38,12 @@ def density(clouds: Sequence[npt.NDArray[np.float64]]) -> float:
     return points / area if area else 1.0
 
 
-def spacing_for(points: int, per_square_metre: float) -> float:
+def spacing_for(points: int, per_square_meter: float) -> float:
     """Spacing in meters at which circles of `points` points cover each point :data:`COVERAGE` times.
 
     A circle covers points / density square meters and each grid point stands for spacing^2 of them.
     """
-    return max(round(math.sqrt(points / (COVERAGE * per_square_metre)), 2), 0.05)
+    return max(round(math.sqrt(points / (COVERAGE * per_square_meter)), 2), 0.05)
 
 
 def halo_m(spacing: float) -> float:

@@ -37,11 +37,11 @@ NOISE = (7, 18)
 #: Wires that carry current, and bridge decks.
 WIRE, BRIDGE = 14, 17
 #: Codes that say nothing about the object: never classified, unclassified.
-UNLABELLED = (0, 1)
+UNLABELED = (0, 1)
 #: Overlap of strips, before LAS 1.4 had a flag for it.
 OVERLAP = 12
 #: Codes that do not say what kind of thing a point is. They are neither trained on nor scored unless they are named.
-UNINFORMATIVE = (*UNLABELLED, *NOISE, OVERLAP)
+UNINFORMATIVE = (*UNLABELED, *NOISE, OVERLAP)
 #: Largest code LAS 1.0-1.3 point formats (0-5) hold: five bits.
 LEGACY_LIMIT = 31
 

@@ -208,7 +208,7 @@ def _laid_out(
     refuse(split & ~np.isfinite(threshold), "a threshold is not a finite number")
     splits = np.concatenate(([0], np.cumsum(split)))  # before each node, in all trees
     before = splits[:-1] - splits[start][tree]
-    refuse(node > 2 * before, "a tree has nodes that are nobody's children")
+    refuse(node > 2 * before, "a tree has nodes without a parent")
     short = sizes != 2 * (splits[end] - splits[start]) + 1
     refuse(short[tree] & (node == sizes[tree] - 1), "a tree ends before all its branches do")
     depths = np.zeros(len(sizes), np.int32)

@@ -54,7 +54,7 @@ FIRST_ROOM = 4096
 
 
 def radii_of(first: float, last: float, step: float) -> np.ndarray:
-    """The radii first, first + step, ... up to `last`, rounded to nanometres.
+    """The radii first, first + step, ... up to `last`, rounded to nanometers.
 
     >>> radii_of(0.25, 0.4, 0.05).tolist()
     [0.25, 0.3, 0.35, 0.4]

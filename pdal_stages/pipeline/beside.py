@@ -38,7 +38,7 @@ def only(writer: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
     OptionError
         If the format has dimensions, but no option to choose among them.
     """
-    kind = writer.get("type") or pdal_env.writer_of(str(writer["filename"]))
+    kind = writer.get("type") or pdal_env.writer_type(str(writer["filename"]))
     listed = ",".join(dict.fromkeys(names))
     if kind == "writers.text":
         return {**writer, "type": kind, "order": listed, "keep_unspecified": False}

@@ -62,7 +62,7 @@ class Parting:
     ----------
     way : str
         ``split``: into two dimensions, right after the readers of LAS 1.0-1.3; ``around``: taken off before each writer
-        that is none of LAS, and put back after it; empty where they come through as they are.
+        of another format than LAS, and put back after it; empty where they come through as they are.
     old : tuple of bool
         Of each reader, whether it reads LAS 1.0-1.3.
     mixed : bool
@@ -143,7 +143,7 @@ def is_ours(stage: Mapping[str, Any]) -> bool:
 
 
 def around(stages: list[dict[str, Any]]) -> Iterator[tuple[dict[str, Any], int | None]]:
-    """The stages, with flags taken off before each writer that is none of LAS, and put back where others follow."""
+    """The stages, with flags taken off before each writer of another format than LAS, and put back where others follow."""
     instead: dict[str, list[str]] = {}
     bare = {n for n, s in enumerate(stages) if is_writer(s, stages) and not writes_las(s)}
     bare -= {n for n in bare if stages[n].get("type") in registry.stages()}

@@ -240,7 +240,7 @@ def read_table(path: str, wkt: str = "") -> tuple[NDArray[np.float64], NDArray[n
     Raises
     ------
     StageError
-        If a column is missing, or a value is no number.
+        If a column is missing, or a value is not a number.
     """
     if not Path(path).exists():
         raise StageError("there is no such file", found=path)
@@ -259,13 +259,13 @@ def read_table(path: str, wkt: str = "") -> tuple[NDArray[np.float64], NDArray[n
     try:
         numbers = np.column_stack([np.asarray(found[name], np.float64) for name in _NAMES])
     except (TypeError, ValueError) as error:
-        raise StageError("the table holds what is no number", where=path, found=str(error)) from None
+        raise StageError("the table has a value that is not a number", where=path, found=str(error)) from None
     codes = numbers[:, 3]
     good = np.isfinite(numbers).all(axis=1) & (codes >= 0) & (codes <= 255) & (codes == np.floor(codes))
     if not good.all():
         row = int(np.flatnonzero(~good)[0])
         raise StageError(
-            "a row of the table is no point with a class code",
+            "a row of the table is not a point with a class code",
             where=path,
             found=f"row {row + 1}: {', '.join(f'{v:g}' for v in numbers[row])}",
         )

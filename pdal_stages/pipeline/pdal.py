@@ -229,7 +229,7 @@ def stages_of(thing: Any) -> list[dict[str, Any]] | None:
     return [{"type": stage.type, **stage.options} for stage in stages]
 
 
-def writer_of(filename: str) -> str:
+def writer_type(filename: str) -> str:
     """The writer that PDAL takes for a file's name; empty where it knows none."""
     bindings()
     from pdal import libpdalpython

@@ -101,7 +101,7 @@ def area_of(path: str) -> Any:
     return vector("shapely").union_all(vector("shapely").make_valid(things.buildings))
 
 
-def compare_files(
+def compare_objects(
     found: str, reference: str, area: str | None = None
 ) -> tuple[dict[str, Any], Things, Things]:
     """Figures of ``buildings`` and ``trees``, as far as both files have them, and what was read."""

@@ -17,7 +17,7 @@ from .districts import fill
 from .flight import Flight
 from .raycast import cast
 from .solids import VEGETATION, build_scene
-from .townplan import block_at, heights, make_plan
+from .townplan import block_at, heights, plan_town
 
 PULSES_PER_CHUNK = 60_000
 SAMPLE = 20_000  # pulses that tell how many returns a pulse gives
@@ -78,7 +78,7 @@ class Town:
 
     def ground_height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """True height of the bare ground at any coordinates of the town (same system as ``xyz``)."""
-        plan = make_plan(int(self.options.seed))
+        plan = plan_town(int(self.options.seed))
         local = np.column_stack([x, y]) - self.options.origin[:2] - self.options.size / 2
         return heights(local @ plan.turn, plan) + self.options.origin[2]
 
@@ -87,7 +87,7 @@ class FlownTown:
     """One town's plan, things and flight, ready to be cast part by part."""
 
     def __init__(self, options: TownOptions) -> None:
-        self.options, self.plan = options, make_plan(int(options.seed))
+        self.options, self.plan = options, plan_town(int(options.seed))
         # Blocks are made when first needed; the latest ones are kept.
         self.block = lru_cache(1500)(lambda i, j: fill(self.plan, i, j))
         # The spacing that gives the wanted density: from the returns of a coarse flight over the middle of the town.

@@ -38,7 +38,7 @@ class Plan(NamedTuple):
     turn: np.ndarray  # (2, 2): meters east and north from the middle, times this, are town coordinates
 
 
-def make_plan(seed: int) -> Plan:
+def plan_town(seed: int) -> Plan:
     """The plan of a seed."""
     rng = np.random.default_rng([seed, 0x7031])
     angle, waves = math.radians(rng.uniform(5.0, 13.0)) * rng.choice([-1, 1]), []

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from .districts import filled
 from .solids import Site
 from .town import SPAN, TownOptions
-from .townplan import block_at, make_plan
+from .townplan import block_at, plan_town
 
 
 class House(NamedTuple):
@@ -65,7 +65,7 @@ def true_objects(options: TownOptions) -> TrueObjects:
     TrueObjects
         In the town's coordinates (meters).
     """
-    plan, half = make_plan(int(options.seed)), options.size / 2
+    plan, half = plan_town(int(options.seed)), options.size / 2
     square = np.array([(p * half, q * half) for p in (-1, 1) for q in (-1, 1)]) @ plan.turn
     low, high = square.min(axis=0) - SPAN, square.max(axis=0) + SPAN
     (i0, j0, _), (i1, j1, _) = block_at(*low, plan), block_at(*high, plan)

@@ -7,7 +7,7 @@ import numpy as np
 from ..base.jit import device, njit
 from .clusters import SIDE
 
-#: Columns within which a plane is led through the ground, and if there are too few, within which then.
+#: Columns within which a plane is fitted through the ground, and if there are too few, within which then.
 NEAR, WIDER = 6, 13
 #: Columns a plane needs.
 ENOUGH = 12

@@ -72,7 +72,7 @@ class FilterOptions:
         """How far away, in cells, lowest points can change which cells are ground, and how high.
 
         An opening looks twice its radius away, a plateau as far as it is wide; low outliers are judged before, and surfaces
-        led through ground between.
+        fitted through ground between.
         """
         surfaces = ROUNDS * planes_reach(self.levels(NEAR))
         found = COMPANY + SURROUNDINGS + 2 * self.largest_radius + plateau_reach(self.cell) + surfaces + 2

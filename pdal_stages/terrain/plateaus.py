@@ -24,7 +24,7 @@ JUMP, WALL = 1.5, 0.75
 #: The share of a set's cells that must have been taken for ground: a few are more likely ground among treetops.
 FOOTING = 0.05
 #: Lower ground must lie in so many of 16 directions from the middle, and be such a share of the ground that is lower or
-#: less than a step away, where there may be a way up; a higher storey does not count.
+#: less than a step away, where there may be a way up; a higher story does not count.
 DIRECTIONS, SHARE = 14, 0.8
 
 

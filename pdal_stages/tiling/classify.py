@@ -190,8 +190,8 @@ class ClassifyTask:
         def finished_one(job: TileJob | FileJob) -> None:
             if finished is not None:
                 for path in (job.outputs or [])[:1]:
-                    classes = {int(code): n for code, n in job.report.get("classes", {}).items()}
-                    finished(Written(path, job.report.get("written", 0), classes))
+                    classes = {int(code): n for code, n in job.record.get("classes", {}).items()}
+                    finished(Written(path, job.record.get("written", 0), classes))
 
         return run_plan(
             plan,

@@ -33,7 +33,7 @@ def run_all(
     show: bool | None,
     finished: Callable[[TileJob | FileJob], None] | None = None,
 ) -> None:
-    """Do all waiting tiles and outputs; their states, reports and reasons are set. `finished` hears of outputs.
+    """Do all waiting tiles and outputs; their states, records and reasons are set. `finished` hears of outputs.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def run_all(
             if answer.reason:
                 item.state, item.reason = "failed", answer.reason
             else:
-                item.state, item.report = "done", answer.result | answer.cost
+                item.state, item.record = "done", answer.result | answer.cost
                 with contextlib.suppress(StageError, OSError):  # no room: a later run does it again
                     work.keep(store, item)
             if finished is not None and item.state == "done" and item.outputs:

@@ -36,7 +36,7 @@ class FileTask:
     scratch: str  #: folder for temporary files
 
     def run(self) -> dict[str, Any]:
-        """Write the outputs; see :func:`~pdal_stages.tiling.tail.run_tail`. The report counts classes, too."""
+        """Write the outputs; see :func:`~pdal_stages.tiling.tail.run_tail`. The record counts classes, too."""
         classes = np.zeros(256, np.int64)
         holds_flags = las.holds_flags(self.source.path)
 
@@ -50,8 +50,8 @@ class FileTask:
                 np.add(classes, np.bincount(codes, minlength=256), out=classes)
             return values
 
-        report = self._write(new_values)
-        return report | {"classes": {str(code): int(classes[code]) for code in np.flatnonzero(classes)}}
+        record = self._write(new_values)
+        return record | {"classes": {str(code): int(classes[code]) for code in np.flatnonzero(classes)}}
 
     def _write(self, new_values: Callable[[int, int], NewValues]) -> dict[str, Any]:
         tail = with_beside(self.tail, self.beside, [self.source.path])

@@ -38,7 +38,8 @@ class _Work:
 
     #: ``waiting``, ``ready`` (an output whose tiles are done), ``done``, ``kept`` (from an earlier run) or ``failed``.
     state: str = "waiting"
-    report: dict[str, Any] = field(default_factory=dict)
+    #: What its task says of it, as it is kept in the work folder: counts, messages, outputs, cost, fingerprint.
+    record: dict[str, Any] = field(default_factory=dict)
     reason: str = ""  #: why it failed
     blocked_by: str = ""  #: the unreadable input that it failed for, where that is the reason
     tries: int = 0
@@ -147,7 +148,7 @@ class TiledRun:
             "failures": [{"what": what, "reason": reason} for what, reason in self.failures],
             "tiles": [
                 {"name": j.name, "tile": list(j.tile), "state": j.state, "tries": j.tries, "points": j.points}
-                | {k: v for k, v in j.report.items() if k != "fingerprint"}
+                | {k: v for k, v in j.record.items() if k != "fingerprint"}
                 | ({"reason": j.reason} if j.reason else {})
                 for j in self.tiles
             ],
@@ -155,9 +156,9 @@ class TiledRun:
                 {"input": o.source.path, "output": o.outputs, "state": o.state}
                 | ({"reason": o.reason} if o.reason else {})
                 | {
-                    k: o.report[k]
+                    k: o.record[k]
                     for k in ("written", "classes", "seconds", "cpu_seconds", "peak_mb")
-                    if k in o.report
+                    if k in o.record
                 }
                 for o in self.outputs
             ],
@@ -170,26 +171,26 @@ def summarize(tiles: list[TileJob], outputs: list[FileJob], seconds: float) -> d
     worked = [job for job in tiles if job.state == "done"]
     classes: dict[str, int] = {}
     for job in tiles:
-        for code, count in (job.report.get("classes") or {}).items():
+        for code, count in (job.record.get("classes") or {}).items():
             classes[code] = classes.get(code, 0) + count
 
     def total(key: str) -> int:
-        return sum(job.report.get(key, 0) for job in worked)
+        return sum(job.record.get(key, 0) for job in worked)
 
-    reports = [job.report for job in worked] + [out.report for out in outputs]
+    records = [job.record for job in worked] + [out.record for out in outputs]
     return {
         "points": total("points"),
         "points_read": total("read"),
         "dropped": total("dropped"),
         "seconds": seconds,
         "points_per_second": total("points") / seconds if seconds else 0.0,
-        "cpu_seconds": sum(report.get("cpu_seconds", 0.0) for report in reports),
-        "peak_mb_of_a_worker": max((report.get("peak_mb", 0.0) for report in reports), default=0.0),
+        "cpu_seconds": sum(one.get("cpu_seconds", 0.0) for one in records),
+        "peak_mb_of_a_worker": max((one.get("peak_mb", 0.0) for one in records), default=0.0),
         "states": {s: sum(job.state == s for job in tiles) for s in ("done", "kept", "failed")},
         "classes": dict(sorted(classes.items(), key=lambda item: int(item[0]))),
         "left_alone": {
             key: n
             for key in LEFT_ALONE
-            if (n := sum(j.report.get("left_alone", {}).get(key, 0) for j in tiles))
+            if (n := sum(j.record.get("left_alone", {}).get(key, 0) for j in tiles))
         },
     }

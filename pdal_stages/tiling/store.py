@@ -165,23 +165,23 @@ class Store:
             if path.name not in kept:
                 path.unlink(missing_ok=True)
 
-    def has_result(self, name: str, report: dict[str, Any]) -> bool:
-        """Whether the file of a tile's results is there, as long as the tile's report says."""
+    def has_result(self, name: str, record: dict[str, Any]) -> bool:
+        """Whether the file of a tile's results is there, as long as the tile's record says."""
         try:
-            return self.result(name).stat().st_size == report.get("result_bytes")
+            return self.result(name).stat().st_size == record.get("result_bytes")
         except OSError:
             return False
 
-    def finish(self, name: str, mark: str, report: dict[str, Any]) -> None:
+    def finish(self, name: str, mark: str, record: dict[str, Any]) -> None:
         """Remember that a tile is done."""
-        _keep(self._done(name), {**report, "fingerprint": mark}, "result")
+        _keep(self._done(name), {**record, "fingerprint": mark}, "result")
 
     def forget(self, name: str) -> None:
         """A tile is to be done anew: what an earlier run noted of it must not be believed of a file made since."""
         _forget(self._done(name))
 
     def finished(self, name: str) -> dict[str, Any] | None:
-        """The report of a tile that is done, with its fingerprint; otherwise None."""
+        """The record of a tile that is done, with its fingerprint; otherwise None."""
         return _read(self._done(name))
 
     def _done(self, name: str) -> Path:
@@ -197,20 +197,20 @@ class Store:
         return found
 
     def written(self, name: str) -> dict[str, Any] | None:
-        """The report of outputs that exist unchanged, with its fingerprint; otherwise None."""
-        report = self._written.get(name)
-        for path, size, changed in report["outputs"] if report else ():
+        """The record of outputs that exist unchanged, with its fingerprint; otherwise None."""
+        record = self._written.get(name)
+        for path, size, changed in record["outputs"] if record else ():
             try:
                 status = os.stat(path)
             except OSError:
                 return None
             if [status.st_size, status.st_mtime_ns] != [size, changed]:
                 return None
-        return report
+        return record
 
-    def wrote(self, name: str, mark: str, report: dict[str, Any]) -> None:
+    def wrote(self, name: str, mark: str, record: dict[str, Any]) -> None:
         """Remember outputs."""
-        self._written[name] = {**report, "fingerprint": mark}
+        self._written[name] = {**record, "fingerprint": mark}
         with _open_own(self.files) as file:
             file.write("\n" + _sealed(self.files, {name: self._written[name]}))
 

@@ -90,6 +90,6 @@ def _put(callbacks: Callbacks, new: NewValues, after: str, tag: str) -> list[dic
 
 
 def written(outputs: Sequence[str], count: int) -> dict[str, Any]:
-    """What a report says of files just written: their size and time of change, and the points that came out."""
+    """What a record says of files just written: their size and time of change, and the points that came out."""
     found = [(path, os.stat(path)) for path in outputs]
     return {"outputs": [[path, s.st_size, s.st_mtime_ns] for path, s in found], "written": count}

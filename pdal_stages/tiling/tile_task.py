@@ -37,21 +37,21 @@ class TileTask:
     before: str  #: the folder of what the rounds before made; empty where there were none
 
     def run(self) -> dict[str, Any]:
-        """Run the head; write its results, or the outputs. The report says which."""
+        """Run the head; write its results, or the outputs. The record says which."""
         with TemporaryDirectory(
             prefix="tile-", dir=self.context.scratch, ignore_cleanup_errors=True
         ) as folder:
-            results, report = _settle(self, folder)
+            results, record = _settle(self, folder)
             if self.outputs is not None:
-                return report | write_tile(
+                return record | write_tile(
                     results, self.context.plan, self.outputs, self.context.grid.box(self.tile)
                 )
             save(self.result, results)
-        return report | {"result_bytes": os.path.getsize(self.result)}
+        return record | {"result_bytes": os.path.getsize(self.result)}
 
 
 def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, Any]]:
-    """Run the head with surroundings that suffice; results, and the report.
+    """Run the head with surroundings that suffice; results, and the record.
 
     It has the ``points`` of the tile, those ``read`` with its halo, the ``halo_m`` used, and whether that did not
     suffice (``short``).
@@ -89,7 +89,7 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
     if head is None:
         empty = np.empty(0, np.int64)
         head = HeadRun([PieceResults(piece, empty, {}) for piece in cuts], 0.0)
-    report = {
+    record = {
         "points": own,
         "read": read,
         "halo_m": halo_m,
@@ -100,7 +100,7 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
         "messages": head.messages,
         "left_alone": head.left_alone,
     }
-    return head.results, report
+    return head.results, record
 
 
 def _before(task: TileTask, cuts: list[Piece], halo_m: float) -> FromBefore | None:

@@ -152,7 +152,7 @@ def run_plan(
     summary = survey.figures(plan) | {"workers": pool.slots, "threads_per_worker": pool.threads}
     summary |= summarize(work.jobs, work.outputs, time.monotonic() - started)
     survey.messages += _messages_of_tiles(work)
-    short = [job.name for job in work.jobs if job.state == "done" and job.report.get("short")]
+    short = [job.name for job in work.jobs if job.state == "done" and job.record.get("short")]
     if short:
         survey.messages.append(
             f"{len(short)} tiles have points whose neighborhoods or terrain reach farther than could be read within "
@@ -171,7 +171,7 @@ _MOST_MESSAGES = 20
 def _messages_of_tiles(work: Worklist) -> list[str]:
     """Warnings and notes of tiles, once each, the most frequent first."""
     found = Counter(
-        text for job in work.jobs if job.state == "done" for text in set(job.report.get("messages", ()))
+        text for job in work.jobs if job.state == "done" for text in set(job.record.get("messages", ()))
     )
     found.update(text for messages in work.messages_before for text in set(messages))
     messages = [f"{text} ({n} tile{'s' * (n != 1)})" for text, n in found.most_common(_MOST_MESSAGES)]

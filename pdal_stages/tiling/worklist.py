@@ -57,13 +57,13 @@ class Worklist:
                 job.outputs = paths
         return jobs
 
-    def mark_of(self, job: TileJob, report: dict[str, Any]) -> str:
+    def mark_of(self, job: TileJob, record: dict[str, Any]) -> str:
         """Fingerprint of all that decides a tile's result: of every input that was read for it too.
 
-        That is known from the report alone, as a tile may be read with a wider halo.
+        That is known from the record alone, as a tile may be read with a wider halo.
         """
         survey = self.survey
-        halo_m = max(float(report.get("halo_m", 0.0)), self.plan.sees_m)
+        halo_m = max(float(record.get("halo_m", 0.0)), self.plan.sees_m)
         read = survey.near(job.tile, halo_m / survey.unit)
         return fingerprint(self._common, job.tile, [[s.path, survey.stamps[s.path], s.reader] for s in read])
 
@@ -95,22 +95,22 @@ class Worklist:
             for job in self.jobs:
                 known = store.written(job.name)
                 if job.state == "waiting" and known and known["fingerprint"] == self.mark_of(job, known):
-                    job.state, job.report = "kept", known
+                    job.state, job.record = "kept", known
             return
-        reports = {job.tile: store.finished(job.name) for job in self.jobs}
-        marks = {job.tile: self.mark_of(job, reports[job.tile] or {}) for job in self.jobs}
+        records = {job.tile: store.finished(job.name) for job in self.jobs}
+        marks = {job.tile: self.mark_of(job, records[job.tile] or {}) for job in self.jobs}
         for out in self.outputs:
             known = store.written(out.source.key)
             if out.state == "waiting" and known and known["fingerprint"] == self.output_mark(out, marks):
-                out.state, out.report = "kept", known
+                out.state, out.record = "kept", known
         needed = {job.tile for out in self.outputs if out.state == "waiting" for job in out.jobs}
         for job in self.jobs:
             if job.state != "waiting":
                 continue
-            known = reports[job.tile]
+            known = records[job.tile]
             same = known is not None and known["fingerprint"] == marks[job.tile]
             if known is not None and same and (job.tile not in needed or store.has_result(job.name, known)):
-                job.state, job.report = "kept", known
+                job.state, job.record = "kept", known
             elif job.tile not in needed:
                 job.state = "kept"
 
@@ -126,12 +126,12 @@ class Worklist:
     def keep(self, store: Store, item: TileJob | FileJob) -> None:
         """Remember what was finished, for runs to come."""
         if isinstance(item, FileJob):
-            marks = {job.tile: self.mark_of(job, job.report) for job in item.jobs}
-            store.wrote(item.source.key, self.output_mark(item, marks), item.report)
+            marks = {job.tile: self.mark_of(job, job.record) for job in item.jobs}
+            store.wrote(item.source.key, self.output_mark(item, marks), item.record)
         elif item.outputs is not None:
-            store.wrote(item.name, self.mark_of(item, item.report), item.report)
+            store.wrote(item.name, self.mark_of(item, item.record), item.record)
         else:
-            store.finish(item.name, self.mark_of(item, item.report), item.report)
+            store.finish(item.name, self.mark_of(item, item.record), item.record)
 
     @property
     def farthest(self) -> float:

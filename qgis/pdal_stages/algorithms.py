@@ -282,7 +282,7 @@ class Train(Algorithm):
 
     key, title, command = "train", "Train a model", "train"
     about = (
-        "Trains a model on labelled point clouds, from nothing or on top of a model that knows much already: then few "
+        "Trains a model on labeled point clouds, from nothing or on top of a model that knows much already: then few "
         "labels are enough. The model is scored on points that it has not seen, and the score is in the log."
     )
     listed = ("base", "classes", "count")

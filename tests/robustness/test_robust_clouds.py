@@ -401,7 +401,7 @@ BOXES = [
     ("bounding box of 1e300", 1e300, 20, None),
     ("tiles of 1e-300", None, 1e-300, "too far away to be counted in tiles"),
     ("tiles of 1e-9", None, 1e-9, "too far away to be counted in tiles"),
-    ("tiles of a millimetre", None, 0.001, None),
+    ("tiles of a millimeter", None, 0.001, None),
 ]  # fmt: skip
 
 
