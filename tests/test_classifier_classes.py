@@ -45,7 +45,7 @@ def test_a_single_label_with_a_name_of_its_own_keeps_its_code():
     [
         ({"3,4": "Shrubbery"}, "its code too"),
         ({"3,4": 5, "4": 6}, "twice"),
-        ({"x": 5}, "no list of labels"),
+        ({"x": 5}, "not a list of labels"),
         ({"5-3": 5}, "range"),
         ({"2": 256}, "0 to 255"),
         ({"2": {"nr": 3}}, "'code' and 'name'"),
@@ -70,7 +70,7 @@ def test_binary():
     assert classes.codes == (1, 6) and classes.labels == ((2, 3, 4, 5), (6,))
     assert classes.names == ("Background", "Building")
     assert ClassMap.parse([2, 6]).binary(2, 40).codes == (2, 40)
-    with pytest.raises(OptionError, match="none of the classes"):
+    with pytest.raises(OptionError, match="not one of the classes"):
         classes.binary(9, 1)
     with pytest.raises(OptionError, match="same code"):
         classes.binary(6, 6)

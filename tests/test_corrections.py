@@ -150,8 +150,8 @@ def test_a_layer_of_points(town, tmp_path):
     ("text", "what"),
     [
         ("x,y,z\n1,2,3\n", "lacks a column"),
-        ("x,y,z,class\n1,2,3,tree\n", "no number"),
-        ("x,y,z,class\n1,2,3,2.5\n", "no point with a class code"),
+        ("x,y,z,class\n1,2,3,tree\n", "not a number"),
+        ("x,y,z,class\n1,2,3,2.5\n", "not a point with a class code"),
         ("x,y,z,class\n1,2,3,2\n4,5,6\n", "another number of values"),
         ("x,y,z,class\n1,2,3,2\n", "no point of the cloud lies within"),
         ("x,y,z,class\n", "holds no points"),

@@ -106,7 +106,7 @@ class ClassMap:
         """One class against all the others, which become `background`."""
         if target not in self.codes:
             raise OptionError(
-                "'target' is none of the classes", found=target, cure=f"Choose one of {list(self.codes)}"
+                "'target' is not one of the classes", found=target, cure=f"Choose one of {list(self.codes)}"
             )
         if background == target:
             raise OptionError("'background' and 'target' are the same code", found=target)
@@ -165,7 +165,7 @@ def _labels(text: Any) -> tuple[int, ...]:
     for part in text.split(","):
         span = re.fullmatch(r"\s*(\d{1,5})(?:\s*-\s*(\d{1,5}))?\s*", part)
         if span is None:
-            raise OptionError("'classes' has a key that is no list of labels", found=repr(text), cure=_CURE)
+            raise OptionError("'classes' has a key that is not a list of labels", found=repr(text), cure=_CURE)
         first, last = int(span[1]), int(span[2] or span[1])
         if last < first or last > MAX_LABEL:
             raise OptionError("'classes' has an invalid label range", found=part.strip(), cure=_CURE)
@@ -204,7 +204,7 @@ def _target(value: Any, labels: tuple[int, ...]) -> tuple[int, str | None] | Non
     if len(labels) == 1 and labels[0] <= MAX_CODE:
         return labels[0], word
     raise OptionError(
-        f"'{word}' is no ASPRS class, and several labels become it",
+        f"'{word}' is not an ASPRS class, and several labels become it",
         found=f"labels {list(labels)}",
         cure=suggest(word.lower(), _WORDS) + f"Say its code too: '5 {word}'",
     )

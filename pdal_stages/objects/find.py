@@ -63,7 +63,7 @@ class ObjectSettings:
     roof_part: float = _setting(
         10.0, "Smaller parts of a roof (dormers) go with their neighbor", 0, 10_000, "m2"
     )
-    tree_height: float = _setting(3.0, "Lower plants are no trees", 0, 100)
+    tree_height: float = _setting(3.0, "Lower plants are not trees", 0, 100)
     tree_area: float = _setting(1.5, "Trees with smaller crowns are left out", 0, 1000, "m2")
     window: float = _setting(
         1.5, "Radius in which a tree has no second top, for a tree of no height", 0.1, 10

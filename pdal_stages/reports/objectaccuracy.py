@@ -36,7 +36,7 @@ class Things:
             layers = pyogrio.list_layers(path)
         except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
             raise StageError(
-                "objects are compared in vector files, and this is none that GDAL reads",
+                "objects are compared in vector files, and GDAL cannot read this one",
                 found=f"{path}: {error}",
                 cure="Of a cloud make one first: pdal-stages objects classified.laz town.gpkg",
             ) from None

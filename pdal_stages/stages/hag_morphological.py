@@ -91,7 +91,7 @@ class HagMorphological(Stage):
     decks: bool = option(
         "boolean",
         False,
-        "Also find bridge decks, which then are no ground, and write Deck: 1 on a deck, 2 its parapets, flanks and what "
+        "Also find bridge decks, which then are not ground, and write Deck: 1 on a deck, 2 its parapets, flanks and what "
         "stands on it, else 0",
     )
     details = """

@@ -84,7 +84,7 @@ def filtered_ground(
     slope_too : bool
         Whether the slope of the terrain is wanted.
     decks : bool
-        Whether bridge decks are looked for, which then are no ground.
+        Whether bridge decks are looked for, which then are not ground.
     threads : int, optional
         None or 0: every available core.
     figures : dict, optional
