@@ -165,7 +165,9 @@ def _labels(text: Any) -> tuple[int, ...]:
     for part in text.split(","):
         span = re.fullmatch(r"\s*(\d{1,5})(?:\s*-\s*(\d{1,5}))?\s*", part)
         if span is None:
-            raise OptionError("'classes' has a key that is not a list of labels", found=repr(text), cure=_CURE)
+            raise OptionError(
+                "'classes' has a key that is not a list of labels", found=repr(text), cure=_CURE
+            )
         first, last = int(span[1]), int(span[2] or span[1])
         if last < first or last > MAX_LABEL:
             raise OptionError("'classes' has an invalid label range", found=part.strip(), cure=_CURE)
