@@ -213,6 +213,7 @@ def test_tiles_say_what_was_left_alone_as_one_piece_does(folder, classify, tmp_p
     source = write_las(tmp_path / "in.las", arrays, point_format=6)
     options = ("--where", "X < 25", "--filters.modelclassifier.reject_below=0.97", "--no-noise")
     said = []
+    classes: list[set[str]] = []
     for words in ((), ("--tile", "10"), ("--tile", "10", "--per", "tile")):
         place = tmp_path / "out"
         place.mkdir(exist_ok=True)
@@ -221,10 +222,25 @@ def test_tiles_say_what_was_left_alone_as_one_piece_does(folder, classify, tmp_p
         said.append(
             [line for line in out.splitlines() if line.startswith("  ") and not line[:5].strip().isdecimal()]
         )
+        classes.append({line.strip() for line in out.splitlines() if re.match(r"  [ \d]{3} ", line)})
+        assert sum(int(line.split()[-1].replace(",", "")) for line in classes[-1]) == len(las.points)
     assert said[0] == said[1] == said[2]
+    assert classes[0] == classes[1] == classes[2]
     lines = "\n".join(said[0])
     for text in ("rejected as unreliable", "left out: noise", "class kept (keep)", "outside where"):
         assert text in lines, lines
+
+
+@pytest.mark.parametrize(
+    ("where", "said"), [("Z > 1000", True), ("X < 7", False)]
+)  # the second in some tiles alone
+def test_a_where_that_chooses_nothing_is_said_once(folder, classify, tmp_path, where, said):
+    code, _, err = classify(
+        folder / "in" / "t1.laz", tmp_path / "o.laz", "--tile", "10", "--where", where, "--workers", "0"
+    )
+    told = [line for line in err.splitlines() if "'where' holds for none" in line]
+    assert code == 0 and len(told) == said, err
+    assert all(where in line and "PdalStages" not in line for line in told)
 
 
 @pytest.mark.parametrize(

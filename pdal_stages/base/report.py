@@ -21,12 +21,15 @@ class Report:
     beyond_halo : dict of str to int
         By neighborhood, the points whose nearest neighbors lay farther away than the halo: in a tile of that halo their
         values may differ from those of the whole cloud.
+    codes : dict of str to int or None
+        The points of each class code after a stage that gives classes, whichever it looked at; not in the metadata.
     """
 
     figures: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     beyond_halo: dict[str, int] = field(default_factory=dict)
+    codes: dict[str, int] | None = None
 
     def merge(self, other: Report) -> None:
         """Take over what another has. Of figures of one name, its own stay; dicts are merged by their keys."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import class_color, class_name
+from ..base.plain import one_line
 from .maps import Key, Picture
 from .page import duration, render
 from .raster import Frame
@@ -155,7 +156,7 @@ def lines(found: Mapping[str, Any], most: int = 10) -> list[str]:
     ]
     for row in found["tiles"][:most]:
         out.append(
-            f"{row['tile'][-40:]:<40}{row['points']:>14,}{row['expected']:>16,.0f}{100 * row['share']:>8.2f}"
+            f"{one_line(row['tile'])[-40:]:<40}{row['points']:>14,}{row['expected']:>16,.0f}{100 * row['share']:>8.2f}"
             f"{row['patches']:>9,}{row['minutes']:>9.1f}"
         )
     if len(found["tiles"]) > most:
@@ -165,6 +166,6 @@ def lines(found: Mapping[str, Any], most: int = 10) -> list[str]:
         x, y = (0.5 * (row["box"][k] + row["box"][k + 2]) for k in (0, 1))
         out.append(
             f"{row['rank']:>5}{row['expected']:>10,.0f}{row['area']:>8,.0f}  {row['reason']}; "
-            f"{row['tile']} at {x:.0f}, {y:.0f}"
+            f"{one_line(row['tile'])} at {x:.0f}, {y:.0f}"
         )
     return out

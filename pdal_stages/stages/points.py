@@ -30,6 +30,8 @@ MAKERS = {
         "The reader does not give it; leave it out of the model's dimensions",
     ),
 }
+#: How the warning begins that a `where` chooses no point.
+HOLDS_NOWHERE = "'where' holds for none of the"
 #: Flags of a point, in the order of their bits.
 _FLAGS = ("Synthetic", "KeyPoint", "Withheld", "Overlap")
 #: How the names of dimensions begin that are lengths upward, as Z is, so they follow the vertical unit.
@@ -78,9 +80,7 @@ class Points:
             self.mask = where.evaluate(freed)
             self.report.figures["where"] = int(np.count_nonzero(self.mask))
             if self.count and not self.report.figures["where"]:
-                self.report.warnings.append(
-                    f"'where' holds for none of the {self.count:,} points: {where.text}"
-                )
+                self.report.warnings.append(f"{HOLDS_NOWHERE} {self.count:,} points: {where.text}")
 
     @property
     def inside(self) -> NDArray[np.bool_]:
@@ -218,7 +218,8 @@ class Points:
         return self.inside if made_before else self.inside | (self.arrays[name] == 0)
 
     def with_codes(self, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """New class codes for `Classification`, with the flag bits of each point kept."""
+        """New class codes for `Classification`, with the flag bits of each point kept; they are counted in the report."""
+        self.report.codes = class_counts(codes)
         if not self.legacy_flags:
             return codes
         flags = np.asarray(self.arrays["Classification"], np.uint8) & ~np.uint8(LEGACY_LIMIT)

@@ -221,7 +221,8 @@ def classify_file(
     if metadata:
         write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
     reports = [each[-1].figures for _, each in pipeline.reports if each]
-    classes = {int(code): n for one in reports for code, n in one.get("classes", {}).items()}
+    after = [each[-1].codes for _, each in pipeline.reports if each and each[-1].codes is not None]
+    classes = {int(code): n for code, n in after[-1].items()} if after and after[-1] else {}
     counts = left_alone(reports)
     messages = [*(f"PDAL says: {line}" for line in pipeline.log_lines), *pipeline.messages]
     return Written(target, count, classes, counts, messages, pipeline.metadata)

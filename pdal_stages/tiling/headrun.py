@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -18,6 +19,7 @@ from ..pipeline.runtime import points_of
 from ..pipeline.writerlimits import check_writers
 from ..stages import registry
 from ..stages.base import Stage
+from ..stages.points import HOLDS_NOWHERE
 from .extract import Piece
 from .grid import Box, TileGrid
 from .outcome import left_alone
@@ -122,7 +124,7 @@ def run_head(
     if far and not everything:
         most = max(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
         need = max(need, _far_neighbors(pipeline.arrays, most, context, tile))
-    messages = [*(f"PDAL says: {line}" for line in pipeline.log_lines), *pipeline.messages]
+    messages = _messages(pipeline)
     return HeadRun(
         results, need, messages, left_alone(each[-1].figures for _, each in pipeline.reports if each)
     )
@@ -137,6 +139,24 @@ class FirstResults(NamedTuple):
     messages: list[str]
 
 
+#: The warning of `Points` in a tile: of the user's `where` with what was added for the tile, or of that alone.
+_NOWHERE = re.compile(rf"{HOLDS_NOWHERE} [\d,]+ points: (?:\((.*)\) && \()?{OUTSIDE} <", re.DOTALL)
+
+
+def _messages(pipeline: Pipeline) -> list[str]:
+    """What is said of a tile, in the same words of every tile, as a run says it once."""
+    lines = [f"PDAL says: {line}" for line in pipeline.log_lines]
+    for text in pipeline.messages:
+        nowhere = _NOWHERE.search(text)
+        if nowhere is None:
+            lines.append(text)
+        elif (
+            nowhere[1] is not None
+        ):  # otherwise the tile has no point of its own: nothing that the user asked for
+            lines.append(f"{HOLDS_NOWHERE} points: {nowhere[1]}")
+    return lines
+
+
 def run_first(context: RunContext, cuts: list[Piece], first: FirstRound) -> FirstResults:
     """Run the stages before the one that looks far, on a tile and the surroundings that they need."""
     marks = _marks(cuts, context, first.kept or () if first.at else ())
@@ -149,7 +169,7 @@ def run_first(context: RunContext, cuts: list[Piece], first: FirstRound) -> Firs
         run = callbacks.filter(left, **(_after(marks) if first.at == 0 else {}))
         pipeline = Pipeline([*stages, *head[:-1], run], whole=False)
         pipeline.execute(arrays=False)
-    messages = [*(f"PDAL says: {line}" for line in pipeline.log_lines), *pipeline.messages]
+    messages = _messages(pipeline)
     points = np.concatenate(left.found) if left.found else np.empty((0, 3))
     return FirstResults(points, _changes(left.values, marks), messages)
 

@@ -16,6 +16,7 @@ from ..pipeline import classflags
 from ..pipeline.overrides import Override
 from ..pipeline.read import PipelineSource
 from ..pipeline.run import Pipeline
+from ..stages.points import HOLDS_NOWHERE
 from .complete import remember, told_again
 from .dispatch import run_all, run_first_round
 from .estimate import estimate
@@ -170,10 +171,18 @@ _MOST_MESSAGES = 20
 
 def _messages_of_tiles(work: Worklist) -> list[str]:
     """Warnings and notes of tiles, once each, the most frequent first."""
-    found = Counter(
-        text for job in work.jobs if job.state == "done" for text in set(job.record.get("messages", ()))
-    )
-    found.update(text for messages in work.messages_before for text in set(messages))
+    of_tiles = [
+        set(job.record.get("messages", ()))
+        for job in work.jobs
+        if job.state == "done" and job.record.get("points")
+    ]
+    found: Counter[str] = Counter()
+    for lines in (of_tiles, [set(messages) for messages in work.messages_before]):
+        for text, n in Counter(text for each in lines for text in each).items():
+            if not text.startswith(HOLDS_NOWHERE):
+                found[text] += n
+            elif n == len(lines):  # that there is nothing to do in some tiles is as it should be
+                found[text] = max(found[text], n)
     messages = [f"{text} ({n} tile{'s' * (n != 1)})" for text, n in found.most_common(_MOST_MESSAGES)]
     return messages + (
         [f"and {len(found) - _MOST_MESSAGES} more; see --report"] if len(found) > _MOST_MESSAGES else []
