@@ -21,6 +21,15 @@ def test_answers_come_back():
     assert apart.apart(print, "what a library prints is no answer") is None
 
 
+def test_modules_of_the_folder_at_hand_are_not_run(tmp_path, monkeypatch):
+    """Whoever works among files of others runs none of them."""
+    for name in ("json", "numpy", "pickle", "subprocess", "pdal_stages"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")
+    monkeypatch.chdir(tmp_path)
+    assert apart.apart(whole, "--workers", 5, 1, 1024) == whole("--workers", 5, 1, 1024)
+    assert not (tmp_path / "ran").exists()
+
+
 def test_errors_come_back():
     with pytest.raises(OptionError) as told:
         apart.apart(whole, "--workers", 5000, 1, 1024)

@@ -26,13 +26,13 @@ def apart(function: Callable[..., Any], *arguments: Any) -> Any:
         f"import sys; sys.path[:0] = [{root!r}]; sys.path += {[path for path in sys.path if path]!r}; "
         "from pdal_stages.base.apart import answer; answer()"
     )
+    safe = "-P" if sys.version_info >= (3, 11) else "-I"  # nothing is imported from the folder one happens to be in
     try:
         done = subprocess.run(
-            [interpreter(), "-c", program],
+            [interpreter(), safe, "-c", program],
             input=pickle.dumps((function, arguments)),
             stdout=subprocess.PIPE,
             check=False,
-            cwd=None,
         )
         good, result = pickle.loads(done.stdout)
     except (OSError, EOFError, pickle.UnpicklingError) as error:
