@@ -26,7 +26,8 @@ def apart(function: Callable[..., Any], *arguments: Any) -> Any:
         f"import sys; sys.path[:0] = [{root!r}]; sys.path += {[path for path in sys.path if path]!r}; "
         "from pdal_stages.base.apart import answer; answer()"
     )
-    safe = "-P" if sys.version_info >= (3, 11) else "-I"  # nothing is imported from the folder one happens to be in
+    # Nothing is imported from the folder one happens to be in.
+    safe = "-P" if sys.version_info >= (3, 11) else "-I"
     try:
         done = subprocess.run(
             [interpreter(), safe, "-c", program],
