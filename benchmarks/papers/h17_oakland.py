@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -231,7 +231,7 @@ def score(
     clouds = [
         _matrix(test.labels[test.cloud == k], found[test.cloud == k]) for k in range(test.cloud[-1] + 1)
     ]
-    return {**result, "clouds": clouds}
+    return {**result, "clouds": clouds, "over_clouds": over_clouds(clouds)}
 
 
 def _matrix(truth: np.ndarray, found: np.ndarray) -> list[list[int]]:
@@ -279,10 +279,15 @@ def ground_lost(run: Mapping[str, Any]) -> tuple[int, int]:
     return int(row.sum() - row[codes.index(2)]), int(row[codes.index(14)])
 
 
-def over_clouds(run: Mapping[str, Any]) -> list[float]:
-    """Mean precision, recall, F1 and OA, each computed of one cloud and then averaged."""
+def averages_of(run: Mapping[str, Any]) -> list[float] | None:
+    """Those of :func:`over_clouds`: of the run's own matrices, or as results that were taken over have them, if any do."""
+    return over_clouds(run["clouds"]) if "clouds" in run else run.get("over_clouds")
+
+
+def over_clouds(clouds: Iterable[Any]) -> list[float]:
+    """Mean precision, recall, F1 and OA, each computed of one cloud's confusion matrix and then averaged."""
     each = []
-    for counts in run["clouds"]:
+    for counts in clouds:
         counts, codes = np.asarray(counts), np.array(list(CLASSES))
         there = counts.sum(axis=1) > 0  # classes a cloud has
         one = Accuracy.from_confusion(
@@ -329,9 +334,9 @@ def report(runs: list[dict[str, Any]], found: dict[str, Any]) -> str:
     text.append(table(("Neighborhood", "Depth", *SCORES, "Kappa"), rows))
     rows = []
     for name in PUBLISHED:
-        some = choose(runs, **main, name=name, depth=None)
-        rows.append([name, *(spread(column) for column in zip(*map(over_clouds, some), strict=True))])
-    if all(len(row) == 5 for row in rows):
+        some = [averages_of(run) for run in choose(runs, **main, name=name, depth=None)]
+        rows.append([name, *(spread(column) for column in zip(*filter(None, some), strict=True))])
+    if rows := [row for row in rows if len(row) == 5]:
         words = "Averaged over the test clouds, not over the points, unlimited depth\n\n"
         text.append(words + table(("", *SCORES), rows))
     for key in ("recall", "precision"):
