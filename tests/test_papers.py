@@ -391,6 +391,12 @@ def test_h17_score_and_report(town, monkeypatch):
     lost, wire = h17_oakland.ground_lost(runs[0])
     assert lost >= wire >= 0 and lost == (1 - runs[0]["recall"]["2"] / 100) * (labels == 2).sum()
     assert f"{runs[0]['mcp']:.2f}" in text
+    # Results that are taken over lack the clouds' matrices: their averages are kept, or the table is left out.
+    found = {"train": 0.03, "test": 0.03, "pooled": 0.03, "shares": shares}
+    kept = [{k: v for k, v in run.items() if k not in kit.BULKY} for run in runs]
+    assert h17_oakland.report(kept, found) == text and "Averaged over the test clouds" in text
+    older = [{k: v for k, v in run.items() if k != "over_clouds"} for run in kept]
+    assert "Averaged" not in h17_oakland.report(older, found)
 
 
 def test_b16_command_on_pts_resumes(folder, tmp_path, monkeypatch, capsys):
