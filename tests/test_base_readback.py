@@ -71,7 +71,10 @@ def test_a_hole_before_the_table_is_seen(tmp_path, write_las, point_format):
         content = path.read_bytes()
         for length in (40, 200, 5_000, 65_536, found.sizes[-1], found.sizes[-1] + 100, sum(found.sizes[1:])):
             path.write_bytes(content[: end - length] + bytes(length) + content[end:])
-            check_readable(path)  # which looks at header and table
+            try:
+                check_readable(path)  # which looks at header, table and the last chunk's own count
+            except StageError:
+                continue
             assert not chunks_are_whole(path, read_header(path)), (kind, length)
 
 

@@ -11,7 +11,7 @@ from scipy import ndimage
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.stages.hag_morphological import HagMorphological
-from pdal_stages.terrain import filtered_ground, morphological, patches
+from pdal_stages.terrain import filtered_ground, groundcells, patches
 from pdal_stages.terrain.lowest import pits
 from pdal_stages.terrain.morphological import reach
 from pdal_stages.terrain.openings import HOLE, opening_radii, square_steps
@@ -388,13 +388,13 @@ def test_land_without_points_costs_nothing_and_changes_nothing(monkeypatch, spac
     z = np.round(0.1 * x + rng.choice([0.0, 6.0, -20.0], n, p=[0.7, 0.29, 0.01]) + rng.normal(0, 0.1, n), 2)
     mask = rng.random(n) < 0.95
     options = {"openings": (5, 120), "slope_too": True, "window": 40.0, "mask": mask}
-    shapes, real = [], morphological.pits
+    shapes, real = [], groundcells.pits
 
     def looked_at(raster, cell):
         shapes.append(raster.size)
         return real(raster, cell)
 
-    monkeypatch.setattr(morphological, "pits", looked_at)
+    monkeypatch.setattr(groundcells, "pits", looked_at)
     monkeypatch.setattr(patches, "_FEW", 1 << 40)
     monkeypatch.setattr(patches, "LARGEST", 1 << 40)
     figures, again = {}, {}

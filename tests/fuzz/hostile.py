@@ -18,6 +18,7 @@ import zipfile
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -168,6 +169,10 @@ def _notes() -> tuple[dict, dict]:
     return report, {"count": 3, "boxes": [[0, 0, 1, 1]], "tiles": [[0, 0, 3]]}
 
 
+def _plain(index: Any) -> dict:
+    return {name: np.asarray(value).tolist() for name, value in asdict(index).items()}
+
+
 def store(data: bytes) -> str:
     """Notes of a run: what was changed, or belongs elsewhere, is not believed."""
     keeping, paths = _kept()
@@ -176,7 +181,7 @@ def store(data: bytes) -> str:
     with keeping:
         found = keeping.written("a"), keeping.finished("a"), keeping.index("a")
     report, index = _notes()
-    assert found[0] is None and found[1] in (None, report) and (found[2] is None or asdict(found[2]) == index)
+    assert found[0] is None and found[1] in (None, report) and (found[2] is None or _plain(found[2]) == index)
     return "read" if any(found) else "refused"
 
 
