@@ -43,3 +43,18 @@ def test_it_is_found_before_the_first_tile(tmp_path, monkeypatch, write_las, sta
     with pytest.raises(ps.StageError, match=words) as raised:
         run_tiled(tmp_path / "job.json", 20, workers=0, buffer=0, dry_run=dry_run, progress=False)
     assert line in str(raised.value)
+
+
+@pytest.mark.parametrize("door", ["validate", "tiles"])
+def test_outputs_are_left_alone(tmp_path, write_las, door):
+    """PDAL's text writer empties its file as soon as it is prepared."""
+    x, y, z = np.random.default_rng(0).uniform(0, 30, (3, 300))
+    cloud = write_las(tmp_path / "a.las", {"X": x, "Y": y, "Z": z})
+    older = tmp_path / "o_0.txt"
+    older.write_text("older")
+    stages = [str(cloud), HEIGHTS, str(older if door == "validate" else tmp_path / "o_#.txt")]
+    if door == "validate":
+        ps.Pipeline(stages).validate()
+    else:
+        run_tiled(stages, 20, workers=0, buffer=0, progress=False, dry_run=True)
+    assert older.read_text() == "older" and not list(tmp_path.glob(".*/*.txt"))

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import re
 import signal
 import threading
 from collections.abc import Iterable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from ..base.complete import check_complete
@@ -21,7 +23,7 @@ from ..base.shortage import check_limit
 from ..stages import registry
 from . import packing, runtime
 from . import pdal as pdal_env
-from .filenames import is_writer, named_files, readers_files, stage_files, writers_outputs
+from .filenames import is_writer, named_files, readers_files, stage_files, with_outputs, writers_outputs
 from .foreseen import check_dimensions, unread_extra_dimensions
 from .groundcheck import GroundChecks
 from .interrupts import gentle
@@ -103,9 +105,16 @@ class Pipeline:
 
     def prepare(self) -> None:
         """Let PDAL check its own stages' options and dimensions, without reading points; outputs are not looked at."""
+        stages = self.lowered.stages
         try:
             self._check_inputs()
-            pdal_env.validate(self.lowered.stages)
+            # Some of PDAL's writers open their file, and empty it, when they are prepared: theirs are in a folder of ours.
+            with TemporaryDirectory(prefix="pdal-stages-") as folder:
+                names = [
+                    os.path.basename(output.path).replace("#", "0") for output in writers_outputs(stages)
+                ]
+                elsewhere = [os.path.join(folder, f"{n}-{name}") for n, name in enumerate(names)]
+                pdal_env.validate(with_outputs(stages, elsewhere))
         except StageError as error:
             raise self._located(error) from None
 
