@@ -641,3 +641,14 @@ def test_ctrl_c_in_a_stage_is_an_interrupt(cloud, monkeypatch, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         ps.run_pipeline([str(cloud), {"type": "filters.hag_minima"}, str(tmp_path / "o.laz")])
     assert not list(tmp_path.glob("*o.laz*"))
+
+
+def test_a_pipeline_without_a_reader_names_its_first_stage():
+    with pytest.raises(PipelineError, match=r"does not start with a reader \(found filters\.hag_minima\)"):
+        ps.Pipeline([{"type": "filters.hag_minima"}, {"type": "writers.null"}]).execute()
+
+
+def test_names_with_line_breaks_make_no_lines_of_their_own_in_what_pdal_says():
+    with pytest.raises(PipelineError) as raised:
+        ps.Pipeline([{"type": "readers.text", "filename": "no\npdal-stages: forged.txt"}]).execute()
+    assert "\n" not in str(raised.value)

@@ -32,7 +32,8 @@ class StageError(Exception):
         super().__init__(what)
 
     def __str__(self) -> str:
-        text = f"{self.where}: {self.what}" if self.where else self.what
+        # A file's name may hold line breaks, and must not pass for lines of its own.
+        text = f"{self.where}: {self.what}".replace("\n", "\\n") if self.where else self.what
         if self.found is not None:
             text += f" (found {self.found})"
         return _sentence(text) + (f" {_sentence(self.cure)}" if self.cure else "")

@@ -273,7 +273,9 @@ def translate(message: str, before: Sequence[str] = ()) -> PipelineError | Depen
         place = [line for line in lines if line.startswith("File ")][-1:]
         last = [line for line in lines if line][-1]
         return PipelineError("a script of filters.python failed", found="; ".join([last, *place]))
-    return PipelineError("PDAL could not run the pipeline", found="; ".join([text, *before]))
+    # On one line: what PDAL says quotes names of files, which may hold line breaks.
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    return PipelineError("PDAL could not run the pipeline", found="; ".join([*lines, *before]))
 
 
 def _log(pipeline) -> str:

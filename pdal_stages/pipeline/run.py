@@ -226,7 +226,7 @@ class Pipeline:
                     pass
             except OSError as error:
                 raise PipelineError("the file cannot be read", where=path, found=error) from None
-        check_start(self.lowered.stages)
+        check_start(self.lowered.stages, {ours.index: ours.stage.type for ours in self.lowered.ours})
         check_dimensions(self.lowered)
         self.warnings = [*self.lowered.warnings, *unread_extra_dimensions(self.lowered.stages)]
         self.warnings += [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..base.errors import PipelineError
@@ -74,12 +74,15 @@ def warning_of_ends(stages: Sequence[dict[str, Any]], run: Sequence[int], where:
     return f"{what}. Not run: {named}. {_CURE}"
 
 
-def check_start(stages: Sequence[dict[str, Any]]) -> None:
-    """Refuse a pipeline that begins with a filter or writer, which newer PDAL refuses and older one runs on nothing."""
+def check_start(stages: Sequence[dict[str, Any]], ours: Mapping[int, str]) -> None:
+    """Refuse a pipeline that begins with a filter or writer, which newer PDAL refuses and older one runs on nothing.
+
+    `ours`: types of the stages that are ours, by their place.
+    """
     if stages and not is_reader(stages, 0):
         raise PipelineError(
             "the pipeline does not start with a reader",
-            found=stages[0].get("type", ""),
+            found=ours.get(0, stages[0].get("type", "")),
             cure="Put the file that is to be read first",
         )
 
