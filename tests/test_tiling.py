@@ -613,7 +613,7 @@ def test_a_failed_tile_is_crossed_out():
     from pdal_stages.tiling.outcome import TiledRun, TileJob
 
     report = {"points": 5, "read": 9, "halo_m": 1.0, "seconds": 2.0}
-    jobs = [TileJob((0, 0), "0_0", 5, [], state="done", report=report)]
+    jobs = [TileJob((0, 0), "0_0", 5, [], state="done", record=report)]
     jobs.append(TileJob((1, 0), "10_0", 5, [], state="failed", reason="<odd> & broken"))
     summary = {"tile": 10.0, "points": 5, "states": {"done": 1, "kept": 0, "failed": 1}, "classes": {}}
     text = run_page(TiledRun(jobs, [], {}, [], [], summary).to_dict())
