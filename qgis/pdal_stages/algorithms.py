@@ -9,7 +9,6 @@ from qgis.core import (
     QgsProcessingOutputString,
     QgsProcessingParameterBoolean,
     QgsProcessingParameterEnum,
-    QgsProcessingParameterFileDestination,
     QgsProcessingParameterFolderDestination,
     QgsProcessingParameterNumber,
     QgsProcessingParameterRasterDestination,
@@ -17,14 +16,15 @@ from qgis.core import (
 )
 
 from . import results
-from .base import CLOUDS, LAZ, Algorithm, written
+from .base import CLOUDS, Algorithm, written
+from .jobs import NOT_NOISE, class_map, raster, reader, writer
 
 _VECTORS = "GeoPackage (*.gpkg);;GeoJSON (*.geojson);;FlatGeobuf (*.fgb);;Shapefiles (*.shp)"
 _AREAS = "Polygons (*.gpkg *.geojson *.fgb *.shp);;All files (*)"
 _CORRECTED = "Point clouds, tables, layers (*.laz *.las *.csv *.gpkg *.geojson *.fgb *.shp);;All files (*)"
 _MODELS = "Model files (*.model);;All files (*)"
+_PAGES = "Pages (*.html)"
 _SHOW = "Show the result on the map"
-NOT_NOISE = {"type": "filters.range", "limits": "Classification![7:7],Classification![18:18]"}
 _NO_CLOUDS = "This QGIS is built without support for LAS and LAZ files, so the point cloud is not shown: {}"
 
 
@@ -110,9 +110,7 @@ class ClassifyFile(_Classifying):
         self.add_file("INPUT", "Point cloud", "A LAS, LAZ or COPC file, or any that PDAL reads")
         self.add_model()
         self.add_declared()
-        made = QgsProcessingParameterFileDestination("OUTPUT", "Classified point cloud", LAZ)
-        made.setHelp("The same points with classes")
-        self.addParameter(made)
+        self.add_destination("OUTPUT", "Classified point cloud", "The same points with classes")
         self.add_raster(
             "MAP", "Map of classes", "A picture of the result from above: the highest class code of each cell"
         )
@@ -121,7 +119,7 @@ class ClassifyFile(_Classifying):
 
     def processAlgorithm(self, parameters, context, feedback):
         source = self.parameterAsFile(parameters, "INPUT", context)
-        target = written(self.parameterAsFileOutput(parameters, "OUTPUT", context))
+        target = self.destination(parameters, "OUTPUT", context)
         chosen = self.arguments(parameters, context)
         self.execute(["classify", *chosen, *self.model(parameters, context), source, target], feedback)
         self.show_clouds([target], parameters, context)
@@ -151,17 +149,15 @@ class ClassifySurvey(_Classifying):
         self.add_declared()
         made = QgsProcessingParameterFolderDestination("OUTPUT", "Folder of classified point clouds")
         self.addParameter(made)
-        made = QgsProcessingParameterFileDestination(
-            "REPORT", "Report", "Pages (*.html)", optional=True, createByDefault=False
+        self.add_destination(
+            "REPORT", "Report", self.help_of("report"), _PAGES, optional=True, createByDefault=False
         )
-        made.setHelp(self.help_of("report"))
-        self.addParameter(made)
         self.addParameter(QgsProcessingParameterBoolean("SHOW", _SHOW, defaultValue=False))
 
     def processAlgorithm(self, parameters, context, feedback):
         target = written(self.parameterAsString(parameters, "OUTPUT", context), folder=True)
         more = [*self.arguments(parameters, context), *self.model(parameters, context)]
-        report = self.parameterAsFileOutput(parameters, "REPORT", context)
+        report = self.destination(parameters, "REPORT", context)
         if report:
             more.append(f"--report={report}")
         before = set(os.listdir(target))
@@ -191,13 +187,13 @@ class Heights(_Showing):
     def initAlgorithm(self, configuration=None):
         self.add_file("INPUT", "Point cloud")
         self.add_declared()
-        self.addParameter(QgsProcessingParameterFileDestination("OUTPUT", "Point cloud with heights", LAZ))
+        self.add_destination("OUTPUT", "Point cloud with heights")
         self.add_raster("MAP", "Map of heights above ground", "The highest of each cell")
         self.add_cell("Cell of the map")
         self.add_show()
 
     def processAlgorithm(self, parameters, context, feedback):
-        target = written(self.parameterAsFileOutput(parameters, "OUTPUT", context))
+        target = self.destination(parameters, "OUTPUT", context)
         stage = {"type": self.stage, **self.options(parameters, context)}
         job = [reader(self.parameterAsFile(parameters, "INPUT", context)), stage, writer(target)]
         out = {"OUTPUT": target}
@@ -291,24 +287,25 @@ class Train(Algorithm):
     def initAlgorithm(self, configuration=None):
         self.add_inputs(self.help_of("inputs"))
         self.add_declared()
-        made = QgsProcessingParameterFileDestination("MODEL", "Model", _MODELS)
-        made.setHelp(self.help_of("model"))
-        self.addParameter(made)
-        made = QgsProcessingParameterFileDestination(
-            "PAGE", "Page about the model", "Pages (*.html)", optional=True, createByDefault=True
+        self.add_destination("MODEL", "Model", self.help_of("model"), _MODELS)
+        self.add_destination(
+            "PAGE",
+            "Page about the model",
+            "Its scores, confusion matrix and what it goes by",
+            _PAGES,
+            optional=True,
+            createByDefault=True,
         )
-        made.setHelp("Its scores, confusion matrix and what it goes by")
-        self.addParameter(made)
         self.addOutput(QgsProcessingOutputHtml("HTML", "Page about the model"))
 
     def processAlgorithm(self, parameters, context, feedback):
-        target = written(self.parameterAsFileOutput(parameters, "MODEL", context))
+        target = self.destination(parameters, "MODEL", context)
         chosen = [*self.arguments(parameters, context), f"--model={target}"]
         self.execute(["train", *chosen, *self.inputs(parameters, context)], feedback)
-        page = self.parameterAsFileOutput(parameters, "PAGE", context)
+        page = self.destination(parameters, "PAGE", context)
         if not page:
             return {"MODEL": target}
-        self.execute(["model", target, f"--html={written(page)}"], feedback, quiet=True)
+        self.execute(["model", target, f"--html={page}"], feedback, quiet=True)
         return {"MODEL": target, "PAGE": page, "HTML": page}
 
 
@@ -329,25 +326,22 @@ class Accuracy(Algorithm):
             "REFERENCE", "The same points with true classes", self.help_of("reference"), CLOUDS, optional=True
         )
         self.add_declared()
-        made = QgsProcessingParameterFileDestination("PAGE", "Report", "Pages (*.html)")
-        self.addParameter(made)
-        made = QgsProcessingParameterFileDestination(
-            "JSON", "Figures", "JSON (*.json)", optional=True, createByDefault=False
+        self.add_destination("PAGE", "Report", files=_PAGES)
+        self.add_destination(
+            "JSON", "Figures", self.help_of("json"), "JSON (*.json)", optional=True, createByDefault=False
         )
-        made.setHelp(self.help_of("json"))
-        self.addParameter(made)
         self.addOutput(QgsProcessingOutputHtml("HTML", "Report"))
         self.addOutput(QgsProcessingOutputString("FIGURES", "Table"))
 
     def processAlgorithm(self, parameters, context, feedback):
-        page = written(self.parameterAsFileOutput(parameters, "PAGE", context))
+        page = self.destination(parameters, "PAGE", context)
         chosen = [*self.arguments(parameters, context), f"--html={page}"]
         reference = self.parameterAsFile(parameters, "REFERENCE", context)
         if reference:
             chosen.append(f"--reference={reference}")
-        figures = self.parameterAsFileOutput(parameters, "JSON", context)
+        figures = self.destination(parameters, "JSON", context)
         if figures:
-            chosen.append(f"--json={written(figures)}")
+            chosen.append(f"--json={figures}")
         text = self.execute(
             ["accuracy", *chosen, self.parameterAsFile(parameters, "INPUT", context)], feedback
         )
@@ -369,17 +363,11 @@ class Objects(_Showing):
     def initAlgorithm(self, configuration=None):
         self.add_inputs(self.help_of("inputs"))
         self.add_declared()
-        made = QgsProcessingParameterFileDestination(
-            "OUTPUT",
-            "Objects",
-            _VECTORS,
-        )
-        made.setHelp(self.help_of("output"))
-        self.addParameter(made)
+        self.add_destination("OUTPUT", "Objects", self.help_of("output"), _VECTORS)
         self.add_show()
 
     def processAlgorithm(self, parameters, context, feedback):
-        target = written(self.parameterAsFileOutput(parameters, "OUTPUT", context))
+        target = self.destination(parameters, "OUTPUT", context)
         self.execute(
             ["objects", *self.arguments(parameters, context), *self.inputs(parameters, context), target],
             feedback,
@@ -387,13 +375,6 @@ class Objects(_Showing):
         if self.parameterAsBool(parameters, "SHOW", context):
             self.to_show.append(("vector", target))
         return {"OUTPUT": target}
-
-
-def writer(target):
-    """A writer that keeps everything."""
-    if target.lower().endswith((".las", ".laz")) and not target.lower().endswith(".copc.laz"):
-        return {"type": "writers.las", "filename": target, "forward": "all", "extra_dims": "all"}
-    return {"filename": target}
 
 
 class Review(_Showing):
@@ -410,18 +391,16 @@ class Review(_Showing):
     def initAlgorithm(self, configuration=None):
         self.add_inputs(self.help_of("inputs"))
         self.add_declared()
-        made = QgsProcessingParameterFileDestination("OUTPUT", "Patches", _VECTORS)
-        made.setHelp(self.help_of("output"))
-        self.addParameter(made)
-        made = QgsProcessingParameterFileDestination("PAGE", "Page", "Pages (*.html)")
-        made.setHelp("The patches with pictures; under Processing > Results Viewer")
-        self.addParameter(made)
+        self.add_destination("OUTPUT", "Patches", self.help_of("output"), _VECTORS)
+        self.add_destination(
+            "PAGE", "Page", "The patches with pictures; under Processing > Results Viewer", _PAGES
+        )
         self.addOutput(QgsProcessingOutputHtml("HTML", "Page"))
         self.add_show()
 
     def processAlgorithm(self, parameters, context, feedback):
-        target = written(self.parameterAsFileOutput(parameters, "OUTPUT", context))
-        page = written(self.parameterAsFileOutput(parameters, "PAGE", context))
+        target = self.destination(parameters, "OUTPUT", context)
+        page = self.destination(parameters, "PAGE", context)
         chosen = [*self.arguments(parameters, context), f"--html={page}"]
         self.execute(["review", *chosen, *self.inputs(parameters, context), target], feedback)
         if self.parameterAsBool(parameters, "SHOW", context):
@@ -445,13 +424,11 @@ class Corrections(_Showing):
         self.add_file("AFTER", "Corrected", self.help_of("after"), _CORRECTED, optional=True)
         self.add_file("AREA", "What was looked at", self.help_of("area"), _AREAS, optional=True)
         self.add_declared()
-        made = QgsProcessingParameterFileDestination("OUTPUT", "Checked point cloud", LAZ)
-        made.setHelp(self.help_of("out"))
-        self.addParameter(made)
+        self.add_destination("OUTPUT", "Checked point cloud", self.help_of("out"))
         self.add_show()
 
     def processAlgorithm(self, parameters, context, feedback):
-        target = written(self.parameterAsFileOutput(parameters, "OUTPUT", context))
+        target = self.destination(parameters, "OUTPUT", context)
         before, after, area = (
             self.parameterAsFile(parameters, key, context) for key in ("BEFORE", "AFTER", "AREA")
         )
@@ -460,39 +437,6 @@ class Corrections(_Showing):
         self.execute(["corrections", *chosen, before, *([after] if after else [])], feedback)
         self.show_clouds([target], parameters, context)
         return {"OUTPUT": target}
-
-
-def reader(source):
-    """A reader that sees extra dimensions of old LAS files too."""
-    if source.lower().endswith((".las", ".laz")) and not source.lower().endswith(".copc.laz"):
-        return {"type": "readers.las", "filename": source, "use_eb_vlr": True}
-    return {"filename": source}
-
-
-def raster(target, side, dimension, what):
-    """A writer of a GeoTIFF."""
-    return {
-        "type": "writers.gdal",
-        "filename": target,
-        "gdaldriver": "GTiff",
-        "resolution": side,
-        "dimension": dimension,
-        "output_type": what,
-        "radius": side * 0.5**0.5,
-        "window_size": 2,
-        "data_type": "float",
-    }
-
-
-def class_map(cloud, target, side):
-    """Classes from above."""
-    writes = {
-        **raster(target, side, "Classification", "max"),
-        "data_type": "uint8_t",
-        "nodata": 0,
-        "window_size": 1,
-    }
-    return [reader(cloud), NOT_NOISE, writes]
 
 
 ALGORITHMS = (

@@ -7,6 +7,7 @@ from qgis.core import (
     QgsProcessingAlgorithm,
     QgsProcessingException,
     QgsProcessingParameterFile,
+    QgsProcessingParameterFileDestination,
     QgsProcessingParameterMultipleLayers,
 )
 
@@ -16,14 +17,35 @@ CLOUDS = "Point clouds (*.laz *.las *.copc.laz *.LAZ *.LAS *.ply *.e57 *.bpf);;A
 LAZ = "LAZ files (*.laz);;LAS files (*.las);;COPC files (*.copc.laz)"
 
 
-class Algorithm(QgsProcessingAlgorithm):
+class Named(QgsProcessingAlgorithm):
+    """What QGIS asks of every algorithm: its name, and the provider's picture."""
+
+    key = title = ""
+
+    def name(self):
+        return self.key
+
+    def displayName(self):
+        return self.title
+
+    def group(self):
+        return ""
+
+    def groupId(self):
+        return ""
+
+    def icon(self):
+        return self.provider().icon() if self.provider() else super().icon()
+
+
+class Algorithm(Named):
     """An algorithm that runs commands of the program.
 
     `command` names the command (or `stage` the stage) whose declarations give the parameters that `listed` and `advanced`
     name; what a new version adds is found under "Advanced" by itself.
     """
 
-    key = title = about = command = ""
+    about = command = ""
     stage = ""
     listed = ()
     #: Names of arguments that the algorithm has parameters of its own for.
@@ -43,21 +65,6 @@ class Algorithm(QgsProcessingAlgorithm):
 
     def createInstance(self):
         return type(self)(self.forms)
-
-    def name(self):
-        return self.key
-
-    def displayName(self):
-        return self.title
-
-    def group(self):
-        return ""
-
-    def groupId(self):
-        return ""
-
-    def icon(self):
-        return self.provider().icon() if self.provider() else super().icon()
 
     def shortHelpString(self):
         lines = [f"<p>{self.about}</p>"]
@@ -114,6 +121,16 @@ class Algorithm(QgsProcessingAlgorithm):
         made = QgsProcessingParameterFile(key, label, fileFilter=files, optional=optional)
         made.setHelp(help)
         self.addParameter(made)
+
+    def add_destination(self, key, label, help="", files=LAZ, **how):
+        made = QgsProcessingParameterFileDestination(key, label, files, **how)
+        made.setHelp(help)
+        self.addParameter(made)
+
+    def destination(self, parameters, key, context):
+        """The file that was chosen, in a folder that is there; empty where none was."""
+        path = self.parameterAsFileOutput(parameters, key, context)
+        return written(path) if path else ""
 
     def add_inputs(self, help=""):
         """Files, a folder, or both."""

@@ -1,28 +1,16 @@
 """The algorithm that says what is missing; it is there when nothing else is."""
 
-from qgis.core import QgsProcessingAlgorithm, QgsProcessingException, QgsProcessingOutputString
+from qgis.core import QgsProcessingException, QgsProcessingOutputString
 
 from . import environment, running
+from .base import Named
 
 
-class CheckInstallation(QgsProcessingAlgorithm):
+class CheckInstallation(Named):
+    key, title = "check", "Check the installation"
+
     def createInstance(self):
         return CheckInstallation()
-
-    def name(self):
-        return "check"
-
-    def displayName(self):
-        return "Check the installation"
-
-    def group(self):
-        return ""
-
-    def groupId(self):
-        return ""
-
-    def icon(self):
-        return self.provider().icon() if self.provider() else super().icon()
 
     def shortHelpString(self):
         return (
