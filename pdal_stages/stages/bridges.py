@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import BRIDGE, OVERLAP
+from ..base.asprs import BRIDGE
 from ..terrain.decks import PARTS, SURFACE
 from .base import Stage
-from .options import option
+from .options import ignore_option, keep_option, option
 from .points import Points, class_counts
-from .selection import UNWANTED, Selection
+from .selection import Selection
 
 #: What parapets, flanks and cars are called where they are taken for something that stands on the ground.
 _MISTAKEN = (2, 6)
@@ -22,15 +22,8 @@ class Bridges(Stage):
     where_chooses = True
     where_help = "Points outside keep their class."
     code: int = option("integer", BRIDGE, "Class code of bridge decks", minimum=0, maximum=255)
-    ignore: Selection = option(
-        "selection",
-        UNWANTED,
-        "Points that keep their class: class codes, ranges such as Classification[7:7], or the word withheld",
-        may_be_empty=True,
-    )
-    keep: Selection = option(
-        "selection", (OVERLAP,), "The same: points that keep their class", may_be_empty=True
-    )
+    ignore: Selection = ignore_option("Points that keep their class")
+    keep: Selection = keep_option("Further points that keep their class")
     details = """
 Comes after a classification, and after `filters.hag_morphological` with `"decks": true`, which finds the decks by their
 shape: a classifier cannot know a deck from a road or a roof by what is near a point. All points of a deck's surface get the

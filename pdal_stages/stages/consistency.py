@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import OVERLAP
 from ..objects.consistency import REACH, RULES, consistent
 from .base import Stage
-from .options import option
+from .options import ignore_option, keep_option, option
 from .points import Points
-from .selection import UNWANTED, Selection
+from .selection import Selection
 
 
 class Consistency(Stage):
@@ -33,16 +32,8 @@ class Consistency(Stage):
     lone: bool = option(
         "boolean", True, "A lone building or leaf among at least ten of the other is of their class"
     )
-    ignore: Selection = option(
-        "selection",
-        UNWANTED,
-        "Points that are neither neighbors nor changed: class codes, ranges such as Classification[7:7], or the word "
-        "withheld",
-        may_be_empty=True,
-    )
-    keep: Selection = option(
-        "selection", (OVERLAP,), "Points that are neighbors but keep their class", may_be_empty=True
-    )
+    ignore: Selection = ignore_option("Points that are neither neighbors nor changed")
+    keep: Selection = keep_option()
     details = """
 The last step after a classification. Only ground (2), vegetation (3, 4, 5) and buildings (6) are changed, and only into one
 another; `ground` and `islands` need `HeightAboveGround` and `Ground` and do nothing without them, which the metadata says.

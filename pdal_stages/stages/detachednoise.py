@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from ..base.asprs import NOISE
 from ..terrain.detached import REACH, detached_noise
 from .base import Stage
-from .options import option
+from .options import ignore_option, option
 from .points import Points
-from .selection import UNWANTED, Selection
+from .selection import Selection
 
 
 class DetachedNoise(Stage):
@@ -41,13 +41,7 @@ class DetachedNoise(Stage):
     )
     low_class: int = option("integer", NOISE[0], "Class code of low noise", minimum=0, maximum=255)
     high_class: int = option("integer", NOISE[1], "Class code of high noise", minimum=0, maximum=255)
-    ignore: Selection = option(
-        "selection",
-        UNWANTED,
-        "Points that are as good as not there, and keep their class: class codes, ranges such as Classification[7:7], "
-        "or the word withheld",
-        may_be_empty=True,
-    )
+    ignore: Selection = ignore_option("Points that are as good as not there, and keep their class")
     details = """
 Marks echoes from below the ground (multiple reflections), birds, clouds and the sun, alone or in small clusters, in clouds
 of any density. Put it first: one echo 10 m below ground spoils a ground filter, and features, for many meters around.

@@ -11,9 +11,9 @@ from ..base.errors import OptionError
 from ..terrain.minima import MinimaTerrain, check_sizes, terrain_reach
 from . import carried
 from .base import HEIGHTS_OUTSIDE, Stage
-from .options import option
+from .options import ignore_option, option
 from .points import Points
-from .selection import UNWANTED, Selection
+from .selection import Selection
 
 
 class HagMinima(Stage):
@@ -46,13 +46,7 @@ class HagMinima(Stage):
         maximum=10_000,
         unit="m",
     )
-    ignore: Selection = option(
-        "selection",
-        UNWANTED,
-        "Points that do not form the terrain but still receive heights: class codes, ranges such as "
-        "Classification[7:7], or the word withheld",
-        may_be_empty=True,
-    )
+    ignore: Selection = ignore_option("Points that do not form the terrain but still receive heights")
     details = """
 The terrain is the lowest point of each cell of a coarse grid, interpolated bilinearly between cell centers and
 evaluated on a fine grid; a point's height is its Z minus the value of the fine cell it falls in. Both grids are

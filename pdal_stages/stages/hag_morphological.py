@@ -17,9 +17,9 @@ from ..terrain.morphological import check_sizes, filtered_ground, reach, reach_o
 from ..terrain.profile import opening_names
 from . import carried
 from .base import HEIGHTS_OUTSIDE, Blocks, Stage
-from .options import option
+from .options import ignore_option, option
 from .points import Points
-from .selection import UNWANTED, Selection
+from .selection import Selection
 
 
 class HagMorphological(Stage):
@@ -70,13 +70,7 @@ class HagMorphological(Stage):
     scalar: float = option(
         "number", 1.25, "Added to the threshold per unit of the terrain's slope", minimum=0, maximum=1000
     )
-    ignore: Selection = option(
-        "selection",
-        UNWANTED,
-        "Points that cannot be ground but still receive heights: class codes, ranges such as Classification[7:7], or the "
-        "word withheld",
-        may_be_empty=True,
-    )
+    ignore: Selection = ignore_option("Points that cannot be ground but still receive heights")
     ground: bool = option(
         "boolean", False, "Also write Ground: 1 where the filter calls the point ground, else 0"
     )

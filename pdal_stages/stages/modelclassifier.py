@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import OVERLAP
 from ..base.errors import DimensionError, OptionError
 from ..base.progress import Progress
 from ..classifier import Model, Prediction
@@ -18,10 +17,10 @@ from ..classifier.sureness import Limit, Sureness, said, sureness_of
 from ..models import find
 from .base import Stage
 from .loading import loaded_model
-from .options import option
+from .options import ignore_option, keep_option, option
 from .points import Points, class_counts
 from .preparation import as_json, same
-from .selection import UNWANTED, Selection
+from .selection import Selection
 
 HEIGHT = "HeightAboveGround"
 #: Vegetation in ASPRS's codes.
@@ -74,19 +73,12 @@ class ModelClassifier(Stage):
         minimum=0.5,
         maximum=0.999,
     )
-    ignore: Selection = option(
-        "selection",
-        UNWANTED,
-        "Points that are neither neighbors nor classified, and keep their class: class codes, ranges such as "
-        "Classification[7:7], or the word withheld",
-        may_be_empty=True,
+    ignore: Selection = ignore_option(
+        "Points that are neither neighbors nor classified, and keep their class"
     )
-    keep: Selection = option(
-        "selection",
-        (OVERLAP,),
+    keep: Selection = keep_option(
         "Points that are neighbors but keep the class they have, written as for ignore; 12 (overlap of strips) says of a "
-        "point what a class would overwrite",
-        may_be_empty=True,
+        "point what a class would overwrite"
     )
     smooth: float = option(
         "number",

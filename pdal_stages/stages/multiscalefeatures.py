@@ -19,9 +19,9 @@ from ..features.neighborhoods import LEAST_RADIUS, Neighborhood, parse_neighborh
 from ..features.plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS
 from ..features.voxels import LARGEST, check_side, represent
 from .base import Stage
-from .options import option
+from .options import ignore_option, option
 from .points import Points
-from .selection import UNWANTED, Selection
+from .selection import Selection
 
 #: Bytes a LAS extra-dimension name may have.
 _NAME_BYTES = 32
@@ -56,13 +56,7 @@ class MultiscaleFeatures(Stage):
         "JSON file with the thresholds of shape histograms and curvature: read if it exists, otherwise fitted to "
         "these points and written, so that other tiles use the same ones",
     )
-    ignore: Selection = option(
-        "selection",
-        UNWANTED,
-        "Points that are not neighbors and get no features: class codes, ranges such as Classification[7:7], or the word "
-        "withheld",
-        may_be_empty=True,
-    )
+    ignore: Selection = ignore_option("Points that are not neighbors and get no features")
     optimal: bool = option(
         "boolean",
         False,

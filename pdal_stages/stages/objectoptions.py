@@ -8,9 +8,9 @@ from typing import Any
 
 from ..objects import Cells, ObjectSettings
 from ..objects.cells import CLASSES, Kind, kind_of_code, refuse_unclassified
-from .options import option
+from .options import ignore_option, option
 from .points import Points
-from .selection import UNWANTED, Selection
+from .selection import Selection
 
 _SETTINGS = {one.name: one for one in fields(ObjectSettings)}
 _CODES = {
@@ -56,12 +56,7 @@ class ObjectOptions:
     saddle: float = _setting("saddle")
     smoothing: float = _setting("smoothing")
     span_gap: float = _setting("span_gap")
-    ignore: Selection = option(
-        "selection",
-        UNWANTED,
-        "Points of no object: class codes, ranges such as Classification[7:7], or the word withheld",
-        may_be_empty=True,
-    )
+    ignore: Selection = ignore_option("Points of no object")
 
     options: dict[str, Any]
 

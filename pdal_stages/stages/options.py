@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..base import checks
+from ..base.asprs import OVERLAP
 from ..base.errors import OptionError, suggest
-from .selection import Selection
+from .selection import UNWANTED, Selection
 
 _LISTED = ["array", "string"], "a list, or text separated by commas"
 #: Kind of option -> its JSON type (PDAL takes numbers as text too), and what errors call it.
@@ -180,6 +181,17 @@ def option(kind: str, default: Any, help: str, **more: Any) -> Any:
     The annotation says what the parsed value is; all else is as for :class:`Option`.
     """
     return Option(kind, default, help, **more)
+
+
+def ignore_option(points: str) -> Any:
+    """The option `ignore`, which noise and withheld points are unless told; says what becomes of the `points`."""
+    words = ": class codes, ranges such as Classification[7:7], or the word withheld"
+    return option("selection", UNWANTED, points + words, may_be_empty=True)
+
+
+def keep_option(points: str = "Points that are neighbors but keep their class") -> Any:
+    """The option `keep`, which overlap is unless told; says what becomes of the `points`."""
+    return option("selection", (OVERLAP,), points, may_be_empty=True)
 
 
 def split_list(text: str) -> list[str]:

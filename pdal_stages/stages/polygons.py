@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import OVERLAP
 from ..objects.outlines import with_vector
 from ..objects.overlay import Overlay, inside_of
 from .base import Stage
-from .options import option
+from .options import ignore_option, keep_option, option
 from .points import Points, class_counts
-from .selection import UNWANTED, Selection
+from .selection import Selection
 
 
 class Polygons(Stage):
@@ -26,12 +25,8 @@ class Polygons(Stage):
         "bridge decks, FILE=CODE:all everything inside; a layer is named as in lakes.gpkg|layername=canals=9",
         required=True,
     )
-    ignore: Selection = option(
-        "selection", UNWANTED, "Points that keep their class, as noise does", may_be_empty=True
-    )
-    keep: Selection = option(
-        "selection", (OVERLAP,), "Further points that keep their class", may_be_empty=True
-    )
+    ignore: Selection = ignore_option("Points that keep their class")
+    keep: Selection = keep_option("Further points that keep their class")
     details = """
 Lays a map over the points: lakes, roads, bridges. A point inside a polygon, or on its edge, gets the code that belongs to
 the file, if its class is one of those that the code may be put in place of: ground (2) unless others are named, so

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import OVERLAP, WIRE
+from ..base.asprs import WIRE
 from ..terrain.wires import REACH, find_wires
 from .base import Stage
-from .options import option
+from .options import ignore_option, keep_option, option
 from .points import Points, class_counts
-from .selection import UNWANTED, Selection
+from .selection import Selection
 
 
 class Wires(Stage):
@@ -19,16 +19,8 @@ class Wires(Stage):
     where_chooses = True
     where_help = "Points outside keep their class but still serve as neighbors."
     code: int = option("integer", WIRE, "Class code of wires", minimum=0, maximum=255)
-    ignore: Selection = option(
-        "selection",
-        UNWANTED,
-        "Points that are as good as not there, and keep their class: class codes, ranges such as Classification[7:7], "
-        "or the word withheld",
-        may_be_empty=True,
-    )
-    keep: Selection = option(
-        "selection", (OVERLAP,), "Points that are neighbors but keep their class", may_be_empty=True
-    )
+    ignore: Selection = ignore_option("Points that are as good as not there, and keep their class")
+    keep: Selection = keep_option()
     details = """
 Finds wires by their shape, whatever their class was: points more than 4 m above the ground on a straight line of 24 m
 that is filled and around which the air is empty, or of some lines side by side; lines that hang together over 30 m. What
