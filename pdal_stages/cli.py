@@ -131,7 +131,7 @@ def _unforeseen(error: Exception) -> StageError:
 
 def _refuse_words(command: argparse.ArgumentParser, unknown: list[str]) -> None:
     """Leave with the command's usage and the flag that may have been meant."""
-    flags = re.findall(r"(?<!\S)--[\w-]+", command.format_help())
+    flags = re.findall(r"(?<!\S)--[\w-]+(?![\w.-])", command.format_help())
     near = suggest(unknown[0].partition("=")[0], flags)
     command.error(f"unrecognized arguments: {' '.join(unknown)}. {near}".rstrip(". "))
 

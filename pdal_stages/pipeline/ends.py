@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import StageError
+from ..base.errors import StageError, suggest
 from . import pdal as pdal_env
 from .overrides import Override, apply_overrides
 from .tindex import locations
@@ -26,7 +26,7 @@ def input_files(names: Sequence[str]) -> list[str]:
     Raises
     ------
     StageError
-        Where a folder or a tile index holds no input.
+        Where a name stands for nothing, or a folder or a tile index holds no input.
     """
     found: list[str] = []
     for name in names:
@@ -39,14 +39,22 @@ def input_files(names: Sequence[str]) -> list[str]:
             found += locations(name)
         elif not path.exists() and (matches := sorted(glob.glob(name, recursive=True))):
             found += matches
-        else:
+        elif path.exists() or name.startswith("/vsi"):
             found.append(name)
+        else:
+            raise StageError("there is no such file or folder", where=name, cure=_nearest_file(path))
     by_place = {name if "://" in name else os.path.realpath(name): name for name in reversed(found)}
     return [
         name
         for name in dict.fromkeys(found)
         if by_place.get(name if "://" in name else os.path.realpath(name)) == name
     ]
+
+
+def _nearest_file(path: Path) -> str:
+    """What may have been meant, of the names beside it."""
+    beside = os.listdir(path.parent) if path.parent.is_dir() else []
+    return f"{suggest(path.name, beside)}Check the path"
 
 
 def _inside(folder: Path) -> list[str]:

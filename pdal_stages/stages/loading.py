@@ -7,9 +7,10 @@ import os
 from functools import lru_cache
 from pathlib import Path
 
+from ..base.errors import ModelError, suggest
 from ..classifier import Model
 from ..classifier import load_model as read_model
-from ..models import find
+from ..models import find, shipped
 
 
 def load_model(path: str | os.PathLike) -> Model:
@@ -20,7 +21,13 @@ def load_model(path: str | os.PathLike) -> Model:
     ModelError
         The file is missing, damaged, of a newer version, not what it says, or asks for what no model may ask for.
     """
-    return read_model(find(os.fspath(path)))
+    name = os.fspath(path)
+    try:
+        return read_model(find(name))
+    except ModelError as error:
+        if not os.path.lexists(name):
+            error.cure = f"{suggest(name, shipped())}{error.cure}"
+        raise
 
 
 def digest_of(path: str) -> str:

@@ -148,6 +148,9 @@ def test_models_that_are_not_there(cell, tmp_path, cloud):
     cell("Models", "model that is not there").refused(
         [*words, tmp_path / "nix.model"], "nix.model", "no such model file", "Check the path"
     )
+    cell("Models", "mistyped name of a shipped model").refused(
+        [*words, "standrd"], "standrd", "Did you mean 'standard'?"
+    )
     cell("Models", "folder as the model").refused([*words, tmp_path], "not a file")
     cell("Models", "model name that is empty").refused([*words, ""], "model")
     cell("Models", "NUL in the model's name").refused([*words, "a\0b"], "model")

@@ -213,7 +213,12 @@ USAGE = [
     ("no pipeline file", ["pipeline"], 1, "no pipeline file was given"),
     ("stage options where none are taken", ["drivers", "--stage.a.b=1"], 1, "takes no stage options"),
     ("options of a stage that is not there", ["options", "filters.hag_minimum"], 1, "Did you mean 'filters.hag_minima'?"),
-    ("classify with a model that is not there", ["classify", "a.las", "b.las", "--model", "standart"], 1, "standart"),
+    ("classify with a model that is not there", ["classify", "JOB", "b.las", "--model", "standart"], 1, "Did you mean 'standard'?"),
+    ("classify a file that is not there", ["classify", "a.las", "b.las"], 1, "a.las: there is no such file or folder. Check the path"),
+    ("train on a mistyped file", ["train", "jbo.json", "--model", "m"], 1, "Did you mean 'job.json'?"),
+    ("objects of a file that is not there", ["objects", "a.las", "b.gpkg"], 1, "a.las: there is no such file or folder"),
+    ("accuracy of a file that is not there", ["accuracy", "a.las"], 1, "a.las: there is no such file or folder"),
+    ("review of a file that is not there", ["review", "a.las", "b.gpkg"], 1, "a.las: there is no such file or folder"),
     ("count that is no number", ["train", "a.las", "--model", "m", "--count", "many"], 2, "invalid int value"),
     ("metadata in a folder that is not there", ["pipeline", "JOB", "--metadata", "no/m.json"], 1, "metadata file does not exist"),
 ]  # fmt: skip
