@@ -73,8 +73,8 @@ def reads_in_parts(path: str) -> bool:
     return Path(path).suffix.lower() in (".las", ".laz") and read_header(path) is not None
 
 
-def reference_and_wkt(path: str) -> tuple[Reference, str]:
-    """A file's reference, and its well-known text."""
+def reference_and_wkt(path: str, horizontal: str = "") -> tuple[Reference, str]:
+    """A file's reference, and its well-known text; `horizontal`: the unit that a stage was told, if any."""
     reader: dict[str, Any] = {"filename": path}
     if reads_in_parts(path):
         reader |= {"type": "readers.las", "count": 1}
@@ -82,7 +82,8 @@ def reference_and_wkt(path: str) -> tuple[Reference, str]:
     name = next(key for key in metadata if key.startswith("readers."))
     node = metadata[name]
     srs = (node[0] if isinstance(node, list) else node).get("srs", {})
-    return reference_of({**reader, "type": name}), str(srs.get("horizontal") or srs.get("wkt") or "")
+    wkt = str(srs.get("horizontal") or srs.get("wkt") or "")
+    return reference_of({**reader, "type": name}, horizontal), wkt
 
 
 def parts_of(path: str, wkt: str, more: Sequence[str] = ()) -> Iterator[Part]:

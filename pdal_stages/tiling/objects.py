@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from ..base import kinds
 from ..base.errors import OptionError, StageError
 from ..base.files import write_whole
-from ..base.las import read_header
 from ..base.outputs import Output, check_outputs
 from ..base.plain import print_messages
 from ..base.progress import Progress
@@ -33,8 +32,9 @@ from ..objects.cells import Kind, refuse_unclassified
 from ..pipeline import pdal as pdal_env
 from ..pipeline.ends import input_files, outputs_of
 from ..pipeline.overrides import Override
+from ..pipeline.parts import reads_in_parts, reference_and_wkt
 from ..pipeline.processes import each_file
-from ..pipeline.references import Reference, check_one_reference, reference_of
+from ..pipeline.references import check_one_reference
 from ..reports.objectlayers import check_target, object_layers, target_files, write_layers
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter
 from .classify import ClassifyTask
@@ -78,7 +78,7 @@ def run_command(options: argparse.Namespace) -> int:
 def refuse_tiles(task: ClassifyTask, output: str) -> None:
     """Refuse, before any work, what ``classify --objects`` cannot do."""
     check_target(output)
-    if task.options.per == "tile" or not all(map(_is_las, task.files)):
+    if task.options.per == "tile" or not all(map(reads_in_parts, task.files)):
         raise OptionError(
             "classify --objects needs an output for each LAS or LAZ input",
             cure="Classify first, then: pdal-stages objects OUTPUT town.gpkg",
@@ -146,7 +146,7 @@ def objects_of_files(
 ) -> tuple[Objects, tuple[Units, str]]:
     """The objects of all files together; units of the coordinates and their reference (WKT)."""
     check_target(stage.filename)
-    references = {path: _reference(path, stage) for path in inputs}
+    references = {path: reference_and_wkt(path, stage.horizontal_unit) for path in inputs}
     check_one_reference({path: one for path, (one, _) in references.items()})
     units, wkt = references[inputs[0]][0].units, references[inputs[0]][1]
     folder = _kept(stage.filename)
@@ -195,23 +195,6 @@ def _tell_density(cells: Cells) -> None:
         )
 
 
-def _reference(path: str, stage: ObjectsWriter) -> tuple[Reference, str]:
-    """A file's reference, and its well-known text."""
-    reader: dict[str, Any] = {"filename": path}
-    if _is_las(path):
-        reader |= {"type": "readers.las", "count": 1}
-    metadata = pdal_env.execute([reader], arrays=False).metadata.get("metadata", {})
-    name = next(key for key in metadata if key.startswith("readers."))
-    node = metadata[name]
-    srs = (node[0] if isinstance(node, list) else node).get("srs", {})
-    one = reference_of({**reader, "type": name}, stage.horizontal_unit)
-    return one, str(srs.get("horizontal") or srs.get("wkt") or "")
-
-
-def _is_las(path: str) -> bool:
-    return Path(path).suffix.lower() in (".las", ".laz") and read_header(path) is not None
-
-
 def read_cells(path: str, stage: ObjectsWriter, wkt: str, kept: str) -> list[int]:
     """Read a file's records and keep them in a file; which class codes it has (256 of 0 or 1)."""
     target = Path(kept + ".npz")
@@ -253,7 +236,7 @@ def _load(kept: str, size: float) -> Cells:
 
 def _points_of(path: str) -> Iterator[dict[str, NDArray]]:
     """The dimensions that objects read, a part of a LAS or LAZ file at a time; of others all, by PDAL."""
-    if not _is_las(path):
+    if not reads_in_parts(path):
         for points in pdal_env.execute([{"filename": path}]).arrays:
             yield {name: np.asarray(points[name]) for name in points.dtype.names}
         return

@@ -25,17 +25,8 @@ def rehearse(source: PipelineSource, sources: list[InputSource], readers: int) -
     reader: dict[str, Any] = {**first.reader, "type": "readers.las", "filename": first.path}
     tags = [stage.get("tag") if isinstance(stage, dict) else None for stage in source.stages[:readers]]
     stages = [{**reader, "tag": tag} if tag else dict(reader) for tag in tags]
-    rest = [_named(stage) for stage in source.stages[readers:]]
-    pipeline = Pipeline(replace(source, stages=[*stages, *rest]), whole=False)
+    pipeline = Pipeline(replace(source, stages=[*stages, *source.stages[readers:]]), whole=False)
     try:
         pipeline.prepare()
     except DependencyError:
         return  # the program pdal is not there to ask
-
-
-def _named(stage: Any) -> Any:
-    """A stage whose file has the name of an output: PDAL refuses a # after a dot, also of a folder."""
-    if isinstance(stage, str):
-        return stage.replace("#", "0")
-    name = stage.get("filename")
-    return {**stage, "filename": name.replace("#", "0")} if isinstance(name, str) else stage
