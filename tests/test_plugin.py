@@ -37,7 +37,7 @@ QUICK = ["--stage.model.neighborhoods=c2,s2", "--stage.model.count=300", "--stag
 @pytest.fixture(scope="module")
 def plugin(tmp_path_factory):
     """The folder of the plugin."""
-    folder = tmp_path_factory.mktemp("plugin")
+    folder = tmp_path_factory.mktemp("plugin") / "not" / "there"
     building.install(folder)
     return folder
 

@@ -281,8 +281,8 @@ def records(file: BinaryIO, header: LasHeader) -> Iterator[Record]:
 _MOST_RECORDS, _LARGEST_RECORD = 10_000, 1 << 20
 
 
-def _read_records(path: str | os.PathLike, user: bytes) -> Iterator[tuple[Record, bytes]]:
-    """The records of a user, with their data."""
+def records_of(path: str | os.PathLike, user: bytes) -> Iterator[tuple[Record, bytes]]:
+    """The records of a user (``LASF_Spec``) in a file, with their data; none where it is no LAS file."""
     header = read_header(path)
     if header is None:
         return
@@ -291,30 +291,6 @@ def _read_records(path: str | os.PathLike, user: bytes) -> Iterator[tuple[Record
             if record.user == user and record.length <= _LARGEST_RECORD:
                 file.seek(record.data)
                 yield record, file.read(record.length)
-
-
-#: Types of extra dimensions by number, 1 to 10 (LAS 1.4 R15, table 24), in PDAL's words.
-_EXTRA_TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float", "double")
-
-
-def extra_dimensions(path: str | os.PathLike) -> dict[str, str]:
-    """Extra dimensions that a LAS file describes, by name: the types PDAL holds them in. Empty where there are none.
-
-    Scaled ones are ``double``; those that are not valid numbers are left out.
-    """
-    found: dict[str, str] = {}
-    try:
-        for record, data in _read_records(path, b"LASF_Spec"):
-            if record.number != 4:
-                continue
-            for start in range(0, len(data) - 191, 192):
-                kind, options = data[start + 2 : start + 4]
-                name = data[start + 4 : start + 36].split(b"\0")[0].decode("utf-8", "replace")
-                if name and 1 <= kind <= len(_EXTRA_TYPES):
-                    found[name] = "double" if options & 0x18 else _EXTRA_TYPES[kind - 1]
-    except (OSError, ValueError):
-        return {}
-    return found
 
 
 def _chunk_table(path: str | os.PathLike, size: int, header: LasHeader) -> int:
@@ -461,6 +437,6 @@ def projection(path: str | os.PathLike) -> str:
     OSError
         If the file cannot be read.
     """
-    held = _read_records(path, b"LASF_Projection")
+    held = records_of(path, b"LASF_Projection")
     found = [struct.pack("<HQ", record.number, record.length) + data for record, data in held]
     return hashlib.sha256(b"".join(found)).hexdigest()[:16] if found else ""

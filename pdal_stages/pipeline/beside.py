@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import OptionError
-from ..base.las import extra_dimensions
+from ..base.extrabytes import extra_dimensions
 from . import pdal as pdal_env
 
 

@@ -6,7 +6,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..base.las import extra_dimensions, read_header
+from ..base.extrabytes import extra_dimensions
+from ..base.las import read_header
 from . import pdal as pdal_env
 from .filenames import is_writer, reader_files, writes_las
 from .writerlimits import las_version

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..base.errors import DimensionError, PipelineError
-from ..base.las import extra_dimensions, read_header
+from ..base.extrabytes import extra_dimensions
+from ..base.las import read_header
 from ..stages import preparation
 from ..stages.points import MAKERS
 from . import classflags

@@ -50,6 +50,11 @@ class Lowered:
     ours: list[LoweredStage] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
+    @property
+    def meanings(self) -> dict[str, str]:
+        """What LAS files say of the dimensions that stages of ours make; of what several change, the last one's word."""
+        return {name: text for ours in self.ours for name, text in ours.stage.meanings().items()}
+
 
 def lower(source: PipelineSource, whole: bool = True) -> Lowered:
     """Lower a pipeline; not `whole`: to be cut into tiles, whose outputs part flags from classes themselves.

@@ -185,7 +185,7 @@ class Pipeline:
             check_complete(made, final, writers[number], count)
             supersede_copc(made)
             if self.lowered.ours:  # else the file is as PDAL writes it, to the byte
-                keep_records(made, writers[number], stages)
+                keep_records(made, writers[number], stages, self.lowered.meanings)
 
         if self.lowered.ours:
             check_limit()

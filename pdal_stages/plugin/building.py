@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -39,6 +40,8 @@ def usual_folder() -> Path:
 def install(folder: Path | None = None) -> list[Path]:
     """Compile the plugin and put it into a folder, by default beside ``filters.python``; the files.
 
+    A `folder` that is not there yet is made.
+
     Raises
     ------
     DependencyError
@@ -48,6 +51,9 @@ def install(folder: Path | None = None) -> list[Path]:
     """
     target = folder or usual_folder()
     found = places.pdal()
+    if folder is not None:
+        with contextlib.suppress(OSError):  # told below
+            folder.mkdir(parents=True, exist_ok=True)
     if not target.is_dir() or not os.access(target, os.W_OK):
         raise StageError(
             "the folder of PDAL's plugins cannot be written",

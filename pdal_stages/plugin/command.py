@@ -16,7 +16,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--folder",
         type=Path,
         metavar="DIR",
-        help="Another folder, which must then be in PDAL_DRIVER_PATH, together with that of filters.python",
+        help="Another folder, made where it is not there, which must then be in PDAL_DRIVER_PATH, together with that of "
+        "filters.python",
     )
 
 

@@ -13,6 +13,7 @@ from ..base.errors import StageError
 from ..base.outputs import Output
 from ..base.units import named_unit
 from .carried import Rule
+from .dimensions import meaning
 from .options import Option, option, parse_options
 from .points import Points
 from .where import Expression
@@ -159,6 +160,10 @@ class Stage(ABC):
     def creates(self) -> dict[str, str]:
         """Dimensions made or overwritten: name -> PDAL type (``double``, ``float``, ``uint8_t``)."""
         return {}
+
+    def meanings(self) -> dict[str, str]:
+        """What LAS files say of dimensions that the stage makes or changes: name -> at most 31 bytes."""
+        return {name: text for name in self.creates() if (text := meaning(name))}
 
     def halo_m(self) -> float:
         """How far beyond a tile, in meters, points can change the tile's results."""

@@ -16,6 +16,7 @@ from ..classifier.smoothing import FARTHEST
 from ..classifier.sureness import Limit, Sureness, said, sureness_of
 from ..models import find
 from .base import Stage
+from .dimensions import meaning
 from .loading import loaded_model
 from .options import ignore_option, keep_option, option
 from .points import Points, class_counts
@@ -221,6 +222,11 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         if self.probabilities:
             out.update({f"Probability_{code}": "float" for code, _ in self.model.classes})
         return out
+
+    def meanings(self) -> dict[str, str]:
+        rounded = [HEIGHT] if self.compact else []
+        texts = {name: meaning(name, self.compact) for name in [*self.creates(), *rounded]}
+        return {name: text for name, text in texts.items() if text}
 
     def halo_m(self) -> float:
         return self.model.halo_m + self.inner_halo_m()

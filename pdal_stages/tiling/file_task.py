@@ -34,6 +34,7 @@ class FileTask:
     beside: dict[str, str] | None  #: see TilePlan
     outputs: list[str]  #: what each of the writers writes
     scratch: str  #: folder for temporary files
+    meanings: dict[str, str]  #: see TilePlan
 
     def run(self) -> dict[str, Any]:
         """Write the outputs; see :func:`~pdal_stages.tiling.tail.run_tail`. The record counts classes, too."""
@@ -60,7 +61,14 @@ class FileTask:
         if self.count > sizing.MOST_AT_ONCE and kinds <= {("writers.las", ".las"), ("writers.las", ".laz")}:
             try:
                 return write_in_parts(
-                    self.source, self.count, sizing.MOST_AT_ONCE, new_values, tail, self.outputs, self.scratch
+                    self.source,
+                    self.count,
+                    sizing.MOST_AT_ONCE,
+                    new_values,
+                    tail,
+                    self.outputs,
+                    self.scratch,
+                    self.meanings,
                 )
             except HeadersDifferError:  # such as automatic offsets: written at once
                 pass
@@ -68,7 +76,7 @@ class FileTask:
         header = las.read_header(self.source.path)
         if header is not None and header.count:
             tail = on_one_grid(tail, header.box, half_open=False)
-        return run_tail([reader], [new_values(0, self.count)], tail, self.outputs)
+        return run_tail([reader], [new_values(0, self.count)], tail, self.outputs, self.meanings)
 
 
 def write_tile(results: list[PieceResults], plan: TilePlan, outputs: list[str], box: Box) -> dict[str, Any]:
@@ -81,7 +89,7 @@ def write_tile(results: list[PieceResults], plan: TilePlan, outputs: list[str], 
         return {"outputs": []}
     readers = [{**result.piece.reader, "filename": result.piece.core} for result in mine]
     tail = on_one_grid(tail, box, half_open=True)
-    return run_tail(readers, [of_own_points(result) for result in mine], tail, outputs)
+    return run_tail(readers, [of_own_points(result) for result in mine], tail, outputs, plan.meanings)
 
 
 def with_beside(

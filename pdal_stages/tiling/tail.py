@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,18 +24,22 @@ _FLOATS = {"float64": "double", "float32": "float"}
 
 
 def run_tail(
-    readers: list[dict[str, Any]], new: list[NewValues], tail: list[dict[str, Any]], outputs: Sequence[str]
+    readers: list[dict[str, Any]],
+    new: list[NewValues],
+    tail: list[dict[str, Any]],
+    outputs: Sequence[str],
+    meanings: Mapping[str, str],
 ) -> dict[str, Any]:
     """Run readers, the new values of each, and the tail with its writers; what they have :func:`written`.
 
-    The files, `outputs`, appear under their names when all are whole.
+    The files, `outputs`, appear under their names when all are whole; `meanings` is what they say of dimensions.
     """
     writers = [stage for stage in tail if stage["type"].startswith("writers.")]
 
     def finish(made: Path, final: Path, number: int) -> None:
         check_complete(made, final, writers[number], None if "where" in writers[number] else run.count)
         supersede_copc(made)
-        keep_records(made, writers[number], [*readers, *tail])
+        keep_records(made, writers[number], [*readers, *tail], meanings)
 
     flags = classflags.parting([*readers, *tail], with_ours=True)
     with Callbacks() as callbacks:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +74,9 @@ class TilePlan:
     #: Of the dimensions that stages make, those that LAS files get beside the input's own; None leaves it to the writer.
     beside: dict[str, str] | None = None
     first: FirstRound | None = None  #: what is made of the points before any tile
+    meanings: dict[str, str] = field(
+        default_factory=dict
+    )  #: what LAS files say of dimensions that stages make
     whole_names: bool = False  #: '#' in an output's name is the whole name of the input file, with its suffix
 
     @property
@@ -163,6 +166,7 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
         else list(dict.fromkeys(name for stage in stages for name in stage.creates())),
         unit=next(filter(None, (stage.horizontal_unit for stage in stages)), ""),
         messages=messages,
+        meanings=pipeline.lowered.meanings,
         name=source.name,
     )
 

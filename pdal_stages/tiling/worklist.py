@@ -157,7 +157,9 @@ class Worklist:
             if isinstance(item, FileJob):
                 count = survey.indexes[item.source.path].count
                 results = [str(store.result(job.name)) for job in item.jobs]
-                return FileTask(item.source, count, results, plan.tail, plan.beside, item.outputs, scratch)
+                return FileTask(
+                    item.source, count, results, plan.tail, plan.beside, item.outputs, scratch, plan.meanings
+                )
             sources = survey.near(item.tile, far)
             return TileTask(
                 context,

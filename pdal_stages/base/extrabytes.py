@@ -1,0 +1,82 @@
+"""Extra dimensions of LAS files: what a file says of each, beside its name and type (LAS 1.4 R15, table 24).
+
+PDAL writes its own words for dimensions that it knows and none for others, whatever the input said.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+from .las import records_of
+
+#: Bytes of an entry, and where in it the name and the description are; both are texts of at most 32 bytes.
+_ENTRY, _NAME, _DESCRIPTION = 192, slice(4, 36), slice(160, 192)
+#: Types by number, 1 to 10, in PDAL's words.
+_TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float", "double")
+_SCALE, _OFFSET = 0x08, 0x10
+
+
+class _Entry(NamedTuple):
+    place: int  #: in the file
+    name: str
+    type: str  #: empty for what is not a number
+    description: bytes
+
+
+def _entries(path: str | os.PathLike) -> Iterator[_Entry]:
+    for record, data in records_of(path, b"LASF_Spec"):
+        if record.number != 4:
+            continue
+        for start in range(0, len(data) - _ENTRY + 1, _ENTRY):
+            entry = data[start : start + _ENTRY]
+            kind, options = entry[2], entry[3]
+            name = _text(entry[_NAME]).decode("utf-8", "replace")
+            known = _TYPES[kind - 1] if 1 <= kind <= len(_TYPES) else ""
+            scaled = known and options & (_SCALE | _OFFSET)
+            yield _Entry(record.data + start, name, "double" if scaled else known, _text(entry[_DESCRIPTION]))
+
+
+def _text(field: bytes) -> bytes:
+    return field.split(b"\0")[0]
+
+
+def extra_dimensions(path: str | os.PathLike) -> dict[str, str]:
+    """Extra dimensions that a LAS file describes, by name: the types PDAL holds them in. Empty where there are none.
+
+    Scaled ones are ``double``; those that are not valid numbers are left out.
+    """
+    try:
+        return {entry.name: entry.type for entry in _entries(path) if entry.name and entry.type}
+    except (OSError, ValueError):
+        return {}
+
+
+def descriptions(path: str | os.PathLike) -> dict[str, bytes]:
+    """What a LAS file says of its extra dimensions, by name; those of which it says nothing are left out."""
+    try:
+        return {entry.name: entry.description for entry in _entries(path) if entry.description}
+    except (OSError, ValueError):
+        return {}
+
+
+def describe(path: str | os.PathLike, texts: Mapping[str, bytes]) -> None:
+    """Put descriptions of extra dimensions, by name, into a LAS file; what it says of others stays.
+
+    Raises
+    ------
+    ValueError
+        For a text of more than 32 bytes.
+    OSError
+        If the file cannot be written.
+    """
+    if long := [text for text in texts.values() if len(text) > 32]:
+        raise ValueError(f"longer than 32 bytes: {long[0]!r}")
+    new = [(one.place, texts[one.name]) for one in _entries(path) if one.name in texts]
+    if not new:
+        return
+    with open(path, "r+b") as file:
+        for place, text in new:
+            file.seek(place + _DESCRIPTION.start)
+            file.write(text.ljust(32, b"\0"))

@@ -1,0 +1,37 @@
+"""What LAS files say of the dimensions that stages make, beside their names: meaning and unit."""
+
+from __future__ import annotations
+
+import re
+
+#: In at most 31 bytes, which is what the file has room for. ``Z unit``: whatever unit the cloud's heights have.
+_MEANINGS = {
+    "HeightAboveGround": "above ground (Z unit)",
+    "Ground": "1: ground, found by a filter",
+    "Slope": "of the terrain, degrees",
+    "Deck": "1: bridge deck, found by shape",
+    "Reliability": "probability of class",
+    "Margin": "best minus second",
+    "Variance": "of probabilities",
+    "ObjectID": "of building, tree, span, deck",
+    "ObjectVerdict": "1: sure, 2: to be checked",
+    "ObjectHeight": "height of the object (Z unit)",
+    "ObjectExtent": "area, m2; of spans length, m",
+}
+_FAMILIES = (
+    (re.compile(r"HeightAboveOpening_(.+)"), r"above \1 m opening (Z unit)"),
+    (re.compile(r"Probability_(\d+)"), r"probability of \1"),
+)
+#: What is added for values that were rounded.
+ROUNDED = ", to 1/64"
+
+
+def meaning(name: str, rounded: bool = False) -> str:
+    """Meaning and unit of a dimension; empty where nothing is known of it."""
+    text = _MEANINGS.get(name, "")
+    for pattern, family in _FAMILIES:
+        if found := pattern.fullmatch(name):
+            text = found.expand(family).replace("_", ".")
+    if not rounded or not text:
+        return text
+    return text + ROUNDED
