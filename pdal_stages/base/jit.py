@@ -19,11 +19,12 @@ cache ahead of time, e.g. at installation.
 from __future__ import annotations
 
 import hashlib
+import importlib
 import os
 import stat
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import lru_cache, update_wrapper
 from pathlib import Path
 from typing import Any
@@ -68,6 +69,12 @@ class Kernel:
                     file._source_stamp = "-".join(sorted(_stamps[self]))
                 self._dispatcher = made
             return self._dispatcher
+
+    @property
+    def kept(self) -> bool:
+        """Whether compiled code of it is in the cache."""
+        file: Any = getattr(getattr(self.dispatcher, "_cache", None), "_cache_file", None)
+        return bool(file is not None and file._load_index())
 
     @property
     def _numba_type_(self) -> Any:
@@ -188,15 +195,17 @@ def _stamp(kernel: Any, function: Callable) -> None:
 
 
 class Compiling:
-    """Says on stderr how many kernels were compiled so far, where that takes longer than two seconds.
+    r"""Says on stderr how many kernels were compiled so far, where that takes longer than two seconds.
 
     numba compiles a kernel when a job first calls it, so these are the job's own. It tells the beginning and the end
-    of each, with those of the functions that it calls in between.
+    of each, with those of the functions that it calls in between. How many there will be is known where the job told
+    which ones it :meth:`expect`\ s to call.
     """
 
     #: Whether this process says it, whatever PDAL_STAGES_PROGRESS is.
     enabled: bool | None = None
     _bar: Progress | None = None
+    _expected: Callable[[], Iterable[str]] | None = None
     _inside = threading.local()
 
     @classmethod
@@ -209,12 +218,35 @@ class Compiling:
             if cls.enabled:
                 cls._bar.enabled = cls._bar.stream is not None
 
+    @classmethod
+    def expect(cls, names: Callable[[], Iterable[str]]) -> None:
+        """Be told which kernels will be called, as ``terrain.minima.lowest``; asked when the first one is compiled."""
+        cls._expected = names
+
+    @classmethod
+    def _count(cls) -> None:
+        """The total: what was compiled already, and what is expected and not in the cache."""
+        names, cls._expected = cls._expected, None
+        if cls._bar is None or names is None:
+            return
+        missing = 0
+        for name in names():
+            module, _, function = f"{__package__.rpartition('.')[0]}.{name}".rpartition(".")
+            kernel = getattr(importlib.import_module(module), function, None)
+            missing += isinstance(kernel, Kernel) and not kernel.kept
+        cls._bar.total = cls._bar.count + missing
+
     @staticmethod
     def _start(_: Any, event: Any) -> None:
         Compiling._inside.depth = getattr(Compiling._inside, "depth", 0) + 1
+        if Compiling._inside.depth == 1:
+            with _lock:
+                Compiling._count()
 
     @staticmethod
     def _end(_: Any, event: Any) -> None:
         Compiling._inside.depth = getattr(Compiling._inside, "depth", 1) - 1
-        if Compiling._inside.depth == 0 and Compiling._bar is not None:
-            Compiling._bar.update()
+        if Compiling._inside.depth == 0 and (bar := Compiling._bar) is not None:
+            if bar.total:  # more than was foreseen
+                bar.total = max(bar.total, bar.count + 1)
+            bar.update()

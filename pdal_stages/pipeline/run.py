@@ -16,6 +16,7 @@ from typing import Any
 from ..base.complete import check_complete
 from ..base.errors import InterruptedStage, PipelineError, StageError
 from ..base.files import whole_files
+from ..base.jit import Compiling
 from ..base.las import check_readable, odd_text, supersede_copc
 from ..base.outputs import Output, check_outputs
 from ..base.report import Report
@@ -189,6 +190,8 @@ class Pipeline:
 
         if self.lowered.ours:
             check_limit()
+            types = [ours.stage.type for ours in self.lowered.ours]
+            Compiling.expect(lambda: registry.kernels(types))
         runtime.remember_stdout()
         failure: StageError | None = None
         try:
