@@ -5,10 +5,45 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.jit import njit
+from ..base.jit import device, njit
 
 #: Smallest plane that counts, m2.
 SMALLEST = 3.0
+
+
+@device
+def plane_around(z, r, c, size, level, reach, flat):
+    """The plane through the five by five cells around a cell that lie within `reach` of a level, by least squares.
+
+    Returns how many they are, the rise per meter east and north, the height above `level` at the cell, and the mean
+    square of how far they lie from it; NaN where they are fewer than six, or in a row (a determinant below `flat`).
+    """
+    n, x, y, h, xx, yy, xy, xh, yh, hh = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(max(r - 2, 0), min(r + 3, z.shape[0])):
+        for j in range(max(c - 2, 0), min(c + 3, z.shape[1])):
+            d = z[i, j] - level
+            if not abs(d) <= reach:
+                continue
+            u, v = (j - c) * size, (i - r) * size
+            n += 1
+            x += u
+            y += v
+            h += d
+            xx += u * u
+            yy += v * v
+            xy += u * v
+            xh += u * d
+            yh += v * d
+            hh += d * d
+    if n < 6:
+        return n, np.nan, np.nan, np.nan, np.nan
+    xx, yy, xy = xx - x * x / n, yy - y * y / n, xy - x * y / n
+    xh, yh, hh = xh - x * h / n, yh - y * h / n, hh - h * h / n
+    det = xx * yy - xy * xy
+    if det < max(1e-9, flat * n * n * size**4):
+        return n, np.nan, np.nan, np.nan, np.nan
+    a, b = (xh * yy - yh * xy) / det, (yh * xx - xh * xy) / det
+    return n, a, b, (h - a * x - b * y) / n, (hh - a * xh - b * yh) / n
 
 
 @njit
@@ -21,31 +56,9 @@ def _gradients(z: NDArray, size: float) -> tuple[NDArray, NDArray, NDArray]:
         for c in range(columns):
             if np.isnan(z[r, c]):
                 continue
-            n, x, y, h, xx, yy, xy, xh, yh = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            for i in range(max(r - 2, 0), min(r + 3, rows)):
-                for j in range(max(c - 2, 0), min(c + 3, columns)):
-                    d = z[i, j] - z[r, c]
-                    if np.isnan(d) or abs(d) > 1.5:
-                        continue
-                    u, v = (j - c) * size, (i - r) * size
-                    n += 1
-                    x += u
-                    y += v
-                    h += d
-                    xx += u * u
-                    yy += v * v
-                    xy += u * v
-                    xh += u * d
-                    yh += v * d
-            if n < 6:
+            n, a, b, base, _ = plane_around(z, r, c, size, z[r, c], 1.5, 0.0)
+            if np.isnan(a):
                 continue
-            xx, yy, xy = xx - x * x / n, yy - y * y / n, xy - x * y / n
-            xh, yh = xh - x * h / n, yh - y * h / n
-            det = xx * yy - xy * xy
-            if det < 1e-9:
-                continue
-            a, b = (xh * yy - yh * xy) / det, (yh * xx - xh * xy) / det
-            base = (h - a * x - b * y) / n
             worst = 0.0
             for i in range(max(r - 2, 0), min(r + 3, rows)):
                 for j in range(max(c - 2, 0), min(c + 3, columns)):

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ..base.jit import device, njit
 from ..base.unionfind import root as root_of
+from .planes import plane_around
 
 #: Scatter of a roof's plane that is gone on from, and how near to it vegetation is of the roof, meters.
 PLANE, NEAR = 0.12, 0.2
@@ -45,36 +46,14 @@ def roof_cells(
 def _leaning(z, r, c, size, level):
     """How far `level` lies from the plane through the five by five cells around a cell that lie within a meter of it,
     meters; NaN where they are too few or scatter."""
-    n, x, y, h, xx, yy, xy, xh, yh, hh = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(max(r - 2, 0), min(r + 3, z.shape[0])):
-        for j in range(max(c - 2, 0), min(c + 3, z.shape[1])):
-            d = z[i, j] - level
-            if not abs(d) <= 1.0:
-                continue
-            u, v = (j - c) * size, (i - r) * size
-            n += 1
-            x += u
-            y += v
-            h += d
-            xx += u * u
-            yy += v * v
-            xy += u * v
-            xh += u * d
-            yh += v * d
-            hh += d * d
-    if n < 6:
+    _, a, b, above, scatter = plane_around(z, r, c, size, level, 1.0, 1e-3)
+    if np.isnan(a):
         return np.nan
-    xx, yy, xy = xx - x * x / n, yy - y * y / n, xy - x * y / n
-    xh, yh, hh = xh - x * h / n, yh - y * h / n, hh - h * h / n
-    det = xx * yy - xy * xy
-    if det < 1e-3 * n * n * size**4:  # all in a row
-        return np.nan
-    a, b = (xh * yy - yh * xy) / det, (yh * xx - xh * xy) / det
     steep = a * a + b * b
     # The highest point of a cell lies anywhere in it.
-    if (hh - a * xh - b * yh) / n > PLANE * PLANE + steep * (0.3 * size) ** 2 or steep > 4.0:
+    if scatter > PLANE * PLANE + steep * (0.3 * size) ** 2 or steep > 4.0:
         return np.nan
-    return max(0.0, abs(h - a * x - b * y) / n - 0.4 * size * np.sqrt(steep))
+    return max(0.0, abs(above) - 0.4 * size * np.sqrt(steep))
 
 
 @njit
@@ -284,10 +263,13 @@ def building_parts(
 
 def numbered(first: NDArray[np.int64]) -> NDArray[np.int64]:
     """Parts numbered from 0 in the order of what they are called; below 0 is nothing."""
-    inside, out = first >= 0, np.full(first.shape, -1, np.int64)
-    if inside.any():
-        _, out[inside] = np.unique(first[inside], return_inverse=True)
-    return out
+    inside = first >= 0
+    if not inside.any():
+        return np.full(first.shape, -1, np.int64)
+    known = np.zeros(int(first.max()) + 1, bool)
+    known[first[inside]] = True
+    place = np.cumsum(known, dtype=np.int32) - 1
+    return np.where(inside, place[first], np.int64(-1))
 
 
 def absorbed(number: NDArray[np.int64], z: NDArray, smallest: int) -> NDArray[np.int64]:
@@ -334,9 +316,11 @@ def _shared(number: NDArray[np.int64], z: NDArray, step: float) -> list[dict[int
     shared: list[dict[int, tuple[int, int]]] = [{} for _ in range(int(number.max(initial=-1)) + 1)]
     pairs = borders(number, z, step)
     if len(pairs):
-        ends, which, length = np.unique(pairs[:, :2], axis=0, return_inverse=True, return_counts=True)
-        near = np.bincount(which.ravel(), weights=pairs[:, 2]).astype(np.int64)
-        for (a, b), n, m in zip(ends.tolist(), length.tolist(), near.tolist(), strict=True):
+        pair = pairs[:, 0] * len(shared) + pairs[:, 1]
+        ends, which, length = np.unique(pair, return_inverse=True, return_counts=True)
+        near = np.bincount(which, weights=pairs[:, 2]).astype(np.int64)
+        for both, n, m in zip(ends.tolist(), length.tolist(), near.tolist(), strict=True):
+            a, b = divmod(both, len(shared))
             shared[a][b] = shared[b][a] = (n, m)
     return shared
 
