@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -190,15 +191,15 @@ def find_objects(
     if chosen.cell != cells.size:
         raise ValueError(f"cells of {cells.size} m, settings for {chosen.cell} m")
     found = {kind: _Found() for kind in FOUND}
-    blocks = {kind: _blocks(cells, kind, block) for kind in FOUND}
-    total = sum(map(len, blocks.values()))
+    of_block = _blocks(cells, block)
     extent = _extent(cells) if len(cells) else Window(0, 0, 0, 0)
-    with Progress(total, "objects", "blocks", enabled=progress) as line:
-        for kind in FOUND:
-            finder = _FINDERS[kind]
-            for row, column in blocks[kind]:
-                finder(cells, extent, chosen, Window(row, column, block, block), found[kind])
-                line.update()
+    with Progress(len(of_block), "objects", "blocks", enabled=progress) as line:
+        for (row, column), kinds in of_block.items():
+            core = Window(row, column, block, block)
+            near = _View(cells, _around(core, round(MARGIN / cells.size)), extent, chosen)
+            for kind in kinds:
+                _FINDERS[kind](near, core, found[kind])
+            line.update()
     keys = [k for one in found.values() for k in one.keys]
     owners = [k for one in found.values() for k in one.owners]
     key = np.concatenate(keys) if keys else np.empty(0, np.int64)
@@ -207,11 +208,14 @@ def find_objects(
     return Objects(chosen, {kind: one.table() for kind, one in found.items()}, key[order], owner[order])
 
 
-def _blocks(cells: Cells, kind: Kind, block: int) -> list[tuple[int, int]]:
-    """First row and column of each block that has cells of a kind."""
-    _, row, column = unpack(cells.of_kind(kind).key)
-    pairs = np.unique(np.column_stack([row // block, column // block]), axis=0) * block
-    return [(int(r), int(c)) for r, c in pairs]
+def _blocks(cells: Cells, block: int) -> dict[tuple[int, int], list[Kind]]:
+    """First row and column of each block, and the kinds that are to be found there."""
+    out: dict[tuple[int, int], list[Kind]] = {}
+    for kind in FOUND:
+        _, row, column = unpack(cells.of_kind(kind).key)
+        for r, c in np.unique(np.column_stack([row // block, column // block]), axis=0) * block:
+            out.setdefault((int(r), int(c)), []).append(kind)
+    return out
 
 
 def _around(core: Window, margin: int) -> Window:
@@ -235,24 +239,60 @@ def _common(a: Window, b: Window) -> Window:
     return Window(row, column, rows, min(a.column + a.columns, b.column + b.columns) - column)
 
 
-class _Layers:
-    """What the cells of a kind hold, as arrays of the part of a window that has any cells."""
+class _View:
+    """What the cells of a window hold, as arrays of the part of it that has any; what several kinds need is made once."""
 
-    def __init__(self, cells: Cells, kind: Kind, window: Window, extent: Window) -> None:
-        window = _common(window, extent)
-        self.cells, self.window, self.kind = cells, window, kind
-        self._inside = window.of(cells, kind)
-        self.high = window.dense(self._inside, "high", np.nan) / MM
-        self.ground = window.ground(cells)
+    def __init__(self, cells: Cells, window: Window, extent: Window, chosen: ObjectSettings) -> None:
+        self.cells, self.seen, self.extent, self.chosen = cells, window, extent, chosen
+        self.window = _common(window, extent)
+        self._held: dict[Kind, tuple[Cells, NDArray, NDArray]] = {}
 
-    def column(self, kind: Kind, name: str, empty: float, dtype=np.float64) -> NDArray:
-        """What cells of any kind hold, `empty` where there is none."""
-        inside = self._inside if kind == self.kind else self.window.of(self.cells, kind)
-        return self.window.dense(inside, name, empty, dtype)
+    def wider(self, margin: int) -> _View:
+        """The same with more around it."""
+        return _View(self.cells, _around(self.seen, margin), self.extent, self.chosen)
 
-    def body(self, r: NDArray, c: NDArray, z: NDArray) -> Body:
-        row, column, known = r + self.window.row, c + self.window.column, self._inside
-        key = cell_keys(self.kind, row, column)
+    def held(self, kind: Kind) -> tuple[Cells, NDArray[np.int64], NDArray[np.int64]]:
+        """The cells of a kind, and their rows and columns in the window."""
+        if kind not in self._held:
+            inside = self.window.of(self.cells, kind)
+            _, row, column = unpack(inside.key)
+            self._held[kind] = inside, row - self.window.row, column - self.window.column
+        return self._held[kind]
+
+    def column(self, kind: Kind, name: str, empty: float) -> NDArray[np.float64]:
+        """What cells of a kind hold, `empty` where there is none."""
+        inside, row, column = self.held(kind)
+        out = np.full((self.window.rows, self.window.columns), empty)
+        out[row, column] = inside.columns[name]
+        return out
+
+    def high(self, kind: Kind) -> NDArray[np.float64]:
+        """Height of the highest point of a kind, meters; NaN where there is none."""
+        return self.column(kind, "high", np.nan) / MM
+
+    @cached_property
+    def ground(self) -> NDArray[np.float64]:
+        """Height of the ground, meters; NaN where it is not known."""
+        return self.window.ground(self.cells)
+
+    @cached_property
+    def roofs(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+        """Cells of roofs, gone on into vegetation in their planes and over gaps of sparse ones, and their heights."""
+        chosen = self.chosen
+        leaves = self.high(Kind.TREE)
+        seen = self.window.has_ground(self.cells)
+        seen |= ~np.isnan(leaves) | (self.column(Kind.OTHER, "count", 0.0) > 0)
+        with np.errstate(invalid="ignore"):
+            leaves = np.where(leaves - self.ground < chosen.building_height, np.nan, leaves)
+        high = roofs.continued(self.high(Kind.BUILDING), leaves, chosen.cell, round(GROWTH / chosen.cell))
+        high = np.where(high - self.ground < chosen.building_height, np.nan, high)
+        high = roofs.covered(high, seen, round(DARK / chosen.cell))
+        return roofs.roof_cells(high, self.ground, chosen.building_height)
+
+    def body(self, kind: Kind, r: NDArray, c: NDArray, z: NDArray) -> Body:
+        """An object's cells, of which rows and columns in the window are given, with heights `z` of the window."""
+        row, column, known = r + self.window.row, c + self.window.column, self.held(kind)[0]
+        key = cell_keys(kind, row, column)
         at = np.minimum(np.searchsorted(known.key, key), len(known) - 1)
         there = known.key[at] == key
 
@@ -291,121 +331,102 @@ def _part(window: Window, part: Window) -> tuple[slice, slice]:
 
 
 def _whole(
-    cells: Cells, extent: Window, kind: Kind, core: Window, masked: Callable[[_Layers], NDArray[np.bool_]]
-) -> tuple[_Layers, NDArray[np.bool_], Window]:
-    """A block's layers with as much around it as it takes for all that reaches into the block to be whole.
+    near: _View, core: Window, masked: Callable[[_View], NDArray[np.bool_]]
+) -> tuple[_View, NDArray[np.bool_], Window]:
+    """A block's view with as much around it as it takes for all that reaches into the block to be whole.
 
     The last is the window within which they are: only objects larger than a window may be go beyond it.
     """
-    margin = round(MARGIN / cells.size)
-    around = margin
+    margin = round(MARGIN / near.chosen.cell)
+    view, around = near, margin
     while True:
-        seen = _around(core, around)
-        layers = _Layers(cells, kind, seen, extent)
-        mask = masked(layers)
+        mask = masked(view)
         first = roofs.connected(roofs.dilated(mask), np.zeros(mask.shape), np.inf)
-        sure = _around(seen, -margin)
-        inside = first[_part(layers.window, core)]
-        rim = first.copy()
-        rim[_part(layers.window, sure)] = -1
-        near = np.intersect1d(inside[inside >= 0], rim[rim >= 0])
-        if near.size == 0 or mask.size > MOST_CELLS:
-            return layers, mask, sure
-        around += max(margin, around // 2)
+        sure = _around(view.seen, -margin)
+        reached = np.zeros(mask.size + 1, bool)  # the last: no part
+        reached[first[_part(view.window, core)]] = True
+        first[_part(view.window, sure)] = -1
+        if not reached[first[first >= 0]].any() or mask.size > MOST_CELLS:
+            return view, mask, sure
+        more = max(margin, around // 2)
+        view, around = view.wider(more), around + more
 
 
-def _roofs_of(layers: _Layers, chosen: ObjectSettings) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Cells of roofs, gone on into vegetation in their planes and over gaps of sparse ones, and their heights."""
-    high, leaves = (layers.column(kind, "high", np.nan) / MM for kind in (Kind.BUILDING, Kind.TREE))
-    seen = layers.window.has_ground(layers.cells)
-    seen |= ~np.isnan(leaves) | (layers.column(Kind.OTHER, "count", 0.0) > 0)
-    with np.errstate(invalid="ignore"):
-        leaves = np.where(leaves - layers.ground < chosen.building_height, np.nan, leaves)
-    high = roofs.continued(high, leaves, chosen.cell, round(GROWTH / chosen.cell))
-    high = np.where(high - layers.ground < chosen.building_height, np.nan, high)
-    high = roofs.covered(high, seen, round(DARK / chosen.cell))
-    return roofs.roof_cells(high, layers.ground, chosen.building_height)
-
-
-def _buildings(cells: Cells, extent: Window, chosen: ObjectSettings, core: Window, found: _Found) -> None:
-    heights: list[NDArray] = []
-
-    def masked(layers: _Layers) -> NDArray[np.bool_]:
-        mask, z = _roofs_of(layers, chosen)
-        heights[:] = [z]
-        return mask
-
-    layers, mask, sure = _whole(cells, extent, Kind.BUILDING, core, masked)
+def _buildings(near: _View, core: Window, found: _Found) -> None:
+    view, mask, sure = _whole(near, core, lambda view: view.roofs[0])
+    chosen, z = view.chosen, view.roofs[1]
     area = chosen.cell**2
-    number = roofs.building_parts(
-        mask, heights[0], step=chosen.step, smallest=int(np.ceil(chosen.roof_part / area))
-    )
+    number = roofs.building_parts(mask, z, step=chosen.step, smallest=int(np.ceil(chosen.roof_part / area)))
     number = _without_small(number, chosen.building_area / area)
     # Points of a wall that stands out, and low ones beside it, belong to the building beside them.
     theirs = np.where(number < 0, _beside(number), number)
-    _keep(layers, number, theirs, heights[0], core, sure, Kind.BUILDING, chosen, found, measure.building)
+    _keep(view, number, theirs, z, core, sure, Kind.BUILDING, found, measure.building)
 
 
-def _decks(cells: Cells, extent: Window, chosen: ObjectSettings, core: Window, found: _Found) -> None:
+def _decks(near: _View, core: Window, found: _Found) -> None:
     heights: list[NDArray] = []
 
-    def masked(layers: _Layers) -> NDArray[np.bool_]:
-        mask, z = roofs.roof_cells(layers.high, np.full(layers.high.shape, np.nan), 0.0)
+    def masked(view: _View) -> NDArray[np.bool_]:
+        high = view.high(Kind.DECK)
+        mask, z = roofs.roof_cells(high, np.full(high.shape, np.nan), 0.0)
         heights[:] = [z]
         return mask
 
-    layers, mask, sure = _whole(cells, extent, Kind.DECK, core, masked)
-    number = roofs.building_parts(mask, heights[0], step=1.0, smallest=int(np.ceil(10.0 / chosen.cell**2)))
-    number = _without_small(number, chosen.building_area / chosen.cell**2)
+    view, mask, sure = _whole(near, core, masked)
+    cell = view.chosen.cell
+    number = roofs.building_parts(mask, heights[0], step=1.0, smallest=int(np.ceil(10.0 / cell**2)))
+    number = _without_small(number, view.chosen.building_area / cell**2)
     theirs = np.where(number < 0, _beside(number), number)
-    _keep(layers, number, theirs, heights[0], core, sure, Kind.DECK, chosen, found, measure.deck)
+    _keep(view, number, theirs, heights[0], core, sure, Kind.DECK, found, measure.deck)
 
 
-def _spans(cells: Cells, extent: Window, chosen: ObjectSettings, core: Window, found: _Found) -> None:
-    def masked(layers: _Layers) -> NDArray[np.bool_]:
-        towers = layers.window.of(cells, Kind.TOWER)
-        tower = layers.window.dense(towers, "count", 0.0) > 0
+def _spans(near: _View, core: Window, found: _Found) -> None:
+    chosen = near.chosen
+
+    def masked(view: _View) -> NDArray[np.bool_]:
+        tower = view.column(Kind.TOWER, "count", 0.0) > 0
         for _ in range(round(1.5 / chosen.cell)):
             tower = roofs.dilated(tower)
-        mask = ~np.isnan(layers.high)
+        mask = ~np.isnan(view.high(Kind.SPAN))
         for _ in range(round(chosen.span_gap / chosen.cell / 2)):
             mask = roofs.dilated(mask)
         return mask & ~tower
 
-    layers, mask, sure = _whole(cells, extent, Kind.SPAN, core, masked)
+    view, mask, sure = _whole(near, core, masked)
+    high = view.high(Kind.SPAN)
     joined = roofs.connected(mask, np.zeros(mask.shape), np.inf)
-    number = roofs.numbered(np.where(np.isnan(layers.high), -1, joined))
+    number = roofs.numbered(np.where(np.isnan(high), -1, joined))
     number = _without_small(number, 4)
 
     def measured(body: Body, size: float) -> dict[str, object]:
         found.paths.append(measure.path_of(body, size))
         return measure.span(body, size)
 
-    _keep(layers, number, number, layers.high, core, sure, Kind.SPAN, chosen, found, measured)
+    _keep(view, number, number, high, core, sure, Kind.SPAN, found, measured)
 
 
-def _trees(cells: Cells, extent: Window, chosen: ObjectSettings, core: Window, found: _Found) -> None:
-    size = chosen.cell
-    layers = _Layers(cells, Kind.TREE, _around(core, round(MARGIN / size)), extent)
-    mask, roof = _roofs_of(layers, chosen)
+def _trees(near: _View, core: Window, found: _Found) -> None:
+    chosen = near.chosen
+    size, high = chosen.cell, near.high(Kind.TREE)
+    mask, roof = near.roofs
     with np.errstate(invalid="ignore"):
         # Chimneys, gutters and walls that were taken for leaves are no trees.
-        layers.high[mask & (layers.high <= roof + 0.5)] = np.nan
-    height = crowns.canopy(layers.high, layers.ground)
+        high[mask & (high <= roof + 0.5)] = np.nan
+    height = crowns.canopy(high, near.ground)
     s = crowns.smoothed(height, crowns.bell(chosen.smoothing / size))
     up = crowns.summits(s, min(1.5, chosen.tree_height / 2))
     heir = crowns.heirs(
         s, up, chosen.window / size, chosen.window_slope / size, crowns.REACH / 2 / size, chosen.saddle
     )
     top = crowns.crown_cells(s, up, heir, 0.3, 0.8 * chosen.tree_height, crowns.REACH / size)
-    number = np.where(np.isnan(layers.high), -1, top)
-    z = np.where(np.isnan(layers.high), layers.ground + height, layers.high)
-    window = layers.window
+    number = np.where(np.isnan(high), -1, top)
+    z = np.where(np.isnan(high), near.ground + height, high)
+    window = near.window
     for n, r, c in _bodies(number):
         tr, tc = n // window.columns + window.row, n % window.columns + window.column
         if not _inside(core, tr, tc) or len(r) * size**2 < chosen.tree_area:
             continue
-        body = layers.body(r, c, z)
+        body = near.body(Kind.TREE, r, c, z)
         record = measure.tree(body, tr, tc, size)
         if not record["height"] >= chosen.tree_height:  # type: ignore[operator]
             continue
@@ -419,31 +440,30 @@ _FINDERS = {Kind.BUILDING: _buildings, Kind.TREE: _trees, Kind.SPAN: _spans, Kin
 
 
 def _keep(
-    layers: _Layers,
+    view: _View,
     number: NDArray[np.int64],
     theirs: NDArray[np.int64],
     z: NDArray,
     core: Window,
     sure: Window,
     kind: Kind,
-    chosen: ObjectSettings,
     found: _Found,
     measured: Callable[[Body, float], Mapping[str, object]],
 ) -> None:
     """Keep the objects whose first cell lies in the block; `theirs` says whose points cells hold."""
-    window, identities = layers.window, {}
+    window, identities = view.window, {}
     for n, r, c in _bodies(number):
         row, column = int(r[0]) + window.row, int(c[0]) + window.column
         if _inside(core, row, column):
             identity = int(object_id(kind, np.array(row), np.array(column)))
             identities[n] = identity
-            body = layers.body(r, c, z)
-            record = dict(measured(body, chosen.cell))
+            body = view.body(kind, r, c, z)
+            record = dict(measured(body, view.chosen.cell))
             ends = ((body.row.min(), body.column.min()), (body.row.max(), body.column.max()))
             if not all(_inside(sure, *map(int, end)) for end in ends):
                 record |= measure.judged([*filter(None, [record["reason"]]), measure.CUT])
             _add(found, identity, record, body)
-    for n, r, c in _bodies(np.where(np.isnan(layers.high), -1, theirs)):
+    for n, r, c in _bodies(np.where(np.isnan(view.high(kind)), -1, theirs)):
         if n in identities:
             found.keys.append(cell_keys(kind, r + window.row, c + window.column))
             found.owners.append(np.full(len(r), identities[n]))
