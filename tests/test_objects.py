@@ -329,3 +329,33 @@ def test_what_is_larger_than_a_window_says_that_it_was_cut(monkeypatch):
     cut = find_objects(cells, block=64, progress=False).tables[Kind.BUILDING]
     assert cut.columns["reason"][0] == "cut off" and cut.columns["verdict"][0] == CHECK
     assert "cut off" in REASONS
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 0.6, 0.9]))
+def test_boundaries_of_cells_against_their_union(seed, share):
+    shapely = pytest.importorskip("shapely")
+    from pdal_stages.objects.boundaries import polygon
+
+    rng = np.random.default_rng(seed)
+    row, column = np.nonzero(rng.random(rng.integers(1, 14, 2)) < share)
+    if row.size:
+        row, column = row - 1_000_000, column + 2_000_000
+        whole = shapely.union_all(shapely.box(column, row, column + 1, row + 1))
+        walked = polygon(shapely, row, column, 0.0)
+        assert walked.is_valid and walked.equals(whole) and walked.area == row.size
+        assert len(shapely.get_parts(walked)) == len(shapely.get_parts(whole))
+        parts = [shapely.Polygon(p.exterior, [h for h in p.interiors if shapely.Polygon(h).area >= 3])
+                 for p in shapely.get_parts(whole)]  # fmt: skip
+        assert polygon(shapely, row, column, 3.0).equals(shapely.MultiPolygon(parts))
+
+
+def test_lone_wires_are_not_looked_at_twice(monkeypatch):
+    from pdal_stages.objects import find
+
+    at = np.arange(60) * 3.0
+    x, y = (v.ravel() for v in np.meshgrid(at, at))
+    xyz = np.concatenate([np.column_stack([x, y, 0 * x + 8]), np.column_stack([x + 1, y, 0 * x])])
+    codes = np.repeat([14, 2], x.size).astype(np.uint8)
+    monkeypatch.setattr(find._View, "wider", None)
+    assert len(find_objects(Cells.of(*xyz.T, codes, 0.5), block=64, progress=False).tables[Kind.SPAN]) == 0

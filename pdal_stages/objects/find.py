@@ -26,6 +26,8 @@ from .rasters import GROUND_REACH, Window
 
 #: Meters around a place that decide about it, but for the extent of buildings, spans and decks.
 MARGIN = GROUND_REACH + 2 * crowns.REACH
+#: Meters more that are looked at first: most buildings that reach into a block end there, so few blocks are looked at twice.
+AHEAD = 64.0
 #: How far a roof goes on into what a classifier took for leaves, meters.
 GROWTH = 3.0
 #: How far the cells of a roof from which nothing came back lie from its rim at most, meters.
@@ -196,7 +198,7 @@ def find_objects(
     with Progress(len(of_block), "objects", "blocks", enabled=progress) as line:
         for (row, column), kinds in of_block.items():
             core = Window(row, column, block, block)
-            near = _View(cells, _around(core, round(MARGIN / cells.size)), extent, chosen)
+            near = _View(cells, _around(core, round((MARGIN + AHEAD) / cells.size)), extent, chosen)
             for kind in kinds:
                 _FINDERS[kind](near, core, found[kind])
             line.update()
@@ -331,17 +333,19 @@ def _part(window: Window, part: Window) -> tuple[slice, slice]:
 
 
 def _whole(
-    near: _View, core: Window, masked: Callable[[_View], NDArray[np.bool_]]
+    near: _View, core: Window, masked: Callable[[_View], NDArray[np.bool_]], beside: bool = True
 ) -> tuple[_View, NDArray[np.bool_], Window]:
     """A block's view with as much around it as it takes for all that reaches into the block to be whole.
 
-    The last is the window within which they are: only objects larger than a window may be go beyond it.
+    The last is the window within which they are: only objects larger than a window may be go beyond it. `beside`: cells
+    beside an object are looked at, too, so objects a cell apart reach as far as both.
     """
     margin = round(MARGIN / near.chosen.cell)
-    view, around = near, margin
+    view, around = near, near.seen.rows - core.rows >> 1
     while True:
         mask = masked(view)
-        first = roofs.connected(roofs.dilated(mask), np.zeros(mask.shape), np.inf)
+        wide = roofs.dilated(mask) if beside else mask
+        first = roofs.connected(wide, np.zeros(mask.shape), np.inf)
         sure = _around(view.seen, -margin)
         reached = np.zeros(mask.size + 1, bool)  # the last: no part
         reached[first[_part(view.window, core)]] = True
@@ -392,7 +396,7 @@ def _spans(near: _View, core: Window, found: _Found) -> None:
             mask = roofs.dilated(mask)
         return mask & ~tower
 
-    view, mask, sure = _whole(near, core, masked)
+    view, mask, sure = _whole(near, core, masked, beside=False)
     high = view.high(Kind.SPAN)
     joined = roofs.connected(mask, np.zeros(mask.shape), np.inf)
     number = roofs.numbered(np.where(np.isnan(high), -1, joined))

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from ..base.apart import apart
 from ..base.errors import DependencyError, StageError
+from .boundaries import polygon
 from .find import Table
 
 #: Holes smaller than this are closed, m2.
@@ -93,22 +94,7 @@ def _clashes(name: str) -> bool:
 def raw_outlines(table: Table, size: float, *, hole: float = SMALLEST_HOLE) -> list[Any]:
     """The union of each object's cells, in numbers of cells; holes smaller than `hole` m2 closed."""
     shapely = vector("shapely")
-    out = []
-    for number in range(len(table)):
-        row, column, _ = table.cells_of(number)
-        begins = np.flatnonzero(np.r_[True, (row[1:] != row[:-1]) | (column[1:] != column[:-1] + 1)])
-        ends = np.r_[begins[1:], len(row)] - 1
-        runs = shapely.box(column[begins], row[begins], column[ends] + 1, row[begins] + 1)
-        out.append(_without_holes(shapely, shapely.union_all(runs), hole / size**2))
-    return out
-
-
-def _without_holes(shapely: Any, shape: Any, least: float) -> Any:
-    parts = []
-    for part in shapely.get_parts(shape):
-        holes = [ring for ring in part.interiors if shapely.Polygon(ring).area >= least]
-        parts.append(shapely.Polygon(part.exterior, holes))
-    return parts[0] if len(parts) == 1 else shapely.MultiPolygon(parts)
+    return [polygon(shapely, *table.cells_of(number)[:2], hole / size**2) for number in range(len(table))]
 
 
 def straight_outlines(raw: list[Any], size: float) -> list[Any]:
@@ -160,7 +146,7 @@ def _touching(shapely: Any, shapes: list[Any]) -> list[list[int]]:
 
 def _straight(shapely: Any, shapes: list[Any], size: float) -> list[Any]:
     """Straight outlines of shapes that stand wall to wall."""
-    whole = shapely.union_all(shapes)
+    whole = shapely.union_all(shapes) if len(shapes) > 1 else shapes[0]
     angle = main_direction(np.concatenate([_middles(r) for r in _rings(shapely, whole)]))
     made = []
     for part in shapely.get_parts(whole):
@@ -169,10 +155,10 @@ def _straight(shapely: Any, shapes: list[Any], size: float) -> list[Any]:
         shape = _polygon(shapely, shell, holes)
         box = shapely.oriented_envelope(part)  # which the cells' corners make too large
         box = box.buffer(-max(0.0, box.area - part.area) / box.length, join_style="mitre")
-        alike = _likeness(shape, part) - 0.03 if shape is not None else 0.0
-        if not part.interiors and _likeness(box, part) >= max(_BOXLIKE, alike):
-            shape = box
-        if shape is None or _likeness(shape, part) < _LIKENESS:
+        alike = _likeness(shape, part) if shape is not None else -1.0
+        if not part.interiors and (boxlike := _likeness(box, part)) >= max(_BOXLIKE, alike - 0.03):
+            shape, alike = box, boxlike
+        if alike < _LIKENESS:
             shape = part.simplify(_TOLERANCE)
         made.append(shape if shape.is_valid and shape.geom_type == "Polygon" and shape.area > 0 else part)
     outer = shapely.union_all(made)
