@@ -19,6 +19,7 @@ import laspy
 import numpy as np
 import pytest
 
+import pdal_stages as ps
 from pdal_stages.base.version import __version__
 from pdal_stages.cli import main
 from pdal_stages.stages import registry
@@ -452,6 +453,24 @@ def test_the_way_of_a_tile(qgis, session, town, tmp_path):
     assert main([*words, "--out", str(tmp_path / "k.laz")]) == 0
     assert (out / "k.laz").read_bytes() == (tmp_path / "k.laz").read_bytes()
     assert np.count_nonzero(laspy.read(out / "k.laz")["Checked"]), said
+
+
+@pytest.mark.pdal
+def test_flags_of_old_files_are_no_classes_of_a_map(package, tmp_path):
+    """A key point of the ground is ground, flagged noise is noise."""
+    jobs = importlib.import_module("qgis_plugin.jobs")
+    old = laspy.create(file_version="1.2", point_format=1)
+    old.x, old.y, old.z = np.arange(12.0).reshape(3, 4)
+    old.classification, old.key_point = [2, 6, 18, 2], [1, 1, 1, 0]
+    old.write(tmp_path / "old.las")
+    job = jobs.class_map(str(tmp_path / "old.las"), str(tmp_path / "map.tif"), 1.0)[:-1]
+    pipeline = ps.Pipeline(job)
+    assert pipeline.execute() == 3
+    assert pipeline.arrays[0]["Classification"].tolist() == [2, 6, 2]
+    new = laspy.convert(old, file_version="1.4", point_format_id=6)
+    new.classification[:] = [2, 64, 18, 2]
+    new.write(tmp_path / "new.las")
+    assert jobs.plain_classes(str(tmp_path / "new.las")) == jobs.plain_classes("no.ply") == []
 
 
 @pytest.mark.pdal

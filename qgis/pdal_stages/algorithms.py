@@ -17,7 +17,7 @@ from qgis.core import (
 
 from . import results
 from .base import CLOUDS, Algorithm, written
-from .jobs import NOT_NOISE, class_map, raster, reader, writer
+from .jobs import NOT_NOISE, class_map, plain_classes, raster, reader, writer
 
 _VECTORS = "GeoPackage (*.gpkg);;GeoJSON (*.geojson);;FlatGeobuf (*.fgb);;Shapefiles (*.shp)"
 _AREAS = "Polygons (*.gpkg *.geojson *.fgb *.shp);;All files (*)"
@@ -195,12 +195,13 @@ class Heights(_Showing):
     def processAlgorithm(self, parameters, context, feedback):
         target = self.destination(parameters, "OUTPUT", context)
         stage = {"type": self.stage, **self.options(parameters, context)}
-        job = [reader(self.parameterAsFile(parameters, "INPUT", context)), stage, writer(target)]
+        source = self.parameterAsFile(parameters, "INPUT", context)
+        job = [reader(source), stage, writer(target)]
         out = {"OUTPUT": target}
         if parameters.get("MAP"):
             out["MAP"] = written(self.parameterAsOutputLayer(parameters, "MAP", context))
             side = self.parameterAsDouble(parameters, "RESOLUTION", context)
-            job += [NOT_NOISE, raster(out["MAP"], side, "HeightAboveGround", "max")]
+            job += [*plain_classes(source), NOT_NOISE, raster(out["MAP"], side, "HeightAboveGround", "max")]
         self.execute(["pipeline", "--stdin"], feedback, json.dumps(job))
         self.show_clouds([target], parameters, context)
         if "MAP" in out:
@@ -252,9 +253,15 @@ class TerrainModels(_Showing):
         side = self.parameterAsDouble(parameters, "RESOLUTION", context)
         by_class = self.parameterAsEnum(parameters, "GROUND_FROM", context) == 1
         stage = {"type": self.stage, **self.options(parameters, context), "ground": True}
-        source = reader(self.parameterAsFile(parameters, "INPUT", context))
+        source = self.parameterAsFile(parameters, "INPUT", context)
         # One line: of several ends PDAL runs only the first
-        job = [source, {"type": "filters.detachednoise"}, stage, NOT_NOISE]
+        job = [
+            reader(source),
+            {"type": "filters.detachednoise"},
+            stage,
+            *plain_classes(source),
+            NOT_NOISE,
+        ]
         if "SURFACE" in chosen:
             job.append(raster(chosen["SURFACE"], side, "Z", "max"))
         if "HEIGHTS" in chosen:

@@ -1,6 +1,17 @@
 """The pipelines that are no command of the program. No QGIS here."""
 
-NOT_NOISE = {"type": "filters.range", "limits": "Classification![7:7],Classification![18:18]"}
+#: What is within one of several ranges stays, so two negated ones would leave all.
+NOT_NOISE = {
+    "type": "filters.range",
+    "limits": "Classification[0:6],Classification[8:17],Classification[19:255]",
+}
+
+
+_PLAIN = """\
+def plain(ins, outs):
+    outs["Classification"] = ins["Classification"] & 31
+    return True
+"""
 
 
 def reader(source):
@@ -8,6 +19,18 @@ def reader(source):
     if source.lower().endswith((".las", ".laz")) and not source.lower().endswith(".copc.laz"):
         return {"type": "readers.las", "filename": source, "use_eb_vlr": True}
     return {"filename": source}
+
+
+def plain_classes(source):
+    """What takes the flags of LAS 1.0 to 1.3 off the classes, with which PDAL before 2.6 reads them; rasters have none."""
+    try:
+        with open(source, "rb") as file:
+            head = file.read(26)
+    except OSError:
+        return []  # told by whoever reads it
+    if head[:4] != b"LASF" or head[25] >= 4:
+        return []
+    return [{"type": "filters.python", "module": "classes", "function": "plain", "source": _PLAIN}]
 
 
 def writer(target):
@@ -40,4 +63,4 @@ def class_map(cloud, target, side):
         "nodata": 0,
         "window_size": 1,
     }
-    return [reader(cloud), NOT_NOISE, writes]
+    return [reader(cloud), *plain_classes(cloud), NOT_NOISE, writes]

@@ -10,7 +10,6 @@ from qgis.core import (
     QgsPointCloudLayer,
     QgsProcessingLayerPostProcessorInterface,
     QgsProviderRegistry,
-    QgsRasterBandStats,
     QgsSingleBandPseudoColorRenderer,
     QgsStyle,
     QgsVectorLayer,
@@ -98,11 +97,11 @@ def classes_of(classes):
 
     def act(layer):
         provider = layer.dataProvider()
-        most = int(provider.bandStatistics(1, QgsRasterBandStats.Max).maximumValue)
+        there = {int(one.value) for one in QgsPalettedRasterRenderer.classDataFromRaster(provider, 1)}
         shown = [
             QgsPalettedRasterRenderer.Class(int(code), QColor(*one["color"]), f"{code} {one['name']}")
             for code, one in classes.items()
-            if 1 <= int(code) <= most
+            if int(code) in there
         ]
         layer.setRenderer(QgsPalettedRasterRenderer(provider, 1, shown))
 
