@@ -67,7 +67,10 @@ def test_the_shipped_model_says_what_it_costs():
     assert any("6 Building" in line for line in lines) and ClassifyRequest().cost == []
     known = Sureness()
     known.add(np.array([6, 6]), np.array([6, 2]), np.array([0.9, 0.9]))
-    assert "none keeps it" in said(known.limits(0.9), {}, 0.9, 0.0)[1]
+    line = said(known, {}, 0.9)[1]
+    assert "none keeps it" in line and "50.0 % of the surest were right; with 0.5, 100.0 % would" in line
+    sure = ClassifyRequest(keep_sure=0.98).cost  # buildings stay with 98 %, too
+    assert not any("none keeps it" in line for line in sure)
 
 
 def blocks(seed, n=6000):

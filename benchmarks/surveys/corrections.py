@@ -18,7 +18,7 @@ from typing import Any
 
 import laspy
 import numpy as np
-from clouds import SURVEYS, VEGETATION
+from clouds import SURVEYS, true_classes
 from review import slug
 
 from pdal_stages import cli
@@ -36,15 +36,17 @@ def run(*words: object) -> None:
     assert cli.main([str(word) for word in words]) == 0, words
 
 
-def truth_of(survey: Any, las: Any, height: np.ndarray) -> np.ndarray:
-    """True classes, 0 where they are not known."""
-    label = np.asarray(las.classification)
-    truth = np.zeros(len(label), np.uint8)
-    for given, ours in survey.labels.items():
-        truth[label == given] = ours
-    for given, least in survey.tall.items():
-        truth[(label == given) & (height >= least)] = VEGETATION
-    return truth
+def corrected(before: Path, after: Path, truth: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """Write a file in which points `inside` have their true classes: the new classes.
+
+    What has no class of these three he leaves unclassified.
+    """
+    las = laspy.read(before)
+    codes = np.asarray(las.classification).copy()
+    codes[inside] = np.where(truth[inside] > 0, truth[inside], 1)
+    las.classification = codes
+    las.write(after)
+    return codes
 
 
 def rounds(data: Path, name: str, model: Path, folder: Path) -> dict[str, Any]:
@@ -57,8 +59,8 @@ def rounds(data: Path, name: str, model: Path, folder: Path) -> dict[str, Any]:
     las.write(raw)
     run("classify", raw, before, "--model", model, "--no-progress")
     start = laspy.read(before)
-    truth = truth_of(survey, las, np.asarray(start["HeightAboveGround"]))
     x, y = np.asarray(start.x), np.asarray(start.y)
+    truth = true_classes(survey, x, y, np.asarray(las.classification), np.asarray(start["HeightAboveGround"]))
     touched = np.zeros(len(x), bool)
     given = [np.asarray(start.classification).copy()]
     done: list[Any] = []
@@ -74,12 +76,7 @@ def rounds(data: Path, name: str, model: Path, folder: Path) -> dict[str, Any]:
         told.append([", ".join(REASONS[word] for word in found.patches.reasons[k]) for k in chosen])
         mine = points_inside(x, y, [shapes[k] for k in chosen])
         touched |= mine
-        # What has no class of these three he leaves unclassified.
-        after = laspy.read(checked_file)
-        codes = np.asarray(after.classification).copy()
-        codes[mine] = np.where(truth[mine] > 0, truth[mine], 1)
-        after.classification = codes
-        after.write(folder / "after.laz")
+        corrected(checked_file, folder / "after.laz", truth, mine)
         area = folder / f"area{number}.gpkg"
         write_area(area, [shapes[k] for k in chosen], reference_and_wkt(str(before))[1])
         checked = folder / f"checked{number}.laz"

@@ -16,18 +16,19 @@ import argparse
 import json
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import laspy
 import numpy as np
-from clouds import SURVEYS, VEGETATION
+from clouds import SURVEYS, true_classes
 
 from pdal_stages import cli
 from pdal_stages.classifier.sureness import Sureness
 from pdal_stages.review import Calibration, Outlook, Records, Settings, find_patches, side_for
-from pdal_stages.review.cells import BINS, GROUP_OF, PARTS, bins_of
+from pdal_stages.review.cells import BINS, GROUP_OF, PARTS, bins_of, cell_keys
 from pdal_stages.review.expected import binned, kinds_of, learned_factors, learned_rates, outlook
 from pdal_stages.review.signals import JUDGED, signals
 
@@ -45,9 +46,20 @@ class Classified:
     reliability: np.ndarray
     height: np.ndarray
     strip: np.ndarray
-    truth: np.ndarray
+    label: np.ndarray
 
-    @property
+    @cached_property
+    def truth(self) -> np.ndarray:
+        """True classes, 0 where they are not known."""
+        x, y, _ = self.xyz.T
+        return true_classes(SURVEYS[self.name], x, y, self.label, self.height)
+
+    @cached_property
+    def bins(self) -> np.ndarray:
+        """The bin of each point in the tables of rates."""
+        return bins_of(self.codes, self.reliability, self.height)
+
+    @cached_property
     def side(self) -> float:
         cells = len(np.unique(np.floor(self.xyz[:, :2] / 4.0), axis=0))
         return side_for(len(self.xyz), 16.0 * cells)
@@ -56,23 +68,29 @@ class Classified:
         """Wrong and known points in each bin of group, reliability and height."""
         known = self.truth > 0
         wrong = known & (GROUP_OF[self.truth] != GROUP_OF[self.codes])
-        bins = bins_of(self.codes, self.reliability, self.height)
         size = 4 * BINS[0] * BINS[1]
         return tuple(
-            np.bincount(bins[one], minlength=size).reshape(4, *BINS).astype(float) for one in (wrong, known)
+            np.bincount(self.bins[one], minlength=size).reshape(4, *BINS).astype(float)
+            for one in (wrong, known)
         )
 
+    @cached_property
+    def _records(self) -> Records:
+        none = np.zeros((4, *BINS))
+        points = self.xyz, self.codes, self.reliability, self.height
+        return Records.of(*points, self.side, none, strip=self.strip, truth=self.truth)
+
+    @cached_property
+    def _place(self) -> np.ndarray:
+        """The cell and the group of each point."""
+        column, row = (np.floor(self.xyz[:, axis] / self.side).astype(np.int64) for axis in (0, 1))
+        return np.searchsorted(self._records.key, cell_keys(row, column)) * 4 + GROUP_OF[self.codes]
+
     def records(self, rates: np.ndarray) -> Records:
-        return Records.of(
-            self.xyz,
-            self.codes,
-            self.reliability,
-            self.height,
-            self.side,
-            rates,
-            strip=self.strip,
-            truth=self.truth,
-        )
+        """Those of the survey; only what is expected depends on the rates, so the rest is made once."""
+        share = np.rint(rates.ravel() * PARTS)[self.bins]
+        expected = np.bincount(self._place, share, 4 * len(self._records)).astype(np.int64)  # whole: exact
+        return replace(self._records, expected=expected.reshape(-1, 4))
 
 
 def slug(name: str) -> str:
@@ -105,19 +123,14 @@ def _classify(data: Path, name: str, model: Path, folder: Path) -> dict[str, np.
     found = [laspy.read(folder / "classified" / Path(one).name) for one in inputs]
     label = np.concatenate(codes)
     height = np.concatenate([np.asarray(las["HeightAboveGround"]) for las in found]).astype(np.float32)
-    truth = np.zeros(len(label), np.uint8)
-    for given, ours in survey.labels.items():
-        truth[label == given] = ours
-    for given, least in survey.tall.items():
-        # Else vegetation would be judged only where it is none.
-        truth[(label == given) & (height >= least)] = VEGETATION
+    xyz = np.concatenate([np.column_stack([las.x, las.y, las.z]) for las in found]).astype(float)
     out = {
-        "xyz": np.concatenate([np.column_stack([las.x, las.y, las.z]) for las in found]).astype(float),
+        "xyz": xyz,
         "codes": np.concatenate([np.asarray(las.classification) for las in found]).astype(np.uint8),
         "reliability": np.concatenate([np.asarray(las["Reliability"]) for las in found]).astype(np.float32),
         "height": height,
         "strip": np.concatenate([np.asarray(las.point_source_id) for las in found]),
-        "truth": truth,
+        "label": label,
     }
     there = ~np.isin(out["codes"], (7, 18)) & (out["reliability"] > 0)  # overlap keeps its class
     return {key: values[there] for key, values in out.items()}
@@ -163,8 +176,8 @@ def sureness(surveys: Sequence[Classified]) -> Sureness:
 
 
 def survey_weights(points: np.ndarray) -> np.ndarray:
-    """Of a point of each survey: all alike, so that sums are right over all surveys together."""
-    return np.ones(len(points))
+    """Of a point of each survey: between all points alike and all surveys alike, so that no large one decides alone."""
+    return points**-0.5 * points.sum() / (points**0.5).sum()
 
 
 def judged(one: Classified, calibration: Calibration) -> dict[str, Any]:

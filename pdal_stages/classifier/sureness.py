@@ -140,17 +140,22 @@ def sureness_of(info: Mapping[str, Any], path: str) -> Sureness:
     )
 
 
-def said(limits: Mapping[int, Limit], names: Mapping[int, str], accuracy: float, kept: float) -> list[str]:
-    """What it costs, in lines."""
+def said(known: Sureness, names: Mapping[int, str], accuracy: float) -> list[str]:
+    """What it costs, in lines; where no point of a class can be kept, what can be had instead."""
+    limits = known.limits(accuracy)
+    lost = 100 * (1 - known.kept(limits))
     lines = [
-        f"to be right in {100 * accuracy:g} % of the points of each class, about {100 * (1 - kept):.1f} % of all points are "
+        f"to be right in {100 * accuracy:g} % of the points of each class, about {lost:.1f} % of all points are "
         "expected to become class 1 (unclassified):"
     ]
     for code, one in limits.items():
         name = f"{code} {names.get(code, '')}".strip()
         if one.reliability > 1.0:
+            best = np.floor(100 * one.right) / 100
+            share = 100 * known.limits(best)[code].kept
             lines.append(
-                f"  {name}: none keeps it, as never more than {100 * one.right:.1f} % of the surest were right"
+                f"  {name}: none keeps it, as never more than {100 * one.right:.1f} % of the surest were right; "
+                f"with {best:g}, {share:.1f} % would"
             )
         else:
             lines.append(

@@ -180,9 +180,9 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
 
     def cost(self) -> list[str]:
         """What `keep_sure` is expected to cost, in lines; none without it."""
-        if self.limits is None or self.keep_sure is None:
+        if self.keep_sure is None:
             return []
-        return said(self.limits, dict(self.model.classes), self.keep_sure, self.sureness.kept(self.limits))
+        return said(self.sureness, dict(self.model.classes), self.keep_sure)
 
     @property
     def preparation(self) -> list[dict[str, Any]]:
