@@ -307,8 +307,9 @@ def _parser() -> argparse.ArgumentParser:
         "--cell",
         type=float,
         metavar="METERS",
-        help="Side of the cells that are judged; default: by the density, 2 m at least",
+        help="Side of the cells that are judged; default: by the density, 1 m at least",
     )
+    takes("--workers", type=int, default=1, metavar="N", help="Files read at the same time (1)")
     takes(
         "--model",
         default="standard",
@@ -625,6 +626,7 @@ def _review(options: argparse.Namespace) -> None:
         pictures=options.pictures,
         model=options.model,
         cell=options.cell,
+        workers=options.workers,
     )
     print("\n".join(lines(write_review(request).to_dict())))
     print(f"written to {', '.join(name for name in (request.output, request.html, request.json) if name)}")

@@ -163,7 +163,9 @@ def test_a_calibration_makes_expected_and_true_agree():
     rate, known = np.full(20_000, 0.05), np.full(20_000, 40.0)
     true_rate = 0.05 * np.where(bins[:, 0] > 4, 0.4, 2.0)
     wrong = random.poisson(true_rate * known).astype(float)
-    base, factors = learned_factors(bins, rate, wrong, known, np.ones(20_000), strength=30.0, rounds=60)
+    base, factors = learned_factors(
+        bins, rate, wrong, known, np.ones(20_000), strength=30.0, rounds=60, trust=1.0
+    )
     found = base * rate * known
     for column, factor in enumerate(factors):
         found = found * factor[bins[:, column]]
@@ -203,8 +205,9 @@ def test_patches_hold_each_cell_once_and_come_best_first():
 
 
 def test_cells_grow_where_points_are_few():
-    assert side_for(8_000_000, 1_000_000.0) == 2.0
-    assert side_for(300_000, 1_000_000.0) == 8.0
+    assert side_for(8_000_000, 1_000_000.0) == 1.0
+    assert side_for(300_000, 1_000_000.0) == 4.0
+    assert side_for(10**10, 1e9) == 8.0  # 1,000 square kilometers: not more cells than memory holds
     assert side_for(1, 1_000_000.0) == 16.0
 
 
@@ -254,6 +257,18 @@ def test_the_command_lists_where_a_model_was_unsure(folder, tmp_path, capsys):
     base.close()
     assert rank == tuple(range(1, len(rank) + 1)) and all(reason) and min(expected) >= 0
     assert set(styles) == {"patches", "tiles"} and "looked at" in styles["patches"]
+    # In two processes: the same.
+    again = [
+        "review",
+        str(folder / "parts"),
+        str(tmp_path / "again.gpkg"),
+        "--workers",
+        "2",
+        "--pictures",
+        "0",
+    ]
+    assert cli.main([*again, "--json", str(tmp_path / "again.json")]) == 0
+    assert json.loads((tmp_path / "again.json").read_text()) == figures
     # One file or two: the same cells are expected to hold the same.
     assert cli.main(["review", str(folder / "whole.laz"), str(tmp_path / "w.gpkg"), "--json", str(tmp_path / "w.json"),
                      "--pictures", "0"]) == 0  # fmt: skip
@@ -283,6 +298,7 @@ def test_what_is_missing_is_made_and_said(folder, tmp_path, capsys):
         (["--share", "0"], "'--share'"),
         (["--cell", "0"], "'--cell'"),
         (["--pictures", "-1"], "'--pictures'"),
+        (["--workers", "0"], "'--workers'"),
     ],
 )
 def test_what_cannot_be_is_refused(folder, tmp_path, words, what, capsys):

@@ -41,6 +41,7 @@ from ..stages.heights import PREPARATION, made_of_coordinates
 from ..stages.loading import loaded_model
 from .ends import input_files
 from .parts import Part, parts_of, reads_in_parts, reference_and_wkt
+from .processes import each_file
 from .references import check_one_reference
 
 #: Classes by which a model's own class is known under another code.
@@ -71,6 +72,8 @@ class ReviewRequest:
         What gives reliabilities where the files have none.
     settings : Settings
         Its cell is chosen by the density where it is 0.
+    workers : int
+        Files read at the same time.
     """
 
     inputs: tuple[str, ...]
@@ -81,6 +84,7 @@ class ReviewRequest:
     pictures: int = 40
     model: str = STANDARD
     settings: Settings = field(default_factory=lambda: Settings(cell=0.0))
+    workers: int = 1
 
     @cached_property
     def files(self) -> list[str]:
@@ -108,6 +112,7 @@ def request_of(
         cell = checks.number("'--cell'", cell, 0.5, 100, unit="m")
     checks.number("'--share'", more.get("share", 1.0), 0, 1, above=True)
     checks.whole("'--pictures'", more.get("pictures", 0), 0, 10_000)
+    checks.whole("'--workers'", more.get("workers", 1), 1, 1024)
     return ReviewRequest(tuple(inputs), output, page, settings=Settings(cell=cell or 0.0), **more)
 
 
@@ -198,28 +203,18 @@ def review_files(request: ReviewRequest) -> Review:
     """
     references = {path: reference_and_wkt(path) for path in request.files}
     check_one_reference({path: one for path, (one, _) in references.items()})
-    calibration = standard_calibration()
     side = request.settings.cell or side_for(*_extent(request.files, references))
     records: list[Records] = []
-    with Progress(len(request.files), "reading", "files") as line:
-        for number, path in enumerate(request.files):
-            for part in complete_parts(path, references[path][1], request.model):
-                if not len(part):
-                    continue
-                records.append(
-                    Records.of(
-                        part.xyz,
-                        part.codes,
-                        part.arrays["Reliability"],
-                        part.arrays["HeightAboveGround"],
-                        side,
-                        calibration.rates,
-                        tile=number,
-                        strip=part.arrays.get("PointSourceId"),
-                    )
-                )
-                if len(records) >= 8:
-                    records = [Records.join(records)]
+    work = [
+        (path, references[path][1], request.model, side, number) for number, path in enumerate(request.files)
+    ]
+    with Progress(len(work), "reading", "files") as line:
+        for _, answer in each_file(records_of, work, request.workers):
+            if answer.reason:
+                raise StageError(answer.reason)
+            records += answer.result
+            if len(records) >= 8:
+                records = [Records.join(records)]
             line.update(1)
     if not records:
         raise StageError("there are no points to review", found=", ".join(request.files[:3]))
@@ -231,11 +226,26 @@ def review_files(request: ReviewRequest) -> Review:
             cure="Classify the files first: pdal-stages classify raw.laz classified.laz",
         )
     settings = Settings(**{**asdict(request.settings), "cell": side})
-    seen = outlook(joined, calibration)
+    seen = outlook(joined, standard_calibration())
     patches = find_patches(seen, settings)
     held = np.cumsum(patches.errors)
     listed = int(np.searchsorted(held, request.share * held[-1])) + 1 if held[-1] > 0 else 0
     return Review(seen, patches, min(listed, len(patches)), request.files, settings)
+
+
+def records_of(path: str, wkt: str, model: str, side: float, number: int) -> list[Records]:
+    """What the cells of a file say, in one record at most; `number` is the file's."""
+    rates = standard_calibration().rates
+    out: list[Records] = []
+    for part in complete_parts(path, wkt, model):
+        if len(part):
+            reliability, height = (part.arrays[name] for name in ("Reliability", "HeightAboveGround"))
+            strip = part.arrays.get("PointSourceId")
+            made = Records.of(
+                part.xyz, part.codes, reliability, height, side, rates, tile=number, strip=strip
+            )
+            out = [Records.join([*out, made])]
+    return out
 
 
 def _extent(files: Sequence[str], references: dict[str, Any]) -> tuple[int, float]:

@@ -28,7 +28,9 @@ UNSURE = 0.8
 #: A building is on the ground below this height, and heights are doubtful below that, meters.
 LOW_BUILDING, NEGATIVE = 0.5, -0.5
 #: Smallest side of a cell in meters, points it should hold, and the largest side there is.
-SIDE, HELD, WIDEST = 2.0, 8.0, 16.0
+SIDE, HELD, WIDEST = 1.0, 4.0, 16.0
+#: Cells that are held at once, about: for more ground they are larger.
+MOST_CELLS = 1 << 24
 #: Heights are whole millimeters.
 MM = 1000.0
 _HALF = np.int64(1) << 30
@@ -42,7 +44,7 @@ _ADDED = ("points", "expected", "unsure", "doubtful", "contrary", "wrong", "know
 def side_for(points: int, area: float) -> float:
     """The side of cells for so many points on so many square meters: a power of two, :data:`SIDE` at least."""
     side = SIDE
-    while side < WIDEST and points < HELD / side**2 * area:
+    while side < WIDEST and (points < HELD / side**2 * area or area > MOST_CELLS * side**2):
         side *= 2.0
     return side
 
@@ -64,7 +66,7 @@ class Settings:
     """
 
     cell: float = SIDE
-    block: float = 32.0
+    block: float = 64.0
     getting_there: float = 5.0
     looking: float = 2.5
 

@@ -41,8 +41,11 @@ KINDS: dict[str, tuple[float, ...]] = {
     "tall": (0.5, 3.0, 10.0, 25.0, 60.0),
     "relief": (1.0, 4.0, 12.0),
 }
-#: No more of a cell's points are expected wrong than this share.
-MOST = 0.97
+#: Shares of wrong points are between these.
+LEAST, MOST = 1e-5, 0.97
+#: How far signals are believed on a survey that was not learned from: factors are raised to it. Half leaves what is expected
+#: midway between what reliability and height say alone and what the surveys that were learned from say.
+TRUST = 0.5
 _FORMAT = "pdal-stages review calibration"
 
 
@@ -213,7 +216,7 @@ def learned_rates(
     few = 300.0
     group = (w.sum(axis=(1, 2), keepdims=True) + 1.0) / (k.sum(axis=(1, 2), keepdims=True) + 50.0)
     level = (w.sum(axis=2, keepdims=True) + few * group) / (k.sum(axis=2, keepdims=True) + few)
-    return np.clip((w + few * level) / (k + few), 5e-4, MOST)
+    return np.clip((w + few * level) / (k + few), LEAST, MOST)
 
 
 def learned_factors(
@@ -224,11 +227,12 @@ def learned_factors(
     weight: NDArray[np.float64],
     strength: float = 300.0,
     rounds: int = 25,
+    trust: float = TRUST,
 ) -> tuple[float, tuple[NDArray[np.float64], ...]]:
     """The factor of each bin of each signal that makes expected and true numbers agree in all bins.
 
     Iterative proportional fitting of a Poisson rate, each factor drawn toward 1 as if `strength` weighted errors more
-    agreed with it.
+    agreed with it; in the end all are raised to `trust`.
 
     Parameters
     ----------
@@ -252,4 +256,4 @@ def learned_factors(
         change = true.sum() / max(now.sum(), 1e-9)
         base *= change
         now *= change
-    return base, tuple(factors)
+    return base**trust, tuple(factor**trust for factor in factors)
