@@ -226,7 +226,7 @@ def _parser() -> argparse.ArgumentParser:
         "--dimensions",
         metavar="LIST",
         help="Extra dimensions to write beside the input's own: e.g. Reliability,Margin,Probability_6, all, or none; "
-        "default HeightAboveGround,Reliability, in 64ths (1.6 cm, 1.6 %%), which keeps files small",
+        "default HeightAboveGround,Reliability, rounded to 1/32 (3 cm) and 1/64 (1.6 %%), which keeps files small",
     )
     takes(
         "--noise",

@@ -22,8 +22,8 @@ _FAMILIES = (
     (re.compile(r"HeightAboveOpening_(.+)"), r"above \1 m opening (Z unit)"),
     (re.compile(r"Probability_(\d+)"), r"probability of \1"),
 )
-#: What is added for values that were rounded.
-ROUNDED = ", to 1/64"
+#: To which parts of the unit values are rounded: probabilities and the like, and heights.
+PARTS, PARTS_OF_HEIGHT = 64, 32
 
 
 def meaning(name: str, rounded: bool = False) -> str:
@@ -34,4 +34,4 @@ def meaning(name: str, rounded: bool = False) -> str:
             text = found.expand(family).replace("_", ".")
     if not rounded or not text:
         return text
-    return text + ROUNDED
+    return f"{text}, to 1/{PARTS_OF_HEIGHT if name.startswith('Height') else PARTS}"

@@ -16,7 +16,7 @@ from ..classifier.smoothing import FARTHEST
 from ..classifier.sureness import Limit, Sureness, said, sureness_of
 from ..models import find
 from .base import Stage
-from .dimensions import meaning
+from .dimensions import PARTS, PARTS_OF_HEIGHT, meaning
 from .loading import loaded_model
 from .options import ignore_option, keep_option, option
 from .points import Points, class_counts
@@ -99,8 +99,8 @@ class ModelClassifier(Stage):
     compact: bool = option(
         "boolean",
         False,
-        "Round Reliability and its like, and the heights that the points have, to 1/64: compressed, they take a third of "
-        "the bytes",
+        "Round the heights that the points have to 1/32 of Z's unit, Reliability and its like to 1/64: compressed, they "
+        "take a third of the bytes",
     )
     memory: int = option(
         "integer", 512, "Memory for blocks of points, in addition to the cloud itself", minimum=16, unit="MB"
@@ -297,10 +297,12 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
             for column, (code, _) in enumerate(self.model.classes):
                 values[f"Probability_{code}"] = found.probabilities[:, column]
         if self.compact:
-            values |= {name: _rounded(value) for name, value in values.items() if name != "Classification"}
+            values |= {
+                name: _rounded(value, PARTS) for name, value in values.items() if name != "Classification"
+            }
             if HEIGHT in points.arrays:
                 height = points.arrays[HEIGHT]
-                values[HEIGHT] = np.where(inside, _rounded(height), height)
+                values[HEIGHT] = np.where(inside, _rounded(height, PARTS_OF_HEIGHT), height)
         if points.mask is not None:  # what was there before stays outside `where`
             for name in self.creates():
                 if name != "Classification":
@@ -339,6 +341,6 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
             )
 
 
-def _rounded(values: NDArray) -> NDArray:
-    """To 64ths: a power of two, so that the last bytes of the floats are zero and compress to nothing."""
-    return np.round(values * 64) / 64
+def _rounded(values: NDArray, parts: int) -> NDArray:
+    """To these parts: a power of two, so that the last bytes of the floats are zero and compress to nothing."""
+    return np.round(values * parts) / parts
