@@ -159,6 +159,21 @@ def test_a_stopped_run_goes_on(folder, tmp_path, monkeypatch):
 
 
 @pytest.mark.pdal
+def test_two_runs_into_one_file(folder, tmp_path, capsys):
+    from pdal_stages.tiling import objects, store
+
+    target = tmp_path / "town.gpkg"
+    command = ["objects", str(folder / "parts" / "1.laz"), str(target)]
+    with store.take_lock(objects._kept(str(target)), "taken", "wait"):
+        assert cli.main(command) == 1 and not target.exists()
+        assert "another run is writing these objects" in capsys.readouterr().err
+    assert cli.main(command) == 0 and target.exists()
+    assert not objects._kept(str(target)).exists()
+    assert cli.main(["objects", str(tmp_path / "none.laz"), str(tmp_path / "more.gpkg")]) == 1
+    assert not objects._kept(str(tmp_path / "more.gpkg")).exists()
+
+
+@pytest.mark.pdal
 def test_metadata_never_replaces_an_input(folder, tmp_path, capsys):
     cloud = tmp_path / "0.laz"
     cloud.write_bytes((folder / "parts" / "0.laz").read_bytes())

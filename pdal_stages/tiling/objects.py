@@ -11,6 +11,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,7 @@ from ..stages.objectswriter import STRAIGHT, ObjectsWriter
 from .classify import ClassifyTask
 from .cloudindex import BLOCK, open_las, read_block
 from .outcome import FoundObjects
-from .store import make_own
+from .store import take_lock
 
 #: Whose options the commands take for objects.
 OPTIONS_OF = ("writers.objects", "filters.objects")
@@ -103,10 +104,12 @@ def _write(
     draw: bool = False,
 ) -> FoundObjects:
     """Find objects, write them, say what was found; `draw`: also a map."""
-    found, reference = objects_of_files(inputs, stage, workers=workers, resume=resume)
-    layers = object_layers(found, straight=stage.outlines == STRAIGHT, units=reference[0])
-    files = write_layers(stage.filename, layers, reference[1])
-    _forget(stage.filename)
+    check_target(stage.filename)
+    with _own(stage.filename):
+        found, reference = objects_of_files(inputs, stage, workers=workers, resume=resume)
+        layers = object_layers(found, straight=stage.outlines == STRAIGHT, units=reference[0])
+        files = write_layers(stage.filename, layers, reference[1])
+        shutil.rmtree(_kept(stage.filename), ignore_errors=True)
     summary = found.summary()
     for kind, one in summary.items():
         print(f"{one['objects']:,} {kind}, {one['to_be_checked']:,} to be checked")
@@ -144,15 +147,17 @@ def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> Obj
 def objects_of_files(
     inputs: Sequence[str], stage: ObjectsWriter, *, workers: int = 1, resume: bool = False
 ) -> tuple[Objects, tuple[Units, str]]:
-    """The objects of all files together; units of the coordinates and their reference (WKT)."""
-    check_target(stage.filename)
+    """The objects of all files together; units of the coordinates and their reference (WKT).
+
+    The folder for what is read (see `_own`) is there, and ours.
+    """
     references = {path: reference_and_wkt(path, stage.horizontal_unit) for path in inputs}
     check_one_reference({path: one for path, (one, _) in references.items()})
     units, wkt = references[inputs[0]][0].units, references[inputs[0]][1]
     folder = _kept(stage.filename)
     if not resume:
-        shutil.rmtree(folder, ignore_errors=True)
-    make_own(folder)
+        for file in folder.glob("*.npz"):
+            file.unlink()
     what = json.dumps({k: str(v) for k, v in sorted(stage.options.items())})
     parts, failed, seen = [], [], np.zeros(256, bool)
     work = []
@@ -272,5 +277,15 @@ def _kept(output: str) -> Path:
     return path.with_name(f".{path.name}.cells")
 
 
-def _forget(output: str) -> None:
-    shutil.rmtree(_kept(output), ignore_errors=True)
+@contextmanager
+def _own(output: str) -> Iterator[None]:
+    """The folder in which a run keeps what it read, for one run at a time."""
+    lock = take_lock(
+        _kept(output), "another run is writing these objects", "Wait for it, or name another output"
+    )
+    try:
+        yield
+    finally:
+        if not any(_kept(output).glob("*.npz")):
+            shutil.rmtree(_kept(output), ignore_errors=True)
+        lock.close()

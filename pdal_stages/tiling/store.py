@@ -88,23 +88,11 @@ class Store:
     # ---- the lock ------------------------------------------------------------------------------------
 
     def _take(self) -> None:
-        file = _open_own(self.folder / "lock")
-        if not try_lock(file):
-            file.seek(0)
-            who = file.read().strip() or str(self.folder)
-            file.close()
-            raise StageError(
-                "another run is working in this output folder",
-                found=who,
-                cure="Wait for it, or write to another folder",
-            )
-        file.seek(0)
-        file.truncate()
-        file.write(
-            f"process {os.getpid()} on {socket.gethostname()} since {time.strftime('%Y-%m-%d %H:%M:%S')}\n"
+        self._lock = take_lock(
+            self.folder,
+            "another run is working in this output folder",
+            "Wait for it, or write to another folder",
         )
-        file.flush()
-        self._lock = file
 
     def _release(self) -> None:
         if self._lock is not None:
@@ -232,6 +220,38 @@ class Store:
 
 
 # ---- files that nobody else put there ----------------------------------------------------------------------
+
+
+def take_lock(folder: Path, taken: str, cure: str) -> Any:
+    """Lock a run's own folder; the open file, which releases it when closed.
+
+    Raises
+    ------
+    StageError
+        With the text `taken`, where another run has it.
+    """
+    while True:
+        make_own(folder)
+        try:
+            file = _open_own(folder / "lock")
+        except FileNotFoundError:  # the run that had it has just removed its folder
+            continue
+        if not try_lock(file):
+            file.seek(0)
+            who = file.read().strip() or str(folder)
+            file.close()
+            raise StageError(taken, found=who, cure=cure)
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(file.fileno()), os.stat(folder / "lock")):
+                break
+        file.close()
+    file.seek(0)
+    file.truncate()
+    file.write(
+        f"process {os.getpid()} on {socket.gethostname()} since {time.strftime('%Y-%m-%d %H:%M:%S')}\n"
+    )
+    file.flush()
+    return file
 
 
 def make_own(folder: Path) -> None:
