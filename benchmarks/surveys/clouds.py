@@ -157,6 +157,11 @@ SURVEYS = {
 }
 
 
+def slug(name: str) -> str:
+    """A survey's name in that of a file."""
+    return name.replace(" ", "-").replace("'", "")
+
+
 def true_classes(
     survey: LabeledSurvey, x: np.ndarray, y: np.ndarray, codes: np.ndarray, height: np.ndarray
 ) -> np.ndarray:

@@ -18,7 +18,7 @@ from typing import Any
 
 import laspy
 import numpy as np
-from clouds import SURVEYS, Cloud, load, thinned, with_heights
+from clouds import SURVEYS, Cloud, load, slug, thinned, with_heights
 from folds import LeaveOneOut
 from recipe import OPTIONS
 
@@ -129,7 +129,7 @@ def main() -> None:
             started = time.process_time()
             model, cloud = all_of_them.without(left_out), load(args.data, left_out)
             if args.save:
-                model.save(args.save / f"{left_out.replace(' ', '-').replace(chr(39), '')}.model")
+                model.save(args.save / f"{slug(left_out)}.model")
             for one in (cloud, thinned(cloud, 2.0), thinned(cloud, 0.5)):
                 if one is not None:
                     runs.append(score(model, one, args.pictures if one is cloud else None))

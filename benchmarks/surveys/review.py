@@ -1,7 +1,9 @@
 """How well `review` tells where the errors are, and the calibration that it comes with.
 
-    python benchmarks/surveys/leave_one_out.py --data DIR --save MODELS
-    python benchmarks/surveys/review.py --data DIR --models MODELS [--json FILE] [--out pdal_stages/review/standard.json]
+    python benchmarks/surveys/review.py --data DIR --models MODELS [--json FILE] [--ship]
+
+--ship writes what the package comes with: after the shipped model was built anew, this one command renews it. MODELS may
+be a new folder: the models that miss a survey each are then made there (about 10 CPU minutes).
 
 Each survey is classified, by the command, with the model that has not seen it, and then reviewed with a calibration
 learned from the other surveys alone. Figures: points expected wrong beside those that are; the share of the wrong points
@@ -23,8 +25,10 @@ from typing import Any
 
 import laspy
 import numpy as np
-from clouds import SURVEYS, true_classes
+from clouds import SURVEYS, slug, true_classes
+from folds import LeaveOneOut
 
+import pdal_stages
 from pdal_stages import cli
 from pdal_stages.classifier.sureness import Sureness
 from pdal_stages.review import Calibration, Outlook, Records, Settings, find_patches, side_for
@@ -93,15 +97,10 @@ class Classified:
         return replace(self._records, expected=expected.reshape(-1, 4))
 
 
-def slug(name: str) -> str:
-    """A survey's name in that of a file."""
-    return name.replace(" ", "-").replace("'", "")
-
-
 def classified(data: Path, name: str, model: Path, kept: Path) -> Classified:
-    """A survey's files, classified by the command; kept in a folder for the next time."""
+    """A survey's files, classified by the command; kept in a folder as long as the model stays the same."""
     path = kept / f"{slug(name)}.npz"
-    if not path.exists():
+    if not path.exists() or path.stat().st_mtime < model.stat().st_mtime:
         with tempfile.TemporaryDirectory() as folder:
             np.savez(path, **_classify(data, name, model, Path(folder)))
     with np.load(path) as held:
@@ -248,8 +247,12 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     options.add_argument("--data", type=Path, required=True, help="folder of the clouds")
     options.add_argument(
-        "--models", type=Path, required=True, help="folder that leave_one_out.py --save filled"
+        "--models",
+        type=Path,
+        required=True,
+        help="folder of the models; those that leave_one_out.py --save has not left there are made",
     )
+    options.add_argument("--trees", type=int, default=20, help="of a forest of a model that is made")
     options.add_argument(
         "--kept", type=Path, help="folder for the classified surveys; default: that of the models"
     )
@@ -258,10 +261,34 @@ def main() -> None:
     options.add_argument("--out", type=Path, help="where the calibration of all surveys goes")
     options.add_argument("--sureness", type=Path, help="where the counts behind --keep-sure go")
     options.add_argument(
+        "--ship", action="store_true", help="both where the package has them, beside the shipped model"
+    )
+    options.add_argument(
         "--only-learn", action="store_true", help="no figures, only what --out and --sureness write"
     )
     args = options.parse_args()
+    calibrate(args)
+
+
+def make_models(data: Path, folder: Path, surveys: Sequence[str], trees: int) -> None:
+    """The models that miss a survey each, where the folder has none."""
+    folder.mkdir(parents=True, exist_ok=True)
+    missing = [name for name in surveys if not (folder / f"{slug(name)}.model").exists()]
+    if missing:
+        with tempfile.TemporaryDirectory() as features:
+            left_out = LeaveOneOut(data, SURVEYS, Path(features), trees)
+            for name in missing:
+                left_out.without(name).save(folder / f"{slug(name)}.model")
+                print(f"a model without {name}", flush=True)
+
+
+def calibrate(args: argparse.Namespace) -> None:
+    """Score the reviews, and learn the calibration, as the command's options say."""
     kept = args.kept or args.models
+    if args.ship:
+        package = Path(pdal_stages.__file__).parent
+        args.out, args.sureness = package / "review/standard.json", package / "models/standard.sureness.json"
+    make_models(args.data, args.models, args.surveys, args.trees)
     all_ = [classified(args.data, name, args.models / f"{slug(name)}.model", kept) for name in args.surveys]
     rows = []
     for one in [] if args.only_learn else all_:
