@@ -210,3 +210,35 @@ def test_training_draws_from_checked_points_alone(town, tmp_path, capsys):
     assert cli.main([*common, "--writers.classifiermodel.checked_only=false"]) == 0
     more = {one["code"]: one["available"] for one in ps.load_model(str(model)).info["classes"]}
     assert more[2] > counts[2]
+
+
+@pytest.mark.pdal
+def test_training_on_corrections_keeps_the_base_where_it_is_sure(town, tmp_path, capsys):
+    """Where the points have a Reliability, as many of those that nobody looked at as of the most frequent checked class."""
+    las = laspy.read(town)
+    codes = np.asarray(las.classification).copy()
+    known = np.isin(codes, (2, 5, 6))
+    xyz = np.asarray(las.xyz)
+    checked = known & (xyz[:, 0] > np.quantile(xyz[:, 0], 0.9))
+    sure = known & ~checked & (xyz[:, 1] > np.median(xyz[:, 1]))
+    for name, kind in (("Checked", "uint8"), ("Reliability", "float32")):
+        las.add_extra_dim(laspy.ExtraBytesParams(name, kind))
+    las["Checked"] = checked.astype(np.uint8)
+    las["Reliability"] = np.where(sure, 0.97, 0.9).astype(np.float32)
+    las.write(tmp_path / "checked.laz")
+    model = tmp_path / "m.model"
+    assert cli.main(["train", str(tmp_path / "checked.laz"), "--base", "standard", "--classes", "2,5,6",
+                     "--model", str(model)]) == 0  # fmt: skip
+    said = capsys.readouterr()
+    mine = {code: np.count_nonzero(checked & (codes == code)) for code in (2, 5, 6)}
+    anchors = {
+        code: min(np.count_nonzero(sure & (codes == code)), max(mine.values())) for code in mine if mine[code]
+    }
+    assert f"from {sum(anchors.values()):,} others of which the base is sure" in said.err + said.out
+    info = ps.load_model(str(model)).info
+    for one in info["classes"]:
+        most = mine[one["code"]] + anchors[one["code"]]
+        assert 0.5 * most < one["available"] <= most, (
+            one
+        )  # less what stands for it: a voxel's, or contradicted
+    assert info["sureness"]["about"].startswith("its base (8 surveys")

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 import pdal_stages as ps
 from pdal_stages.base.errors import ModelError, OptionError
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
-from pdal_stages.classifier.sureness import BINS, Sureness, said, sureness_of
+from pdal_stages.classifier.sureness import BINS, Sureness, of_the_base, said, sureness_of
 from pdal_stages.cli import main
+from pdal_stages.models import find
 from pdal_stages.pipeline.classifying import ClassifyRequest
 from pdal_stages.synthetic import write_town
 
@@ -69,6 +70,16 @@ def test_the_shipped_model_says_what_it_costs():
     known.add(np.array([6, 6]), np.array([6, 2]), np.array([0.9, 0.9]))
     line = said(known, {}, 0.9)[1]
     assert "none keeps it" in line and "50.0 % of the surest were right; with 0.5, 100.0 % would" in line
+    # Of corrections on top of a base: what is known of the base, and of new classes alone what they say.
+    own = {
+        "about": "",
+        "classes": {"6": known.to_dict()["classes"]["6"], "14": known.to_dict()["classes"]["6"]},
+    }
+    standard = of_the_base({}, {}, find("standard"))
+    joined = of_the_base(own, {}, find("standard"))
+    assert joined["about"] == standard["about"] and standard["about"].startswith("its base (8 surveys")
+    assert joined["classes"] == {**standard["classes"], "14": own["classes"]["14"]}
+    assert of_the_base(own, {}, "nowhere.model") == own
     sure = ClassifyRequest(keep_sure=0.98).cost  # buildings stay with 98 %, too
     assert not any("none keeps it" in line for line in sure)
 

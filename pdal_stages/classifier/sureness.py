@@ -140,6 +140,21 @@ def sureness_of(info: Mapping[str, Any], path: str) -> Sureness:
     )
 
 
+def of_the_base(own: Mapping[str, Any], base: Mapping[str, Any], path: str) -> dict[str, Any]:
+    """What a model on top of a base says of itself where its labels are a person's corrections.
+
+    These lie where the base was worst, so how often it was right there says nothing of the rest: of the base's classes
+    counts what is known of the base, where that is, and only of new ones its `own` counts.
+    """
+    try:
+        known = sureness_of(base, path)
+    except OptionError:
+        return dict(own)
+    about = f"its base ({known.about}), as its own labels lie where that was looked at"
+    classes = {**own.get("classes", {}), **known.to_dict()["classes"]}
+    return {"about": about, "classes": classes}
+
+
 def said(known: Sureness, names: Mapping[int, str], accuracy: float) -> list[str]:
     """What it costs, in lines; where no point of a class can be kept, what can be had instead."""
     limits = known.limits(accuracy)

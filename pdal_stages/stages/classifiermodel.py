@@ -15,12 +15,15 @@ from numpy.typing import NDArray
 from ..base import kinds
 from ..base.errors import ModelError, OptionError, StageError
 from ..base.files import check_writable
+from ..base.hashing import coordinate_hash
 from ..base.outputs import Output
 from ..base.report import Report
 from ..classifier import Model, TrainingCloud, TrainingOptions, summary, train
 from ..classifier.algorithms import ALGORITHMS, Trainer, trainer
 from ..classifier.classes import ClassMap
 from ..classifier.dimensions import ALWAYS, CHECKED, required, welcome
+from ..classifier.sureness import of_the_base
+from ..models import find
 from .base import Stage, files_read
 from .loading import digest_of, loaded_model
 from .options import option
@@ -34,6 +37,8 @@ _TRAINING = {field.name: field for field in fields(TrainingOptions)}
 _SHOWN = ("strategy", "classes", "accuracy", "parameters")
 #: Most files that a model names.
 _NAMED = 20
+#: A base is sure of a point from this reliability on.
+_SURE = 0.95
 #: The word for the dimensions that follow from what the points have.
 AUTO = "auto"
 
@@ -271,6 +276,9 @@ holds the classes.
         model.info["preparation"] = self._preparation
         if self.base is not None:
             model.info["base"] = {"name": Path(self.base).stem, "sha256": digest_of(self.base)}
+            if "checked" in report.figures and "sureness" in model.info:
+                before = loaded_model(self.base).info
+                model.info["sureness"] = of_the_base(model.info["sureness"], before, find(self.base))
         if self._by_hand:
             model.info["by_hand"] = self._by_hand
         model.save(self.filename)
@@ -315,12 +323,42 @@ holds the classes.
             raise StageError(
                 "no checked point lies inside 'where'", found=f"{int(checked.sum()):,} checked points"
             )
-        points.report.figures["checked"] = int(np.count_nonzero(wanted))
+        number = int(np.count_nonzero(wanted))
+        points.report.figures["checked"] = number
+        said = f"{number:,} of {points.count:,} points were checked by a person ({CHECKED}): samples are drawn from these"
+        if self.base is None:
+            points.report.notes.append(f"{said} alone, the others are neighbors")
+            return wanted
+        anchors = self._anchors(points, wanted, points.inside & ~checked)
+        count = int(np.count_nonzero(anchors))
+        points.report.figures["anchors"] = count
         points.report.notes.append(
-            f"{int(np.count_nonzero(wanted)):,} of {points.count:,} points were checked by a person ({CHECKED}): samples "
-            "are drawn from these alone, the others are neighbors"
+            f"{said}, and from {count:,} others of which the base is sure, so that it is kept where nobody looked"
+            if count
+            else f"{said} alone, the others are neighbors; nothing keeps the base where nobody looked, as no other point "
+            f"has a Reliability of {_SURE:g} or more"
         )
-        return wanted
+        return wanted | anchors
+
+    def _anchors(
+        self, points: Points, checked: NDArray[np.bool_], free: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Points of which the base is sure, of each class as many as there are checked ones of the most frequent.
+
+        What is corrected lies where the base was unsure: from these alone a forest does not learn what the rest looks like.
+        """
+        out = np.zeros(points.count, np.bool_)
+        if self.base is None or "Reliability" not in points.arrays:
+            return out
+        codes = points.codes_of(self.label)
+        told, number = np.unique(codes[checked], return_counts=True)
+        known = np.isin(told, loaded_model(self.base).codes)
+        sure = free & (np.asarray(points.arrays["Reliability"]) >= _SURE)
+        for code in told[known]:
+            mine = np.flatnonzero(sure & (codes == code))
+            order = np.argsort(coordinate_hash(points.xyz[mine], self.seed), kind="stable")
+            out[mine[order[: number[known].max()]]] = True
+        return out
 
     def _surveys(self, cloud: TrainingCloud, points: Points) -> list[TrainingCloud]:
         """The points as one cloud, or one for each value of the dimension `survey`."""
