@@ -127,7 +127,6 @@ def _coarsest(floor, raster, left, bottom, level, out, out_left, out_bottom):
 def _fit(moments, size, needed, planes):
     """Correct the needed planes (given: what the coarser level says) by the ground of 3 x 3 blocks."""
     h, w = planes.shape[:2]
-    m = np.empty(9)
     for j in range(h):
         for i in range(w):
             if not needed[j, i]:
@@ -135,29 +134,41 @@ def _fit(moments, size, needed, planes):
             height, across, along = planes[j, i, 0], planes[j, i, 1], planes[j, i, 2]
             if np.isnan(height):
                 continue
-            m[:] = 0.0
+            # As in _add, but in registers: this is what terrain takes longest for where points are sparse.
+            n = x = y = xx = xy = yy = z = xz = yz = 0.0
             for b in range(max(j - 1, 0), min(j + 2, h)):
+                dy, near = (b - j) * size, 1.0 - 0.5 * abs(b - j)
                 for a in range(max(i - 1, 0), min(i + 2, w)):
-                    weight = (1.0 - 0.5 * abs(b - j)) * (1.0 - 0.5 * abs(a - i))
-                    _add(m, moments[b, a], (a - i) * size, (b - j) * size, weight)
-            n = m[0]
+                    m = moments[b, a]
+                    k = m[0]
+                    if k > 0:
+                        dx, weight = (a - i) * size, near * (1.0 - 0.5 * abs(a - i))
+                        n += weight * k
+                        x += weight * (m[1] + k * dx)
+                        y += weight * (m[2] + k * dy)
+                        xx += weight * (m[3] + 2 * dx * m[1] + k * dx * dx)
+                        xy += weight * (m[4] + dx * m[2] + dy * m[1] + k * dx * dy)
+                        yy += weight * (m[5] + 2 * dy * m[2] + k * dy * dy)
+                        z += weight * m[6]
+                        xz += weight * (m[7] + dx * m[6])
+                        yz += weight * (m[8] + dy * m[6])
             if n == 0.0:
                 continue
             # Residuals of the coarser plane; the offset is eliminated, two unknowns are left.
-            r = m[6] - n * height - across * m[1] - along * m[2]
-            rx = m[7] - height * m[1] - across * m[3] - along * m[4]
-            ry = m[8] - height * m[2] - across * m[4] - along * m[5]
+            r = z - n * height - across * x - along * y
+            rx = xz - height * x - across * xx - along * xy
+            ry = yz - height * y - across * xy - along * yy
             n_held = n + _HOLD
             stiff = _STIFFNESS * n * size * size
-            xx = m[3] + stiff - m[1] * m[1] / n_held
-            xy = m[4] - m[1] * m[2] / n_held
-            yy = m[5] + stiff - m[2] * m[2] / n_held
-            rx -= m[1] * r / n_held
-            ry -= m[2] * r / n_held
+            xx = xx + stiff - x * x / n_held
+            xy -= x * y / n_held
+            yy = yy + stiff - y * y / n_held
+            rx -= x * r / n_held
+            ry -= y * r / n_held
             determinant = xx * yy - xy * xy
             gx = (rx * yy - ry * xy) / determinant
             gy = (ry * xx - rx * xy) / determinant
-            planes[j, i, 0] = height + (r - m[1] * gx - m[2] * gy) / n_held
+            planes[j, i, 0] = height + (r - x * gx - y * gy) / n_held
             planes[j, i, 1], planes[j, i, 2] = across + gx, along + gy
 
 
