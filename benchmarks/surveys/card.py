@@ -1,8 +1,8 @@
 """The card of a shipped model: what it was trained on, how it does survey by survey, where it fails.
 
-    python benchmarks/surveys/card.py --model pdal_stages/models/standard.model --scores FILE > docs/models.md
+    python benchmarks/surveys/card.py --model pdal_stages/models/standard.model --scores FILE --rules RULES > docs/models.md
 
-FILE is what leave_one_out.py wrote.
+FILE is what leave_one_out.py wrote, RULES what rules.py wrote.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from clouds import SURVEYS
 from leave_one_out import tables
 from recipe import DENSITIES, MOST, OPTIONS, SLOPES
+from rules import table
 
 from pdal_stages.classifier import load_model
 from pdal_stages.stages.heights import PREPARATION
@@ -26,6 +27,7 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     options.add_argument("--model", type=Path, required=True)
     options.add_argument("--scores", type=Path, required=True)
+    options.add_argument("--rules", type=Path, required=True)
     args = options.parse_args()
     model, scores = load_model(args.model), json.loads(args.scores.read_text())
     surveys = [
@@ -57,6 +59,7 @@ def main() -> None:
             read=f"At their own densities the mean is {np.mean(own):.1f}; the worst of all is {worst['cloud']}, "
             f"{worst['oa']:.1f}.",
             surveys="\n".join(surveys),
+            rules=table(json.loads(args.rules.read_text())),
             count=OPTIONS.count,
             most=MOST,
             below=OPTIONS.contradicted_below,

@@ -17,7 +17,7 @@ from typing import Any
 
 import laspy
 import numpy as np
-from clouds import SURVEYS, slug
+from clouds import SURVEYS, slug, true_classes
 
 from pdal_stages import detached_noise, filtered_ground, load_model
 from pdal_stages.base.asprs import BRIDGE
@@ -49,9 +49,7 @@ def count(data: Path, survey: str, model: Model) -> dict[str, Any]:
     after = consistent(
         xyz, codes, height=made["HeightAboveGround"], ground=made["Ground"], mask=seen, figures=changed
     )
-    truth = np.zeros(len(label), np.uint8)
-    for given, ours in known.labels.items():
-        truth[label == given] = ours
+    truth = true_classes(known, xyz[:, 0], xyz[:, 1], label, made["HeightAboveGround"])
     judged = (truth > 0) & (after != codes)
     return {
         "survey": survey,
@@ -75,10 +73,17 @@ def table(runs: list[dict[str, Any]]) -> str:
     ]
     for run in runs:
         counts = [run["noise"], run["decks"], *(run["changed"][rule] for rule in RULES)]
-        shares = " | ".join(f"{100 * n / run['points']:.3f} %" if n else "–" for n in counts)
+        shares = " | ".join(_share(n, run["points"]) for n in counts)
         rest = f"{run['judged']:,} | {run['wrong_before']:,} | {run['wrong_after']:,}"
         lines.append(f"| {run['survey']} | {run['points']:,} | {shares} | {rest} |")
     return "\n".join(lines)
+
+
+def _share(n: int, points: int) -> str:
+    if n == 0:
+        return "–"
+    percent = 100 * n / points
+    return f"{percent:.3f} %" if percent >= 0.001 else "< 0.001 %"
 
 
 def main() -> None:
