@@ -94,12 +94,10 @@ class GroundRaster(NamedTuple):
 
     left: int  #: number of the first column
     bottom: int  #: of the first row
-    lowest: NDArray[
-        np.float32
-    ]  #: (h, w) heights of the lowest points, meters; HOLE where there is none, or a pit
-    place: NDArray[
-        np.float64
-    ]  #: (h, w, 3) where ground is in its cell, from the middle, in cells; its height
+    #: (h, w) heights of the lowest points, meters; HOLE where there is none, or a pit
+    lowest: NDArray[np.float32]
+    #: (h, w, 3) where ground is in its cell, from the middle, in cells; its height
+    place: NDArray[np.float64]
     ground: NDArray[np.bool_]  #: (h, w)
     floor: NDArray[np.float32]  #: (h, w) what lies below objects
     opened: Mapping[int, NDArray[np.float32]]  #: (h, w) openings by their radius
@@ -124,8 +122,7 @@ def ground_raster(
     """What the raster round points tells of the ground, and the numbers of points (n,) that are pits.
 
     Points have coordinates in meters, and columns and rows of their cells; those of `use` may be ground, but not those of a
-    `deck`. On every side are
-    `margin` empty cells, one at least: points blend the four cells round them.
+    `deck`. On every side are `margin` empty cells, one at least: points blend the four cells round them.
     """
     left, bottom = int(column.min()) - margin, int(row.min()) - margin
     shape = int(row.max()) + margin + 1 - bottom, int(column.max()) + margin + 1 - left
@@ -175,9 +172,8 @@ class GroundCells:
     ground: NDArray[np.bool_]  #: (n,)
     place: NDArray[np.float64]  #: (number of ground cells, 3), in their order
     opened: NDArray[np.float32]  #: (number of openings, n)
-    decks: NDArray[
-        np.float64
-    ]  #: (number of levels near bridge decks, 5): see :func:`.decks.levels_near_decks`
+    #: (number of levels near bridge decks, 5): see :func:`.decks.levels_near_decks`
+    decks: NDArray[np.float64]
 
     def arrays(self) -> dict[str, NDArray]:
         """All by name, for files."""

@@ -90,7 +90,6 @@ def filtered_ground(
     figures : dict, optional
         Receives counts: ``ground_points``, ``pits`` (cells whose lowest point is a low outlier),
         ``without_terrain`` (points with no usable point near; their height is 0), ``unused_points``.
-
     cells : GroundCells, optional
         Cells whose ground was found before (:func:`.groundcells.cells_of_block`), all within :func:`reach_of_cells` of the
         points. The points then are those within :func:`reach_of_points` of the ones whose results are used.
@@ -100,8 +99,7 @@ def filtered_ground(
     dict of str to ndarray, shape (n,)
         ``HeightAboveGround`` (float64), ``Ground`` (uint8, 1 where the filter calls a point ground), ``Slope``
         (float64, degrees), ``HeightAboveOpening_<window>`` (float32) and ``Deck`` (uint8: see :func:`.decks.find_decks`) on
-        request. NaN where a coordinate is not
-        finite.
+        request. NaN where a coordinate is not finite.
 
     Raises
     ------
