@@ -359,3 +359,10 @@ def test_lone_wires_are_not_looked_at_twice(monkeypatch):
     codes = np.repeat([14, 2], x.size).astype(np.uint8)
     monkeypatch.setattr(find._View, "wider", None)
     assert len(find_objects(Cells.of(*xyz.T, codes, 0.5), block=64, progress=False).tables[Kind.SPAN]) == 0
+
+
+def test_what_is_nowhere_two_meters_wide_is_to_be_checked():
+    wire, shed = house(5, 5, 35, 6.4, 7.0), house(10, 20, 13.5, 23.5, 3.0)
+    table = found_in(*scene(wire, shed)).tables[Kind.BUILDING]
+    assert len(table) == 2
+    assert ["narrow" in reason for reason in table.columns["reason"]] == [True, False]

@@ -15,10 +15,12 @@ from .planes import roof_planes
 SURE, CHECK = "sure", "check"
 #: The reason of an object that is larger than what is looked at in one piece.
 CUT = "cut off"
+#: A building holds a square of this side, meters; wires that were taken for one do not.
+WIDE = 2.0
 #: Why an object is to be checked.
 REASONS = (
-    "no ground near", "small", "low", "rough roof", "unsure points", "no facade", "few points", "thin crown", "wide crown",
-    "short", "not straight", CUT,
+    "no ground near", "small", "narrow", "low", "rough roof", "unsure points", "no facade", "few points", "thin crown",
+    "wide crown", "short", "not straight", CUT,
 )  # fmt: skip
 
 
@@ -45,6 +47,13 @@ class Body(NamedTuple):
         inside = np.pad(~np.isnan(self.image(np.zeros(len(self.row)))), 1)
         core = inside[:-2, 1:-1] & inside[2:, 1:-1] & inside[1:-1, :-2] & inside[1:-1, 2:]
         return ~core[self.row - self.row.min(), self.column - self.column.min()]
+
+    def holds_square(self, side: int) -> bool:
+        """Whether a square of so many cells a side lies inside."""
+        inside = ~np.isnan(self.image(np.zeros(len(self.row))))
+        if min(inside.shape) < side:
+            return False
+        return bool(np.lib.stride_tricks.sliding_window_view(inside, (side, side)).all(axis=(2, 3)).any())
 
     @property
     def reliability(self) -> float:
@@ -77,6 +86,8 @@ def building(body: Body, size: float) -> dict[str, object]:
         reasons.append("no ground near")
     if area < 10:
         reasons.append("small")
+    if not body.holds_square(math.ceil(WIDE / size)):
+        reasons.append("narrow")
     if ridge < 2.2:
         reasons.append("low")
     if planar < 0.3 and area >= 30:
