@@ -2,7 +2,7 @@
 
 python benchmarks/bridges.py --data FOLDER
 
-Decks of scenes (tests/bridge_scenes.py: viaducts, rivers, an overpass, a footbridge, a canal; 16 points/m2), of the
+Decks of scenes (tests/bridge_scenes.py, tests/long_bridge_scenes.py; 16 points/m2), of the
 generated town and of the labeled clouds; wires of the town and of those clouds. Cars, lamps and what was never labeled count
 neither way. `false` is the share of all points that are wrongly taken; seconds are of one process.
 """
@@ -24,6 +24,7 @@ from pdal_stages.terrain.wires import find_wires
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from bridge_scenes import SCENES, scan
+from long_bridge_scenes import LONG_SCENES
 
 CLOUDS = (
     "bridge/ign_0299_6802.laz", "delft/train.laz", "forest/neon_osbs.laz", "isprs_filter/samp11.laz",
@@ -70,7 +71,7 @@ def main() -> None:
     folder = parser.parse_args().data
     print("| cloud | what | points | F1 % | false % | CPU s |")
     print("|---|---|---:|---:|---:|---:|")
-    for name, make in SCENES.items():
+    for name, make in {**SCENES, **LONG_SCENES}.items():
         xyz, codes = scan(make())
         decks(name, xyz, np.ones(len(xyz), bool), codes == 17, codes == 1)
     for seed, density in ((1, 16.0), (2, 7.0)):

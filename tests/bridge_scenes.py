@@ -26,8 +26,9 @@ class Slab:
     depth: float
     code: int
 
-    def inside(self, s, t):
-        return (s > self.start) & (s < self.end) & (t > self.right) & (t < self.left)
+    def inside(self, s, t, beyond=0.0):
+        east, north = (s > self.start - beyond) & (s < self.end + beyond), t < self.left + beyond
+        return east & north & (t > self.right - beyond)
 
 
 @dataclass
@@ -38,6 +39,14 @@ class Scene:
     turn: float = 0.4
     length: float = 300.0
     width: float = 160.0
+    bend: float = 0.0  # radius of the axis, which is straight where it is 0
+
+    def along(self, p):
+        """Places (n, 2) on the plane as places along and across the axis."""
+        if not self.bend:
+            return p[:, 0], p[:, 1]
+        x, y = p[:, 0], self.bend - p[:, 1]
+        return self.bend * np.arctan2(x, y), self.bend - np.hypot(x, y)
 
 
 def scan(scene: Scene, density: float = 16.0, seed: int = 0, angle: float = 20.0):
@@ -65,26 +74,35 @@ def scan(scene: Scene, density: float = 16.0, seed: int = 0, angle: float = 20.0
         ground = np.zeros(n)
         for _ in range(6):
             q = at(ground)
-            height, kind = scene.terrain(q[:, 0], q[:, 1])
+            height, kind = scene.terrain(*scene.along(q))
             ground = np.where(np.isnan(height), 0.0, height)
         z, code = np.where(np.isnan(height), -np.inf, ground), kind.copy()
+        place = scene.along(p)
         for slab in scene.slabs:
-            level = np.full(n, float(np.nanmedian(slab.top(p[:, 0]))))
+            near = np.flatnonzero(slab.inside(*place, 30.0))  # leaning beams come from no farther
+            if not len(near):
+                continue
+            lean = slope[near]
+
+            def on(z, foot=p[near], lean=lean):
+                return scene.along(foot - lean * np.asarray(z)[:, None])
+
+            level = np.full(len(near), float(np.nanmedian(slab.top(place[0]))))
             for _ in range(4):
-                q = at(level)
-                level = slab.top(q[:, 0])
-            hit = slab.inside(*at(level).T) & (level > z)
-            z[hit], code[hit] = level[hit], slab.code
-            for part in rng.uniform(0, 1, 3):  # its flank
-                face = level - part * slab.depth
-                hit = slab.inside(*at(face).T) & (face > z)
-                z[hit], code[hit] = face[hit], slab.code
+                level = slab.top(on(level)[0])
+            faces = [
+                level,
+                *(level - part * slab.depth for part in rng.uniform(0, 1, 3)),
+            ]  # its top, its flank
+            for face in faces:
+                hit = slab.inside(*on(face)) & (face > z[near])
+                z[near[hit]], code[near[hit]] = face[hit], slab.code
         for a, b, radius, tall in scene.trees:
             foot = scene.terrain(np.array([a]), np.array([b]))[0][0]
             if np.isnan(foot):
                 continue
             level = foot + tall * rng.uniform(0.35, 1.0, n)
-            q = at(level)
+            q = np.column_stack(scene.along(at(level)))
             reach = radius * np.sqrt(np.clip(1 - ((level - foot) / tall - 0.65) ** 2 / 0.1225, 0, 1))
             hit = (np.hypot(q[:, 0] - a, q[:, 1] - b) < reach) & (rng.random(n) < 0.7) & (level > z)
             z[hit], code[hit] = level[hit], LEAF

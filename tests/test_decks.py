@@ -11,6 +11,7 @@ import pytest
 from bridge_scenes import DECK, GROUND, OTHER, SCENES, Scene, Slab, scan, viaduct
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from long_bridge_scenes import LEAF, LONG_SCENES
 
 import pdal_stages as ps
 import pdal_stages.synthetic
@@ -18,6 +19,7 @@ from pdal_stages.cli import main
 from pdal_stages.stages.bridges import Bridges
 from pdal_stages.stages.hag_morphological import HagMorphological
 from pdal_stages.terrain import decks, walkable
+from pdal_stages.terrain.deckrims import is_land
 from pdal_stages.terrain.decks import PARTS, SURFACE, find_decks, level_points
 from pdal_stages.terrain.levels import GAP, levels
 from pdal_stages.terrain.morphological import filtered_ground, reach
@@ -115,8 +117,8 @@ def slow_kinds(held):
 
 
 def slow_ways(held, kinds, most=600):
-    """Of each level and direction: how far to a drop, and how it ends at once."""
-    directions = list(zip(walkable._DI.tolist(), walkable._DJ.tolist(), strict=True))
+    """Of each level and direction: how far to a drop or to nothing, which of them it is, and how it ends at once."""
+    directions = list(zip(walkable.RIGHT.tolist(), walkable.UP.tolist(), strict=True))
 
     @functools.cache
     def go(cell, z, d):
@@ -130,9 +132,9 @@ def slow_ways(held, kinds, most=600):
                 q for q in held.get(there, ()) if kinds[there, q] == SOLID and abs(q - z) <= 0.35 + 0.25 * far
             ]
             if steps:
-                way, _ = go(there, min(steps, key=lambda q: (abs(q - z), -q)), d)
+                way, last, _ = go(there, min(steps, key=lambda q: (abs(q - z), -q)), d)
                 way = None if way is None else way + s * (10 if straight else 14)
-                return (None if way is None or way > most else way), ON
+                return (None, WALLED, ON) if way is None or way > most else (way, last, ON)
             if any(q < z - max(2.0, 1.25 * far) for q in held.get(there, ())):
                 # Something to step on farther ahead comes first.
                 farther = [
@@ -144,13 +146,13 @@ def slow_ways(held, kinds, most=600):
                     for away, c in farther
                     for q in held.get(c, ())
                 ):
-                    return 0, DOWN
+                    return 0, DOWN, DOWN
         patch = [(s, 0) for s in range(edge + 1, ahead + 1)]
         patch += [(s, side) for s in range(edge + 1, ahead + 2) for side in (-1, 0, 1)]
         for s, side in patch:
             there = cell[0] + s * dj + side * di, cell[1] + s * di - side * dj
             if any(q < z + 1.5 or kinds[there, q] != ROUGH for q in held.get(there, ())):
-                return None, WALLED
+                return None, WALLED, WALLED
         nothing, far_below = True, False
         for there, heights in held.items():
             b, a = there[0] - cell[0], there[1] - cell[1]
@@ -160,7 +162,7 @@ def slow_ways(held, kinds, most=600):
             turn = np.degrees(np.arccos(min(along / np.sqrt(r2), 1.0)))
             q = heights[0]
             if r2 <= 16**2 and r2 > 4 and turn <= 30 + 1e-9 and q < z - 1.2:
-                return 0, ACROSS
+                return 0, ACROSS, ACROSS
             if (
                 r2 <= 16**2
                 and turn <= 45 + 1e-9
@@ -171,8 +173,8 @@ def slow_ways(held, kinds, most=600):
             if r2 <= 80**2 and turn <= 60 + 1e-9 and q < z - max(3.0, 0.1 * np.sqrt(r2)):
                 far_below = True
         if nothing:
-            return (0, ACROSS) if far_below else (None, NOTHING)
-        return None, WALLED
+            return (0, ACROSS, ACROSS) if far_below else (0, NOTHING, NOTHING)
+        return None, WALLED, WALLED
 
     return {(*key, d): go(*key, d) for key, kind in kinds.items() if kind == SOLID for d in range(8)}
 
@@ -193,13 +195,13 @@ def test_the_kernels_equal_the_slow_reference(seed, water):
     kind = walkable.surfaces(z, start, h, w)
     assert kind.tolist() == [kinds[c, q] for c, q in zip(cells, z, strict=True)]
     assert {ROUGH, SMOOTH, SOLID} <= set(kind.tolist())
-    way, end = walkable.ways(z, start, h, w, kind, 600)
+    way, last, end = walkable.ways(z, start, h, w, kind, 600)
     slow = slow_ways(held, kinds)
     ends = set()
     for n in np.flatnonzero(kind == SOLID):
         for d in range(8):
-            far, how = slow[cells[n], z[n], d]
-            assert (way[n, d], end[n, d]) == (walkable.ENDLESS if far is None else far, how)
+            far, at, how = slow[cells[n], z[n], d]
+            assert (way[n, d], last[n, d], end[n, d]) == (walkable.ENDLESS if far is None else far, at, how)
             ends.add(how)
     assert {ON, DOWN, WALLED} <= ends and (not water or ACROSS in ends)
 
@@ -216,9 +218,29 @@ def f1(deck, true, known):
 def test_decks_of_scenes_are_found_whole(name):
     xyz, codes = seen(name)
     deck = found(xyz) > 0
-    assert f1(deck, codes == DECK, codes != OTHER) > 0.92  # cars and piers belong to neither
+    assert f1(deck, codes == DECK, codes != OTHER) > 0.91  # cars and piers belong to neither
     wrong = deck & (codes != DECK) & (codes != OTHER)
-    assert wrong.sum() < 0.001 * len(xyz)  # a strip of a meter at the ends
+    assert wrong.sum() < 0.0005 * len(xyz)  # a strip of a meter at the ends
+
+
+@pytest.mark.parametrize("name", LONG_SCENES)
+def test_long_bridges_are_found_whole(name):
+    xyz, codes = scan(LONG_SCENES[name](), 8.0)
+    deck = found(xyz) > 0
+    assert f1(deck, codes == DECK, codes != OTHER) > (0.84 if name == "crossing" else 0.92)
+    wrong = deck & ~np.isin(codes, (DECK, OTHER, LEAF))
+    assert wrong.sum() < 0.0005 * len(xyz)
+
+
+def test_a_quay_is_land_and_a_roof_is_not():
+    def ends(down, walled, sides):
+        return np.array([0, down, 0, 0, walled, *sides])
+
+    one, all_round = [0, 0, 50, 100, 50, 0, 0, 0], [25] * 8
+    assert is_land(2000, ends(200, 300, one))
+    assert not is_land(2000, ends(200, 300, all_round))
+    assert not is_land(500, ends(200, 300, one))
+    assert not is_land(2000, ends(200, 100, one))
 
 
 def test_without_a_bridge_nothing_is_found():

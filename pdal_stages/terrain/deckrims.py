@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from .walkable import ACROSS, DOWN, NOTHING, SOLID, distance, walkable
+from .walkable import ACROSS, DOWN, NOTHING, RIGHT, SOLID, UP, distance, walkable
 
 #: Cells across which one walks on from a deck, and across which its parts belong together.
 LINK, JOIN = 2, 4
@@ -17,6 +17,8 @@ SMALLEST, LAND, AWAY = 20, 100, 40
 OUTWARD, OUTWARD_ACROSS, WALLS, RIM = 0.7, 1.75, 0.7, 0.3
 #: The most of the ways over land that end at a drop, at any drop, at nothing.
 _LAND_DROPS = (0.15, 0.35, 0.3)
+#: Land behind a quay has so many cells, no more of its ways end at a drop, and so much of these add up in one direction.
+QUAY, QUAY_DROPS, ONE_SIDED = 1000, 0.45, 0.5
 #: Directions from a deck's middle; an end has the sectors so near.
 SECTORS, NEAR = 16, 2
 
@@ -95,7 +97,10 @@ def step_on(z, start, h, w, kind, number, only, j, i, n, land, seen, stamp, leng
 
 @njit
 def spread(z, start, h, w, kind, end, number, part, land, seen, stamp, length, ends):
-    """Add all one walks on to from there, up to AWAY cells, and count how its ways end; returns how many cells that are."""
+    """Add all one walks on to from there, up to AWAY cells, and count how its ways end (5), and at drops by direction (8).
+
+    Returns how many cells that are.
+    """
     low_j, high_j, low_i, high_i = h, -1, w, -1
     for q in range(length):
         low_j, high_j = min(low_j, land[q, 1]), max(high_j, land[q, 1])
@@ -108,13 +113,19 @@ def spread(z, start, h, w, kind, end, number, part, land, seen, stamp, length, e
             continue
         for d in range(8):
             ends[end[n, d]] += 1
+            ends[5 + d] += end[n, d] == DOWN or end[n, d] == ACROSS
         length = step_on(z, start, h, w, kind, number, part, j, i, n, land, seen, stamp, length)
     return length
 
 
 def is_land(cells: int, ends: NDArray[np.int64]) -> bool:
-    over = max(int(ends[1:].sum()), 1)
+    over = max(int(ends[1:5].sum()), 1)
     down, any_down, nothing = ends[DOWN] / over, (ends[DOWN] + ends[ACROSS]) / over, ends[NOTHING] / over
-    return (
-        cells >= LAND and down <= _LAND_DROPS[0] and any_down <= _LAND_DROPS[1] and nothing <= _LAND_DROPS[2]
-    )
+    if cells < LAND or nothing > _LAND_DROPS[2]:
+        return False
+    if down <= _LAND_DROPS[0] and any_down <= _LAND_DROPS[1]:
+        return True
+    # A quay, unlike a roof, ends at a drop to one side.
+    length = np.hypot(RIGHT, UP)
+    side = np.hypot(np.sum(ends[5:] * RIGHT / length), np.sum(ends[5:] * UP / length))
+    return bool(cells >= QUAY and any_down <= QUAY_DROPS and side >= ONE_SIDED * ends[5:].sum())

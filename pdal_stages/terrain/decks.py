@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.jit import njit
+from ..base.jit import device, njit
 from ..base.unionfind import root as root_of
 from .deckrims import (
     AWAY,
@@ -48,7 +48,9 @@ from .walkable import (
     DOWN,
     FAR,
     NOTHING,
+    ROUGH,
     SOLID,
+    STEP,
     STRAIGHT,
     WALLED,
     distance,
@@ -69,10 +71,12 @@ _FILLS = 2
 CUT, CUT_RIM = 60, 3
 #: How far from the deck's surface its points lie, meters: on it; parapets and cars above; its flank below.
 ON_DECK, PARAPET, FLANK = 0.4, 1.6, 2.0
+#: Rise over run of banks, whose points are no flank of the deck above.
+BANK = 0.7
 #: Cells beyond those that were found, to the deck's edge and under its cars.
 BESIDE = 2
 #: How far away points matter, in meters: cells of a deck, its rim, and land at its ends, which all look around.
-REACH = (BLOCK * (FAR_ENDS + 1) + LINK + AWAY + AHEAD + FAR + 8 + WIDEST + 2 * _FILLS) * CELL
+REACH = (BLOCK * (FAR_ENDS + 1) + LINK + AWAY + AHEAD + FAR + 8 + WIDEST + 2 * _FILLS + 2 * BESIDE) * CELL
 #: What points are: of a deck's surface, of its parapets and flanks, or of none.
 SURFACE, PARTS = 1, 2
 
@@ -118,8 +122,8 @@ def levels_near_decks(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """All that :func:`decks_of_levels` needs, of the points :func:`level_points` at least, and what these are numbers of.
 
-    Levels in cells up to BESIDE from a deck (n, 5): column, row, height, whether it is a deck's, whether it is solid; and
-    the numbers of the points that are their lowest.
+    Levels in cells up to twice BESIDE from a deck (n, 5): column, row, height, whether it is a deck's, its kind; and the
+    numbers of the points that are their lowest.
     """
     rows, numbers = [np.empty((0, 5))], [np.empty(0, np.int64)]
     if len(x):
@@ -133,9 +137,7 @@ def levels_near_decks(
             *_, heights, lowest, start, kind, deck = found
             near = near_decks(start, *found[2:4], deck) & mine[lowest]
             point = at[lowest[near]]
-            rows.append(
-                np.column_stack([column[point], row[point], heights[near], deck[near], kind[near] == SOLID])
-            )
+            rows.append(np.column_stack([column[point], row[point], heights[near], deck[near], kind[near]]))
             numbers.append(point)
     return np.concatenate(rows), np.concatenate(numbers)
 
@@ -162,7 +164,7 @@ def decks_of_levels(
         place = (rows[mine] - bottom) * w + columns[mine] - left
         start = np.searchsorted(place, np.arange(h * w + 1))
         found = np.zeros(len(near), np.uint8)
-        kind = np.where(table[mine, 4] != 0, SOLID, SOLID + 1).astype(np.int8)
+        kind = table[mine, 4].astype(np.int8)
         _mark(
             z[near], use[near], column[near], row[near], left, bottom, h, w,
             np.ascontiguousarray(table[mine, 2]), start, kind, table[mine, 3] != 0, found,
@@ -173,14 +175,14 @@ def decks_of_levels(
 
 @njit
 def near_decks(start, h, w, deck):
-    """Levels (n,) in cells up to BESIDE from one with a deck."""
+    """Levels (n,) in cells up to twice BESIDE from one with a deck."""
     out = np.zeros(len(deck), np.bool_)
     for j in range(h):
         for i in range(w):
             for n in range(start[j * w + i], start[j * w + i + 1]):
                 if deck[n]:
-                    for b in range(max(j - BESIDE, 0), min(j + BESIDE + 1, h)):
-                        for a in range(max(i - BESIDE, 0), min(i + BESIDE + 1, w)):
+                    for b in range(max(j - 2 * BESIDE, 0), min(j + 2 * BESIDE + 1, h)):
+                        for a in range(max(i - 2 * BESIDE, 0), min(i + 2 * BESIDE + 1, w)):
                             out[start[b * w + a] : start[b * w + a + 1]] = True
     return out
 
@@ -190,22 +192,32 @@ def _deck_levels(z, use, column, row):
     left, bottom, h, w = _raster(column, row)
     heights, lowest, start = levels(z, use, column, row, left, bottom, h, w)
     kind = surfaces(heights, start, h, w)
-    way, end = ways(heights, start, h, w, kind, int(WIDEST / CELL) * STRAIGHT)
-    deck = between_drops(way, int(WIDEST / CELL) * STRAIGHT)
+    way, last, end = ways(heights, start, h, w, kind, int(WIDEST / CELL) * STRAIGHT)
+    deck, above = between_drops(way, last, int(WIDEST / CELL) * STRAIGHT)
     if not deck.any():
         return None
+    raster = heights, start, h, w, kind, end
+    found = _judged(raster, deck, left, bottom)
+    # Where a river without returns is wider than one sees, decks lead on over nothing.
+    if above.any():
+        found |= _judged(raster, deck | above, left, bottom, FAR)
+    return (left, bottom, h, w, heights, lowest, start, kind, found) if found.any() else None
+
+
+def _judged(raster, deck, left, bottom, least=0) -> NDArray[np.bool_]:
+    """Levels (n,) of decks, of those that may be of one; the decks longer than `least` cells."""
+    heights, start, h, w, kind, _ = raster
     for _ in range(_FILLS):
         deck = filled(heights, start, h, w, kind, deck)
-    raster = heights, start, h, w, kind, end
     number, sums, box = parts(heights, start, h, w, deck, np.zeros(len(deck), bool))
     long = np.append(_extent(box) > LONGEST / CELL, False)[number]
-    found = whole_decks(raster, number, sums, box)
+    found = whole_decks(raster, number, sums, box) & np.append(_extent(box) > least, False)[number]
     if long.any():  # wires may join roofs to something long
         number, sums, box = parts(heights, start, h, w, long, broad(heights, start, h, w, long))
         found |= whole_decks(raster, number, sums, box)
         long = np.append(_extent(box) > LONGEST / CELL, False)[number]
         found |= stretches(*raster, long, left, bottom)
-    return (left, bottom, h, w, heights, lowest, start, kind, found) if found.any() else None
+    return found
 
 
 def _find(z, use, column, row) -> NDArray[np.uint8]:
@@ -218,14 +230,18 @@ def _find(z, use, column, row) -> NDArray[np.uint8]:
 
 
 @njit
-def between_drops(way, most):
-    """Levels (n,) with drops on opposite sides, no farther apart than `most` tenths of cells."""
-    found = np.zeros(len(way), np.bool_)
+def between_drops(way, last, most):
+    """Levels (n,) with drops on opposite sides, no farther apart than `most` tenths of cells; and with nothing there."""
+    found, above = np.zeros(len(way), np.bool_), np.zeros(len(way), np.bool_)
     for n in range(len(way)):
         for d in range(4):
             if way[n, d] + way[n, d + 4] + (STRAIGHT if d % 2 == 0 else DIAGONAL) <= most:
-                found[n] = True
-    return found
+                one, other = last[n, d], last[n, d + 4]
+                if one != NOTHING and other != NOTHING:
+                    found[n] = True
+                elif one != DOWN and other != DOWN:
+                    above[n] = True
+    return found, above & ~found
 
 
 @njit
@@ -339,7 +355,7 @@ def whole_decks(raster, number, sums, box) -> NDArray[np.bool_]:
         assert opposite is not None
         good[k] = True
         for sectors in opposite if whole else opposite[:1]:
-            over = np.zeros(5, np.int64)
+            over = np.zeros(13, np.int64)
             cells = first_land(z, start, h, w, kind, number, sums[k], box[k], k, sectors, land, seen, stamp)
             cells = spread(z, start, h, w, kind, end, number, k, land, seen, stamp, cells, over)
             stamp += 1
@@ -389,10 +405,25 @@ def _mark(z, use, column, row, left, bottom, h, w, heights, start, kind, deck, o
                             nearest, level = squared, heights[m]
         if weights == 0 or not -FLANK <= z[p] - level <= PARAPET:
             continue
-        # Ground that one walks on to is no deck.
-        own = False
-        for m in range(start[j * w + i], start[j * w + i + 1]):
-            if kind[m] == SOLID and not deck[m] and abs(heights[m] - level) <= 2 * ON_DECK:
-                own = True
-        if not own:
+        if not _on_land(z[p], j, i, h, w, heights, start, kind, deck, nearest, level):
             out[p] = SURFACE if abs(z[p] - level) <= ON_DECK else PARTS
+
+
+@device
+def _on_land(z, j, i, h, w, heights, start, kind, deck, nearest, level):
+    """Whether ground that one walks on to, or the bank below, is as near to a point as its deck is."""
+    below = z < level - ON_DECK
+    for b in range(max(j - BESIDE, 0), min(j + BESIDE + 1, h)):
+        for a in range(max(i - BESIDE, 0), min(i + BESIDE + 1, w)):
+            squared = (a - i) ** 2 + (b - j) ** 2
+            if squared > max(nearest, 2 if below else 0):
+                continue
+            for m in range(start[b * w + a], start[b * w + a + 1]):
+                if deck[m] or kind[m] == ROUGH:
+                    continue
+                if below:
+                    if abs(heights[m] - z) <= STEP + BANK * distance(a - i, b - j):
+                        return True
+                elif kind[m] == SOLID and abs(heights[m] - level) <= 2 * ON_DECK:
+                    return True
+    return False

@@ -81,7 +81,7 @@ class FilterOptions:
     @property
     def reach_of_decks(self) -> int:
         """How far away, in cells, points can change what is a bridge deck, which is found apart."""
-        return math.ceil((DECKS_REACH + (BESIDE + 1) * CELL) / self.cell)
+        return math.ceil((DECKS_REACH + (2 * BESIDE + 1) * CELL) / self.cell)
 
     @property
     def link(self) -> int:

@@ -9,10 +9,13 @@ from numpy.typing import NDArray
 
 from ..base.jit import njit
 from .deckrims import OUTWARD, WALLS, is_land, leads_on, spread, step_on
-from .walkable import ACROSS, DOWN, WALLED
+from .walkable import ACROSS, DOWN, NOTHING, WALLED
 
 #: Blocks in which long decks are judged, cells, and how many blocks away land must be seen at an end.
 BLOCK, FAR_ENDS = 64, 3
+#: So many cells are at a drop near what is wider than one sees; there, for each way that ends at nothing, so many end at
+#: something else, as lamps, cars and the deck itself are before what lies askew.
+LONG_RIM, OVER_NOTHING = 100, 1.0
 
 
 def stretches(z, start, h, w, kind, end, long, left, bottom) -> NDArray[np.bool_]:
@@ -22,23 +25,25 @@ def stretches(z, start, h, w, kind, end, long, left, bottom) -> NDArray[np.bool_
     number = np.where(long, 0, -1)
     low_a, low_b = left // BLOCK - 1, bottom // BLOCK - 1
     shape = (bottom + h) // BLOCK + 2 - low_b, (left + w) // BLOCK + 2 - low_a
-    sums, block = np.zeros((*shape, 4), np.int64), np.full((len(z), 2), -1, np.int64)
+    sums, block = np.zeros((*shape, 6), np.int64), np.full((len(z), 2), -1, np.int64)
     leads = np.zeros(len(z), bool)
     _count_blocks(z, start, h, w, kind, end, number, left, bottom, low_a, low_b, sums, block, leads)
     near = _around(sums, 1)
-    good = (
-        (near[..., 0] > 0) & (near[..., 1] <= WALLS * near[..., 0]) & (near[..., 3] <= OUTWARD * near[..., 2])
-    )
+    # Over nothing, such as a wide river, drops are seen farther away.
+    far = _around(sums, FAR_ENDS)[..., 2] >= LONG_RIM
+    ways, cells = near[..., 0] + far * near[..., 4], near[..., 2] + far * near[..., 5]
+    walls = np.where(far & (near[..., 4] > near[..., 0]), OVER_NOTHING, WALLS)
+    good = (ways > 0) & (near[..., 1] <= walls * ways) & (near[..., 3] <= OUTWARD * cells)
     ends_here = np.zeros(shape, np.int64)
     land, seen = np.empty((len(z), 3), np.int64), np.full(len(z), -1, np.int64)
     for stamp, (b, a) in enumerate(np.argwhere(sums[..., 3] > 0)):
-        over = np.zeros(5, np.int64)
+        over = np.zeros(13, np.int64)
         own = leads & (block[:, 0] == b) & (block[:, 1] == a)
         low = max((b + low_b) * BLOCK - bottom, 0), max((a + low_a) * BLOCK - left, 0)
         cells = _land_of_block(z, start, h, w, kind, number, own, *low, land, seen, stamp)
         cells = spread(z, start, h, w, kind, end, number, 0, land, seen, stamp, cells, over)
         ends_here[b, a] = is_land(cells, over)
-    good &= (_around(ends_here[..., None], FAR_ENDS)[..., 0] > 0) | _passed(sums[..., 2] > 0)
+    good &= (_around(ends_here[..., None], FAR_ENDS)[..., 0] > 0) | _passed(sums[..., 2] + sums[..., 5] > 0)
     return long & good[block[:, 0], block[:, 1]]
 
 
@@ -64,7 +69,9 @@ def _around(values: NDArray[np.int64], reach: int) -> NDArray[Any]:
 
 @njit
 def _count_blocks(z, start, h, w, kind, end, number, left, bottom, low_a, low_b, sums, block, leads):
-    """Of each block: ways that end at a drop, and at something else; cells at a drop, and cells that lead on."""
+    """Of each block: ways that end at a drop, and at something else; cells at a drop, and cells that lead on; ways that
+    end at nothing, and cells at nothing but no drop.
+    """
     for j in range(h):
         for i in range(w):
             for n in range(start[j * w + i], start[j * w + i + 1]):
@@ -72,14 +79,18 @@ def _count_blocks(z, start, h, w, kind, end, number, left, bottom, low_a, low_b,
                     continue
                 block[n, 0], block[n, 1] = (j + bottom) // BLOCK - low_b, (i + left) // BLOCK - low_a
                 own = sums[block[n, 0], block[n, 1]]
-                drop = False
+                drop = nothing = False
                 for d in range(8):
                     if end[n, d] == DOWN or end[n, d] == ACROSS:
                         own[0] += 1
                         drop = True
                     elif end[n, d] == WALLED:
                         own[1] += 1
+                    elif end[n, d] == NOTHING:
+                        own[4] += 1
+                        nothing = True
                 own[2] += drop
+                own[5] += nothing and not drop
                 leads[n] = leads_on(z, start, h, w, kind, number, j, i, n)
                 own[3] += leads[n]
 

@@ -30,7 +30,7 @@ ROUGH, SMOOTH, SOLID = 0, 1, 2
 #: How a way ends: not at all, at a drop, at one across emptiness, at nothing, at something else.
 ON, DOWN, ACROSS, NOTHING, WALLED = 0, 1, 2, 3, 4
 #: Eight directions, and the length of a step, in tenths of cells.
-_DI, _DJ = np.array([1, 1, 0, -1, -1, -1, 0, 1]), np.array([0, 1, 1, 1, 0, -1, -1, -1])
+RIGHT, UP = np.array([1, 1, 0, -1, -1, -1, 0, 1]), np.array([0, 1, 1, 1, 0, -1, -1, -1])
 STRAIGHT, DIAGONAL = 10, 14
 #: No way.
 ENDLESS = 1 << 20
@@ -125,13 +125,15 @@ def surfaces(z, start, h, w):
 
 @njit
 def ways(z, start, h, w, kind, most):
-    """How far one walks to a drop from each level in each of eight directions (n, 8), and how the way ends at once (n, 8).
+    """How far one walks to a drop, or to nothing, from each level in each of eight directions (n, 8), and which of them it
+    is (n, 8); and how the way ends at once (n, 8).
 
-    In tenths of cells, ENDLESS where there is no drop or it is more than `most` away; ON where the way goes on.
+    In tenths of cells, ENDLESS where there is neither or it is more than `most` away; ON where the way goes on.
     """
     way, end = np.full((len(z), 8), ENDLESS, np.int32), np.zeros((len(z), 8), np.int8)
+    last = np.full((len(z), 8), WALLED, np.int8)
     for d in range(8):
-        di, dj = _DI[d], _DJ[d]
+        di, dj = RIGHT[d], UP[d]
         straight = di == 0 or dj == 0
         length = STRAIGHT if straight else DIAGONAL
         ahead = AHEAD if straight else AHEAD * STRAIGHT // DIAGONAL + 1
@@ -161,6 +163,7 @@ def ways(z, start, h, w, kind, most):
                         if found >= 0:
                             if way[found, d] + s * length <= most:
                                 way[n, d] = way[found, d] + s * length
+                                last[n, d] = last[found, d]
                             break
                     if found >= 0:
                         continue
@@ -169,9 +172,9 @@ def ways(z, start, h, w, kind, most):
                         end[n, d] = DOWN
                     elif empty and _bare(z, start, h, w, kind, j, i, di, dj, edge, ahead, z[n] + ABOVE):
                         end[n, d] = _sight(z, start, h, w, kind, j, i, di, dj, z[n])
-                    if end[n, d] == DOWN or end[n, d] == ACROSS:
-                        way[n, d] = 0
-    return way, end
+                    if end[n, d] != WALLED:
+                        way[n, d], last[n, d] = 0, end[n, d]
+    return way, last, end
 
 
 @device
