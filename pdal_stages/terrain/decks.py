@@ -206,7 +206,7 @@ def _deck_levels(z, use, column, row):
 
 def _judged(raster, deck, left, bottom, least=0) -> NDArray[np.bool_]:
     """Levels (n,) of decks, of those that may be of one; the decks longer than `least` cells."""
-    heights, start, h, w, kind, _ = raster
+    heights, start, h, w, kind, end = raster
     for _ in range(_FILLS):
         deck = filled(heights, start, h, w, kind, deck)
     number, sums, box = parts(heights, start, h, w, deck, np.zeros(len(deck), bool))
@@ -216,7 +216,7 @@ def _judged(raster, deck, left, bottom, least=0) -> NDArray[np.bool_]:
         number, sums, box = parts(heights, start, h, w, long, broad(heights, start, h, w, long))
         found |= whole_decks(raster, number, sums, box)
         long = np.append(_extent(box) > LONGEST / CELL, False)[number]
-        found |= stretches(*raster, long, left, bottom)
+        found |= stretches(heights, start, h, w, kind, end, long, left, bottom)
     return found
 
 
