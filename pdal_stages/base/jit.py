@@ -72,9 +72,10 @@ class Kernel:
 
     @property
     def kept(self) -> bool:
-        """Whether compiled code of it is in the cache."""
-        file: Any = getattr(getattr(self.dispatcher, "_cache", None), "_cache_file", None)
-        return bool(file is not None and file._load_index())
+        """Whether compiled code of it is in the cache; False where this numba does not tell."""
+        file = getattr(getattr(self.dispatcher, "_cache", None), "_cache_file", None)
+        read = getattr(file, "_load_index", None)
+        return bool(read and read())
 
     @property
     def _numba_type_(self) -> Any:
