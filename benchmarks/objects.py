@@ -1,6 +1,6 @@
 """Objects of generated towns and of Delft's train part against what truly stands there.
 
-python benchmarks/objects.py [--data FOLDER] [--classified MODEL]
+python benchmarks/objects.py [--data FOLDER [--picture FILE]] [--classified MODEL]
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ def town(seed, codes=None):
     return rows
 
 
-def delft(data):
-    """Figures of Delft's train part by its own classes: houses covered, area, boundary."""
+def delft(data, picture=None):
+    """Figures of Delft's train part by its own classes: houses covered, area, boundary; and a picture of a part."""
     import json
 
     import laspy
@@ -111,6 +111,23 @@ def delft(data):
             f"{100 * got['area']['completeness']:.1f} % of their area, boundary {got['boundary']['median']:.2f} m, "
             f"95 %: {got['boundary']['p95']:.2f} m"
         )
+    if picture:
+        draw(picture, {(58, 116, 214): true, (190, 30, 36): shapes}, true)
+
+
+def draw(path, colored, around, size=(170, 140), pixels=5, finer=3):
+    """Outlines by color, in the middle of what they are `around`: `size` in meters, `pixels` a meter."""
+    from PIL import Image, ImageDraw
+
+    west, south, east, north = shapely.total_bounds(around)
+    corner = np.array([(west + east - size[0]) / 2, (south + north + size[1]) / 2])
+    image = Image.new("RGB", tuple(side * pixels * finer for side in size), "white")
+    pen = ImageDraw.Draw(image)
+    for color, shapes in colored.items():
+        for ring in (ring for part in shapely.get_parts(shapes) for ring in [part.exterior, *part.interiors]):
+            at = (shapely.get_coordinates(ring) - corner) * (pixels * finer, -pixels * finer)
+            pen.line([tuple(xy) for xy in at], color, 2 * finer, joint="curve")
+    image.reduce(finer).quantize(64).save(path)
 
 
 def classified(model):
@@ -135,6 +152,7 @@ def classified(model):
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", help="folder of the real clouds")
+    parser.add_argument("--picture", metavar="FILE", help="of the outlines in Delft over the official ones")
     parser.add_argument(
         "--classified", metavar="MODEL", help="classes by this model instead of the true ones"
     )
@@ -153,4 +171,4 @@ if __name__ == "__main__":
                     f"{got['boundary']['median']:.2f} m, 95 %: {got['boundary']['p95']:.2f} m; {seconds:.2f} CPU s"
                 )
     if options.data:
-        delft(options.data)
+        delft(options.data, options.picture)

@@ -366,3 +366,32 @@ def test_what_is_nowhere_two_meters_wide_is_to_be_checked():
     table = found_in(*scene(wire, shed)).tables[Kind.BUILDING]
     assert len(table) == 2
     assert ["narrow" in reason for reason in table.columns["reason"]] == [True, False]
+
+
+@pytest.mark.parametrize("degrees", [17.0, 30.0, 41.5])
+def test_a_straight_outline_that_is_shared_out_stays_straight(degrees):
+    """Neighbors share an outline in which nothing of the cells' steps is left, nor any piece of it lost."""
+    shapely = pytest.importorskip("shapely")
+    from pdal_stages.objects.outlines import _shared_out, raw_outlines
+
+    outer = shapely.affinity.rotate(shapely.box(100, 100, 220, 160), degrees)
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(60, 260), np.arange(60, 260)))
+    middle = shapely.points(x + 0.5, y + 0.5)
+    west = shapely.affinity.rotate(shapely.box(100, 100, 150, 160), degrees, origin=outer.centroid)
+    inside = shapely.contains(outer, middle)
+    first = inside & shapely.contains(west, middle)
+
+    class Cut:
+        def __len__(self):
+            return 2
+
+        def cells_of(self, number):
+            mine = (inside & ~first, first)[number]
+            return x[mine], y[mine]
+
+    shapes = raw_outlines(Cut(), 1.0)
+    parts = _shared_out(shapely, outer, shapes)
+    assert shapely.union_all(parts).symmetric_difference(outer).area < 1.0
+    assert parts[0].intersection(parts[1]).area == 0
+    edges = np.hypot(*np.diff(shapely.get_coordinates(shapely.union_all(parts).exterior), axis=0).T)
+    assert len(edges) <= 8 and edges.min() > 3

@@ -189,10 +189,18 @@ def _shared_out(shapely: Any, outer: Any, shapes: list[Any]) -> list[Any]:
     parts = [_polygons(shapely, shapely.intersection(outer, shape, grid_size=_GRID)) for shape in shapes]
     left = shapely.difference(outer, shapely.union_all(parts, grid_size=_GRID), grid_size=_GRID)
     more: list[list[Any]] = [[part] for part in parts]
-    for piece in shapely.get_parts(_polygons(shapely, left)):
-        shared = [piece.boundary.intersection(part.boundary).length for part in parts]
-        if max(shared, default=0.0) > 0:
-            more[int(np.argmax(shared))].append(piece)
+    # However small: between a wall and the steps of the cells there is one at each step.
+    pieces = [piece for piece in shapely.get_parts(left) if piece.geom_type == "Polygon"]
+    shared = np.zeros((len(pieces), len(parts)))
+    near = shapely.STRtree(pieces)
+    for n, part in enumerate(parts):
+        beside = near.query(part)
+        shared[beside, n] = shapely.length(
+            shapely.intersection(shapely.boundary(near.geometries[beside]), part.boundary)
+        )
+    for piece, most, most_shared in zip(pieces, shared.argmax(axis=1), shared.max(axis=1), strict=True):
+        if most_shared > 0:
+            more[most].append(piece)
     whole = [_polygons(shapely, shapely.union_all(pieces, grid_size=_GRID)) for pieces in more]
     inner = shapely.coverage_simplify(whole, _TOLERANCE, simplify_boundary=False)
     return list(shapely.coverage_simplify(inner, 0.1))  # corners on straight walls, where cells crossed them
