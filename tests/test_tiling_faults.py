@@ -25,8 +25,9 @@ import tiling_clouds as clouds
 from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.base.threads import available_threads
 from pdal_stages.pipeline import lifesigns, processes
-from pdal_stages.tiling import run_tiled
-from pdal_stages.tiling.store import Store
+from pdal_stages.pipeline.work import Call, perform
+from pdal_stages.tiling import pool, results, run_tiled, tail
+from pdal_stages.tiling.store import Store, check_run
 
 pytestmark = pytest.mark.pdal
 WORKERS = min(2, available_threads())
@@ -319,6 +320,39 @@ def test_two_runs_into_one_folder(tmp_path, folder):
             run_tiled(stages, 20, workers=0)
         assert str(os.getpid()) in str(caught.value)
     assert not run_tiled(stages, 20, workers=0).failures
+
+
+@pytest.mark.parametrize("per", ["file", "tile"])
+def test_a_straggler_of_an_ended_run_changes_nothing(tmp_path, folder, monkeypatch, per):
+    """What a cluster's worker still does for a run that was killed: it is refused when its file is to get its name."""
+    stages = pipeline(folder, tmp_path / "o_#.laz")
+    late = []
+    monkeypatch.setattr(pool, "perform", lambda task: late.append(pickle.dumps(task)) or perform(task))
+    assert not run_tiled(stages, 20, workers=0, per=per).failures
+    late = [task for task in map(pickle.loads, late) if not isinstance(task, Call)]
+    monkeypatch.undo()
+    assert not run_tiled(stages, 20, workers=0, per=per).failures  # the run after
+    own = tmp_path / ".pdal-stages"
+    before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.is_file()}
+    for task in late:
+        assert perform(task).reason
+    # At its very end: the folder for temporary files is gone when the work is done.
+    for task in late:
+        scratch = Path(task.scratch if hasattr(task, "scratch") else task.context.scratch)
+        scratch.mkdir(parents=True)
+        with monkeypatch.context() as patch:
+            for module in (results, tail):
+                patch.setattr(
+                    module, "check_run", lambda given, f=check_run: shutil.rmtree(given) or f(given)
+                )
+            reason = perform(task).reason
+        assert (
+            "the run that wanted this has ended" in reason
+            or "cannot be read back" in reason
+            or "not there" in reason
+        )
+        shutil.rmtree(own / "scratch", ignore_errors=True)
+    assert {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.is_file()} == before
 
 
 def test_the_command_says_what_is_missing(tmp_path, folder):

@@ -10,10 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
+from .byplace import CopyByPlace
 from .grid import Box, TileGrid, check_number
 
 #: Points of a block: LAZ is compressed in pieces of so many.
 BLOCK = 50_000
+#: Points of a file at most that a worker keeps in memory; 2,048 such files hold 250 MB or less.
+SMALL = 2_500
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,7 @@ class CloudIndex:
     count: int
     boxes: NDArray[np.float64]  #: (n, 4) of each block of 50,000 points: a country has millions of them
     tiles: list[tuple[int, int, int]]  #: column, row and number of points of each tile
+    copy: str = ""  #: a copy of the file by place, see :mod:`.byplace`; empty where none was made
 
 
 def open_las(path: str):
@@ -55,8 +59,8 @@ def read_block(reader: Any, path: str, start: int, end: int):
     return points
 
 
-def index_las(path: str, grid: TileGrid) -> CloudIndex:
-    """Read a file once and say where its points lie.
+def index_las(path: str, grid: TileGrid, copy: str = "") -> CloudIndex:
+    """Read a file once and say where its points lie; `copy`: a file for a copy by place, empty for none.
 
     Raises
     ------
@@ -65,7 +69,7 @@ def index_las(path: str, grid: TileGrid) -> CloudIndex:
     """
     boxes: list[Box] = []
     tiles: Counter[tuple[int, int]] = Counter()
-    with open_las(path) as reader:
+    with open_las(path) as reader, CopyByPlace(copy) as copying:
         total = int(reader.header.point_count)
         for start in range(0, total, BLOCK):
             points = read_block(reader, path, start, total)
@@ -74,8 +78,12 @@ def index_las(path: str, grid: TileGrid) -> CloudIndex:
             for i, j, number in counted(grid.index(x), grid.index(y)):
                 tiles[i, j] += number
             check_number(len(tiles), f"{path}, tiles of {grid.size:g}")
+            copying.add(points.array, x, y)
     return CloudIndex(
-        total, np.array(boxes, np.float64).reshape(-1, 4), [(i, j, n) for (i, j), n in sorted(tiles.items())]
+        total,
+        np.array(boxes, np.float64).reshape(-1, 4),
+        [(i, j, n) for (i, j), n in sorted(tiles.items())],
+        copy,
     )
 
 

@@ -163,7 +163,7 @@ def run_first_round(work: Worklist, store: Store, pool: Pool, retries: int, show
 
     def block_task(block: tuple[int, int]) -> BlockTask:
         left = [str(store.left(by_tile[t].name)) for t in near[block] if t not in failed]
-        return BlockTask(context.plan, block, left, str(store.block(block)))
+        return BlockTask(context.plan, block, left, str(store.block(block)), context.scratch)
 
     halo = first.halo_m / unit
     context = work.context(store, pool.threads)

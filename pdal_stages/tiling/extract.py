@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from ..base import las
 from ..base.errors import StageError
-from .cloudindex import BLOCK, CloudIndex, counted, open_las, read_block
+from .byplace import points_in
+from .cloudindex import BLOCK, SMALL, CloudIndex, counted, open_las, read_block
 from .ept import fetch
 from .grid import Box, TileGrid, touching
 from .sources import InputSource
@@ -24,8 +25,6 @@ from .sources import InputSource
 _COMPRESSOR = b"laszip encoded"
 #: Bytes of the header that decide how points are read: encoding, version, sizes, point format, scales and offsets.
 _COMPARED = ((6, 8), (24, 26), (94, 107), (131, 179))
-#: Points of a file at most that is kept in memory; 2,048 such files hold 250 MB or less.
-_SMALL = 2_500
 
 
 @dataclass(frozen=True)
@@ -173,7 +172,7 @@ def cut(
             core_out.write(head)
             for member in members:
                 first = found
-                for start, points in _blocks(member, box):
+                for numbers, points in _blocks(member, box):
                     x, y = points.x, points.y
                     rows = np.flatnonzero((x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3]))
                     if not rows.size:
@@ -190,7 +189,7 @@ def cut(
                         mine = away < 0
                         core_out.write(raw[mine].tobytes())
                         cores += int(np.count_nonzero(mine))
-                    rows_cut.append(rows + start)
+                    rows_cut.append(numbers[rows])
                     aways.append(away)
                     found += len(rows)
                 if found > first:
@@ -216,20 +215,40 @@ class _Points(NamedTuple):
     y: NDArray[np.float64]
 
 
-def _blocks(member: Member, box: Box) -> Iterator[tuple[int, _Points]]:
-    """Blocks of a file that may have points in a box, each with the number of its first."""
+def _blocks(member: Member, box: Box) -> Iterator[tuple[NDArray[np.int64], _Points]]:
+    """Numbers, ascending, and points of a file, in parts: all that may lie in a box."""
     blocks = touching(member.index.boxes, box)
     if not blocks:
         return
-    if member.index.count <= _SMALL:
+    if member.index.count <= SMALL:
         status = os.stat(member.path)
-        yield 0, _small(member.path, member.index.count, status.st_mtime_ns, status.st_size)
+        points = _small(member.path, member.index.count, status.st_mtime_ns, status.st_size)
+        yield np.arange(len(points.x)), points
+        return
+    copied = points_in(member.index.copy, member.index.count, box) if member.index.copy else None
+    if copied is not None:
+        yield from _scaled(member.path, copied)
         return
     with open_las(member.path) as reader:
         for block in blocks:
             start = block * BLOCK
             points = read_block(reader, member.path, start, member.index.count)
-            yield start, _Points(points.array, np.asarray(points.x), np.asarray(points.y))
+            numbers = np.arange(start, start + len(points))
+            yield numbers, _Points(points.array, np.asarray(points.x), np.asarray(points.y))
+
+
+def _scaled(
+    path: str, copied: Iterator[tuple[NDArray[np.int64], NDArray]]
+) -> Iterator[tuple[NDArray[np.int64], _Points]]:
+    """Records of a file's copy, with coordinates as they are read from the file itself."""
+    import laspy
+
+    with open_las(path) as reader:
+        header = reader.header
+    for numbers, records in copied:
+        array = records.view(header.point_format.dtype())
+        points = laspy.ScaleAwarePointRecord(array, header.point_format, header.scales, header.offsets)
+        yield numbers, _Points(array, np.asarray(points.x), np.asarray(points.y))
 
 
 @lru_cache(maxsize=2048)

@@ -76,11 +76,18 @@ class FileTask:
         header = las.read_header(self.source.path)
         if header is not None and header.count:
             tail = on_one_grid(tail, header.box, half_open=False)
-        return run_tail([reader], [new_values(0, self.count)], tail, self.outputs, self.meanings)
+        return run_tail(
+            [reader], [new_values(0, self.count)], tail, self.outputs, self.meanings, self.scratch
+        )
 
 
-def write_tile(results: list[PieceResults], plan: TilePlan, outputs: list[str], box: Box) -> dict[str, Any]:
-    """Write one tile's own points, from the files that were cut for it; `box`: where it lies."""
+def write_tile(
+    results: list[PieceResults], plan: TilePlan, outputs: list[str], box: Box, scratch: str
+) -> dict[str, Any]:
+    """Write one tile's own points, from the files that were cut for it.
+
+    `box`: where it lies; `scratch`: the run's folder for temporary files.
+    """
     mine = [result for result in results if result.piece.own.size]
     tail = with_beside(
         plan.tail, plan.beside, [source.path for result in mine for source, *_ in result.piece.spans]
@@ -89,7 +96,9 @@ def write_tile(results: list[PieceResults], plan: TilePlan, outputs: list[str], 
         return {"outputs": []}
     readers = [{**result.piece.reader, "filename": result.piece.core} for result in mine]
     tail = on_one_grid(tail, box, half_open=True)
-    return run_tail(readers, [of_own_points(result) for result in mine], tail, outputs, plan.meanings)
+    return run_tail(
+        readers, [of_own_points(result) for result in mine], tail, outputs, plan.meanings, scratch
+    )
 
 
 def with_beside(

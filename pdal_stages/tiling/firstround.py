@@ -27,7 +27,7 @@ from .extract import Piece, cut_all
 from .grid import Box, TileGrid
 from .headrun import FirstResults, RunContext, run_first
 from .sources import InputSource
-from .store import block_file, left_file
+from .store import block_file, check_run, left_file
 from .tileplan import FirstRound, TilePlan
 
 
@@ -53,7 +53,7 @@ class FirstRoundTask:
         for key, (index, values) in found.changed.items():
             arrays[f"{key}/index"] = index
             arrays |= {f"{key}/{name}": column for name, column in values.items()}
-        _save(self.target, arrays)
+        _save(self.target, arrays, context.scratch)
         return {"result_bytes": os.path.getsize(self.target), "messages": found.messages}
 
 
@@ -65,13 +65,15 @@ class BlockTask:
     block: tuple[int, int]
     tiles: list[str]  #: files of what is left of the tiles around, as far as these were done
     target: str
+    scratch: str  #: the run's folder for temporary files
 
     def run(self) -> dict[str, Any]:
         """Write what tiles need of the block."""
         assert self.plan.first is not None
         stage = stage_of(self.plan)
         parts = [_load(path)["left"] for path in self.tiles]
-        _save(self.target, stage.block_of(np.concatenate([np.empty((0, 3)), *parts]), self.block))
+        block = stage.block_of(np.concatenate([np.empty((0, 3)), *parts]), self.block)
+        _save(self.target, block, self.scratch)
         return {"result_bytes": os.path.getsize(self.target)}
 
 
@@ -160,8 +162,9 @@ def tiles_around(
                 yield i, j
 
 
-def _save(path: str, arrays: dict[str, NDArray]) -> None:
-    with whole_files(path, what="result") as (partial,), open(partial, "wb") as file:
+def _save(path: str, arrays: dict[str, NDArray], scratch: str) -> None:
+    made = whole_files(path, what="result", check=lambda *_: check_run(scratch))
+    with made as (partial,), open(partial, "wb") as file:
         np.savez(file, **arrays, names=np.array(sorted(arrays)))  # type: ignore[arg-type]
 
 

@@ -15,6 +15,7 @@ from .cloudindex import BLOCK, open_las, read_block
 from .extract import finish, plain_header
 from .results import NewValues
 from .sources import InputSource
+from .store import check_run
 from .tail import run_tail, written
 
 
@@ -45,6 +46,7 @@ def write_in_parts(
     joined: list[_Joined] = []
 
     def check(made: Path, final: Path, number: int) -> None:
+        check_run(scratch)
         check_complete(made, final, {"type": "writers.las", "filename": final}, joined[number].count)
 
     with whole_files(*outputs, check=check) as partials, contextlib.ExitStack() as stack:
@@ -56,7 +58,7 @@ def write_in_parts(
             _copy(source.path, start, end, piece)
             parts = [os.path.join(folder, f"out{n}.las") for n in range(len(outputs))]
             reader = {**source.reader, "filename": piece}
-            run_tail([reader], [new_values(start, end)], _uncompressed(tail), parts, meanings)
+            run_tail([reader], [new_values(start, end)], _uncompressed(tail), parts, meanings, scratch)
             for one, part in zip(joined, parts, strict=True):
                 one.add(part)
     return written(outputs, joined[0].count if joined else 0)

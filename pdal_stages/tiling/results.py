@@ -18,6 +18,7 @@ from ..base.errors import StageError
 from ..base.files import whole_files
 from .extract import Piece
 from .sources import InputSource
+from .store import check_run
 
 
 @dataclass
@@ -58,8 +59,8 @@ def class_counts(results: Iterable[PieceResults]) -> dict[str, int]:
     return {str(code): int(counts[code]) for code in np.flatnonzero(counts)}
 
 
-def save(path: str | Path, results: Iterable[PieceResults]) -> None:
-    """Write a tile's results, for the files that outputs are put together from."""
+def save(path: str | Path, results: Iterable[PieceResults], scratch: str) -> None:
+    """Write a tile's results, for the files that outputs are put together from; `scratch`: see :func:`.store.check_run`."""
     content: dict[str, NDArray] = {}
     for result in results:
         piece = result.piece
@@ -72,7 +73,7 @@ def save(path: str | Path, results: Iterable[PieceResults]) -> None:
             content[f"{source.key}/core"] = np.array(own[1] - own[0])
             content |= {f"{source.key}/dim/{name}": values[mine] for name, values in result.values.items()}
     content["names"] = np.array(sorted(content))
-    with whole_files(path, what="result") as (partial,):
+    with whole_files(path, what="result", check=lambda *_: check_run(scratch)) as (partial,):
         np.savez(partial, **content)  # type: ignore[arg-type]
 
 

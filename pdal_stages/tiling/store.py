@@ -6,9 +6,11 @@ import contextlib
 import hashlib
 import json
 import os
+import secrets
 import shutil
 import socket
 import stat
+import tempfile
 import time
 from collections.abc import Collection
 from pathlib import Path
@@ -23,11 +25,30 @@ from .cloudindex import CloudIndex
 
 #: The folder beside the outputs.
 FOLDER = ".pdal-stages"
+_SCRATCH = "scratch"
+#: What can be done without is kept where so many times its size is free.
+_ROOM = 4
 
 
 def fingerprint(*parts: Any) -> str:
     """A digest of JSON-able things."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:32]
+
+
+def check_run(scratch: str) -> None:
+    """Refuse to go on where the run whose scratch folder this is has ended.
+
+    A cluster's worker may still be at a task of a run that was killed when the next run has noted its own result. It asks
+    before a file gets its name, by making another, as a network's file system may remember folders that are gone.
+    """
+    try:
+        with tempfile.TemporaryFile(dir=scratch):
+            pass
+    except OSError as error:
+        raise StageError(
+            "the run that wanted this has ended, or has no room left for scratch",
+            found=f"{scratch}: {error.strerror}",
+        ) from None
 
 
 def left_file(tile: str) -> str:
@@ -57,7 +78,8 @@ class Store:
     def __init__(self, outputs: Path) -> None:
         self.folder = outputs / FOLDER
         self.tiles = self.folder / "tiles"
-        self.scratch = self.folder / "scratch"
+        #: Of this very run, and gone when it has ended: see :func:`check_run`.
+        self.scratch = self.folder / _SCRATCH / secrets.token_hex(4)
         self.files = self.folder / "files.jsonl"
         self.indexes = self.folder / "index"
         self._lock: Any = None
@@ -68,8 +90,8 @@ class Store:
             for folder in (self.folder, self.tiles, self.indexes):
                 make_own(folder)
             self._take()
-            _remove(self.scratch)
-            self.scratch.mkdir()
+            _remove(self.scratch.parent)
+            self.scratch.mkdir(parents=True)
         except BaseException as error:
             self._release()
             if not isinstance(error, OSError):
@@ -82,7 +104,7 @@ class Store:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        shutil.rmtree(self.scratch, ignore_errors=True)
+        shutil.rmtree(self.scratch.parent, ignore_errors=True)
         self._release()
 
     # ---- the lock ------------------------------------------------------------------------------------
@@ -210,7 +232,27 @@ class Store:
         if known is None:
             return None
         boxes = np.array(known["boxes"], np.float64).reshape(-1, 4)
-        return CloudIndex(int(known["count"]), boxes, [(i, j, n) for i, j, n in known["tiles"]])
+        copy = self.copy(mark)
+        tiles = [(i, j, n) for i, j, n in known["tiles"]]
+        return CloudIndex(int(known["count"]), boxes, tiles, str(copy) if copy.exists() else "")
+
+    def copy(self, mark: str) -> Path:
+        """The file of an input's copy by place."""
+        return self.indexes / f"{mark}.points"
+
+    def forget_copies(self, but: Collection[str] = ()) -> None:
+        """Remove copies of inputs, but those of these marks."""
+        kept = {self.copy(mark).name for mark in but}
+        # Also what is left of one that was not finished.
+        for path in self.indexes.glob("*.points*"):
+            if path.name not in kept:
+                path.unlink(missing_ok=True)
+
+    def room_for(self, size: int) -> bool:
+        """Whether so many bytes are a small part of what is free on the disk."""
+        with contextlib.suppress(OSError):
+            return size * _ROOM <= shutil.disk_usage(self.folder).free
+        return False
 
     def keep_index(self, mark: str, index: CloudIndex) -> None:
         """Keep the index of an input, where there is room."""

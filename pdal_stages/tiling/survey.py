@@ -18,7 +18,7 @@ from ..base.units import Units
 from ..pipeline.filenames import named_files
 from ..pipeline.references import Reference, check_one_reference, reference_of
 from ..pipeline.work import Call
-from .cloudindex import CloudIndex, index_las
+from .cloudindex import SMALL, CloudIndex, index_las
 from .grid import Box, TileGrid, check_number, touching, union
 from .pool import Pool, last_tries
 from .settings import TilingOptions
@@ -184,19 +184,26 @@ class Survey:
     def read_indexes(self, store: Store, pool: Pool, retries: int, show: bool | None) -> None:
         """Read every LAS and LAZ file once, but those whose index an earlier run kept."""
         waiting: deque[_Reading] = deque()
+        marks = []
         for source in self.sources:
             if source.kind != "las" or source.path in self.unreadable:
                 continue
             mark = fingerprint(source.path, self.stamps[source.path], self.grid.size)
+            marks.append(mark)
             if (known := store.index(mark)) is not None:
                 self.indexes[source.path] = known
             else:
                 waiting.append(_Reading(source.path, mark))
+        store.forget_copies(but=marks)
+        copied = self._copied([reading.path for reading in waiting], store)
+
+        def task_of(reading: _Reading) -> Call:
+            copy = str(store.copy(reading.mark)) if reading.path in copied else ""
+            return Call(index_las, (reading.path, self.grid, copy))
+
         total = sum(self.extents[reading.path].count for reading in waiting)
         with Progress(total, "reading the inputs", enabled=show) as progress:
-            for reading, answer in last_tries(
-                pool, waiting, lambda reading: Call(index_las, (reading.path, self.grid)), retries
-            ):
+            for reading, answer in last_tries(pool, waiting, task_of, retries):
                 if answer.reason:
                     self.unreadable[reading.path] = answer.reason
                     continue
@@ -204,6 +211,17 @@ class Survey:
                 store.keep_index(reading.mark, answer.result)
                 progress.update(answer.result.count)
         self._place()
+
+    def _copied(self, paths: list[str], store: Store) -> set[str]:
+        """Inputs of which copies by place are worth it: tiles read more than their own of them, and there is room."""
+        if self.options.scheduler or not self.halo_units or len(self.tiles()) == 1:
+            return set()  # a network carries them less often compressed
+        large = [path for path in paths if self.extents[path].count > SMALL]
+        return set(large) if store.room_for(sum(self._bytes_of_copy(path) for path in large)) else set()
+
+    def _bytes_of_copy(self, path: str) -> int:
+        header = las.read_header(path)
+        return 0 if header is None else self.extents[path].count * (header.point_bytes + 8)
 
 
 @dataclass

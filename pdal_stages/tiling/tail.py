@@ -18,6 +18,7 @@ from ..pipeline import pdal as pdal_env
 from ..pipeline.callbacks import Callbacks
 from ..pipeline.records import keep_records
 from .results import NewValues
+from .store import check_run
 
 #: PDAL's names of types that are not NumPy's with ``_t``.
 _FLOATS = {"float64": "double", "float32": "float"}
@@ -29,14 +30,17 @@ def run_tail(
     tail: list[dict[str, Any]],
     outputs: Sequence[str],
     meanings: Mapping[str, str],
+    scratch: str,
 ) -> dict[str, Any]:
     """Run readers, the new values of each, and the tail with its writers; what they have :func:`written`.
 
-    The files, `outputs`, appear under their names when all are whole; `meanings` is what they say of dimensions.
+    The files, `outputs`, appear under their names when all are whole, and the run goes on whose folder for temporary files
+    is `scratch`; `meanings` is what they say of dimensions.
     """
     writers = [stage for stage in tail if stage["type"].startswith("writers.")]
 
     def finish(made: Path, final: Path, number: int) -> None:
+        check_run(scratch)
         check_complete(made, final, writers[number], None if "where" in writers[number] else run.count)
         supersede_copc(made)
         keep_records(made, writers[number], [*readers, *tail], meanings)

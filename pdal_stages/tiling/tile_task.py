@@ -44,9 +44,13 @@ class TileTask:
             results, record = _settle(self, folder)
             if self.outputs is not None:
                 return record | write_tile(
-                    results, self.context.plan, self.outputs, self.context.grid.box(self.tile)
+                    results,
+                    self.context.plan,
+                    self.outputs,
+                    self.context.grid.box(self.tile),
+                    self.context.scratch,
                 )
-            save(self.result, results)
+            save(self.result, results, self.context.scratch)
         return record | {"result_bytes": os.path.getsize(self.result)}
 
 

@@ -122,6 +122,7 @@ class Worklist:
                 store.result(job.name).unlink(missing_ok=True)
         if not any(job.state in ("waiting", "failed") for job in self.jobs):
             store.forget_left()
+            store.forget_copies()
 
     def keep(self, store: Store, item: TileJob | FileJob) -> None:
         """Remember what was finished, for runs to come."""
