@@ -178,7 +178,7 @@ def test_forms_follow_the_command(capsys):
     assert (
         arguments["per"]["choices"] == ["auto", "file", "tile"] and arguments["retries"]["kind"] == "integer"
     )
-    assert "(1.6 cm, 1.6 %)" in arguments["dimensions"]["help"]
+    assert "1/32 (3 cm" in arguments["dimensions"]["help"]
     options = {one["name"]: one for one in said["stages"]["filters.hag_morphological"]["options"]}
     assert options["window"]["default"] == 75.0 and options["window"]["exclusive"]
     assert main(["commands"]) == 0
