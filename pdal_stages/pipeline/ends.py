@@ -26,29 +26,41 @@ def input_files(names: Sequence[str]) -> list[str]:
     Raises
     ------
     StageError
-        Where a name stands for nothing, or a folder or a tile index holds no input.
+        Where a name is empty, stands for nothing or cannot be looked at, or a folder or a tile index holds no input.
     """
     found: list[str] = []
     for name in names:
-        path = Path(name)
-        if "://" in name:
-            found.append(name)
-        elif path.is_dir():
-            found += _inside(path)
-        elif path.suffix.lower() in _INDEXES:
-            found += locations(name)
-        elif not path.exists() and (matches := sorted(glob.glob(name, recursive=True))):
-            found += matches
-        elif path.exists() or name.startswith("/vsi"):
-            found.append(name)
-        else:
-            raise StageError("there is no such file or folder", where=name, cure=_nearest_file(path))
+        try:
+            found += _meant(name)
+        except OSError as error:
+            raise StageError("the input cannot be read", where=name, found=error.strerror) from None
     by_place = {name if "://" in name else os.path.realpath(name): name for name in reversed(found)}
     return [
         name
         for name in dict.fromkeys(found)
         if by_place.get(name if "://" in name else os.path.realpath(name)) == name
     ]
+
+
+def _meant(name: str) -> list[str]:
+    """The inputs that one name stands for."""
+    if not name:  # which for a path is the current folder
+        raise StageError(
+            "the name of an input is empty",
+            cure="Name a file, or '.' for the current folder; is a variable not set?",
+        )
+    path = Path(name)
+    if "://" in name:
+        return [name]
+    if path.is_dir():
+        return _inside(path)
+    if path.suffix.lower() in _INDEXES:
+        return locations(name)
+    if not path.exists() and (matches := sorted(glob.glob(name, recursive=True))):
+        return matches
+    if path.exists() or name.startswith("/vsi"):
+        return [name]
+    raise StageError("there is no such file or folder", where=name, cure=_nearest_file(path))
 
 
 def _nearest_file(path: Path) -> str:
