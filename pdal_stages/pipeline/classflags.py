@@ -110,7 +110,7 @@ def parting(stages: Sequence[dict[str, Any]], *, with_ours: bool = False) -> Par
     raise PipelineError(
         "this PDAL cannot bring the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 into a pipeline with LAS 1.4",
         found=f"PDAL {pdal_env.dotted_version()}, "
-        + ("writers of both" if known == {True} else "readers of both, and a writer of LAS 1.0-1.3"),
+        + ("writers of both" if known == {True} else "readers of both, and a writer of point formats 0 to 5"),
         cure=_CURE
         if known == {True}
         else 'Give the writer "minor_version": 4 and "dataformat_id": 6 (7 with colors)',
