@@ -29,7 +29,7 @@ def test_the_hour_of_an_operator(tmp_path, monkeypatch, capsys):
     text = "\n".join(re.findall(r"```sh\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL))
     lines = [line.split("#")[0].strip() for line in text.splitlines() if line.startswith("pdal-stages")]
     assert [line.split()[1] for line in lines] == [
-        "classify", "review", "corrections", "train", "classify", "accuracy", "classify",
+        "classify", "review", "corrections", "train", "classify", "review", "accuracy", "classify",
     ]  # fmt: skip
     for line in lines:
         words = shlex.split(line)[1:]

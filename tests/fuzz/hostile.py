@@ -166,7 +166,7 @@ def _kept() -> tuple[Store, tuple[Path, ...]]:
 
 def _notes() -> tuple[dict, dict]:
     report = {"fingerprint": "f", "outputs": [["/no/such", 1, 2]], "points": 3}
-    return report, {"count": 3, "boxes": [[0, 0, 1, 1]], "tiles": [[0, 0, 3]]}
+    return report, {"count": 3, "boxes": [[0, 0, 1, 1]], "tiles": [[0, 0, 3]], "copy": ""}
 
 
 def _plain(index: Any) -> dict:

@@ -27,6 +27,8 @@ _OPENED = re.compile(r'\b(?:open|openat|creat)\((?:[^"]*)"((?:[^"\\]|\\.)*)", ([
 _CHANGED = re.compile(
     r"\b(rename\w*|link\w*|symlink\w*|truncate|chmod|fchmodat|chown|fchownat|mknod\w*|unlink\w*|mkdir\w*|rmdir)\((.*)\) = 0"
 )
+#: A name, and the folder that it is in, where that is open.
+_NAMED = re.compile(r'(?:\d+<([^>]*)>, )?"((?:[^"\\]|\\.)*)"')
 _WRITES = {"O_WRONLY", "O_RDWR", "O_CREAT", "O_TRUNC", "O_APPEND"}
 
 
@@ -38,7 +40,7 @@ def changed_files(log: str, folder: Path) -> set[str]:
             if _WRITES & set(opened[2].split("|")):
                 found.add(opened[1])
         elif done := _CHANGED.search(line):
-            found.update(re.findall(r'"((?:[^"\\]|\\.)*)"', done[2]))
+            found.update(os.path.join(at, name) for at, name in _NAMED.findall(done[2]))
     return {os.path.normpath(os.path.join(folder, name)) for name in found}
 
 
@@ -50,6 +52,7 @@ def watched(folder: Path, *words: object) -> set[str]:
         "strace",
         "-f",
         "-qq",
+        "-y",
         "-s",
         "4096",
         "-o",

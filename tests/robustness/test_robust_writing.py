@@ -65,6 +65,7 @@ SITES = {
     "synthetic/demo:_work": _WHOLE,
     "synthetic/demo:run_demo": _WHOLE,
     "synthetic/townfile:write_town": "town",
+    "tiling/byplace:CopyByPlace.__enter__": "a copy that a run goes on without; test_tiling_copies fills its disk",
     "tiling/classify:classify_file": "metadata of classify",
     "tiling/command:_classify_each": "metadata of classify",
     "tiling/firstround:_save": "classify in tiles: what a run keeps",
