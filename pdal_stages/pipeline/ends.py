@@ -34,12 +34,10 @@ def input_files(names: Sequence[str]) -> list[str]:
             found += _meant(name)
         except OSError as error:
             raise StageError("the input cannot be read", where=name, found=error.strerror) from None
-    by_place = {name if "://" in name else os.path.realpath(name): name for name in reversed(found)}
-    return [
-        name
-        for name in dict.fromkeys(found)
-        if by_place.get(name if "://" in name else os.path.realpath(name)) == name
-    ]
+    by_place: dict[str, str] = {}
+    for name in found:
+        by_place.setdefault(name if "://" in name else os.path.realpath(name), name)
+    return list(by_place.values())
 
 
 def _meant(name: str) -> list[str]:
@@ -56,10 +54,10 @@ def _meant(name: str) -> list[str]:
         return _inside(path)
     if path.suffix.lower() in _INDEXES:
         return locations(name)
-    if not path.exists() and (matches := sorted(glob.glob(name, recursive=True))):
-        return matches
     if path.exists() or name.startswith("/vsi"):
         return [name]
+    if matches := sorted(glob.glob(name, recursive=True)):
+        return matches
     raise StageError("there is no such file or folder", where=name, cure=_nearest_file(path))
 
 
