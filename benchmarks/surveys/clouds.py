@@ -166,15 +166,20 @@ def true_classes(
     survey: LabeledSurvey, x: np.ndarray, y: np.ndarray, codes: np.ndarray, height: np.ndarray
 ) -> np.ndarray:
     """(n,) uint8 what errors are counted against: ours of a survey's codes, 0 where the class is not known."""
-    truth = np.zeros(len(codes), np.uint8)
-    for given, ours in survey.labels.items():
-        truth[codes == given] = ours
+    truth = _relabeled(survey, codes)
     for given, least in survey.tall.items():
         # Else vegetation would be judged only where it is none.
         truth[(codes == given) & (height >= least)] = VEGETATION
     for west, south, east, north in survey.mislabeled:
         truth[(x >= west) & (x <= east) & (y >= south) & (y <= north)] = 0
     return truth
+
+
+def _relabeled(survey: LabeledSurvey, codes: np.ndarray) -> np.ndarray:
+    labels = np.zeros(len(codes), np.uint8)
+    for given, ours in survey.labels.items():
+        labels[codes == given] = ours
+    return labels
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,21 +236,25 @@ class Cloud:
         return float(np.median(number[number > 1]) / 16.0)
 
 
-def load(data: Path, survey: str) -> Cloud:
-    """A survey as it was published, with heights above filtered ground."""
-    known = SURVEYS[survey]
+def published(data: Path, known: LabeledSurvey) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """All of a survey's points: (n, 3) coordinates, (n,) the survey's own codes, and the return numbers."""
     parts = [laspy.read(data / name) for name in known.files]
     xyz = np.concatenate([np.column_stack([p.x, p.y, p.z]) for p in parts]).astype(float)
-    code = np.concatenate([np.asarray(p.classification) for p in parts]).astype(np.uint8)
+    codes = np.concatenate([np.asarray(p.classification) for p in parts]).astype(np.uint8)
     dimensions = {
         name: np.concatenate([np.asarray(p[word]) for p in parts]).astype(np.uint8)
         for name, word in (("ReturnNumber", "return_number"), ("NumberOfReturns", "number_of_returns"))
     }
+    return xyz, codes, dimensions
+
+
+def load(data: Path, survey: str) -> Cloud:
+    """A survey as it was published, with heights above filtered ground."""
+    known = SURVEYS[survey]
+    xyz, code, dimensions = published(data, known)
     kept = ~np.isin(code, known.dropped)
     xyz, code = xyz[kept], code[kept]
-    labels = np.zeros(len(code), np.uint8)
-    for given, ours in known.labels.items():
-        labels[code == given] = ours
+    labels = _relabeled(known, code)
     kept_dimensions = {name: values[kept] for name, values in dimensions.items()}
     cloud = with_heights(Cloud(survey, survey, xyz, labels, labels.copy(), kept_dimensions))
     for given, height in known.tall.items():

@@ -15,9 +15,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-import laspy
 import numpy as np
-from clouds import SURVEYS, slug, true_classes
+from clouds import SURVEYS, published, slug, true_classes
 
 from pdal_stages import detached_noise, filtered_ground, load_model
 from pdal_stages.base.asprs import BRIDGE
@@ -31,13 +30,7 @@ NO_DECK = (2, 3, 4, 5, 6, 9)
 def count(data: Path, survey: str, model: Model) -> dict[str, Any]:
     """Points of a survey, and how many of them each rule changes."""
     known = SURVEYS[survey]
-    parts = [laspy.read(data / name) for name in known.files]
-    xyz = np.concatenate([np.column_stack([p.x, p.y, p.z]) for p in parts]).astype(float)
-    label = np.concatenate([np.asarray(p.classification) for p in parts]).astype(np.uint8)
-    returns = {
-        name: np.concatenate([np.asarray(p[word]) for p in parts]).astype(np.uint8)
-        for name, word in (("ReturnNumber", "return_number"), ("NumberOfReturns", "number_of_returns"))
-    }
+    xyz, label, returns = published(data, known)
     noise = detached_noise(xyz)
     seen = noise == 0
     made = filtered_ground(*xyz.T, mask=seen, openings=(5, 17), decks=True)
