@@ -29,6 +29,11 @@ _END = np.dtype([("cells", "<i8"), ("width", "<i8"), ("count", "<i8"), ("magic",
 _MAGIC = b"by place"
 
 
+def copy_bytes(count: int, point_bytes: int) -> int:
+    """About how large a copy of so many points gets, of so many bytes each."""
+    return count * (point_bytes + np.dtype(np.int64).itemsize)
+
+
 class CopyByPlace:
     """Writes a copy; one that finds no room on the disk is not there in the end.
 

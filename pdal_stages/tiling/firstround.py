@@ -18,16 +18,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import StageError
-from ..base.files import whole_files
 from ..stages import registry
 from ..stages.base import Stage
 from .cloudindex import CloudIndex
 from .extract import Piece, cut_all
 from .grid import Box, TileGrid
 from .headrun import FirstResults, RunContext, run_first
+from .kept import load_arrays, save_arrays
 from .sources import InputSource
-from .store import block_file, check_run, left_file
+from .store import block_file, left_file
 from .tileplan import FirstRound, TilePlan
 
 
@@ -53,7 +52,7 @@ class FirstRoundTask:
         for key, (index, values) in found.changed.items():
             arrays[f"{key}/index"] = index
             arrays |= {f"{key}/{name}": column for name, column in values.items()}
-        _save(self.target, arrays, context.scratch)
+        save_arrays(self.target, arrays, context.scratch)
         return {"result_bytes": os.path.getsize(self.target), "messages": found.messages}
 
 
@@ -71,9 +70,9 @@ class BlockTask:
         """Write what tiles need of the block."""
         assert self.plan.first is not None
         stage = stage_of(self.plan)
-        parts = [_load(path)["left"] for path in self.tiles]
+        parts = [load_arrays(path)["left"] for path in self.tiles]
         block = stage.block_of(np.concatenate([np.empty((0, 3)), *parts]), self.block)
-        _save(self.target, block, self.scratch)
+        save_arrays(self.target, block, self.scratch)
         return {"result_bytes": os.path.getsize(self.target)}
 
 
@@ -111,7 +110,7 @@ class Before:
         x0, y0, x1, y1 = (side * context.unit for side in context.grid.box(tile))
         box = (x0 - around, y0 - around, x1 + around, y1 + around)
         paths = [os.path.join(self.folder, block_file(block)) for block in block_grid(first).covering(box)]
-        found = (_load(path) for path in paths if os.path.exists(path))  # others have no points
+        found = (load_arrays(path) for path in paths if os.path.exists(path))  # others have no points
         return stage_of(context.plan).made_of_blocks(list(found), box)
 
     def changed(self, piece: Piece) -> dict[str, tuple[NDArray[np.int64], NDArray]]:
@@ -121,7 +120,7 @@ class Before:
         }
         for tile in sorted(piece.tiles):
             path = os.path.join(self.folder, left_file(self.context.grid.name(tile)))
-            kept = _load(path)
+            kept = load_arrays(path)
             for source, first, end in piece.spans:
                 index = kept.get(f"{source.key}/index")
                 if index is None:
@@ -160,35 +159,3 @@ def tiles_around(
         for i in range(i0, i1 + 1):
             if (i, j) in known:
                 yield i, j
-
-
-def _save(path: str, arrays: dict[str, NDArray], scratch: str) -> None:
-    made = whole_files(path, what="result", check=lambda *_: check_run(scratch))
-    with made as (partial,), open(partial, "wb") as file:
-        np.savez(file, **arrays, names=np.array(sorted(arrays)))  # type: ignore[arg-type]
-
-
-def _load(path: str) -> dict[str, NDArray]:
-    """The arrays of a file; one that cannot be read is removed, so that a later run makes it anew."""
-    try:
-        with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
-            found = {name: file[name] for name in file.files if name != "names"}
-            if sorted(found) != file["names"].tolist():
-                raise ValueError("its members have other names")
-            return found
-    except FileNotFoundError:
-        raise StageError(
-            "what the first round left of a tile is not there any more",
-            found=path,
-            cure="Run it again with --resume",
-        ) from None
-    except Exception as error:  # zipfile and numpy raise many types
-        if isinstance(error, MemoryError):
-            raise
-        if os.path.exists(path):
-            os.unlink(path)
-        raise StageError(
-            "what the first round left of a tile cannot be read back, and was removed",
-            found=f"{path}: {error}",
-            cure="Run it again with --resume",
-        ) from error

@@ -150,10 +150,9 @@ def _messages(pipeline: Pipeline) -> list[str]:
         nowhere = _NOWHERE.search(text)
         if nowhere is None:
             lines.append(text)
-        elif (
-            nowhere[1] is not None
-        ):  # otherwise the tile has no point of its own: nothing that the user asked for
+        elif nowhere[1] is not None:
             lines.append(f"{HOLDS_NOWHERE} points: {nowhere[1]}")
+        # Otherwise the tile has no point of its own: nothing that the user asked for.
     return lines
 
 

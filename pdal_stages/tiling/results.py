@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import StageError
-from ..base.files import whole_files
 from .extract import Piece
+from .kept import members, save_arrays
 from .sources import InputSource
-from .store import check_run
 
 
 @dataclass
@@ -72,9 +71,7 @@ def save(path: str | Path, results: Iterable[PieceResults], scratch: str) -> Non
             content[f"{source.key}/index"] = piece.index[result.rows[mine]]
             content[f"{source.key}/core"] = np.array(own[1] - own[0])
             content |= {f"{source.key}/dim/{name}": values[mine] for name, values in result.values.items()}
-    content["names"] = np.array(sorted(content))
-    with whole_files(path, what="result", check=lambda *_: check_run(scratch)) as (partial,):
-        np.savez(partial, **content)  # type: ignore[arg-type]
+    save_arrays(path, content, scratch)
 
 
 class _Results:
@@ -85,10 +82,8 @@ class _Results:
             self._arrays = stack.enter_context(
                 np.load(stack.enter_context(open(name, "rb")), allow_pickle=False)
             )
-            if sorted({*self._arrays.files} - {"names"}) != self._arrays["names"].tolist():
-                raise ValueError("its members have other names")
             self._dimensions: dict[str, list[str]] = {}
-            for member in self._arrays.files:
+            for member in members(self._arrays):
                 source, _, rest = member.partition("/")
                 if rest:
                     self._dimensions.setdefault(source, [])

@@ -121,6 +121,7 @@ class Extent:
 
     count: int  #: points
     box: Box
+    point_bytes: int = 0  #: of a point as an uncompressed file holds it, where that is known
 
 
 def read_extent(source: InputSource) -> Extent:
@@ -165,7 +166,7 @@ def las_extent(path: str) -> Extent:
         raise StageError(
             "the header has no bounding box", where=path, found=f"x {x0} to {x1}, y {y0} to {y1}"
         )
-    return Extent(found.count, found.box)
+    return Extent(found.count, found.box, found.point_bytes)
 
 
 def read_ept(path: str) -> dict[str, Any]:

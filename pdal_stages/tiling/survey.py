@@ -18,6 +18,7 @@ from ..base.units import Units
 from ..pipeline.filenames import named_files
 from ..pipeline.references import Reference, check_one_reference, reference_of
 from ..pipeline.work import Call
+from .byplace import copy_bytes
 from .cloudindex import SMALL, CloudIndex, index_las
 from .grid import Box, TileGrid, check_number, touching, union
 from .pool import Pool, last_tries
@@ -216,12 +217,9 @@ class Survey:
         """Inputs of which copies by place are worth it: tiles read more than their own of them, and there is room."""
         if self.options.scheduler or not self.halo_units or len(self.tiles()) == 1:
             return set()  # a network carries them less often compressed
-        large = [path for path in paths if self.extents[path].count > SMALL]
-        return set(large) if store.room_for(sum(self._bytes_of_copy(path) for path in large)) else set()
-
-    def _bytes_of_copy(self, path: str) -> int:
-        header = las.read_header(path)
-        return 0 if header is None else self.extents[path].count * (header.point_bytes + 8)
+        large = {path: self.extents[path] for path in paths if self.extents[path].count > SMALL}
+        size = sum(copy_bytes(one.count, one.point_bytes) for one in large.values())
+        return set(large) if store.room_for(size) else set()
 
 
 @dataclass

@@ -74,9 +74,8 @@ class TilePlan:
     #: Of the dimensions that stages make, those that LAS files get beside the input's own; None leaves it to the writer.
     beside: dict[str, str] | None = None
     first: FirstRound | None = None  #: what is made of the points before any tile
-    meanings: dict[str, str] = field(
-        default_factory=dict
-    )  #: what LAS files say of dimensions that stages make
+    #: What LAS files say of dimensions that stages make.
+    meanings: dict[str, str] = field(default_factory=dict)
     whole_names: bool = False  #: '#' in an output's name is the whole name of the input file, with its suffix
 
     @property
