@@ -100,6 +100,9 @@ def test_tiles_are_the_same_bits_and_read_few_points(tmp_path, survey, before):
     own = sum(job.record["points"] for job in run.tiles)
     near = reach_of_points(1.0)  # what noise marked is kept
     assert read < own * (1 + 2 * near / TILE) ** 2
+    steps = run.summary["cpu_seconds_by_step"]
+    assert set(steps) == {"index", "first_rounds", "tiles", "outputs"} and min(steps.values()) > 0
+    assert run.summary["cpu_seconds"] == pytest.approx(sum(steps.values()))
     assert not list((tmp_path / "out" / ".pdal-stages" / "tiles").glob("*.np[yz]"))
 
 

@@ -65,6 +65,7 @@ def told_again(store: Store, plan: TilePlan, options: TilingOptions) -> TiledRun
         "seconds": seconds,
         "points_per_second": 0.0,
         "cpu_seconds": 0.0,
+        "cpu_seconds_by_step": {},
         "peak_mb_of_a_worker": 0.0,
         "states": {"done": 0, "kept": known["tiles"], "failed": 0},
         "classes": {},

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -15,7 +15,7 @@ from ..base.version import build
 from ..pipeline.work import Task, TaskResult
 from .firstround import BlockTask, FirstRoundTask, block_grid, blocks_around, blocks_of, tiles_around
 from .grid import Box
-from .outcome import FileJob, TileJob
+from .outcome import Costs, FileJob, TileJob
 from .pace import Pace
 from .pool import Pool, last_tries
 from .store import Store, block_file, fingerprint, left_file
@@ -57,8 +57,13 @@ def run_all(
         total, sum(out.points for out in work.outputs if out.state in ("waiting", "ready")), pool.slots
     )
     failed = 0
+    costs = work.survey.costs
+
+    def spent(item: TileJob | FileJob, cost: Mapping[str, float]) -> None:
+        costs.add("tiles" if isinstance(item, TileJob) else "outputs", cost)
+
     with Progress(total, f"{done} of {len(jobs)} tiles", enabled=show) as progress:
-        for item, answer in last_tries(pool, waiting, work.tasks(store, pool.threads), retries):
+        for item, answer in last_tries(pool, waiting, work.tasks(store, pool.threads), retries, spent):
             if answer.reason:
                 item.state, item.reason = "failed", answer.reason
             else:
@@ -183,7 +188,8 @@ def run_first_round(work: Worklist, store: Store, pool: Pool, retries: int, show
             _Item(job.tile, left_file(job.name), marks[job.tile], partial(first_task, job), job.points)
         )
     failed: set[tuple[int, int]] = set()
-    for item, answer in _made(items, store, pool, retries, "lowest points of cells", show):
+    made = partial(_made, store=store, pool=pool, retries=retries, show=show, costs=survey.costs)
+    for item, answer in made(items, "lowest points of cells"):
         if answer.reason:
             failed.add(item.at)
             fail(grid.box(item.at), first.far_m, answer.reason)
@@ -194,14 +200,21 @@ def run_first_round(work: Worklist, store: Store, pool: Pool, retries: int, show
         made_of = [marks[tile] for tile in found if tile not in failed]
         mark = fingerprint(build(), before[-1], unit, block, made_of)
         items.append(_Item(block, block_file(block), mark, partial(block_task, block)))
-    for item, answer in _made(items, store, pool, retries, "ground of blocks", show):
+    for item, answer in made(items, "ground of blocks"):
         if answer.reason:
             x0, y0, x1, y1 = (side / unit for side in block_grid(first).box(item.at))
             fail((x0, y0, x1, y1), context.plan.halo_m + first.blocks.around, answer.reason)
 
 
 def _made(
-    items: list[_Item], store: Store, pool: Pool, retries: int, what: str, show: bool | None
+    items: list[_Item],
+    what: str,
+    *,
+    store: Store,
+    pool: Pool,
+    retries: int,
+    show: bool | None,
+    costs: Costs,
 ) -> Iterator[tuple[_Item, TaskResult]]:
     """Do what is not there from an earlier run, and yield it; StageError where all fail for one reason."""
     waiting: deque[_Item] = deque()
@@ -212,7 +225,9 @@ def _made(
             waiting.append(item)
     count, failures = len(waiting), []
     with Progress(sum(item.points for item in waiting) or count, what, enabled=show) as progress:
-        for item, answer in last_tries(pool, waiting, lambda item: item.task(), retries):
+        for item, answer in last_tries(
+            pool, waiting, lambda item: item.task(), retries, lambda _, cost: costs.add("first_rounds", cost)
+        ):
             progress.update(item.points or 1)
             if answer.reason:
                 failures.append(answer.reason)

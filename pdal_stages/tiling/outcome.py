@@ -32,6 +32,19 @@ def left_alone(reports: Iterable[Mapping[str, Any]]) -> dict[str, int]:
     }
 
 
+@dataclass
+class Costs:
+    """What the tasks of a run took, tries that failed too, by step: ``index``, ``first_rounds``, ``tiles``, ``outputs``."""
+
+    cpu_seconds: dict[str, float] = field(default_factory=dict)
+    peak_mb: float = 0.0  #: the most memory that a process held
+
+    def add(self, step: str, cost: Mapping[str, float]) -> None:
+        """A task was done, or failed."""
+        self.cpu_seconds[step] = self.cpu_seconds.get(step, 0.0) + cost.get("cpu_seconds", 0.0)
+        self.peak_mb = max(self.peak_mb, cost.get("peak_mb", 0.0))
+
+
 @dataclass(kw_only=True)
 class _Work:
     """What became of a tile or an output."""
@@ -166,8 +179,8 @@ class TiledRun:
         }
 
 
-def summarize(tiles: list[TileJob], outputs: list[FileJob], seconds: float) -> dict[str, Any]:
-    """Figures of all tiles and outputs together, for :attr:`TiledRun.summary`."""
+def summarize(tiles: list[TileJob], costs: Costs, seconds: float) -> dict[str, Any]:
+    """Figures of all tiles and tasks together, for :attr:`TiledRun.summary`."""
     worked = [job for job in tiles if job.state == "done"]
     classes: dict[str, int] = {}
     for job in tiles:
@@ -177,15 +190,15 @@ def summarize(tiles: list[TileJob], outputs: list[FileJob], seconds: float) -> d
     def total(key: str) -> int:
         return sum(job.record.get(key, 0) for job in worked)
 
-    records = [job.record for job in worked] + [out.record for out in outputs]
     return {
         "points": total("points"),
         "points_read": total("read"),
         "dropped": total("dropped"),
         "seconds": seconds,
         "points_per_second": total("points") / seconds if seconds else 0.0,
-        "cpu_seconds": sum(one.get("cpu_seconds", 0.0) for one in records),
-        "peak_mb_of_a_worker": max((one.get("peak_mb", 0.0) for one in records), default=0.0),
+        "cpu_seconds": sum(costs.cpu_seconds.values()),
+        "cpu_seconds_by_step": costs.cpu_seconds,
+        "peak_mb_of_a_worker": costs.peak_mb,
         "states": {s: sum(job.state == s for job in tiles) for s in ("done", "kept", "failed")},
         "classes": dict(sorted(classes.items(), key=lambda item: int(item[0]))),
         "left_alone": {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -33,11 +33,19 @@ class Here(AbstractContextManager):
 
 
 def last_tries(
-    pool: Pool, waiting: deque, task_of: Callable[[Any], Task], retries: int
+    pool: Pool,
+    waiting: deque,
+    task_of: Callable[[Any], Task],
+    retries: int,
+    spent: Callable[[Any, Mapping[str, float]], None],
 ) -> Iterator[tuple[Any, TaskResult]]:
-    """Items and the answers of their last tries; failed ones wait again behind the others, up to `retries` times."""
+    """Items and the answers of their last tries; failed ones wait again behind the others, up to `retries` times.
+
+    `spent` hears of each item what each try took.
+    """
     for item, answer in pool.run(waiting, task_of):
         item.tries += 1
+        spent(item, answer.cost)
         if answer.reason and answer.again and item.tries <= retries:
             waiting.append(item)
         else:

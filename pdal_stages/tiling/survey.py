@@ -21,6 +21,7 @@ from ..pipeline.work import Call
 from .byplace import copy_bytes
 from .cloudindex import SMALL, CloudIndex, index_las
 from .grid import Box, TileGrid, check_number, touching, union
+from .outcome import Costs
 from .pool import Pool, last_tries
 from .settings import TilingOptions
 from .sizing import Density, settled
@@ -38,6 +39,7 @@ class Survey:
         self._whole_names = plan.whole_names
         self.unreadable: dict[str, str] = {}  #: inputs by path that cannot be read, and why
         self.extents: dict[str, Extent] = {}  #: of inputs by path, where the header can be read
+        self.costs = Costs()  #: of the run's tasks
         self.indexes: dict[str, CloudIndex] = {}  #: of LAS and LAZ files by path, once they were read
         self.sources = find_sources(plan.readers)
         others = named_files([*plan.head, *plan.tail])
@@ -204,7 +206,9 @@ class Survey:
 
         total = sum(self.extents[reading.path].count for reading in waiting)
         with Progress(total, "reading the inputs", enabled=show) as progress:
-            for reading, answer in last_tries(pool, waiting, task_of, retries):
+            for reading, answer in last_tries(
+                pool, waiting, task_of, retries, lambda _, cost: self.costs.add("index", cost)
+            ):
                 if answer.reason:
                     self.unreadable[reading.path] = answer.reason
                     continue

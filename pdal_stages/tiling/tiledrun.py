@@ -151,7 +151,7 @@ def run_plan(
         finally:
             sweep(folder)  # what workers left that were killed
     summary = survey.figures(plan) | {"workers": pool.slots, "threads_per_worker": pool.threads}
-    summary |= summarize(work.jobs, work.outputs, time.monotonic() - started)
+    summary |= summarize(work.jobs, survey.costs, time.monotonic() - started)
     survey.messages += _messages_of_tiles(work)
     short = [job.name for job in work.jobs if job.state == "done" and job.record.get("short")]
     if short:
