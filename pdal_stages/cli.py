@@ -259,7 +259,7 @@ def _parser() -> argparse.ArgumentParser:
         "--wires",
         action=argparse.BooleanOptionalAction,
         default=False,
-        help="Find wires (14), whatever they were called (filters.wires); tiles are read with 60 m more around them",
+        help="Find wires (14), whatever they were called (filters.wires); tiles are read with 85 m more around them",
     )
     takes(
         "--consistency",

@@ -23,9 +23,9 @@ class Wires(Stage):
     keep: Selection = keep_option()
     details = """
 Finds wires by their shape, whatever their class was: points more than 4 m above the ground on a straight line of 24 m
-that is filled and around which the air is empty, or of some lines side by side; lines that hang together over 30 m. What
-goes on along the line is of it, up to 6 m into a tree or a tower. Towers and poles keep their class.
-From about 4 points/m2 on: in thinner clouds rows of leaves and ridges look like wires.
+that is filled and around which the air is empty, or of some lines side by side; lines that hang together over 30 m and
+hide nothing: an eave, a cornice or a balcony has no ground below, or none on one side. What goes on along the line is of
+it, up to 6 m into a tree or a tower. Towers and poles keep their class.
 
 Put it after the classifier. Nothing depends on the order of points, and the grid is anchored to absolute coordinates: a
 tile with its halo gets the wires of the whole cloud. The count is in the metadata as `wires`, the classes that they leave

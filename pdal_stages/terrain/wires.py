@@ -2,11 +2,14 @@
 
 A cell's points above the ground are parted into levels; thin ones with few others beside them may be of a wire. One is
 where such levels, up to `HALF` meters to both sides, fill a straight line (a wire bends by decimeters over that length),
-alone or with others side by side, around which the air is empty. Lines that hang together are wires if they are long. Sums
+alone or with others side by side, around which the air is empty and which hides nothing: below it as much is seen as on
+either side, which parts wires from eaves, cornices and balconies. Lines that hang together are wires if they are long. Sums
 are whole numbers and all reaches are bounded (:data:`REACH`), so neither the order of points nor the tile matters.
 """
 
 from __future__ import annotations
+
+import functools
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,13 +33,21 @@ STEEPEST = 0.6
 FILLED, ONE_SIDED = 8, 5
 #: Around the line, from `CLEAR` meters farther on to `AROUND`, there is at most such a share of what is on it.
 CLEAR, AROUND, MUCH = 0.45, 2.0, 0.34
+#: What lies `UNDER` meters below the line is counted up to `STRIP` meters from it, and to each side from `STRIP_FROM` to
+#: `STRIP_TO`: below are so many of all that is not higher on the fuller side, for the same area, and to either side so many
+#: of what is below on the other.
+UNDER, STRIP, STRIP_FROM, STRIP_TO, SEEN, EITHER = 1.0, 0.6, 1.2, 3.6, 0.55, 0.2
+#: Of the lines' levels on a line, so many hide nothing: a tree or a roof may stand close to a wire.
+VOTE = 0.3
 #: Lines are so long, and the gaps in them no longer.
 LONG, HOP = 30.0, 6
 #: How far a wire goes on along its line into what is not clear, such as a tree or its tower.
 ON = 6.0
 #: How far away points matter, meters.
-REACH = LONG + HALF + HOP + ON + 6.0
+REACH = LONG + 3 * HALF + HOP + ON + 6.0
 _PARTS = 1024
+#: Cells beside the high points' raster from which the ground near lines may be seen.
+_MARGIN = int((HALF + STRIP_TO) / CELL) + 1
 
 
 @njit
@@ -156,6 +167,67 @@ def _lines(place, cells, start, h, w, thin, line):
     return good
 
 
+@njit
+def _near_lines(cells, h, w, good):
+    """Cells of a raster wider by `_MARGIN` on all sides whose points count for what is seen below a line."""
+    wide = w + 2 * _MARGIN
+    out = np.zeros((h + 2 * _MARGIN) * wide, np.bool_)
+    for n in range(len(good)):
+        if good[n]:
+            j, i = cells[n] // w, cells[n] % w
+            for b in range(j, j + 2 * _MARGIN + 1):
+                out[b * wide + i : b * wide + i + 2 * _MARGIN + 1] = True
+    return out
+
+
+@njit
+def _seen_through(place, cells, h, w, good, line, x, y, z, cell, column, row, on, order):
+    """The same lines, those that hide nothing: of points in the wider raster, in whose order by cell `order` has them;
+    some are `on` such lines.
+    """
+    wide = w + 2 * _MARGIN
+    begin = np.zeros((h + 2 * _MARGIN) * wide + 1, np.int64)
+    for p in range(len(cell)):
+        begin[cell[p] + 1] += 1
+    for k in range(len(begin) - 1):
+        begin[k + 1] += begin[k]
+    out = good.copy()
+    for n in range(len(good)):
+        if not good[n]:
+            continue
+        j, i = cells[n] // w + _MARGIN, cells[n] % w + _MARGIN
+        below = right = left = right_below = left_below = 0
+        for b in range(j - _MARGIN, j + _MARGIN + 1):
+            # Of the row, the columns near to the line.
+            low, high = i - _MARGIN, i + _MARGIN + 1
+            if abs(line[n, 1]) > 0.1:
+                middle, around = (
+                    i + (b - j) * line[n, 0] / line[n, 1],
+                    (STRIP_TO + 2.0) / abs(line[n, 1]) + 1.0,
+                )
+                low, high = max(low, int(middle - around)), min(high, int(middle + around) + 2)
+            if low >= high:
+                continue
+            for q in range(begin[b * wide + low], begin[b * wide + high]):
+                p = order[q]
+                dx = (cell[p] % wide - i) * CELL + (x[p] - column[p] * CELL) - place[n, 0]
+                dy = (b - j) * CELL + (y[p] - row[p] * CELL) - place[n, 1]
+                along, aside = dx * line[n, 0] + dy * line[n, 1], dy * line[n, 0] - dx * line[n, 1]
+                if abs(along) > HALF or abs(aside) > STRIP_TO:
+                    continue
+                above = z[p] - place[n, 2] - line[n, 2] * along
+                if abs(aside) <= STRIP:
+                    below += above < -UNDER
+                elif abs(aside) > STRIP_FROM and above < UNDER and not on[p]:
+                    right += aside < 0.0
+                    left += aside > 0.0
+                    right_below += aside < 0.0 and above < -UNDER
+                    left_below += aside > 0.0 and above < -UNDER
+        out[n] = below * (STRIP_TO - STRIP_FROM) >= SEEN * 2.0 * STRIP * max(right, left)
+        out[n] &= min(right_below, left_below) >= EITHER * max(right_below, left_below)
+    return out
+
+
 @device
 def _on_line(place, line, n, m, dj, di, along_most):
     """Whether a level lies on the line through another."""
@@ -164,6 +236,26 @@ def _on_line(place, line, n, m, dj, di, along_most):
     aside = dy * line[n, 0] - dx * line[n, 1]
     above = place[m, 2] - place[n, 2] - line[n, 2] * along
     return abs(along) <= along_most and abs(aside) <= BESIDE and abs(above) <= NEAR + 0.02 * abs(along)
+
+
+@njit
+def _voted(place, cells, start, h, w, good, line, seen):
+    """Levels of lines, of whose levels near by most are `seen` through."""
+    out = np.zeros(len(good), np.bool_)
+    reach = int(HALF / CELL)
+    for n in range(len(good)):
+        if not good[n]:
+            continue
+        j, i = cells[n] // w, cells[n] % w
+        all_of, those = 0, 0
+        for b in range(max(j - reach, 0), min(j + reach + 1, h)):
+            for a in range(max(i - reach, 0), min(i + reach + 1, w)):
+                for m in range(start[b * w + a], start[b * w + a + 1]):
+                    if good[m] and _on_line(place, line, n, m, b - j, a - i, HALF):
+                        all_of += 1
+                        those += seen[m]
+        out[n] = those >= VOTE * all_of
+    return out
 
 
 @njit
@@ -224,6 +316,7 @@ def find_wires(
         return out
     x, y, z = (np.ascontiguousarray(axis) for axis in xyz[high].T)
     column, row = cell_numbers(x, CELL), cell_numbers(y, CELL)
+    below = _Below(xyz, use, high)
     for points, own in patches(column, row, int(REACH), int(LONG)):
         at = np.arange(len(high))[points]
         c, r = column[at], row[at]
@@ -234,7 +327,38 @@ def find_wires(
         thin = _thin(place, thick, cells, start, h, w)
         line = np.zeros((len(thin), 3))
         good = _lines(place, cells, start, h, w, thin, line)
+        if not good.any():
+            continue
+        seen = below.seen_through(good, line, place, cells, (left, bottom, h, w), at, level)
+        good = _voted(place, cells, start, h, w, good, line, seen)
         good = _joined(place, cells, start, h, w, good, line)
         found = _extended(place, cells, start, h, w, good, line)[level]
         out[high[at[own]]] = found[own]
     return out
+
+
+class _Below:
+    """All points, of which those below and beside lines are asked for."""
+
+    def __init__(self, xyz: NDArray[np.float64], use: NDArray[np.bool_], high: NDArray[np.int64]) -> None:
+        self._xyz, self._use, self._high = xyz, use, high
+
+    @functools.cached_property
+    def _places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        return cell_numbers(self._xyz[:, 0], CELL), cell_numbers(self._xyz[:, 1], CELL)
+
+    def seen_through(self, good, line, place, cells, raster, at, level) -> NDArray[np.bool_]:
+        """Which levels are `good` and hide nothing; the points `at` of the high ones are of the levels `level`."""
+        left, bottom, h, w = raster
+        column, row = self._places[0] - (left - _MARGIN), self._places[1] - (bottom - _MARGIN)
+        wide, tall = w + 2 * _MARGIN, h + 2 * _MARGIN
+        points = np.flatnonzero(self._use & (column >= 0) & (column < wide) & (row >= 0) & (row < tall))
+        cell = row[points] * wide + column[points]
+        near = _near_lines(cells, h, w, good)[cell]
+        points, cell = points[near], cell[near]
+        on = np.zeros(len(self._use), bool)
+        on[self._high[at]] = good[level]
+        x, y, z = (np.ascontiguousarray(axis) for axis in self._xyz[points].T)
+        order = np.argsort(cell, kind="stable")
+        columns, rows = (places[points] for places in self._places)
+        return _seen_through(place, cells, h, w, good, line, x, y, z, cell, columns, rows, on[points], order)
