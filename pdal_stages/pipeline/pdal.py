@@ -17,7 +17,9 @@ from functools import cache
 from typing import Any
 
 from ..base.errors import DependencyError, PipelineError
+from ..base.las import check_readable
 from ..base.shortage import is_short, shortage
+from .filenames import readers_files
 from .interrupts import fragile
 
 INSTALL = (
@@ -104,9 +106,13 @@ def execute(
     ------
     PipelineError
         With PDAL's own words.
+    StageError
+        If a LAS file that is read is damaged.
     DependencyError
         If python-pdal or filters.python is missing.
     """
+    for path in readers_files(stages, las=True):
+        check_readable(path)  # newer PDAL crashes of a LAZ file that is cut short
     with _one_run:
         return _execute(stages, arrays, loglevel)
 

@@ -401,3 +401,25 @@ def test_damaged_in_tiles(cell, tmp_path, good, case, edit, says):
     it.before = it.files()  # the marks of the run stay, for --resume
     it.refused(done, "in.las", says)
     assert not (tmp_path / "out.las").exists()
+
+
+@pytest.mark.pdal
+def test_cut_short_whoever_reads_it(tmp_path, write_las):
+    """Newer PDAL crashes of such a file, so it is asked for nothing of it: not for a reference, nor for dimensions."""
+    from pdal_stages.base.errors import StageError
+    from pdal_stages.pipeline.beside import dimensions_of
+    from pdal_stages.pipeline.parts import reference_and_wkt
+    from pdal_stages.pipeline.references import reference_of
+
+    xyz = np.random.default_rng(0).uniform(0, 50, (5000, 3))
+    whole = write_las(tmp_path / "whole.laz", dict(zip("XYZ", xyz.T, strict=True)))
+    cut = tmp_path / "cut.laz"
+    cut.write_bytes(whole.read_bytes()[:-100])
+    reader = {"type": "readers.las", "filename": str(cut)}
+    for read in (
+        lambda: dimensions_of(reader),
+        lambda: reference_of({**reader, "count": 1}),
+        lambda: reference_and_wkt(str(cut)),
+    ):
+        with pytest.raises(StageError, match=r"cut\.laz: the LAS file is damaged: it is cut short"):
+            read()
