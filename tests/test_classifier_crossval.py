@@ -9,6 +9,7 @@ from scipy.spatial.distance import cdist
 from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier.crossval import block_folds, choose, search, split
 from pdal_stages.classifier.growing import TreeOptions
+from pdal_stages.classifier.trees import Ranked
 
 
 @settings(max_examples=30, deadline=None)
@@ -65,7 +66,7 @@ def test_a_memorised_place_scores_no_better_than_chance():
     xy = random.random((1500, 2)) * 100
     cell = np.floor(xy / 5).astype(int)
     label = random.integers(0, 2, (20, 20))[cell[:, 0], cell[:, 1]]
-    values = np.ascontiguousarray(xy, dtype=np.float32)
+    values = Ranked.of(xy.astype(np.float32))
     weight = np.ones(1500, np.int64)
     rows = search(
         values, label, weight, xy, (2, 6), [TreeOptions(min_samples_leaf=1, max_samples=1.0)], [5, 20],
@@ -81,7 +82,7 @@ def test_a_class_only_in_one_block_is_an_error():
     label = (np.hypot(*(xy - 10).T) < 5).astype(int)
     with pytest.raises(OptionError, match="no samples left"):
         search(
-            xy.astype(np.float32), label, np.ones(300, np.int64), xy, (2, 6), [TreeOptions()], [3],
+            Ranked.of(xy.astype(np.float32)), label, np.ones(300, np.int64), xy, (2, 6), [TreeOptions()], [3],
             folds=3, block_size=25.0, gap=0.0, seed=0, progress=False,
         )  # fmt: skip
 

@@ -6,10 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sklearn.tree import DecisionTreeClassifier
 
 from pdal_stages.base.errors import DimensionError, ModelError, OptionError, StageError
-from pdal_stages.classifier import Model, Prediction, TrainingCloud, TrainingOptions, load_model, train
-from pdal_stages.classifier.forest import Forest
+from pdal_stages.classifier import (
+    Model,
+    Prediction,
+    TrainingCloud,
+    TrainingOptions,
+    growing,
+    load_model,
+    train,
+)
 from pdal_stages.classifier.samplefeatures import percentiles
 from pdal_stages.features import FeatureEngine, FeaturePlan
 
@@ -91,12 +99,24 @@ def test_equals_sklearn_on_the_same_features(other, monkeypatch):
     """The same features into scikit-learn's own trees: identical labels, identical probabilities."""
     xyz, label, dimensions = scene()
     kept = []
-    original = Forest.from_sklearn
-    monkeypatch.setattr(
-        Forest, "from_sklearn", classmethod(lambda cls, trees, n: kept.extend(trees) or original(trees, n))
-    )
+    original = growing.grow_tree
+
+    def beside(ranked, label, weight, tried, seed, *, max_depth, min_samples_leaf):
+        columns = zip(ranked.start[:-1], ranked.start[1:], ranked.place, strict=True)
+        values = np.stack([ranked.different[a:b][place] for a, b, place in columns], axis=1)
+        theirs = DecisionTreeClassifier(
+            max_features=tried, random_state=seed, max_depth=max_depth, min_samples_leaf=min_samples_leaf
+        )
+        kept.append(theirs.fit(values, label, sample_weight=weight.astype(float)).tree_)
+        return original(
+            ranked, label, weight, tried, seed, max_depth=max_depth, min_samples_leaf=min_samples_leaf
+        )
+
+    monkeypatch.setattr(growing, "grow_tree", beside)
     model = train(
-        [TrainingCloud(xyz, label, dimensions)], TrainingOptions(**SMALL, prior_weight=0), progress=False
+        [TrainingCloud(xyz, label, dimensions)],
+        TrainingOptions(**SMALL, prior_weight=0, folds=0, threads=1),
+        progress=False,
     )
     xyz, label, dimensions = other
     engine = FeatureEngine(xyz, model.plan, bins=model.algorithm.features.bins)

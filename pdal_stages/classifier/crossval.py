@@ -17,6 +17,7 @@ from ..accuracy.measures import Accuracy
 from ..base.errors import OptionError
 from ..base.progress import Progress
 from .growing import TreeOptions, grow
+from .trees import Ranked
 
 #: A smaller forest is preferred if its mean F1 is within this of the best.
 TOLERANCE = 0.002
@@ -88,7 +89,7 @@ def split(
 
 
 def search(
-    values: npt.NDArray[np.float32],
+    ranked: Ranked,
     label: npt.NDArray[Any],
     weight: npt.NDArray[np.int64],
     xy: npt.NDArray[np.float64],
@@ -137,7 +138,7 @@ def search(
                 )
             for c, candidate in enumerate(candidates):
                 trees = grow(
-                    values,
+                    ranked,
                     label,
                     weight * train,
                     tree_counts[-1],

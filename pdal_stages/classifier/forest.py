@@ -1,4 +1,4 @@
-"""A random forest as plain arrays: made from scikit-learn's trees, checked, and applied without scikit-learn.
+"""A random forest as plain arrays: made from trees, checked, and applied.
 
 Trees are stored level by level (root, its children, theirs, ...). The children of the k-th split node of
 a tree (k from 0) are then its nodes 2k+1 and 2k+2, so no child pointers are needed. See docs/model-file.md.
@@ -17,6 +17,7 @@ from ..base.errors import ModelError
 from ..base.hashing import hash_of
 from ..base.runs import begins_run
 from .arrays import ArrayRule
+from .trees import Tree
 
 #: Of 32 and 64 bits: the type of a node's two numbers, that of its threshold, and the bits of NaN that are free.
 WORDS: tuple[tuple[Any, Any, int], ...] = ((np.uint32, np.float32, 22), (np.uint64, np.float64, 51))
@@ -110,7 +111,17 @@ class Forest:
             Trained on float32 features with whole-number sample weights (bootstrap counts), one output.
         n_features : int
         """
-        parts = [_level_order(getattr(tree, "tree_", tree)) for tree in trees]
+        return cls._of([_of_sklearn(getattr(tree, "tree_", tree)) for tree in trees], n_features)
+
+    @classmethod
+    def from_trees(cls, trees: Sequence[Tree], n_features: int) -> Forest:
+        """Of trees as they were grown."""
+        return cls._of(
+            [_level_order(t.left, t.right, t.feature, t.threshold, t.counts) for t in trees], n_features
+        )
+
+    @classmethod
+    def _of(cls, parts: Sequence[Any], n_features: int) -> Forest:
         kind = np.int16 if n_features <= np.iinfo(np.int16).max else np.int32
         return cls(
             np.array([len(part[0]) for part in parts], np.int32),
@@ -252,9 +263,21 @@ def _distinct(values: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.int64], n
     return (rows, table) if np.array_equal(table[rows], values) else (np.arange(len(values)), values)
 
 
-def _level_order(tree) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
-    """(feature, threshold, leaf counts) of a scikit-learn ``Tree``, level by level."""
-    left, right = tree.children_left, tree.children_right
+def _of_sklearn(tree) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
+    """:func:`_level_order` of a scikit-learn ``Tree``."""
+    shares = tree.value[:, 0, :]
+    # scikit-learn keeps shares (before 1.3: counts) and the weight of a node; bootstrap weights are whole.
+    exact = shares / shares.sum(axis=1, keepdims=True) * tree.weighted_n_node_samples[:, None]
+    counts = np.rint(exact)
+    if tree.n_outputs != 1 or np.abs(counts - exact).max(initial=0) > 1e-3 or counts.max() >= 2**32:
+        raise ModelError("these trees were not grown with whole-number sample weights and one output")
+    return _level_order(tree.children_left, tree.children_right, tree.feature, tree.threshold, counts)
+
+
+def _level_order(
+    left, right, feature, threshold, counts
+) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
+    """(feature, threshold, leaf counts) of a tree, level by level."""
     levels = [np.zeros(1, np.int64)]
     while True:
         splits = levels[-1][left[levels[-1]] >= 0]
@@ -263,16 +286,11 @@ def _level_order(tree) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32], npt.N
         levels.append(np.column_stack([left[splits], right[splits]]).reshape(-1))
     order = np.concatenate(levels)
     leaf = left[order] < 0
-    feature = np.where(leaf, -1, tree.feature[order])
-    threshold = np.where(leaf, 0.0, float32_at_most(tree.threshold[order])).astype(np.float32)
-    leaves = order[leaf]
-    shares = tree.value[leaves, 0, :]
-    # scikit-learn keeps shares (before 1.3: counts) and the weight of a node; bootstrap weights are whole.
-    exact = shares / shares.sum(axis=1, keepdims=True) * tree.weighted_n_node_samples[leaves][:, None]
-    counts = np.rint(exact)
-    if tree.n_outputs != 1 or np.abs(counts - exact).max(initial=0) > 1e-3 or counts.max() >= 2**32:
-        raise ModelError("these trees were not grown with whole-number sample weights and one output")
-    return feature, threshold, counts.astype(np.uint32)
+    return (
+        np.where(leaf, -1, feature[order]),
+        np.where(leaf, 0.0, float32_at_most(threshold[order])).astype(np.float32),
+        counts[order[leaf]].astype(np.uint32),
+    )
 
 
 def float32_at_most(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:

@@ -37,6 +37,7 @@ from .sampling import Samples, draw_samples
 from .sureness import Sureness, counted
 from .thinning import density_range
 from .trainoptions import TrainingOptions
+from .trees import Ranked, Tree
 from .unscored import why_unscored
 
 #: Trees of a forest that judges a fold, as a share of the final one's.
@@ -93,8 +94,12 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     xy = samples.take([cloud.xyz[:, :2] for cloud in clouds])
     priors = _priors(samples, len(classes.codes), options.prior_weight)
     heard = _Heard(samples, classes.codes, priors, below, options)
+    ranked = Ranked.of(values, options.threads)
+    del values  # as large again
+    if below is not None:
+        ranked = ranked.beside(Ranked.of(below.columns, options.threads))
     chosen, validation = _validate(
-        values if below is None else np.concatenate([values, below.columns], axis=1),
+        ranked,
         samples,
         xy,
         samples.take(groups),
@@ -105,7 +110,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
         heard,
     )
     started = time.perf_counter()
-    passes = _Passes(labeled, samples, values, features, chosen, options, progress, below)
+    passes = _Passes(labeled, samples, ranked, features, chosen, options, progress, below)
     passes.grow(*limits)
     left_out = passes.without_each_survey() if options.leave_one_survey_out else None
     timed["trees"] = time.perf_counter() - started
@@ -194,7 +199,7 @@ def _groups(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> list[n
 
 
 def _validate(
-    values: npt.NDArray[np.float32],
+    ranked: Ranked,
     samples: Samples,
     xy: npt.NDArray[np.float64],
     group: npt.NDArray[Any],
@@ -222,7 +227,7 @@ def _validate(
         heard.tables.clear()
         try:
             rows = crossval.search(
-                values,
+                ranked,
                 samples.label,
                 samples.weight,
                 xy,
@@ -314,7 +319,7 @@ class _Passes:
         self,
         labeled: Labeled,
         samples: Samples,
-        values: npt.NDArray[np.float32],
+        ranked: Ranked,
         features: Features,
         chosen: Mapping[str, Any],
         options: TrainingOptions,
@@ -323,7 +328,7 @@ class _Passes:
     ) -> None:
         self.below = below
         self.clouds, self.codes = labeled.clouds, labeled.classes.codes
-        self.samples, self.values, self.features = samples, values, features
+        self.samples, self.ranked, self.features = samples, ranked, features
         self.chosen, self.options, self.progress = chosen, options, progress
         self.context = Context(tuple(options.context))
         self.setting = _tree_options(options, chosen["max_depth"], chosen["min_samples_leaf"])
@@ -337,14 +342,14 @@ class _Passes:
 
     def grow(self, low: list[float], high: list[float]) -> None:
         """Fill `made` and `scores`; `low` and `high` are the percentiles of the features."""
-        for number, columns in enumerate(self._columns(self.samples.weight)):
-            forest, importances, bag = self._forest(columns, number)
+        for number, ranked in enumerate(self._ranked(self.samples.weight)):
+            forest, importances, bag = self._forest(ranked, number)
             reads = number or self.below is not None
             self.made.append(FeatureForest(self.features, forest, self.context if reads else None))
-            read = columns[:, self.values.shape[1] :]
+            least, largest = ranked.limits(len(low))
             percentiles = {
-                "low": [*low, *read.min(axis=0).tolist()],
-                "high": [*high, *read.max(axis=0).tolist()],
+                "low": [*low, *least],
+                "high": [*high, *largest],
                 "limited": self.options.scale,
             }
             self.scores.append({"percentiles": percentiles, "importances": importances, "out_of_bag": bag})
@@ -360,31 +365,30 @@ class _Passes:
         weight, trees, rows = self.samples.weight, self.chosen["trees"], []
         for name in names:
             mine = flight == name
-            *_, columns = self._columns(weight * ~mine)
+            *_, ranked = self._ranked(weight * ~mine)
+            total = np.zeros((np.count_nonzero(mine), len(self.codes)))
             with Progress(trees, f"growing without {name}", "trees", enabled=self.progress) as bar:
-                grown = self._grown(columns, weight * ~mine, trees, bar)
-                forest = Forest.from_sklearn([tree.tree_ for tree, _, _ in grown], columns.shape[1])
-            best = forest.predict_proba(np.ascontiguousarray(columns[mine])).argmax(axis=1)
+                judged = np.flatnonzero(mine)
+                for _, _, shares in self._grown(ranked, weight * ~mine, trees, bar, score=judged):
+                    total += shares
+            best = total.argmax(axis=1)
             rows.append({"name": os.path.basename(name), **self._figures(mine, best)})
         means = {key: float(np.mean([row[key] for row in rows])) for key in ("overall_accuracy", "mean_f1")}
         return {"surveys": rows, **means}
 
-    def _columns(self, weight: npt.NDArray[np.int64]) -> Iterator[npt.NDArray[np.float32]]:
+    def _ranked(self, weight: npt.NDArray[np.int64]) -> Iterator[Ranked]:
         """What each pass reads of the samples; those of weight 0 teach none of them anything."""
         held_out: list[list[Forest]] = []
-        columns = self.values
+        ranked = self.ranked
+        yield ranked
         if self.below is not None:
-            yield np.concatenate([columns, self.below.columns], axis=1)
             return
-        yield columns
         for number in range(1, self.options.passes):
-            held_out.append(self._hold_out(columns, weight, number))
-            columns = np.concatenate([self.values, self._context(held_out)], axis=1)
-            yield columns
+            held_out.append(self._hold_out(ranked, weight, number))
+            ranked = self.ranked.beside(Ranked.of(self._context(held_out), self.options.threads))
+            yield ranked
 
-    def _hold_out(
-        self, columns: npt.NDArray[np.float32], weight: npt.NDArray[np.int64], number: int
-    ) -> list[Forest]:
+    def _hold_out(self, ranked: Ranked, weight: npt.NDArray[np.int64], number: int) -> list[Forest]:
         """The pass `number` once more, a forest without each fold.
 
         Ground beside a fold is not left out as in cross-validation: the forests miss the fold's samples already, and the
@@ -404,8 +408,8 @@ class _Passes:
                         "without one of its folds the training ground has fewer than two classes left",
                         cure="Give more training data, or set passes to 1",
                     )
-                grown = self._grown(columns, weight * train, trees, bar)
-                forests.append(Forest.from_sklearn([tree.tree_ for tree, _, _ in grown], columns.shape[1]))
+                grown = self._grown(ranked, weight * train, trees, bar)
+                forests.append(Forest.from_trees([tree for tree, _, _ in grown], ranked.columns))
         return forests
 
     def _context(self, held_out: Sequence[Sequence[Forest]]) -> npt.NDArray[np.float32]:
@@ -429,32 +433,30 @@ class _Passes:
 
     def _grown(
         self,
-        columns: npt.NDArray[np.float32],
+        ranked: Ranked,
         weight: npt.NDArray[np.int64],
         trees: int,
         bar: Progress,
         **more: Any,
-    ) -> Iterator[tuple[Any, Any, Any]]:
+    ) -> Iterator[tuple[Tree, Any, Any]]:
         """The trees of a forest, as :func:`grow` gives them."""
         label, o = self.samples.label, self.options
         return grow(
-            columns, label, weight, trees, self.setting, o.seed, threads=o.threads, progress=bar, **more
+            ranked, label, weight, trees, self.setting, o.seed, threads=o.threads, progress=bar, **more
         )
 
-    def _forest(
-        self, columns: npt.NDArray[np.float32], number: int
-    ) -> tuple[Forest, list[float], dict[str, Any] | None]:
+    def _forest(self, ranked: Ranked, number: int) -> tuple[Forest, list[float], dict[str, Any] | None]:
         """(forest, importances, out-of-bag score)."""
         total = np.zeros((len(self.samples), len(self.codes)))
         trees = []
-        importance = np.zeros(columns.shape[1])
+        importance = np.zeros(ranked.columns)
         several = self.options.passes > 1 and self.below is None
         what = f"growing pass {number + 1}" if several else "growing"
         count, weight = self.chosen["trees"], self.samples.weight
         with Progress(count, what, "trees", enabled=self.progress) as bar:
-            for tree, rows, shares in self._grown(columns, weight, count, bar, score="out of bag"):
-                trees.append(tree.tree_)
-                importance += tree.feature_importances_
+            for tree, rows, shares in self._grown(ranked, weight, count, bar, score="out of bag"):
+                trees.append(tree)
+                importance += tree.importances(ranked.columns)
                 total[rows] += shares
         scored = total.sum(axis=1) > 0
         bag = None
@@ -463,7 +465,7 @@ class _Passes:
             bag["samples"] = int(np.count_nonzero(scored))
         whole = importance.sum()
         importances = (importance / whole if whole else importance).tolist()
-        return Forest.from_sklearn(trees, columns.shape[1]), importances, bag
+        return Forest.from_trees(trees, ranked.columns), importances, bag
 
     def _figures(self, mine: npt.NDArray[np.bool_], best: npt.NDArray[np.int64]) -> dict[str, Any]:
         """Scores of some samples by their most probable classes."""

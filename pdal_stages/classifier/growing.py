@@ -1,8 +1,7 @@
-"""Growing the trees: scikit-learn's decision trees under a bootstrap of our own.
+"""Growing the trees of a forest, each on a bootstrap sample.
 
-The bootstrap is drawn here rather than in scikit-learn's forest so that a sample that counts w times is drawn
-as if it were there w times (its releases differ in that), so that such copies are all in the bag or all out
-of it (the out-of-bag score would be far too good otherwise), and so that progress can be shown.
+A sample that counts w times is drawn as if it were there w times, and such copies are all in the bag or all out
+of it: the out-of-bag score would be far too good otherwise.
 """
 
 from __future__ import annotations
@@ -17,9 +16,7 @@ import numpy.typing as npt
 
 from ..base.progress import Progress
 from ..base.threads import map_blocks
-
-#: Rows scored in one go: a copy of them is made.
-_ROWS = 8192
+from .trees import Ranked, Tree, grow_tree
 
 
 @dataclass(frozen=True)
@@ -31,15 +28,24 @@ class TreeOptions:
     max_samples: float = 1.0
     max_features: str | int | float = "auto"
 
-    def tried(self, features: int) -> str | int | float:
-        """What scikit-learn is told to try at a split: a tenth of the features, but at least their root."""
-        if self.max_features != "auto":
-            return self.max_features
-        return max(1, math.isqrt(features), features // 10)
+    def tried(self, features: int) -> int:
+        """How many features are tried at a split; by default a tenth of them, but at least their root."""
+        asked = self.max_features
+        if asked == "auto":
+            return max(1, math.isqrt(features), features // 10)
+        if asked == "sqrt":
+            return max(1, math.isqrt(features))
+        if asked == "log2":
+            return max(1, features.bit_length() - 1)
+        return (
+            max(1, int(asked * features))
+            if isinstance(asked, float | np.floating)
+            else min(int(asked), features)
+        )
 
 
 def grow(
-    values: npt.NDArray[np.float32],
+    ranked: Ranked,
     label: npt.NDArray[Any],
     weight: npt.NDArray[np.int64],
     n_trees: int,
@@ -49,13 +55,13 @@ def grow(
     score: npt.NDArray[np.int64] | str | None = None,
     threads: int | None = None,
     progress: Progress | None = None,
-) -> Iterator[tuple[Any, npt.NDArray[np.int64], npt.NDArray[np.float64]]]:
+) -> Iterator[tuple[Tree, npt.NDArray[np.int64], npt.NDArray[np.float64]]]:
     """Grow trees, one after the other, and apply each to the rows it should be judged by.
 
     Parameters
     ----------
-    values : (n, features) float32
-        Not copied.
+    ranked : Ranked
+        Of n samples.
     label : (n,) int
         Class positions; every class occurs, if only with weight 0.
     weight : (n,) int
@@ -65,13 +71,11 @@ def grow(
 
     Yields
     ------
-    tree : sklearn.tree.DecisionTreeClassifier
+    tree : Tree
     rows : (m,) int64
     shares : (m, classes) float64
         The tree's class frequencies for those rows.
     """
-    from sklearn.tree import DecisionTreeClassifier
-
     ends = np.cumsum(weight)
     draws = max(1, round(options.max_samples * int(ends[-1])))
     labels = np.asarray(label, dtype=np.int64)
@@ -79,24 +83,22 @@ def grow(
     def one(number: int):
         random = np.random.default_rng([seed, number])
         drawn = np.searchsorted(ends, random.integers(0, ends[-1], draws), side="right")
-        bag = np.bincount(drawn, minlength=len(weight)).astype(np.float64)
-        tree = DecisionTreeClassifier(
+        bag = np.bincount(drawn, minlength=len(weight))
+        tree = grow_tree(
+            ranked,
+            labels,
+            bag,
+            options.tried(ranked.columns),
+            int(random.integers(0, 2**31 - 1)),
             max_depth=options.max_depth,
             min_samples_leaf=options.min_samples_leaf,
-            max_features=options.tried(values.shape[1]),
-            random_state=int(random.integers(0, 2**31 - 1)),
         )
-        tree.fit(values, labels, sample_weight=bag, check_input=False)
         rows = np.zeros(0, np.int64)
         if isinstance(score, str):
             rows = np.flatnonzero((bag == 0) & (weight > 0))
         elif score is not None:
             rows = score
-        shares = np.empty((len(rows), len(tree.classes_)))
-        for start in range(0, len(rows), _ROWS):
-            part = slice(start, start + _ROWS)
-            shares[part] = tree.predict_proba(np.ascontiguousarray(values[rows[part]]), check_input=False)
-        return tree, rows, shares
+        return tree, rows, tree.shares(ranked, rows)
 
     for tree in map_blocks(one, range(n_trees), threads):
         if progress is not None:

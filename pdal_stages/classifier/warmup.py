@@ -18,6 +18,7 @@ from .context import Context
 from .forest import Forest
 from .training import train
 from .trainoptions import TrainingOptions
+from .trees import Ranked, grow_tree
 
 
 def warmup() -> None:
@@ -54,6 +55,9 @@ def other_part() -> None:
     tables = Context.parse(TrainingOptions().context).tables(xyz, shares, threads=1)
     tables.fill(np.arange(len(xyz)), np.empty((len(xyz), 2 * len(tables.tokens)), np.float32))
     leaf = np.zeros(1, np.float32), np.ones((1, 2), np.uint32)
+    ranked = Ranked.of(np.zeros((2, 1), np.float32), threads=1)
+    tree = grow_tree(ranked, np.arange(2), np.ones(2, np.int64), tried=1, seed=0)
+    tree.shares(ranked, np.arange(2))
     Forest(np.ones(1, np.int32), np.full(1, -1, np.int16), *leaf, n_features=1).predict_proba(
         np.zeros((1, 1), np.float32)
     )
