@@ -17,7 +17,7 @@ from ..base.errors import ModelError
 from ..base.hashing import hash_of
 from ..base.runs import begins_run
 from .arrays import ArrayRule
-from .trees import Tree
+from .trees import GrownTree
 
 #: Of 32 and 64 bits: the type of a node's two numbers, that of its threshold, and the bits of NaN that are free.
 WORDS: tuple[tuple[Any, Any, int], ...] = ((np.uint32, np.float32, 22), (np.uint64, np.float64, 51))
@@ -114,7 +114,7 @@ class Forest:
         return cls._of([_of_sklearn(getattr(tree, "tree_", tree)) for tree in trees], n_features)
 
     @classmethod
-    def from_trees(cls, trees: Sequence[Tree], n_features: int) -> Forest:
+    def from_trees(cls, trees: Sequence[GrownTree], n_features: int) -> Forest:
         """Of trees as they were grown."""
         return cls._of(
             [_level_order(t.left, t.right, t.feature, t.threshold, t.counts) for t in trees], n_features
@@ -264,7 +264,7 @@ def _distinct(values: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.int64], n
 
 
 def _of_sklearn(tree) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
-    """:func:`_level_order` of a scikit-learn ``Tree``."""
+    """:func:`_level_order` of a scikit-learn ``GrownTree``."""
     shares = tree.value[:, 0, :]
     # scikit-learn keeps shares (before 1.3: counts) and the weight of a node; bootstrap weights are whole.
     exact = shares / shares.sum(axis=1, keepdims=True) * tree.weighted_n_node_samples[:, None]

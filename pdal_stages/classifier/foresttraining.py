@@ -37,7 +37,7 @@ from .sampling import Samples, draw_samples
 from .sureness import Sureness, counted
 from .thinning import density_range
 from .trainoptions import TrainingOptions
-from .trees import Ranked, Tree
+from .trees import GrownTree, Ranked
 from .unscored import why_unscored
 
 #: Trees of a forest that judges a fold, as a share of the final one's.
@@ -438,7 +438,7 @@ class _Passes:
         trees: int,
         bar: Progress,
         **more: Any,
-    ) -> Iterator[tuple[Tree, Any, Any]]:
+    ) -> Iterator[tuple[GrownTree, Any, Any]]:
         """The trees of a forest, as :func:`grow` gives them."""
         label, o = self.samples.label, self.options
         return grow(

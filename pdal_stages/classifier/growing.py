@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from ..base.progress import Progress
 from ..base.threads import map_blocks
-from .trees import Ranked, Tree, grow_tree
+from .trees import GrownTree, Ranked, grow_tree
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def grow(
     score: npt.NDArray[np.int64] | str | None = None,
     threads: int | None = None,
     progress: Progress | None = None,
-) -> Iterator[tuple[Tree, npt.NDArray[np.int64], npt.NDArray[np.float64]]]:
+) -> Iterator[tuple[GrownTree, npt.NDArray[np.int64], npt.NDArray[np.float64]]]:
     """Grow trees, one after the other, and apply each to the rows it should be judged by.
 
     Parameters
@@ -71,7 +71,7 @@ def grow(
 
     Yields
     ------
-    tree : Tree
+    tree : GrownTree
     rows : (m,) int64
     shares : (m, classes) float64
         The tree's class frequencies for those rows.

@@ -86,7 +86,7 @@ class Ranked:
 
 
 @dataclass(frozen=True, eq=False)
-class Tree:
+class GrownTree:
     """A decision tree; arrays are of its nodes, a node before its children and all of its left side before the right one.
 
     Attributes
@@ -138,7 +138,7 @@ def grow_tree(
     *,
     max_depth: int | None = None,
     min_samples_leaf: int = 1,
-) -> Tree:
+) -> GrownTree:
     """The tree that scikit-learn's ``DecisionTreeClassifier`` grows.
 
     Parameters
@@ -171,7 +171,7 @@ def grow_tree(
         NO_LIMIT if max_depth is None else max_depth, min_samples_leaf, np.uint32(state),
         left, right, feature, threshold, last, counts, impurity,
     )  # fmt: skip
-    return Tree(
+    return GrownTree(
         left[:made].copy(), right[:made].copy(), feature[:made].copy(), threshold[:made].copy(),
         last[:made].copy(), counts[:made].copy(), impurity[:made].copy(),
     )  # fmt: skip
