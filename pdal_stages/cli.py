@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from .base import kinds
 from .base.errors import OptionError, StageError, suggest
+from .base.lean import import_lean
 from .base.outputs import Output, check_outputs
 from .base.plain import PlainStream, print_messages
 from .base.runlog import LoggedStream, RunLog
@@ -36,6 +37,8 @@ _VERBOSE = ("-v", "--verbose")
 _LEVELS = {0: logging.ERROR, 1: logging.WARNING, 2: logging.INFO}
 #: Commands that work long enough for a log and progress.
 _LOGGED = ("pipeline", "classify", "objects", "review", "train", "accuracy", "demo")
+#: Commands that run no code but ours: no stage of a user's, no notebook.
+_OWN_CODE = ("classify", "objects")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -59,6 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise StageError(f"'{options.command}' takes no stage options", found=overrides[0].flag)
         options.overrides, options.arguments = overrides, arguments
         options.is_program = argv is None
+        if options.is_program and options.command in _OWN_CODE:
+            import_lean()
         if getattr(options, "progress", None) is not None:
             os.environ["PDAL_STAGES_PROGRESS"] = "1" if options.progress else "0"
         if getattr(options, "log", None):

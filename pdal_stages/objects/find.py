@@ -215,9 +215,21 @@ def _blocks(cells: Cells, block: int) -> dict[tuple[int, int], list[Kind]]:
     out: dict[tuple[int, int], list[Kind]] = {}
     for kind in FOUND:
         _, row, column = unpack(cells.of_kind(kind).key)
-        for r, c in np.unique(np.column_stack([row // block, column // block]), axis=0) * block:
-            out.setdefault((int(r), int(c)), []).append(kind)
+        if not row.size:
+            continue
+        row, column = row // block, column // block
+        first, low = int(row[0]), int(column.min())  # keys are sorted by row
+        across = int(column.max()) - low + 1
+        there = _unique_of_sorted_runs((row - first) * across + (column - low))
+        for at in there.tolist():
+            place = (at // across + first) * block, (at % across + low) * block
+            out.setdefault(place, []).append(kind)
     return out
+
+
+def _unique_of_sorted_runs(values: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Sorted different values, of many that repeat the one before."""
+    return np.unique(values[np.r_[True, values[1:] != values[:-1]]])
 
 
 def _around(core: Window, margin: int) -> Window:

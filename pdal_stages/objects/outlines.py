@@ -8,7 +8,6 @@ the middle of its cells' steps lies. Walls between buildings are drawn once, so 
 from __future__ import annotations
 
 import ctypes
-import importlib
 import importlib.util
 import itertools
 import math
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 
 from ..base.apart import apart
 from ..base.errors import DependencyError, StageError
+from ..base.lean import imported
 from .boundaries import polygon
 from .find import Table
 
@@ -42,7 +42,7 @@ _SLACK = 2.5
 def vector(name: str) -> Any:
     """shapely, pyogrio or pyproj; an error says how to get it."""
     try:
-        return importlib.import_module(name)
+        return imported(name)
     except ImportError as error:
         raise DependencyError(
             f"outlines need {name}",

@@ -82,18 +82,16 @@ class ObjectOptions:
         StageError
             Where no point has a class of any kind, or none is ground.
         """
-        usable = points.usable(self.ignore)
-        codes = points.class_codes[usable]
-        x, y, z = points.xyz[usable].T
-        told = points.arrays.get("Reliability")
-        cells = Cells.of(
-            x,
-            y,
-            z,
-            codes,
-            self.settings.cell,
-            reliability=None if told is None else told[usable],
-            classes=self.classes,
-        )
-        refuse_unclassified(cells, codes)
+        cells = self.records(points)
+        refuse_unclassified(cells, points.class_codes[points.usable(self.ignore)])
         return cells
+
+    def records(self, points: Points) -> Cells:
+        """The same of a part of the points, whatever classes it has."""
+        usable = points.usable(self.ignore)
+        x, y, z = points.axes
+        codes, told = points.class_codes, points.arrays.get("Reliability")
+        if not usable.all():
+            x, y, z, codes = x[usable], y[usable], z[usable], codes[usable]
+            told = None if told is None else told[usable]
+        return Cells.of(x, y, z, codes, self.settings.cell, reliability=told, classes=self.classes)

@@ -114,20 +114,34 @@ class Points:
         StageError
             If any is NaN or infinite, with the count.
         """
-        out = np.empty((self.count, 3))
-        for column, (name, unit) in enumerate(
-            (("X", self.units.horizontal), ("Y", self.units.horizontal), ("Z", self.units.vertical))
-        ):
-            np.multiply(self.dimension(name, meters=False), unit, out=out[:, column])
-        bad = int(np.count_nonzero(~np.isfinite(out).all(axis=1)))
-        if bad:
+        return np.column_stack(self.axes)
+
+    @cached_property
+    def axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """The same, x, y and z each by itself.
+
+        Raises
+        ------
+        StageError
+            If any is NaN or infinite, with the count.
+        """
+        across, up = self.units.horizontal, self.units.vertical
+        x, y, z = (
+            values if unit == 1.0 and values.dtype == np.float64 else values * unit
+            for values, unit in (
+                (np.asarray(self.dimension(name, meters=False)), unit)
+                for name, unit in (("X", across), ("Y", across), ("Z", up))
+            )
+        )
+        if not all(np.isfinite(values).all() for values in (x, y, z)):
+            bad = int(np.count_nonzero(~(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))))
             raise StageError(
                 "coordinates are not finite (NaN or infinite)",
                 found=f"{bad:,} of {self.count:,} points",
                 cure='Drop them before this stage: {"type": "filters.expression", "expression": "X < 1e9 && Y < 1e9 '
                 '&& Z < 1e9"} (filters.range with "limits": "Z[-1000:10000]" in PDAL 2.2)',
             )
-        return out
+        return x, y, z
 
     def dimension(self, name: str, *, meters: bool = True) -> NDArray:
         """A dimension's values; lengths upward are converted to meters.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,12 +30,22 @@ class CloudIndex:
     copy: str = ""  #: a copy of the file by place, see :mod:`.byplace`; empty where none was made
 
 
-def open_las(path: str):
-    """The file, for reading; StageError with the reason where it cannot be."""
+def open_las(path: str, only: Sequence[str] = ()):
+    """The file, for reading; StageError with the reason where it cannot be.
+
+    `only`: the dimensions that are needed beside X, Y and the returns, by laspy's names of its selections (``Z``,
+    ``CLASSIFICATION``, ...): LAZ 1.4 holds them apart, so the others take no time. They hold nothing then.
+    """
     import laspy
 
+    more = {}
+    if only:
+        wanted = laspy.DecompressionSelection.base()
+        for name in only:
+            wanted |= laspy.DecompressionSelection[name]
+        more["decompression_selection"] = wanted
     try:
-        return laspy.open(path)
+        return laspy.open(path, **more)
     except Exception as error:  # laspy and the decompressor raise many types
         found = error if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
         raise StageError("the input cannot be read", where=path, found=found) from None
@@ -44,7 +55,8 @@ def read_block(reader: Any, path: str, start: int, end: int):
     """Points from number `start` to `end`, a block at most; StageError where the file is cut short or damaged."""
     count = min(BLOCK, end - start)
     try:
-        reader.seek(start)
+        if reader.points_read != start:  # seeking to where one is costs, and forgets what is wanted
+            reader.seek(start)
         points = reader.read_points(count)
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt | MemoryError):

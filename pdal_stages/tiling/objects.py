@@ -45,6 +45,8 @@ from .store import take_lock
 
 #: Whose options the commands take for objects.
 OPTIONS_OF = ("writers.objects", "filters.objects")
+#: What is read of LAZ 1.4 (see :func:`open_las`).
+ONLY = ("Z", "CLASSIFICATION", "FLAGS", "ALL_EXTRA_BYTES")
 #: Blocks of points read at a time.
 _BLOCKS = 20
 
@@ -209,20 +211,7 @@ def read_cells(path: str, stage: ObjectsWriter, wkt: str, kept: str) -> list[int
         for arrays in _points_of(path):
             points = stage.points(arrays, wkt=wkt)
             seen += np.bincount(points.class_codes, minlength=256)
-            usable = points.inside & ~points.chosen(stage.ignore)
-            x, y, z = points.xyz[usable].T
-            told = arrays.get("Reliability")
-            parts.append(
-                Cells.of(
-                    x,
-                    y,
-                    z,
-                    points.class_codes[usable],
-                    stage.settings.cell,
-                    reliability=None if told is None else told[usable],
-                    classes=stage.classes,
-                )
-            )
+            parts.append(stage.records(points))
             if len(parts) >= 8:
                 parts = [Cells.join(parts)]
         cells = Cells.join(parts)
@@ -245,7 +234,7 @@ def _points_of(path: str) -> Iterator[dict[str, NDArray]]:
         for points in pdal_env.execute([{"filename": path}]).arrays:
             yield {name: np.asarray(points[name]) for name in points.dtype.names}
         return
-    with open_las(path) as reader:
+    with open_las(path, ONLY) as reader:
         total = reader.header.point_count
         extra = [n for n in ("Reliability",) if n in reader.header.point_format.extra_dimension_names]
         for start in range(0, total, BLOCK * _BLOCKS):
