@@ -119,6 +119,41 @@ def normal_gap(members):
     return float((l[1] - l[2]) / l[0]) if l[0] > 0.0 else 0.0
 
 
+SURFACES = ("NormalAgreement", "SurfaceVariationMin", "SurfaceVariationMean", "SurfaceVariationStd")
+AROUND = 10  # neighbors that make a point's surface
+
+
+def surface(xyz, q):
+    """Normal (zeros for none) and surface variation of q's 10 nearest, and how well the normal is defined."""
+    members, _ = nearest(xyz, q, AROUND)
+    if len(members) < 3 or (members == members[0]).all():
+        return np.zeros(3), 1.0 / 3.0, 1.0
+    l, vectors = eigen(members)
+    normal = vectors[:, 2]
+    if (
+        l[1] <= 1e-12 * l[0]
+    ):  # a line: its steepest perpendicular, that to the north of a vertical one left open
+        along = vectors[:, 0]
+        normal = np.array([0.0, 0.0, 1.0]) - along[2] * along
+        length = np.linalg.norm(normal)
+        return (normal / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])), float(l[2] / l.sum()), 1.0
+    return normal, float(l[2] / l.sum()), normal_gap(members)
+
+
+def surfaces(xyz, q, k):
+    """What the surfaces of q and its k nearest make of it, and how well the worst of their normals is defined."""
+    own, _, gap = surface(xyz, q)
+    found = [surface(xyz, p) for p in nearest(xyz, q, k)[0]]
+    variation = np.array([v for _, v, _ in found])
+    values = (
+        float(np.mean([abs(own @ normal) for normal, _, _ in found])),
+        float(variation.min()),
+        float(variation.mean()),
+        float(variation.std()),
+    )
+    return dict(zip(SURFACES, values, strict=True)), min(gap, *(g for _, _, g in found))
+
+
 def of_cylinder(xyz, q, radius):
     """Features of a cylinder."""
     return features(cylinder(xyz, q, radius), math.pi * radius**2, q)

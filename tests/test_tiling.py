@@ -406,6 +406,23 @@ def test_sparse_points_widen_the_surroundings_of_a_model(tmp_path, random_cloud,
     clouds.same_points(tmp_path / "a.las", tmp_path / "b.las")
 
 
+@pytest.mark.parametrize("neighborhoods", ["k2", "k30"])
+def test_sparse_points_widen_the_surroundings_by_two_steps(tmp_path, random_cloud, write_las, neighborhoods):
+    """Neighbors' surfaces are made of their own neighbors, which lie farther still."""
+    xyz = random_cloud(900, seed=3, extent=(300, 300, 4))
+    path = write_las(tmp_path / "sparse.las", dict(zip("XYZ", xyz.T, strict=True)))
+    features = {
+        "type": "filters.multiscalefeatures",
+        "neighborhoods": neighborhoods,
+        "feature_set": "surfaces",
+    }
+    writer = {"type": "writers.las", "forward": "all", "extra_dims": "all"}
+    ps.Pipeline([str(path), features, {**writer, "filename": str(tmp_path / "a.las")}]).execute(arrays=False)
+    run = run_tiled([str(path), features, {**writer, "filename": str(tmp_path / "b.las")}], 60, workers=0)
+    assert not run.failures and any(job.record["widened"] for job in run.tiles)
+    clouds.same_points(tmp_path / "a.las", tmp_path / "b.las")
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10_000), st.floats(0.002, 0.1))
 def test_terrain_within_its_reach_is_the_whole_terrain(seed, density):

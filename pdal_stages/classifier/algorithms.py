@@ -39,6 +39,8 @@ class InputPlan:
     halo_m: float  #: meters around a tile whose points the tile's results depend on
     #: the most a point is asked for, where their number decides how far away they are
     most_neighbors: int = 0
+    #: the most that these are asked for in turn
+    second_neighbors: int = 0
 
 
 class Column(NamedTuple):

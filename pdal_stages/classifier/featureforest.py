@@ -130,7 +130,11 @@ class FeatureForest:
 
     def columns(self, codes: Sequence[int]) -> list[Column]:
         """The features; a histogram's bins are one feature."""
-        group_of = {name: group for group in ("covariance", "geometric", "shapes") for name in GROUPS[group]}
+        group_of = {
+            name: group
+            for group in ("covariance", "geometric", "shapes", "surfaces")
+            for name in GROUPS[group]
+        }
         group_of.update(dict.fromkeys(RELATIVE, "geometric"))
         found = []
         for part in self.plan.layout:

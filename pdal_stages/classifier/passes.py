@@ -67,6 +67,7 @@ class Passes:
             tuple(dict.fromkeys(name for plan in plans for name in plan.dimensions)),
             halo_m,
             max(plan.most_neighbors for plan in plans),
+            max(plan.second_neighbors for plan in plans),
         )
 
     def predict(

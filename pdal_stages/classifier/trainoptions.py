@@ -49,7 +49,7 @@ class TrainingOptions:
     feature_set: Any = setting(
         ("covariance", "Verticality", "HeightRange", "HeightStd", "HeightAboveLowest"),
         "list",
-        "Groups (covariance, geometric, shapes, all) or single features. 'all' is the papers' set",
+        "Groups (covariance, geometric, shapes, surfaces, all) or single features. 'all' is the papers' set",
         "The default leaves out density, which belongs to the sensor, and shape distributions, and adds the height above "
         "the lowest point of each neighborhood [HWS16], which tells low vegetation from sloping ground.",
     )

@@ -44,7 +44,7 @@ def compile_part(part: Callable[[], None]) -> None:
 
 def features_part() -> None:
     """The kernels of features."""
-    compute_features(_cloud(), None, "s5,k10", ("covariance", "geometric"), threads=1)
+    compute_features(_cloud(), None, "s5,k10", ("covariance", "geometric", "surfaces"), threads=1)
 
 
 def other_part() -> None:

@@ -16,12 +16,14 @@ from .bins import ShapeBins
 from .index import CellGrid
 from .kdtree import KdTree, build_tree
 from .moments import BATCH, FEATURES, MOMENTS, WIDTH, finish
-from .names import MOMENT_FEATURES, SHAPE_FEATURES
-from .neighborhoods import LEAST_RADIUS
+from .names import MOMENT_FEATURES, SHAPE_FEATURES, SURFACES
+from .neighborhoods import AROUND, LEAST_RADIUS
 from .optimal import kopt_block, nearest_block
 from .plan import Columns, FeaturePlan
 from .ropt import COPT_RADII, copt_block, curvature_block, radii_of, ropt_block
 from .shapes import Shapes, count_shapes, list_shapes, no_shapes, point_seeds
+from .surfaces import MADE, write_surfaces
+from .surfaces import WIDTH as SURFACE
 
 #: Queries computed at a time when curvatures of a whole cloud are.
 CHUNK = 16_384
@@ -29,6 +31,7 @@ CHUNK = 16_384
 #: Estimated cost of one query on one core, nanoseconds, to cut blocks of about equal time.
 NS_QUERY = {"knn": 2000.0, "kopt": 4500.0, "ropt": 3500.0, "copt": 5500.0}
 NS_SHAPES = 2000.0
+NS_SURFACES = 200.0
 
 Point = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -40,7 +43,9 @@ class _Spec:
     parameters: tuple[float, ...]
     columns: np.ndarray  # (13,) int64: of the moment features and Radius, or -1
     shape_columns: np.ndarray  # (50,) int64, or -1
+    surface_columns: np.ndarray  # (4,) int64, or -1
     shaped: bool
+    surfaced: bool
     unbounded: bool
 
 
@@ -54,16 +59,26 @@ class AdaptiveNeighborhoods:
         #: In the plan's order: what `few` and `far` of :meth:`fill` count for.
         self.tokens = [spec.token for spec in self.specs]
         #: Estimated cost of one query, and memory of one call of :meth:`fill` besides its rows.
-        self.query_ns = sum(NS_QUERY[s.kind] * _load(s) + NS_SHAPES * s.shaped for s in self.specs)
+        self.query_ns = sum(
+            NS_QUERY[s.kind] * _load(s) + NS_SHAPES * s.shaped + NS_SURFACES * s.surfaced for s in self.specs
+        )
         largest = max((s.parameters[-1] for s in self.specs if s.parameters), default=0.0)
         self.scratch_bytes = 2_000_000 + int(500 * largest)
-        nearest = [n for n, spec in enumerate(self.specs) if spec.kind == "knn" and not spec.shaped]
+        nearest = [
+            n
+            for n, spec in enumerate(self.specs)
+            if spec.kind == "knn" and (spec.surfaced or not spec.shaped)
+        ]
         nearest.sort(key=lambda n: self.specs[n].parameters[0])
-        #: Places in `specs` of plain nearest neighbors, which one search of the largest k serves.
+        #: Places in `specs` of nearest neighbors, which one search of the largest k serves; where shapes are wanted too,
+        #: for their surfaces alone.
         self._nearest = nearest
         self._tree: KdTree | None = None
+        self._surfaces = np.empty((0, SURFACE), np.float32)
         if len(grid):
             self._tree = build_tree(grid.x, grid.y, grid.z, lambda f, b: list(map_blocks(f, b, threads)))
+            if any(spec.surfaced for spec in self.specs):
+                self._surfaces = self._surfaces_of_all(threads)
             self._touch()
 
     def __len__(self) -> int:
@@ -75,7 +90,10 @@ class AdaptiveNeighborhoods:
         together = self._compute_nearest(*one) if self._nearest else {}
         for number, spec in enumerate(self.specs):
             shapes = count_shapes(np.zeros((5, 9)), 1) if spec.shaped else no_shapes()
-            table, radius, _ = together.get(number) or self._compute(spec, *one, 0, 0.0, shapes)
+            if number in together and not spec.shaped:
+                table, radius, *_ = together[number]
+            else:
+                table, radius, _ = self._compute(spec, *one, 0, 0.0, shapes)
             few, copies = np.zeros(1, np.int64), np.ones(1, np.int64)
             nowhere = np.full(len(spec.columns), -1, np.int64)
             write_columns(table, radius, one[2], few, copies, nowhere, np.zeros((1, 1), np.float32))
@@ -93,6 +111,29 @@ class AdaptiveNeighborhoods:
         for _ in map_blocks(compute, range(0, len(grid), CHUNK), threads):
             pass
         return curvatures
+
+    def _surfaces_of_all(self, threads: int | None) -> np.ndarray:
+        """The surface of every point of the cloud, in the order of the grid, (n, surfaces.WIDTH) float32."""
+        grid = self.grid
+        out = np.empty((len(grid), SURFACE), np.float32)
+        ks, unwanted = np.array([AROUND], np.int64), np.zeros(1, np.bool_)
+
+        def compute(start: int) -> None:
+            part = slice(start, start + CHUNK)
+            x, y, z = grid.x[part], grid.y[part], grid.z[part]
+            tables, radius, reach = (
+                np.empty((1, MOMENTS, len(x))),
+                np.empty((1, len(x))),
+                np.empty((1, len(x))),
+            )
+            nothing = np.empty((1, 0, MADE))
+            nearest_block(self._tree, x, y, z, ks, tables, radius, reach, self._surfaces, unwanted, nothing)
+            write_surfaces(tables[0], reach[0], out[part])
+
+        compute(len(out) - 1)  # compiled before threads want it
+        for _ in map_blocks(compute, range(0, len(out), CHUNK), threads):
+            pass
+        return out
 
     def shape_values(self, token: str, points: Point, seed: int, copt_threshold: float | None) -> np.ndarray:
         """Metrics of all pulls of a neighborhood for a few points, (m, 5, 255) float32, comparable."""
@@ -127,26 +168,33 @@ class AdaptiveNeighborhoods:
                 shapes = count_shapes(bins.comparable([spec.token])[0], len(qx))
             else:
                 shapes = no_shapes()
-            if number in together:
-                table, radius, reach = together[number]
+            if number in together and not spec.shaped:
+                table, radius, reach, made = together[number]
             else:
                 table, radius, reach = self._compute(spec, qx, qy, qz, seed, copt_threshold, shapes)
+                if spec.surfaced:
+                    *_, reach, made = together[number]
             write_columns(table, radius, qz, few[number : number + 1], copies, spec.columns, out)
             if spec.shaped:
                 wanted = spec.shape_columns >= 0
                 out[:, spec.shape_columns[wanted]] = shapes.counts[:, wanted]
+            if spec.surfaced:
+                wanted = spec.surface_columns >= 0
+                out[:, spec.surface_columns[wanted]] = made[:, wanted]
             if spec.unbounded:
                 far[number] += int(copies[reach > self.halo_m].sum())
 
     def _compute_nearest(
         self, qx: np.ndarray, qy: np.ndarray, qz: np.ndarray
-    ) -> dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """What :meth:`_compute` gives, for all of ``_nearest``."""
+    ) -> dict[int, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+        """What :meth:`_compute` gives, for all of ``_nearest``, and what surfaces make of them (m, 4)."""
         ks = np.array([int(self.specs[n].parameters[0]) for n in self._nearest], np.int64)
         tables = np.empty((len(ks), MOMENTS, len(qx)))
         radius, reach = np.empty((len(ks), len(qx))), np.empty((len(ks), len(qx)))
-        nearest_block(self._tree, qx, qy, qz, ks, tables, radius, reach)
-        return {n: (tables[j], radius[j], reach[j]) for j, n in enumerate(self._nearest)}
+        wanted = np.array([self.specs[n].surfaced for n in self._nearest])
+        made = np.empty((len(ks), len(qx) if wanted.any() else 0, MADE))
+        nearest_block(self._tree, qx, qy, qz, ks, tables, radius, reach, self._surfaces, wanted, made)
+        return {n: (tables[j], radius[j], reach[j], made[j]) for j, n in enumerate(self._nearest)}
 
     def _compute(
         self,
@@ -220,7 +268,11 @@ def _spec(columns: Columns) -> _Spec:
         return np.array([columns.at.get(name, -1) for name in names], np.int64)
 
     moments, shapes = at((*MOMENT_FEATURES, "Radius")), at(SHAPE_FEATURES)
-    return _Spec(one.token, one.kind, one.parameters, moments, shapes, columns.shapes, one.reach is None)
+    surfaces, unbounded = at(SURFACES), one.reach is None
+    surfaced = bool((surfaces >= 0).any())
+    return _Spec(
+        one.token, one.kind, one.parameters, moments, shapes, surfaces, columns.shapes, surfaced, unbounded
+    )
 
 
 def _load(spec: _Spec) -> float:

@@ -162,6 +162,68 @@ def eigen3(xx, xy, xz, yy, yz, zz):
 
 
 @device(forceinline=True)
+def _turn(c, s, a, b):
+    return c * a - s * b, s * a + c * b
+
+
+@device(forceinline=True)
+def normal3(xx, xy, xz, yy, yz, zz):
+    """Eigenvalues as :func:`eigenvalues3`, and the unit eigenvector of l3, of either sign.
+
+    Of points on a line (l2 below 1e-12 of l1) the steepest perpendicular, as in :func:`eigen3`; (1, 0, 0) where the line
+    is vertical.
+    """
+    ax, ay, az = 1.0, 0.0, 0.0
+    bx, by, bz = 0.0, 1.0, 0.0
+    cx, cy, cz = 0.0, 0.0, 1.0
+    for _ in range(4):
+        c, s, t = _rotation(xx, yy, xy)
+        xx, yy = xx - t * xy, yy + t * xy
+        xy = 0.0
+        xz, yz = c * xz - s * yz, s * xz + c * yz
+        ax, bx = _turn(c, s, ax, bx)
+        ay, by = _turn(c, s, ay, by)
+        az, bz = _turn(c, s, az, bz)
+        c, s, t = _rotation(xx, zz, xz)
+        xx, zz = xx - t * xz, zz + t * xz
+        xz = 0.0
+        xy, yz = c * xy - s * yz, s * xy + c * yz
+        ax, cx = _turn(c, s, ax, cx)
+        ay, cy = _turn(c, s, ay, cy)
+        az, cz = _turn(c, s, az, cz)
+        c, s, t = _rotation(yy, zz, yz)
+        yy, zz = yy - t * yz, zz + t * yz
+        yz = 0.0
+        xy, xz = c * xy - s * xz, s * xy + c * xz
+        bx, cx = _turn(c, s, bx, cx)
+        by, cy = _turn(c, s, by, cy)
+        bz, cz = _turn(c, s, bz, cz)
+    xx, yy, zz = max(xx, 0.0), max(yy, 0.0), max(zz, 0.0)
+    # Sort downwards, the vectors with their values.
+    swap = xx < yy
+    xx, yy = (yy if swap else xx), (xx if swap else yy)
+    ax, bx = (bx if swap else ax), (ax if swap else bx)
+    ay, by = (by if swap else ay), (ay if swap else by)
+    az, bz = (bz if swap else az), (az if swap else bz)
+    swap = yy < zz
+    yy, zz = (zz if swap else yy), (yy if swap else zz)
+    bx, cx = (cx if swap else bx), (bx if swap else cx)
+    by, cy = (cy if swap else by), (by if swap else cy)
+    bz, cz = (cz if swap else bz), (bz if swap else cz)
+    swap = xx < yy
+    xx, yy = (yy if swap else xx), (xx if swap else yy)
+    ax, ay, az = (bx if swap else ax), (by if swap else ay), (bz if swap else az)
+    line = yy <= LINE * xx
+    level = 1.0 - az * az
+    leans = level > LINE
+    scale = 1.0 / math.sqrt(level if leans else 1.0)
+    cx = (-az * ax * scale if leans else 1.0) if line else cx
+    cy = (-az * ay * scale if leans else 0.0) if line else cy
+    cz = (level * scale if leans else 0.0) if line else cz
+    return xx, yy, zz, cx, cy, cz
+
+
+@device(forceinline=True)
 def entropy_term(e):
     """-e ln e, 0 for e = 0 (and below 1e-290)."""
     some = e > 1e-290

@@ -63,7 +63,7 @@ class FeatureEngine:
     threads, any block size, and in a tile whose halo is ``plan.halo_m`` meters or more.
 
     Memory over the cloud's own: 28 bytes a point for the index (about 52 while it is being sorted), about 10 more with
-    neighborhoods of k points, and the block budget of :meth:`blocks`.
+    neighborhoods of k points, 20 more with their surfaces, and the block budget of :meth:`blocks`.
     """
 
     def __init__(
@@ -329,8 +329,8 @@ def compute_features(
     neighborhoods : str or list of str
         Presets and tokens, e.g. ``"weinmann2018"`` or ``"c1, s2, kopt"``.
     feature_set : str or list of str
-        Groups (``all``, ``covariance``, ``geometric``, ``shapes``, ``A3``, ``D1`` .. ``D4``) or single features. The
-        defaults of both are those of ``filters.multiscalefeatures``.
+        Groups (``all``, ``covariance``, ``geometric``, ``shapes``, ``surfaces``, ``A3``, ``D1`` .. ``D4``) or single
+        features. The defaults of both are those of ``filters.multiscalefeatures``.
     dimensions : mapping of str to (m,) array
         The queries' own dimensions that the plan uses as features (HeightAboveGround for weinmann2018).
     bins, copt_threshold, seed, threads
@@ -360,5 +360,5 @@ def compute_features(
 def warmup() -> None:
     """Compile every kernel and fill the cache, e.g. at installation; seconds where it is filled already."""
     xyz = np.random.default_rng(0).uniform(0.0, 3.0, (60, 3))
-    compute_features(xyz, None, "c1,s1,k5,kopt(2,5),ropt,copt", "all", threads=1)
+    compute_features(xyz, None, "c1,s1,k5,kopt(2,5),ropt,copt", "all,surfaces", threads=1)
     compute_features(xyz, np.zeros((1, 3)), neighborhoods="c1", feature_set="covariance", threads=1)

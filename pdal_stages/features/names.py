@@ -31,6 +31,14 @@ GEOMETRIC = {
 }
 #: What the papers' sets of features lack, and "all" therefore leaves out.
 RELATIVE = {"HeightAboveLowest": "z of the point minus the lowest z of the neighborhood, meters [HWS16]"}
+#: Of the points around a point, each with the surface that its 10 nearest make (``surfaces.py``). Features of features:
+#: of nearest neighbors (``k20``) only, and no part of "all".
+SURFACES = {
+    "NormalAgreement": "mean |n . n'| of the point's normal n and those of the neighborhood's points",
+    "SurfaceVariationMin": "lowest surface variation of the neighborhood's points",
+    "SurfaceVariationMean": "mean surface variation of the neighborhood's points",
+    "SurfaceVariationStd": "standard deviation of the surface variation of the neighborhood's points (divisor n)",
+}
 SHAPES = {
     "A3": "angle between two pulled points seen from a third",
     "D1": "distance of a pulled point from the centroid",
@@ -44,8 +52,8 @@ SHAPE_BINS = 10
 MOMENT_FEATURES = (*COVARIANCE, "Density", "Verticality", "HeightRange", "HeightStd", "HeightAboveLowest")
 SHAPE_FEATURES = tuple(f"{metric}_{b}" for metric in SHAPES for b in range(SHAPE_BINS))
 
-#: Every feature of an adaptive neighborhood, in order; the others lack Radius.
-ALL_FEATURES = (*COVARIANCE, *GEOMETRIC, *SHAPE_FEATURES, *RELATIVE)
+#: Every feature, in order. Radius is of adaptive neighborhoods alone, SURFACES of nearest neighbors.
+ALL_FEATURES = (*COVARIANCE, *GEOMETRIC, *SHAPE_FEATURES, *RELATIVE, *SURFACES)
 
 #: Words for several features at once.
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -53,6 +61,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "covariance": tuple(COVARIANCE),
     "geometric": tuple(GEOMETRIC),
     "shapes": SHAPE_FEATURES,
+    "surfaces": tuple(SURFACES),
     "he2017": ("Linearity", "Planarity", "Scattering", "SurfaceVariation", "Verticality", "HeightRange"),
     **{metric: tuple(f"{metric}_{b}" for b in range(SHAPE_BINS)) for metric in SHAPES},
 }
@@ -84,7 +93,7 @@ def describe(feature: str) -> str:
     metric, _, number = feature.partition("_")
     if metric in SHAPES and number:
         return f"share of 255 pulls in bin {number} of 10: {SHAPES[metric]}"
-    return {**COVARIANCE, **GEOMETRIC, **SHAPES, **RELATIVE}[feature]
+    return {**COVARIANCE, **GEOMETRIC, **SHAPES, **RELATIVE, **SURFACES}[feature]
 
 
 def parse_feature_set(spec: str | Iterable[str]) -> tuple[str, ...]:
@@ -117,9 +126,10 @@ def parse_feature_set(spec: str | Iterable[str]) -> tuple[str, ...]:
                 raise OptionError(f"'{theirs}' is PDAL's word, not a feature", cure=cure)
             if head is None:
                 cure = suggest(word, (*GROUPS, *ALL_FEATURES))
+                single = (*COVARIANCE, *GEOMETRIC, *RELATIVE, *SURFACES)
                 raise OptionError(
                     f"unknown feature or group '{word}'",
-                    cure=f"{cure}Groups: {', '.join(GROUPS)}; features: {', '.join((*COVARIANCE, *GEOMETRIC, *RELATIVE))}",
+                    cure=f"{cure}Groups: {', '.join(GROUPS)}; features: {', '.join(single)}",
                 )
             name = head + word[len(head) :].lower()
         found[name] = None

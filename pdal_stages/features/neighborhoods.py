@@ -29,6 +29,8 @@ ROPT_DEFAULT = (0.25, 2.0, 0.05)  # r_min, r_max, step in meters [H17]
 LEAST_MEMBERS = 10
 COPT_REACH = 3.0  # meters: the cap of the scattered branch, the largest radius copt looks at [H17]
 MAX_K = 10_000
+#: Nearest neighbors whose surface a point is given, where neighbors are summed up by their surfaces.
+AROUND = 10
 #: Density takes smaller radii as this, meters: copies of one point lie at a distance of 0.
 LEAST_RADIUS = 0.001
 MIN_RADIUS, MAX_RADIUS = 0.001, 100_000.0  # meters

@@ -26,7 +26,9 @@ from .candidates import from_order_bits, order_bits
 from .eigen import eigenentropy, eigenvalues3, log_fast
 from .knn import CROWD, ROOM, make_rows, make_scratch, next_rows, start_search
 from .moments import COINCIDENT, HIGH, LOW, SX, SXX, SXY, SXZ, SY, SYY, SYZ, SZ, SZZ, N
+from .neighborhoods import AROUND
 from .shapes import COUNTS, VALUES, shape_counts, shape_values
+from .surfaces import NX, NY, NZ, agreement, surface
 
 #: Estimated entropies are off by less than half of this.
 MARGIN = 2e-6
@@ -329,7 +331,7 @@ def kopt_into(tree, qx, qy, qz, target, k_min, k_max, cap2, table, radius, reach
 
 
 @njit
-def nearest_block(tree, qx, qy, qz, ks, tables, radius, reach):
+def nearest_block(tree, qx, qy, qz, ks, tables, radius, reach, surfaces, wanted, made):
     """Moments, radius and reach of several numbers of nearest neighbors at once, from one search.
 
     The bits are those of :func:`kopt_block` for each k by itself.
@@ -343,8 +345,15 @@ def nearest_block(tree, qx, qy, qz, ks, tables, radius, reach):
     tables : ndarray of float64, shape (s, 12, m)
     radius, reach : ndarray of float64, shape (s, m)
         Out, as for :func:`kopt_block`.
+    surfaces : ndarray of float32, shape (n, surfaces.WIDTH)
+        Of the cloud, see :func:`surfaces.surfaces_of`; not used where none is wanted.
+    wanted : ndarray of bool, shape (s,)
+        Which numbers of neighbors are summed up by their surfaces.
+    made : ndarray of float64, shape (s, m, surfaces.MADE)
+        Out: what their surfaces make of these.
     """
-    need = ks[len(ks) - 1] + 1
+    some = wanted.any()
+    need = max(ks[len(ks) - 1], AROUND if some else 0) + 1
     search = start_search(qx, qy, qz)
     scratch = make_scratch(CROWD * need + ROOM)
     rows = make_rows(need)
@@ -364,6 +373,22 @@ def nearest_block(tree, qx, qy, qz, ks, tables, radius, reach):
                 write_moments(s, last, members, last + 1, tables[j], q)
                 radius[j, q] = math.sqrt(rows.d2[row, last])
                 reach[j, q] = radius[j, q] if last == ks[j] else math.inf
+            if not some:
+                continue
+            at, d2 = rows.at[row], rows.d2[row]
+            own = surfaces[at[0]]
+            nx, ny, nz = np.float64(own[NX]), np.float64(own[NY]), np.float64(own[NZ])
+            around = 0.0
+            if d2[0] > 0.0:  # a query that is no point of the cloud
+                t = min(AROUND, found - 1)
+                nx, ny, nz, _ = surface(
+                    s.n[t], s.x[t], s.y[t], s.z[t], s.xx[t], s.xy[t], s.xz[t], s.yy[t], s.yz[t], s.zz[t]
+                )
+                around = math.sqrt(d2[t]) if t == AROUND else math.inf
+            for j in range(len(ks)):
+                if wanted[j]:
+                    far = agreement(surfaces, at, d2, min(ks[j], found - 1) + 1, nx, ny, nz, made[j, q])
+                    reach[j, q] = max(reach[j, q], far, around)
         for i in range(lo + count, hi):  # queries that coincide with the first
             source, target = search.order[lo], search.order[i]
             for j in range(len(ks)):
@@ -371,6 +396,8 @@ def nearest_block(tree, qx, qy, qz, ks, tables, radius, reach):
                     tables[j, row, target] = tables[j, row, source]
                 radius[j, target] = radius[j, source]
                 reach[j, target] = reach[j, source]
+                if wanted[j]:
+                    made[j, target] = made[j, source]
 
 
 @device

@@ -11,8 +11,8 @@ from typing import Any
 from ..base import checks
 from ..base.errors import OptionError
 from . import returns
-from .names import ALL_FEATURES, GROUPS, WITH_DIMENSIONS, parse_feature_set
-from .neighborhoods import LEAST_MEMBERS, Neighborhood, parse_neighborhoods, preset_dimensions
+from .names import ALL_FEATURES, GROUPS, SURFACES, WITH_DIMENSIONS, parse_feature_set
+from .neighborhoods import AROUND, LEAST_MEMBERS, Neighborhood, parse_neighborhoods, preset_dimensions
 
 #: What is computed where nothing is asked for, by the function and the stage alike.
 DEFAULT_NEIGHBORHOODS = ("c1", "c2", "c3", "c5", "kopt")
@@ -64,7 +64,7 @@ class FeaturePlan:
         neighborhoods : str or iterable of str
             Presets and tokens, e.g. ``"weinmann2018"`` or ``"c1, s2, kopt"``.
         feature_set : str or iterable of str
-            Groups (``all``, ``covariance``, ``geometric``, ``shapes``, ``A3``, ``D1`` .. ``D4``), features
+            Groups (``all``, ``covariance``, ``geometric``, ``shapes``, ``surfaces``, ``A3``, ``D1`` .. ``D4``), features
             (``Linearity``) or features of one neighborhood (``Linearity_c1``). Only what is named is computed; columns
             come in the order of ``names.ALL_FEATURES``, neighborhood by neighborhood.
         dimensions : str or iterable of str
@@ -96,7 +96,7 @@ class FeaturePlan:
             at = {}
             for feature in ALL_FEATURES:
                 name = f"{feature}_{one.suffix}"
-                if (one.adaptive or feature != "Radius") and (feature in wanted or name in wanted):
+                if has(one, feature) and (feature in wanted or name in wanted):
                     at[feature] = len(names)
                     names.append(name)
             result.append(Columns(one, at))
@@ -109,7 +109,7 @@ class FeaturePlan:
             raise OptionError(
                 f"none of the neighborhoods has the feature '{', '.join(self.features)}'",
                 found=", ".join(n.token for n in self.neighborhoods),
-                cure="Radius exists for kopt, ropt and copt only" if "Radius" in self.features else None,
+                cure=_cure(wanted),
             )
         if clash := {*names} & {*self.dimensions}:
             raise OptionError(f"the dimension '{min(clash)}' is also a computed feature")
@@ -146,18 +146,33 @@ class FeaturePlan:
 
         The largest reach and one cell. ``k50`` and ``kopt`` reach as far as their points lie, which no number
         bounds; for them at least 15 m are asked for, enough for 100 neighbors down to 0.15 points a square
-        meter. How many queries had to look farther is counted in ``FeatureEngine.report.beyond_halo``.
+        meter; neighbors' surfaces take a second step from there, by 10 more. How many queries had to look farther is
+        counted in ``FeatureEngine.report.beyond_halo``.
         """
         reach = max((n.reach for n in self.neighborhoods if n.reach is not None), default=0.0)
         reach = max(reach, returns.reach(self.dimensions))
         if self.unbounded:
             reach = max(reach, POINTS_HALO)
+        for k in self._surfaced:
+            reach = max(reach, POINTS_HALO * (math.sqrt(k) + math.sqrt(AROUND)) / math.sqrt(100))
         return reach + self.cell
 
     @property
     def most_neighbors(self) -> int:
         """The most neighbors a point is asked for, of neighborhoods whose size is a number of points; 0 where none is."""
         return max((int(n.parameters[-1]) for n in self.neighborhoods if n.reach is None), default=0)
+
+    @cached_property
+    def second_neighbors(self) -> int:
+        """The neighbors that neighbors' own features are made of (``names.SURFACES``); 0 where none is wanted."""
+        return AROUND if self._surfaced else 0
+
+    @property
+    def _surfaced(self) -> list[int]:
+        """The numbers of neighbors whose surfaces are wanted."""
+        return [
+            int(c.neighborhood.parameters[0]) for c in self.layout if any(name in c.at for name in SURFACES)
+        ]
 
     @property
     def copt(self) -> bool:
@@ -192,6 +207,19 @@ class FeaturePlan:
         given = data.get("least_members", LEAST_MEMBERS)
         least = checks.whole("'least_members' of a feature plan", given, 3, 100)
         return cls(parsed, parse_feature_set(words), tuple(dict.fromkeys(dimensions)), least)
+
+
+def has(neighborhood: Neighborhood, feature: str) -> bool:
+    """Whether a neighborhood has a feature: all have, but for the size chosen and what neighbors' surfaces make."""
+    if feature == "Radius":
+        return neighborhood.adaptive
+    return feature not in SURFACES or neighborhood.kind == "knn"
+
+
+def _cure(wanted: set[str]) -> str | None:
+    if "Radius" in wanted:
+        return "Radius exists for kopt, ropt and copt only"
+    return "Neighbors' surfaces exist for k20 and the like only" if wanted & {*SURFACES} else None
 
 
 def _by_radius(neighborhoods: Iterable[Neighborhood]) -> bool:

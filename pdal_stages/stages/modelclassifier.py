@@ -210,6 +210,9 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
     def most_neighbors(self) -> int:
         return self.model.plan.most_neighbors
 
+    def second_neighbors(self) -> int:
+        return self.model.plan.second_neighbors
+
     def reads(self) -> list[str]:
         return list(dict.fromkeys([*self.model.required_dimensions, *([HEIGHT] if self.bands else [])]))
 

@@ -45,7 +45,7 @@ class MultiscaleFeatures(Stage):
     feature_set: list = option(
         "list",
         DEFAULT_FEATURES,
-        "Groups (covariance, geometric, shapes, all) or single features (Linearity, A3, ...)",
+        "Groups (covariance, geometric, shapes, surfaces, all) or single features (Linearity, A3, ...)",
     )
     seed: int = option(
         "integer", 0, "Seed for the random draws of the shape distributions", minimum=0, maximum=2**31 - 1
@@ -144,6 +144,9 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
 
     def most_neighbors(self) -> int:
         return self.plan.most_neighbors
+
+    def second_neighbors(self) -> int:
+        return self.plan.second_neighbors
 
     def check_tiled(self) -> None:
         if self.bins and Path(self.bins).exists():

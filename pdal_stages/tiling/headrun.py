@@ -28,6 +28,8 @@ from .tileplan import INPUT, OUTSIDE, ROW, FirstRound, TilePlan
 
 #: Points are left out before a stage that needs less than this share of the halo.
 _NARROW = 0.5
+#: Points whose neighbors are looked at in one go where they lie far apart.
+_AT_ONCE = 100_000
 _MARK_TYPES = {ROW: "uint32_t", INPUT: "uint32_t", OUTSIDE: "double"}
 
 
@@ -123,7 +125,8 @@ def run_head(
         return run_head(context, tile, cuts, everything, before, narrowing=False)
     if far and not everything:
         most = max(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
-        need = max(need, _far_neighbors(pipeline.arrays, most, context, tile))
+        second = max(ours.stage.second_neighbors() for ours in pipeline.lowered.ours)
+        need = max(need, _far_neighbors(pipeline.arrays, most, second, context, tile))
     messages = _messages(pipeline)
     return HeadRun(
         results, need, messages, left_alone(each[-1].figures for _, each in pipeline.reports if each)
@@ -359,8 +362,10 @@ def _changed(result: PieceResults, name: str, original: Mapping[str, NDArray]) -
     return name not in original or not np.array_equal(original[name][before], result.values[name])
 
 
-def _far_neighbors(arrays: list[NDArray], most: int, context: RunContext, tile: tuple[int, int]) -> float:
-    """Meters around the tile within which the `most` nearest neighbors of all its points lie."""
+def _far_neighbors(
+    arrays: list[NDArray], most: int, second: int, context: RunContext, tile: tuple[int, int]
+) -> float:
+    """Meters around the tile within which the `most` nearest neighbors of all its points lie, and the `second` of these."""
     from scipy.spatial import cKDTree
 
     x0, y0, x1, y1 = (side * context.unit for side in context.grid.box(tile))
@@ -370,5 +375,14 @@ def _far_neighbors(arrays: list[NDArray], most: int, context: RunContext, tile: 
     if len(xyz) <= most:
         return 2 * (x1 - x0)
     inward = np.min([mine[:, 0] - x0, x1 - mine[:, 0], mine[:, 1] - y0, y1 - mine[:, 1]], axis=0)
-    far = cKDTree(xyz).query(mine, k=[most + 1], workers=context.threads)[0][:, 0]
-    return float(max(0.0, (far - inward).max()))
+    tree = cKDTree(xyz)
+    if not second:
+        far = tree.query(mine, k=[most + 1], workers=context.threads)[0][:, 0]
+        return float(max(0.0, (far - inward).max()))
+    beyond = tree.query(xyz, k=[second + 1], workers=context.threads)[0][:, 0]
+    need = 0.0
+    for start in range(0, len(mine), _AT_ONCE):
+        part = slice(start, start + _AT_ONCE)
+        away, at = tree.query(mine[part], k=most + 1, workers=context.threads)
+        need = max(need, float(((away + beyond[at]).max(axis=1) - inward[part]).max()))
+    return need

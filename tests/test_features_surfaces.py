@@ -1,0 +1,230 @@
+"""Neighbors' surfaces against the oracle; the same bits in any order, block and tile; two steps of reach."""
+
+import numpy as np
+import oracle
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_features_adaptive import CLOUDS, some, town
+
+from pdal_stages.base.errors import OptionError
+from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, train
+from pdal_stages.features import FeatureEngine, FeaturePlan, compute_features
+from pdal_stages.features.eigen import normal3
+from pdal_stages.features.names import SURFACES
+
+TOKENS = "k3,k20"
+
+
+def test_names_are_the_oracle_s():
+    assert tuple(SURFACES) == oracle.SURFACES
+
+
+@pytest.mark.parametrize("cloud", CLOUDS)
+def test_surfaces_are_the_oracle_s(cloud):
+    xyz = CLOUDS[cloud]
+    queries = some(xyz, 25)
+    got = compute_features(xyz, queries, TOKENS, "surfaces")
+    assert np.isfinite(got.values).all()
+    for i, q in enumerate(queries):
+        for k in (3, 20):
+            expected, gap = oracle.surfaces(xyz, q, k)
+            for name, value in expected.items():
+                if name == "NormalAgreement" and gap < 1e-5:
+                    continue  # some normal is any perpendicular of a line, or anything at all
+                assert got[f"{name}_k{k}"][i] == pytest.approx(value, rel=1e-4, abs=2e-5), (name, k, i)
+
+
+def test_queries_that_are_no_points_of_the_cloud():
+    xyz = CLOUDS["town"]
+    queries = np.vstack([some(xyz, 30) + 0.07, [[200.0, 0.0, 0.0]]])
+    got = compute_features(xyz, queries, "k3", "surfaces")
+    for i, q in enumerate(queries):
+        expected, gap = oracle.surfaces(xyz, q, 3)
+        assert gap < 1e-5 or got.values[i] == pytest.approx(list(expected.values()), rel=1e-4, abs=2e-5)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.tuples(*[st.integers(-3, 3)] * 3), min_size=1, max_size=40),
+    st.integers(1, 25),
+    st.sampled_from([1.0, 0.1, 1e4]),
+)
+def test_variations_with_many_ties(points, k, scale):
+    xyz = np.array(points, float) * scale
+    got = compute_features(xyz, None, f"k{k}", "surfaces", threads=1)
+    for i, q in enumerate(xyz[:8]):
+        expected, gap = oracle.surfaces(xyz, q, k)
+        assert got.values[i, 1:] == pytest.approx(list(expected.values())[1:], rel=1e-4, abs=2e-5)
+        if gap > 1e-3:
+            assert got.values[i, 0] == pytest.approx(expected["NormalAgreement"], rel=1e-4, abs=2e-5)
+
+
+def test_surface_variation_is_that_of_k10():
+    """One definition: a neighborhood that is the point alone and its nearest has the variations of both."""
+    xyz = town(2000)
+    own = compute_features(xyz, None, "k10", "SurfaceVariation")["SurfaceVariation_k10"]
+    index = [np.argsort(oracle.squared_distance(xyz, q), kind="stable")[:2] for q in xyz[:400]]
+    low = compute_features(xyz, np.arange(400), "k1", "SurfaceVariationMin")["SurfaceVariationMin_k1"]
+    assert np.array_equal(low, np.array([own[at].min() for at in index]))
+
+
+def test_a_plane_agrees_and_a_crown_does_not():
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(0, 10, (800, 2))
+    roof = np.column_stack([xy, 0.7 * xy[:, 0]])
+    table = compute_features(roof, None, "k20", "surfaces")
+    assert table["NormalAgreement_k20"].min() > 1 - 1e-6 and table["SurfaceVariationMean_k20"].max() < 1e-12
+    crown = compute_features(rng.normal(0, 2, (800, 3)), None, "k20", "surfaces")
+    assert crown["NormalAgreement_k20"].max() < 0.95 and crown["SurfaceVariationMin_k20"].min() > 0
+
+
+@pytest.mark.parametrize("along", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 2.0, 0.5)])
+def test_points_on_a_line_agree(along):
+    table = compute_features(np.outer(np.arange(50), along), None, "k5", "surfaces")
+    assert table["NormalAgreement_k5"].min() > 1 - 1e-6
+    assert table["SurfaceVariationStd_k5"].max() < 1e-12
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 5])
+def test_few_points(count):
+    xyz = np.random.default_rng(1).uniform(0, 2, (count, 3))
+    table = compute_features(xyz, None, "k20", "surfaces")
+    assert table.shape == (count, 4) and np.isfinite(table.values).all()
+    if 0 < count < 3:  # no surface at all: it agrees with none
+        assert np.array_equal(table.values[0], np.array([0, 1 / 3, 1 / 3, 0], np.float32))
+
+
+def test_copies_of_one_point_have_no_surface():
+    values = compute_features(CLOUDS["all copies"], None, "k20", "surfaces").values
+    assert (values == np.array([0, 1 / 3, 1 / 3, 0], np.float32)).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from([(0, 1, 2), (1, 0, 2), (2, 0, 1)]), st.integers(-4000, 4000))
+def test_rigid_motions(seed, axes, shift):
+    """Surfaces know neither north nor up."""
+    rng = np.random.default_rng(seed)
+    xyz = np.round(rng.uniform(0, 6, (int(rng.integers(12, 80)), 3)) * 1024) / 1024
+    one = compute_features(xyz, None, "k4,k12", "surfaces", threads=1).values
+    other = compute_features(xyz[:, axes] * [1, -1, 1] + shift, None, "k4,k12", "surfaces", threads=1).values
+    np.testing.assert_allclose(one, other, rtol=1e-4, atol=3e-4)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.floats(-1.0, 1.0), min_size=9, max_size=9))
+def test_the_normal_is_the_eigenvector(values):
+    a = np.array(values).reshape(3, 3)
+    c = a @ a.T
+    l1, l2, l3, *normal = normal3(c[0, 0], c[0, 1], c[0, 2], c[1, 1], c[1, 2], c[2, 2])
+    expected = np.linalg.eigvalsh(c)[::-1]
+    assert np.allclose((l1, l2, l3), np.maximum(expected, 0), atol=1e-13)
+    if l2 > 1e-9 and l2 - l3 > 1e-6 * l1:
+        assert np.linalg.norm(normal) == pytest.approx(1, abs=1e-12)
+        assert np.allclose(c @ normal, l3 * np.array(normal), atol=1e-10)
+
+
+# ---- the same bits -----------------------------------------------------------------------------------------
+
+
+def test_any_order_threads_blocks_and_queries():
+    xyz = np.vstack([town(6000), town(6000)[:50]])  # copies of points too
+    whole = compute_features(xyz, None, TOKENS, "surfaces,Linearity", threads=1)
+    order = np.random.default_rng(0).permutation(len(xyz))
+    other = compute_features(xyz[order], None, TOKENS, "surfaces,Linearity", threads=3, memory_mb=16)
+    assert other.values.tobytes() == whole.values[order].tobytes()
+    rows = order[:300]
+    for queries in (rows, xyz[rows]):
+        assert np.array_equal(
+            compute_features(xyz, queries, TOKENS, "surfaces,Linearity").values, whole.values[rows]
+        )
+
+
+def test_beside_other_features():
+    xyz = town(1500)
+    alone = compute_features(xyz, None, "k8", "surfaces")
+    beside = compute_features(xyz, None, "c1,k3,k8,k30,kopt(5,20)", "all,HeightAboveLowest,surfaces")
+    with_shapes = compute_features(xyz, None, "k8", "D1,surfaces")
+    for name in alone.names:
+        assert np.array_equal(beside[name], alone[name]) and np.array_equal(with_shapes[name], alone[name])
+    plain = compute_features(xyz, None, "k8,k30", "covariance,geometric")
+    for name in plain.names:
+        assert np.array_equal(beside[name], plain[name])
+
+
+def test_in_a_tile_as_in_the_whole():
+    """Where no query's two steps lead out of the halo; and those that do are counted."""
+    rng = np.random.default_rng(5)
+    xyz = np.column_stack([rng.uniform(0, 90, (8000, 2)), rng.normal(0, 0.5, 8000)])
+    whole = FeatureEngine(xyz, FeaturePlan.parse("k20", "surfaces"))
+    values, halo = whole.table().values, whole.plan.halo_m
+    assert not whole.report.beyond_halo
+    inside = ((xyz[:, :2] >= 40) & (xyz[:, :2] < 50)).all(axis=1)
+    near = ((xyz[:, :2] >= 40 - halo) & (xyz[:, :2] < 50 + halo)).all(axis=1)
+    assert 50 < inside.sum() < near.sum() < 0.5 * len(xyz)
+    part = compute_features(xyz[near], np.flatnonzero(inside[near]), "k20", "surfaces")
+    assert np.array_equal(part.values, values[inside])
+
+
+def test_the_second_step_is_counted():
+    """Three neighbors lie close by; the ten nearest of these do not."""
+    rng = np.random.default_rng(2)
+    clumps = [rng.uniform(0, 1, (5, 3)) + np.array([40.0 * i, 0, 0]) for i in range(6)]
+    lone, plain = (
+        compute_features(np.vstack(clumps), None, "k3", words) for words in ("surfaces", "Linearity")
+    )
+    assert lone.report.beyond_halo == {"k3": 30} and not plain.report.beyond_halo
+    dense = compute_features(
+        np.vstack([np.vstack([c, c + 0.3, c + 0.7]) for c in clumps]), None, "k3", "surfaces"
+    )
+    assert not dense.report.beyond_halo
+
+
+# ---- plans -------------------------------------------------------------------------------------------------
+
+
+def test_plans():
+    plan = FeaturePlan.parse("s1,k10,k20,kopt", "Linearity,surfaces")
+    assert [name for name in plan.names if "Linearity" not in name] == [
+        f"{name}_{token}" for token in ("k10", "k20") for name in SURFACES
+    ]
+    assert FeaturePlan.parse("k10,k20", "surfacevariationstd_K20").names == ("SurfaceVariationStd_k20",)
+    assert not {*SURFACES} & {name.split("_")[0] for name in FeaturePlan.parse("k10").names}
+    assert FeaturePlan.from_dict(plan.to_dict()) == plan
+    assert (plan.second_neighbors, plan.most_neighbors) == (10, 100)
+    assert FeaturePlan.parse("k20", "Linearity").second_neighbors == 0
+    for spec in ("s1", "kopt", "ropt"):
+        with pytest.raises(OptionError, match="k20 and the like"):
+            FeaturePlan.parse(spec, "NormalAgreement")
+    with pytest.raises(OptionError, match="belongs to none"):
+        FeaturePlan.parse("k10", "NormalAgreement_k20")
+
+
+def test_the_halo_grows_where_neighbors_lie_far():
+    assert FeaturePlan.parse("k20,k50", "Linearity,NormalAgreement_k20").halo_m == 16.0
+    many = FeaturePlan.parse("k100", "NormalAgreement").halo_m
+    assert many == pytest.approx(16.0 + 15.0 * 10**0.5 / 10)
+
+
+def test_a_model_reads_them(tmp_path):
+    xyz = town(3000)
+    label = np.where(xyz[:, 2] > 1.5, 6, 2).astype(np.uint8)
+    options = TrainingOptions(
+        neighborhoods="k10,k20",
+        feature_set="covariance,surfaces",
+        dimensions=(),
+        count=300,
+        trees=4,
+        folds=0,
+        voxel=0.0,
+    )
+    model = train([TrainingCloud(xyz, label, {})], options)
+    model.save(tmp_path / "m.model")
+    again = load_model(tmp_path / "m.model")
+    assert "SurfaceVariationStd_k20" in again.passes[0].plan.names
+    first = again.passes[0]
+    assert {column.group for column in first.columns([2, 6])} == {"covariance", "surfaces"}
+    assert again.plan.second_neighbors == 10
+    found = again.predict(xyz, {})
+    assert np.array_equal(found.classification, model.predict(xyz[::-1], {}).classification[::-1])
+    assert (found.classification == label).mean() > 0.9
