@@ -174,9 +174,10 @@ def test_what_is_wrong_is_said_before_any_work(tmp_path, monkeypatch):
 def test_in_tiles_as_in_one_piece(tmp_path, write_las):
     path = write(tmp_path / "lakes.gpkg", [LAKE])
     source = write_las(tmp_path / "in.las", cloud(), point_format=1)
-    stages = [str(source), {"type": "filters.polygons", "polygons": f"{path}=9"}, str(tmp_path / "whole.las")]
+    writer = {"type": "writers.las", "filename": str(tmp_path / "whole.las"), "forward": "all"}
+    stages = [str(source), {"type": "filters.polygons", "polygons": f"{path}=9"}, writer]
     ps.Pipeline(stages).execute()
-    stages[2] = {"type": "writers.las", "filename": str(tmp_path / "tiled.las"), "forward": "all"}
+    writer["filename"] = str(tmp_path / "tiled.las")
     ps.run_tiled(stages, tile=30, workers=0)
     one, two = (laspy.read(tmp_path / f"{name}.las") for name in ("whole", "tiled"))
     assert np.array_equal(one.classification, two.classification)

@@ -42,7 +42,7 @@ def run(tmp_path, capsys):
 @pytest.mark.parametrize("tiles", [(), ("--tile", 20, "--workers", 0, "--buffer", 5)])
 def test_warnings_of_pdal_are_shown_once(cloud, tmp_path, run, tiles):
     """filters.hag_nn warns of ground points that are not there."""
-    smrf = {"type": "filters.smrf", "cell": 40}
+    smrf = {"type": "filters.smrf", "cell": 20}
     stages = [cloud, smrf, {"type": "filters.hag_minima"}, {"type": "filters.hag_minima", "tag": "b"}]
     code, _, err = run([*stages, tmp_path / "o.las"], *tiles)
     assert code == 0, err
