@@ -153,17 +153,14 @@ class Outcome:
             instead = np.uint8(UNCLASSIFIED) if self._current is None else self._current[rows]
         self.classification[rows] = np.where(low, instead, decided.code)
 
-    def prediction(
-        self, rows: npt.NDArray[np.int64] | None, there: npt.NDArray[np.int64] | None, counted: Report
-    ) -> Prediction:
+    def prediction(self, asked: npt.NDArray[np.bool_] | None, ignored: int, counted: Report) -> Prediction:
         """The result once all blocks are written.
 
-        `rows` are the points that were to be classified, `there` those that were not ignored; None: all.
+        `asked` (n,) are the points that were to be classified, None for all; so many others were `ignored`.
         """
         n = len(self.classification)
-        ignored = 0 if there is None else n - len(there)
-        count = n if rows is None else len(rows)
-        given = self.classification if rows is None else self.classification[rows]
+        count = n if asked is None else int(np.count_nonzero(asked))
+        given = self.classification if asked is None else self.classification[asked]
         code, number = np.unique(given, return_counts=True)
         report = Report(
             {

@@ -53,12 +53,16 @@ def known(
     rows: npt.NDArray[np.int64] | None = None,
     where: str | None = None,
 ) -> list[npt.NDArray[Any]]:
-    """Values of the dimensions that these features must have, and of those they use where a cloud has them.
+    """Values (n,) of the dimensions that these features must have, and of those they use where a cloud has them.
 
-    Parameters and errors as for :func:`gather`.
+    Parameters and errors as for :func:`gather`; what is not at `rows` is not looked at.
     """
     there = (name for name in welcome(names) if name in dimensions)
-    return list(gather((*required(names), *there), dimensions, n, rows, where)[0].values())
+    found = []
+    for name in (*required(names), *there):
+        if gather((name,), dimensions, n, rows, where)[0]:  # one after the other: it may be a copy
+            found.append(np.asarray(dimensions[name]))
+    return found
 
 
 def with_returns(

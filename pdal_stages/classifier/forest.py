@@ -264,7 +264,7 @@ def _distinct(values: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.int64], n
 
 
 def _of_sklearn(tree) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
-    """:func:`_level_order` of a scikit-learn ``GrownTree``."""
+    """:func:`_level_order` of a scikit-learn tree."""
     shares = tree.value[:, 0, :]
     # scikit-learn keeps shares (before 1.3: counts) and the weight of a node; bootstrap weights are whole.
     exact = shares / shares.sum(axis=1, keepdims=True) * tree.weighted_n_node_samples[:, None]

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from ..base.errors import DimensionError, ModelError, OptionError
 from ..base.report import Report
 from ..features import FeaturePlan
-from ..features.voxels import check_side, represent
+from ..features.voxels import Representatives, check_side, represent
 from . import modelfile, summary
 from .algorithms import InputPlan, PredictRequest, algorithm
 from .deciding import Outcome, Prediction, PredictionOptions, decide
@@ -214,40 +214,45 @@ class Model:
                 found=f"a model of {self.algorithm.name}",
                 cure="Use 'margin'",
             )
-        rows = None
-        if where is not None and not (mask := mask_of("where", where, len(xyz))).all():
-            rows = np.flatnonzero(mask)
-        old = None if current is None else _codes_now(current, len(xyz))
-        there = None
-        if ignore is not None and (gone := mask_of("ignore", ignore, len(xyz))).any():
-            there = np.flatnonzero(~gone)
-            rows = there if rows is None else rows[~gone[rows]]
-        return self._predict(xyz, given, rows, there, old, how, progress)
+        n = len(xyz)
+        asked = None if where is None else mask_of("where", where, n)
+        old = None if current is None else _codes_now(current, n)
+        there, ignored = None, 0
+        if ignore is not None and (gone := mask_of("ignore", ignore, n)).any():
+            there, ignored = np.flatnonzero(~gone), int(np.count_nonzero(gone))
+            asked = ~gone if asked is None else asked & ~gone
+        if asked is not None and asked.all():
+            asked = None
+        rows = None if asked is None else np.flatnonzero(asked)
+        outcome = Outcome(n, len(self.codes), old, how)
+        values = known(self.plan.dimensions, given, n, there)
+        representatives = represent(xyz, self.voxel, values, rows, there)
+        del values, there
+        if representatives is not None:  # from here on nobody looks at the others
+            rows = representatives.wanted
+            xyz = xyz[representatives.rows]
+            given = {name: np.asarray(given[name])[representatives.rows] for name in given}
+        report = self._predict(xyz, given, rows, representatives, outcome, how, progress)
+        if len(xyz) < n - ignored:
+            report.figures["representatives"] = len(xyz)
+        return outcome.prediction(asked, ignored, report)
 
     def _predict(
         self,
         xyz: npt.NDArray[np.float64],
         dimensions: Mapping[str, npt.ArrayLike],
         rows: npt.NDArray[np.int64] | None,
-        there: npt.NDArray[np.int64] | None,
-        old: npt.NDArray[np.uint8] | None,
+        representatives: Representatives | None,
+        outcome: Outcome,
         how: PredictionOptions,
         progress: Any,
-    ) -> Prediction:
-        """Classify the points `rows` of those that are `there`; None: all."""
+    ) -> Report:
+        """Classify the points `rows` (None: all), each for those that it represents."""
         codes, factors = self.codes, self.factors
 
         def finish(p):
             p = weighed(p, factors)
             return count_shares(p) if how.smooth else decide(p, codes, how)
-
-        outcome = Outcome(len(xyz), len(codes), old, how)
-        values = known(self.plan.dimensions, dimensions, len(xyz), there)
-        representatives = represent(xyz, self.voxel, values, rows, there)
-        asked, count = rows, len(xyz if there is None else there)
-        if representatives is not None:
-            xyz, asked = xyz[representatives.rows], representatives.wanted
-            dimensions = {name: np.asarray(dimensions[name])[representatives.rows] for name in dimensions}
 
         def write(at, decided, variance=None):
             if representatives is not None:
@@ -258,7 +263,7 @@ class Model:
             return at
 
         request = PredictRequest(
-            xyz, dimensions, asked, how.threads, how.memory_mb, progress if representatives is None else None
+            xyz, dimensions, rows, how.threads, how.memory_mb, progress if representatives is None else None
         )
         predicted = self.algorithm.predict(request, finish)
         shares = np.zeros((len(xyz), len(codes)), np.uint16) if how.smooth else None
@@ -269,13 +274,11 @@ class Model:
             if representatives is not None and progress is not None:
                 progress.update(len(written))
         if shares is not None and request.count:
-            for part, p in _smoothed(xyz, asked, shares, how):
+            for part, p in _smoothed(xyz, rows, shares, how):
                 write(part, decide(p, codes, how))
             predicted.report.figures["smooth"] = how.smooth
-        if len(xyz) < count:
-            predicted.report.figures["representatives"] = len(xyz)
         self._report_density(predicted.report, xyz, request.count)
-        return outcome.prediction(rows, there, predicted.report)
+        return predicted.report
 
     def _report_density(self, report: Report, xyz: npt.NDArray[np.float64], count: int) -> None:
         """How dense the cloud is; a warning where that is not what the model was trained for."""

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from ..base.runs import begins_run
 from ..base.threads import map_blocks
 from ..features.index import cell_numbers
 from .context import Context, Tables
@@ -70,10 +71,18 @@ class Sweep:
         self._xyz, self._context, self._threads, self._again = xyz, context, threads, again
         self._room = keep_bytes
         y = xyz[:, 1] if coming is None else xyz[coming, 1]
-        self._numbers, strip = np.unique(cell_numbers(y, context.strip), return_inverse=True)
+        number = cell_numbers(y, context.strip)
+        least = int(number.min(initial=0))
+        number -= least
+        if number.max(initial=0) < 2**16:
+            number = number.astype(np.uint16)  # sorted digit by digit
         small = np.int32 if len(xyz) < 2**31 else np.int64
-        order = np.argsort(strip, kind="stable").astype(small)
-        self._start = np.searchsorted(strip[order], np.arange(len(self._numbers) + 1))
+        order = np.argsort(number, kind="stable").astype(small)
+        number = number[order]
+        first = np.flatnonzero(begins_run(number))
+        self._numbers = number[first].astype(np.int64) + least
+        self._start = np.append(first, len(number))
+        del number
         self._order = order if coming is None else coming[order].astype(small)
         self._place = np.zeros(len(xyz), small)  # of each row in the order of strips
         self._place[self._order] = np.arange(len(self._order), dtype=small)

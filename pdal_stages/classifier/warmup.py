@@ -12,6 +12,7 @@ import numpy as np
 
 from ..base.jit import Compiling
 from ..features import compute_features
+from ..features.voxels import represent
 from ..terrain import detached_noise, filtered_ground, hag_minima
 from .clouds import TrainingCloud
 from .context import Context
@@ -55,6 +56,7 @@ def other_part() -> None:
     tables = Context.parse(TrainingOptions().context).tables(xyz, shares, threads=1)
     tables.fill(np.arange(len(xyz)), np.empty((len(xyz), 2 * len(tables.tokens)), np.float32))
     leaf = np.zeros(1, np.float32), np.ones((1, 2), np.uint32)
+    represent(xyz, 1.0)
     ranked = Ranked.of(np.zeros((2, 1), np.float32), threads=1)
     tree = grow_tree(ranked, np.arange(2), np.ones(2, np.int64), tried=1, seed=0)
     tree.shares(ranked, np.arange(2))

@@ -7,6 +7,8 @@ tile that holds those cells; and a point costs as much in a dense cloud as in a 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -14,6 +16,8 @@ from ..base.jit import njit
 from ..base.runs import begins_run
 from .index import cell_numbers
 
+#: Points whose cells are numbered in one go: they stay in a core's cache.
+_TOGETHER = 1 << 16
 #: A share of 1.
 WHOLE = 65535
 
@@ -28,10 +32,11 @@ def cell_means(
     """
     keys, offsets = cell_keys(coordinates, side)
     order = np.argsort(keys)
-    ascending = keys[order]
-    start = np.append(np.flatnonzero(begins_run(ascending)), len(keys))
-    occupied = ascending[start[:-1]]
+    keys = keys[order]
+    start = np.append(np.flatnonzero(begins_run(keys)), len(keys))
+    occupied = keys[start[:-1]]
     cell = np.empty(len(keys), np.int32)
+    del keys
     sums = np.zeros((len(occupied), shares.shape[1] + 1), np.int64)
     add_cells(order, start, shares, votes, cell, sums)
     means = np.empty((len(occupied), shares.shape[1]), np.float32)
@@ -46,18 +51,29 @@ def cell_keys(
 
     And offsets (3 or 9,): added to a number, they give the middle cells of the rows of three around it.
     """
-    numbers = [cell_numbers(coordinates[:, k], side) for k in _ORDER[coordinates.shape[1]]]
-    lengths = []
-    for attempt in (_from_zero, _without_gaps):
-        numbers = [attempt(number) for number in numbers]
-        # One empty cell beside the last, so that no cell has neighbors at the other end of the grid.
+    axes, n = _ORDER[coordinates.shape[1]], len(coordinates)
+    spans = np.array([[coordinates[:, k].min(), coordinates[:, k].max()] if n else [0.0, 0.0] for k in axes])
+    first, last = cell_numbers(spans, side).T
+    # One empty cell beside the last, so that no cell has neighbors at the other end of the grid.
+    lengths = [int(length) + 2 for length in last - first]
+    numbers = None
+    if float(np.prod(np.array(lengths, float))) >= 2.0**62:
+        numbers = [_without_gaps(cell_numbers(coordinates[:, k], side)) for k in axes]
         lengths = [int(number.max(initial=0)) + 2 for number in numbers]
-        if float(np.prod(np.array(lengths, float))) < 2.0**62:
-            break
-    keys = numbers[0]
+    keys = np.empty(n, np.int64)
+    for start in range(0, n, _TOGETHER):
+        part = slice(start, start + _TOGETHER)
+        key: Any = 0
+        for place, (k, length) in enumerate(zip(axes, lengths, strict=True)):
+            number = (
+                cell_numbers(coordinates[part, k], side) - first[place]
+                if numbers is None
+                else numbers[place][part]
+            )
+            key = key * length + number
+        keys[part] = key
     steps = [1]
-    for number, length in zip(numbers[1:], lengths[1:], strict=True):
-        keys = keys * length + number
+    for length in lengths[1:]:
         steps = [step * length for step in steps] + [1]
     offsets = np.zeros(1, np.int64)
     for step in steps[:-1]:
@@ -67,10 +83,6 @@ def cell_keys(
 
 #: Axes from the slowest to the fastest.
 _ORDER = {2: (1, 0), 3: (1, 0, 2)}
-
-
-def _from_zero(number: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    return number - number.min() if len(number) else number
 
 
 def _without_gaps(number: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

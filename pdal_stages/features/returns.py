@@ -11,15 +11,17 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OptionError
-from ..base.threads import map_blocks
 from .cells import WHOLE, cell_means, take_means
 from .neighborhoods import SIDES
 
+#: Points looked at in one go.
+_TOGETHER = 1 << 16
 #: What they are made of.
 SOURCES = ("ReturnNumber", "NumberOfReturns")
 
@@ -75,8 +77,10 @@ def return_features(
     xyz: npt.NDArray[np.float64],
     dimensions: Mapping[str, npt.ArrayLike],
     threads: int | None = None,
-) -> dict[str, npt.NDArray[np.float32]]:
-    """Those of `names` that are return features, for every point of a cloud: (n,) float32 each, 0 to 1.
+) -> dict[str, npt.NDArray[Any]]:
+    """Those of `names` that are return features, for every point of a cloud: (n,) each, 0 to 1, whole numbers or float32.
+
+    Columns may be those of a table.
 
     Of `dimensions`, ``ReturnNumber`` and ``NumberOfReturns`` are read, (n,) each; without them all is 0.
     """
@@ -87,17 +91,18 @@ def return_features(
     flags = np.empty((len(xyz), len(FLAGS)), np.uint16)
     flags[:, 0] = np.where(total > 1, WHOLE, 0)
     flags[:, 1] = np.where((number > 0) & (number < total), WHOLE, 0)
-    every = np.arange(len(xyz))
 
     def table(scale: tuple[int, float]) -> npt.NDArray[np.float32]:
         out = np.empty((len(xyz), len(FLAGS)), np.float32)
-        take_means(*cell_means(xyz[:, : scale[0]], flags, scale[1]), every, out)
+        cell, means = cell_means(xyz[:, : scale[0]], flags, scale[1])
+        some = np.arange(min(len(xyz), _TOGETHER))
+        for start in range(0, len(xyz), _TOGETHER):
+            part = slice(start, start + _TOGETHER)
+            take_means(cell[part], means, some[: len(out[part])], out[part])
         return out
 
+    # One after the other: each needs room for a while.
     scales = list(dict.fromkeys((one.axes, one.side) for one in wanted.values() if one.axes))
-    tables = dict(zip(scales, map_blocks(table, scales, threads), strict=True))
-    tables[0, 0.0] = (flags > 0).astype(np.float32)
-    columns = {
-        name: tables[one.axes, one.side][:, list(FLAGS).index(one.flag)] for name, one in wanted.items()
-    }
-    return {name: np.ascontiguousarray(column) for name, column in columns.items()}
+    tables: dict[tuple[int, float], npt.NDArray[Any]] = {scale: table(scale) for scale in scales}
+    tables[0, 0.0] = (flags > 0).view(np.uint8)
+    return {name: tables[one.axes, one.side][:, list(FLAGS).index(one.flag)] for name, one in wanted.items()}

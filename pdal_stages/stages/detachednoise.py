@@ -80,7 +80,7 @@ marks of the whole cloud. The counts are in the metadata as `low` and `high`.
             return {}
         ignored = points.ignored(self.ignore)
         found = detached_noise(
-            points.xyz,
+            *points.axes,
             mask=None if not ignored.any() else ~ignored,
             cluster=self.cluster,
             gap=self.gap,

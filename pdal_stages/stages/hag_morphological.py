@@ -162,12 +162,12 @@ of Z.
         )
 
     def left_of(self, points: Points) -> NDArray[np.float64]:
-        x, y, z = points.xyz.T
+        x, y, z = points.axes
         usable = points.usable(self.ignore)
         left = lowest_of_cells(x, y, z, usable, self.cell)
         if self.decks:
             left = np.union1d(left, level_points(x, y, z, usable))
-        return points.xyz[left]
+        return np.column_stack([x[left], y[left], z[left]])
 
     def block_of(self, left: NDArray[np.float64], block: tuple[int, int]) -> dict[str, NDArray]:
         x, y, z = left.T
@@ -183,7 +183,7 @@ of Z.
         wanted = points.wanting("HeightAboveGround", self.makes_again)
         all_wanted = bool(wanted.all())
         found = filtered_ground(
-            points.xyz if all_wanted else points.xyz[wanted],
+            *(points.axes if all_wanted else [axis[wanted] for axis in points.axes]),
             mask=usable if all_wanted else usable[wanted],
             cell=self.cell,
             slope=self.slope,
@@ -199,9 +199,12 @@ of Z.
         )
         out = {}
         for name in self.creates():
-            values = found[name]
+            values = found.pop(name)
             if name.startswith("HeightAbove") and points.units.vertical != 1.0:
                 values = values / points.units.vertical
-            out[name] = np.array(points.arrays[name], values.dtype)
-            out[name][wanted] = values
+            # As PDAL will have it; a copy more of each would be the most that this stage holds.
+            out[name] = values.astype(points.arrays[name].dtype, copy=False)
+            if not all_wanted:
+                out[name] = np.array(points.arrays[name])
+                out[name][wanted] = values
         return out

@@ -268,7 +268,7 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         self._refuse_codes_that_stay(points, wanted)
         with Progress(int(np.count_nonzero(wanted)), self.type) as progress:
             found = self.model.predict(
-                points.xyz,
+                points.take_xyz(),
                 self._dimensions(points),
                 None if wanted.all() else wanted,
                 current=points.class_codes,

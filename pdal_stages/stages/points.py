@@ -143,6 +143,13 @@ class Points:
             )
         return x, y, z
 
+    def take_xyz(self) -> NDArray[np.float64]:
+        """:attr:`xyz`, not kept here: who takes it may let go of it."""
+        xyz = self.xyz
+        del self.__dict__["xyz"]
+        self.__dict__.pop("axes", None)
+        return xyz
+
     def dimension(self, name: str, *, meters: bool = True) -> NDArray:
         """A dimension's values; lengths upward are converted to meters.
 

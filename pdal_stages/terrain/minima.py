@@ -244,7 +244,8 @@ def _bounded(index: NDArray[np.float64]) -> NDArray[np.int64]:
 
 def cell_numbers(coordinate: NDArray[np.float64], cell: float) -> NDArray[np.int64]:
     """Which cell coordinates fall in, counted from the origin; StageError beyond what any survey has."""
-    return _bounded(np.floor(coordinate / cell))
+    index = np.asarray(coordinate / cell)
+    return _bounded(np.floor(index, out=index))
 
 
 def _key(column: NDArray[np.int64], row: NDArray[np.int64]) -> NDArray[np.int64]:
