@@ -3,7 +3,7 @@
 python benchmarks/bridges.py --data FOLDER
 
 Decks of scenes (tests/bridge_scenes.py, tests/long_bridge_scenes.py; 16 points/m2), of the
-generated town and of the labeled clouds; wires of the town and of those clouds. Cars, lamps and what was never labeled count
+generated town and of the labeled clouds; wires of the town, of generated corridors (tests/corridor_scenes.py) and of those clouds. Cars, lamps and what was never labeled count
 neither way. `false` is the share of all points that are wrongly taken; seconds are of one process.
 """
 
@@ -24,6 +24,7 @@ from pdal_stages.terrain.wires import find_wires
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from bridge_scenes import SCENES, scan
+from corridor_scenes import CORRIDORS
 from long_bridge_scenes import LONG_SCENES
 
 CLOUDS = (
@@ -79,6 +80,10 @@ def main() -> None:
         true, use = town.classification, town.classification != 7
         decks(f"town {seed}, {density:g} points/m2", town.xyz, use, true == 17, true == 1)
         wires(f"town {seed}, {density:g} points/m2", town.xyz, use, true == 14, true == 15)
+    for density in (8.0, 2.0):
+        for name, corridor in CORRIDORS.items():
+            xyz, codes = corridor(density)
+            wires(f"{name}, {density:g} points/m2", xyz, np.ones(len(xyz), bool), codes == 14, codes == 15)
     for name in CLOUDS:
         las = laspy.read(folder / name)
         codes = np.asarray(las.classification)

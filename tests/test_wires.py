@@ -11,6 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from corridor_scenes import CORRIDORS
+
 import pdal_stages as ps
 import pdal_stages.synthetic
 from pdal_stages.cli import main
@@ -161,6 +163,14 @@ def test_the_stage_gives_wires_their_class():
     assert np.array_equal(after, np.where(wire, 14, before))
     assert points.report.figures["wires"] == wire.sum()
     assert stage.halo_m() == wires.REACH < 90 and stage.largest_class() == 14
+
+
+@pytest.mark.parametrize("name", CORRIDORS)
+def test_generated_corridors(name):
+    xyz, codes = CORRIDORS[name](4.0)
+    wire = find_wires(xyz, filtered_ground(xyz)["HeightAboveGround"], np.ones(len(xyz), bool))
+    assert f1(wire, codes == 14) > 0.95
+    assert (wire & ~np.isin(codes, (14, 15))).sum() <= 0.0001 * len(xyz)
 
 
 def test_a_corridor(data_dir):

@@ -24,6 +24,11 @@ CELL, GAP = 1.0, 1.0
 #: Wires hang higher than that above the ground, are no thicker in a cell, and have no more other levels around, in 5 x 5
 #: cells.
 LOWEST, THICK, CROWD = 4.0, 0.9, 14
+#: Where points are dense, that is in so many of those cells, others may be in such a share of them: three wires side by side.
+DENSE, SHARE = 24, 0.85
+#: Those are leaves unless what lies about as high, within half a line's length, is scattered so much less across than along
+#: (squared).
+ACROSS = 0.3
 #: Half the length of the line that is looked for, its pieces, and how far above or below it, and beside it, points may lie;
 #: meters.
 HALF, PIECE, NEAR, BESIDE = 12.0, 2.0, 0.35, 1.0
@@ -33,6 +38,9 @@ STEEPEST = 0.6
 FILLED, ONE_SIDED = 8, 5
 #: Around the line, from `CLEAR` meters farther on to `AROUND`, there is at most such a share of what is on it.
 CLEAR, AROUND, MUCH = 0.45, 2.0, 0.34
+#: Unless it is on other lines beside, all of which hold no more than so many times what is on the line.
+MOST = 3.0
+_BIN, _BINS = 0.4, 14
 #: What lies `UNDER` meters below the line is counted up to `STRIP` meters from it, and to each side from `STRIP_FROM` to
 #: `STRIP_TO`: below are so many of all that is not higher on the fuller side, for the same area, and to either side so many
 #: of what is below on the other.
@@ -85,24 +93,58 @@ def _levels(x, y, z, column, row, left, bottom, h, w, order):
 
 
 @njit
-def _thin(place, thick, cells, start, h, w):
-    """Levels that may be of a wire."""
-    out = np.zeros(len(thick), np.bool_)
+def _thin(place, thick, cells, start, h, w, held):
+    """Levels that may be of a wire, of cells `held` (h * w) by any point; and those among which leaves may be."""
+    out, crowded = np.zeros(len(thick), np.bool_), np.zeros(len(thick), np.bool_)
     for n in range(len(thick)):
         if thick[n] > THICK:
             continue
         j, i = cells[n] // w, cells[n] % w
-        others = 0
+        others = cloud = 0
         for b in range(max(j - 2, 0), min(j + 3, h)):
             for a in range(max(i - 2, 0), min(i + 3, w)):
+                cloud += held[b * w + a]
                 for m in range(start[b * w + a], start[b * w + a + 1]):
                     others += m != n and abs(place[m, 2] - place[n, 2]) <= 2.0
-        out[n] = others <= CROWD
-    return out
+        crowded[n] = others > CROWD
+        out[n] = not crowded[n] or (cloud >= DENSE and others < SHARE * cloud)
+    return out, crowded
+
+
+@device
+def _clutter(near, count, slim, ux, uy, rise, pieces):
+    """Levels around a line that are on no other line beside it, filled like it."""
+    half, middle = pieces.shape[2] // 2, _BINS // 2 + 1
+    pieces[:] = False
+    for m in range(count):
+        along = near[m, 0] * ux + near[m, 1] * uy
+        a = int(np.floor((near[m, 1] * ux - near[m, 0] * uy) / _BIN)) + middle
+        b = int(np.floor((near[m, 2] - rise * along) / _BIN)) + middle
+        if slim[m] and 0 <= a < _BINS + 2 and 0 <= b < _BINS + 2:
+            pieces[a, b, min(int((along + HALF) / PIECE), 2 * half - 1)] = True
+    beside = 0
+    for m in range(count):
+        along = near[m, 0] * ux + near[m, 1] * uy
+        aside, above = near[m, 1] * ux - near[m, 0] * uy, near[m, 2] - rise * along
+        away = max(max(abs(aside) - BESIDE + NEAR, 0.0), abs(above))
+        if not NEAR + CLEAR < away <= AROUND:
+            continue
+        a, b = int(np.floor(aside / _BIN)) + middle, int(np.floor(above / _BIN)) + middle
+        a, b = min(max(a, 1), _BINS), min(max(b, 1), _BINS)
+        lower = upper = 0
+        for s in range(2 * half):
+            there = False
+            for c in range(a - 1, a + 2):
+                for d in range(b - 1, b + 2):
+                    there |= pieces[c, d, s]
+            lower += there and s < half
+            upper += there and s >= half
+        beside += not slim[m] or (lower + upper < FILLED and max(lower, upper) < ONE_SIDED)
+    return beside
 
 
 @njit
-def _lines(place, cells, start, h, w, thin, line):
+def _lines(place, cells, start, h, w, thin, crowded, line):
     """Fill `line` (n, 3) with the direction (x, y; rise over run) of the line through each level; returns which have one."""
     good = np.zeros(len(thin), np.bool_)
     reach = int(HALF / CELL) + 1
@@ -110,11 +152,13 @@ def _lines(place, cells, start, h, w, thin, line):
     near = np.empty((4096, 3))
     slim = np.empty(4096, np.bool_)
     filled = np.zeros(2 * half, np.bool_)
+    pieces = np.zeros((_BINS + 2, _BINS + 2, 2 * half), np.bool_)
     for n in range(len(thin)):
         if not thin[n]:
             continue
         j, i = cells[n] // w, cells[n] % w
         count = 0
+        xx = xy = yy = 0.0
         for b in range(max(j - reach, 0), min(j + reach + 1, h)):
             for a in range(max(i - reach, 0), min(i + reach + 1, w)):
                 for m in range(start[b * w + a], start[b * w + a + 1]):
@@ -128,9 +172,13 @@ def _lines(place, cells, start, h, w, thin, line):
                     dz = place[m, 2] - place[n, 2]
                     if abs(dz) > STEEPEST * HALF + AROUND or dx * dx + dy * dy > HALF * HALF:
                         continue
+                    if crowded[n] and thin[m] and abs(dz) <= 2.0:
+                        xx, xy, yy = xx + dx * dx, xy + dx * dy, yy + dy * dy
                     near[count, 0], near[count, 1], near[count, 2] = dx, dy, dz
                     slim[count] = thin[m]
                     count += 1
+        if crowded[n] and xx * yy - xy * xy > ACROSS / (1.0 + ACROSS) ** 2 * (xx + yy) ** 2:
+            continue
         best, many = 0, 0
         for c in range(count):
             run = np.sqrt(near[c, 0] ** 2 + near[c, 1] ** 2)
@@ -157,14 +205,28 @@ def _lines(place, cells, start, h, w, thin, line):
                 upper += filled[half + s]
             if lower + upper < FILLED and max(lower, upper) < ONE_SIDED:
                 continue
-            if beside > MUCH * on:
-                continue
             score = 2 * (lower + upper)
-            if score > best or (score == best and on > many):
-                best, many = score, on
-                line[n, 0], line[n, 1], line[n, 2] = ux, uy, rise
-                good[n] = True
+            if score < best or (score == best and on <= many):
+                continue
+            if beside > MUCH * on and (
+                beside > MOST * on or _clutter(near, count, slim, ux, uy, rise, pieces) > MUCH * on
+            ):
+                continue
+            best, many = score, on
+            line[n, 0], line[n, 1], line[n, 2] = ux, uy, rise
+            good[n] = True
     return good
+
+
+@njit
+def _held(column, row, use, left, bottom, h, w):
+    """Cells of a raster (h * w) with a point."""
+    out = np.zeros(h * w, np.bool_)
+    for p in range(len(use)):
+        i, j = column[p] - left, row[p] - bottom
+        if use[p] and 0 <= i < w and 0 <= j < h:
+            out[j * w + i] = True
+    return out
 
 
 @njit
@@ -178,6 +240,20 @@ def _near_lines(cells, h, w, good):
             for b in range(j, j + 2 * _MARGIN + 1):
                 out[b * wide + i : b * wide + i + 2 * _MARGIN + 1] = True
     return out
+
+
+@njit
+def _inside(column, row, use, near, left, bottom, h, w):
+    """Numbers of the points in cells `near` lines, ascending, and these cells."""
+    wide, tall = w + 2 * _MARGIN, h + 2 * _MARGIN
+    points, cell = np.empty(len(use), np.int64), np.empty(len(use), np.int64)
+    n = 0
+    for p in range(len(use)):
+        i, j = column[p] - left, row[p] - bottom
+        if use[p] and 0 <= i < wide and 0 <= j < tall and near[j * wide + i]:
+            points[n], cell[n] = p, j * wide + i
+            n += 1
+    return points[:n].copy(), cell[:n].copy()
 
 
 @njit
@@ -324,9 +400,9 @@ def find_wires(
         h, w = int(r.max()) + 1 - bottom, int(c.max()) + 1 - left
         order = np.lexsort((z[at], c, r))
         place, thick, cells, level, start = _levels(x[at], y[at], z[at], c, r, left, bottom, h, w, order)
-        thin = _thin(place, thick, cells, start, h, w)
+        thin, crowded = _thin(place, thick, cells, start, h, w, below.held((left, bottom, h, w)))
         line = np.zeros((len(thin), 3))
-        good = _lines(place, cells, start, h, w, thin, line)
+        good = _lines(place, cells, start, h, w, thin, crowded, line)
         if not good.any():
             continue
         seen = below.seen_through(good, line, place, cells, (left, bottom, h, w), at, level)
@@ -347,15 +423,15 @@ class _Below:
     def _places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         return cell_numbers(self._xyz[:, 0], CELL), cell_numbers(self._xyz[:, 1], CELL)
 
+    def held(self, raster) -> NDArray[np.bool_]:
+        """Which cells of a raster (h * w) hold a point."""
+        return _held(*self._places, self._use, *raster)
+
     def seen_through(self, good, line, place, cells, raster, at, level) -> NDArray[np.bool_]:
         """Which levels are `good` and hide nothing; the points `at` of the high ones are of the levels `level`."""
         left, bottom, h, w = raster
-        column, row = self._places[0] - (left - _MARGIN), self._places[1] - (bottom - _MARGIN)
-        wide, tall = w + 2 * _MARGIN, h + 2 * _MARGIN
-        points = np.flatnonzero(self._use & (column >= 0) & (column < wide) & (row >= 0) & (row < tall))
-        cell = row[points] * wide + column[points]
-        near = _near_lines(cells, h, w, good)[cell]
-        points, cell = points[near], cell[near]
+        near = _near_lines(cells, h, w, good)
+        points, cell = _inside(*self._places, self._use, near, left - _MARGIN, bottom - _MARGIN, h, w)
         on = np.zeros(len(self._use), bool)
         on[self._high[at]] = good[level]
         x, y, z = (np.ascontiguousarray(axis) for axis in self._xyz[points].T)
