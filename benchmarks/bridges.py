@@ -3,7 +3,8 @@
 python benchmarks/bridges.py --data FOLDER
 
 Decks of scenes (tests/bridge_scenes.py, tests/long_bridge_scenes.py; 16 points/m2), of the
-generated town and of the labeled clouds; wires of the town, of generated corridors (tests/corridor_scenes.py) and of those clouds. Cars, lamps and what was never labeled count
+generated town and of the labeled clouds; wires of the town, of generated corridors
+(tests/corridor_scenes.py) and of those clouds. Cars, lamps and what was never labeled count
 neither way. `false` is the share of all points that are wrongly taken; seconds are of one process.
 """
 

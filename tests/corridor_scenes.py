@@ -1,11 +1,11 @@
-"""Corridors of power lines with true classes: spans between towers or poles over land, trees and houses, and what is like them.
+"""Corridors of power lines with true classes: spans between towers or poles over land, trees and houses.
 
-Points lie at random as dense as asked for; wires catch what hits a footprint's width. Leaves, masts without wires, spires and
-cranes stand about.
+Points lie at random, as dense as asked for; wires catch what hits a footprint's width.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,7 +69,8 @@ def _frame(rng, foot, turn, tall, wires, density):
     """Two poles and a beam."""
     reach = max(abs(t) for t, _ in wires) * 0.7
     stems = [
-        _pole(rng, (0, 0, 0), 0, tall, ((0.0, 0.0),), density * 1.3) + (0, t, 0) for t in (-reach, reach)
+        _pole(rng, (0, 0, 0), 0, tall, ((0.0, 0.0),), density * 1.3) + np.array([0.0, t, 0.0])
+        for t in (-reach, reach)
     ]
     m = int(3 * reach * density * 0.5)
     beam = np.column_stack(
@@ -134,7 +135,7 @@ def corridor(
 
     for line in lines:
         feet = [(a, line.across, float(land(a, line.across))) for a in line.stations]
-        for (a, b, foot), (c, d, other) in zip(feet, feet[1:], strict=False):
+        for (a, b, foot), (c, d, other) in itertools.pairwise(feet):
             span = c - a
             for aside, up in line.wires:
                 m = int(span * density * rng.uniform(0.35, 0.6))
@@ -170,7 +171,7 @@ def corridor(
     xyz[:, 2] += rng.normal(0, 0.03, len(xyz))
     c, r = np.cos(turn), np.sin(turn)
     xyz = np.column_stack([xyz[:, 0] * c - xyz[:, 1] * r, xyz[:, 0] * r + xyz[:, 1] * c, xyz[:, 2] + 100.0])
-    return np.round(xyz + (85_000.0 + offset, 447_000.0, 0.0), 3), code.astype(np.uint8)
+    return np.round(xyz + np.array([85_000.0 + offset, 447_000.0, 0.0]), 3), code.astype(np.uint8)
 
 
 def _every(step, length=700.0, start=0.0):
@@ -178,24 +179,44 @@ def _every(step, length=700.0, start=0.0):
 
 
 CORRIDORS = {
-    "high voltage": lambda d=8.0, seed=0: corridor([Line(0.0, _every(280.0, 840.0), HIGH, 1.1e-4, "lattice", 42.0)], d, seed),
+    "high voltage": lambda d=8.0, seed=0: corridor(
+        [Line(0.0, _every(280.0, 840.0), HIGH, 1.1e-4, "lattice", 42.0)], d, seed
+    ),
     "high voltage, uphill": lambda d=8.0, seed=1: corridor(
         [Line(5.0, _every(240.0, 720.0, 30.0), DOUBLE, 1.2e-4, "lattice", 25.0)], d, seed, slope=0.2, turn=1.1
     ),
     "medium voltage in woods": lambda d=8.0, seed=2: corridor(
-        [Line(0.0, _every(80.0), MEDIUM, 2.0e-4, "pole", 10.8)], d, seed, trees=400, tall=(8, 22), clear=4.0, turn=0.8
+        [Line(0.0, _every(80.0), MEDIUM, 2.0e-4, "pole", 10.8)],
+        d,
+        seed,
+        trees=400,
+        tall=(8, 22),
+        clear=4.0,
+        turn=0.8,
     ),
     "low voltage along a street": lambda d=8.0, seed=3: corridor(
-        [Line(-20.0, _every(40.0), LOW, 4.0e-4, "pole", 8.2)], d, seed, trees=120, tall=(4, 10), clear=1.5, houses=25, turn=2.0
+        [Line(-20.0, _every(40.0), LOW, 4.0e-4, "pole", 8.2)],
+        d,
+        seed,
+        trees=120,
+        tall=(4, 10),
+        clear=1.5,
+        houses=25,
+        turn=2.0,
     ),
     "frames": lambda d=8.0, seed=4: corridor(
-        [Line(10.0, _every(150.0), ((-4.0, 13.0), (0.0, 13.0), (4.0, 13.0)), 1.5e-4, "frame", 13.8)], d, seed, turn=0.0
+        [Line(10.0, _every(150.0), ((-4.0, 13.0), (0.0, 13.0), (4.0, 13.0)), 1.5e-4, "frame", 13.8)],
+        d,
+        seed,
+        turn=0.0,
     ),
     "two lines beside each other": lambda d=8.0, seed=5: corridor(
         [
             Line(-25.0, _every(260.0, 780.0, 60.0), HIGH, 1.1e-4, "lattice", 42.0),
             Line(25.0, _every(200.0, 800.0, 20.0), DOUBLE, 1.2e-4, "lattice", 25.0),
         ],
-        d, seed, turn=1.6,
+        d,
+        seed,
+        turn=1.6,
     ),
-}  # fmt: skip
+}

@@ -8,10 +8,9 @@ import json
 import laspy
 import numpy as np
 import pytest
+from corridor_scenes import CORRIDORS
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from corridor_scenes import CORRIDORS
 
 import pdal_stages as ps
 import pdal_stages.synthetic
