@@ -106,7 +106,7 @@ def _seen_through(place, cells, h, w, good, line, x, y, z, cell, column, row, on
     return out
 
 
-class Below:
+class SeenBelow:
     """All points, of which those below and beside lines are asked for."""
 
     def __init__(self, xyz: NDArray[np.float64], use: NDArray[np.bool_], high: NDArray[np.int64]) -> None:

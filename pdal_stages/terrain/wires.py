@@ -16,7 +16,7 @@ from ..base.jit import device, njit
 from ..base.unionfind import root as root_of
 from .minima import cell_numbers
 from .patches import patches
-from .seenbelow import CELL, HALF, Below
+from .seenbelow import CELL, HALF, SeenBelow
 
 #: How far apart in height the levels of a cell are at least, meters.
 GAP = 1.0
@@ -298,7 +298,7 @@ def find_wires(
         return out
     x, y, z = (np.ascontiguousarray(axis) for axis in xyz[high].T)
     column, row = cell_numbers(x, CELL), cell_numbers(y, CELL)
-    below = Below(xyz, use, high)
+    below = SeenBelow(xyz, use, high)
     for points, own in patches(column, row, int(REACH), int(LONG)):
         at = np.arange(len(high))[points]
         c, r = column[at], row[at]
