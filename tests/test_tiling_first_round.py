@@ -11,9 +11,10 @@ import pdal_stages as ps
 from pdal_stages.stages.hag_morphological import HagMorphological
 from pdal_stages.terrain import filtered_ground
 from pdal_stages.terrain.decks import level_points
-from pdal_stages.terrain.groundcells import BLOCK_SIDE, FilterOptions, GroundCells, cells_of_block
+from pdal_stages.terrain.groundblocks import by_block, cells_of_block, reach_of_block
+from pdal_stages.terrain.groundcells import BLOCK_SIDE, FilterOptions, GroundCells
 from pdal_stages.terrain.lowpoints import lowest_of_cells
-from pdal_stages.terrain.morphological import reach, reach_of_cells, reach_of_points
+from pdal_stages.terrain.morphological import reach_of_cells
 from pdal_stages.tiling import run_tiled
 
 HEIGHTS = {"type": "filters.hag_morphological", "window": 8, "ground": True, "openings": [5, 9]}
@@ -38,28 +39,9 @@ def test_the_lowest_points_of_cells(cell):
     assert lowest_of_cells(x, y, z, np.zeros(3000, bool), cell).size == 0
 
 
-@pytest.mark.parametrize("origin", [(0.0, 0.0), (770_500.0, 6_277_550.0)])
-def test_lowest_points_are_enough_beyond_the_reach_of_points(origin):
-    x, y, z, _ = town(4, side=500, density=0.8, origin=origin)
-    options = {"window": 8.0, "openings": (5, 9), "slope_too": True}
-    whole = filtered_ground(x, y, z, **options)
-    u, v = x - origin[0], y - origin[1]
-    away = np.maximum(np.maximum(220 - u, u - 260), np.maximum(230 - v, v - 280))
-    near = away <= reach_of_points(1.0)
-    lowest = lowest_of_cells(x, y, z, np.ones(len(x), bool), 1.0)
-    far = lowest[~near[lowest]]
-    assert len(far) < 0.7 * np.count_nonzero(~near)
-    points = np.concatenate([np.flatnonzero(near), far])
-    some = filtered_ground(x[points], y[points], z[points], **options)
-    core = away[points] < 0
-    for name, values in some.items():
-        assert np.array_equal(values[core], whole[name][points][core]), name
-    assert reach_of_points(1.0) < 0.3 * reach()
-
-
 def test_a_stage_is_given_what_it_left(write_las):
     stage = HagMorphological({"openings": "5"})
-    assert stage.near_halo_m() < stage.halo_m() and stage.from_blocks is None
+    assert stage.near_halo_m() == 0.0 < stage.halo_m() and stage.from_blocks is None
 
 
 @pytest.fixture(scope="module")
@@ -98,8 +80,7 @@ def test_tiles_are_the_same_bits_and_read_few_points(tmp_path, survey, before):
         assert np.array_equal(of_files(tmp_path / "out", name), whole[name]), name
     read = sum(job.record["read"] for job in run.tiles)
     own = sum(job.record["points"] for job in run.tiles)
-    near = reach_of_points(1.0)  # what noise marked is kept
-    assert read < own * (1 + 2 * near / TILE) ** 2
+    assert read <= 1.01 * own  # what noise marked is kept
     steps = run.summary["cpu_seconds_by_step"]
     assert set(steps) == {"index", "first_rounds", "tiles", "outputs"} and min(steps.values()) > 0
     assert run.summary["cpu_seconds"] == pytest.approx(sum(steps.values()))
@@ -207,7 +188,7 @@ def test_what_is_left_of_an_input_that_is_gone_is_removed(tmp_path, survey, monk
     left = folder / ".pdal-stages" / "tiles"
     names = {path.name for path in left.glob("*.first.npz")}
     np.savez(
-        left / "-200_0.first.npz", left=np.array([[-1.0, 100.0, -500.0]])
+        left / "-200_0.first.npz", around=np.array([[-1.0, 100.0, -500.0]])
     )  # of a tile without points now
     assert in_tiles(survey, [HEIGHTS], folder, resume=True, retries=0).failures
     assert {path.name for path in left.glob("*.first.npz")} == names
@@ -258,13 +239,15 @@ def blocks_of(points, options, near):
     """The cells of all blocks that points need, each made of the lowest points that it may look at."""
     cell = options.cell
     low = points[:, lowest_of_cells(*points, np.ones(points.shape[1], bool), cell)]
-    side, around = BLOCK_SIDE * cell, (options.reach + 1) * cell
+    side, around = BLOCK_SIDE * cell, (reach_of_block(options) + 1) * cell
+    inside = by_block(*points, np.ones(points.shape[1], bool), cell)
     found = []
     for i in range(int(near[0] // side), int(near[2] // side) + 1):
         for j in range(int(near[1] // side), int(near[3] // side) + 1):
             box = i * side - around, j * side - around, (i + 1) * side + around, (j + 1) * side + around
             seen = (low[0] >= box[0]) & (low[0] <= box[2]) & (low[1] >= box[1]) & (low[1] <= box[3])
-            found.append(cells_of_block(*low[:, seen], (i, j), options))
+            mine = inside.get((i, j), np.empty((0, 3)))
+            found.append(cells_of_block(*low[:, seen], (i, j), options, [mine[::2], mine[1::2]]))
     return GroundCells.joined(found, len(options.openings))
 
 
@@ -293,8 +276,8 @@ def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, 
     u, v = x - origin[0], y - origin[1]
     for box in ((430, 410, 520, 560), (-10, 830, 60, 910), *([(4000, -3000, 4050, -2950)] if strays else [])):
         away = np.maximum(np.maximum(box[0] - u, u - box[2]), np.maximum(box[1] - v, v - box[3]))
-        near = away <= reach_of_points(cell)
-        wide = reach_of_points(cell) + reach_of_cells(cell)
+        near = away <= 3.0
+        wide = 3.0 + reach_of_cells(cell)
         around = [box[0] - wide, box[1] - wide, box[2] + wide, box[3] + wide]
         around = [side + origin[n % 2] for n, side in enumerate(around)]
         cells = blocks_of(np.array([x, y, z]), made, around).within(*(int(side // cell) for side in around))
@@ -303,6 +286,24 @@ def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, 
         assert core.any()
         for name, values in some.items():
             assert np.array_equal(values[core], whole[name][near][core]), (box, name)
+
+
+@pytest.mark.parametrize("cell", [1.0, 0.7])
+def test_points_by_block_are_by_the_cells_of_blocks(cell):
+    rng = np.random.default_rng(3)
+    xyz = np.round(rng.uniform(-3000, 3000, (500, 3)), 1)
+    xyz[0] = 1e7, -1e7, 5.0
+    xyz[1, 2] = -1e7  # no terrain
+    use = np.arange(500) != 7
+    found = by_block(*xyz.T, use, cell)
+    assert sum(map(len, found.values())) == 498
+    for block, points in found.items():
+        cells = np.floor(points[:, :2] / cell)
+        assert (cells // BLOCK_SIDE == block).all()
+    assert set(by_block(*xyz[:1].T, use[:1], cell)) == {
+        tuple((np.floor(xyz[0, :2] / cell) // BLOCK_SIDE).astype(int))
+    }
+    assert by_block(*np.empty((3, 0)), use[:0], cell) == {}
 
 
 def test_a_block_without_points_has_no_cells():
@@ -323,7 +324,12 @@ def test_decks_of_blocks_are_those_of_the_whole(name):
     assert np.count_nonzero(whole["Deck"]) > 500
     left = np.union1d(lowest_of_cells(x, y, z, use, 1.0), level_points(x, y, z, use))
     made = FilterOptions(openings=(5,), decks=True)
-    parts = [cells_of_block(x[left], y[left], z[left], (i, j), made) for i in (0, 1) for j in (1, 2)]
+    inside = by_block(x, y, z, use, 1.0)
+    parts = [
+        cells_of_block(x[left], y[left], z[left], (i, j), made, [inside[i, j]])
+        for i in (0, 1)
+        for j in (1, 2)
+    ]
     assert all(len(part.decks) for part in parts)
     some = filtered_ground(x, y, z, mask=use, cells=GroundCells.joined(parts, 1), **options)
     for key, values in some.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -46,6 +46,14 @@ class Blocks(NamedTuple):
     reach: float  #: how far around a block points matter
     around: float  #: how far beyond the points that are read a tile needs blocks
     spill: float  #: how far beyond all points blocks hold something
+
+
+class Left(NamedTuple):
+    """What a stage needs of points, in the rounds before the tiles; coordinates in meters."""
+
+    around: NDArray[np.float64]  #: (n, 3) of points that blocks need that are far away
+    #: (m, 3) what blocks need of points inside them alone, by block (column, row)
+    inside: dict[tuple[int, int], NDArray[np.float64]]
 
 
 class Stage(ABC):
@@ -177,12 +185,17 @@ class Stage(ABC):
         """How far the rounds before the tiles reach, for a stage with a :meth:`near_halo_m`."""
         raise NotImplementedError
 
-    def left_of(self, points: Points) -> NDArray[np.float64]:
-        """First, what blocks need of points: coordinates (n, 3), meters."""
+    def left_of(self, points: Points) -> Left:
+        """First, what blocks need of points."""
         raise NotImplementedError
 
-    def block_of(self, left: NDArray[np.float64], block: tuple[int, int]) -> dict[str, NDArray]:
-        """Then, of a block (column, row) of a grid anchored at zero, what tiles need; from what is left around it (n, 3)."""
+    def block_of(
+        self, around: NDArray[np.float64], inside: Iterable[NDArray[np.float64]], block: tuple[int, int]
+    ) -> dict[str, NDArray]:
+        """Then, of a block (column, row) of a grid anchored at zero, what tiles need.
+
+        From what was left of points around it (n, 3) and, in parts, of those inside (m, 3).
+        """
         raise NotImplementedError
 
     def made_of_blocks(self, blocks: Sequence[Mapping[str, NDArray]], box: Sequence[float]) -> Any:

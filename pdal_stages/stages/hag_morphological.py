@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from ..base.errors import OptionError
 from ..terrain.decks import level_points
-from ..terrain.groundcells import BLOCK_SIDE, FilterOptions, GroundCells, cells_of_block
+from ..terrain.groundblocks import by_block, cells_of_block, reach_of_block
+from ..terrain.groundcells import BLOCK_SIDE, FilterOptions, GroundCells
 from ..terrain.lowpoints import lowest_of_cells
-from ..terrain.morphological import check_sizes, filtered_ground, reach, reach_of_cells, reach_of_points
+from ..terrain.morphological import check_sizes, filtered_ground, reach, reach_of_cells
 from ..terrain.profile import opening_names
 from . import carried
-from .base import HEIGHTS_OUTSIDE, Blocks, Stage
+from .base import HEIGHTS_OUTSIDE, Blocks, Left, Stage
 from .options import ignore_option, option
 from .points import Points
 from .selection import Selection
@@ -143,11 +144,12 @@ of Z.
         return reach(cell=self.cell, window=self.window, openings=self.windows, decks=self.decks)
 
     def near_halo_m(self) -> float:
-        return reach_of_points(self.cell)
+        return 0.0  # all that a point's height depends on is in cells
 
     def blocks(self) -> Blocks:
         cell = self.cell
-        return Blocks(BLOCK_SIDE * cell, (self._filter.reach + 2) * cell, reach_of_cells(cell), 2 * cell)
+        reach = (reach_of_block(self._filter) + 2) * cell
+        return Blocks(BLOCK_SIDE * cell, reach, reach_of_cells(cell), 2 * cell)
 
     @cached_property
     def _filter(self) -> FilterOptions:
@@ -161,17 +163,19 @@ of Z.
             self.decks,
         )
 
-    def left_of(self, points: Points) -> NDArray[np.float64]:
+    def left_of(self, points: Points) -> Left:
         x, y, z = points.axes
         usable = points.usable(self.ignore)
         left = lowest_of_cells(x, y, z, usable, self.cell)
         if self.decks:
             left = np.union1d(left, level_points(x, y, z, usable))
-        return np.column_stack([x[left], y[left], z[left]])
+        return Left(np.column_stack([x[left], y[left], z[left]]), by_block(x, y, z, usable, self.cell))
 
-    def block_of(self, left: NDArray[np.float64], block: tuple[int, int]) -> dict[str, NDArray]:
-        x, y, z = left.T
-        return cells_of_block(x, y, z, block, self._filter).arrays()
+    def block_of(
+        self, around: NDArray[np.float64], inside: Iterable[NDArray[np.float64]], block: tuple[int, int]
+    ) -> dict[str, NDArray]:
+        x, y, z = around.T
+        return cells_of_block(x, y, z, block, self._filter, inside).arrays()
 
     def made_of_blocks(self, blocks: Sequence[Mapping[str, NDArray]], box: Sequence[float]) -> GroundCells:
         sides = [math.floor(side / self.cell) for side in box]

@@ -248,8 +248,15 @@ def between_drops(way, last, most):
 def filled(z, start, h, w, kind, deck):
     """The same, and what is walked on and has more of it than of other ground around."""
     out = deck.copy()
+    near = np.zeros((h, w), np.bool_)  # cells with some of it around: few
     for j in range(h):
         for i in range(w):
+            if deck[start[j * w + i] : start[j * w + i + 1]].any():
+                near[max(j - 2, 0) : j + 3, max(i - 2, 0) : i + 3] = True
+    for j in range(h):
+        for i in range(w):
+            if not near[j, i]:
+                continue
             for n in range(start[j * w + i], start[j * w + i + 1]):
                 if kind[n] != SOLID or deck[n]:
                     continue

@@ -8,19 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import njit
-from .decks import BESIDE, CELL, decks_of_levels, levels_near_decks
+from .decks import BESIDE, CELL
 from .decks import REACH as DECKS_REACH
-from .lowest import COMPANY, SURROUNDINGS, cell_values, lowest_points, pits
-from .minima import cell_numbers
+from .lowest import COMPANY, SURROUNDINGS, heights_of, lowest_points, pits, places_of
 from .openings import HOLE
-from .patches import SIDE, connected
+from .patches import SIDE
 from .planes import reach as planes_reach
 from .planes import surface
 from .plateaus import reach as plateau_reach
@@ -67,6 +66,16 @@ class FilterOptions:
         """How often cells are put together until they are blocks of so many meters."""
         return max(1, round(math.log2(block / self.cell)))
 
+    def is_ground(
+        self,
+        use: NDArray[np.bool_],
+        deck: NDArray[np.uint8],
+        height: NDArray[np.float64],
+        gradient: NDArray[np.float64],
+    ) -> NDArray[np.bool_]:
+        """Which of the points to `use` are ground, by their heights above the surface and its slope there; NaN is not."""
+        return use & (deck == 0) & (np.abs(height) <= self.threshold + self.scalar * gradient)
+
     @property
     def reach(self) -> int:
         """How far away, in cells, lowest points can change which cells are ground, and how high.
@@ -89,6 +98,29 @@ class FilterOptions:
         return max(COMPANY, self.largest_radius, planes_reach(self.levels(FAR))) + 2
 
 
+#: Which cells (h, w) hold ground points, and where these are on average (h, w, 3), as :attr:`GroundRaster.place`.
+CellMeans = tuple[NDArray[np.bool_], NDArray[np.float64]]
+
+
+class Window(NamedTuple):
+    """Cells from a column and row on."""
+
+    left: int
+    bottom: int
+    width: int
+    height: int
+
+    def grown(self, by: int) -> Window:
+        """So many cells more on every side."""
+        return Window(self.left - by, self.bottom - by, self.width + 2 * by, self.height + 2 * by)
+
+    def on(self, left: int, bottom: int, h: int, w: int) -> tuple[slice, slice]:
+        """Rows and columns of what of it lies on a raster."""
+        i, j = self.left - left, self.bottom - bottom
+        (j0, j1), (i0, i1) = np.clip((j, j + self.height), 0, h), np.clip((i, i + self.width), 0, w)
+        return slice(int(j0), int(j1)), slice(int(i0), int(i1))
+
+
 class GroundRaster(NamedTuple):
     """A minimum grid and what was found on it."""
 
@@ -107,6 +139,19 @@ class GroundRaster(NamedTuple):
         """Rows and columns."""
         return self.ground.shape
 
+    def cut(self, window: Window) -> GroundRaster:
+        """A copy of what lies in a window."""
+        part = window.on(self.left, self.bottom, *self.shape)
+        return GroundRaster(
+            self.left + part[1].start,
+            self.bottom + part[0].start,
+            self.lowest[part].copy(),
+            self.place[part].copy(),
+            self.ground[part].copy(),
+            self.floor[part].copy(),
+            {radius: values[part].copy() for radius, values in self.opened.items()},
+        )
+
 
 def ground_raster(
     x: NDArray[np.float64],
@@ -118,29 +163,45 @@ def ground_raster(
     row: NDArray[np.int64],
     options: FilterOptions,
     margin: int = 1,
+    wanted: Window | None = None,
 ) -> tuple[GroundRaster, NDArray[np.int64]]:
     """What the raster round points tells of the ground, and the numbers of points (n,) that are pits.
 
     Points have coordinates in meters, and columns and rows of their cells; those of `use` may be ground, but not those of a
-    `deck`. On every side are `margin` empty cells, one at least: points blend the four cells round them.
+    `deck`. On every side are `margin` empty cells, one at least: points blend the four cells round them. Where only some
+    cells are `wanted`, the raster holds these and as many around as steps still look at, when that is known.
     """
     left, bottom = int(column.min()) - margin, int(row.min()) - margin
     shape = int(row.max()) + margin + 1 - bottom, int(column.max()) + margin + 1 - left
     lowest = np.empty(shape, np.int64)
     lowest_points(z, x, y, use, column, row, left, bottom, lowest)
     cell = options.cell
-    place, raster = cell_values(x, y, z, cell, lowest)
+    raster = heights_of(z, lowest)
     bad = pits(raster, cell)
     pit_points = lowest[bad]
     raster[bad] = HOLE
+    objects, floor, opened = objects_of(raster, cell, options.slope, options.radius, options.opening_radii)
+    step = planes_reach(options.levels(NEAR))
+    plateaus = plateau_reach(cell)
+
+    def grown(by: int) -> tuple[slice, slice]:
+        """The wanted cells and so many around, as far as there are any."""
+        return (slice(None), slice(None)) if wanted is None else wanted.grown(by).on(left, bottom, *shape)
+
+    part = grown(plateaus + ROUNDS * step)
+    lowest, raster, objects, floor = (np.ascontiguousarray(a[part]) for a in (lowest, raster, objects, floor))
+    opened = {radius: np.ascontiguousarray(values[part]) for radius, values in opened.items()}
+    left, bottom, shape = left + (part[1].start or 0), bottom + (part[0].start or 0), raster.shape
+    place = places_of(x, y, z, cell, lowest)
     on_deck = (deck != 0)[lowest] & (lowest >= 0)
     del lowest, bad
-    objects, floor, opened = objects_of(raster, cell, options.slope, options.radius, options.opening_radii)
     ground = np.isfinite(raster) & ~objects
-    levels, measured = options.levels(NEAR), np.isfinite(raster)
-    for _ in range(ROUNDS):
+    levels = options.levels(NEAR)
+    for number in range(1, ROUNDS + 1):
+        measured, seen = np.zeros(shape, bool), grown(plateaus + (ROUNDS - number) * step)
+        measured[seen] = np.isfinite(raster[seen])
         planes = surface(ground, place, floor, raster, left, bottom, levels, measured)
-        _regain(ground, raster, place, planes, cell, options.threshold, options.scalar)
+        _regain(ground, measured, place, planes, cell, options.threshold, options.scalar)
     remove_plateaus(ground, floor, raster, cell)
     # The terrain runs below: no level of a deck stands for it either.
     ground &= ~on_deck
@@ -149,11 +210,11 @@ def ground_raster(
 
 
 @njit
-def _regain(ground, raster, place, planes, cell, threshold, scalar):
+def _regain(ground, measured, place, planes, cell, threshold, scalar):
     """Make ground what lies near the surface of the ground found so far."""
     for j in range(ground.shape[0]):
         for i in range(ground.shape[1]):
-            if not ground[j, i] and raster[j, i] != HOLE:
+            if not ground[j, i] and measured[j, i]:
                 height, across, along = planes[j, i, 0], planes[j, i, 1], planes[j, i, 2]
                 x, y, z = place[j, i, 0], place[j, i, 1], place[j, i, 2]
                 gradient = np.sqrt(across * across + along * along) / cell
@@ -163,7 +224,7 @@ def _regain(ground, raster, place, planes, cell, threshold, scalar):
 
 @dataclass(frozen=True)
 class GroundCells:
-    """Cells of :class:`GroundRaster`, one by one: all with a height, or an opening."""
+    """Cells of :class:`GroundRaster`, one by one: all with a height, an opening, or ground points."""
 
     column: NDArray[np.int64]  #: (n,)
     row: NDArray[np.int64]  #: (n,)
@@ -172,6 +233,10 @@ class GroundCells:
     ground: NDArray[np.bool_]  #: (n,)
     place: NDArray[np.float64]  #: (number of ground cells, 3), in their order
     opened: NDArray[np.float32]  #: (number of openings, n)
+    held: NDArray[np.bool_]  #: (n,) whether it holds ground points
+    means: NDArray[
+        np.float64
+    ]  #: (number of such cells, 3), in their order: as `place`, of the mean of its ground points
     #: (number of levels near bridge decks, 5): see :func:`.decks.levels_near_decks`
     decks: NDArray[np.float64]
 
@@ -197,13 +262,15 @@ class GroundCells:
             self.ground[chosen],
             places,
             self.opened[:, chosen],
+            self.held[chosen],
+            self.means[chosen[self.held]],
             self.decks,
         )
 
     @staticmethod
     def joined(parts: Iterable[GroundCells], openings: int) -> GroundCells:
         """The cells of parts that share none; with so many openings."""
-        given = [_no_cells(openings), *parts]
+        given = [no_cells(openings), *parts]
         names = list(vars(given[0]))
         axes = {name: 1 if name == "opened" else 0 for name in names}
         return GroundCells(**{n: np.concatenate([getattr(g, n) for g in given], axis=axes[n]) for n in names})
@@ -222,69 +289,16 @@ class GroundCells:
             opened[radius][j, i] = values
         return GroundRaster(left, bottom, lowest, place, ground, floor, opened)
 
-
-def _no_cells(openings: int) -> GroundCells:
-    n, f = np.empty(0, np.int64), np.empty(0, np.float32)
-    return GroundCells(
-        n, n, f, f, np.empty(0, bool), np.empty((0, 3)), np.empty((openings, 0), np.float32), np.empty((0, 5))
-    )
-
-
-def cells_of_block(
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    z: NDArray[np.float64],
-    block: tuple[int, int],
-    options: FilterOptions,
-) -> GroundCells:
-    """The cells of a block, column and row of a grid of blocks of :data:`BLOCK_SIDE` cells.
-
-    The points are the lowest of cells, in meters: all within `options.reach` cells of the block, and as many more as you
-    like.
-    """
-    column, row = cell_numbers(x, options.cell), cell_numbers(y, options.cell)
-    west, south = (BLOCK_SIDE * number for number in block)
-    east, north = west + BLOCK_SIDE - 1, south + BLOCK_SIDE - 1
-    margin = max([*options.opening_radii, 0]) + 2
-    around = options.reach
-    near = (column >= west - around) & (column <= east + around)
-    near &= (row >= south - around) & (row <= north + around)
-    x, y, z, column, row = x[near], y[near], z[near], column[near], row[near]
-    levels, deck = np.empty((0, 5)), np.zeros(len(x), np.uint8)
-    if options.decks:
-        far = options.reach_of_decks + margin
-        seen = (column >= west - far) & (column <= east + far) & (row >= south - far) & (row <= north + far)
-        levels, lowest = levels_near_decks(x[seen], y[seen], z[seen], np.ones(np.count_nonzero(seen), bool))
-        deck[seen] = decks_of_levels(x[seen], y[seen], z[seen], np.ones(np.count_nonzero(seen), bool), levels)
-        columns, rows = column[seen][lowest], row[seen][lowest]
-        levels = levels[(columns >= west) & (columns <= east) & (rows >= south) & (rows <= north)]
-    # Openings reach into cells without points.
-    mine = (column >= west - margin) & (column <= east + margin)
-    mine &= (row >= south - margin) & (row <= north + margin)
-    found = []
-    for part, _own in connected(column, row, mine, options.link):
-        use = np.ones(len(part), bool)
-        raster, _ = ground_raster(
-            x[part], y[part], z[part], use, deck[part], column[part], row[part], options, margin
-        )
-        found.append(_cells_of(raster, options).within(west, south, east, north))
-    return replace(GroundCells.joined(found, len(options.openings)), decks=levels)
+    def means_on(self, left: int, bottom: int, shape: tuple[int, int]) -> CellMeans:
+        """What the cells' ground points say, on a raster that holds all cells."""
+        j, i = self.row[self.held] - bottom, self.column[self.held] - left
+        held, means = np.zeros(shape, bool), np.zeros((*shape, 3))
+        held[j, i] = True
+        means[j, i] = self.means
+        return held, means
 
 
-def _cells_of(raster: GroundRaster, options: FilterOptions) -> GroundCells:
-    opened = [raster.opened[radius] for radius in options.opening_radii]
-    there = np.isfinite(raster.lowest)
-    for values in opened:
-        there |= np.isfinite(values)
-    j, i = np.nonzero(there)
-    ground = raster.ground[there]
-    return GroundCells(
-        i + raster.left,
-        j + raster.bottom,
-        raster.lowest[there],
-        raster.floor[there],
-        ground,
-        raster.place[there][ground],
-        np.array([values[there] for values in opened], np.float32).reshape(len(opened), len(j)),
-        np.empty((0, 5)),
-    )
+def no_cells(openings: int) -> GroundCells:
+    number, height, no = np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, bool)
+    place, opened = np.empty((0, 3)), np.empty((openings, 0), np.float32)
+    return GroundCells(number, number, height, height, no, place, opened, no, place, np.empty((0, 5)))

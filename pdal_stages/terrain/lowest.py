@@ -50,11 +50,21 @@ def lowest_points(z, x, y, use, column, row, left, bottom, grid):
 
 
 @njit
-def cell_values(x, y, z, cell, grid):
+def heights_of(z, grid):
+    """Height of each cell's lowest point."""
+    raster = np.full(grid.shape, HOLE, np.float32)
+    for j in range(grid.shape[0]):
+        for i in range(grid.shape[1]):
+            if grid[j, i] >= 0:
+                raster[j, i] = z[grid[j, i]]
+    return raster
+
+
+@njit
+def places_of(x, y, z, cell, grid):
     """Place in the cell (from its center, in cells) and height of each cell's lowest point."""
     h, w = grid.shape
     place = np.zeros((h, w, 3))
-    raster = np.full((h, w), HOLE, np.float32)
     for j in range(h):
         for i in range(w):
             p = grid[j, i]
@@ -63,8 +73,7 @@ def cell_values(x, y, z, cell, grid):
                 place[j, i, 0] = u - np.floor(u) - 0.5
                 place[j, i, 1] = v - np.floor(v) - 0.5
                 place[j, i, 2] = z[p]
-                raster[j, i] = z[p]
-    return place, raster
+    return place
 
 
 @njit

@@ -25,24 +25,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..base.errors import OptionError, StageError
-from ..base.jit import njit
 from ..base.threads import map_blocks
 from .columns import columns
 from .decks import decks_of_levels, find_decks
-from .groundcells import FAR, NEAR, FilterOptions, GroundCells, GroundRaster, ground_raster
+from .groundcells import FAR, NEAR, CellMeans, FilterOptions, GroundCells, GroundRaster, ground_raster
+from .groundmeans import add_ground, around, heights_above, means_of
 from .lowpoints import HIGHEST
 from .minima import cell_numbers
 from .patches import patches
-from .planes import blend, surface
 from .planes import reach as planes_reach
+from .planes import surface
 from .profile import above_opening, opening_names
 
 #: The most cells a window's radius may have.
 _MOST_CELLS = 300
 #: Points handed to a thread at a time.
 _SPAN = 1 << 17
-#: Sums of coordinates are whole numbers of this part of a meter, so that order does not matter.
-_PARTS = 2.0**20
 
 
 def filtered_ground(
@@ -92,7 +90,7 @@ def filtered_ground(
         ``without_terrain`` (points with no usable point near; their height is 0), ``unused_points``.
     cells : GroundCells, optional
         Cells whose ground was found before (:func:`.groundcells.cells_of_block`), all within :func:`reach_of_cells` of the
-        points. The points then are those within :func:`reach_of_points` of the ones whose results are used.
+        points, which then need no others around them.
 
     Returns
     -------
@@ -136,10 +134,10 @@ def filtered_ground(
             if cells is None
             else _given(cells, column, row, options)
         )
-        for points, own, raster in pieces:
+        for points, own, raster, means in pieces:
             found = _measured(
                 x[points], y[points], z[points], use[points], deck[points], column[points], row[points], own,
-                raster, options, slope_too=slope_too, threads=threads, counts=counts,
+                raster, means, options, slope_too=slope_too, threads=threads, counts=counts,
             )  # fmt: skip
             for name, values in found.items():
                 out[name][points if isinstance(points, slice) else points[own]] = values[own]
@@ -158,7 +156,7 @@ def filtered_ground(
 
 def _found(
     x, y, z, use, deck, column, row, options: FilterOptions, counts: dict[str, int]
-) -> Iterator[tuple[Any, Any, GroundRaster]]:
+) -> Iterator[tuple[Any, Any, GroundRaster, CellMeans | None]]:
     """Pieces of the points, which of each are its own, and the ground found there."""
     around = options.reach + sum(planes_reach(options.levels(block)) for block in (NEAR, FAR))
     for points, own in patches(column, row, around, options.link):
@@ -166,12 +164,12 @@ def _found(
             x[points], y[points], z[points], use[points], deck[points], column[points], row[points], options
         )
         counts["pits"] += len(pits) if isinstance(own, slice) else int(np.count_nonzero(own[pits]))
-        yield points, own, raster
+        yield points, own, raster, None
 
 
 def _given(
     cells: GroundCells, column, row, options: FilterOptions
-) -> Iterator[tuple[Any, Any, GroundRaster]]:
+) -> Iterator[tuple[Any, Any, GroundRaster, CellMeans | None]]:
     """The same with the ground that was found before, as cells."""
     number = len(column)
     columns = np.concatenate([column, cells.column])
@@ -186,8 +184,14 @@ def _given(
             continue
         left, bottom = int(columns[members].min()) - 1, int(rows[members].min()) - 1
         shape = int(rows[members].max()) + 2 - bottom, int(columns[members].max()) + 2 - left
-        raster = cells[members[~mine] - number].raster(left, bottom, shape, options.opening_radii)
-        yield points, own if isinstance(own, slice) else own[mine], raster
+        chosen = cells[members[~mine] - number]
+        raster = chosen.raster(left, bottom, shape, options.opening_radii)
+        yield (
+            points,
+            own if isinstance(own, slice) else own[mine],
+            raster,
+            chosen.means_on(left, bottom, shape),
+        )
 
 
 def reach(
@@ -202,16 +206,9 @@ def reach(
     return (options.reach + surfaces) * cell
 
 
-def reach_of_points(cell: float) -> float:
-    """How far away, in meters, more than the lowest points of cells matters: those of :func:`.lowpoints.lowest_of_cells`,
-    or the ground of cells that was made of them, are enough beyond.
-    """
-    return (planes_reach(FilterOptions(cell).levels(FAR)) + 4) * cell
-
-
 def reach_of_cells(cell: float) -> float:
     """How far away from points, in meters, cells of the ground matter that was found before."""
-    return (planes_reach(FilterOptions(cell).levels(NEAR)) + 4) * cell
+    return (planes_reach(FilterOptions(cell).levels(FAR)) + 4) * cell
 
 
 def check_sizes(
@@ -247,16 +244,17 @@ def _measured(
     row,
     own,
     raster: GroundRaster,
+    means: CellMeans | None,
     options: FilterOptions,
     *,
     slope_too,
     threads,
     counts,
 ):
-    """Heights of points above the ground of a raster, and what they say of that themselves."""
+    """Heights of points above the ground of a raster, and what they say of that themselves, where no `means` say it."""
     cell, left, bottom = options.cell, raster.left, raster.bottom
     ground, place = raster.ground, raster.place
-    needed = _around(column, row, left, bottom, raster.shape)
+    needed = around(column, row, left, bottom, raster.shape)
     planes = surface(ground, place, raster.floor, raster.lowest, left, bottom, options.levels(NEAR), needed)
     height, gradient = np.empty((2, len(x)))
 
@@ -267,13 +265,16 @@ def _measured(
             pass
 
     def above(span):
-        _heights(x[span], y[span], z[span], cell, left, bottom, planes, height[span], gradient[span])
+        heights_above(x[span], y[span], z[span], cell, left, bottom, planes, height[span], gradient[span])
 
     each(above)
-    is_ground = (
-        use & (deck == 0) & (np.abs(height) <= options.threshold + options.scalar * gradient)
-    )  # NaN is not
-    _means(x, y, z, is_ground, column, row, cell, left, bottom, ground, place)
+    is_ground = options.is_ground(use, deck, height, gradient)
+    if means is None:
+        sums = np.zeros((*raster.shape, 4), np.int64)
+        add_ground(x, y, z, is_ground, column, row, cell, left, bottom, sums)
+        means_of(sums, ground, place)
+    else:
+        ground, place = means
     planes = surface(ground, place, raster.floor, raster.lowest, left, bottom, options.levels(FAR), needed)
     each(above)
     nowhere = np.isnan(height)
@@ -291,44 +292,3 @@ def _measured(
 
         each(over)
     return found
-
-
-def _around(column, row, left, bottom, shape) -> NDArray[np.bool_]:
-    """Cells at which a surface is asked for: those of points, and all round them, whose planes points blend."""
-    needed = np.zeros(shape, bool)
-    for down in (-1, 0, 1):
-        for right in (-1, 0, 1):
-            needed[row - bottom + down, column - left + right] = True
-    return needed
-
-
-@njit
-def _heights(x, y, z, cell, left, bottom, planes, height, gradient):
-    """Height above the surface, and its slope, at points."""
-    for p in range(len(x)):
-        u, v = x[p] / cell - 0.5, y[p] / cell - 0.5
-        i, j = np.floor(u), np.floor(v)
-        level, across, along = blend(planes, int(i) - left, int(j) - bottom, u - i, v - j, 1.0)
-        height[p] = z[p] - level
-        gradient[p] = np.sqrt(across * across + along * along) / cell
-
-
-@njit
-def _means(x, y, z, is_ground, column, row, cell, left, bottom, ground, place):
-    """Put the mean of each cell's ground points in its place; the sums are whole numbers, so order is free."""
-    h, w = ground.shape
-    sums = np.zeros((h, w, 4), np.int64)
-    for p in range(len(x)):
-        if is_ground[p]:
-            total = sums[row[p] - bottom, column[p] - left]
-            total[0] += 1
-            total[1] += int(np.rint((x[p] / cell - column[p] - 0.5) * _PARTS))
-            total[2] += int(np.rint((y[p] / cell - row[p] - 0.5) * _PARTS))
-            total[3] += int(np.rint(z[p] * _PARTS))
-    for j in range(h):
-        for i in range(w):
-            n = sums[j, i, 0]
-            ground[j, i] = n > 0
-            if n > 0:
-                for k in range(3):
-                    place[j, i, k] = sums[j, i, k + 1] / _PARTS / n

@@ -1,10 +1,11 @@
 """Rounds before the tiles: what a far-reaching stage needs of points is made once, and tiles put it together.
 
-Filtered ground looks half a kilometer around a tile, but all that looks farther than a hundred meters is done on a raster of
-the lowest points. So each tile's own points are read first, with the surroundings that the stages before need (noise is
-marked before heights are made); the lowest are written into a file, and what the stages before changed. Then blocks of the
-raster are made, each out of the files of its surroundings. At last a tile reads the points near it, gives them what the
-stages before changed, and takes the raster from the blocks.
+Filtered ground looks half a kilometer around a tile, but what decides on it is a raster: of the lowest points, and of where
+the ground's points lie in each cell. So each tile's own points are read first, with the surroundings that the stages before
+need (noise is marked before heights are made). The lowest are written into a file, all that may be ground, and what the
+stages before changed. Then blocks of the raster are made, each out of the lowest points of its surroundings and the points
+inside. At last a tile reads the points that the stages after need, gives them what the stages before changed, and takes the
+raster from the blocks.
 """
 
 from __future__ import annotations
@@ -47,8 +48,11 @@ class FirstRoundTask:
             cuts = cut_all(
                 context.grid, self.tile, self.sources, self.first.halo_m / context.unit, folder, False
             )
-            found = run_first(context, cuts, self.first) if cuts else FirstResults(np.empty((0, 3)), {}, [])
-        arrays: dict[str, NDArray] = {"left": found.left}
+            found = run_first(context, cuts, self.first) if cuts else FirstResults([], {}, [])
+        arrays = {"around": np.concatenate([np.empty((0, 3)), *(one.around for one in found.left)])}
+        for block in {block for one in found.left for block in one.inside}:
+            parts = [one.inside[block] for one in found.left if block in one.inside]
+            arrays[_inside(block)] = np.concatenate(parts)
         for key, (index, values) in found.changed.items():
             arrays[f"{key}/index"] = index
             arrays |= {f"{key}/{name}": column for name, column in values.items()}
@@ -69,11 +73,29 @@ class BlockTask:
     def run(self) -> dict[str, Any]:
         """Write what tiles need of the block."""
         assert self.plan.first is not None
-        stage = stage_of(self.plan)
-        parts = [load_arrays(path)["left"] for path in self.tiles]
-        block = stage.block_of(np.concatenate([np.empty((0, 3)), *parts]), self.block)
+        first, stage = self.plan.first, stage_of(self.plan)
+        box = block_grid(first).box(self.block, first.blocks.reach)
+        around = [_within(box, load_arrays(path, ["around"])["around"]) for path in self.tiles]
+        inside = _inside(self.block)
+        points = (load_arrays(path, [inside]).get(inside) for path in self.tiles)
+        block = stage.block_of(
+            np.concatenate([np.empty((0, 3)), *around]),
+            (some for some in points if some is not None),
+            self.block,
+        )
         save_arrays(self.target, block, self.scratch)
         return {"result_bytes": os.path.getsize(self.target)}
+
+
+def _within(box: Box, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Those of points (n, 3) that lie in a box."""
+    x, y, _ = points.T
+    return points[(x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])]
+
+
+def _inside(block: tuple[int, int]) -> str:
+    """The name of the array of points of a block."""
+    return f"inside/{block[0]}/{block[1]}"
 
 
 def stage_of(plan: TilePlan) -> Stage:
@@ -120,7 +142,8 @@ class Before:
         }
         for tile in sorted(piece.tiles):
             path = os.path.join(self.folder, left_file(self.context.grid.name(tile)))
-            kept = load_arrays(path)
+            names = [f"{source.key}/{name}" for source, *_ in piece.spans for name in ("index", *found)]
+            kept = load_arrays(path, names)
             for source, first, end in piece.spans:
                 index = kept.get(f"{source.key}/index")
                 if index is None:

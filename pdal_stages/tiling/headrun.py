@@ -18,7 +18,7 @@ from ..pipeline.run import Pipeline
 from ..pipeline.runtime import points_of
 from ..pipeline.writerlimits import check_writers
 from ..stages import registry
-from ..stages.base import Stage
+from ..stages.base import Left, Stage
 from ..stages.points import HOLDS_NOWHERE
 from .extract import Piece
 from .grid import Box, TileGrid
@@ -136,7 +136,7 @@ def run_head(
 class FirstResults(NamedTuple):
     """What the first round leaves of a tile's own points."""
 
-    left: NDArray[np.float64]  #: (n, 3) what the far-reaching stage needs of them, meters
+    left: list[Left]  #: what the far-reaching stage needs of them
     #: New values that the stages before it gave: by inputs' keys, the points' numbers and values by dimension.
     changed: dict[str, tuple[NDArray[np.int64], dict[str, NDArray]]]
     messages: list[str]
@@ -172,8 +172,7 @@ def run_first(context: RunContext, cuts: list[Piece], first: FirstRound) -> Firs
         pipeline = Pipeline([*stages, *head[:-1], run], whole=False)
         pipeline.execute(arrays=False)
     messages = _messages(pipeline)
-    points = np.concatenate(left.found) if left.found else np.empty((0, 3))
-    return FirstResults(points, _changes(left.values, marks), messages)
+    return FirstResults(left.found, _changes(left.values, marks), messages)
 
 
 def _changes(
@@ -236,7 +235,7 @@ class _Left:
 
     def __init__(self, stage: Stage, marks: list[_Mark]) -> None:
         self.stage, self.marks = stage, marks
-        self.found: list[NDArray[np.float64]] = []  # one for each view
+        self.found: list[Left] = []  # one for each view
         self.values: list[
             tuple[int, NDArray[np.int64], dict[str, NDArray]]
         ] = []  # a piece's rows and their values

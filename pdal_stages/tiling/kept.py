@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -32,11 +32,14 @@ def members(file: np.lib.npyio.NpzFile) -> list[str]:
     return found
 
 
-def load_arrays(path: str | Path) -> dict[str, NDArray]:
-    """The arrays of a file; one that cannot be read is removed, so that a later run makes it anew."""
+def load_arrays(path: str | Path, only: Collection[str] | None = None) -> dict[str, NDArray]:
+    """The arrays of a file, or `only` some as far as they are there.
+
+    A file that cannot be read is removed, so that a later run makes it anew.
+    """
     try:
         with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
-            return {name: file[name] for name in members(file)}
+            return {name: file[name] for name in members(file) if only is None or name in only}
     except FileNotFoundError:
         raise StageError(
             "what the first round left of a tile is not there any more",
