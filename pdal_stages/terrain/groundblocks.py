@@ -15,10 +15,10 @@ from .groundcells import (
     BLOCK_SIDE,
     NEAR,
     CellMeans,
+    CellWindow,
     FilterOptions,
     GroundCells,
     GroundRaster,
-    Window,
     ground_raster,
 )
 from .groundmeans import add_ground, around, heights_above, means_of
@@ -96,7 +96,7 @@ def cells_of_block(
         own_levels = levels[within(column[seen][lowest], row[seen][lowest], 0)]
     ground = _GroundPoints(west, south, levels, options)
     rasters = []
-    own = Window(west, south, BLOCK_SIDE, BLOCK_SIDE)
+    own = CellWindow(west, south, BLOCK_SIDE, BLOCK_SIDE)
     for part, _own in connected(column, row, within(column, row, margin), options.link):
         given = x, y, z, np.ones(len(x), bool), deck, column, row
         if len(part) < len(x):

@@ -102,7 +102,7 @@ class FilterOptions:
 CellMeans = tuple[NDArray[np.bool_], NDArray[np.float64]]
 
 
-class Window(NamedTuple):
+class CellWindow(NamedTuple):
     """Cells from a column and row on."""
 
     left: int
@@ -110,9 +110,9 @@ class Window(NamedTuple):
     width: int
     height: int
 
-    def grown(self, by: int) -> Window:
+    def grown(self, by: int) -> CellWindow:
         """So many cells more on every side."""
-        return Window(self.left - by, self.bottom - by, self.width + 2 * by, self.height + 2 * by)
+        return CellWindow(self.left - by, self.bottom - by, self.width + 2 * by, self.height + 2 * by)
 
     def on(self, left: int, bottom: int, h: int, w: int) -> tuple[slice, slice]:
         """Rows and columns of what of it lies on a raster."""
@@ -139,7 +139,7 @@ class GroundRaster(NamedTuple):
         """Rows and columns."""
         return self.ground.shape
 
-    def cut(self, window: Window) -> GroundRaster:
+    def cut(self, window: CellWindow) -> GroundRaster:
         """A copy of what lies in a window."""
         part = window.on(self.left, self.bottom, *self.shape)
         return GroundRaster(
@@ -163,7 +163,7 @@ def ground_raster(
     row: NDArray[np.int64],
     options: FilterOptions,
     margin: int = 1,
-    wanted: Window | None = None,
+    wanted: CellWindow | None = None,
 ) -> tuple[GroundRaster, NDArray[np.int64]]:
     """What the raster round points tells of the ground, and the numbers of points (n,) that are pits.
 
