@@ -91,6 +91,7 @@ def run_head(
     reaches: dict[int, _Reach] = {}
     narrowed = False
     from_afar = None
+    found = _Found(plan.creates)
     with Callbacks() as callbacks:
         stages = _marked(callbacks, cuts, marks)
         for number, (given, later) in enumerate(zip(plan.head, plan.later, strict=True)):
@@ -107,6 +108,7 @@ def run_head(
             if narrowing and kind is not None and 0 < later < plan.halo_m * _NARROW:
                 narrowed = True
                 stages.append({"type": "filters.range", "limits": f"{OUTSIDE}[:{later!r}]"})
+        stages.append(callbacks.filter(found))
         pipeline = Pipeline(stages, whole=False)
         ours_there = [(ours.stage, ours.place, ours.index) for ours in pipeline.lowered.ours]
         check_writers([*pipeline.lowered.stages, *plan.tail], ours_there)
@@ -117,8 +119,9 @@ def run_head(
                 ours.stage.from_blocks = before.from_blocks
             if ours.number in reaches:
                 reaches[ours.number].stage = ours.stage
-        pipeline.execute(arrays=True)
-    results = _collect(pipeline.arrays, cuts, plan.creates, marks)
+        found.with_places = any(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
+        pipeline.execute(arrays=False)
+    results = _collect(found.views, cuts, plan.creates, marks)
     need = max((reach.need for reach in reaches.values()), default=0.0)
     far = any(report.beyond_halo for _, reports in pipeline.reports for report in reports)
     if far and narrowed:
@@ -126,7 +129,7 @@ def run_head(
     if far and not everything:
         most = max(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
         second = max(ours.stage.second_neighbors() for ours in pipeline.lowered.ours)
-        need = max(need, _far_neighbors(pipeline.arrays, most, second, context, tile))
+        need = max(need, _far_neighbors(found.places, most, second, context, tile))
     messages = _messages(pipeline)
     return HeadRun(
         results, need, messages, left_alone(each[-1].figures for _, each in pipeline.reports if each)
@@ -317,22 +320,40 @@ class _Reach:
         self.need = max(self.need, self.stage.reach_of(points, wanted, box))
 
 
+class _Found:
+    """Takes what the stages gave the tile's own points, view by view: far less than all arrays of all points.
+
+    `with_places`: where all points are, too: X, Y, Z and how far outside the tile.
+    """
+
+    def __init__(self, creates: list[str] | None) -> None:
+        self.creates, self.with_places = creates, False
+        self.views: list[dict[str, NDArray]] = []
+        self.places: list[NDArray[np.float64]] = []
+
+    def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        if self.creates is None:
+            names = [name for name in ins if name not in _MARK_TYPES]
+        else:
+            names = [name for name in self.creates if name in ins]
+        mine = np.flatnonzero(ins[OUTSIDE] < 0)
+        self.views.append({name: ins[name][mine] for name in (ROW, INPUT, *names)})
+        if self.with_places:
+            self.places.append(np.column_stack([ins[name] for name in ("X", "Y", "Z", OUTSIDE)]))
+
+
 def _collect(
-    arrays: list[NDArray],
+    views: list[dict[str, NDArray]],
     cuts: list[Piece],
     creates: list[str] | None,
     marks: list[_Mark],
 ) -> list[PieceResults]:
     """Results of the tile's own points, sorted as their pieces are."""
-    names = [n for a in arrays[:1] for n in a.dtype.names or ()]
-    if creates is None:
-        names = [n for n in names if n not in _MARK_TYPES]
-    else:
-        names = [n for n in creates if n in names]
+    names = [name for view in views[:1] for name in view if name not in _MARK_TYPES]
     results = []
     for number, piece in enumerate(cuts):
-        mine = [(a, np.flatnonzero((a[OUTSIDE] < 0) & (a[INPUT] == number))) for a in arrays]
-        rows = np.concatenate([a[ROW][at].astype(np.int64) for a, at in mine] or [np.empty(0, np.int64)])
+        mine = [(view, np.flatnonzero(view[INPUT] == number)) for view in views]
+        rows = np.concatenate([np.empty(0, np.int64), *(view[ROW][at] for view, at in mine)])
         order = np.argsort(rows, kind="stable")
         rows = rows[order]
         if (np.diff(rows) == 0).any():
@@ -340,7 +361,7 @@ def _collect(
                 "a stage makes new points, which have no place in the input files",
                 cure="Run the pipeline without --tile",
             )
-        values = {name: np.concatenate([a[name][at] for a, at in mine])[order] for name in names}
+        values = {name: np.concatenate([view[name][at] for view, at in mine])[order] for name in names}
         marks[number].put_flags_back(rows, values)
         results.append(PieceResults(piece, rows, values, marks[number].holds_flags))
     if creates is None:
@@ -362,15 +383,15 @@ def _changed(result: PieceResults, name: str, original: Mapping[str, NDArray]) -
 
 
 def _far_neighbors(
-    arrays: list[NDArray], most: int, second: int, context: RunContext, tile: tuple[int, int]
+    places: list[NDArray[np.float64]], most: int, second: int, context: RunContext, tile: tuple[int, int]
 ) -> float:
     """Meters around the tile within which the `most` nearest neighbors of all its points lie, and the `second` of these."""
     from scipy.spatial import cKDTree
 
     x0, y0, x1, y1 = (side * context.unit for side in context.grid.box(tile))
-    array = np.concatenate([a[["X", "Y", "Z", OUTSIDE]] for a in arrays])
-    xyz = np.column_stack([array[c] for c in "XYZ"]) * context.unit
-    mine = xyz[array[OUTSIDE] < 0]
+    every = np.concatenate(places)
+    xyz = every[:, :3] * context.unit
+    mine = xyz[every[:, 3] < 0]
     if len(xyz) <= most:
         return 2 * (x1 - x0)
     inward = np.min([mine[:, 0] - x0, x1 - mine[:, 0], mine[:, 1] - y0, y1 - mine[:, 1]], axis=0)
