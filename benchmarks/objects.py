@@ -15,7 +15,7 @@ import shapely
 
 from pdal_stages.objects import Cells, ObjectSettings, find_objects
 from pdal_stages.objects.cells import Kind
-from pdal_stages.objects.compare import compare_buildings, matched_by_place
+from pdal_stages.objects.compare import compare_buildings, matched_by_overlap, matched_by_place
 from pdal_stages.objects.outlines import raw_outlines, straight_outlines
 from pdal_stages.synthetic import TownOptions, make_town
 from pdal_stages.synthetic.truth import true_objects
@@ -54,6 +54,13 @@ def true_buildings(houses, step):
     return [shape.buffer(-0.3, join_style="mitre") for shape in joined]
 
 
+def true_spans(cables):
+    """A line of each span: its middle conductor; of `cables` (n, 2, 3) those of a span follow each other."""
+    middle = cables[:, :, :2].mean(axis=1)
+    apart = np.flatnonzero(np.hypot(*np.diff(middle, axis=0).T) > 1.0) + 1
+    return [shapely.LineString(span[len(span) // 2, :, :2]) for span in np.split(cables, apart) if len(span)]
+
+
 def town(seed, codes=None):
     """Figures of a town, by its true classes or by others."""
     made = make_town(SIZE, DENSITY, seed, progress=False)
@@ -87,6 +94,11 @@ def town(seed, codes=None):
     extra = sorted(set(range(len(at))) - {a for a, _ in pairs})
     wrong = sum(alone[np.argmin(np.hypot(*(places - at[n]).T))] for n in extra)
     hit = sum(alone[b] for _, b in pairs)
+    paths = [shapely.LineString(path) for path in found.tables[Kind.SPAN].paths]
+    true_paths = [line.intersection(square) for line in true_spans(true.cables)]
+    lines = [[shapely.buffer(line, 1.0, cap_style="flat") for line in many] for many in (paths, true_paths)]
+    lines[1] = [shape for shape in lines[1] if shape.area > 8]
+    rows["spans"] = 2 * len(matched_by_overlap(*lines)) / sum(map(len, lines))
     rows["trees"] = 2 * len(pairs) / (len(at) + len(places)), 2 * hit / (hit + wrong + alone.sum())
     return rows
 
@@ -162,6 +174,8 @@ if __name__ == "__main__":
         for name, value in town(seed, classified(options.classified) if options.classified else None).items():
             if name == "trees":
                 print(f"town {seed}, trees: F1 {value[0]:.3f}, isolated ones {value[1]:.3f}")
+            elif name == "spans":
+                print(f"town {seed}, spans: F1 {value:.3f}")
             else:
                 got, seconds = value
                 of = got["objects"]

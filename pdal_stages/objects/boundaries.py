@@ -32,13 +32,8 @@ def rings(row: NDArray, column: NDArray) -> tuple[NDArray, NDArray]:
         for c0 in range(1, columns + 1):
             if not inside[r0, c0] or inside[r0 + 1, c0] or walked[r0, c0]:
                 continue
-            r, c, dr, dc, top = (
-                r0 + 1,
-                c0,
-                0,
-                1,
-                0,
-            )  # a corner between cells: the southwestern one of cell (r, c)
+            # A corner between cells: the southwestern one of cell (r, c).
+            r, c, dr, dc, top = r0 + 1, c0, 0, 1, 0
             turned = True
             while True:
                 if turned:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..base import checks
 from ..base.jit import device, njit
 from ..base.progress import Progress
-from . import crowns, measure, roofs
+from . import crowns, lines, measure, roofs
 from .cells import GROUND_CELLS, MM, Cells, Kind, cell_keys, object_id, point_keys, unpack
 from .measure import Body
 from .rasters import GROUND_REACH, Window
@@ -260,6 +260,7 @@ class _View:
         self.cells, self.seen, self.extent, self.chosen = cells, window, extent, chosen
         self.window = _common(window, extent)
         self._held: dict[Kind, tuple[Cells, NDArray, NDArray]] = {}
+        self._places: dict[Kind, NDArray[np.int32]] = {}
 
     def wider(self, margin: int) -> _View:
         """The same with more around it."""
@@ -303,19 +304,25 @@ class _View:
         high = roofs.covered(high, seen, round(DARK / chosen.cell))
         return roofs.roof_cells(high, self.ground, chosen.building_height)
 
+    def _place(self, kind: Kind) -> NDArray[np.int32]:
+        """Where among the cells of a kind each of the window is, -1 for those that are not."""
+        if kind not in self._places:
+            inside, row, column = self.held(kind)
+            self._places[kind] = np.full((self.window.rows, self.window.columns), -1, np.int32)
+            self._places[kind][row, column] = np.arange(len(inside))
+        return self._places[kind]
+
     def body(self, kind: Kind, r: NDArray, c: NDArray, z: NDArray) -> Body:
         """An object's cells, of which rows and columns in the window are given, with heights `z` of the window."""
-        row, column, known = r + self.window.row, c + self.window.column, self.held(kind)[0]
-        key = cell_keys(kind, row, column)
-        at = np.minimum(np.searchsorted(known.key, key), len(known) - 1)
-        there = known.key[at] == key
+        known, at = self.held(kind)[0], self._place(kind)[r, c]
+        there = at >= 0
 
         def held(name: str, empty: float) -> NDArray:
             return np.where(there, known.columns[name][at], empty)
 
         return Body(
-            row,
-            column,
+            r + self.window.row,
+            c + self.window.column,
             z[r, c],
             held("low", np.nan) / MM,
             self.ground[r, c],
@@ -413,12 +420,23 @@ def _spans(near: _View, core: Window, found: _Found) -> None:
     joined = roofs.connected(mask, np.zeros(mask.shape), np.inf)
     number = roofs.numbered(np.where(np.isnan(high), -1, joined))
     number = _without_small(number, 4)
+    number = _parted(number, chosen)
 
     def measured(body: Body, size: float) -> dict[str, object]:
         found.paths.append(measure.path_of(body, size))
         return measure.span(body, size)
 
     _keep(view, number, number, high, core, sure, Kind.SPAN, found, measured)
+
+
+def _parted(number: NDArray[np.int64], chosen: ObjectSettings) -> NDArray[np.int64]:
+    """Wires that touch, parted where lines of them cross or bend."""
+    out = np.full(number.shape, -1, np.int64)
+    for _, r, c in _bodies(number):
+        line = lines.parted(r, c, chosen.cell, chosen.span_gap)
+        where, first = np.unique(line, return_index=True)
+        out[r, c] = (r * number.shape[1] + c)[first[np.searchsorted(where, line)]]
+    return roofs.numbered(out)
 
 
 def _trees(near: _View, core: Window, found: _Found) -> None:

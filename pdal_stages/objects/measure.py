@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.jit import njit
 from .cells import MM
 from .planes import roof_planes
 
@@ -44,16 +45,11 @@ class Body(NamedTuple):
 
     def edge(self) -> NDArray[np.bool_]:
         """Whether each cell lies at the object's edge."""
-        inside = np.pad(~np.isnan(self.image(np.zeros(len(self.row)))), 1)
-        core = inside[:-2, 1:-1] & inside[2:, 1:-1] & inside[1:-1, :-2] & inside[1:-1, 2:]
-        return ~core[self.row - self.row.min(), self.column - self.column.min()]
+        return _edge(self.row, self.column)
 
     def holds_square(self, side: int) -> bool:
         """Whether a square of so many cells a side lies inside."""
-        inside = ~np.isnan(self.image(np.zeros(len(self.row))))
-        if min(inside.shape) < side:
-            return False
-        return bool(np.lib.stride_tricks.sliding_window_view(inside, (side, side)).all(axis=(2, 3)).any())
+        return bool(_holds_square(self.row, self.column, side))
 
     @property
     def reliability(self) -> float:
@@ -68,6 +64,47 @@ class Body(NamedTuple):
         return float(np.median(known)) if known.size else math.nan
 
 
+@njit
+def _edge(row: NDArray, column: NDArray) -> NDArray:
+    """Whether each cell has a side in common with one that is not among them."""
+    low_row, low_column = row.min() - 1, column.min() - 1
+    inside = np.zeros((row.max() - low_row + 2, column.max() - low_column + 2), np.bool_)
+    for n in range(len(row)):
+        inside[row[n] - low_row, column[n] - low_column] = True
+    out = np.empty(len(row), np.bool_)
+    for n in range(len(row)):
+        r, c = row[n] - low_row, column[n] - low_column
+        out[n] = not (inside[r - 1, c] and inside[r + 1, c] and inside[r, c - 1] and inside[r, c + 1])
+    return out
+
+
+@njit
+def _holds_square(row: NDArray, column: NDArray, side: int) -> bool:
+    low_row, low_column = row.min(), column.min()
+    rows, columns = row.max() - low_row + 1, column.max() - low_column + 1
+    inside = np.zeros((rows, columns), np.bool_)
+    for n in range(len(row)):
+        inside[row[n] - low_row, column[n] - low_column] = True
+    # Of each cell the side of the largest square of which it is the last corner.
+    before, now = np.zeros(columns + 1, np.int64), np.zeros(columns + 1, np.int64)
+    for r in range(rows):
+        for c in range(columns):
+            now[c + 1] = 1 + min(before[c], before[c + 1], now[c]) if inside[r, c] else 0
+            if now[c + 1] >= side:
+                return True
+        before, now = now, before
+    return False
+
+
+def percentile(values: NDArray[np.float64], q: float) -> float:
+    """What :func:`numpy.percentile` gives of finite values (n,), to the bit, in a tenth of its time."""
+    at = (len(values) - 1) * (q / 100)
+    first = int(at)
+    t, ends = at - first, [first, min(first + 1, len(values) - 1)]
+    low, high = np.partition(values, ends)[ends].tolist()
+    return low + (high - low) * t if t < 0.5 else high - (high - low) * (1 - t)
+
+
 def judged(reasons: Sequence[object]) -> dict[str, object]:
     """The verdict that follows from reasons to check."""
     return {"verdict": CHECK if reasons else SURE, "reason": ", ".join(map(str, reasons))}
@@ -80,7 +117,7 @@ def building(body: Body, size: float) -> dict[str, object]:
     planes, slope, planar = roof_planes(body.image(body.z), size)
     depth = body.z[edge] - body.low[edge]
     facade = float(np.mean(np.nan_to_num(depth) >= 1.5))
-    ridge = float(np.percentile(above, 98))
+    ridge = percentile(above, 98)
     reasons = []
     if math.isnan(ground):
         reasons.append("no ground near")
@@ -98,7 +135,7 @@ def building(body: Body, size: float) -> dict[str, object]:
         reasons.append("no facade")
     return {
         "area": area,
-        "h_eave": float(np.percentile(above[edge], 25)),
+        "h_eave": percentile(above[edge], 25),
         "h_ridge": ridge,
         "ground": ground,
         "slope": slope,
@@ -185,10 +222,16 @@ def path_of(body: Body, size: float, every: float = 2.0) -> NDArray[np.float64]:
     aside = v * math.cos(angle) - u * math.sin(angle)
     if np.ptp(aside) < 4.0:  # wires side by side: one straight line between them
         aside = np.full(len(aside), aside.mean())
-        u = along * math.cos(angle) - aside * math.sin(angle)
-        v = along * math.sin(angle) + aside * math.cos(angle)
-    middle = [np.bincount(piece, weights=values) / many for values in (u, v, body.z)]
-    path = np.column_stack([middle[0] + origin[0], middle[1] + origin[1], middle[2]])
+    middle = [np.bincount(piece, weights=values) / many for values in (along, aside, body.z)]
+    if len(many) > 1:  # from one end to the other
+        middle[0][[0, -1]] = along.min(), along.max()
+    path = np.column_stack(
+        [
+            origin[0] + middle[0] * math.cos(angle) - middle[1] * math.sin(angle),
+            origin[1] + middle[0] * math.sin(angle) + middle[1] * math.cos(angle),
+            middle[2],
+        ]
+    )
     if len(path) == 1:  # a wire seen in one place
         first, last = np.argmin(along), np.argmax(along)
         path = np.array([[x[first], y[first], body.z[first]], [x[last], y[last], body.z[last]]])

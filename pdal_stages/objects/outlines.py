@@ -113,14 +113,28 @@ def straight_outlines(raw: list[Any], size: float) -> list[Any]:
         Valid ones, in the same order; the raw one where no straight one is like it.
     """
     shapely = vector("shapely")
-    out = list(raw)
-    for group in _touching(shapely, raw):
-        shapes = [raw[n] for n in group]
-        corner = np.floor(np.min([s.bounds[:2] for s in shapes], axis=0))
-        local = [shapely.transform(s, lambda xy, c=corner: xy - c) for s in shapes]  # type: ignore[misc]
-        for n, shape in zip(group, _straight(shapely, local, size), strict=True):
-            out[n] = shapely.transform(shape, lambda xy, c=corner: xy + c)  # type: ignore[misc]
-    return out
+    groups = _touching(shapely, raw)
+    if not groups:
+        return []
+    # Every group in a frame of its own, so that places are exact numbers.
+    corner = np.empty((len(raw), 2))
+    lows = shapely.bounds(raw)[:, :2]
+    for group in groups:
+        corner[group] = np.floor(lows[group].min(axis=0))
+    local = _moved(shapely, np.array(raw, object), -corner)
+    wholes = [shapely.union_all(local[group]) if len(group) > 1 else local[group[0]] for group in groups]
+    angles = [main_direction(np.concatenate([_middles(r) for r in _rings(shapely, w)])) for w in wholes]
+    outers = _outers(shapely, wholes, angles, size)
+    out = np.empty(len(raw), object)
+    for group, outer, angle in zip(groups, outers, angles, strict=True):
+        out[group] = _straight(shapely, list(local[group]), outer, angle) if len(group) > 1 else outer
+    return list(_moved(shapely, out, corner))
+
+
+def _moved(shapely: Any, shapes: NDArray, by: NDArray) -> NDArray:
+    """Shapes (n,), each moved by (n, 2)."""
+    away = np.repeat(by, shapely.get_num_coordinates(shapes), axis=0)
+    return shapely.transform(shapes, lambda xy: xy + away)
 
 
 def _touching(shapely: Any, shapes: list[Any]) -> list[list[int]]:
@@ -144,26 +158,37 @@ def _touching(shapely: Any, shapes: list[Any]) -> list[list[int]]:
     return list(groups.values())
 
 
-def _straight(shapely: Any, shapes: list[Any], size: float) -> list[Any]:
-    """Straight outlines of shapes that stand wall to wall."""
-    whole = shapely.union_all(shapes) if len(shapes) > 1 else shapes[0]
-    angle = main_direction(np.concatenate([_middles(r) for r in _rings(shapely, whole)]))
-    made = []
-    for part in shapely.get_parts(whole):
-        shell = straight_ring(_middles(part.exterior), angle)
+def _outers(shapely: Any, wholes: list[Any], angles: list[float], size: float) -> list[Any]:
+    """Straight outlines of all that stands wall to wall, of which main directions are given."""
+    parts, which = shapely.get_parts(wholes, return_index=True)
+    made = np.full(len(parts), None, object)
+    for n, part in enumerate(parts):
+        angle = angles[which[n]]
         holes = [straight_ring(_middles(r), angle) for r in part.interiors]
-        shape = _polygon(shapely, shell, holes)
-        box = shapely.oriented_envelope(part)  # which the cells' corners make too large
-        box = box.buffer(-max(0.0, box.area - part.area) / box.length, join_style="mitre")
-        alike = _likeness(shape, part) if shape is not None else -1.0
-        if not part.interiors and (boxlike := _likeness(box, part)) >= max(_BOXLIKE, alike - 0.03):
-            shape, alike = box, boxlike
-        if alike < _LIKENESS:
-            shape = part.simplify(_TOLERANCE)
-        made.append(shape if shape.is_valid and shape.geom_type == "Polygon" and shape.area > 0 else part)
-    outer = shapely.union_all(made)
-    if len(shapes) == 1:
-        return [outer]
+        made[n] = _polygon(shapely, straight_ring(_middles(part.exterior), angle), holes)
+    boxes = shapely.oriented_envelope(parts)  # which the cells' corners make too large
+    area, length = shapely.area(boxes), shapely.length(boxes)
+    boxes = shapely.buffer(
+        boxes, -np.maximum(0.0, area - shapely.area(parts)) / length, quad_segs=16, join_style="mitre"
+    )
+    there = ~shapely.is_missing(made)
+    alike = np.where(there, _likeness(shapely, np.where(there, made, parts), parts), -1.0)
+    boxlike = np.where(shapely.get_num_interior_rings(parts) == 0, _likeness(shapely, boxes, parts), -1.0)
+    box = boxlike >= np.maximum(_BOXLIKE, alike - 0.03)
+    made, alike = np.where(box, boxes, made), np.where(box, boxlike, alike)
+    made = np.where(alike < _LIKENESS, shapely.simplify(parts, _TOLERANCE), made)
+    polygons = shapely.get_type_id(made) == shapely.GeometryType.POLYGON
+    made = np.where(polygons & shapely.is_valid(made) & (shapely.area(made) > 0), made, parts)
+    alone = np.bincount(which) == 1
+    out = np.empty(len(wholes), object)
+    out[alone] = shapely.union_all(made[alone[which], None], axis=1)
+    for n in np.flatnonzero(~alone).tolist():
+        out[n] = shapely.union_all(made[which == n])
+    return list(out)
+
+
+def _straight(shapely: Any, shapes: list[Any], outer: Any, angle: float) -> list[Any]:
+    """Straight outlines of shapes that stand wall to wall, of which the one around all is given."""
     walls = []
     for a, one in enumerate(shapes):
         for other in shapes[a + 1 :]:
@@ -173,15 +198,14 @@ def _straight(shapely: Any, shapes: list[Any], size: float) -> list[Any]:
     corners = np.concatenate([np.array(ring.coords)[:-1] for ring in _rings(shapely, outer)])
     lines = [_attached(_straight_wall(np.array(w.coords), angle), corners) for w in walls]
     parts = _divided(shapely, outer, lines, shapes)
-    if not _good(parts, shapes):
+    if not _good(shapely, parts, shapes):
         parts = _shared_out(shapely, outer, shapes)
-    return parts if _good(parts, shapes) else shapes
+    return parts if _good(shapely, parts, shapes) else shapes
 
 
-def _good(parts: list[Any], shapes: list[Any]) -> bool:
-    return all(
-        p is not None and p.is_valid and _likeness(p, s) >= 0.5 for p, s in zip(parts, shapes, strict=True)
-    )
+def _good(shapely: Any, parts: list[Any], shapes: list[Any]) -> bool:
+    there = not shapely.is_missing(parts).any() and shapely.is_valid(parts).all()
+    return bool(there and (_likeness(shapely, parts, shapes) >= 0.5).all())
 
 
 def _shared_out(shapely: Any, outer: Any, shapes: list[Any]) -> list[Any]:
@@ -201,7 +225,7 @@ def _shared_out(shapely: Any, outer: Any, shapes: list[Any]) -> list[Any]:
     for piece, most, most_shared in zip(pieces, shared.argmax(axis=1), shared.max(axis=1), strict=True):
         if most_shared > 0:
             more[most].append(piece)
-    whole = [_polygons(shapely, shapely.union_all(pieces, grid_size=_GRID)) for pieces in more]
+    whole = [_polygons(shapely, shapely.union_all(one, grid_size=_GRID)) for one in more]
     inner = shapely.coverage_simplify(whole, _TOLERANCE, simplify_boundary=False)
     return list(shapely.coverage_simplify(inner, 0.1))  # corners on straight walls, where cells crossed them
 
@@ -230,9 +254,10 @@ def _rings(shapely: Any, shape: Any) -> list[Any]:
     return [ring for part in shapely.get_parts(shape) for ring in (part.exterior, *part.interiors)]
 
 
-def _likeness(a: Any, b: Any) -> float:
-    shared = a.intersection(b).area
-    return shared / max(a.area + b.area - shared, 1e-9)
+def _likeness(shapely: Any, a: Any, b: Any) -> NDArray[np.float64]:
+    """Intersection over union of each of shapes (n,) with its fellow."""
+    shared = shapely.area(shapely.intersection(a, b))
+    return shared / np.maximum(shapely.area(a) + shapely.area(b) - shared, 1e-9)
 
 
 def _polygon(shapely: Any, shell: NDArray | None, holes: list[NDArray | None]) -> Any:
@@ -244,7 +269,7 @@ def _polygon(shapely: Any, shell: NDArray | None, holes: list[NDArray | None]) -
 
 def _middles(ring: Any) -> NDArray[np.float64]:
     """Middles of the unit steps of a boundary along cells (n, 2)."""
-    corners = np.rint(np.array(ring.coords))
+    corners = np.rint(vector("shapely").get_coordinates(ring))
     away = np.diff(corners, axis=0)
     many = np.abs(away).max(axis=1).astype(np.int64)
     edge = np.repeat(np.arange(len(many)), many)
