@@ -111,3 +111,16 @@ def test_spans_that_cross_are_the_same_in_any_blocks(block):
         np.testing.assert_array_equal(a, b)
     lengths = np.sort(table.columns["length"])[::-1][:3]
     np.testing.assert_allclose(lengths, [70, 60, 40], atol=1.0)
+
+
+@pytest.mark.parametrize("cell", [0.1, 0.5, 1.0, 3.0, 20.0])
+def test_any_size_of_cells(cell):
+    points = np.concatenate([turned((300, 300), 400, 10), turned((310, 300), 300, 80)])
+    row, column = np.unique(np.floor(points[:, [1, 0]] / cell).astype(np.int64), axis=0).T
+    got = parted(row, column, cell, 2.0)
+    assert got.max() == 1 and 0.5 < (got == np.bincount(got).argmax()).mean() < 0.65
+
+
+def test_what_hangs_together_farther_stays_one():
+    points = np.concatenate([line_of((0, 0), (1400, 10)), line_of((700, -200), (710, 200))])
+    assert parted(*cells_of(points), CELL, 2.0).max() == 0

@@ -22,6 +22,8 @@ LEAST = 8.0
 PARALLEL = 9
 #: What is wider on average, for the length of the lines in it, is left in one piece: no wires, meters.
 WIDTH = 2.5
+#: What reaches farther is left in one piece, meters: a line for which towers are no class of their own.
+FARTHEST = 1000.0
 #: Steps of direction in half a turn.
 _WAYS = 180
 
@@ -40,10 +42,10 @@ def parted(row: NDArray[np.int64], column: NDArray[np.int64], size: float, gap: 
     """
     one = np.zeros(len(row), np.int64)
     extent = np.hypot(float(np.ptp(row)), float(np.ptp(column))) * size
-    if extent < LEAST:
+    if not LEAST <= extent <= FARTHEST:
         return one
     turns = np.arange(_WAYS) * (np.pi / _WAYS)
-    strip, away = STRIP / size, max(1.0, GAP / size)
+    strip, away = max(1.0, STRIP / size), max(1.0, GAP / size)
     owner, ways = _lines(
         row - row.min(), column - column.min(), np.cos(turns), np.sin(turns), strip, away, LEAST / size
     )
@@ -54,7 +56,7 @@ def parted(row: NDArray[np.int64], column: NDArray[np.int64], size: float, gap: 
     for line in np.unique(owner):
         mine, turn = owner == line, turns[ways[line]]
         length += float(np.ptp(column[mine] * np.cos(turn) + row[mine] * np.sin(turn))) + 1.0
-    if len(row) * size > WIDTH * length:
+    if len(row) * size > max(WIDTH, 2 * size) * length:
         return one
     first = np.full(len(ways), len(row))
     np.minimum.at(first, owner, np.arange(len(row)))
