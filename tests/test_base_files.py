@@ -225,7 +225,10 @@ def test_leftovers_of_the_dead_go_and_of_the_living_stay(tmp_path, monkeypatch):
     dead.communicate("")
     assert os.path.exists(left)
     strange = tmp_path / f"{PREFIX}strange"
-    strange.mkdir()  # without a lock: it may just be made
+    strange.mkdir()
+    (strange / "o.txt").touch()  # without a lock: it is not known whose it is
+    empty = tmp_path / f"{PREFIX}empty"
+    empty.mkdir()  # of a process that was killed when it had removed the lock
     foreign = tmp_path / f"{PREFIX}link"
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / ".lock").touch()
@@ -233,7 +236,12 @@ def test_leftovers_of_the_dead_go_and_of_the_living_stay(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "_swept", set())
     write_whole(tmp_path / "other.txt", b"x")
     assert not os.path.exists(left) and os.path.exists(working)
-    assert strange.is_dir() and foreign.is_symlink() and (tmp_path / "folder" / ".lock").exists()
+    assert (
+        not empty.exists()
+        and strange.is_dir()
+        and foreign.is_symlink()
+        and (tmp_path / "folder" / ".lock").exists()
+    )
     old = time.time() - 2 * files._GRACE
     os.utime(strange, (old, old))
     sweep(tmp_path)
@@ -241,6 +249,30 @@ def test_leftovers_of_the_dead_go_and_of_the_living_stay(tmp_path, monkeypatch):
     alive.communicate("")
     sweep(tmp_path)
     assert names(tmp_path) == [foreign.name, "folder", "other.txt"]
+
+
+def test_the_lock_is_removed_last(tmp_path, monkeypatch):
+    """So that a process that is killed while it removes its folder leaves one that the next sweep removes."""
+    gone, unlink = [], os.unlink
+
+    def killed(path, **more):
+        if len(gone) == 2:
+            raise OSError("killed")
+        gone.append(os.path.basename(path))
+        unlink(path, **more)
+
+    with monkeypatch.context() as patch, whole_files(tmp_path / "a#.txt") as (partial,):
+        for number in range(3):
+            (partial.parent / f"a{number}.txt").write_text("x")
+        for name in ("b", "c", "d"):
+            (partial.parent / name).mkdir()
+        (partial.parent / "b" / "e.txt").touch()
+        folder = partial.parent
+        patch.setattr(os, "replace", lambda *_: None)
+        patch.setattr(os, "unlink", killed)
+    assert gone and ".lock" not in gone and (folder / ".lock").exists()
+    sweep(tmp_path)
+    assert not folder.exists()
 
 
 @unix

@@ -26,7 +26,7 @@ from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.base.threads import available_threads
 from pdal_stages.pipeline import lifesigns, processes
 from pdal_stages.pipeline.work import Call, perform
-from pdal_stages.tiling import pool, results, run_tiled, tail
+from pdal_stages.tiling import kept, pool, run_tiled, tail
 from pdal_stages.tiling.store import Store, check_run
 
 pytestmark = pytest.mark.pdal
@@ -341,7 +341,7 @@ def test_a_straggler_of_an_ended_run_changes_nothing(tmp_path, folder, monkeypat
         scratch = Path(task.scratch if hasattr(task, "scratch") else task.context.scratch)
         scratch.mkdir(parents=True)
         with monkeypatch.context() as patch:
-            for module in (results, tail):
+            for module in (kept, tail):
                 patch.setattr(
                     module, "check_run", lambda given, f=check_run: shutil.rmtree(given) or f(given)
                 )

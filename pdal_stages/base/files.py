@@ -244,7 +244,7 @@ class _Place:
 
     def close(self) -> None:
         """Remove the folder and whatever it holds."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        _remove(self.folder)
         self._lock.close()
 
 
@@ -315,12 +315,25 @@ def _remove_dead(folder: Path) -> None:
         try:
             lock = os.fdopen(os.open(folder / _LOCK, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0)), "r+b")
         except FileNotFoundError:
+            with contextlib.suppress(OSError):
+                folder.rmdir()  # an empty one; who has just made it makes another
             if time.time() - found.st_mtime > _GRACE:
                 shutil.rmtree(folder, ignore_errors=True)
             return
         with lock:
             if try_lock(lock):
-                shutil.rmtree(folder, ignore_errors=True)
+                _remove(folder)
+
+
+def _remove(folder: Path) -> None:
+    """The lock goes last, so that what a killed process leaves here is known to be dead, or empty."""
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.is_dir(follow_symlinks=False):
+                shutil.rmtree(entry.path, ignore_errors=True)
+            elif entry.name != _LOCK:
+                os.unlink(entry.path)
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def try_lock(file: Any) -> bool:
