@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..base.jit import device
+from ..base.lending import lent
 from .kdtree import STACK, bounding_box, farthest2, gather, halve
 
 #: Queries that share one set of candidates.
@@ -346,6 +347,7 @@ def next_rows(tree, search, need, cap2, scratch, rows):
 def _search_group(tree, search, lo, hi, need, cap2, reach2, scratch, rows):
     """Rows filled (0: the group must be split), the reach to start the next group with, the scratch."""
     need = min(need, len(tree.perm))
+    owned, scratch = scratch, lent(scratch)
     order = search.order
     box = bounding_box(search.qx, search.qy, search.qz, order, lo, hi)
     one = box[0] == box[3] and box[1] == box[4] and box[2] == box[5]
@@ -362,13 +364,14 @@ def _search_group(tree, search, lo, hi, need, cap2, reach2, scratch, rows):
         c = gather(tree, box, reach2, need, limit, scratch.stack, cx, cy, cz, scratch.ci)
         if c < 0:
             if count > 1:
-                return 0, reach2 if pending < count else 0.25 * reach2, scratch
+                return 0, reach2 if pending < count else 0.25 * reach2, owned
             flips += 1 if low > 0.0 else 0
             if flips > 6 or reach2 < TINY:  # many at the same distance: they must all be looked at
                 limit *= 4
                 high = np.inf
                 if limit > len(scratch.d):
-                    scratch = make_scratch(limit)
+                    owned = make_scratch(limit)
+                    scratch = lent(owned)
             else:
                 high = reach2
                 reach2 = math.sqrt(low * high) if low > 0.0 else 0.25 * reach2
@@ -400,4 +403,4 @@ def _search_group(tree, search, lo, hi, need, cap2, reach2, scratch, rows):
         if pending > 0:
             low, high = reach2, np.inf
             reach2 = more2
-    return count, max(SPARE * kth2, TINY), scratch
+    return count, max(SPARE * kth2, TINY), owned

@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..base.jit import FAST, device, njit
+from ..base.lending import lent
 from .candidates import from_order_bits, order_bits
 from .eigen import eigenentropy, eigenvalues3, log_fast
 from .knn import CROWD, ROOM, make_rows, make_scratch, next_rows, start_search
@@ -352,13 +353,23 @@ def nearest_block(tree, qx, qy, qz, ks, tables, radius, reach, surfaces, wanted,
     made : ndarray of float64, shape (s, m, surfaces.MADE)
         Out: what their surfaces make of these.
     """
+    need = max(ks[len(ks) - 1], AROUND if wanted.any() else 0) + 1
+    search, scratch = start_search(qx, qy, qz), make_scratch(CROWD * need + ROOM)
+    rows, members, s = make_rows(need), make_members(need), make_sums(need)
+    _nearest_block(
+        lent(tree), search, ks, lent(tables), lent(radius), lent(reach), lent(surfaces), wanted, lent(made),
+        need, scratch, rows, members, s,
+    )  # fmt: skip
+
+
+@device
+def _nearest_block(
+    tree, search, ks, tables, radius, reach, surfaces, wanted, made, need, scratch, rows, members, s
+):  # fmt: skip
     some = wanted.any()
-    need = max(ks[len(ks) - 1], AROUND if some else 0) + 1
-    search = start_search(qx, qy, qz)
-    scratch = make_scratch(CROWD * need + ROOM)
-    rows = make_rows(need)
-    members = make_members(need)
-    s = make_sums(need)
+    # Kept by the caller.
+    search, rows, members, s = lent(search), lent(rows), lent(members), lent(s)
+    qx, qy, qz = search.qx, search.qy, search.qz
     while True:
         lo, hi, count, scratch = next_rows(tree, search, need, math.inf, scratch, rows)
         if lo < 0:
