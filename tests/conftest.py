@@ -27,6 +27,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from functools import cache
 from pathlib import Path
 
@@ -43,6 +44,9 @@ for _ignored, _usual in (("SIGINT", signal.default_int_handler), ("SIGHUP", sign
 # A slow or busy machine is no failure.
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")
+
+# What runs note of their pace is not the user's.
+os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="pdal-stages-cache-of-tests-")
 
 ROOT = Path(__file__).resolve().parent.parent
 REQUIRED = {word.strip() for word in os.environ.get("PDAL_STAGES_REQUIRE", "").split(",") if word.strip()}

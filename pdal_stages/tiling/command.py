@@ -383,13 +383,18 @@ def _print_dry(run: TiledRun) -> None:
     print(
         f"about {s['points_read_by_a_tile']:,} points read for a tile, {s['points_of_largest_tile']:,} its own at most"
     )
-    memory, rate = s["memory_mb_of_a_worker"], s["assumed_points_per_core_second"]
+    memory, rate, known = s["memory_mb_of_a_worker"], s["points_per_core_second"], s["measured"]
     workers = {0: "this process", 1: "the worker"}.get(s["workers"], f"each of {s['workers']} workers")
     print(f"up to {memory:,.0f} MB for {workers} with {_counted(s['threads_per_worker'], 'thread')}")
     hours = f"roughly {s['core_hours']:.2f}" if s["core_hours"] >= 0.01 else "less than 0.01"
-    print(f"{hours} core hours at {rate:,} points/s and core; the model decides")
+    told = "no run was measured here yet; the model decides"
+    if known:
+        told = f"as in a run of {known['points']:,} points here on {known['day']}"
+    print(f"{hours} core hours at {rate:,.0f} points/s and core, {told}")
     if s["disk_gb"] >= 0.01:
-        print(f"{s['disk_gb']:,.2f} GB of disk beside the outputs, until these are written")
+        copies = s["disk_gb_of_copies"]
+        some = f", {copies:,.2f} of it for copies of the inputs by place" if copies >= 0.01 else ""
+        print(f"{s['disk_gb']:,.2f} GB of disk beside the outputs, until these are written{some}")
     for job in run.tiles[:50]:
         print(f"  {job.name:24s} {job.points:>14,} points  {_counted(len(job.sources), 'input')}")
     if len(run.tiles) > 50:

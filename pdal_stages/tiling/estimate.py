@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+from .measured import pace_before
 from .outcome import TiledRun, TileJob
 from .sizing import Density, worker_bytes
+from .store import has_room
 from .survey import Survey
 from .tileplan import TilePlan, outputs_for
 
-#: For the estimate of a dry run, with the model that comes with the package: points of its own that a core does in a second,
-#: and points that it only reads, as halo (benchmarks/tiling.py).
-_RATE, _READ_RATE = 40_000, 250_000
 #: Bytes that a run keeps of a point until its output is written.
 _KEPT = 20
-#: Bytes that the rounds before the tiles keep of a cell of a raster of 1,024 x 1,024, until all tiles are done.
-_KEPT_OF_CELL = 82
+#: Bytes that the rounds before the tiles keep of a point, and of a cell of a raster of 1,024 x 1,024, until all tiles are
+#: done.
+_KEPT_BEFORE, _KEPT_OF_CELL = 24, 112
 
 
 def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
@@ -39,6 +41,12 @@ def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
     density = Density.of(survey.extents.values())
     read = density.read_by(grid.size, survey.halo_units)
     held = worker_bytes(read, density.largest if survey.per == "file" else 0)
+    pace = pace_before(plan.head)
+    seconds = pace.core_seconds(count, _beside(listed, read))
+    kept = count * _KEPT * (survey.per == "file") + _kept_before(plan, count, density.area * survey.unit**2)
+    copies = survey.copy_bytes()
+    if not has_room(Path(plan.writers[0]["filename"]).absolute().parent, copies):
+        copies = 0
     summary = survey.figures(plan) | {
         "workers": options.local_workers,
         "threads_per_worker": options.threads,
@@ -46,20 +54,21 @@ def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
         "points_of_largest_tile": max((job.points for job in listed), default=0),
         "points_read_by_a_tile": read,
         "memory_mb_of_a_worker": held / 2**20,
-        "assumed_points_per_core_second": _RATE,
-        "core_hours": (count / _RATE + _beside(listed, read) / _READ_RATE) / 3600,
-        "disk_gb": (
-            _kept_of_cells(plan, density.area * survey.unit**2) + count * _KEPT * (survey.per == "file")
-        )
-        / 1e9,
+        "points_per_core_second": count / seconds if seconds else 0.0,
+        "measured": {"points": pace.points, "day": pace.day} if pace.points else None,
+        "core_hours": seconds / 3600,
+        "disk_gb": (kept + copies) / 1e9,
+        "disk_gb_of_copies": copies / 1e9,
         "states": {"waiting": len(listed)},
     }
     return TiledRun(listed, [], survey.unreadable, [], survey.messages, summary)
 
 
-def _kept_of_cells(plan: TilePlan, area: float) -> float:
-    """Bytes that the rounds before the tiles keep of so many square meters."""
-    return 0.0 if plan.first is None else area / (plan.first.blocks.side / 1024) ** 2 * _KEPT_OF_CELL
+def _kept_before(plan: TilePlan, count: int, area: float) -> float:
+    """Bytes that the rounds before the tiles keep of so many points on so many square meters."""
+    if plan.first is None:
+        return 0.0
+    return count * _KEPT_BEFORE + area / (plan.first.blocks.side / 1024) ** 2 * _KEPT_OF_CELL
 
 
 def _beside(tiles: list[TileJob], read: int) -> int:

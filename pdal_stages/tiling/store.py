@@ -250,15 +250,21 @@ class Store:
 
     def room_for(self, size: int) -> bool:
         """Whether so many bytes are a small part of what is free on the disk."""
-        with contextlib.suppress(OSError):
-            return size * _ROOM <= shutil.disk_usage(self.folder).free
-        return False
+        return has_room(self.folder, size)
 
     def keep_index(self, mark: str, index: CloudIndex) -> None:
         """Keep the index of an input, where there is room."""
         with contextlib.suppress(StageError, OSError):
             known = {"count": index.count, "boxes": index.boxes.tolist(), "tiles": index.tiles}
             _keep(self.indexes / f"{mark}.json", known, "index")
+
+
+def has_room(folder: Path, size: int) -> bool:
+    """Whether so many bytes are a small part of what is free where a folder is, or will be made."""
+    with contextlib.suppress(OSError):
+        there = next(path for path in (folder, *folder.parents) if path.is_dir())
+        return size * _ROOM <= shutil.disk_usage(there).free
+    return False
 
 
 # ---- files that nobody else put there ----------------------------------------------------------------------

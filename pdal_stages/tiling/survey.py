@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -198,7 +199,10 @@ class Survey:
             else:
                 waiting.append(_Reading(source.path, mark))
         store.forget_copies(but=marks)
-        copied = self._copied([reading.path for reading in waiting], store)
+        copied = set(self._worth(reading.path for reading in waiting))
+        sizes = (copy_bytes(self.extents[path].count, self.extents[path].point_bytes) for path in copied)
+        if not store.room_for(sum(sizes)):
+            copied = set()
 
         def task_of(reading: _Reading) -> Call:
             copy = str(store.copy(reading.mark)) if reading.path in copied else ""
@@ -217,13 +221,18 @@ class Survey:
                 progress.update(answer.result.count)
         self._place()
 
-    def _copied(self, paths: list[str], store: Store) -> set[str]:
-        """Inputs of which copies by place are worth it: tiles read more than their own of them, and there is room."""
+    def copy_bytes(self) -> int:
+        """How much disk copies of all inputs by place take, as far as they are worth it."""
+        return sum(
+            copy_bytes(self.extents[path].count, self.extents[path].point_bytes)
+            for path in self._worth(self.extents)
+        )
+
+    def _worth(self, paths: Iterable[str]) -> list[str]:
+        """Inputs of which copies by place are worth it: tiles read more than their own of them."""
         if self.options.scheduler or not self.halo_units or len(self.tiles()) == 1:
-            return set()  # a network carries them less often compressed
-        large = {path: self.extents[path] for path in paths if self.extents[path].count > SMALL}
-        size = sum(copy_bytes(one.count, one.point_bytes) for one in large.values())
-        return set(large) if store.room_for(size) else set()
+            return []  # a network carries them less often compressed
+        return [path for path in paths if self.extents[path].count > SMALL]
 
 
 @dataclass

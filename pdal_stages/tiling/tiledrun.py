@@ -17,6 +17,7 @@ from ..pipeline.overrides import Override
 from ..pipeline.read import PipelineSource
 from ..pipeline.run import Pipeline
 from ..stages.points import HOLDS_NOWHERE
+from . import measured
 from .complete import remember, told_again
 from .dispatch import run_all, run_first_round
 from .estimate import estimate
@@ -160,6 +161,8 @@ def run_plan(
             f"{chosen.most_points:,} points; they may differ from an untiled run: " + ", ".join(short[:5])
         )
     run = TiledRun(work.jobs, work.outputs, survey.unreadable, changed, survey.messages, summary)
+    if not chosen.scheduler:
+        measured.remember(run, plan.head)
     if interrupted:
         raise InterruptedRun(run)
     return run

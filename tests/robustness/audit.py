@@ -14,11 +14,11 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-#: Ours: hidden folders beside outputs, notes of tiled runs, compiled kernels, temporary folders; and the system's.
+#: Ours: hidden folders beside outputs, notes of tiled runs and of their pace, compiled kernels, temporary folders; and the system's.
 OWN = (
     r"/\.pdal-stages-partial-[^/]+(/|$)", r"/\.pdal-stages(/|$)", r"/\.[^/]+\.cells(/|$)", r"/__pycache__(/|$)",
     r"^/(tmp|var/tmp)/pdal-stages-[^/]+(/|$)", r"^/dev/(null|tty|shm/(sem\.)?[\w.-]+)$", r"^/proc/",
-    r"\.nb[ic]", r"^/tmp/tmp\w+(/|$)", r"^/tmp/[a-z0-9_]{8}$",
+    r"/pdal-stages(/measured\.json)?$", r"\.nb[ic]", r"^/tmp/tmp\w+(/|$)", r"^/tmp/[a-z0-9_]{8}$",
 )  # fmt: skip
 #: Programs that commands may start.
 PROGRAMS = r"(python[\d.]*|pdal|uname|sh)$"

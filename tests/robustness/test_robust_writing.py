@@ -68,6 +68,7 @@ SITES = {
     "tiling/byplace:CopyByPlace.__enter__": "a copy that a run goes on without; test_tiling_copies fills its disk",
     "tiling/classify:classify_file": "metadata of classify",
     "tiling/command:_classify_each": "metadata of classify",
+    "tiling/measured:remember": _WHOLE,
     "tiling/objects:_write": _WHOLE,
     "tiling/objects:read_cells": "objects: what a run keeps",
     "tiling/command:_write_json": "tiles: report .json",
