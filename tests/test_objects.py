@@ -368,6 +368,47 @@ def test_what_is_nowhere_two_meters_wide_is_to_be_checked():
     assert ["narrow" in reason for reason in table.columns["reason"]] == [True, False]
 
 
+@pytest.mark.parametrize("degrees", [0.0, 20.0, 45.0, 70.0])
+@pytest.mark.parametrize(
+    ("length", "width", "height", "like"),
+    [
+        (5.2, 2.0, 2.1, "vehicle"),
+        (4.2, 1.8, 1.6, "vehicle"),
+        (6.1, 2.4, 2.6, "container"),
+        (12.2, 2.4, 2.9, "container"),
+        (4.0, 3.2, 2.3, ""),  # a hut
+        (4.4, 2.2, 2.7, ""),  # a long one
+        (6.0, 5.5, 2.5, ""),  # two garages
+        (20.0, 2.6, 2.6, ""),  # a shelter
+        (6.1, 2.4, 6.0, ""),
+    ],
+)
+def test_boxes_of_the_size_of_vehicles_and_containers(degrees, length, width, height, like):
+    roof, codes = house(-length / 2, -width / 2, length / 2, width / 2, height, 0.15)
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    roof[:, :2] = roof[:, :2] @ np.array([[c, s], [-s, c]]) + [20.2, 20.1]
+    table = found_in(*scene((roof, codes))).tables[Kind.BUILDING]
+    assert len(table) == 1
+    assert {"vehicle", "container"} & set(str(table.columns["reason"][0]).split(", ")) == ({like} - {""})
+
+
+def test_objects_of_some_reasons_left_out():
+    wire, shed, van = house(5, 5, 35, 6.4, 7.0), house(10, 20, 14, 24, 3.0), house(30, 30, 35, 32, 2.0, 0.2)
+    tree = np.random.default_rng(1).normal([20, 14, 6], [1, 1, 1], (300, 3))
+    found = found_in(*scene(wire, shed, van, (tree, np.full(300, 5, np.uint8))))
+    same(found.without(())[0], found)
+    rest, left = found.without(["narrow", "vehicle"])
+    assert left == 2 and len(found.tables[Kind.BUILDING]) == 3 and len(rest.tables[Kind.BUILDING]) == 1
+    kept = np.flatnonzero(found.tables[Kind.BUILDING].ids == rest.tables[Kind.BUILDING].ids[0])[0]
+    for one, other in zip(
+        rest.tables[Kind.BUILDING].cells_of(0), found.tables[Kind.BUILDING].cells_of(kept), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+    assert set(rest.owner) == {i for table in rest.tables.values() for i in table.ids}
+    assert len(rest.key) == len(rest.owner) < len(found.key)
+    assert len(rest.tables[Kind.TREE]) == len(found.tables[Kind.TREE]) == 1
+
+
 @pytest.mark.parametrize("degrees", [17.0, 30.0, 41.5])
 def test_a_straight_outline_that_is_shared_out_stays_straight(degrees):
     """Neighbors share an outline in which nothing of the cells' steps is left, nor any piece of it lost."""

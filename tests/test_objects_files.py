@@ -188,12 +188,27 @@ def test_metadata_never_replaces_an_input(folder, tmp_path, capsys):
 
 
 @pytest.mark.pdal
+def test_a_reason_that_is_none_is_refused(folder, tmp_path, capsys):
+    files = [str(folder / "town.laz"), str(tmp_path / "t.gpkg")]
+    assert cli.main(["objects", *files, "--writers.objects.refuse=narow"]) == 1
+    assert "Did you mean 'narrow'" in capsys.readouterr().err and not (tmp_path / "t.gpkg").exists()
+
+
+@pytest.mark.pdal
 def test_settings_and_metadata(folder, tmp_path):
     def run(*more):
         files = [str(folder / "town.laz"), str(tmp_path / "t.gpkg"), "--metadata", str(tmp_path / "m.json")]
         assert cli.main(["objects", *files, *more]) == 0
         return json.loads((tmp_path / "m.json").read_text())
 
+    checked = run()["objects"]["buildings"]
+    reason = max(checked["reasons"], key=checked["reasons"].get)
+    left = run(f"--filters.objects.refuse={reason}")
+    assert left["refused"]["objects"] >= checked["reasons"][reason] > 0
+    assert left["objects"]["buildings"]["objects"] == checked["objects"] - checked["reasons"][reason]
+    assert reason not in left["objects"]["buildings"]["reasons"]
+    shown, _, _ = layer(tmp_path / "t.gpkg", "buildings")
+    assert len(shown["object_id"]) == left["objects"]["buildings"]["objects"]
     one, two = run(), run("--writers.objects.tree_height=9", "--cell", "1", "--outlines", "cells")
     assert two["settings"]["tree_height"] == 9 and two["settings"]["cell"] == 1
     assert two["objects"]["trees"]["objects"] < one["objects"]["trees"]["objects"]

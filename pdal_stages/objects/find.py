@@ -8,7 +8,7 @@ So blocks, and tiles that hold as much, find exactly what one look at everything
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
@@ -109,6 +109,24 @@ class Table:
         part = slice(self.start[number], self.start[number + 1])
         return self.row[part], self.column[part], self.z[part]
 
+    def having(self, reasons: Collection[str]) -> NDArray[np.bool_]:
+        """Which objects are to be checked for one of the reasons."""
+        texts = self.columns["reason"].tolist() if len(self) else []
+        return np.array([any(one in reasons for one in str(text).split(", ")) for text in texts], bool)
+
+    def only(self, kept: NDArray[np.bool_]) -> Table:
+        """Some of the objects."""
+        cells = np.repeat(kept, np.diff(self.start))
+        return Table(
+            self.ids[kept],
+            {name: values[kept] for name, values in self.columns.items()},
+            np.r_[0, np.cumsum(np.diff(self.start)[kept])].astype(np.int64),
+            self.row[cells],
+            self.column[cells],
+            self.z[cells],
+            [path for path, stays in zip(self.paths, kept, strict=True) if stays] if self.paths else [],
+        )
+
 
 @dataclass
 class Objects:
@@ -118,6 +136,16 @@ class Objects:
     tables: dict[Kind, Table]
     key: NDArray[np.int64]  # sorted keys of cells
     owner: NDArray[np.int64]  # id of the object that has their points
+
+    def without(self, reasons: Collection[str]) -> tuple[Objects, int]:
+        """The objects that are not to be checked for one of the reasons; how many are left out."""
+        left = {kind: table.having(reasons) for kind, table in self.tables.items()}
+        gone = np.concatenate([table.ids[left[kind]] for kind, table in self.tables.items()])
+        if not gone.size:
+            return self, 0
+        stays = ~np.isin(self.owner, gone)
+        tables = {kind: table.only(~left[kind]) for kind, table in self.tables.items()}
+        return Objects(self.settings, tables, self.key[stays], self.owner[stays]), gone.size
 
     def ids_at(self, x: NDArray, y: NDArray, kinds: NDArray) -> NDArray[np.int64]:
         """The id of each point's object, 0 where it is of none; `kinds` are numbers of :class:`Kind`, or -1."""

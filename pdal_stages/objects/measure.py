@@ -18,10 +18,16 @@ SURE, CHECK = "sure", "check"
 CUT = "cut off"
 #: A building holds a square of this side, meters; wires that were taken for one do not.
 WIDE = 2.0
+#: What stands about and is no building, by reason: its width, length and height, meters, as cells show them, up to two
+#: cells wider; how many times as long as wide it is at least; and how much its top slopes at most, degrees.
+BOXES = {
+    "vehicle": ((1.5, 3.2), (3.5, 7.0), (0.0, 2.4), 1.5, 25.0),
+    "container": ((2.0, 3.7), (5.5, 13.5), (2.2, 3.8), 1.9, 6.0),
+}
 #: Why an object is to be checked.
 REASONS = (
-    "no ground near", "small", "narrow", "low", "rough roof", "unsure points", "no facade", "few points", "thin crown",
-    "wide crown", "short", "not straight", CUT,
+    "no ground near", "small", "narrow", "vehicle", "container", "low", "rough roof", "unsure points", "no facade",
+    "few points", "thin crown", "wide crown", "short", "not straight", CUT,
 )  # fmt: skip
 
 
@@ -125,6 +131,8 @@ def building(body: Body, size: float) -> dict[str, object]:
         reasons.append("small")
     if not body.holds_square(math.ceil(WIDE / size)):
         reasons.append("narrow")
+    if area < 45 and (like := _box_like(body, ridge, slope, size)):
+        reasons.append(like)
     if ridge < 2.2:
         reasons.append("low")
     if planar < 0.3 and area >= 30:
@@ -145,6 +153,21 @@ def building(body: Body, size: float) -> dict[str, object]:
         "reliab": body.reliability,
         **judged(reasons),
     }
+
+
+def _box_like(body: Body, height: float, slope: float, size: float) -> str:
+    """Which of `BOXES` an object may be; empty where none."""
+    turns = np.radians(np.arange(0.0, 90.0, 3.0))[:, None]
+    u = body.column * np.cos(turns) + body.row * np.sin(turns)
+    v = body.row * np.cos(turns) - body.column * np.sin(turns)
+    sides = (np.ptp(u, axis=1) + 1.0) * size, (np.ptp(v, axis=1) + 1.0) * size
+    best = int(np.argmin(np.round(sides[0] * sides[1], 6)))
+    width, length = sorted((float(sides[0][best]), float(sides[1][best])))
+    for name, (wide, long, high, ratio, flat) in BOXES.items():
+        fits = wide[0] <= width <= wide[1] and long[0] <= length <= long[1] and high[0] <= height <= high[1]
+        if fits and length >= ratio * width and slope <= flat:
+            return name
+    return ""
 
 
 def tree(body: Body, top_row: int, top_column: int, size: float) -> dict[str, object]:

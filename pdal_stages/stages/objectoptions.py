@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields
 from functools import cached_property
 from typing import Any
 
+from ..base.errors import OptionError, suggest
 from ..objects import Cells, ObjectSettings
 from ..objects.cells import CLASSES, Kind, kind_of_code, refuse_unclassified
+from ..objects.measure import REASONS
 from .options import ignore_option, option
 from .points import Points
 from .selection import Selection
@@ -33,6 +36,17 @@ def _setting(name: str) -> Any:
 
 def _codes(name: str, what: str) -> Any:
     return option("codes", CLASSES[_CODES[name]], f"Class codes of {what}", may_be_empty=True)
+
+
+def check_reasons(names: Sequence[str]) -> None:
+    """Refuse what is no reason to check an object."""
+    for name in names:
+        if name not in REASONS:
+            raise OptionError(
+                "option 'refuse' names no reason",
+                found=repr(name),
+                cure=f"{suggest(str(name), REASONS)}Reasons: {', '.join(REASONS)}",
+            )
 
 
 class ObjectOptions:

@@ -7,13 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import OptionError, suggest
 from ..objects import Objects, find_objects
 from ..objects.cells import Kind, kind_of_code
 from ..objects.find import FOUND, MARGIN
 from ..objects.measure import CHECK, REASONS
 from .base import Stage
-from .objectoptions import ObjectOptions
+from .objectoptions import ObjectOptions, check_reasons
 from .options import option
 from .points import Points
 
@@ -58,8 +57,8 @@ them. **Spans** are wires between towers or poles, **decks** those of bridges.
 
 Heights are above the ground that the points of its classes show, so `Classification` is all that is read; a mean
 `Reliability`, where points have one, is part of the verdict. Each object is *sure* or *to be checked*, with the reasons:
-small, narrow (nowhere 2 m wide), low, rough roof,
-no facade, no ground near, unsure points, few points, thin crown, wide crown, short, not straight.
+small, narrow (nowhere 2 m wide: wires), vehicle or container (a box of the size of one, which some garages have), low,
+rough roof, no facade, no ground near, unsure points, few points, thin crown, wide crown, short, not straight.
 Metadata counts objects by kind, verdict and reason. The objects of the reasons in `refuse` lose their class (and are
 counted): their points get `refused_class`, and no `ObjectID`.
 
@@ -72,13 +71,7 @@ the tile is read wider. To write objects as polygons and points use `pdal-stages
 
     def check(self) -> None:
         self.check_classes()
-        for reason in self.refuse:
-            if reason not in REASONS:
-                raise OptionError(
-                    "option 'refuse' names no reason",
-                    found=repr(reason),
-                    cure=f"{suggest(str(reason), REASONS)}Reasons: {', '.join(REASONS)}",
-                )
+        check_reasons(self.refuse)
 
     def reads(self) -> list[str]:
         return ["Classification"]
@@ -147,10 +140,7 @@ the tile is read wider. To write objects as polygons and points use `pdal-stages
                     np.nan_to_num(columns[_HEIGHT[kind]][which]) / points.units.vertical
                 )
                 out["ObjectExtent"][rows] = columns[_EXTENT[kind]][which]
-            bad = np.array(
-                [any(r in self.refuse for r in str(text).split(", ")) for text in columns["reason"]]
-            )
-            refused[rows] = bad[which]
+            refused[rows] = found.tables[kind].having(self.refuse)[which]
         if self.refuse:
             codes = points.class_codes.copy()
             codes[refused] = self.refused_class

@@ -7,9 +7,10 @@ from numpy.typing import NDArray
 from ..base.errors import StageError
 from ..base.outputs import Output
 from ..objects import find_objects
+from ..objects.measure import REASONS
 from ..objects.outlines import with_vector
 from .base import Stage
-from .objectoptions import ObjectOptions
+from .objectoptions import ObjectOptions, check_reasons
 from .options import option
 from .points import Points
 
@@ -34,6 +35,12 @@ class ObjectsWriter(ObjectOptions, Stage):
         "Outlines of buildings and decks: straight, along walls, or along cells",
         choices=(STRAIGHT, CELLS),
     )
+    refuse: list[str] = option(
+        "list",
+        (),
+        f"Objects with one of these reasons to be checked are left out, and counted: {', '.join(REASONS)}",
+        may_be_empty=True,
+    )
     details = """
 The objects are those of `filters.objects`, with the same ids and options. Layers and their columns (measures in meters,
 whatever the unit of the coordinates; names fit into shapefiles):
@@ -57,6 +64,7 @@ tell what is to be checked; beside other files lies a `.qml`. Needs the extra `v
         from ..reports.objectlayers import check_target
 
         self.check_classes()
+        check_reasons(self.refuse)
         with_vector(check_target, self.filename)
 
     def outputs(self) -> list[Output]:
@@ -74,7 +82,9 @@ tell what is to be checked; beside other files lies a `.qml`. Needs the extra `v
             )
         from ..reports.objectlayers import write_objects
 
-        found = find_objects(self.cells(points), self.settings)
+        found, refused = find_objects(self.cells(points), self.settings).without(self.refuse)
+        if self.refuse:
+            points.report.figures["refused"] = refused
         straight = self.outlines == STRAIGHT
         figures = with_vector(write_objects, self.filename, found, straight, points.units, points.wkt)
         points.report.figures |= figures

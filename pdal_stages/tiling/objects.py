@@ -109,6 +109,7 @@ def _write(
     check_target(stage.filename)
     with _own(stage.filename):
         found, reference = objects_of_files(inputs, stage, workers=workers, resume=resume)
+        found, refused = found.without(stage.refuse)
         layers = object_layers(found, straight=stage.outlines == STRAIGHT, units=reference[0])
         files = write_layers(stage.filename, layers, reference[1])
         shutil.rmtree(_kept(stage.filename), ignore_errors=True)
@@ -117,6 +118,8 @@ def _write(
         print(f"{one['objects']:,} {kind}, {one['to_be_checked']:,} to be checked")
         for reason, count in one["reasons"].items():
             print(f"  {reason:28s} {count:>10,}")
+    if stage.refuse:
+        print(f"{refused:,} left out (refuse: {', '.join(stage.refuse)})")
     print("written to " + ", ".join(str(file) for file in files))
     if metadata:
         about = {
@@ -125,6 +128,7 @@ def _write(
             "files": [str(f) for f in files],
             "settings": {one.name: getattr(stage.settings, one.name) for one in fields(ObjectSettings)},
             "objects": summary,
+            "refused": {"reasons": list(stage.refuse), "objects": refused},
         }
         write_whole(metadata, (json.dumps(about, indent=1) + "\n").encode(), "metadata")
     picture = None
