@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import mmap
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,6 +12,7 @@ from hypothesis import strategies as st
 
 from pdal_stages.base import checks
 from pdal_stages.base.errors import OptionError
+from pdal_stages.base.memory import give_back
 
 
 @given(st.integers() | st.floats() | st.booleans() | st.none() | st.text())
@@ -74,3 +78,23 @@ def test_words():
             checks.names("x", wrong)
     with pytest.raises(OptionError, match="true or false"):
         checks.flag("x", "yes")
+
+
+# ---- memory ----------------------------------------------------------------------------------------------
+
+
+def test_only_whole_pages_inside_an_array_are_given_back():
+    page = mmap.PAGESIZE
+    room = np.ones(16 * page, np.uint8)
+    give_back(room[100:200])  # within a page, or two
+    assert room.all()
+    part = room[page + 8 : 9 * page + 8]
+    give_back(part.view(np.float64))
+    gone = np.flatnonzero(room == 0)
+    assert room[: page + 8].all() and room[9 * page + 8 :].all()
+    if sys.platform == "linux":
+        assert 7 * page <= len(gone) < 8 * page and np.array_equal(np.unique(np.diff(gone)), [1])
+    part[:] = 3  # it is still there
+    assert (part == 3).all()
+    give_back(room[::2])
+    assert room[:page].all()

@@ -99,7 +99,8 @@ def consistent(
     if len(there):
         kinds = np.full(256, _OTHER, np.uint8)
         kinds[GROUND], kinds[list(VEGETATION)], kinds[BUILDING] = _GROUND, _VEGETATION, _BUILDING
-        work = _Neighborhoods(xyz[there], kinds[out[there]])
+        xyz = xyz if len(there) == len(xyz) else xyz[there]
+        work = _Neighborhoods(xyz, kinds[out[there]])
         free = may[there] & (work.kind != _OTHER)
         flat = None if ground is None else np.asarray(ground)[there] != 0
         above = None if height is None else np.asarray(height, np.float64)[there]

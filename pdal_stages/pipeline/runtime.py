@@ -19,6 +19,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from ..base.errors import InterruptedStage, StageError
+from ..base.memory import give_back
 from ..base.report import Report
 from ..base.shortage import is_short, shortage
 from ..stages import registry
@@ -131,8 +132,11 @@ def run_on_view(
     for name in stage.reads():
         if name not in ins:
             stage.take(points, name)  # raises, naming the stage that makes it
+    types = {name: array.dtype for name, array in ins.items()}
+    # PDAL makes these arrays for this one call, and frees them after it.
+    points.let_go_of = give_back
     for name, values in stage.run(points).items():
-        target = ins[name].dtype
+        target = types[name]
         # PDAL copies raw memory: exactly this type, contiguous, one value per point.
         array = np.ascontiguousarray(values, dtype=target)
         if array.shape != (points.count,):

@@ -73,8 +73,9 @@ feet of walls stay what they are: surveys label them building as often as ground
                 "there is no HeightAboveGround or no Ground: the rules ground and islands did nothing"
             )
         before = points.class_codes
+        points.keep_only(["Classification", "HeightAboveGround", "Ground"])
         codes = consistent(
-            points.xyz,
+            points.take_xyz(),
             before,
             **heights,
             mask=~ignored,

@@ -266,12 +266,14 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         points.report.figures["kept"] = points.counted(inside & kept & ~ignored)
         wanted = inside & ~ignored & ~kept
         self._refuse_codes_that_stay(points, wanted)
+        dimensions, current = self._dimensions(points), points.class_codes
+        points.keep_only([*dimensions, *self.creates(), HEIGHT])
         with Progress(int(np.count_nonzero(wanted)), self.type) as progress:
             found = self.model.predict(
                 points.take_xyz(),
-                self._dimensions(points),
+                dimensions,
                 None if wanted.all() else wanted,
-                current=points.class_codes,
+                current=current,
                 ignore=ignored if ignored.any() else None,
                 threads=self.threads,
                 memory_mb=self.memory,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 
 import numpy as np
@@ -55,7 +55,14 @@ class Points:
         True where the three flag bits of LAS 1.0-1.3 sit inside `Classification`.
     own : (n,) ndarray, optional
         Below zero for the points whose results are used: :meth:`counted` counts those alone.
+
+    Attributes
+    ----------
+    let_go_of : function, optional
+        Called by :meth:`keep_only` with the arrays that are not kept, by whom they are lent to the stage.
     """
+
+    let_go_of: Callable[[NDArray], None] | None = None
 
     def __init__(
         self,
@@ -142,6 +149,17 @@ class Points:
                 '&& Z < 1e9"} (filters.range with "limits": "Z[-1000:10000]" in PDAL 2.2)',
             )
         return x, y, z
+
+    def keep_only(self, names: Iterable[str]) -> None:
+        """Forget the other dimensions: from here on nobody reads them. Of coordinates :attr:`xyz` is left."""
+        self.xyz  # noqa: B018  before they are gone
+        self.__dict__.pop("axes", None)
+        kept = set(names)
+        others = [name for name, array in self.arrays.items() if name not in kept and array is not self._own]
+        for name in others:
+            if self.let_go_of is not None:
+                self.let_go_of(self.arrays[name])
+        self.arrays = {name: array for name, array in self.arrays.items() if name not in others}
 
     def take_xyz(self) -> NDArray[np.float64]:
         """:attr:`xyz`, not kept here: who takes it may let go of it."""
