@@ -25,12 +25,14 @@ import numpy as np
 from pdal_stages.accuracy import Accuracy
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 from pdal_stages.classifier.dimensions import ALWAYS, WHERE_THERE
+from pdal_stages.features.names import SURFACES
 from pdal_stages.terrain import filtered_ground
 
 #: What ``pdal-stages train`` takes where points have it.
 DIMENSIONS = (*ALWAYS, *WHERE_THERE, "returns")
 PAPERS = "c1,c2,c3,c5,s1,s2,s3,s5,kopt"
 ONE = {"passes": 1}
+FEATURES = TrainingOptions().feature_set
 #: Table -> row -> what differs from today's defaults.
 TABLES: dict[str, dict[str, dict[str, Any]]] = {
     "features": {
@@ -47,6 +49,13 @@ TABLES: dict[str, dict[str, dict[str, Any]]] = {
         "without return numbers": {**ONE, "dimensions": (*ALWAYS, *WHERE_THERE)},
         "without heights above openings": {**ONE, "dimensions": (*ALWAYS, "Ground", "returns")},
         "heights above ground alone": {**ONE, "dimensions": ALWAYS},
+    },
+    "surfaces": {
+        "none": {},
+        "agreement and lowest of k20": {
+            "feature_set": (*FEATURES, "NormalAgreement_k20", "SurfaceVariationMin_k20")
+        },
+        "all four of k20": {"feature_set": (*FEATURES, *(f"{name}_k20" for name in SURFACES))},
     },
     "voxel": {
         "0.125 m": {},

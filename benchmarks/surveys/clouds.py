@@ -41,7 +41,8 @@ class LabeledSurvey:
     samples : int
         Of each class from each copy, at most: fewer from what is alike all over, or has one building.
     mislabeled : tuple of boxes
-        West, south, east, north of where the labels were looked at and are wrong: errors are not counted there.
+        West, south, east, north of where the labels were looked at and are wrong: nothing is learned from them, and
+        errors are not counted.
     what, license : str
         For the card.
     """
@@ -170,9 +171,16 @@ def true_classes(
     for given, least in survey.tall.items():
         # Else vegetation would be judged only where it is none.
         truth[(codes == given) & (height >= least)] = VEGETATION
-    for west, south, east, north in survey.mislabeled:
-        truth[(x >= west) & (x <= east) & (y >= south) & (y <= north)] = 0
+    truth[mislabeled(survey, x, y)] = 0
     return truth
+
+
+def mislabeled(survey: LabeledSurvey, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Which points lie where the labels were looked at and are wrong, (n,) bool."""
+    inside = np.zeros(len(x), np.bool_)
+    for west, south, east, north in survey.mislabeled:
+        inside |= (x >= west) & (x <= east) & (y >= south) & (y <= north)
+    return inside
 
 
 def _relabeled(survey: LabeledSurvey, codes: np.ndarray) -> np.ndarray:
@@ -262,6 +270,8 @@ def load(data: Path, survey: str) -> Cloud:
         cloud.labels[tall] = VEGETATION
         if known.tall_scored:
             cloud.truth[tall] = VEGETATION
+    wrong = mislabeled(known, *xyz[:, :2].T)
+    cloud.labels[wrong] = cloud.truth[wrong] = 0
     return cloud
 
 

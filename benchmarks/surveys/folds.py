@@ -28,6 +28,8 @@ from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.classifier.smoothing import count_shares
 from pdal_stages.stages.loading import load_model
 
+#: Of a forest of a model that misses a survey, by default: what the card's and the review's figures are of.
+TREES = 20
 FEATURES = Features(feature_plan(OPTIONS))
 CONTEXT = Context(tuple(OPTIONS.context))
 
@@ -44,7 +46,7 @@ def features_of(cloud: TrainingCloud) -> npt.NDArray[np.float32]:
 class LeaveOneOut:
     """The copies of all surveys, and models of so many trees a pass without one of these."""
 
-    def __init__(self, data: Path, surveys: Iterable[str], folder: Path, trees: int = OPTIONS.trees) -> None:
+    def __init__(self, data: Path, surveys: Iterable[str], folder: Path, trees: int = TREES) -> None:
         self.trees = trees
         self.names = sorted(surveys)
         self.clouds: list[TrainingCloud] = []
@@ -88,10 +90,14 @@ class LeaveOneOut:
             shares = count_shares(forest.predict_proba(np.ascontiguousarray(table)))
             CONTEXT.tables(cloud.xyz, shares).fill(rows, part)
             around[at] = part
-        second = self._grow(np.concatenate([self.values, around], axis=1), kept, self.trees)
+        both = np.concatenate([self.values, around], axis=1)
+        second = self._grow(both, kept, self.trees)
         passes = FeatureForest(FEATURES, first), FeatureForest(FEATURES, second, CONTEXT)
-        # What is known of the shipped model, which is of the same make.
+        # What is known of the shipped model, which is of the same make, but for what is known of its samples.
         info = {**copy.deepcopy(load_model("standard").info), "training": self._training(name)}
+        for one, columns in zip(info["passes"], (self.values, both), strict=True):
+            low, high = np.percentile(columns[kept], (1, 99), axis=0).tolist()
+            one.update(percentiles={"low": low, "high": high, "limited": False}, importances=None)
         return Model(passes, self.classes, {**info, "voxel": OPTIONS.voxel})
 
     def _training(self, without: str) -> dict[str, Any]:

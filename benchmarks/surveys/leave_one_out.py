@@ -19,7 +19,7 @@ from typing import Any
 import laspy
 import numpy as np
 from clouds import SURVEYS, Cloud, load, slug, thinned, with_heights
-from folds import LeaveOneOut
+from folds import TREES, LeaveOneOut
 from recipe import OPTIONS
 
 from pdal_stages.accuracy import Accuracy
@@ -113,7 +113,7 @@ def main() -> None:
     options.add_argument("--data", type=Path, required=True, help="folder of the clouds")
     options.add_argument("--json", type=Path, help="where the figures go")
     options.add_argument("--surveys", nargs="+", default=list(SURVEYS), choices=list(SURVEYS))
-    options.add_argument("--trees", type=int, default=OPTIONS.trees, help="of a forest")
+    options.add_argument("--trees", type=int, default=TREES, help="of a forest")
     options.add_argument("--ground", type=Path, help="model file to score on the ISPRS samples")
     options.add_argument(
         "--pictures", type=Path, help="folder for pictures of the surveys at their own density"

@@ -25,7 +25,8 @@ MOST = 50_000
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 OPTIONS = TrainingOptions(
     neighborhoods="s5,k10,k20,k50",
-    feature_set="covariance,Verticality,HeightRange,HeightStd,HeightAboveLowest",
+    feature_set="covariance,Verticality,HeightRange,HeightStd,HeightAboveLowest,"
+    "NormalAgreement_k20,SurfaceVariationMin_k20",
     dimensions=("HeightAboveGround", "Ground", "HeightAboveOpening_5", "HeightAboveOpening_17", "returns"),
     classes={"2": 2, "5": 5, "6": 6},
     count=40_000,

@@ -26,7 +26,7 @@ from typing import Any
 import laspy
 import numpy as np
 from clouds import SURVEYS, slug, true_classes
-from folds import LeaveOneOut
+from folds import TREES, LeaveOneOut
 
 import pdal_stages
 from pdal_stages import cli
@@ -252,7 +252,7 @@ def main() -> None:
         required=True,
         help="folder of the models; those that leave_one_out.py --save has not left there are made",
     )
-    options.add_argument("--trees", type=int, default=20, help="of a forest of a model that is made")
+    options.add_argument("--trees", type=int, default=TREES, help="of a forest of a model that is made")
     options.add_argument(
         "--kept", type=Path, help="folder for the classified surveys; default: that of the models"
     )
