@@ -34,6 +34,7 @@ from pdal_stages.classifier.foresttraining import feature_plan
 from pdal_stages.classifier.growing import TreeOptions, grow
 from pdal_stages.classifier.smoothing import count_shares, smooth
 from pdal_stages.classifier.trainoptions import DEFAULT_CONTEXT, TrainingOptions
+from pdal_stages.classifier.trees import Ranked
 from pdal_stages.features import FeatureEngine
 from pdal_stages.features.voxels import represent
 
@@ -126,8 +127,8 @@ class Scene:
 def forest(values: Table, label: Any, weight: Any, trees: int) -> Forest:
     """As training grows it."""
     setting = TreeOptions(None, 3, 1.0, "auto")
-    grown = grow(np.ascontiguousarray(values), label, weight, trees, setting, SEED, threads=1)
-    return Forest.from_sklearn([tree.tree_ for tree, _, _ in grown], values.shape[1])
+    grown = grow(Ranked.of(values, 1), label, weight, trees, setting, SEED, threads=1)
+    return Forest.from_trees([tree for tree, _, _ in grown], values.shape[1])
 
 
 def context(part: Part) -> Table:

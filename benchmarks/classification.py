@@ -31,6 +31,7 @@ from pdal_stages.classifier.crossval import block_folds, split
 from pdal_stages.classifier.forest import Forest
 from pdal_stages.classifier.growing import TreeOptions, grow
 from pdal_stages.classifier.sampling import draw_samples
+from pdal_stages.classifier.trees import Ranked
 from pdal_stages.features import FeatureEngine, FeaturePlan
 from pdal_stages.terrain.minima import hag_minima
 
@@ -232,8 +233,8 @@ def tune(
                     np.clip(x[:, j], *np.percentile(x[:, j], [1, 99]).astype(np.float32), out=x[:, j])
             start = time.process_time()
             setting = TreeOptions(None, trial["leaf"], trial["bag"], trial["tried"])
-            grown = grow(x, samples.label, samples.weight, trial["trees"], setting, options.seed)
-            forest = Forest.from_sklearn([tree.tree_ for tree, _, _ in grown], x.shape[1])
+            grown = grow(Ranked.of(x), samples.label, samples.weight, trial["trees"], setting, options.seed)
+            forest = Forest.from_trees([tree for tree, _, _ in grown], x.shape[1])
             cpu += time.process_time() - start
             nodes += len(forest.feature)
             rows = use[np.random.default_rng(0).permutation(held)[:30_000]]

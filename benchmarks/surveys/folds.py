@@ -26,6 +26,7 @@ from pdal_stages.classifier.foresttraining import FOLD_TREES, feature_plan
 from pdal_stages.classifier.growing import TreeOptions, grow
 from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.classifier.smoothing import count_shares
+from pdal_stages.classifier.trees import Ranked
 from pdal_stages.stages.loading import load_model
 
 #: Of a forest of a model that misses a survey, by default: what the card's and the review's figures are of.
@@ -62,24 +63,24 @@ class LeaveOneOut:
         of = [cloud.flight for cloud in self.clouds]
         self.samples = draw_samples(labeled, len(self.classes), OPTIONS.count, OPTIONS.seed, of)
         self.survey = np.array([self.names.index(name) for name in of])[self.samples.cloud]
-        self.values = self.samples.take(self.tables)
+        self.ranked = Ranked.of(self.samples.take(self.tables))
         self._pair = cache(self._grown_without)
 
-    def _grow(self, columns: npt.NDArray[np.float32], kept: npt.NDArray[np.bool_], trees: int) -> Forest:
+    def _grow(self, ranked: Ranked, kept: npt.NDArray[np.bool_], trees: int) -> Forest:
         setting = TreeOptions(None, OPTIONS.min_samples_leaf, OPTIONS.max_samples, OPTIONS.max_features)
         weight = self.samples.weight * kept
-        grown = grow(columns, self.samples.label, weight, trees, setting, OPTIONS.seed)
-        return Forest.from_sklearn([tree.tree_ for tree, _, _ in grown], columns.shape[1])
+        grown = grow(ranked, self.samples.label, weight, trees, setting, OPTIONS.seed)
+        return Forest.from_trees([tree for tree, _, _ in grown], ranked.columns)
 
     def _grown_without(self, one: int, other: int) -> Forest:
         kept = (self.survey != one) & (self.survey != other)
-        return self._grow(self.values, kept, max(1, round(FOLD_TREES * self.trees)))
+        return self._grow(self.ranked, kept, max(1, round(FOLD_TREES * self.trees)))
 
     def without(self, name: str) -> Model:
         """The model of all surveys but this one."""
         left = self.names.index(name)
         kept = self.survey != left
-        first = self._grow(self.values, kept, self.trees)
+        first = self._grow(self.ranked, kept, self.trees)
         around = np.zeros((len(self.samples), len(CONTEXT.tokens) * len(self.classes)), np.float32)
         for number, (cloud, table) in enumerate(zip(self.clouds, self.tables, strict=True)):
             at, rows = self.samples.of_cloud(number)
@@ -90,13 +91,13 @@ class LeaveOneOut:
             shares = count_shares(forest.predict_proba(np.ascontiguousarray(table)))
             CONTEXT.tables(cloud.xyz, shares).fill(rows, part)
             around[at] = part
-        both = np.concatenate([self.values, around], axis=1)
+        both = self.ranked.beside(Ranked.of(around))
         second = self._grow(both, kept, self.trees)
         passes = FeatureForest(FEATURES, first), FeatureForest(FEATURES, second, CONTEXT)
         # What is known of the shipped model, which is of the same make, but for what is known of its samples.
         info = {**copy.deepcopy(load_model("standard").info), "training": self._training(name)}
-        for one, columns in zip(info["passes"], (self.values, both), strict=True):
-            low, high = np.percentile(columns[kept], (1, 99), axis=0).tolist()
+        for one, ranked in zip(info["passes"], (self.ranked, both), strict=True):
+            low, high = ranked.limits(0)
             one.update(percentiles={"low": low, "high": high, "limited": False}, importances=None)
         return Model(passes, self.classes, {**info, "voxel": OPTIONS.voxel})
 
