@@ -28,6 +28,9 @@ from .patches import connected
 from .planes import reach as planes_reach
 from .planes import surface
 
+#: Cells beyond its reach that points may lie in without being left out.
+_FEW = 4
+
 
 def reach_of_block(options: FilterOptions) -> int:
     """How far around a block, in cells, lowest points matter."""
@@ -81,16 +84,23 @@ def cells_of_block(
         inside = (column >= west - away) & (column <= east + away)
         return inside & (row >= south - away) & (row <= north + away)
 
+    def beyond(away):
+        """Whether any lies so far away that it is worth a copy of the others."""
+        left, right, low, high = column.min(), column.max(), row.min(), row.max()
+        return left < west - away or right > east + away or low < south - away or high > north + away
+
     # Openings reach into cells without points.
     spill = max([*options.opening_radii, 0]) + 2
     margin = max(spill, _beside(options))
-    near = within(column, row, reach_of_block(options))
-    x, y, z, column, row = x[near], y[near], z[near], column[near], row[near]
+    if len(x) and beyond(reach_of_block(options) + _FEW):
+        near = within(column, row, reach_of_block(options))
+        x, y, z, column, row = x[near], y[near], z[near], column[near], row[near]
     levels, deck = np.empty((0, 5)), np.zeros(len(x), np.uint8)
     own_levels = levels
-    if options.decks:
-        seen = within(column, row, options.reach_of_decks + margin)
-        use = np.ones(np.count_nonzero(seen), bool)
+    if options.decks and len(x):
+        far = options.reach_of_decks + margin
+        seen = within(column, row, far) if beyond(far + _FEW) else slice(None)
+        use = np.ones(len(x[seen]), bool)
         levels, lowest = levels_near_decks(x[seen], y[seen], z[seen], use)
         deck[seen] = decks_of_levels(x[seen], y[seen], z[seen], use, levels)
         own_levels = levels[within(column[seen][lowest], row[seen][lowest], 0)]

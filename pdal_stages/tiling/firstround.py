@@ -75,11 +75,13 @@ class BlockTask:
         assert self.plan.first is not None
         first, stage = self.plan.first, stage_of(self.plan)
         box = block_grid(first).box(self.block, first.blocks.reach)
-        around = [_within(box, load_arrays(path, ["around"])["around"]) for path in self.tiles]
+        parts = [_within(box, load_arrays(path, ["around"])["around"]).T for path in self.tiles]
+        around = np.concatenate([np.empty((3, 0)), *parts], axis=1)  # whose rows are taken as they are
+        del parts
         inside = _inside(self.block)
         points = (load_arrays(path, [inside]).get(inside) for path in self.tiles)
         block = stage.block_of(
-            np.concatenate([np.empty((0, 3)), *around]),
+            around.T,
             (some for some in points if some is not None),
             self.block,
         )
