@@ -1,4 +1,4 @@
-"""Bridge decks and wires: how many of their points are found, and how many others are taken for them.
+"""Bridge decks, wires and towers: how many of their points are found, and how many others are taken for them.
 
 python benchmarks/bridges.py --data FOLDER
 
@@ -21,6 +21,7 @@ import numpy as np
 from pdal_stages.synthetic import make_town
 from pdal_stages.terrain.decks import find_decks
 from pdal_stages.terrain.morphological import filtered_ground
+from pdal_stages.terrain.towers import find_towers
 from pdal_stages.terrain.wires import find_wires
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -61,10 +62,17 @@ def decks(name: str, xyz: np.ndarray, use: np.ndarray, true: np.ndarray, either:
     row(name, "deck", found, true, either, time.process_time() - begin)
 
 
-def wires(name: str, xyz: np.ndarray, use: np.ndarray, true: np.ndarray, either: np.ndarray) -> None:
+def wires(
+    name: str, xyz: np.ndarray, use: np.ndarray, true: np.ndarray, either: np.ndarray, unknown: np.ndarray
+) -> None:
     height = filtered_ground(xyz, mask=use)["HeightAboveGround"]
     begin = time.process_time()
-    row(name, "wire", find_wires(xyz, height, use), true, either, time.process_time() - begin)
+    wire = find_wires(xyz, height, use)
+    row(name, "wire", wire, true, either, time.process_time() - begin)
+    if either.any() and wire.any():
+        begin = time.process_time()
+        tower = find_towers(xyz, height, wire, use)
+        row(name, "tower", tower, either, unknown, time.process_time() - begin)
 
 
 def main() -> None:
@@ -80,11 +88,18 @@ def main() -> None:
         town = make_town(300.0, density, seed, progress=False)
         true, use = town.classification, town.classification != 7
         decks(f"town {seed}, {density:g} points/m2", town.xyz, use, true == 17, true == 1)
-        wires(f"town {seed}, {density:g} points/m2", town.xyz, use, true == 14, true == 15)
+        wires(f"town {seed}, {density:g} points/m2", town.xyz, use, true == 14, true == 15, true == 14)
     for density in (8.0, 2.0):
         for name, corridor in CORRIDORS.items():
             xyz, codes = corridor(density)
-            wires(f"{name}, {density:g} points/m2", xyz, np.ones(len(xyz), bool), codes == 14, codes == 15)
+            wires(
+                f"{name}, {density:g} points/m2",
+                xyz,
+                np.ones(len(xyz), bool),
+                codes == 14,
+                codes == 15,
+                np.isin(codes, (1, 14)),
+            )
     for name in CLOUDS:
         las = laspy.read(folder / name)
         codes = np.asarray(las.classification)
@@ -93,7 +108,7 @@ def main() -> None:
         if "powerline" in name:
             use &= codes != 26
         decks(name, las.xyz, use, bridge, codes == 1)
-        wires(name, las.xyz, use, codes == 14, codes == 15)
+        wires(name, las.xyz, use, codes == 14, codes == 15, np.isin(codes, (1, 14)))
 
 
 if __name__ == "__main__":

@@ -267,6 +267,12 @@ def _parser() -> argparse.ArgumentParser:
         help="Find wires (14), whatever they were called (filters.wires); tiles are read with 85 m more around them",
     )
     takes(
+        "--towers",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="Find wires, and towers and poles (15) where they meet; tiles are read with 135 m more around them",
+    )
+    takes(
         "--consistency",
         action=argparse.BooleanOptionalAction,
         default=True,
@@ -595,7 +601,8 @@ def _classify(options: argparse.Namespace) -> int:
         named,
         noise=options.noise,
         bridges=options.bridges,
-        wires=options.wires,
+        wires=options.wires or options.towers,
+        towers=options.towers,
         consistency=options.consistency,
         polygons=tuple(options.polygons),
         keep_sure=options.keep_sure,

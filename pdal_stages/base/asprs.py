@@ -34,8 +34,8 @@ NAMES = {code: name for code, (name, _) in _CLASSES.items()}
 
 #: Codes of noise points: below ground (7) and in the air (18).
 NOISE = (7, 18)
-#: Wires that carry current, and bridge decks.
-WIRE, BRIDGE = 14, 17
+#: Wires that carry current, what holds them, and bridge decks.
+WIRE, TOWER, BRIDGE = 14, 15, 17
 #: Codes that say nothing about the object: never classified, unclassified.
 UNLABELED = (0, 1)
 #: Overlap of strips, before LAS 1.4 had a flag for it.

@@ -46,6 +46,8 @@ class ClassifyRequest:
         Whether bridge decks are found, where heights are made by ``filters.hag_morphological``.
     wires : bool
         Whether wires are found, where heights are made.
+    towers : bool
+        Whether the towers and poles that hold them are found with them.
     consistency : bool
         Whether classes that contradict their surroundings are mended at the end.
     polygons : tuple of str
@@ -61,6 +63,7 @@ class ClassifyRequest:
     noise: bool = True
     bridges: bool = True
     wires: bool = False
+    towers: bool = False
     consistency: bool = True
     polygons: tuple[str, ...] = ()
     keep_sure: float | None = None
@@ -155,6 +158,9 @@ class ClassifyRequest:
             "filters.polygons": bool(self.polygons),
         }
         stages = [{"type": kind, **taken, **self._inside} for kind, chosen in wanted.items() if chosen]
+        for stage in stages:
+            if stage["type"] == "filters.wires" and self.towers:
+                stage["towers"] = True
         if self.polygons:
             stages[-1]["polygons"] = list(self.polygons)
         return stages

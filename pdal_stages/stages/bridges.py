@@ -59,7 +59,7 @@ they leave (`left`).
         codes = before.copy()
         codes[found] = self.code
         figures = points.report.figures
-        figures["decks"], figures["parts"] = int(np.count_nonzero(found)), int(np.count_nonzero(parts))
+        figures["decks"], figures["parts"] = points.counted(found), points.counted(parts)
         left = found & (before != self.code)
         figures["left"] = class_counts(before[left])
         figures["classes"] = class_counts(codes[free])

@@ -21,6 +21,7 @@ LEFT_ALONE = {
     "outside_where": "outside where",
     "decks": "put on bridge decks (bridges)",
     "wires": "found to be wires (wires)",
+    "towers": "found to be towers and poles (wires)",
     "changed": "mended by rules (consistency)",
 }
 
