@@ -14,10 +14,11 @@ import tiling_clouds as clouds
 from pdal_stages.base.errors import OptionError
 from pdal_stages.base.memory import free_memory, parse_size
 from pdal_stages.cli import main
+from pdal_stages.stages.base import Blocks
 from pdal_stages.synthetic.townfile import wkt
 from pdal_stages.tiling import TilingOptions
 from pdal_stages.tiling.pace import Pace
-from pdal_stages.tiling.sizing import PARENT, Density, settled, worker_bytes
+from pdal_stages.tiling.sizing import PARENT, Density, block_bytes, settled, worker_bytes
 from pdal_stages.tiling.sources import Extent
 
 pytestmark = pytest.mark.pdal
@@ -309,3 +310,13 @@ def test_a_map_of_many_tiles_shows_several_as_one_square():
     page = run_page(run)
     assert DRAWN / 2 < page.count("<rect") <= DRAWN and len(page) < 2_000_000
     assert "1 failed: broken" in page and "9 tiles" in page
+
+
+def test_a_worker_has_room_for_the_blocks_before_the_tiles():
+    blocks = Blocks(1024.0, 494.0, 100.0, 2.0)
+    whole = block_bytes(blocks, 1e9)
+    assert block_bytes(blocks, 2e9) == whole and block_bytes(blocks, 1e5) < 0.1 * whole
+    assert block_bytes(Blocks(2048.0, 988.0, 200.0, 4.0), 1e9) == whole  # of cells of 2 m
+    assert worker_bytes(1000, 0, whole) - worker_bytes(1000, 0) == pytest.approx(
+        whole - (512 << 20) - 350_000
+    )

@@ -40,7 +40,7 @@ def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
     count = sum(header.count for header in survey.extents.values())
     density = Density.of(survey.extents.values())
     read = density.read_by(grid.size, survey.halo_units)
-    held = worker_bytes(read, density.largest if survey.per == "file" else 0)
+    held = worker_bytes(read, density.largest if survey.per == "file" else 0, survey.block_bytes)
     pace = pace_before(plan.head)
     seconds = pace.core_seconds(count, _beside(listed, read))
     kept = count * _KEPT * (survey.per == "file") + _kept_before(plan, count, density.area * survey.unit**2)

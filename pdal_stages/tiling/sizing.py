@@ -8,12 +8,15 @@ from dataclasses import dataclass, replace
 
 from ..base.errors import OptionError
 from ..base.memory import free_memory
+from ..stages.base import Blocks as StageBlocks
 from .settings import TilingOptions
 from .sources import Extent
 
 #: Memory of a worker: programs and model, a point of a tile with its halo, a point of an output file that is put
 #: together, and the `memory` option of our stages. See docs/large-areas.md.
 BASE, TILE_POINT, FILE_POINT, BLOCKS = 350 << 20, 350, 250, 512 << 20
+#: Of a cell of the raster of which a block is made before the tiles.
+_CELL = 250
 #: Of the process that hands out the work.
 PARENT = 350 << 20
 #: Points of a larger file are put together in parts of so many.
@@ -59,9 +62,16 @@ class Density:
         return min(self.points, math.ceil(self.each * (side + 2 * halo_units) ** 2))
 
 
-def worker_bytes(points_read: float, largest_file: float) -> float:
-    """Memory of a worker for tiles of so many points and outputs of so many."""
-    return BASE + max(points_read * TILE_POINT + BLOCKS, min(largest_file, MOST_AT_ONCE) * FILE_POINT)
+def block_bytes(blocks: StageBlocks, area_m2: float) -> float:
+    """Memory that a block takes which is made before the tiles, of so many square meters of points at most."""
+    cell = blocks.side / 1024
+    return min((blocks.side + 2 * blocks.reach) ** 2, area_m2) / cell**2 * _CELL
+
+
+def worker_bytes(points_read: float, largest_file: float, block: float = 0.0) -> float:
+    """Memory of a worker for tiles of so many points and outputs of so many; `block`: see :func:`block_bytes`."""
+    of_file = min(largest_file, MOST_AT_ONCE) * FILE_POINT
+    return BASE + max(points_read * TILE_POINT + BLOCKS, of_file, block)
 
 
 def fits_whole(points: int, memory: int | None) -> bool:
@@ -69,7 +79,9 @@ def fits_whole(points: int, memory: int | None) -> bool:
     return BASE + BLOCKS + points * TILE_POINT <= (memory or free_memory() // 2)
 
 
-def settled(options: TilingOptions, density: Density, halo_units: float, per_file: bool) -> TilingOptions:
+def settled(
+    options: TilingOptions, density: Density, halo_units: float, per_file: bool, block: float = 0.0
+) -> TilingOptions:
     """The options with a side of tiles and a number of workers that the memory allows; the halo is in the coordinates' unit.
 
     Raises
@@ -84,7 +96,7 @@ def settled(options: TilingOptions, density: Density, halo_units: float, per_fil
     sides = [options.tile] if options.tile is not None else _sides(density)
     for workers in [local] if fixed else range(local, 0, -1):
         room = (whole - PARENT) / workers if workers else whole
-        fitting = [s for s in sides if worker_bytes(density.read_by(s, halo_units), largest) <= room]
+        fitting = [s for s in sides if worker_bytes(density.read_by(s, halo_units), largest, block) <= room]
         if not fitting:
             continue
         side = fitting[-1] if options.tile is not None else _enough(fitting, density, workers)
@@ -93,7 +105,9 @@ def settled(options: TilingOptions, density: Density, halo_units: float, per_fil
             return replace(options, tile=side, workers=options.workers if options.scheduler else workers)
     if options.memory is None and options.tile is not None:
         return options  # as it was asked for
-    least = worker_bytes(density.read_by(sides[0], halo_units), largest) * max(1, local if fixed else 1)
+    least = worker_bytes(density.read_by(sides[0], halo_units), largest, block) * max(
+        1, local if fixed else 1
+    )
     raise OptionError(
         "the memory does not suffice for tiles" + ("" if options.tile is None else " of this size"),
         found=f"{whole / 1e9:.1f} GB; about {(least + (PARENT if local else 0)) / 1e9:.1f} GB are needed",

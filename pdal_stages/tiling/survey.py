@@ -25,7 +25,7 @@ from .grid import Box, TileGrid, check_number, touching, union
 from .outcome import Costs
 from .pool import Pool, last_tries
 from .settings import TilingOptions
-from .sizing import Density, settled
+from .sizing import Density, block_bytes, settled
 from .sources import Extent, InputSource, check_source, find_sources, read_ept, read_extent
 from .store import Store, fingerprint
 from .tileplan import TilePlan
@@ -60,9 +60,12 @@ class Survey:
         self.halo_units = plan.halo_m / self.unit  #: of a tile, in the unit of the coordinates
         self._place()
         #: With the tiles' side and the workers settled.
-        self.options = settled(
-            options, Density.of(self.extents.values()), self.halo_units, self.per == "file"
+        density = Density.of(self.extents.values())
+        #: Memory of a worker for what is made before the tiles.
+        self.block_bytes = (
+            0.0 if plan.first is None else block_bytes(plan.first.blocks, density.area * self.unit**2)
         )
+        self.options = settled(options, density, self.halo_units, self.per == "file", self.block_bytes)
         assert self.options.tile is not None
         self.grid = TileGrid(self.options.tile)
 
