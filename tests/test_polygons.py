@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import re
+
 import laspy
 import numpy as np
 import pytest
@@ -224,3 +227,31 @@ def test_what_cannot_be_read_after_the_check_is_an_error_of_ours(tmp_path, monke
     (tmp_path / "lake.gpkg").write_bytes(b"no GeoPackage any more")
     with pytest.raises(StageError, match=r"lake.gpkg: the vector file cannot be read"):
         stage.run(points)
+
+
+def test_polygons_elsewhere_are_told_with_both_places(tmp_path):
+    far = shapely.transform(LAKE, lambda xy: xy + np.array([5000.0, 0.0]))
+    for epsg, words in (
+        (RD, r"they lie at 90010 to 90080, 446000 to 446070 \(Amersfoort"),
+        (4326, r"\(WGS 84\)"),
+    ):
+        file = write(tmp_path / f"far{epsg}.gpkg", [far], epsg)
+        codes, report = run([f"{file}=9"], cloud())
+        assert not (codes == 9).any()
+        (warning,) = report.warnings
+        assert warning.startswith("no polygon is where the points are:")
+        assert re.search(words, warning) and re.search(r"the points at 850\d\d to 85", warning)
+    near = write(tmp_path / "near.gpkg", [LAKE])
+    assert not run([f"{near}=9"], cloud())[1].warnings
+
+
+def test_polygons_elsewhere_are_told_once_of_all_tiles(tmp_path, write_las, capfd):
+    source = write_las(tmp_path / "in.las", cloud())
+    corner = write(tmp_path / "corner.gpkg", [shapely.box(85000, 446000, 85010, 446010)], None)
+    elsewhere = write(tmp_path / "elsewhere.gpkg", [shapely.box(0, 0, 10, 10)], None)
+    job = [str(source), {"type": "filters.polygons", "polygons": [f"{corner}=9:all", f"{elsewhere}=9:all"]}]
+    (tmp_path / "job.json").write_text(json.dumps([*job, str(tmp_path / "out.las")]))
+    words = ["pipeline", str(tmp_path / "job.json"), "--tile", "40", "--workers", "0", "--no-progress"]
+    assert main(words) == 0
+    said = [line for line in capfd.readouterr().err.splitlines() if "no polygon is where" in line]
+    assert len(said) == 1 and "elsewhere.gpkg" in said[0]

@@ -56,3 +56,6 @@ def test_formats_that_number_features(tmp_path):
     with pytest.raises(PipelineError, match=r"cannot write points as GPKG.*ogr2ogr") as caught:
         Pipeline(stages)
     assert "Did you mean" not in str(caught.value)
+    del stages[1]["ogrdriver"]  # which would be a folder of Shapefiles
+    with pytest.raises(PipelineError, match=r"cannot write points as gpkg.*ogr2ogr"):
+        Pipeline(stages)

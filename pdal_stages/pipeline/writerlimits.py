@@ -74,14 +74,16 @@ _NUMBERED = ("gpkg", "sqlite")
 def check_vectors(stages: list[dict[str, Any]]) -> None:
     """Refuse vector formats that an old PDAL can write no second point to, which it says at the end of its work."""
     for stage in stages:
-        driver = str(stage.get("ogrdriver", ""))
+        name = str(stage.get("filename", ""))
+        # Without a driver an old PDAL makes a folder of Shapefiles, whatever the name.
+        driver = str(stage.get("ogrdriver", "")) or name.rpartition(".")[2]
         if stage.get("type") != "writers.ogr" or driver.lower() not in _NUMBERED:
             continue
         if not pdal_env.writes_numbered_features():
             raise PipelineError(
                 f"PDAL {pdal_env.dotted_version()} cannot write points as {driver}: it gives all of them one number",
                 where="writers.ogr",
-                found=str(stage.get("filename", "")),
+                found=name,
                 cure="Write a Shapefile or GeoJSON and convert it with ogr2ogr, or use PDAL 2.5 or later",
             )
 

@@ -23,7 +23,12 @@ _FAMILIES = (
     (re.compile(r"Probability_(\d+)"), r"probability of \1"),
 )
 #: To which parts of the unit values are rounded: probabilities and the like, and heights.
-PARTS, PARTS_OF_HEIGHT = 64, 32
+_PARTS, _PARTS_OF_HEIGHT = 64, 32
+
+
+def parts_of(name: str) -> int:
+    """To which parts of the unit a dimension is rounded."""
+    return _PARTS_OF_HEIGHT if name.startswith("Height") else _PARTS
 
 
 def meaning(name: str, rounded: bool = False) -> str:
@@ -34,4 +39,4 @@ def meaning(name: str, rounded: bool = False) -> str:
             text = found.expand(family).replace("_", ".")
     if not rounded or not text:
         return text
-    return f"{text}, to 1/{PARTS_OF_HEIGHT if name.startswith('Height') else PARTS}"
+    return f"{text}, to 1/{parts_of(name)}"

@@ -16,7 +16,7 @@ from ..classifier.smoothing import FARTHEST
 from ..classifier.sureness import Limit, Sureness, said, sureness_of
 from ..models import find
 from .base import Stage
-from .dimensions import PARTS, PARTS_OF_HEIGHT, meaning
+from .dimensions import meaning, parts_of
 from .loading import loaded_model
 from .options import ignore_option, keep_option, option
 from .points import Points, class_counts
@@ -303,11 +303,13 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
                 values[f"Probability_{code}"] = found.probabilities[:, column]
         if self.compact:
             values |= {
-                name: _rounded(value, PARTS) for name, value in values.items() if name != "Classification"
+                name: _rounded(value, parts_of(name))
+                for name, value in values.items()
+                if name != "Classification"
             }
             if HEIGHT in points.arrays:
                 height = points.arrays[HEIGHT]
-                values[HEIGHT] = np.where(inside, _rounded(height, PARTS_OF_HEIGHT), height)
+                values[HEIGHT] = np.where(inside, _rounded(height, parts_of(HEIGHT)), height)
         if points.mask is not None:  # what was there before stays outside `where`
             for name in self.creates():
                 if name != "Classification":

@@ -19,6 +19,8 @@ OUTWARD, OUTWARD_ACROSS, WALLS, RIM = 0.7, 1.75, 0.7, 0.3
 _LAND_DROPS = (0.15, 0.35, 0.3)
 #: Land behind a quay has so many cells, no more of its ways end at a drop, and so much of these add up in one direction.
 QUAY, QUAY_DROPS, ONE_SIDED = 1000, 0.45, 0.5
+#: How ways over land end, and at drops in eight directions.
+ENDS, DIRECTIONS = 5, 8
 #: Directions from a deck's middle; an end has the sectors so near.
 SECTORS, NEAR = 16, 2
 
@@ -45,7 +47,7 @@ def leads_on(z, start, h, w, kind, number, j, i, n):
 def rims(z, start, h, w, kind, end, number, sums):
     """Of each part, by sector: cells that lead on, and ways that end at nothing; cells at a drop, and how its ways end."""
     outward, cut = np.zeros((len(sums), SECTORS), np.int64), np.zeros((len(sums), SECTORS), np.int64)
-    drops, ends = np.zeros(len(sums), np.int64), np.zeros((len(sums), 5), np.int64)
+    drops, ends = np.zeros(len(sums), np.int64), np.zeros((len(sums), ENDS), np.int64)
     for j in range(h):
         for i in range(w):
             for n in range(start[j * w + i], start[j * w + i + 1]):
@@ -53,7 +55,7 @@ def rims(z, start, h, w, kind, end, number, sums):
                 if k < 0:
                     continue
                 drop = False
-                for d in range(8):
+                for d in range(DIRECTIONS):
                     ends[k, end[n, d]] += 1
                     drop |= end[n, d] == DOWN or end[n, d] == ACROSS
                     if end[n, d] == NOTHING:
@@ -97,7 +99,7 @@ def step_on(z, start, h, w, kind, number, only, j, i, n, land, seen, stamp, leng
 
 @njit
 def spread(z, start, h, w, kind, end, number, part, land, seen, stamp, length, ends):
-    """Add all one walks on to from there, up to AWAY cells, and count how its ways end (5), and at drops by direction (8).
+    """Add all one walks on to from there, up to AWAY cells, and count how its ways end, and at drops by direction.
 
     Returns how many cells that are.
     """
@@ -111,15 +113,20 @@ def spread(z, start, h, w, kind, end, number, part, land, seen, stamp, length, e
         at += 1
         if j < low_j - AWAY or j > high_j + AWAY or i < low_i - AWAY or i > high_i + AWAY:
             continue
-        for d in range(8):
+        for d in range(DIRECTIONS):
             ends[end[n, d]] += 1
-            ends[5 + d] += end[n, d] == DOWN or end[n, d] == ACROSS
+            ends[ENDS + d] += end[n, d] == DOWN or end[n, d] == ACROSS
         length = step_on(z, start, h, w, kind, number, part, j, i, n, land, seen, stamp, length)
     return length
 
 
+def no_ends() -> NDArray[np.int64]:
+    """What :func:`spread` counts in."""
+    return np.zeros(ENDS + DIRECTIONS, np.int64)
+
+
 def is_land(cells: int, ends: NDArray[np.int64]) -> bool:
-    over = max(int(ends[1:5].sum()), 1)
+    over = max(int(ends[1:ENDS].sum()), 1)
     down, any_down, nothing = ends[DOWN] / over, (ends[DOWN] + ends[ACROSS]) / over, ends[NOTHING] / over
     if cells < LAND or nothing > _LAND_DROPS[2]:
         return False
@@ -127,5 +134,5 @@ def is_land(cells: int, ends: NDArray[np.int64]) -> bool:
         return True
     # A quay, unlike a roof, ends at a drop to one side.
     length = np.hypot(RIGHT, UP)
-    side = np.hypot(np.sum(ends[5:] * RIGHT / length), np.sum(ends[5:] * UP / length))
-    return bool(cells >= QUAY and any_down <= QUAY_DROPS and side >= ONE_SIDED * ends[5:].sum())
+    side = np.hypot(np.sum(ends[ENDS:] * RIGHT / length), np.sum(ends[ENDS:] * UP / length))
+    return bool(cells >= QUAY and any_down <= QUAY_DROPS and side >= ONE_SIDED * ends[ENDS:].sum())

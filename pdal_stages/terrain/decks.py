@@ -34,6 +34,7 @@ from .deckrims import (
     WALLS,
     first_land,
     is_land,
+    no_ends,
     rims,
     spread,
 )  # fmt: skip
@@ -362,7 +363,7 @@ def whole_decks(raster, number, sums, box) -> NDArray[np.bool_]:
         assert opposite is not None
         good[k] = True
         for sectors in opposite if whole else opposite[:1]:
-            over = np.zeros(13, np.int64)
+            over = no_ends()
             cells = first_land(z, start, h, w, kind, number, sums[k], box[k], k, sectors, land, seen, stamp)
             cells = spread(z, start, h, w, kind, end, number, k, land, seen, stamp, cells, over)
             stamp += 1

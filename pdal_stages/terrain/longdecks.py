@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import njit
-from .deckrims import OUTWARD, WALLS, is_land, leads_on, spread, step_on
+from .deckrims import OUTWARD, WALLS, is_land, leads_on, no_ends, spread, step_on
 from .walkable import ACROSS, DOWN, NOTHING, WALLED
 
 #: Blocks in which long decks are judged, cells, and how many blocks away land must be seen at an end.
@@ -37,7 +37,7 @@ def stretches(z, start, h, w, kind, end, long, left, bottom) -> NDArray[np.bool_
     ends_here = np.zeros(shape, np.int64)
     land, seen = np.empty((len(z), 3), np.int64), np.full(len(z), -1, np.int64)
     for stamp, (b, a) in enumerate(np.argwhere(sums[..., 3] > 0)):
-        over = np.zeros(13, np.int64)
+        over = no_ends()
         own = leads & (block[:, 0] == b) & (block[:, 1] == a)
         low = max((b + low_b) * BLOCK - bottom, 0), max((a + low_a) * BLOCK - left, 0)
         cells = _land_of_block(z, start, h, w, kind, number, own, *low, land, seen, stamp)

@@ -20,6 +20,7 @@ from ..pipeline.writerlimits import check_writers
 from ..stages import registry
 from ..stages.base import Left, Stage
 from ..stages.points import HOLDS_NOWHERE
+from ..stages.polygons import THE_PLACES, TOUCH_NONE
 from .extract import Piece
 from .grid import Box, TileGrid
 from .outcome import left_alone
@@ -154,7 +155,9 @@ def _messages(pipeline: Pipeline) -> list[str]:
     lines = [f"PDAL says: {line}" for line in pipeline.log_lines]
     for text in pipeline.messages:
         nowhere = _NOWHERE.search(text)
-        if nowhere is None:
+        if TOUCH_NONE in text:  # the places differ from tile to tile
+            lines.append(text[text.index(TOUCH_NONE) :].partition(THE_PLACES)[0])
+        elif nowhere is None:
             lines.append(text)
         elif nowhere[1] is not None:
             lines.append(f"{HOLDS_NOWHERE} points: {nowhere[1]}")

@@ -17,6 +17,7 @@ from ..pipeline.overrides import Override
 from ..pipeline.read import PipelineSource
 from ..pipeline.run import Pipeline
 from ..stages.points import HOLDS_NOWHERE
+from ..stages.polygons import TOUCH_NONE
 from . import measured
 from .complete import remember, told_again
 from .dispatch import run_all, run_first_round
@@ -182,7 +183,7 @@ def _messages_of_tiles(work: Worklist) -> list[str]:
     found: Counter[str] = Counter()
     for lines in (of_tiles, [set(messages) for messages in work.messages_before]):
         for text, n in Counter(text for each in lines for text in each).items():
-            if not text.startswith(HOLDS_NOWHERE):
+            if not text.startswith((HOLDS_NOWHERE, TOUCH_NONE)):
                 found[text] += n
             elif n == len(lines):  # that there is nothing to do in some tiles is as it should be
                 found[text] = max(found[text], n)
