@@ -247,8 +247,8 @@ def test_polygons_elsewhere_are_told_with_both_places(tmp_path):
 
 def test_polygons_elsewhere_are_told_once_of_all_tiles(tmp_path, write_las, capfd):
     source = write_las(tmp_path / "in.las", cloud())
-    corner = write(tmp_path / "corner.gpkg", [shapely.box(85000, 446000, 85010, 446010)], None)
-    elsewhere = write(tmp_path / "elsewhere.gpkg", [shapely.box(0, 0, 10, 10)], None)
+    corner = write(tmp_path / "corner.gpkg", [shapely.box(85000, 446000, 85010, 446010)])
+    elsewhere = write(tmp_path / "elsewhere.gpkg", [shapely.box(1000, 1000, 1010, 1010)])
     job = [str(source), {"type": "filters.polygons", "polygons": [f"{corner}=9:all", f"{elsewhere}=9:all"]}]
     (tmp_path / "job.json").write_text(json.dumps([*job, str(tmp_path / "out.las")]))
     words = ["pipeline", str(tmp_path / "job.json"), "--tile", "40", "--workers", "0", "--no-progress"]
