@@ -220,6 +220,18 @@ def test_a_roof_that_is_partly_called_leaves_is_whole(slope):
     assert len(trees["x"]) == 1 and abs(trees["x"][0] - 18) < 1.5
 
 
+@pytest.mark.parametrize("height", [3.0, 3.1])
+def test_a_hedge_as_high_as_a_roof_is_not_of_it(height):
+    """Nor where a classifier takes some of its points for a building."""
+    rng = np.random.default_rng(2)
+    roof, codes = house(10, 10, 16, 15, 3.0)
+    hedge = np.column_stack([rng.uniform(16, 26, 4000), rng.uniform(11.5, 13.5, 4000), np.zeros(4000)])
+    hedge[:, 2] = height * np.sqrt(rng.uniform(0.3, 1, 4000))
+    other = np.where(rng.random(4000) < 0.02, 6, 5).astype(np.uint8)
+    columns = found_in(*scene((roof, codes), (hedge, other))).tables[Kind.BUILDING].columns
+    assert columns["area"].max() == pytest.approx(30.0, abs=4.0)
+
+
 @pytest.mark.parametrize("turned", [0.0, 0.6])
 def test_a_roof_from_whose_inside_nothing_came_back(turned):
     """Of a wet roof only the rim is there; of a courtyard the ground is, and of a third square cars."""

@@ -326,8 +326,10 @@ class _View:
         seen = self.window.has_ground(self.cells)
         seen |= ~np.isnan(leaves) | (self.column(Kind.OTHER, "count", 0.0) > 0)
         with np.errstate(invalid="ignore"):
-            leaves = np.where(leaves - self.ground < chosen.building_height, np.nan, leaves)
-        high = roofs.continued(self.high(Kind.BUILDING), leaves, chosen.cell, round(GROWTH / chosen.cell))
+            leaves[leaves - self.ground < chosen.building_height] = np.nan
+        thick = leaves - self.column(Kind.TREE, "low", np.nan) / MM
+        reach = round(GROWTH / chosen.cell)
+        high = roofs.continued(self.high(Kind.BUILDING), leaves, thick, chosen.cell, reach)
         high = np.where(high - self.ground < chosen.building_height, np.nan, high)
         high = roofs.covered(high, seen, round(DARK / chosen.cell))
         return roofs.roof_cells(high, self.ground, chosen.building_height)

@@ -13,6 +13,8 @@ from .planes import plane_around
 
 #: Scatter of a roof's plane that is gone on from, and how near to it vegetation is of the roof, meters.
 PLANE, NEAR = 0.12, 0.2
+#: How far apart, up and down, the points of a cell lie at most where a roof was taken for leaves, meters.
+SURFACE = 0.5
 #: Within how many meters the rim of a roof without points is at one height.
 LEVEL = 1.0
 
@@ -43,9 +45,9 @@ def roof_cells(
 
 
 @device
-def _leaning(z, r, c, size, level):
+def _leaning(z, r, c, size, level, thick):
     """How far `level` lies from the plane through the five by five cells around a cell that lie within a meter of it,
-    meters; NaN where they are too few or scatter."""
+    meters; NaN where they are too few or scatter, or where the cell's points, `thick` apart, are no surface."""
     _, a, b, above, scatter = plane_around(z, r, c, size, level, 1.0, 1e-3)
     if np.isnan(a):
         return np.nan
@@ -53,17 +55,21 @@ def _leaning(z, r, c, size, level):
     # The highest point of a cell lies anywhere in it.
     if scatter > PLANE * PLANE + steep * (0.3 * size) ** 2 or steep > 4.0:
         return np.nan
+    if thick > SURFACE + 1.5 * size * np.sqrt(steep):
+        return np.nan
     return max(0.0, abs(above) - 0.4 * size * np.sqrt(steep))
 
 
 @njit
-def continued(high: NDArray, leaves: NDArray, size: float, reach: int) -> NDArray:
+def continued(high: NDArray, leaves: NDArray, thick: NDArray, size: float, reach: int) -> NDArray:
     """Heights of roofs, gone on into cells of vegetation that lie in their planes: what a classifier took for leaves.
 
     Parameters
     ----------
     high, leaves : (r, c) float64
         Height of the highest point of a roof, and of vegetation, in each cell; NaN where there is none.
+    thick : (r, c) float64
+        How far the lowest point of vegetation in each cell lies below the highest.
     size : float
         Side of a cell, meters.
     reach : int
@@ -75,7 +81,8 @@ def continued(high: NDArray, leaves: NDArray, size: float, reach: int) -> NDArra
     for _ in range(reach):
         for n in range(len(rows)):
             level = leaves[rows[n], columns[n]]
-            added[n] = _leaning(out, rows[n], columns[n], size, level) <= NEAR
+            off = _leaning(out, rows[n], columns[n], size, level, thick[rows[n], columns[n]])
+            added[n] = off <= NEAR
         if not added.any():
             break
         for k in np.flatnonzero(added):
