@@ -285,6 +285,18 @@ def test_a_town_of_roofs_and_wires_has_no_false_decks(density):
     assert (found(town.xyz) > 0)[town.classification != DECK].sum() <= 0.0005 * len(town.xyz)
 
 
+def test_roofs_as_high_as_a_viaduct_beside_it_are_none_of_it():
+    scene = viaduct(0, height=8.0, half=7.0)
+    scene.trees.clear()  # one walks on through their crowns
+    for s in (-60.0, -20.0, 20.0):
+        for t in (-23.0, 11.0):
+            scene.slabs.append(Slab(s, s + 26.0, t, t + 12.0, lambda s: 8.2 + 0.0 * s, 8.2, 6))
+    xyz, codes = scan(scene, 16.0)
+    deck = found(xyz) > 0
+    assert deck[codes == DECK].mean() > 0.9
+    assert (deck & (codes == 6)).sum() <= 0.0005 * len(xyz)
+
+
 def test_a_hall_of_300_meters_is_no_viaduct():
     def terrain(s, t):
         return 0.1 * np.sin(s / 9), np.full(len(s), GROUND)

@@ -47,6 +47,7 @@ from .walkable import (
     AHEAD,
     DIAGONAL,
     DOWN,
+    DROP,
     FAR,
     NOTHING,
     ROUGH,
@@ -294,6 +295,19 @@ def broad(z, start, h, w, deck):
     return out
 
 
+@device
+def _chasm(z, start, w, j, i, a, b, level):
+    """Whether on the way to a cell some cells on there is one with nothing but what lies much lower, as between a deck and a
+    roof beside it.
+    """
+    steps = max(abs(a), b)
+    for s in range(1, steps):
+        k = (j + (2 * b * s + steps) // (2 * steps)) * w + i + (2 * a * s + steps) // (2 * steps)
+        if start[k] < start[k + 1] and z[start[k + 1] - 1] < level - DROP:
+            return True
+    return False
+
+
 @njit
 def parts(z, start, h, w, deck, wide):
     """Number the parts that hang together (n,), -1 elsewhere; their size and sums of rows and columns; their boxes.
@@ -312,7 +326,9 @@ def parts(z, start, h, w, deck, wide):
                             continue
                         k = (j + b) * w + i + a
                         for m in range(start[k], start[k + 1]):
-                            if deck[m] and wide[m] == wide[n] and walkable(z[m] - z[n], distance(a, b)):
+                            if not deck[m] or wide[m] != wide[n] or not walkable(z[m] - z[n], distance(a, b)):
+                                continue
+                            if not _chasm(z, start, w, j, i, a, b, min(z[m], z[n])):
                                 one, other = root_of(parent, n), root_of(parent, m)
                                 parent[max(one, other)] = min(one, other)
     number = np.full(len(z), -1, np.int64)
