@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         overrides, rest = parse_overrides(arguments)
         options, unknown = _parser().parse_known_args(rest)
         command = vars(options).pop("parser")  # it cannot travel to workers
-        if unknown:
+        if unknown and not _taken(options, unknown):
             _refuse_words(command, unknown)
         if overrides and not getattr(options, "takes_overrides", False):
             raise StageError(f"'{options.command}' takes no stage options", found=overrides[0].flag)
@@ -132,6 +132,18 @@ def _unforeseen(error: Exception) -> StageError:
     return StageError(
         f"internal error: {type(error).__name__}: {error}", cure="Run with --debug and report what it prints"
     )
+
+
+def _taken(options: argparse.Namespace, words: list[str]) -> bool:
+    """Whether words left over are names of inputs, and of the output, behind a flag, where argparse does not look."""
+    inputs = getattr(options, "inputs", None)
+    if not isinstance(inputs, list) or any(word.startswith("-") for word in words):
+        return False
+    if hasattr(options, "output"):
+        *inputs[len(inputs) :], options.output = [options.output, *words]
+    else:
+        inputs += words
+    return True
 
 
 def _refuse_words(command: argparse.ArgumentParser, unknown: list[str]) -> None:

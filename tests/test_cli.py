@@ -325,6 +325,27 @@ def test_after_warmup_the_demo_and_the_defaults_compile_nothing(tmp_path, write_
     assert np.count_nonzero(laspy.read(tmp_path / "out.las").classification == 17) > 500
 
 
+@pytest.mark.parametrize(
+    ("words", "inputs", "output"),
+    [
+        ("classify a.laz b.laz --tile 500 out/", ["a.laz", "b.laz"], "out/"),
+        ("classify a.laz --tile 500 b.laz --wires c.laz out/", ["a.laz", "b.laz", "c.laz"], "out/"),
+        ("objects a.laz b.laz --cell 1 o.gpkg", ["a.laz", "b.laz"], "o.gpkg"),
+        ("review --workers 2 a.laz b.laz --no-progress o.gpkg", ["a.laz", "b.laz"], "o.gpkg"),
+        ("train a.laz --model m.model b.laz", ["a.laz", "b.laz"], None),
+        ("accuracy a.laz --html r.html b.laz", ["a.laz", "b.laz"], None),
+    ],
+)
+def test_names_may_stand_behind_flags(words, inputs, output, monkeypatch):
+    from pdal_stages import cli
+
+    seen = []
+    command = words.split()[0]
+    monkeypatch.setattr(cli, f"_{command}", seen.append)
+    assert main(words.split()) == 0
+    assert seen[0].inputs == inputs and getattr(seen[0], "output", None) == output
+
+
 def test_a_mistyped_flag_is_named_with_its_command(capsys):
     with pytest.raises(SystemExit) as left:
         main(["classify", "a.laz", "b.laz", "--modle", "x"])

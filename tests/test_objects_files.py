@@ -215,6 +215,44 @@ def test_settings_and_metadata(folder, tmp_path):
 
 
 @pytest.mark.pdal
+def test_larger_cells_where_points_are_few(folder, tmp_path, capsys):
+    las = laspy.read(folder / "town.laz")
+    las.points = las.points[np.arange(0, len(las.points), 8)]
+    las.write(tmp_path / "thin.laz")
+    west = np.asarray(las.x) < 500_066
+    for name, mine in (("west", west), ("east", ~west)):
+        part = laspy.LasData(las.header)
+        part.points = las.points[mine]
+        part.write(tmp_path / f"{name}.laz")
+
+    def run(name, files, *words):
+        target = tmp_path / f"{name}.gpkg"
+        files = [*map(str, files), str(target), "--metadata", str(tmp_path / "m.json")]
+        assert cli.main(["objects", *files, *words]) == 0
+        about = json.loads((tmp_path / "m.json").read_text())
+        return about, {kind: layer(target, kind) for kind in LAYERS}, capsys.readouterr().err
+
+    about, found, said = run("own", [tmp_path / "thin.laz"])
+    size = about["settings"]["cell"]
+    assert size in (1, 2) and f"so cells of {size:g} m are taken; --cell 0.5 keeps to them" in said
+    parted, same, _ = run("parts", [tmp_path / "west.laz", tmp_path / "east.laz"], "--workers", "2")
+    told, given, quiet = run("given", [tmp_path / "thin.laz"], "--cell", str(size))
+    assert parted["settings"] == told["settings"] == about["settings"] and "are taken" not in quiet
+    for kind in LAYERS:
+        for columns, shapes, _ in (same[kind], given[kind]):
+            np.testing.assert_array_equal(columns["object_id"], found[kind][0]["object_id"])
+            assert all(shapely.equals_exact(shapes, found[kind][1]))
+    small, _, said = run("small", [tmp_path / "thin.laz"], "--filters.objects.cell=0.5")
+    assert small["settings"]["cell"] == 0.5 and "so objects may fall apart: try --cell 1" in said
+
+    stage = ps.Pipeline([str(tmp_path / "thin.laz"), {"type": "filters.objects"}])
+    stage.execute()
+    assert any("set cell to 1 or more" in text for text in stage.warnings) or "set cell" in str(
+        stage.metadata
+    )
+
+
+@pytest.mark.pdal
 @pytest.mark.parametrize(
     ("target", "text"),
     [("town.txt", "ends in .gpkg"), ("nowhere/town.gpkg", "nowhere"), ("town.gpkg", "no point has a class")],

@@ -42,6 +42,8 @@ CLASSES: dict[Kind, tuple[int, ...]] = {
 }
 #: Cells of the ground are this many times as wide.
 GROUND_CELLS = 2
+#: Cells are too small where more than `MANY` hold fewer than `ENOUGH` points on average (``benchmarks/objectcells.py``).
+MANY, ENOUGH = 100, 1.6
 #: Height and place are counted in these, and the reliability.
 MM = 1000.0
 _HALF = 1 << 26  # rows and columns run from -_HALF to _HALF
@@ -192,6 +194,18 @@ class Cells:
         """Those of a kind."""
         first, last = np.searchsorted(self.key, [np.int64(kind) << _KIND, np.int64(kind + 1) << _KIND])
         return self._rows(slice(int(first), int(last)))
+
+    def thin(self) -> tuple[str, float] | None:
+        """What there are too few points of for cells of this size, and how many such a cell holds on average.
+
+        Looked at are buildings, or trees where there are hardly any buildings.
+        """
+        for kind, what in ((Kind.BUILDING, "buildings"), (Kind.TREE, "trees")):
+            some = self.of_kind(kind).columns["count"]
+            if len(some) > MANY:
+                mean = float(some.mean())
+                return (what, mean) if mean < ENOUGH else None
+        return None
 
     def within(self, kind: Kind, row: int, column: int, rows: int, columns: int) -> Cells:
         """Those of a kind in a rectangle of its cells."""

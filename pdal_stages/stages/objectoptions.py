@@ -9,7 +9,7 @@ from typing import Any
 
 from ..base.errors import OptionError, suggest
 from ..objects import Cells, ObjectSettings
-from ..objects.cells import CLASSES, Kind, kind_of_code, refuse_unclassified
+from ..objects.cells import CLASSES, ENOUGH, Kind, kind_of_code, refuse_unclassified
 from ..objects.measure import REASONS
 from .options import ignore_option, option
 from .points import Points
@@ -98,6 +98,11 @@ class ObjectOptions:
         """
         cells = self.records(points)
         refuse_unclassified(cells, points.class_codes[points.usable(self.ignore)])
+        if thin := cells.thin():
+            points.report.warnings.append(
+                f"cells of {cells.size:g} m hold fewer than {ENOUGH:g} points of {thin[0]} on average, so objects may fall "
+                f"apart: set cell to {2 * cells.size:g} or more"
+            )
         return cells
 
     def records(self, points: Points) -> Cells:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
@@ -59,6 +61,16 @@ tell what is to be checked; beside other files lies a `.qml`. Needs the extra `v
     before = ({"type": "filters.modelclassifier", "model": "town.model"},)
     after = ()
     example = {"type": "writers.objects", "filename": "town.gpkg"}
+
+    #: Whether whoever reads the files may take larger cells than `cell` where points are few.
+    widens = False
+
+    def with_cell(self, cell: float) -> ObjectsWriter:
+        """The same with cells of another size."""
+        other = copy.copy(self)
+        other.options = {**self.options, "cell": cell}
+        other.__dict__.pop("settings", None)
+        return other
 
     def check(self) -> None:
         from ..reports.objectlayers import check_target

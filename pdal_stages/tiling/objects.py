@@ -29,7 +29,7 @@ from ..base.stamps import stamp
 from ..base.units import Units
 from ..base.version import __version__
 from ..objects import Cells, Objects, ObjectSettings, find_objects
-from ..objects.cells import Kind, refuse_unclassified
+from ..objects.cells import refuse_unclassified
 from ..pipeline import pdal as pdal_env
 from ..pipeline.ends import input_files, outputs_of
 from ..pipeline.overrides import Override
@@ -49,6 +49,8 @@ OPTIONS_OF = ("writers.objects", "filters.objects")
 ONLY = ("Z", "CLASSIFICATION", "FLAGS", "ALL_EXTRA_BYTES")
 #: Blocks of points read at a time.
 _BLOCKS = 20
+#: Larger cells are not taken by themselves: they tell no house from the next.
+LARGEST = 4.0
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -57,7 +59,10 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     takes("inputs", nargs="+", metavar="input", help="Classified files PDAL can read, folders, patterns")
     takes("output", help="Vector file to write: .gpkg, .geojson, .fgb or .shp")
     takes("--outlines", choices=("straight", "cells"), help="Outlines along walls (default) or along cells")
-    takes("--cell", type=float, metavar="METERS", help="Side of the grid's cells (0.5)")
+    takes(
+        "--cell", type=float, metavar="METERS",
+        help="Side of the grid's cells (0.5, where points are fewer than 4 or so per m2 1, 2 or 4)",
+    )  # fmt: skip
     takes("--workers", type=int, default=1, metavar="N", help="Files read at the same time (1)")
     takes("--resume", action="store_true", help="Keep what an earlier run read")
     takes("--metadata", metavar="FILE", help="Write counts, verdicts and settings to a JSON file")
@@ -126,7 +131,7 @@ def _write(
             "version": __version__,
             "inputs": inputs,
             "files": [str(f) for f in files],
-            "settings": {one.name: getattr(stage.settings, one.name) for one in fields(ObjectSettings)},
+            "settings": {one.name: getattr(found.settings, one.name) for one in fields(ObjectSettings)},
             "objects": summary,
             "refused": {"reasons": list(stage.refuse), "objects": refused},
         }
@@ -147,7 +152,9 @@ def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> Obj
                 "objects takes options of writers.objects and filters.objects alone", found=one.flag
             )
         given[one.option] = one.value
-    return ObjectsWriter({**given, "filename": output})
+    stage = ObjectsWriter({**given, "filename": output})
+    stage.widens = "cell" not in given
+    return stage
 
 
 def objects_of_files(
@@ -160,10 +167,27 @@ def objects_of_files(
     references = {path: reference_and_wkt(path, stage.horizontal_unit) for path in inputs}
     check_one_reference({path: one for path, (one, _) in references.items()})
     units, wkt = references[inputs[0]][0].units, references[inputs[0]][1]
-    folder = _kept(stage.filename)
     if not resume:
-        for file in folder.glob("*.npz"):
+        for file in _kept(stage.filename).glob("*.npz"):
             file.unlink()
+    cells = _all_cells(inputs, stage, wkt, workers)
+    before, thin = cells, cells.thin()
+    while stage.widens and cells.thin() and cells.size < LARGEST:
+        stage = stage.with_cell(2 * cells.size)
+        cells = _all_cells(inputs, stage, wkt, workers)
+    if thin:
+        too_few = f"cells of {before.size:g} m hold {thin[1]:.1f} points of {thin[0]} on average"
+        print_messages(
+            f"{too_few}, so cells of {cells.size:g} m are taken; --cell {before.size:g} keeps to them"
+            if stage.widens
+            else f"{too_few}, so objects may fall apart: try --cell {2 * before.size:g}"
+        )
+    return find_objects(cells, stage.settings), (units, wkt)
+
+
+def _all_cells(inputs: Sequence[str], stage: ObjectsWriter, wkt: str, workers: int) -> Cells:
+    """The records of all files; each file's are kept in a file of their own."""
+    folder = _kept(stage.filename)
     what = json.dumps({k: str(v) for k, v in sorted(stage.options.items())})
     parts, failed, seen = [], [], np.zeros(256, bool)
     work = []
@@ -191,19 +215,7 @@ def objects_of_files(
             parts = [Cells.join(parts)]
     cells = Cells.join(parts)
     refuse_unclassified(cells, np.flatnonzero(seen).astype(np.uint8))
-    _tell_density(cells)
-    return find_objects(cells, stage.settings), (units, wkt)
-
-
-def _tell_density(cells: Cells) -> None:
-    """Say where cells are too small for the points."""
-    roofs = cells.of_kind(Kind.BUILDING)
-    if len(roofs) > 100 and float(roofs.columns["count"].mean()) < 1.6:
-        mean = float(roofs.columns["count"].mean())
-        print_messages(
-            f"cells of {cells.size:g} m hold {mean:.1f} points of buildings on average, so roofs may fall apart: "
-            f"try --cell {2 * cells.size:g}"
-        )
+    return cells
 
 
 def read_cells(path: str, stage: ObjectsWriter, wkt: str, kept: str) -> list[int]:
