@@ -236,6 +236,7 @@ def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "'crs' was not provided")  # as the points have none
+            warnings.filterwarnings("ignore", "Passed SRS uses EPSG")
             pyogrio.raw.write(
                 path,
                 np.array([shapely.to_wkb(shape) for shape in layer.shapes], object),
