@@ -166,10 +166,10 @@ def test_copies_are_made_where_tiles_read_more_than_their_own(tmp_path, survey, 
     made = []
     monkeypatch.setattr(
         Survey,
-        "_copied",
-        lambda self, paths, store, f=Survey._copied: made.append(f(self, paths, store)) or made[-1],
+        "_worth",
+        lambda self, paths, f=Survey._worth: made.append(f(self, paths)) or made[-1],
     )
     run(survey, tmp_path / "one")
     monkeypatch.setattr("pdal_stages.tiling.survey.SMALL", 10**9)
     run(survey, tmp_path / "small")
-    assert made == [{str(survey)}, set()]
+    assert made == [[str(survey)], []]
