@@ -232,12 +232,15 @@ def _rise(x, y, z, wire, order, start, h, w, left, bottom, j, i, middle_x, middl
 
 def _best(axes: NDArray[np.float64]) -> NDArray[np.float64]:
     """Of axes near each other the one that is filled best: the highest, then the one first by row and column."""
+    from scipy.spatial import cKDTree
+
     order = np.lexsort((axes[:, 1], axes[:, 0], -axes[:, 4], -np.floor(axes[:, 3])))
     axes = axes[order]
-    near = np.abs(axes[:, None, :2] - axes[None, :, :2]).max(axis=2) <= np.where(
-        axes[:, 2] > 0, APART[1], APART[0]
-    )
-    return axes[~np.tril(near, -1).any(axis=1)]
+    tree, beside = cKDTree(axes[:, :2]), np.zeros(len(axes), bool)
+    for tall, apart in enumerate(APART):
+        better, other = tree.query_pairs(apart, p=np.inf, output_type="ndarray").T
+        beside[other[axes[better, 2] == tall]] = True
+    return axes[~beside]
 
 
 @njit
@@ -248,8 +251,7 @@ def _mark(x, y, z, height, wire, order, start, h, w, left, bottom, axes, out):
         cx, cy = (left + i + 0.5) * CELL + axes[n, 5], (bottom + j + 0.5) * CELL + axes[n, 6]
         ux, uy = np.cos(axes[n, 7]), np.sin(axes[n, 7])
         reach = int(AT_TOWER + BESIDE) + 1
-        widest = low = 0.0
-        low = high
+        widest, low = 0.0, high
         for part in range(2):
             for b in range(max(j - reach, 0), min(j + reach + 1, h)):
                 for a in range(max(i - reach, 0), min(i + reach + 1, w)):
