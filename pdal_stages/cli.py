@@ -291,6 +291,12 @@ def _parser() -> argparse.ArgumentParser:
         help="Mend classes that contradict their surroundings at the end (filters.consistency)",
     )
     takes(
+        "--vegetation-heights",
+        default="",
+        metavar="LOW,MEDIUM",
+        help="Vegetation below these heights in meters, e.g. 0.5,2, is low (3) and medium (4), the rest high (5)",
+    )
+    takes(
         "--keep-sure",
         type=float,
         metavar="SHARE",
@@ -617,6 +623,7 @@ def _classify(options: argparse.Namespace) -> int:
         towers=options.towers,
         consistency=options.consistency,
         polygons=tuple(options.polygons),
+        vegetation_heights=options.vegetation_heights,
         keep_sure=options.keep_sure,
     )
     print_messages(*request.cost)

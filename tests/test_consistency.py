@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pdal_stages as ps
-from pdal_stages.base.errors import OptionError, StageError
+from pdal_stages.base.errors import DimensionError, OptionError, StageError
 from pdal_stages.cli import main
 from pdal_stages.objects import consistency
 from pdal_stages.objects.consistency import RULES, consistent
@@ -229,6 +229,69 @@ def test_overlap_noise_and_where_keep_their_class():
     out = stage.run(stage.points({**arrays, "Classification": codes}))["Classification"]
     left = (codes == 12) | (codes == 7) | (arrays["X"] <= 10)
     assert np.array_equal(out[left], codes[left]) and (out != codes).any()
+
+
+def test_what_becomes_vegetation_has_the_class_of_its_height():
+    arrays, _ = arrays_of()
+    arrays["HeightAboveGround"] = np.where(
+        arrays["Z"] < 5, arrays["Z"] / 8, arrays["Z"]
+    )  # leaves below 0.5 m as well
+    plain = Consistency({})
+    high = plain.run(plain.points(arrays))["Classification"]
+    stage = Consistency({"vegetation_heights": "0.5,2"})
+    split = stage.run(stage.points(arrays))["Classification"]
+    made, height = (high == 5) & (arrays["Classification"] != 5), arrays["HeightAboveGround"]
+    expected = high.copy()
+    expected[made & (height < 2)] = 4
+    expected[made & (height < 0.5)] = 3
+    assert len(np.unique(expected[made])) > 1 and np.array_equal(split, expected)
+
+
+@pytest.mark.parametrize("wrong", ["2", "2,0.5", "a,b"])
+def test_heights_of_vegetation_that_mean_nothing(wrong):
+    with pytest.raises(OptionError, match="vegetation_heights"):
+        Consistency({"vegetation_heights": wrong})
+
+
+def test_heights_of_vegetation_need_heights():
+    arrays, _ = arrays_of()
+    del arrays["HeightAboveGround"]
+    stage = Consistency({"vegetation_heights": "0.5,2", "ground": False, "islands": False})
+    with pytest.raises(DimensionError, match="HeightAboveGround"):
+        stage.run(stage.points(arrays))
+    with pytest.raises(StageError, match="needs 'height'"):
+        consistent(np.zeros((1, 3)), [5], vegetation_heights=(0.5, 2.0))
+
+
+@pytest.mark.pdal
+@pytest.mark.parametrize(
+    "words",
+    [["--vegetation-heights", "0.5,2"], ["--filters.modelclassifier.vegetation_heights=0.5,2"]],
+)
+def test_three_classes_of_vegetation_in_one_command(tmp_path, words):
+    """By the flag, or the classifier's option: the rules at the end take them as well, in tiles as in one piece."""
+    arrays, _ = arrays_of()
+    source = write_file(tmp_path / "in.las", arrays)
+    jobs = {"plain": [], "whole": words, "tiled": [*words, "--tile", "20", "--workers", "0"]}
+    for name, more in jobs.items():
+        out = str(tmp_path / f"{name}.las")
+        assert main(["classify", source, out, "--dimensions", "HeightAboveGround", *more]) == 0
+    plain, whole, tiled = (laspy.read(tmp_path / f"{name}.las") for name in jobs)
+    height, codes = np.asarray(whole.HeightAboveGround), np.asarray(whole.classification)
+    assert np.array_equal(codes, tiled.classification)
+    assert np.array_equal(np.isin(codes, (3, 4, 5)), np.asarray(plain.classification) == 5)
+    assert (height[codes == 3] <= 0.5).all() and (
+        height[codes == 5] >= 2
+    ).all()  # heights are written rounded
+    assert ((height[codes == 4] >= 0.5) & (height[codes == 4] <= 2)).all() and (codes == 5).sum() > 500
+
+
+def write_file(path, arrays):
+    las = laspy.create(point_format=6, file_version="1.4")
+    las.header.scales = [0.001] * 3
+    las.x, las.y, las.z = arrays["X"], arrays["Y"], arrays["Z"]
+    las.write(path)
+    return str(path)
 
 
 @pytest.mark.pdal

@@ -381,7 +381,7 @@ def test_parameters_are_the_commands_own(session, capsys):
         if one["name"] in ("where", "memory", "workers", "polygons", "per"):
             assert shown[one["name"].upper()][3] == one["help"]
     assert shown["PER"][1] and not shown["MEMORY"][1]  # advanced, and not
-    for name in ("BRIDGES", "WIRES"):
+    for name in ("BRIDGES", "WIRES", "VEGETATION_HEIGHTS"):
         assert name in shown and not shown[name][1]
     heights = session("parameters", "heights")["parameters"]
     assert heights["WINDOW"][2] == "75.0" and heights["WINDOW"][3].startswith("Radius of the largest window")

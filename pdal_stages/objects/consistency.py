@@ -18,6 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from ..base.asprs import NOISE
 from ..base.errors import OptionError, StageError
 from ..base.jit import device, njit
+from ..base.vegetation import HIGH as HIGH_VEGETATION
+from ..base.vegetation import by_height
 from ..terrain.clusters import BITS, find, voxels
 
 #: Rules in the order in which they are applied.
@@ -48,6 +50,7 @@ def consistent(
     mask: ArrayLike | None = None,
     change: ArrayLike | None = None,
     rules: Sequence[str] = RULES,
+    vegetation_heights: tuple[float, float] | None = None,
     figures: dict[str, Any] | None = None,
 ) -> NDArray[np.uint8]:
     """Class codes without the contradictions that the rules know.
@@ -70,6 +73,8 @@ def consistent(
         2 m above the terrain is what its neighbors are. ``roofs``: vegetation in the plane of a roof is building.
         ``facades``: vegetation in the plane of a wall is building. ``lone``: one point against all its neighbors is of their
         class.
+    vegetation_heights : pair of float, optional
+        Below these heights, meters, what becomes vegetation is low (3) and medium (4); all else is high (5).
     figures : dict, optional
         Receives the number of points that each rule changed.
 
@@ -82,7 +87,7 @@ def consistent(
     OptionError
         If a rule is not known.
     StageError
-        If shapes differ.
+        If shapes differ, or there are limits for heights and no heights.
     """
     if unknown := [rule for rule in rules if rule not in RULES]:
         raise OptionError(f"'rules' must be of {', '.join(RULES)}", found=", ".join(map(repr, unknown)))
@@ -91,6 +96,8 @@ def consistent(
     given = [np.asarray(a) for a in (height, ground, mask, change) if a is not None]
     if xyz.shape != (len(out), 3) or any(a.shape != out.shape for a in given):
         raise StageError("arrays must have one row per point", found=[xyz.shape, *(a.shape for a in given)])
+    if vegetation_heights is not None and height is None:
+        raise StageError("'vegetation_heights' needs 'height'")
     seen = np.ones(len(out), bool) if mask is None else np.asarray(mask, bool)
     seen = seen & ~np.isin(out, NOISE) & np.isfinite(xyz).all(axis=1)
     may = seen if change is None else seen & np.asarray(change, bool)
@@ -112,8 +119,11 @@ def consistent(
                 counts[rule] = int(np.count_nonzero(changed))
                 work.kind = np.where(changed, new, work.kind)
         other = work.kind != before
-        # A mixture of vegetation classes: high vegetation is what the shipped models know.
-        out[there[other]] = np.array([GROUND, VEGETATION[-1], BUILDING, 0], np.uint8)[work.kind[other]]
+        # High vegetation is what the shipped models know.
+        new = np.array([GROUND, HIGH_VEGETATION, BUILDING, 0], np.uint8)[work.kind[other]]
+        if vegetation_heights is not None and above is not None:
+            by_height(new, np.ones(len(new), bool), above[other], vegetation_heights)
+        out[there[other]] = new
     if figures is not None:
         figures.update(counts)
     return out

@@ -52,6 +52,8 @@ class ClassifyRequest:
         Whether classes that contradict their surroundings are mended at the end.
     polygons : tuple of str
         Files of polygons and the class of what is inside, as ``filters.polygons`` takes them.
+    vegetation_heights : str
+        Two heights in meters, ``0.5,2``, below which vegetation is low and medium; empty for high alone.
     keep_sure : float, optional
         Points keep their class only where this share of such points is right; see ``filters.modelclassifier``.
     """
@@ -66,6 +68,7 @@ class ClassifyRequest:
     towers: bool = False
     consistency: bool = True
     polygons: tuple[str, ...] = ()
+    vegetation_heights: str = ""
     keep_sure: float | None = None
 
     @property
@@ -78,6 +81,8 @@ class ClassifyRequest:
         stage["compact"] = True
         if self.keep_sure is not None:
             stage["keep_sure"] = self.keep_sure
+        if self.vegetation_heights:
+            stage["vegetation_heights"] = self.vegetation_heights
         for option, name in (
             ("margin", "Margin"),
             ("variance", "Variance"),
@@ -161,6 +166,8 @@ class ClassifyRequest:
         for stage in stages:
             if stage["type"] == "filters.wires" and self.towers:
                 stage["towers"] = True
+            if stage["type"] == "filters.consistency" and settled.get("vegetation_heights"):
+                stage["vegetation_heights"] = settled["vegetation_heights"]
         if self.polygons:
             stages[-1]["polygons"] = list(self.polygons)
         return stages

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.vegetation import bands
 from ..objects.consistency import REACH, RULES, consistent
 from .base import Stage
-from .options import ignore_option, keep_option, option
+from .options import ignore_option, keep_option, option, vegetation_heights_option
 from .points import Points
 from .selection import Selection
 
@@ -32,6 +33,10 @@ class Consistency(Stage):
     lone: bool = option(
         "boolean", True, "A lone building or leaf among at least ten of the other is of their class"
     )
+    vegetation_heights: list = vegetation_heights_option(
+        "what becomes vegetation is low (3) below the first, medium (4) below the second and high (5) above; without "
+        "heights all of it is high"
+    )
     ignore: Selection = ignore_option("Points that are neither neighbors nor changed")
     keep: Selection = keep_option()
     details = """
@@ -49,6 +54,9 @@ feet of walls stay what they are: surveys label them building as often as ground
     )
     after = ({"type": "writers.las", "filename": "output.laz", "forward": "all"},)
     example = {"type": "filters.consistency"}
+
+    def check(self) -> None:
+        bands(self.vegetation_heights)  # refused here where it means nothing
 
     def creates(self) -> dict[str, str]:
         return {"Classification": "uint8_t"}
@@ -73,6 +81,9 @@ feet of walls stay what they are: surveys label them building as often as ground
                 "there is no HeightAboveGround or no Ground: the rules ground and islands did nothing"
             )
         before = points.class_codes
+        limits = bands(self.vegetation_heights)
+        if limits:
+            points.dimension("HeightAboveGround")  # refused where there is none
         points.keep_only(["Classification", "HeightAboveGround", "Ground"])
         codes = consistent(
             points.take_xyz(),
@@ -81,6 +92,7 @@ feet of walls stay what they are: surveys label them building as often as ground
             mask=~ignored,
             change=change,
             rules=[rule for rule in RULES if self.options[rule]],
+            vegetation_heights=limits,
             figures=points.report.figures,
         )
         points.report.figures["changed"] = points.counted(codes != before)

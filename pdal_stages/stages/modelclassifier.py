@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from ..base.errors import DimensionError, OptionError
 from ..base.progress import Progress
+from ..base.vegetation import HIGH as HIGH_VEGETATION
+from ..base.vegetation import LOW, MEDIUM, bands, by_height
 from ..classifier import Model, Prediction
 from ..classifier.deciding import UNCLASSIFIED
 from ..classifier.smoothing import FARTHEST
@@ -18,14 +20,12 @@ from ..models import find
 from .base import Stage
 from .dimensions import meaning, parts_of
 from .loading import loaded_model
-from .options import ignore_option, keep_option, option
+from .options import ignore_option, keep_option, option, vegetation_heights_option
 from .points import Points, class_counts
 from .preparation import as_json, same
 from .selection import Selection
 
 HEIGHT = "HeightAboveGround"
-#: Vegetation in ASPRS's codes.
-LOW, MEDIUM, HIGH = 3, 4, 5
 
 
 class ModelClassifier(Stage):
@@ -89,12 +89,8 @@ class ModelClassifier(Stage):
         maximum=FARTHEST,
         unit="m",
     )
-    vegetation_heights: list = option(
-        "list",
-        (),
-        "Two heights above ground in meters, e.g. 0.5,2: points the model calls vegetation (5) become low (3) below the "
-        "first and medium (4) below the second",
-        may_be_empty=True,
+    vegetation_heights: list = vegetation_heights_option(
+        "points the model calls vegetation (5) become low (3) below the first and medium (4) below the second"
     )
     compact: bool = option(
         "boolean",
@@ -140,26 +136,17 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
     @cached_property
     def bands(self) -> tuple[float, float] | None:
         """Below these heights in meters vegetation is low, and medium."""
-        if not self.vegetation_heights:
+        found = bands(self.vegetation_heights)
+        if found is None:
             return None
-        try:
-            low, medium = (float(one) for one in self.vegetation_heights)
-        except (TypeError, ValueError):
-            low = medium = 0.0
-        if not 0.0 < low < medium < 1000.0:
-            raise OptionError(
-                "option 'vegetation_heights' must be two heights in meters, the lower one first",
-                found=", ".join(map(str, self.vegetation_heights)),
-                cure="For example 0.5,2",
-            )
         codes = [code for code, _ in self.model.classes]
-        if HIGH not in codes or {LOW, MEDIUM} & set(codes):
+        if HIGH_VEGETATION not in codes or {LOW, MEDIUM} & set(codes):
             raise OptionError(
                 "option 'vegetation_heights' is for models that know vegetation as one class, 5",
                 found=f"classes {', '.join(map(str, codes))}",
                 cure="Leave it out",
             )
-        return low, medium
+        return found
 
     @cached_property
     def model(self) -> Model:
@@ -289,7 +276,7 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
                 progress=progress,
             )
         if self.bands:
-            self._split_vegetation(points, found, wanted)
+            self._split_vegetation(points, found, wanted, self.bands)
         values: dict[str, NDArray] = {
             "Classification": found.classification,
             "Reliability": found.reliability,
@@ -322,15 +309,15 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         points.report.figures["outside_where"] = points.counted(~inside)
         return values
 
-    def _split_vegetation(self, points: Points, found: Prediction, wanted: NDArray[np.bool_]) -> None:
+    def _split_vegetation(
+        self, points: Points, found: Prediction, wanted: NDArray[np.bool_], limits: tuple[float, float]
+    ) -> None:
         """Low and medium vegetation by height, where the model called a point vegetation."""
-        height, codes = self.take(points, HEIGHT), found.classification
-        given = wanted & (codes == HIGH)
+        given = wanted
         if self.reject_below is not None:
-            given &= found.reliability >= np.float32(self.reject_below)
-        for code, limit in zip((MEDIUM, LOW), reversed(self.bands or ()), strict=True):
-            codes[given & (height < limit)] = code
-        found.report.figures["classes"] = class_counts(codes[wanted])
+            given = wanted & (found.reliability >= np.float32(self.reject_below))
+        by_height(found.classification, given, self.take(points, HEIGHT), limits)
+        found.report.figures["classes"] = class_counts(found.classification[wanted])
 
     def _refuse_codes_that_stay(self, points: Points, wanted: NDArray[np.bool_]) -> None:
         """Before any work: codes that points keep must fit the file, as those do that the model gives."""

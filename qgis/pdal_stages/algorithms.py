@@ -78,7 +78,10 @@ class _Showing(Algorithm):
 
 class _Classifying(_Showing):
     command = "classify"
-    listed = ("dimensions", "noise", "bridges", "wires", "towers", "consistency", "polygons", "where")
+    listed = (
+        *("dimensions", "noise", "bridges", "wires", "towers", "consistency"),
+        *("vegetation_heights", "polygons", "where"),
+    )
 
     def add_model(self):
         name = self.forms["models"][0] if self.forms["models"] else ""
