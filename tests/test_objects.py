@@ -156,6 +156,30 @@ def test_roofs_part_at_a_step_alone():
     assert len(found_in(*scene(low, chimney)).tables[Kind.BUILDING]) == 1
 
 
+@pytest.mark.parametrize("turned", [0.0, 0.3, 0.8])
+@pytest.mark.parametrize("rim, wall", [(0.0, False), (0.8, False), (0.0, True)])
+def test_rims_and_walls_between_roofs_part_nothing_and_join_nothing(rim, wall, turned):
+    """A flat roof of 4 m with a rim beside one of 7.2 m whose wall answers half way up: two."""
+    low, high = house(10, 10, 20, 18, 4.0), house(20.1, 10, 30, 18, 7.2)
+    parts = [low, high]
+    if rim:
+        parts += [house(19.7, 10, 20, 18, 4.0 + rim, 0.15), house(10, 10, 20, 10.3, 4.0 + rim, 0.15)]
+    if wall:  # the last half meter before the higher roof: points of the wall alone
+        parts[1] = house(20.6, 10, 30, 18, 7.2)
+        parts += [house(20.1, 10, 20.6, 18, 5.5, 0.2)]
+    xyz, codes = scene(*parts)
+    c, s = np.cos(turned), np.sin(turned)
+    xyz[:, :2] = (xyz[:, :2] - 20) @ np.array([[c, s], [-s, c]]) + 20
+    assert len(found_in(xyz, codes).tables[Kind.BUILDING]) == 2
+
+
+def test_roofs_that_meet_stay_one_whatever_their_slope():
+    """Two roofs of 45 degrees that meet at their eaves, 0.3 m apart in height, are one building."""
+    xyz, codes = house(10, 10, 30, 18, 0.0)
+    xyz[:, 2] = 5.0 + abs(xyz[:, 0] - 20.0) + 0.3 * (xyz[:, 0] > 20)
+    assert len(found_in(*scene((xyz, codes))).tables[Kind.BUILDING]) == 1
+
+
 def test_tops_of_two_cones():
     rng = np.random.default_rng(1)
     xy = rng.uniform(0, 30, (9000, 2))

@@ -15,6 +15,8 @@ from .planes import plane_around
 PLANE, NEAR = 0.12, 0.2
 #: How far apart, up and down, the points of a cell lie at most where a roof was taken for leaves, meters.
 SURFACE = 0.5
+#: So many cells inside its border a roof's height is measured where two roofs are compared.
+INSIDE = 2
 #: Within how many meters the rim of a roof without points is at one height.
 LEVEL = 1.0
 
@@ -227,10 +229,30 @@ def connected(mask: NDArray, z: NDArray, step: float) -> NDArray:
     return out
 
 
+@device
+def _roof_level(part, z, r, c, dr, dc):
+    """Height of a part's roof at its border: at the outer side of a cell there, whose inner neighbor lies in a direction.
+
+    The cell itself and the next may hold the rim of a flat roof, or the wall of a higher one: so it is the plane through
+    the cells around the `INSIDE`-th beyond it, carried on to the border.
+    """
+    inside = INSIDE
+    while inside > 0:
+        i, j = r + inside * dr, c + inside * dc
+        if 0 <= i < z.shape[0] and 0 <= j < z.shape[1] and part[i, j] == part[r, c]:
+            break
+        inside -= 1
+    level = z[r + inside * dr, c + inside * dc]
+    _, a, b, above, _ = plane_around(z, r + inside * dr, c + inside * dc, 1.0, level, 1.0, 1e-3)
+    if np.isnan(a):
+        return level
+    return level + above - (inside + 0.5) * (a * dc + b * dr)
+
+
 @njit
 def borders(part: NDArray, z: NDArray, step: float) -> NDArray:
     """Every pair of cells side by side in different parts: (n, 3), the numbers of both, the lower first, and whether
-    they lie within `step`."""
+    their roofs lie within `step` there."""
     rows, columns = part.shape
     count = 0
     for turn in range(2):
@@ -246,8 +268,11 @@ def borders(part: NDArray, z: NDArray, step: float) -> NDArray:
                         continue
                     if turn == 1:
                         a, b = part[r, c], part[rr, cc]
-                        out[count, 0], out[count, 1] = min(a, b), max(a, b)
-                        out[count, 2] = 0 if abs(z[r, c] - z[rr, cc]) > step else 1
+                        out[count, 0], out[count, 1], out[count, 2] = min(a, b), max(a, b), 1
+                        if step < np.inf:
+                            one = _roof_level(part, z, r, c, -way, way - 1)
+                            other = _roof_level(part, z, rr, cc, way, 1 - way)
+                            out[count, 2] = 0 if abs(one - other) > step else 1
                     count += 1
     return out
 
@@ -259,8 +284,8 @@ def building_parts(
 
     Connected cells whose heights differ by at most `fine` are a roof. Roofs of fewer than `smallest` cells (dormers,
     chimneys) go with the neighbor that they share the longest border with, the smallest first. Then two roofs are of
-    one building where their heights differ by at most `step` along at least the `share` of their border, the most
-    equal first. A `step` of 0 parts nothing.
+    one building where their heights (measured beyond rims and walls) differ by at most `step` along at least the `share`
+    of their border, the most equal first. A `step` of 0 parts nothing.
     """
     if step <= 0:
         return numbered(connected(mask, z, np.inf))
