@@ -1,0 +1,190 @@
+"""Models: train them, judge and describe them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from ..base import kinds
+from ..base.errors import StageError
+from ..base.outputs import Output, check_outputs
+from ..base.plain import print_messages
+from .adder import INPUTS, OVERRIDES, Adder
+from .running import run
+
+
+def add_commands(add: Adder) -> None:
+    """``models``, ``train``, ``accuracy`` and ``model``."""
+    add("models", _models, "List the models that come with the package")
+
+    takes = add("train", _train, "Train a model on labeled clouds", overrides=True)
+    takes("inputs", nargs="+", metavar="input", help=f"Labeled: {INPUTS[0].lower()}{INPUTS[1:]}")
+    takes("--model", required=True, help="The model file to write")
+    takes(
+        "--base", metavar="MODEL", help="A model to build on: standard, or a file; then few labels are enough"
+    )
+    takes(
+        "--classes",
+        metavar="MAP",
+        help="Codes (2,5,6), or a JSON mapping of labels to classes with their names, e.g. "
+        '\'{"2": "2 Ground", "3,4,5": "5 Vegetation", "6": "6 Building"}\'',
+    )
+    takes("--neighborhoods", help="Preset or tokens, e.g. s5,k10,k50")
+    takes("--feature-set", help="Groups or single features, e.g. covariance,geometric")
+    takes("--count", type=int, help="Samples of each class")
+    takes("--trees", help="Number of trees; of several the best is found")
+
+    takes(
+        "--leave-one-survey-out",
+        action="store_true",
+        help="Score each survey by a model trained without it; each file is a survey, unless --surveys groups them",
+    )
+    takes(
+        "--surveys",
+        nargs="+",
+        metavar="NAME=PATTERN",
+        help="Files of one survey, e.g. north=north/*.laz; surveys do not see each other, weigh alike, and may have "
+        "different reference systems",
+    )
+
+    add.choices["train"].epilog = (
+        "Of several files the score is by file. Of one file, --writers.classifiermodel.groups=PointSourceId makes it one by "
+        "flight line (any dimension with a number for each group), and --writers.classifiermodel.survey=UserData says that "
+        "points of another number there are of another survey. " + OVERRIDES
+    )
+
+    takes = add("accuracy", _accuracy, "Compare two class dimensions, or two files", overrides=True)
+    takes("inputs", nargs="+", metavar="input", help=f"Classified: {INPUTS[0].lower()}{INPUTS[1:]}")
+    takes(
+        "--reference",
+        action="append",
+        metavar="FILE",
+        help="The same points, in the same order, with true classes: a file, a folder or a pattern, paired by name; "
+        "may be repeated",
+    )
+    takes("--model", help="Score this model on labeled files: a model file, or a shipped model's name")
+    takes("--dimension", default="Classification", help="Classes to judge")
+    takes("--reference-dimension", help="Dimension with the true classes")
+    takes(
+        "--objects",
+        metavar="FILE",
+        help="Compare objects instead: the input is a vector file of pdal-stages objects, this one has true buildings "
+        "(polygons) or trees (points; 'height')",
+    )
+    takes("--area", metavar="FILE", help="With --objects: polygons inside of which objects count")
+    takes("--json", help="Write figures to this file")
+    takes("--html", help="Write a report to this file")
+
+    takes = add("model", _model, "Describe a model file")
+    takes("file")
+    takes("--showjson", action="store_true", help="Everything, as JSON")
+    takes("--html", help="Write a page with its scores, training curve and importances to this file")
+
+
+def _models(options: argparse.Namespace) -> None:
+    from ..base.asprs import class_name
+    from ..models import shipped
+    from ..stages.loading import load_model
+
+    for name, path in shipped().items():
+        model = load_model(path)
+        classes = ", ".join(f"{code} {class_name(code)}" for code, _ in model.classes)
+        print(f"{name:12s} {classes}; {path}")
+
+
+def _train(options: argparse.Namespace) -> None:
+    from ..pipeline.ends import input_files
+    from ..pipeline.run import Pipeline
+    from ..pipeline.trainjob import train_pipeline
+    from ..stages.loading import load_model
+
+    named = ("classes", "neighborhoods", "feature_set", "count", "trees", "base")
+    extra = {name: value for name in named if (value := getattr(options, name)) is not None}
+    if options.leave_one_survey_out or options.surveys:
+        from ..pipeline.surveyjob import surveys_of, train_surveys
+
+        surveys = surveys_of(input_files(options.inputs), options.surveys or ())
+        extra |= {"leave_one_survey_out": True} if options.leave_one_survey_out else {}
+        print_messages(*train_surveys(surveys, options.model, options.overrides, **extra))
+    else:
+        stages = train_pipeline(input_files(options.inputs), options.model, options.overrides, **extra)
+        run(options, Pipeline(stages, options.overrides))
+    if Path(options.model).is_file():  # not written into a pipe or device
+        print(load_model(options.model))
+
+
+def _accuracy(options: argparse.Namespace) -> None:
+    from ..pipeline.comparing import accuracy_pipeline, compare_files
+    from ..pipeline.ends import input_files
+    from ..pipeline.run import Pipeline
+
+    reference_dimension = options.reference_dimension or (
+        "Classification" if options.reference else "Reference"
+    )
+    outputs = {k: v for k in ("json", "html") if (v := getattr(options, k))}
+    if options.objects:
+        _compare_objects(options)
+        return
+    if options.area:
+        raise StageError("--area needs --objects", found=options.area)
+    several = len(input_files(options.inputs)) > 1
+    if options.reference or options.model or several:
+        if options.reference and options.model:
+            raise StageError("--reference and --model exclude each other", found=options.model)
+        if options.model:
+            reference_dimension = options.reference_dimension or "Classification"
+        print_messages(
+            *compare_files(
+                options.inputs,
+                options.reference or (),
+                options.dimension,
+                reference_dimension,
+                options.overrides,
+                options.model or "",
+                **outputs,
+            )
+        )
+        return
+    stages = accuracy_pipeline(options.inputs, options.dimension, reference_dimension, **outputs)
+    run(options, Pipeline(stages, options.overrides))
+
+
+def _compare_objects(options: argparse.Namespace) -> None:
+    """``accuracy town.gpkg --objects reference.gpkg``."""
+    from ..base.files import write_whole
+    from ..reports import objectaccuracy
+
+    if len(options.inputs) != 1 or options.reference or options.overrides:
+        raise StageError(
+            "--objects compares one vector file with another, and takes --area, --json and --html alone",
+            found=", ".join(options.inputs),
+        )
+    found, reference = options.inputs[0], options.objects
+    pages = {"json": kinds.JSON, "html": kinds.HTML}
+    outputs = [Output(path, k, kind) for k, kind in pages.items() if (path := getattr(options, k))]
+    check_outputs(outputs, [found, reference, *([options.area] if options.area else [])])
+    figures, one, two = objectaccuracy.compare_objects(found, reference, options.area)
+    print(objectaccuracy.table(figures), end="")
+    if options.json:
+        text = json.dumps(objectaccuracy.to_json(figures), indent=1) + "\n"
+        write_whole(options.json, text.encode(), "json")
+    if options.html:
+        write_whole(
+            options.html, objectaccuracy.page(figures, one, two, "Accuracy of objects").encode(), "html"
+        )
+
+
+def _model(options: argparse.Namespace) -> None:
+    from ..stages.loading import load_model
+
+    model = load_model(options.file)
+    if options.html:
+        from ..reports.modelpage import write_model_report
+
+        check_outputs([Output(options.html, "html", kinds.HTML)], [options.file])
+        write_model_report(options.html, model, Path(options.file).name)
+    if options.showjson:
+        print(json.dumps(model.describe(), indent=2, default=str))
+    else:
+        print(model)

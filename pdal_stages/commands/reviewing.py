@@ -1,0 +1,108 @@
+"""Where a person should look, and what he corrected."""
+
+from __future__ import annotations
+
+import argparse
+
+from .adder import Adder
+
+
+def add_commands(add: Adder) -> None:
+    """``review`` and ``corrections``."""
+    takes = add("review", _review, "List where a person should look in classified files, worst first")
+    takes("inputs", nargs="+", metavar="input", help="Classified files PDAL can read, folders, patterns")
+    takes("output", help="Vector file to write: .gpkg, .geojson, .fgb or .shp")
+    takes(
+        "--html", metavar="FILE", help="A page with pictures; default: beside the vector file, under its name"
+    )
+    takes("--json", metavar="FILE", help="Write figures to a JSON file")
+    takes("--pictures", type=int, default=40, metavar="N", help="Patches that the page shows (40)")
+    takes(
+        "--share",
+        type=float,
+        default=0.95,
+        metavar="SHARE",
+        help="Write patches until they hold this share of the errors that are expected (0.95)",
+    )
+    takes(
+        "--cell",
+        type=float,
+        metavar="METERS",
+        help="Side of the cells that are judged; default: by the density, 1 m at least",
+    )
+    takes("--workers", type=int, default=1, metavar="N", help="Files read at the same time (1)")
+    takes(
+        "--model",
+        default="standard",
+        help="What tells how reliable classes are where the files have no Reliability; default standard",
+    )
+
+    takes = add(
+        "corrections",
+        _corrections,
+        "Mark what a person has corrected, or looked at and found right, for train",
+    )
+    takes("before", help="The file as it was classified (LAS or LAZ)")
+    takes(
+        "after",
+        nargs="?",
+        help="The same points, in any order, as the person left them; or points with true classes: a CSV file or a vector "
+        "layer with x, y, z and class",
+    )
+    takes(
+        "--out",
+        required=True,
+        metavar="FILE",
+        help="The points of the first with the classes of the second, and Checked",
+    )
+    takes(
+        "--area",
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="Polygons inside of which all was looked at: what was not changed there is right. Of the patches of review, "
+        "those whose 'done' is 1; may be repeated",
+    )
+    takes(
+        "--around",
+        type=float,
+        default=1.0,
+        metavar="METERS",
+        help="So far around a changed point all was looked at (1)",
+    )
+    takes(
+        "--within",
+        type=float,
+        default=0.5,
+        metavar="METERS",
+        help="A point of a table is about the nearest one of the file within this distance (0.5)",
+    )
+
+
+def _review(options: argparse.Namespace) -> None:
+    from ..pipeline.reviewing import request_of, write_review
+    from ..reports.reviewpage import lines
+
+    request = request_of(
+        options.inputs,
+        options.output,
+        html=options.html,
+        json=options.json or "",
+        share=options.share,
+        pictures=options.pictures,
+        model=options.model,
+        cell=options.cell,
+        workers=options.workers,
+    )
+    print("\n".join(lines(write_review(request).to_dict())))
+    print(f"written to {', '.join(name for name in (request.output, request.html, request.json) if name)}")
+
+
+def _corrections(options: argparse.Namespace) -> None:
+    from ..pipeline.correcting import request_of, write_corrections
+
+    request = request_of(
+        options.before, options.after, options.out, options.area, options.around, options.within
+    )
+    print("\n".join(write_corrections(request).lines()))
+    print(f"written to {request.output}; next: pdal-stages train --base MODEL {request.output} --model NEW")
