@@ -29,6 +29,7 @@ from functools import lru_cache, update_wrapper
 from pathlib import Path
 from typing import Any
 
+from .cachedcode import load_lightly
 from .errors import DependencyError
 from .progress import Progress
 
@@ -67,6 +68,7 @@ class Kernel:
                 file: Any = getattr(getattr(made, "_cache", None), "_cache_file", None)
                 if hasattr(file, "_source_stamp"):
                     file._source_stamp = "-".join(sorted(_stamps[self]))
+                load_lightly(made)
                 self._dispatcher = made
             return self._dispatcher
 

@@ -353,7 +353,7 @@ def nearest_block(tree, qx, qy, qz, ks, tables, radius, reach, surfaces, wanted,
     made : ndarray of float64, shape (s, m, surfaces.MADE)
         Out: what their surfaces make of these.
     """
-    need = max(ks[len(ks) - 1], AROUND if wanted.any() else 0) + 1
+    need = max(ks[len(ks) - 1], AROUND if _any(wanted) else 0) + 1
     search, scratch = start_search(qx, qy, qz), make_scratch(CROWD * need + ROOM)
     rows, members, s = make_rows(need), make_members(need), make_sums(need)
     _nearest_block(
@@ -366,7 +366,7 @@ def nearest_block(tree, qx, qy, qz, ks, tables, radius, reach, surfaces, wanted,
 def _nearest_block(
     tree, search, ks, tables, radius, reach, surfaces, wanted, made, need, scratch, rows, members, s
 ):  # fmt: skip
-    some = wanted.any()
+    some = _any(wanted)
     # Kept by the caller.
     search, rows, members, s = lent(search), lent(rows), lent(members), lent(s)
     qx, qy, qz = search.qx, search.qy, search.qz
@@ -409,6 +409,15 @@ def _nearest_block(
                 reach[j, target] = reach[j, source]
                 if wanted[j]:
                     made[j, target] = made[j, source]
+
+
+@device
+def _any(flags):
+    # numba's own brings SciPy's linear algebra into every job.
+    found = False
+    for flag in flags:
+        found |= flag
+    return found
 
 
 @device

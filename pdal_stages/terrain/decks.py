@@ -253,8 +253,10 @@ def filled(z, start, h, w, kind, deck):
     near = np.zeros((h, w), np.bool_)  # cells with some of it around: few
     for j in range(h):
         for i in range(w):
-            if deck[start[j * w + i] : start[j * w + i + 1]].any():
-                near[max(j - 2, 0) : j + 3, max(i - 2, 0) : i + 3] = True
+            for n in range(start[j * w + i], start[j * w + i + 1]):
+                if deck[n]:
+                    near[max(j - 2, 0) : j + 3, max(i - 2, 0) : i + 3] = True
+                    break
     for j in range(h):
         for i in range(w):
             if not near[j, i]:
