@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
+from ..base.lean import imported
 from .byplace import CopyByPlace
 from .grid import Box, TileGrid, check_number
 
@@ -36,8 +37,7 @@ def open_las(path: str, only: Sequence[str] = ()):
     `only`: the dimensions that are needed beside X, Y and the returns, by laspy's names of its selections (``Z``,
     ``CLASSIFICATION``, ...): LAZ 1.4 holds them apart, so the others take no time. They hold nothing then.
     """
-    import laspy
-
+    laspy = imported("laspy")
     more = {}
     if only:
         wanted = laspy.DecompressionSelection.base()

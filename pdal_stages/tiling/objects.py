@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,10 +38,12 @@ from ..pipeline.processes import each_file
 from ..pipeline.references import check_one_reference
 from ..reports.objectlayers import check_target, object_layers, target_files, write_layers
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter
-from .classify import ClassifyTask
 from .cloudindex import BLOCK, open_las, read_block
 from .outcome import FoundObjects
 from .store import take_lock
+
+if TYPE_CHECKING:
+    from .classify import ClassifyTask
 
 #: Whose options the commands take for objects.
 OPTIONS_OF = ("writers.objects", "filters.objects")
