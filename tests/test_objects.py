@@ -428,6 +428,34 @@ def test_boxes_of_the_size_of_vehicles_and_containers(degrees, length, width, he
     assert {"vehicle", "container"} & set(str(table.columns["reason"][0]).split(", ")) == ({like} - {""})
 
 
+def plants(*trees, seed=0):
+    """Points in crowns of trees (x, y, height, radius), 60 to each square meter."""
+    rng, made = np.random.default_rng(seed), []
+    for x, y, height, radius in trees:
+        n = int(60 * np.pi * radius**2)
+        away, way = radius * np.sqrt(rng.random(n)), rng.uniform(0, 2 * np.pi, n)
+        up = height * (0.3 + 0.7 * rng.random(n) * (1 - 0.8 * away / radius))
+        up[0] = height
+        made.append(np.column_stack([x + away * np.cos(way), y + away * np.sin(way), up]))
+    xyz = np.concatenate(made)
+    return xyz, np.full(len(xyz), 5, np.uint8)
+
+
+def test_lamps_among_trees_are_to_be_checked():
+    """A pole with an arm is one; a slim tree as high is none, nor what is higher than lamps are."""
+    up, out = np.arange(0.5, 7.6, 0.2), np.arange(0.2, 2.2, 0.2)
+    pole = np.column_stack([np.full(up.size, 10.2), np.full(up.size, 10.2), up])
+    arm = np.column_stack([10.2 + out, np.full(out.size, 10.2), np.full(out.size, 7.5)])
+    lamp = np.concatenate([pole, arm, arm + [0, 0.5, 0.02]])
+    mast = (lamp - [0, 0, 0.0]) * [1, 1, 2.4] + [0, 20, 0]
+    slim = plants((25, 10, 7.5, 0.9), (25, 25, 5, 0.8))
+    leaves = np.concatenate([lamp, mast, slim[0]])
+    table = found_in(*scene((leaves, np.full(len(leaves), 5, np.uint8)))).tables[Kind.TREE]
+    poles = {tuple(np.floor([x / 5, y / 5]).astype(int).tolist()) for x, y, p in zip(
+        table.columns["x"], table.columns["y"], table.having(["pole"]), strict=True) if p}  # fmt: skip
+    assert len(table) == 4 and poles == {(2, 2)}
+
+
 def test_objects_of_some_reasons_left_out():
     wire, shed, van = house(5, 5, 35, 6.4, 7.0), house(10, 20, 14, 24, 3.0), house(30, 30, 35, 32, 2.0, 0.2)
     tree = np.random.default_rng(1).normal([20, 14, 6], [1, 1, 1], (300, 3))

@@ -24,10 +24,13 @@ BOXES = {
     "vehicle": ((1.5, 3.2), (3.5, 7.0), (0.0, 2.4), 1.5, 25.0),
     "container": ((2.0, 3.7), (5.5, 13.5), (2.2, 3.8), 1.9, 6.0),
 }
+#: A lamp or pole that was taken for a tree: no higher, meters; its width at most such a share of its height; and in fewer
+#: than `CROWN` of its cells points `DEEP` meters above each other, since an arm answers once, a crown at several heights.
+POLE, SLIM, DEEP, CROWN = 15.0, 0.35, 0.8, 0.36
 #: Why an object is to be checked.
 REASONS = (
     "no ground near", "small", "narrow", "vehicle", "container", "low", "rough roof", "unsure points", "no facade",
-    "few points", "thin crown", "wide crown", "short", "not straight", CUT,
+    "few points", "thin crown", "wide crown", "pole", "short", "not straight", CUT,
 )  # fmt: skip
 
 
@@ -184,6 +187,10 @@ def tree(body: Body, top_row: int, top_column: int, size: float) -> dict[str, ob
         reasons.append("thin crown")
     if diameter > 1.6 * height:
         reasons.append("wide crown")
+    if height <= POLE and diameter < SLIM * height:
+        deep = np.nan_to_num(body.z - body.low) > DEEP
+        if np.mean(deep) < CROWN:
+            reasons.append("pole")
     if body.reliability < 0.7:
         reasons.append("unsure points")
     return {
