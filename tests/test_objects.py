@@ -446,8 +446,8 @@ def test_lamps_among_trees_are_to_be_checked():
     up, out = np.arange(0.5, 7.6, 0.2), np.arange(0.2, 2.2, 0.2)
     pole = np.column_stack([np.full(up.size, 10.2), np.full(up.size, 10.2), up])
     arm = np.column_stack([10.2 + out, np.full(out.size, 10.2), np.full(out.size, 7.5)])
-    lamp = np.concatenate([pole, arm, arm + [0, 0.5, 0.02]])
-    mast = (lamp - [0, 0, 0.0]) * [1, 1, 2.4] + [0, 20, 0]
+    lamp = np.concatenate([pole, arm, arm + np.array([0, 0.5, 0.02])])
+    mast = lamp * [1, 1, 2.4] + [0, 20, 0]
     slim = plants((25, 10, 7.5, 0.9), (25, 25, 5, 0.8))
     leaves = np.concatenate([lamp, mast, slim[0]])
     table = found_in(*scene((leaves, np.full(len(leaves), 5, np.uint8)))).tables[Kind.TREE]
