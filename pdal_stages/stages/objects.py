@@ -58,9 +58,9 @@ them. **Spans** are wires between towers or poles, **decks** those of bridges.
 Heights are above the ground that the points of its classes show, so `Classification` is all that is read; a mean
 `Reliability`, where points have one, is part of the verdict. Each object is *sure* or *to be checked*, with the reasons:
 small, narrow (nowhere 2 m wide: wires), vehicle or container (a box of the size of one, which some garages have), low,
-rough roof, no facade, no ground near, unsure points, few points, thin crown, wide crown, pole (slim and hollow: lamps), short,
-not straight. Metadata counts objects by kind, verdict and reason. The objects of the reasons in `refuse` lose their class (and are
-counted): their points get `refused_class`, and no `ObjectID`.
+rough roof, no facade, no ground near, unsure points, few points, thin crown, wide crown, pole (slim and hollow: lamps),
+short, not straight. Metadata counts objects by kind, verdict and reason. The objects of the reasons in `refuse` lose their
+class (and are counted): their points get `refused_class`, and no `ObjectID`.
 
 Tiles see what it takes: crowns and ground end within 150 m, and where a building reaches into a tile from farther away
 the tile is read wider. To write objects as polygons and points use `pdal-stages objects` or `writers.objects`.
