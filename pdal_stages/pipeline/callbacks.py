@@ -39,6 +39,11 @@ class Callbacks(AbstractContextManager):
         return {**python_filter(label, _CALLBACK, {"label": label}, adds or {}), **own}
 
 
+def function_of(label: str) -> Function | None:
+    """The function of a filter that :class:`Callbacks` made, by its label."""
+    return _functions.get(label)
+
+
 @catches
 def call_back(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
     """Call the function of a filter that :class:`Callbacks` made."""

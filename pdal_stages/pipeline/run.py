@@ -8,7 +8,7 @@ import os
 import re
 import signal
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -22,7 +22,7 @@ from ..base.outputs import Output, check_outputs
 from ..base.report import Report
 from ..base.shortage import check_limit
 from ..stages import registry
-from . import packing, runtime
+from . import packing, runtime, straight
 from . import pdal as pdal_env
 from .filenames import is_writer, named_files, readers_files, stage_files, with_outputs, writers_outputs
 from .foreseen import check_dimensions, unread_extra_dimensions
@@ -149,11 +149,18 @@ class Pipeline:
         stages = pdal_env.stages_of(other)
         return NotImplemented if stages is None else Pipeline(stages) | self
 
-    def execute(self, *, arrays: bool = True, loglevel: int = logging.WARNING) -> int:
+    def execute(
+        self,
+        *,
+        arrays: bool = True,
+        loglevel: int = logging.WARNING,
+        read: Mapping[str, straight.View] | None = None,
+    ) -> int:
         """Run the pipeline in this process; the number of points that came out.
 
         Files are written in hidden folders and renamed at the end, so an output is whole
-        or absent, and an older one stays if the run fails.
+        or absent, and an older one stays if the run fails. With `read`, what readers give by their tags, PDAL is left out:
+        see :mod:`.straight`.
 
         Raises
         ------
@@ -169,11 +176,11 @@ class Pipeline:
                 )
             self._running = True
         try:
-            return self._execute(arrays, loglevel)
+            return self._execute(arrays, loglevel, read)
         finally:
             self._running = False
 
-    def _execute(self, arrays: bool, loglevel: int) -> int:
+    def _execute(self, arrays: bool, loglevel: int, read: Mapping[str, straight.View] | None) -> int:
         self._check_inputs()
         self.check_outputs()
         stages = self.lowered.stages
@@ -199,7 +206,10 @@ class Pipeline:
                 try:
                     with gentle(signal.SIGINT) as interrupts:
                         run = ground.put_before(packing.unpacked(stages, partials))
-                        result = pdal_env.execute(run, arrays=arrays, loglevel=loglevel)
+                        if read is None:
+                            result = pdal_env.execute(run, arrays=arrays, loglevel=loglevel)
+                        else:
+                            result = straight.execute(run, read)
                         interrupts.check()
                     packed = packing.pack(partials)
                 finally:

@@ -132,11 +132,10 @@ def run_on_view(
     for name in stage.reads():
         if name not in ins:
             stage.take(points, name)  # raises, naming the stage that makes it
-    types = {name: array.dtype for name, array in ins.items()}
-    # PDAL makes these arrays for this one call, and frees them after it.
-    points.let_go_of = give_back
+    if isinstance(ins, dict):  # PDAL makes these arrays for this one call, and frees them after it
+        points.let_go_of = give_back
     for name, values in stage.run(points).items():
-        target = types[name]
+        target = ins[name].dtype
         # PDAL copies raw memory: exactly this type, contiguous, one value per point.
         array = np.ascontiguousarray(values, dtype=target)
         if array.shape != (points.count,):
@@ -235,6 +234,11 @@ def restore_stdout() -> None:
 
 def _redirected() -> bool:
     return type(sys.stdout).__module__ == "redirector"  # PDAL's own type
+
+
+def failure_of(label: str) -> StageError | None:
+    """How a lowered stage failed, as far as that is not collected."""
+    return _failures.get(label)
 
 
 def collect(label: str) -> tuple[list[Report], StageError | None]:

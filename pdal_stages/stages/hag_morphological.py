@@ -166,9 +166,11 @@ of Z.
     def left_of(self, points: Points) -> Left:
         x, y, z = points.axes
         usable = points.usable(self.ignore)
-        left = lowest_of_cells(x, y, z, usable, self.cell)
+        chosen = np.zeros(len(x), bool)
+        chosen[lowest_of_cells(x, y, z, usable, self.cell)] = True
         if self.decks:
-            left = np.union1d(left, level_points(x, y, z, usable))
+            chosen[level_points(x, y, z, usable)] = True
+        left = np.flatnonzero(chosen)
         return Left(np.column_stack([x[left], y[left], z[left]]), by_block(x, y, z, usable, self.cell))
 
     def block_of(

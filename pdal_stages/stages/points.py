@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,7 +85,9 @@ class Points:
         self._own = own
         self.mask: NDArray[np.bool_] | None = None
         if where is not None:
-            freed = {**arrays, "Classification": self.class_codes} if legacy_flags else arrays
+            freed = arrays
+            if legacy_flags:
+                freed = ChainMap({"Classification": self.class_codes}, cast(dict, arrays))
             self.mask = where.evaluate(freed)
             self.report.figures["where"] = int(np.count_nonzero(self.mask))
             if self.count and not self.report.figures["where"]:
@@ -154,12 +158,15 @@ class Points:
         """Forget the other dimensions: from here on nobody reads them. Of coordinates :attr:`xyz` is left."""
         self.xyz  # noqa: B018  before they are gone
         self.__dict__.pop("axes", None)
-        kept = set(names)
-        others = [name for name, array in self.arrays.items() if name not in kept and array is not self._own]
-        for name in others:
-            if self.let_go_of is not None:
-                self.let_go_of(self.arrays[name])
-        self.arrays = {name: array for name, array in self.arrays.items() if name not in others}
+        kept, lent = set(names), self.arrays
+        if isinstance(lent, dict):
+            kept |= {name for name, array in lent.items() if array is self._own}
+        self.arrays = {name: lent[name] for name in lent if name in kept}
+        if self.let_go_of is not None:
+            for name in lent.keys() - kept:
+                self.let_go_of(lent[name])
+        if hasattr(lent, "forget"):  # dimensions that are made as they are asked for
+            lent.forget()
 
     def take_xyz(self) -> NDArray[np.float64]:
         """:attr:`xyz`, not kept here: who takes it may let go of it."""

@@ -25,6 +25,8 @@ from .sources import InputSource
 _COMPRESSOR = b"laszip encoded"
 #: Bytes of the header that decide how points are read: encoding, version, sizes, point format, scales and offsets.
 _COMPARED = ((6, 8), (24, 26), (94, 107), (131, 179))
+#: Points of a piece that its file holds while the others are held in memory.
+SAMPLE = 64
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,20 @@ class Piece:
     away: NDArray[np.float64]
     spans: list[tuple[InputSource, int, int]]  #: whose points are the rows from one number to another
     tiles: set[tuple[int, int]]  #: that its points belong to
+    #: Its points as the file has them, where `path` holds a few of them alone, until :meth:`write`.
+    records: NDArray | None = None
+    like: bytes = b""  #: what is the same in files that are read alike, see :func:`likeness`
+
+    def write(self) -> None:
+        """Write all points into the file at `path`."""
+        if self.records is None:
+            return
+        head, tail = plain_header(self.path)
+        with open(self.path, "wb") as out:
+            out.write(head)
+            out.write(self.records.tobytes())
+            finish(out, head, tail, len(self.records))
+        self.records = None
 
     @cached_property
     def own(self) -> NDArray[np.int64]:
@@ -66,10 +82,12 @@ def cut_all(
     halo_units: float,
     folder: str,
     cores: bool,
+    hold: bool = False,
 ) -> list[Piece]:
     """A tile's points and their surroundings, out of every input; inputs that are alike are read as one.
 
     `halo_units` is in the unit of the coordinates; `cores`: the tile's own points come in files of their own, too.
+    `hold`: see :func:`cut`.
     """
     box = grid.box(tile, halo_units)
     alike: dict[tuple[bytes, str], list[Member]] = {}
@@ -83,10 +101,14 @@ def cut_all(
         reader = json.dumps(source.reader, sort_keys=True)
         alike.setdefault((likeness(path), reader), []).append(Member(source, path, index))
     pieces = []
-    for number, members in enumerate(alike.values()):
+    for number, ((like, _), members) in enumerate(alike.items()):
         core = os.path.join(folder, f"core{number}.las") if cores else ""
-        pieces.append(cut(members, grid, tile, halo_units, os.path.join(folder, f"piece{number}.las"), core))
-    return [piece for piece in pieces if piece is not None]
+        target = os.path.join(folder, f"piece{number}.las")
+        piece = cut(members, grid, tile, halo_units, target, core, hold)
+        if piece is not None:
+            piece.like = like
+            pieces.append(piece)
+    return pieces
 
 
 def likeness(path: str) -> bytes:
@@ -152,17 +174,19 @@ def cut(
     halo_units: float,
     target: str,
     core: str = "",
+    hold: bool = False,
 ) -> Piece | None:
     """Cut a tile and its halo out of files that are alike (:func:`likeness`); None where they have no point there.
 
     `halo_units` is in the unit of the coordinates. A LAS file `target` is written, and a second one, `core`, for the tile's
-    own points alone, where it is given.
+    own points alone, where it is given. With `hold` points stay in memory, and the file has :data:`SAMPLE` of them at most.
     """
     box = grid.box(tile, halo_units)
     rows_cut: list[NDArray[np.int64]] = []
     aways: list[NDArray[np.float64]] = []
     spans: list[tuple[InputSource, int, int]] = []
     tiles: set[tuple[int, int]] = set()
+    held: list[NDArray] = []
     cores = found = 0
     head, tail = plain_header(members[0].path)
     (width,) = struct.unpack_from("<H", head, 105)
@@ -179,12 +203,15 @@ def cut(
                         continue
                     away, others = outside(x[rows], y[rows], grid, tile)
                     tiles |= others
-                    raw = points.array[rows]
+                    raw = points.array if len(rows) == len(x) else points.array[rows]
                     if raw.dtype.itemsize != width:
                         raise StageError(
                             "the points have another length than the header says", where=member.path
                         )
-                    out.write(raw.tobytes())
+                    if hold:
+                        held.append(raw)
+                    else:
+                        out.write(raw.tobytes())
                     if core:
                         mine = away < 0
                         core_out.write(raw[mine].tobytes())
@@ -194,7 +221,11 @@ def cut(
                     found += len(rows)
                 if found > first:
                     spans.append((member.source, first, found))
-            finish(out, bytearray(head), tail, found)
+            records = np.concatenate(held) if held else None
+            held.clear()
+            if records is not None:
+                out.write(sampled(records).tobytes())
+            finish(out, bytearray(head), tail, found if records is None else min(found, SAMPLE))
             if core:
                 finish(core_out, bytearray(head), tail, cores)
     except OSError as error:
@@ -204,7 +235,12 @@ def cut(
         if core:
             os.unlink(core)
         return None
-    return Piece(target, core, np.concatenate(rows_cut), np.concatenate(aways), spans, tiles)
+    return Piece(target, core, np.concatenate(rows_cut), np.concatenate(aways), spans, tiles, records)
+
+
+def sampled(records: NDArray) -> NDArray:
+    """:data:`SAMPLE` of the records at most, spread over all."""
+    return records[np.linspace(0, len(records) - 1, min(len(records), SAMPLE)).astype(np.int64)]
 
 
 class _Points(NamedTuple):

@@ -46,7 +46,7 @@ class FirstRoundTask:
         context = self.context
         with TemporaryDirectory(prefix="first-", dir=context.scratch, ignore_cleanup_errors=True) as folder:
             cuts = cut_all(
-                context.grid, self.tile, self.sources, self.first.halo_m / context.unit, folder, False
+                context.grid, self.tile, self.sources, self.first.halo_m / context.unit, folder, False, True
             )
             found = run_first(context, cuts, self.first) if cuts else FirstResults([], {}, [])
         arrays = {"around": np.concatenate([np.empty((0, 3)), *(one.around for one in found.left)])}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Collection, Mapping
+from collections import OrderedDict
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -16,12 +18,13 @@ from ..base.las import read_header
 from ..pipeline.callbacks import Callbacks
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import points_of
+from ..pipeline.straight import NeedsPdal, Reading, View, may_run, reading_of
 from ..pipeline.writerlimits import check_writers
 from ..stages import registry
 from ..stages.base import Left, Stage
 from ..stages.points import HOLDS_NOWHERE
 from ..stages.polygons import THE_PLACES, TOUCH_NONE
-from .extract import Piece
+from .extract import Piece, sampled
 from .grid import Box, TileGrid
 from .outcome import left_alone
 from .results import PieceResults
@@ -31,6 +34,8 @@ from .tileplan import INPUT, OUTSIDE, ROW, FirstRound, TilePlan
 _NARROW = 0.5
 #: Points whose neighbors are looked at in one go where they lie far apart.
 _AT_ONCE = 100_000
+#: Kinds of files of which it is remembered how PDAL reads them.
+_MOST_READINGS = 16
 _MARK_TYPES = {ROW: "uint32_t", INPUT: "uint32_t", OUTSIDE: "double"}
 
 
@@ -121,7 +126,12 @@ def run_head(
             if ours.number in reaches:
                 reaches[ours.number].stage = ours.stage
         found.with_places = any(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
-        pipeline.execute(arrays=False)
+        read = _read(pipeline, cuts)
+        try:
+            pipeline.execute(arrays=False, read=read)
+        except NeedsPdal:
+            _write(cuts)
+            return run_head(context, tile, cuts, everything, before, narrowing)
     results = _collect(found.views, cuts, plan.creates, marks)
     need = max((reach.need for reach in reaches.values()), default=0.0)
     far = any(report.beyond_halo for _, reports in pipeline.reports for report in reports)
@@ -176,7 +186,11 @@ def run_first(context: RunContext, cuts: list[Piece], first: FirstRound) -> Firs
         left = _Left(wanting, marks)
         run = callbacks.filter(left, **(_after(marks) if first.at == 0 else {}))
         pipeline = Pipeline([*stages, *head[:-1], run], whole=False)
-        pipeline.execute(arrays=False)
+        try:
+            pipeline.execute(arrays=False, read=_read(pipeline, cuts))
+        except NeedsPdal:
+            _write(cuts)
+            return run_first(context, cuts, first)
     messages = _messages(pipeline)
     return FirstResults(left.found, _changes(left.values, marks), messages)
 
@@ -205,6 +219,40 @@ def _changes(
                 chosen = {name: column[these] for name, column in values.items()}
                 out[source.key] = (mark.piece.index[rows[these]], chosen)
     return out
+
+
+def _read(pipeline: Pipeline, cuts: list[Piece]) -> dict[str, View] | None:
+    """The points of pieces that are held in memory, for a pipeline that runs without PDAL; None where it runs with it."""
+    views = {}
+    try:
+        if not may_run(pipeline.lowered.stages):
+            raise NeedsPdal("a stage")
+        for number, piece in enumerate(cuts):
+            if piece.records is None:
+                raise NeedsPdal("points in a file")
+            views[f"in{number}"] = View([(_reading(piece, piece.records), piece.records)], {})
+    except NeedsPdal:
+        _write(cuts)
+        return None
+    return views
+
+
+def _write(cuts: list[Piece]) -> None:
+    for piece in cuts:
+        piece.write()
+
+
+#: How PDAL reads files that are alike, by what is the same in them and their reader.
+_readings: OrderedDict[tuple[bytes, str], Reading] = OrderedDict()
+
+
+def _reading(piece: Piece, records: NDArray) -> Reading:
+    key = (piece.like, json.dumps(piece.reader, sort_keys=True))
+    if key not in _readings:
+        _readings[key] = reading_of({**piece.reader, "filename": piece.path}, sampled(records))
+        while len(_readings) > _MOST_READINGS:
+            _readings.popitem(last=False)
+    return _readings[key]
 
 
 def _marks(cuts: list[Piece], context: RunContext, keep: Collection[str] = ()) -> list[_Mark]:
@@ -236,6 +284,25 @@ def _with_threads(given: dict[str, Any], threads: int) -> dict[str, Any]:
     return {**given, "threads": min(asked, threads) if asked else threads}
 
 
+class _Some(Mapping[str, NDArray]):
+    """Some points' dimensions, each as it is asked for."""
+
+    def __init__(self, arrays: Mapping[str, NDArray], mask: NDArray[np.bool_]) -> None:
+        self._arrays, self._mask = arrays, mask
+        self._found: dict[str, NDArray] = {}
+
+    def __getitem__(self, name: str) -> NDArray:
+        if name not in self._found:
+            self._found[name] = self._arrays[name][self._mask]
+        return self._found[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._arrays)
+
+    def __len__(self) -> int:
+        return len(self._arrays)
+
+
 class _Left:
     """Keeps what a stage would need of a tile's own points if they were far away, and what the stages before changed."""
 
@@ -249,7 +316,7 @@ class _Left:
     def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
         mine = ins[OUTSIDE] < 0
         if mine.any():
-            points = points_of(self.stage, module, {name: values[mine] for name, values in ins.items()})
+            points = points_of(self.stage, module, _Some(ins, mine))
             self.found.append(self.stage.left_of(points))
         for number, mark in enumerate(self.marks):
             if mark.keep:

@@ -65,7 +65,13 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
     head: HeadRun | None = None
     for attempt in range(_WIDENINGS + 1):
         cuts = cut_all(
-            context.grid, tile, task.sources, halo_m / context.unit, folder, task.outputs is not None
+            context.grid,
+            tile,
+            task.sources,
+            halo_m / context.unit,
+            folder,
+            task.outputs is not None,
+            context.plan.all_ours,
         )
         read = sum(len(piece.index) for piece in cuts)
         own = sum(len(piece.own) for piece in cuts)

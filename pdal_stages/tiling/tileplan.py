@@ -79,6 +79,11 @@ class TilePlan:
     whole_names: bool = False  #: '#' in an output's name is the whole name of the input file, with its suffix
 
     @property
+    def all_ours(self) -> bool:
+        """Whether PDAL only reads for the head."""
+        return self.creates is not None
+
+    @property
     def writers(self) -> list[dict[str, Any]]:
         return [s for s in self.tail if s["type"].startswith("writers.")]
 

@@ -1,0 +1,299 @@
+"""Pipelines of readers.las and stages of ours alone, run without PDAL: from a file's records straight to the stages.
+
+PDAL takes a copy of every dimension of every point for each filter that is Python, and keeps its own beside them. In tiles,
+whose points are cut out of files record by record in any case, that is a tenth of the time and half of the memory. So PDAL
+reads a few of the points, and what it makes of them is how all are read: its dimensions and their types, the spatial
+reference, the metadata. A dimension is decoded here only where that gives what PDAL gave, bit for bit, and for whatever
+else it takes PDAL, it is PDAL that runs (:class:`NeedsPdal`).
+"""
+
+from __future__ import annotations
+
+import copy
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import StageError
+from . import callbacks, runtime
+from . import pdal as pdal_env
+
+#: Options of a reader that change nothing but the spatial reference, and which dimensions there are beside the plain ones.
+_PLAIN = {
+    *("type", "filename", "tag", "default_srs", "override_srs", "spatialreference", "nosrs"),
+    *("use_eb_vlr", "extra_dims"),
+}
+#: NumPy's types of PDAL's, where they have other names.
+_TYPES = {"double": "float64", "float": "float32"}
+_LIMITS = re.compile(r"(\w+)\[:([-+.\de]+)\]")
+
+
+class NeedsPdal(StageError):
+    """What is asked for takes PDAL."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How PDAL reads a kind of file."""
+
+    types: dict[str, np.dtype]  #: the dimensions, in their order
+    decoded: dict[str, Callable[[NDArray], NDArray]]  #: of records; those that are read here as PDAL does
+    module: dict[str, Any]  #: what a script finds set: `metadata`, `spatialreference`
+    log: str  #: what PDAL said
+
+
+def may_run(stages: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether these stages, some of them readers, may be run without PDAL as far as can be told from them."""
+    types = [(str(stage.get("type")), stage) for stage in stages]
+    return all(
+        set(stage) <= _PLAIN if kind == "readers.las" else not kind.startswith(("readers.", "writers."))
+        for kind, stage in types
+    )
+
+
+def reading_of(reader: Mapping[str, Any], records: NDArray) -> Reading:
+    """How PDAL reads a LAS file that holds `records` and no other points.
+
+    Raises
+    ------
+    NeedsPdal
+        If it cannot, for PDAL to say why.
+    """
+    found: dict[str, NDArray] = {}
+    module: dict[str, Any] = {}
+
+    def look(given: dict[str, Any], ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        found.update({name: np.array(values) for name, values in ins.items()})
+        module.update({name: copy.deepcopy(given.get(name)) for name in ("metadata", "spatialreference")})
+
+    try:
+        with callbacks.Callbacks() as called:
+            log = pdal_env.execute([dict(reader), called.filter(look)], arrays=False).log
+    except StageError as error:
+        raise NeedsPdal(str(error)) from error
+    if not found or len(found["X"]) != len(records):
+        raise NeedsPdal("the reader gave no points, or others")
+    ways = _ways(records.dtype.names or (), str(reader["filename"]))
+    decoded = {}
+    for name, values in found.items():
+        way = ways.get(name)
+        if way is None:
+            continue
+        here = way(records)
+        if here.dtype == values.dtype and np.array_equal(here.view(np.uint8), values.view(np.uint8)):
+            decoded[name] = way
+    return Reading({name: values.dtype for name, values in found.items()}, decoded, module, log)
+
+
+def _ways(fields: Sequence[str], path: str) -> dict[str, Callable[[NDArray], NDArray]]:
+    """Ways of reading dimensions, by PDAL's names, of records with laspy's fields (LAS 1.4 R15, tables 7 to 18)."""
+    from ..base.las import read_header
+
+    header = read_header(path)
+    assert header is not None
+
+    def scaled(axis: int) -> Callable[[NDArray], NDArray]:
+        field, scale, offset = "XYZ"[axis], header.scales[axis], header.offsets[axis]
+        return lambda records: records[field] * scale + offset
+
+    def bits(field: str, first: int, count: int) -> Callable[[NDArray], NDArray]:
+        return lambda records: records[field] >> np.uint8(first) & np.uint8((1 << count) - 1)
+
+    def plain(field: str, dtype: Any = None) -> Callable[[NDArray], NDArray]:
+        return lambda records: np.ascontiguousarray(records[field], dtype)
+
+    ways = {axis: scaled(number) for number, axis in enumerate("XYZ")}
+    ways |= {
+        "Intensity": plain("intensity"),
+        "UserData": plain("user_data"),
+        "PointSourceId": plain("point_source_id"),
+        "GpsTime": plain("gps_time"),
+        **{color.capitalize(): plain(color) for color in ("red", "green", "blue")},
+    }
+    if "classification_flags" in fields:
+        flags = "classification_flags"
+        ways |= {
+            "ReturnNumber": bits("bit_fields", 0, 4),
+            "NumberOfReturns": bits("bit_fields", 4, 4),
+            "Classification": plain("classification"),
+            "ClassFlags": bits(flags, 0, 4),
+            "ScanChannel": bits(flags, 4, 2),
+            "ScanDirectionFlag": bits(flags, 6, 1),
+            "EdgeOfFlightLine": bits(flags, 7, 1),
+            "ScanAngleRank": lambda records: (records["scan_angle"] * 0.006).astype(np.float32),
+            "Infrared": plain("nir"),
+            **{name: bits(flags, bit, 1) for bit, name in enumerate(pdal_env.FLAGS)},
+        }
+    else:
+        ways |= {
+            "ReturnNumber": bits("bit_fields", 0, 3),
+            "NumberOfReturns": bits("bit_fields", 3, 3),
+            "ScanDirectionFlag": bits("bit_fields", 6, 1),
+            "EdgeOfFlightLine": bits("bit_fields", 7, 1),
+            "ScanAngleRank": plain("scan_angle_rank", np.float32),
+        }
+        if not pdal_env.splits_class_flags():  # else a few points do not tell how flags are read
+            ways["Classification"] = plain("raw_classification")
+    needs = {"GpsTime": "gps_time", "Infrared": "nir", "Red": "red", "Green": "green", "Blue": "blue"}
+    return {name: way for name, way in ways.items() if needs.get(name, "X") in fields}
+
+
+class View(Mapping[str, NDArray]):
+    """Points as a stage sees PDAL's: dimensions by name. What a file holds is decoded each time that it is asked for."""
+
+    def __init__(self, parts: Sequence[tuple[Reading, NDArray]], made: dict[str, NDArray]) -> None:
+        self._parts = list(parts)
+        self._made = made  #: what stages changed or made
+        self._places: dict[str, NDArray] = {}  #: coordinates, which one stage asks for several times
+        self.count = sum(len(records) for _, records in self._parts)
+        types = [reading.types for reading, _ in self._parts]
+        if any(one != types[0] for one in types):
+            raise NeedsPdal("inputs of several kinds")
+        self._read = types[0]
+        self.module = self._parts[0][0].module
+        if any(reading.module["spatialreference"] != self.module["spatialreference"] for reading, _ in parts):
+            raise NeedsPdal("inputs of several references")
+
+    @classmethod
+    def of_file(cls, reader: Mapping[str, Any], reading: Reading, records: NDArray) -> View:
+        """All points that a reader would give."""
+        return cls([(reading, records)], {})
+
+    @classmethod
+    def merged(cls, views: Sequence[View]) -> View:
+        """The points of all, one after the other."""
+        if len(views) == 1:
+            return views[0]
+        names = list(views[0]._made)
+        if any(list(view._made) != names for view in views):
+            names = sorted({name for view in views for name in view._made})
+        made = {name: np.concatenate([view[name] for view in views]) for name in names}
+        return cls([part for view in views for part in view._parts], made)
+
+    def those(self, mask: NDArray[np.bool_]) -> View:
+        """Some of the points."""
+        parts, start = [], 0
+        for reading, records in self._parts:
+            parts.append((reading, records[mask[start : start + len(records)]]))
+            start += len(records)
+        return View(parts, {name: values[mask] for name, values in self._made.items()})
+
+    def __getitem__(self, name: str) -> NDArray:
+        if name in self._made:
+            return self._made[name]
+        if name in self._places:
+            return self._places[name]
+        if name not in self._read:
+            raise KeyError(name)
+        if any(name not in reading.decoded for reading, _ in self._parts):
+            raise NeedsPdal(f"the dimension '{name}'")
+        decoded = [reading.decoded[name](records) for reading, records in self._parts]
+        values = decoded[0] if len(decoded) == 1 else np.concatenate(decoded)
+        if name in ("X", "Y", "Z"):
+            self._places[name] = values
+        return values
+
+    def forget(self) -> None:
+        """Let go of coordinates, which are decoded anew for whoever asks."""
+        self._places = {}
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._made or name in self._read
+
+    def __iter__(self) -> Iterator[str]:
+        yield from self._read
+        yield from (name for name in self._made if name not in self._read)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+    def add(self, name: str, kind: str) -> None:
+        """A dimension of PDAL's type, 0 where it is new."""
+        dtype = np.dtype(_TYPES.get(kind, kind.removesuffix("_t")))
+        if name not in self:
+            self._made[name] = np.zeros(self.count, dtype)
+        elif name not in self._made and (self._read[name] != dtype or not self._decodes(name)):
+            raise NeedsPdal(f"the dimension '{name}'")
+
+    def _decodes(self, name: str) -> bool:
+        return all(name in reading.decoded for reading, _ in self._parts)
+
+    def write(self, outs: Mapping[str, NDArray]) -> None:
+        """Take what a filter wrote."""
+        for name, values in outs.items():
+            there = self._made[name].dtype if name in self._made else self._read.get(name)
+            if there != values.dtype or len(values) != self.count:
+                raise NeedsPdal(f"what is written to '{name}'")
+            self._made[name] = values
+
+
+def execute(stages: Sequence[dict[str, Any]], read: Mapping[str, View]) -> pdal_env.Execution:
+    """Run a lowered pipeline of readers, whose points are given by their tags, and filters of ours.
+
+    Raises
+    ------
+    NeedsPdal
+        Where it takes PDAL.
+    StageError
+        Of a stage.
+    """
+    tagged: dict[str, list[View]] = {}
+    waiting: list[list[View]] = []  # what no stage has taken yet
+    for stage in stages:
+        kind = stage["type"]
+        if kind == "readers.las":
+            views = [read[stage["tag"]]]
+        else:
+            names = stage.get("inputs")
+            if names is None:
+                views = [view for given in waiting for view in given]
+                waiting = []
+            else:
+                taken = [tagged[name] for name in ([names] if isinstance(names, str) else names)]
+                waiting = [given for given in waiting if not any(given is one for one in taken)]
+                views = [view for given in taken for view in given]
+            views = _filtered(stage, views)
+        waiting.append(views)
+        if "tag" in stage:
+            tagged[stage["tag"]] = views
+    log = "\n".join(dict.fromkeys(part[0].log for view in read.values() for part in view._parts))
+    return pdal_env.Execution(
+        count=sum(view.count for given in waiting for view in given), metadata={}, arrays=[], log=log
+    )
+
+
+def _filtered(stage: Mapping[str, Any], views: list[View]) -> list[View]:
+    """What a filter makes of views."""
+    kind = stage["type"]
+    if kind == "filters.merge":
+        return [View.merged(views)]
+    if kind == "filters.range":
+        limits = _LIMITS.fullmatch(str(stage.get("limits")))
+        if limits is None or "where" in stage:
+            raise NeedsPdal(kind)
+        return [view.those(view[limits[1]] <= float(limits[2])) for view in views]
+    if kind != "filters.python" or "where" in stage:
+        raise NeedsPdal(kind)
+    arguments = stage.get("pdalargs", {})
+    label = arguments.get("label", "")
+    function = callbacks.function_of(label)
+    if function is None and runtime.made.get(label) is None:
+        raise NeedsPdal(kind)
+    for view in views:
+        for adds in stage.get("add_dimension", ()):
+            view.add(*adds.split("="))
+        outs: dict[str, NDArray] = {}
+        module = {**view.module, "pdalargs": arguments}
+        if function is not None:
+            function(module, view, outs)
+        else:
+            runtime.run_stage(module, view, outs)
+            if (failure := runtime.failure_of(label)) is not None:
+                raise failure
+        view.write(outs)
+        view.forget()
+    return views
