@@ -24,9 +24,10 @@ def load_lightly(dispatcher: Any) -> None:
         from numba.core.runtime import rtsys
     except ImportError:
         return
-    parts = [(CPUCodeLibrary, "_get_module_for_linking"), (CPUCodeLibrary, "_finalize_final_module")]
-    parts += [(CPUCodeLibrary, "_set_compiled_object"), (JitEngine, "_load_defined_symbols")]
-    if not all(hasattr(owner, name) for owner, name in parts):
+    parts = ("_get_module_for_linking", "_finalize_final_module", "_set_compiled_object")
+    if not (
+        all(hasattr(CPUCodeLibrary, part) for part in parts) and hasattr(JitEngine, "_load_defined_symbols")
+    ):
         return
 
     def library_of(codegen: Any, state: Any) -> Any:

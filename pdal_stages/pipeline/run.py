@@ -33,6 +33,7 @@ from .overrides import Override, apply_overrides
 from .read import PipelineSource, read_pipeline
 from .records import keep_records
 from .references import check_readers
+from .together import joined
 from .wiring import check_start
 
 #: Held while a pipeline is marked as running.
@@ -207,7 +208,7 @@ class Pipeline:
                     with gentle(signal.SIGINT) as interrupts:
                         run = ground.put_before(packing.unpacked(stages, partials))
                         if read is None:
-                            result = pdal_env.execute(run, arrays=arrays, loglevel=loglevel)
+                            result = pdal_env.execute(joined(run), arrays=arrays, loglevel=loglevel)
                         else:
                             result = straight.execute(run, read)
                         interrupts.check()

@@ -103,6 +103,8 @@ class Stage(ABC):
     in_models: ClassVar[Mapping[str, Rule] | None] = None
     #: Whether points beyond the halo may matter; tiles then ask :meth:`reach_of`, and are read wider.
     open_ended: ClassVar[bool] = False
+    #: Whether it lets go, while it works, of points' arrays that it does not read itself.
+    lets_go: ClassVar[bool] = False
 
     where: str | None = option(
         "expression",
