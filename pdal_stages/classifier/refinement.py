@@ -20,6 +20,8 @@ from .forest import Forest
 
 #: As many labeled points of its rarest class count as much as the base.
 EVEN = 30
+#: Probabilities that cannot be divided by.
+NOTHING = 1e-300
 #: Most passes of a base.
 MOST_BELOW = 3
 
@@ -148,8 +150,9 @@ def blended(
         out[:, at[0]] = 0.0
         rest = out.sum(axis=1)
         # Where the base knows of nothing else it stays the target
-        out *= np.where(rest > 0, (1.0 - mine) / np.maximum(rest, 1e-300), 0.0)[:, None]
-        out[:, at[0]] = np.where(rest > 0, mine, 1.0)
+        something = rest > NOTHING
+        out *= np.where(something, (1.0 - mine) / np.maximum(rest, NOTHING), 0.0)[:, None]
+        out[:, at[0]] = np.where(something, mine, 1.0)
         return out
     theirs = out[:, at]
     share = theirs.sum(axis=1, keepdims=True)
