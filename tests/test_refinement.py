@@ -61,7 +61,9 @@ def test_without_trust_the_base_stands(said, grown):
     assert np.allclose(blended(said, grown, BEFORE, BEFORE, 1.0), grown, atol=1e-9)
 
 
-@example(np.array([[1e-308, 0.0, 1.0]]), np.array([[0.5, 0.5]]), 6, 1.0)  # the base knows hardly anything else
+@example(
+    np.array([[1e-308, 0.0, 1.0]]), np.array([[0.5, 0.5]]), 6, 1.0
+)  # the base knows hardly anything else
 @given(shares(3), shares(2), st.sampled_from([6, 17]), st.floats(0.0, 1.0))
 def test_a_target_alone_changes(said, grown, target, trusted):
     got = blended(said, grown, BEFORE, (1, target), trusted, target)

@@ -45,6 +45,12 @@ def test_surveys_of_two_reference_systems_are_left_out_in_turn(tmp_path, write_l
     assert found["overall_accuracy"] > 0.9
     assert [one["name"] for one in info["training"]["clouds"]] == ["t0", "t1", "t2"]
 
+    wide = ["--filters.hag_morphological.window=20", "--writers.classifiermodel.dimensions=Ground"]
+    assert main([*words, *QUICK_WORDS, *telling, "--leave-one-survey-out", *wide]) == 0
+    capsys.readouterr()
+    (heights,) = ps.load_model(tmp_path / "m.model").info["preparation"]  # as they were made
+    assert heights["window"] == 20
+
     grouped = [
         *words,
         *QUICK_WORDS,

@@ -63,7 +63,7 @@ class LeaveOneOut:
         of = [cloud.flight for cloud in self.clouds]
         self.samples = draw_samples(labeled, len(self.classes), OPTIONS.count, OPTIONS.seed, of)
         self.survey = np.array([self.names.index(name) for name in of])[self.samples.cloud]
-        self.ranked = Ranked.of(self.samples.take(self.tables))
+        self.ranked = Ranked.of(self.samples.take(self.tables.__getitem__))
         self._pair = cache(self._grown_without)
 
     def _grow(self, ranked: Ranked, kept: npt.NDArray[np.bool_], trees: int) -> Forest:

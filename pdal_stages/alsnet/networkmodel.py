@@ -95,7 +95,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
             **trained.notes,
             **{name: number for name, number in counts.items() if number},
         },
-        "densities": density_range(checked),
+        "densities": density_range(cloud.density for cloud in clouds),
         "voxel": options.voxel,
         "accuracy": {"cross_validation": None},
         "passes": [

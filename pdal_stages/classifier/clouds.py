@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,11 +13,13 @@ import numpy.typing as npt
 
 from ..base.asprs import UNINFORMATIVE
 from ..base.errors import OptionError, StageError
+from ..base.progress import Progress
 from ..features.voxels import Representatives, represent
 from .classes import MAX_LABEL, ClassMap, as_labels
 from .dimensions import known, required, welcome
-from .telltale import telltale
-from .thinning import thinned
+from .surroundings import Seen
+from .telltale import Labels, telltale
+from .thinning import density, thinned
 from .trainoptions import TrainingOptions
 
 
@@ -52,10 +55,31 @@ class TrainingCloud:
     def __post_init__(self) -> None:
         object.__setattr__(self, "xyz", np.asarray(self.xyz, dtype=np.float64))
 
+    def __len__(self) -> int:
+        return len(self.xyz)
+
     @property
     def flight(self) -> str:
         """The survey, or the cloud's own name."""
         return self.survey or self.name
+
+    @property
+    def whole(self) -> object:
+        """The same for the parts of one cloud (:mod:`.parts`), and for no others."""
+        return id(self)
+
+    @property
+    def density(self) -> float:
+        """Points per square meter; see :func:`.thinning.density`."""
+        return density(self.xyz)
+
+    def seen(self, rows: npt.NDArray[np.int64], reach: float) -> Seen:
+        """What features of some of its points depend on that look so many meters around them."""
+        return Seen(self.xyz, self.dimensions, rows)
+
+    def can_be_seen(self, rows: npt.NDArray[np.int64], reach: float) -> bool:
+        """Whether the memory suffices to see that."""
+        return True
 
     def part(self, rows: npt.NDArray[np.int64], copy: str = "") -> TrainingCloud:
         """Some of its points, as a cloud of the same survey."""
@@ -76,25 +100,40 @@ CloudSource = TrainingCloud | Callable[[], TrainingCloud]
 
 def prepared(sources: Iterable[CloudSource], options: TrainingOptions) -> Iterator[TrainingCloud]:
     """The clouds without ignored points and with one point per voxel, each followed by its thinned copies."""
+    for source in sources:
+        cloud = cleaned(source() if callable(source) else source, options)
+        yield cloud
+        for wanted in options.thin:
+            copy = thinned_copy(cloud, wanted, options.seed)
+            if copy is not None:
+                yield copy
+
+
+def cleaned(cloud: TrainingCloud, options: TrainingOptions) -> TrainingCloud:
+    """A cloud without ignored points and with one point per voxel."""
     named: set[int] = set()
     if options.classes is not None:
         named.update(label for part in ClassMap.parse(options.classes).labels for label in part)
+    labels = _checked_labels(cloud)
     ignored = [label for label in options.ignore if label not in named]
-    for source in sources:
-        cloud = source() if callable(source) else source
-        labels = _checked_labels(cloud)
-        if ignored and (gone := np.isin(labels, ignored)).any():
-            cloud = cloud.part(np.flatnonzero(~gone))
-        values = known(options.inputs, cloud.dimensions, len(cloud.xyz), where=cloud.name)
-        representatives = represent(cloud.xyz, options.voxel, values)
-        if representatives is not None:
-            few = options.base is not None  # then each label counts, whichever point stands for its voxel
-            cloud = _told(cloud, representatives, named) if few else cloud.part(representatives.rows)
-        yield cloud
-        for wanted in options.thin:
-            rows = thinned(cloud.xyz, wanted, options.seed)
-            if rows is not None and len(rows):
-                yield cloud.part(rows, f"thinned to {wanted:g} per m2")
+    if ignored and (gone := np.isin(labels, ignored)).any():
+        cloud = cloud.part(np.flatnonzero(~gone))
+    values = known(options.inputs, cloud.dimensions, len(cloud.xyz), where=cloud.name)
+    representatives = represent(cloud.xyz, options.voxel, values)
+    if representatives is None:
+        return cloud
+    few = options.base is not None  # then each label counts, whichever point stands for its voxel
+    return _told(cloud, representatives, named) if few else cloud.part(representatives.rows)
+
+
+def thinned_copy(
+    cloud: TrainingCloud, wanted: float, seed: int, there: float | None = None
+) -> TrainingCloud | None:
+    """A copy with `wanted` points per square meter; None where there are hardly more. `there`: see :func:`thinned`."""
+    rows = thinned(cloud.xyz, wanted, seed, there)
+    if rows is None or not len(rows):
+        return None
+    return cloud.part(rows, f"thinned to {wanted:g} per m2")
 
 
 def _told(cloud: TrainingCloud, representatives: Representatives, named: set[int]) -> TrainingCloud:
@@ -175,7 +214,12 @@ class Labeled:
         notes: dict[str, Any] = {"contradicted": dict(self.left_out)} if self.left_out else {}
         read = {*required(options.inputs), *welcome(options.inputs)}
         telling = telltale(
-            ({name: np.asarray(v) for name, v in cloud.dimensions.items() if name in read}, self[number][1])
+            Labels(
+                cloud.whole,
+                cloud.xyz,
+                {name: cloud.dimensions[name] for name in cloud.dimensions if name in read},
+                self[number][1],
+            )
             for number, cloud in enumerate(self.clouds)
         )
         return notes | ({"telltale": telling} if telling else {})
@@ -210,10 +254,12 @@ def contradicted(cloud: TrainingCloud, below: float) -> npt.NDArray[np.bool_] | 
     return np.isin(as_labels(cloud.labels, cloud.name), STANDING) & ground & low
 
 
-def label_classes(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> Labeled:
+def label_classes(
+    clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool = False
+) -> Labeled:
     """The classes that the clouds' labels make."""
     number, left_out = np.zeros((2, MAX_LABEL + 1), np.int64)
-    for cloud in clouds:
+    for cloud in watched(clouds, "counting labels", progress):
         labels = as_labels(cloud.labels, cloud.name)
         used = np.ones(len(labels), np.bool_) if cloud.mask is None else np.asarray(cloud.mask)
         gone = contradicted(cloud, options.contradicted_below)
@@ -241,6 +287,23 @@ def label_classes(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> 
         )
     counted = {str(label): int(left_out[label]) for label in np.flatnonzero(left_out)}
     return Labeled(clouds, classes, options.contradicted_below, counted)
+
+
+def watched(clouds: Sequence[TrainingCloud], what: str, progress: bool) -> Iterator[TrainingCloud]:
+    """The clouds, with progress on stderr that counts their points."""
+    with Progress(sum(map(len, clouds)), what, enabled=progress) as bar:
+        for cloud in clouds:
+            yield cloud
+            bar.update(len(cloud))
+
+
+def listed(clouds: Iterable[TrainingCloud]) -> list[dict[str, Any]]:
+    """Names and numbers of points of clouds, those in parts as one, for a manifest."""
+    rows: dict[object, dict[str, Any]] = {}
+    for cloud in clouds:
+        row = rows.setdefault(cloud.whole, {"name": os.path.basename(cloud.name), "points": 0})
+        row["points"] += len(cloud)
+    return list(rows.values())
 
 
 def _checked_labels(cloud: TrainingCloud) -> npt.NDArray[Any]:

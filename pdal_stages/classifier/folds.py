@@ -136,13 +136,15 @@ class ContextOnly:
 
 def sample_context(
     request: PredictRequest, passes: Sequence[FoldForests], context: Context, classes: int
-) -> npt.NDArray[np.float32]:
-    """(m, columns): the context of the m points asked for, as passes say, one after the other, that have not seen them."""
+) -> tuple[npt.NDArray[np.float32], bool]:
+    """(m, columns): the context of the m points asked for, as passes say, one after the other, that have not seen them.
+
+    And whether any of those that were looked at had neighbors beyond the features' halo.
+    """
     asked: Any = request.rows
     out = np.empty((len(asked), len(context.tokens) * classes), np.float32)
-    return context_of(
-        PassRun([*passes, ContextOnly(context)], [classes] * (len(passes) + 1), request), asked, out
-    )
+    run = PassRun([*passes, ContextOnly(context)], [classes] * (len(passes) + 1), request)
+    return context_of(run, asked, out), bool(run.report.beyond_halo)
 
 
 def context_of(

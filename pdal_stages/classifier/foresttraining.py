@@ -17,11 +17,10 @@ from ..base.outputs import Output
 from ..base.progress import Progress
 from ..base.version import __version__
 from ..features import FeaturePlan
-from ..features.fitting import fit_clouds
 from ..features.returns import SOURCES
 from . import crossval
 from .algorithms import PredictRequest
-from .clouds import Labeled, TrainingCloud, label_classes
+from .clouds import Labeled, TrainingCloud, label_classes, listed
 from .context import Context
 from .dimensions import WHERE_THERE, gather, required
 from .featureforest import FeatureForest, Features
@@ -32,9 +31,10 @@ from .model import Model
 from .passes import weighed
 from .refinement import blended
 from .refining import Below, held_by_base, on_top, trust
-from .samplefeatures import must_fit, percentiles, sample_features
+from .samplefeatures import SHORT, fitted, must_fit, percentiles, sample_features
 from .sampling import Samples, draw_samples
 from .sureness import Sureness, counted
+from .surroundings import Looks, Seen, work_on
 from .thinning import density_range
 from .trainoptions import TrainingOptions
 from .trees import GrownTree, Ranked
@@ -74,24 +74,23 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     """See :func:`pdal_stages.classifier.train`."""
     started = time.perf_counter()
     plan = feature_plan(options)
-    groups = _groups(clouds, options)  # before any work: a dimension may be missing
-    labeled = label_classes(clouds, options)
+    _check_groups(clouds, options)  # before any work: a dimension may be missing
+    labeled = label_classes(clouds, options, progress)
     classes = labeled.classes
     shares = [f"{cloud.flight} {cloud.copy}" for cloud in clouds] if options.balance else None
-    samples = draw_samples(labeled, len(classes.codes), options.count, options.seed, shares)
+    total = sum(map(len, clouds)) * (1 + len(classes.codes))  # which are read for each class
+    with Progress(total, "drawing samples", enabled=progress) as bar:
+        samples = draw_samples(labeled, len(classes.codes), options.count, options.seed, shares, progress=bar)
     base = options.base
     read = 0 if options.passes == 1 and base is None else len(classes.codes if base is None else base.classes)
     of_context = len(options.context) * read
     must_fit(len(plan.names) + of_context, len(samples))
-    share = np.bincount(samples.cloud, minlength=len(clouds))
-    used = [cloud.xyz for cloud, n in zip(clouds, share, strict=True) if n]
-    fitted = fit_clouds(used, plan, seed=options.seed, threads=options.threads)
-    features = Features(plan, *fitted, options.seed)
+    features = Features(plan, *fitted(clouds, samples, plan, options), options.seed)
     values, counted = sample_features(clouds, samples, features, options, progress)
     timed = {"features": time.perf_counter() - started}
     limits = percentiles(values, plan, options)
     below = None if base is None else Below(base, clouds, samples, options, progress)
-    xy = samples.take([cloud.xyz[:, :2] for cloud in clouds])
+    xy = samples.take(lambda number: clouds[number].xyz[:, :2])
     priors = _priors(samples, len(classes.codes), options.prior_weight)
     heard = _Heard(samples, classes.codes, priors, below, options)
     ranked = Ranked.of(values, options.threads)
@@ -102,7 +101,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
         ranked,
         samples,
         xy,
-        samples.take(groups),
+        samples.take(lambda number: _groups(clouds[number], options)),
         classes.codes,
         plan,
         options,
@@ -117,7 +116,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     info = {
         **labeled.described(options, map(samples.counts, range(len(classes.codes)))),
         "training": {
-            "clouds": [{"name": os.path.basename(c.name), "points": len(c.xyz)} for c in clouds],
+            "clouds": listed(clouds),
             "count": options.count,
             "seed": options.seed,
             "samples": len(samples),
@@ -129,11 +128,11 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
             **passes.notes,
             **_unscored(heard, validation, xy, samples, labeled, options, _gap(plan, options)),
             **({} if below is None or options.target is not None else _held(below, classes.codes)),
-            **counted,
+            **_with_short(counted, passes.short + (0 if below is None else below.short)),
         },
         "priors": priors,
         **heard.of(chosen, validation, below),
-        "densities": density_range(cloud.xyz for cloud in clouds),
+        "densities": density_range(cloud.density for cloud in clouds),
         "voxel": options.voxel,
         "accuracy": {"cross_validation": validation, "leave_one_survey_out": left_out},
         "passes": passes.scores,
@@ -141,6 +140,12 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     }
     made = Model(tuple(passes.made), list(zip(classes.codes, classes.names, strict=True)), info, timed)
     return made if base is None else on_top(base, made, trust(int(np.bincount(samples.label).min())))
+
+
+def _with_short(counted: Mapping[str, Any], more: int) -> dict[str, Any]:
+    """What was counted of the samples' features, with those of contexts whose neighbors lie too far away."""
+    short = counted.get(SHORT, 0) + more
+    return {**counted, **({SHORT: short} if short else {})}
 
 
 def _unscored(
@@ -186,16 +191,23 @@ def _gap(plan: FeaturePlan, options: TrainingOptions) -> float:
     return max((one.reach or 0.0 for one in plan.neighborhoods), default=0.0)
 
 
-def _groups(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> list[npt.NDArray[Any]]:
-    """What a cloud's points are held out with: their `groups`, or all of them with the survey."""
+def _check_groups(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> None:
+    """OptionError or DimensionError where clouds have not what is to be held out together."""
     name = options.groups
-    if not name:
-        return [np.broadcast_to(np.array(cloud.flight), len(cloud.xyz)) for cloud in clouds]
-    if required((name,)) != (name,):
+    if name and required((name,)) != (name,):
         raise OptionError(
             "'groups' must name a dimension other than coordinates and what is made of them", found=name
         )
-    return [gather((name,), cloud.dimensions, len(cloud.xyz), where=cloud.name)[0][name] for cloud in clouds]
+    for cloud in clouds if name else ():
+        gather((name,), cloud.dimensions, len(cloud), np.zeros(0, np.int64), cloud.name)
+
+
+def _groups(cloud: TrainingCloud, options: TrainingOptions) -> npt.NDArray[Any]:
+    """What a cloud's points are held out with: their `groups`, or all of them with the survey."""
+    name = options.groups
+    if not name:
+        return np.broadcast_to(np.array(cloud.flight), len(cloud))
+    return gather((name,), cloud.dimensions, len(cloud), where=cloud.name)[0][name]
 
 
 def _validate(
@@ -335,6 +347,7 @@ class _Passes:
         self.made: list[FeatureForest] = []
         self.scores: list[dict[str, Any]] = []
         self.notes: dict[str, Any] = {}
+        self.short = 0  #: samples whose neighbors lie farther away than the memory allowed to look
         self.flights = [cloud.flight for cloud in self.clouds]
         if options.passes > 1 and below is None:
             self.folds = Folds.of(labeled, self.flights, options.pass_folds)
@@ -417,18 +430,34 @@ class _Passes:
         classes, o = len(self.codes), self.options
         out = np.empty((len(self.samples), len(self.context.tokens) * classes), np.float32)
         what = f"context for pass {len(held_out) + 1}"
+        looks = Looks(self.features.plan, [self.context] * len(held_out))
         with Progress(len(self.samples), what, enabled=self.progress) as bar:
             for number, cloud in enumerate(self.clouds):
                 at, rows = self.samples.of_cloud(number)
                 if not len(at):
                     continue
-                fold = self.folds.points(cloud.xyz, self.flights[number])
-                passes = [
-                    FoldForests(self.features, self.context if k else None, forests, fold)
-                    for k, forests in enumerate(held_out)
-                ]
-                request = PredictRequest(cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb, bar)
-                out[at] = sample_context(request, passes, self.context, classes)
+                flight = self.flights[number]
+
+                def compute(
+                    places: npt.NDArray[np.int64],
+                    seen: Seen,
+                    again: bool,
+                    at: npt.NDArray[np.int64] = at,
+                    flight: str = flight,
+                ) -> bool:
+                    fold = self.folds.points(seen.xyz, flight)
+                    passes = [
+                        FoldForests(self.features, self.context if k else None, forests, fold)
+                        for k, forests in enumerate(held_out)
+                    ]
+                    shown = None if again else bar
+                    request = PredictRequest(
+                        seen.xyz, seen.dimensions, seen.rows, o.threads, o.memory_mb, shown
+                    )
+                    out[at[places]], beyond = sample_context(request, passes, self.context, classes)
+                    return beyond
+
+                self.short += work_on(cloud, rows, looks, compute, o.threads)
         return out
 
     def _grown(

@@ -19,6 +19,7 @@ from .model import Model
 from .passes import PassRun
 from .refinement import RefinedForest, trust
 from .sampling import Samples
+from .surroundings import Looks, Seen, work_on
 from .trainoptions import TrainingOptions
 
 __all__ = ["Below", "held_by_base", "on_top", "trust"]
@@ -37,6 +38,7 @@ class Below:
     ) -> None:
         self.base, self._clouds, self.samples = base, clouds, samples
         self.options, self._progress = options, progress
+        self.short = 0  #: samples whose neighbors lie farther away than the memory allowed to look
 
     @cached_property
     def columns(self) -> npt.NDArray[np.float32]:
@@ -46,15 +48,29 @@ class Below:
         out = np.empty((len(samples), len(context.tokens) * len(self.base.classes)), np.float32)
         factors = [*(_array(one.get("factors")) for one in self.base.info["passes"]), None]
         factors[len(self.base.passes) - 1] = self.base.factors
+        looks = Looks(self.base.plan, (context,))
         with Progress(len(samples), "what the base says", enabled=self._progress) as bar:
             for number, cloud in enumerate(self._clouds):
                 at, rows = samples.of_cloud(number)
                 if not len(at):
                     continue
-                request = PredictRequest(cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb, bar)
-                run = PassRun([*self.base.passes, ContextOnly(context)], classes, request, factors)
-                mine = np.empty((len(rows), out.shape[1]), np.float32)
-                out[at] = context_of(run, rows, mine)
+
+                def compute(
+                    places: npt.NDArray[np.int64],
+                    seen: Seen,
+                    again: bool,
+                    at: npt.NDArray[np.int64] = at,
+                ) -> bool:
+                    shown = None if again else bar
+                    request = PredictRequest(
+                        seen.xyz, seen.dimensions, seen.rows, o.threads, o.memory_mb, shown
+                    )
+                    run = PassRun([*self.base.passes, ContextOnly(context)], classes, request, factors)
+                    mine = np.empty((len(seen.rows), out.shape[1]), np.float32)
+                    out[at[places]] = context_of(run, seen.rows, mine)
+                    return bool(run.report.beyond_halo)
+
+                self.short += work_on(cloud, rows, looks, compute, o.threads)
         return out
 
     @property

@@ -8,7 +8,7 @@ in the cloud. Ties within a cell are ordered by a hash of the coordinates, never
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 from zlib import crc32
@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from ..base.errors import OptionError
 from ..base.hashing import coordinate_hash
+from ..base.progress import Progress
 
 #: Side of a cell of the curve in meters.
 CELL = 0.5
@@ -48,12 +49,15 @@ class Samples:
         at = at[np.argsort(self.row[at], kind="stable")]
         return at, self.row[at]
 
-    def take(self, arrays: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
-        """The samples' values in one array per cloud, of one value or row per point."""
-        out = np.empty((len(self), *arrays[0].shape[1:]), np.result_type(*(array.dtype for array in arrays)))
-        for number, array in enumerate(arrays):
-            mine = self.cloud == number
-            out[mine] = array[self.row[mine]]
+    def take(self, array_of: Callable[[int], npt.NDArray[Any]]) -> npt.NDArray[Any]:
+        """The samples' values, of one value or row per point of each cloud; called for clouds with samples alone."""
+        places, values = [], []
+        for number in np.unique(self.cloud).tolist():
+            places.append(np.flatnonzero(self.cloud == number))
+            values.append(array_of(number)[self.row[places[-1]]])
+        made = np.concatenate(values)
+        out = np.empty_like(made)
+        out[np.concatenate(places)] = made
         return out
 
     def counts(self, position: int) -> dict[str, int]:
@@ -67,7 +71,13 @@ class Samples:
 
 
 def draw_samples(
-    clouds: Clouds, n_classes: int, count: int, seed: int, groups: Sequence[str] | None = None
+    clouds: Clouds,
+    n_classes: int,
+    count: int,
+    seed: int,
+    groups: Sequence[str] | None = None,
+    *,
+    progress: Progress | None = None,
 ) -> Samples:
     """Draw `count` samples of each class from several clouds.
 
@@ -83,6 +93,8 @@ def draw_samples(
     groups : sequence of str, optional
         The group of each cloud: each gives as many samples of a class as the others, as far as it has them. Without,
         all clouds are one.
+    progress : Progress, optional
+        Updated with the points looked at: all of them once, and once more for each class.
 
     Raises
     ------
@@ -96,6 +108,8 @@ def draw_samples(
     there = np.zeros((len(names), n_classes), np.int64)
     for number, (_, position) in enumerate(clouds):
         there[of_cloud[number]] += np.bincount(position[position >= 0], minlength=n_classes)
+        if progress is not None:
+            progress.update(len(position))
     available = there.sum(axis=0)
     if not available.all():
         raise OptionError("a class has no samples", found=f"class position {int(np.argmin(available))}")
@@ -108,7 +122,14 @@ def draw_samples(
             random = [seed, position] if alone else [seed, position, crc32(str(names[group]).encode())]
             members = np.flatnonzero(of_cloud == group)
             cloud, row, weight = _draw(
-                clouds, members, position, int(there[group, position]), int(quota[group]), seed, random
+                clouds,
+                members,
+                position,
+                int(there[group, position]),
+                int(quota[group]),
+                seed,
+                random,
+                progress,
             )
             parts.append((cloud, row, np.full(len(row), position, np.int16), weight))
     cloud, row, label, weight = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -138,7 +159,14 @@ def share_out(available: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.in
 
 
 def _draw(
-    clouds: Clouds, members: Any, position: int, n: int, count: int, seed: int, random: list[int]
+    clouds: Clouds,
+    members: Any,
+    position: int,
+    n: int,
+    count: int,
+    seed: int,
+    random: list[int],
+    progress: Progress | None,
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """(cloud, row, weight) of `count` samples from the n points of a class in some clouds."""
     limit = np.uint64(2**64 - 1) if n <= MOST else np.uint64(MOST / n * 2.0**64)
@@ -151,6 +179,8 @@ def _draw(
         keys.append(key[keep])
         rows.append(mine[keep])
         where.append(np.full(len(rows[-1]), number, np.int64))
+        if progress is not None:
+            progress.update(len(label))
     key, row, cloud = np.concatenate(keys), np.concatenate(rows), np.concatenate(where)
     order = np.lexsort((key["hash"], key["cell"]))
     place, weight = spread(len(order), count, np.random.default_rng(random))

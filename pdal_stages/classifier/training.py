@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from .algorithms import trainer
 from .clouds import CloudSource, TrainingCloud, prepared, spooled
 from .dimensions import ALWAYS, WHERE_THERE, required
 from .model import Model
+from .parts import CloudParts, prepared_parts
 from .preparing import preparing
 from .trainoptions import TrainingOptions
 
@@ -69,6 +70,23 @@ def train(
     if preparation:
         model.info["preparation"] = preparation
     return model
+
+
+def train_parts(
+    clouds: Sequence[CloudParts], options: TrainingOptions, folder: Path, progress: bool = True
+) -> Model:
+    """Train a forest on clouds in parts, one of which is in memory at a time; the model is that of the whole clouds.
+
+    Files are written into `folder`, and those of `clouds` removed.
+
+    Raises
+    ------
+    OptionError, DimensionError
+    """
+    made = [part for one in clouds for part in prepared_parts(one, options, folder, progress)]
+    if not made:
+        raise OptionError("no training cloud was given")
+    return trainer(options.algorithm).train(made, options, progress)
 
 
 def _prepared(

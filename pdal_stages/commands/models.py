@@ -10,6 +10,7 @@ from ..base import kinds
 from ..base.errors import StageError
 from ..base.outputs import Output, check_outputs
 from ..base.plain import print_messages
+from ..tiling.command import add_tile_arguments
 from .adder import INPUTS, OVERRIDES, Adder
 from .running import run
 
@@ -48,6 +49,7 @@ def add_commands(add: Adder) -> None:
         "different reference systems",
     )
 
+    add_tile_arguments(add.choices["train"])
     add.choices["train"].epilog = (
         "Of several files the score is by file. Of one file, --writers.classifiermodel.groups=PointSourceId makes it one by "
         "flight line (any dimension with a number for each group), and --writers.classifiermodel.survey=UserData says that "
@@ -98,6 +100,8 @@ def _train(options: argparse.Namespace) -> None:
     from ..pipeline.run import Pipeline
     from ..pipeline.trainjob import train_pipeline
     from ..stages.loading import load_model
+    from ..tiling.command import options_of, run_training
+    from ..tiling.training import TrainTask
 
     named = ("classes", "neighborhoods", "feature_set", "count", "trees", "base")
     extra = {name: value for name in named if (value := getattr(options, name)) is not None}
@@ -108,8 +112,14 @@ def _train(options: argparse.Namespace) -> None:
         extra |= {"leave_one_survey_out": True} if options.leave_one_survey_out else {}
         print_messages(*train_surveys(surveys, options.model, options.overrides, **extra))
     else:
-        stages = train_pipeline(input_files(options.inputs), options.model, options.overrides, **extra)
-        run(options, Pipeline(stages, options.overrides))
+        task = TrainTask(
+            input_files(options.inputs), options.model, options.overrides, extra, options_of(options)
+        )
+        if task.in_one_piece():
+            stages = train_pipeline(task.files, options.model, options.overrides, **extra)
+            run(options, Pipeline(stages, options.overrides))
+        else:
+            print_messages(*run_training(task))
     if Path(options.model).is_file():  # not written into a pipe or device
         print(load_model(options.model))
 

@@ -6,24 +6,24 @@ import fnmatch
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..base.errors import OptionError, StageError
 from ..base.progress import Progress
 from ..base.report import Report
 from ..classifier import TrainingCloud, train
 from ..stages.classifiermodel import ClassifierModel
-from ..stages.heights import preparation_of
 from ..stages.points import Points
 from . import pdal as pdal_env
 from .ends import overridden, reader_of
-from .lowering import lower_stage
 from .overrides import Override
 from .references import check_readers
 from .run import Pipeline
 from .runtime import wkt_of
+from .trainjob import heights_for, lowered_writer
 
 
 def surveys_of(files: Sequence[str], grouped: Sequence[str] = ()) -> dict[str, list[str]]:
@@ -87,9 +87,8 @@ def train_surveys(
             "surveys are told by files or by a dimension, not both",
             found=", ".join(f"{k}={given[k]}" for k in ("survey", "groups") if given.get(k)),
         )
-    stage = cast(ClassifierModel, lower_stage(given).stage)
-    base = stage.training.base
-    heights = preparation_of(stage.wished) if base is None else base.info.get("preparation") or []
+    stage = lowered_writer(given)
+    heights = [overridden(one, overrides) for one in heights_for(stage)]
     told: list[str] = []
     if (said := stage.follows(heights)) is not None:
         told.append(said)
@@ -138,13 +137,18 @@ def _points(
     own = [one for one in overrides if one.selector != stage.type]
     pipeline = Pipeline([*readers, *map(dict, heights)], own)
     pipeline.execute()
-    arrays = [array for array in pipeline.arrays if len(array)]
-    if not arrays:
+    if not any(map(len, pipeline.arrays)):
         raise StageError("there are no points to train on", where=", ".join(group[:3]))
+    return points_in(stage, pipeline.arrays, pipeline.metadata)
+
+
+def points_in(stage: ClassifierModel, arrays: Sequence[NDArray], metadata: dict[str, Any]) -> Points:
+    """The points of PDAL's views as the stage sees them; `metadata` is PDAL's. There is one point at least."""
+    arrays = [array for array in arrays if len(array)]
     names = arrays[0].dtype.names or ()
     columns = {name: np.concatenate([array[name] for array in arrays]) for name in names}
-    flags = pdal_env.flags_inside_classification(names, pipeline.metadata)
-    readers_said = [v for k, v in pipeline.metadata.get("metadata", {}).items() if k.startswith("readers.")]
+    flags = pdal_env.flags_inside_classification(names, metadata)
+    readers_said = [v for k, v in metadata.get("metadata", {}).items() if k.startswith("readers.")]
     node = readers_said[0] if readers_said else None
     wkt = wkt_of(node[0] if isinstance(node, list) else node)
     return stage.points(columns, wkt=wkt, legacy_flags=flags)

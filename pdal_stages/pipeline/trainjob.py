@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any, cast
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any, cast
 
 from ..classifier.summary import FILE_NUMBER
 from ..stages.heights import preparation_of
@@ -11,6 +11,9 @@ from .ends import overridden, reader_of
 from .lowering import lower_stage
 from .overrides import Override
 from .runtime import python_filter
+
+if TYPE_CHECKING:
+    from ..stages.classifiermodel import ClassifierModel
 
 #: PDAL calls this for the points of one reader after the other.
 _NUMBER = f"""\
@@ -28,14 +31,28 @@ def train_pipeline(
     sources: Iterable[str], model: str, overrides: Iterable[Override] = (), **options: Any
 ) -> list[dict[str, Any]]:
     """Read labeled files, give heights if wanted, train, write the model; of several files the score is by file."""
-    from ..stages.classifiermodel import ClassifierModel
-
     writer = {"type": "writers.classifiermodel", "filename": model, **options}
-    stage = cast(ClassifierModel, lower_stage(overridden(writer, overrides)).stage)
-    base = stage.training.base
-    heights = preparation_of(stage.wished) if base is None else base.info.get("preparation") or []
+    stage = lowered_writer(overridden(writer, overrides))
+    heights = heights_for(stage)
     readers = [reader_of(name, f"input{i}") for i, name in enumerate(sources, 1)]
-    if len(readers) == 1 or stage.groups or stage.survey or stage.algorithm != "random_forest":
+    if not numbered(stage, len(readers)):
         return [*readers, *heights, writer]
     number = python_filter("pdal_stages_file_number", _NUMBER, {}, {FILE_NUMBER: "uint32_t"})
     return [*readers, number, *heights, {**writer, "groups": FILE_NUMBER}]
+
+
+def lowered_writer(given: Mapping[str, Any]) -> ClassifierModel:
+    """The stage that trains."""
+    return cast("ClassifierModel", lower_stage(dict(given)).stage)
+
+
+def heights_for(stage: ClassifierModel) -> list[dict[str, Any]]:
+    """The stages that make what it reads: those of the model it builds on, or heights."""
+    base = stage.training.base
+    return preparation_of(stage.wished) if base is None else base.info.get("preparation") or []
+
+
+def numbered(stage: ClassifierModel, files: int) -> bool:
+    """Whether the score is by file, so that points need their file's number."""
+    by_itself = stage.groups or stage.survey or stage.algorithm != "random_forest"
+    return files > 1 and not by_itself

@@ -22,6 +22,7 @@ from ..classifier import Model, TrainingCloud, TrainingOptions, summary, train
 from ..classifier.algorithms import ALGORITHMS, Trainer, trainer
 from ..classifier.classes import ClassMap
 from ..classifier.dimensions import ALWAYS, CHECKED, required, welcome
+from ..classifier.samplefeatures import SHORT
 from ..classifier.sureness import of_the_base
 from ..models import find
 from .base import Stage, files_read
@@ -69,7 +70,7 @@ class ClassifierModel(Stage):
     type = "writers.classifiermodel"
     summary = "Train a classifier on the labeled points that reach it, and write one model file"
     source = "[B16] sections 3.3-4.2, [W18] section 4.3, [WM19] for alsnet"
-    instead_of_tiles = "Train without --tile: only samples are computed, so memory goes to the points alone"
+    instead_of_tiles = "Train with the command pdal-stages train, which takes surveys of any size"
     where_help = "Samples are drawn from the points inside; all points are neighbors."
     filename: str = option("filename", None, "The model file to write", required=True)
     label: str = option("string", "Classification", "Dimension that holds the labels")
@@ -250,7 +251,8 @@ holds the classes.
                 cure="Check the reader's file and the filters before this stage",
             )
         training = self.training_on(points)
-        self.finish(train(self._surveys(self.cloud_of(points, training), points), training), points.report)
+        clouds = [cloud for _, cloud in self.surveys(self.cloud_of(points, training), points)]
+        self.finish(train(clouds, training), points.report)
         return {}
 
     def cloud_of(self, points: Points, training: TrainingOptions) -> TrainingCloud:
@@ -296,6 +298,11 @@ holds the classes.
             report.warnings.append(
                 f"{held:,} of {all_:,} samples of class {code} are, to the base, of a class that no label has, and stay it: "
                 "label some of that class too, or find this one alone (strategy binary, target)"
+            )
+        if short := model.info["training"].get(SHORT):
+            report.warnings.append(
+                f"{short:,} samples have neighbors farther away than the memory allowed to look, and may differ from those "
+                "of a run in one piece: give more --memory"
             )
         if unscored := model.info["training"].get("unscored"):
             report.warnings.append(unscored)
@@ -360,13 +367,13 @@ holds the classes.
             out[mine[order[: number[known].max()]]] = True
         return out
 
-    def _surveys(self, cloud: TrainingCloud, points: Points) -> list[TrainingCloud]:
-        """The points as one cloud, or one for each value of the dimension `survey`."""
+    def surveys(self, cloud: TrainingCloud, points: Points) -> list[tuple[float, TrainingCloud]]:
+        """The points as one cloud, or one for each value of the dimension `survey`, after that value."""
         if not self.survey:
-            return [cloud]
+            return [(0.0, cloud)]
         value = points.dimension(self.survey)
-        parts = [(one, cloud.part(np.flatnonzero(value == one))) for one in np.unique(value)]
-        return [replace(part, name=f"{self.survey} {one:g}", survey=None) for one, part in parts]
+        parts = [(float(one), cloud.part(np.flatnonzero(value == one))) for one in np.unique(value)]
+        return [(one, replace(part, name=f"{self.survey} {one:g}", survey=None)) for one, part in parts]
 
 
 def _number(text: Any) -> Any:

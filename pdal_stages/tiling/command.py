@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..base.asprs import class_name
 from ..base.errors import OptionError, StageError
@@ -27,29 +28,16 @@ from .settings import PER, TilingOptions
 from .tiledrun import run_tiled
 from .tileplan import make_plan
 
+if TYPE_CHECKING:
+    from .training import TrainTask
+
 
 def add_arguments(command: argparse.ArgumentParser, survey: bool = False) -> None:
     """Add the flags to the parser of ``pipeline``, or of ``classify`` (a `survey`)."""
     when = "Several inputs, and files too large for memory, are cut into tiles" if survey else "Run in tiles"
     group = command.add_argument_group("large areas", f"{when}; see docs/large-areas.md.")
     takes = group.add_argument
-    takes(
-        "--tile",
-        type=_side,
-        metavar="SIZE",
-        help="Side of the tiles, in the unit of the coordinates; auto takes what the memory allows",
-    )
-    takes(
-        "--memory",
-        metavar="SIZE",
-        help="What all processes together may hold, e.g. 4GB (default: half of what is free)",
-    )
-    takes(
-        "--workers",
-        type=int,
-        metavar="N",
-        help="Worker processes; 0 runs everything in this process (default: half the cores)",
-    )
+    _add_sizes(takes)
     takes("--scheduler", default="", metavar="ADDRESS", help="A running Dask scheduler, tcp://HOST:8786")
     takes("--per", choices=PER, default="auto", help="One output per input file or per tile (auto: per file)")
     takes(
@@ -67,6 +55,32 @@ def add_arguments(command: argparse.ArgumentParser, survey: bool = False) -> Non
         default=[],
         metavar="FILE",
         help="Write a report, .html or .json; may be repeated",
+    )
+
+
+def add_tile_arguments(command: argparse.ArgumentParser) -> None:
+    """Add the flags of ``train``, whose only output is a model."""
+    what = "Points that do not fit into the memory are worked on in tiles; the model is the same."
+    _add_sizes(command.add_argument_group("large areas", what).add_argument)
+
+
+def _add_sizes(takes: Callable) -> None:
+    takes(
+        "--tile",
+        type=_side,
+        metavar="SIZE",
+        help="Side of the tiles, in the unit of the coordinates; auto takes what the memory allows",
+    )
+    takes(
+        "--memory",
+        metavar="SIZE",
+        help="What all processes together may hold, e.g. 4GB (default: half of what is free)",
+    )
+    takes(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="Worker processes; 0 runs everything in this process (default: half the cores)",
     )
 
 
@@ -106,6 +120,12 @@ def wants_tiles(options: argparse.Namespace) -> bool:
                 f"{flag} needs --tile", cure="Give the side of the tiles, e.g. --tile 500, or --tile auto"
             )
     return False
+
+
+def run_training(task: TrainTask) -> list[str]:
+    """Train in tiles; what is to be told."""
+    with _terminated_as_interrupted():
+        return task.run()
 
 
 def run_command(options: argparse.Namespace, source: Path | PipelineSource) -> int:

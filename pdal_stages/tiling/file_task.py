@@ -94,6 +94,8 @@ def write_tile(
     )
     if not mine:
         return {"outputs": []}
+    if plan.takes is not None:
+        return plan.takes(mine, outputs, scratch)
     readers = [{**result.piece.reader, "filename": result.piece.core} for result in mine]
     tail = on_one_grid(tail, box, half_open=True)
     return run_tail(

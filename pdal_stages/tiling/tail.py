@@ -47,16 +47,7 @@ def run_tail(
 
     flags = classflags.parting([*readers, *tail], with_ours=True)
     with Callbacks() as callbacks:
-        stages: list[dict[str, Any]] = []
-        inputs = []
-        for number, (reader, values) in enumerate(zip(readers, new, strict=True)):
-            stages.append({**reader, "tag": f"in{number}"})
-            stages += _put(callbacks, values, f"in{number}", f"put{number}")
-            inputs.append(f"put{number}")
-            if flags.way == "split" and flags.old[number]:
-                stages.append(classflags.splitter(inputs=[f"put{number}"], tag=f"split{number}"))
-                inputs[-1] = f"split{number}"
-        stages.append({"type": "filters.merge", "inputs": inputs})
+        stages = merged(callbacks, readers, new, flags)
         tail = [{k: v for k, v in stage.items() if k != "inputs"} for stage in tail]
         if flags.way == "around":
             tail = [stage for stage, _ in classflags.around(tail)]
@@ -69,6 +60,22 @@ def run_tail(
             run = pdal_env.execute(extradims.settle(stages), arrays=False)
             packing.pack(partials)
     return written(outputs, run.count)
+
+
+def merged(
+    callbacks: Callbacks, readers: list[dict[str, Any]], new: list[NewValues], flags: classflags.Parting
+) -> list[dict[str, Any]]:
+    """Stages that read points, give them their new values, and merge them."""
+    stages: list[dict[str, Any]] = []
+    inputs = []
+    for number, (reader, values) in enumerate(zip(readers, new, strict=True)):
+        stages.append({**reader, "tag": f"in{number}"})
+        stages += _put(callbacks, values, f"in{number}", f"put{number}")
+        inputs.append(f"put{number}")
+        if flags.way == "split" and flags.old[number]:
+            stages.append(classflags.splitter(inputs=[f"put{number}"], tag=f"split{number}"))
+            inputs[-1] = f"split{number}"
+    return [*stages, {"type": "filters.merge", "inputs": inputs}]
 
 
 def _put(callbacks: Callbacks, new: NewValues, after: str, tag: str) -> list[dict[str, Any]]:

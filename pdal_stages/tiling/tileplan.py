@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -76,6 +76,9 @@ class TilePlan:
     first: FirstRound | None = None  #: what is made of the points before any tile
     #: What LAS files say of dimensions that stages make.
     meanings: dict[str, str] = field(default_factory=dict)
+    #: What takes each tile's own points in place of the tail: called with their results, the outputs and the folder for
+    #: temporary files, it gives the record of what it wrote.
+    takes: Callable[[list[Any], list[str], str], dict[str, Any]] | None = None
     whole_names: bool = False  #: '#' in an output's name is the whole name of the input file, with its suffix
 
     @property

@@ -1,0 +1,263 @@
+"""A survey trained on: in one piece where it fits into the memory, otherwise in tiles, and the model is the same."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import OptionError, StageError
+from ..base.memory import free_memory
+from ..base.report import Report
+from ..classifier import TrainingCloud, TrainingOptions
+from ..classifier.dimensions import CHECKED
+from ..classifier.parts import CloudParts
+from ..classifier.summary import FILE_NUMBER
+from ..classifier.training import train_parts
+from ..pipeline import classflags, extradims
+from ..pipeline import pdal as pdal_env
+from ..pipeline.callbacks import Callbacks
+from ..pipeline.ends import is_ept, is_las, overridden
+from ..pipeline.overrides import Override
+from ..pipeline.run import Pipeline
+from ..pipeline.surveyjob import points_in
+from ..pipeline.trainjob import heights_for, lowered_writer, numbered
+from ..stages.classifiermodel import ClassifierModel
+from ..stages.points import HOLDS_NOWHERE
+from .kept import load_arrays, save_arrays
+from .outcome import TiledRun
+from .results import NewValues, PieceResults, of_own_points
+from .settings import TilingOptions
+from .sizing import BASE, BLOCKS, TILE_POINT, fits_whole
+from .sources import find_sources, read_extent
+from .tail import merged, written
+from .tiledrun import run_plan
+from .tileplan import TilePlan, make_plan
+
+#: Bytes of a point on the disk at most: as read, with heights, prepared.
+_DISK = 200
+#: Failed tiles that a message names.
+_NAMED = 3
+
+
+@dataclass(frozen=True)
+class TrainTask:
+    """What a model is trained on, and how.
+
+    Attributes
+    ----------
+    files : sequence of str
+        Labeled inputs.
+    model : str
+        The file to write.
+    overrides : sequence of Override
+    given : mapping
+        Options of ``writers.classifiermodel``.
+    options : TilingOptions
+    """
+
+    files: Sequence[str]
+    model: str
+    overrides: Sequence[Override] = ()
+    given: Mapping[str, Any] = field(default_factory=dict)
+    options: TilingOptions = field(default_factory=TilingOptions)
+
+    @cached_property
+    def _writer(self) -> dict[str, Any]:
+        """As it stands in a pipeline, with what the stages before it tell it."""
+        files = list(self.files)
+        writer = {"type": ClassifierModel.type, "filename": self.model, "files": files, **self.given}
+        writer = overridden(writer, self.overrides)
+        by_file = numbered(lowered_writer(writer), len(files))
+        return {**writer, "groups": FILE_NUMBER} if by_file else writer
+
+    @cached_property
+    def stage(self) -> ClassifierModel:
+        """What trains."""
+        return lowered_writer(self._writer)
+
+    @cached_property
+    def _readers(self) -> list[dict[str, Any]]:
+        """One for each kind of input, of all its files."""
+        of_kind: dict[str, list[str]] = {}
+        for name in self.files:
+            of_kind.setdefault("readers.ept" if is_ept(name) else "readers.las", []).append(name)
+        las = {"use_eb_vlr": True}  # of LAS 1.0-1.3 PDAL leaves extra dimensions out unless told
+        return [
+            {"type": kind, "filename": names, **(las if kind == "readers.las" else {})}
+            for kind, names in of_kind.items()
+        ]
+
+    def in_one_piece(self) -> bool:
+        """Whether all points fit into the memory, or cannot be cut into tiles, and nothing asks for tiles."""
+        can_be_cut = all(is_las(name) or is_ept(name) for name in self.files)
+        if not can_be_cut or self.stage.algorithm != "random_forest":
+            return True
+        if self.options.tile is not None:
+            return False
+        try:
+            points = sum(read_extent(source).count for source in find_sources(self._readers))
+        except StageError:
+            return True  # said when it is read
+        return fits_whole(points, self.options.memory)
+
+    # ---- in tiles ----------------------------------------------------------------------------------------
+
+    def run(self) -> list[str]:
+        """Train in tiles and write the model; what is to be told."""
+        stage = self.stage
+        heights = [overridden(one, self.overrides) for one in heights_for(stage)]
+        told = [said] if (said := stage.follows(heights)) is not None else []
+        pdal_env.bindings()  # says what is wrong with PDAL before any work
+        stage.check()
+        beside = Path(self.model).absolute().parent
+        place = beside if beside.is_dir() and Path(self.model).suffix else None
+        with TemporaryDirectory(prefix=".pdal-stages-train-", dir=place) as folder:
+            self._check_room(Path(folder))
+            report, clouds, training = self._in_tiles(Path(folder), heights)
+            model = train_parts(clouds, training, Path(folder))
+        stage.finish(model, report)
+        return [*told, *report.messages]
+
+    def _check_room(self, folder: Path) -> None:
+        points = sum(read_extent(source).count for source in find_sources(self._readers))
+        free = shutil.disk_usage(folder).free
+        if free < points * _DISK:
+            raise StageError(
+                f"the disk has no room for {points:,} points in parts, which are kept while training lasts",
+                found=f"{folder.parent}: {free / 1e9:.1f} GB free, up to {points * _DISK / 1e9:.1f} GB needed",
+                cure="Write the model to a disk with more room, or give more --memory",
+            )
+
+    def _plan(self, folder: Path, heights: Sequence[Mapping[str, Any]]) -> TilePlan:
+        heads = [{**reader, "filename": reader["filename"][0]} for reader in self._readers]
+        tail = {"type": "writers.null", "filename": str(folder / "#.npz")}
+        own = [one for one in self.overrides if one.selector != self.stage.type]
+        plan = make_plan(Pipeline([*heads, *map(dict, heights), tail], own, whole=False))
+        files = {reader["type"]: reader["filename"] for reader in self._readers}
+        readers = [{**reader, "filename": files[reader["type"]]} for reader in plan.readers]
+        numbers: dict[str, int] = {}
+        if self.stage.groups == FILE_NUMBER:
+            for number, name in enumerate(self.files, 1):
+                kind = "readers.ept" if is_ept(name) else "readers.las"
+                (source,) = find_sources([{"type": kind, "filename": [name]}])
+                numbers[source.path] = number
+        return replace(plan, readers=readers, takes=Taking(self._writer, numbers), name=self.model)
+
+    def _in_tiles(
+        self, folder: Path, heights: Sequence[Mapping[str, Any]]
+    ) -> tuple[Report, list[CloudParts], TrainingOptions]:
+        """What is to be known of the points; these, with heights, as clouds in parts; and how to train on them."""
+        tiles = folder / "tiles"
+        tiles.mkdir()
+        run = run_plan(self._plan(tiles, heights), replace(self.options, per="tile"))
+        if run.failures:
+            named = "; ".join(f"{what}: {why}" for what, why in run.failures[:_NAMED])
+            more = f", and {len(run.failures) - _NAMED} more" if len(run.failures) > _NAMED else ""
+            raise StageError("not all points could be read, so nothing was trained", found=named + more)
+        report = Report({"points": run.summary["points"]}, list(run.messages))
+        _say(report, run)
+        memory = self.options.memory or free_memory() // 2
+        most = max(memory - BASE - BLOCKS, 0) / TILE_POINT
+        side = run.summary["tile"] * run.summary["meters_per_unit"]
+        clouds: dict[float, CloudParts] = {}
+        dimensions: list[str] | None = None
+        for job in run.tiles:
+            for number, cloud in enumerate(job.record.get("clouds", ())):
+                if dimensions not in (None, cloud["dimensions"]):
+                    raise StageError(
+                        "the files do not have the same dimensions",
+                        found=f"{', '.join(cloud['dimensions'])}; before: {', '.join(dimensions or ())}",
+                        cure="Name those that all have: --writers.classifiermodel.dimensions=HeightAboveGround",
+                    )
+                dimensions = cloud["dimensions"]
+                if cloud["value"] not in clouds:
+                    clouds[cloud["value"]] = CloudParts(folder / f"cloud{len(clouds)}", side, most)
+                assert job.outputs is not None
+                clouds[cloud["value"]].put(job.tile, _read_back(job.outputs[0], number, cloud["name"]))
+            for path in job.outputs or ():
+                Path(path).unlink(missing_ok=True)
+        if dimensions is None:
+            raise StageError("there are no points to train on", where=", ".join(self.files[:_NAMED]))
+        training = self.stage.training
+        if self.stage.automatic:
+            training = replace(training, dimensions=tuple(dimensions))
+        return report, [clouds[value] for value in sorted(clouds)], training
+
+
+def _say(report: Report, run: TiledRun) -> None:
+    """What the stage says of tiles, once each; that it takes no point of a tile only where it takes none of any."""
+    said = [job.record.get("said", []) for job in run.tiles if job.record.get("clouds")]
+    for text in dict.fromkeys(text for lines in said for text in lines):
+        if not text.startswith(HOLDS_NOWHERE):
+            report.notes.append(text)
+    nowhere = [line for lines in said for line in lines if line.startswith(HOLDS_NOWHERE)]
+    if nowhere and len(nowhere) == len(said):
+        report.warnings.append(nowhere[0])
+    ignored = sum(job.record.get("ignored", 0) for job in run.tiles)
+    report.figures["ignored"] = ignored
+
+
+def _read_back(path: str, number: int, name: str) -> TrainingCloud:
+    """A cloud's points of a tile, as :class:`Taking` wrote them."""
+    mark = f"{number}/"
+    arrays = {key.removeprefix(mark): v for key, v in load_arrays(path).items() if key.startswith(mark)}
+    dimensions = {key[2:]: values for key, values in arrays.items() if key.startswith("d/")}
+    return TrainingCloud(arrays["xyz"], arrays["labels"], dimensions, name, arrays.get("mask"))
+
+
+@dataclass(frozen=True)
+class Taking:
+    """Writes a tile's own points as they are trained on, in place of a pipeline's writers."""
+
+    writer: Mapping[str, Any]  #: the stage that trains
+    numbers: Mapping[str, int]  #: of inputs by path, where points are to have the number of theirs
+
+    def __call__(self, results: list[PieceResults], outputs: list[str], scratch: str) -> dict[str, Any]:
+        stage = lowered_writer(self.writer)
+        readers = [{**result.piece.reader, "filename": result.piece.core} for result in results]
+        new = [self._new_values(result) for result in results]
+        with Callbacks() as callbacks:
+            flags = classflags.parting(readers, with_ours=True)
+            stages = merged(callbacks, readers, new, flags)
+            run = pdal_env.execute(extradims.settle(stages))
+        if not run.count:
+            return {"outputs": []}
+        points = points_in(stage, run.arrays, run.metadata)
+        run.arrays.clear()
+        if stage.checked_only and CHECKED in points.arrays and points.arrays[CHECKED].any():
+            raise OptionError(
+                f"points that a person checked ({CHECKED}) are weighed against all others, which do not fit in the memory "
+                "that was given",
+                cure="Give more --memory, or --writers.classifiermodel.checked_only=false to take them as all others",
+            )
+        training = stage.training_on(points)
+        arrays: dict[str, NDArray] = {}
+        clouds = []
+        for number, (value, cloud) in enumerate(stage.surveys(stage.cloud_of(points, training), points)):
+            arrays |= {f"{number}/xyz": cloud.xyz, f"{number}/labels": np.asarray(cloud.labels)}
+            if cloud.mask is not None:
+                arrays[f"{number}/mask"] = np.asarray(cloud.mask)
+            arrays |= {f"{number}/d/{name}": np.asarray(v) for name, v in cloud.dimensions.items()}
+            clouds.append({"value": value, "name": cloud.name, "dimensions": list(training.dimensions)})
+        save_arrays(outputs[0], arrays, scratch)
+        report = points.report
+        said = {"said": report.messages, "ignored": int(report.figures.get("ignored", 0)), "clouds": clouds}
+        return written(outputs, run.count) | said
+
+    def _new_values(self, result: PieceResults) -> NewValues:
+        """The results, with the number of each point's file."""
+        found = of_own_points(result)
+        if not self.numbers:
+            return found
+        number = np.empty(len(result.piece.own), np.uint32)
+        for source, first, end in result.piece.spans:
+            number[slice(*np.searchsorted(result.piece.own, (first, end)))] = self.numbers[source.path]
+        return NewValues(found.kept, {**found.values, FILE_NUMBER: (None, number)})

@@ -1,0 +1,131 @@
+"""`train` of a survey that does not fit into the memory: in tiles, and the model is the same file to the byte."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import pdal_stages as ps
+from pdal_stages.cli import main
+from pdal_stages.tiling import training
+from pdal_stages.tiling.settings import TilingOptions
+
+pytestmark = pytest.mark.pdal
+
+WORDS = ["--count", "150", "--trees", "4", "--neighborhoods", "s2,k9", "--no-progress", "--classes", "2,5,6"]
+TOWN = ps.make_town(80.0, 4.0, seed=5)
+#: LAS 1.2 and 1.4, as they come; not one scale and offset.
+FORMATS = (1, 6, 6, 3)
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory, write_las):
+    """Four files that adjoin, with odd offsets."""
+    folder = tmp_path_factory.mktemp("town")
+    xyz, random = TOWN.xyz, np.random.default_rng(0)
+    east, north = xyz[:, 0] > 500_038.0, xyz[:, 1] > 5_400_043.0
+    number = random.integers(1, 3, len(xyz)).astype(np.uint8)
+    for k, point_format in enumerate(FORMATS):
+        mine = (east * 2 + north) == k
+        points = {axis: xyz[mine, n] for n, axis in enumerate("XYZ")}
+        points |= {"Classification": np.where(random.random(mine.sum()) < 0.02, 7, TOWN.classification[mine])}
+        points |= {"ReturnNumber": number[mine], "NumberOfReturns": np.full(mine.sum(), 2, np.uint8)}
+        points |= {"PointSourceId": random.integers(1, 4, mine.sum()).astype(np.uint16)}
+        points["Classification"] = points["Classification"].astype(np.uint8)
+        write_las(folder / f"t{k}.laz", points, point_format=point_format, offset=(500_000 + k, 5_400_000, k))
+    return folder
+
+
+def both(town, tmp_path, capsys, *more, files=("",)):
+    """The models of one run in one piece and one in tiles, as files, and what the two said."""
+    models, said = [], []
+    for name, tiles in (("whole", ()), ("tiles", ("--tile", "23.5", "--workers", "0"))):
+        words = ["train", *(str(town / one) for one in files), "--model", str(tmp_path / f"{name}.model")]
+        assert main([*words, *WORDS, *tiles, *more]) == 0
+        models.append((tmp_path / f"{name}.model").read_bytes())
+        said.append(capsys.readouterr())
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+    return models, said
+
+
+def test_the_model_is_the_same_to_the_byte(town, tmp_path, capsys):
+    (whole, tiles), (one, other) = both(town, tmp_path, capsys)
+    assert whole == tiles and one.out == other.out
+    assert "files held out" in one.out and "t0.laz, t1.laz, t2.laz, t3.laz" in one.out
+    model = ps.load_model(tmp_path / "tiles.model")
+    assert model.info["preparation"][0]["type"] == "filters.hag_morphological"
+    assert "EarlierReturn_box2" in model.plan.names
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        (
+            "--writers.classifiermodel.groups=PointSourceId",
+            "--writers.classifiermodel.where=HeightAboveGround < 9",
+        ),
+        ("--writers.classifiermodel.survey=PointSourceId", "--writers.classifiermodel.thin=1.5"),
+        ("--writers.classifiermodel.dimensions=", "--writers.classifiermodel.passes=1"),
+        ("--writers.classifiermodel.ignore=ReturnNumber[2:2]", "--filters.hag_morphological.window=20"),
+        ("--classes", '{"2": 2, "6": 6}', "--base", "BASE"),
+    ],
+    ids=["groups", "surveys", "no heights", "ignore", "base"],
+)
+def test_with_other_options_too(town, tmp_path, capsys, more):
+    if "BASE" in more:
+        base = tmp_path / "base.model"
+        assert main(["train", str(town / "t0.laz"), "--model", str(base), *WORDS]) == 0
+        more = (*more[:-1], str(base))
+    (whole, tiles), _ = both(town, tmp_path, capsys, *more)
+    assert whole == tiles
+
+
+def test_one_file_and_feet(tmp_path, capsys, write_las):
+    pyproj = pytest.importorskip("pyproj")
+    xyz = (TOWN.xyz - (499_000.0, 5_399_000.0, 0.0)) / 0.3048
+    points = {axis: xyz[:, n] for n, axis in enumerate("XYZ")} | {"Classification": TOWN.classification}
+    wkt = pyproj.CRS("EPSG:2994").to_wkt("WKT1_GDAL")
+    write_las(tmp_path / "feet.laz", points, point_format=6, wkt=wkt)
+    words = ["train", str(tmp_path / "feet.laz"), *WORDS]
+    assert main([*words, "--model", str(tmp_path / "whole.model")]) == 0
+    assert main([*words, "--model", str(tmp_path / "tiles.model"), "--tile", "90", "--workers", "0"]) == 0
+    assert (tmp_path / "whole.model").read_bytes() == (tmp_path / "tiles.model").read_bytes()
+
+
+def test_tiles_where_the_points_do_not_fit(town, tmp_path, monkeypatch):
+    files = [str(path) for path in sorted(town.iterdir())]
+
+    def in_one_piece(**options):
+        return training.TrainTask(
+            files, str(tmp_path / "m.model"), options=TilingOptions(**options)
+        ).in_one_piece()
+
+    assert in_one_piece() and in_one_piece(memory=10**9) and not in_one_piece(tile=30.0)
+    monkeypatch.setattr(training, "TILE_POINT", 10**6)
+    monkeypatch.setattr("pdal_stages.tiling.sizing.TILE_POINT", 10**6)
+    assert not in_one_piece(memory=2 * 10**9)
+    network = {"algorithm": "alsnet", "dimensions": []}
+    assert training.TrainTask(
+        files, str(tmp_path / "m.model"), (), network, TilingOptions(tile=30.0)
+    ).in_one_piece()
+
+
+def test_what_is_wrong_is_said_and_no_model_is_written(town, tmp_path, capsys, write_las):
+    words = ["--model", str(tmp_path / "m.model"), *WORDS, "--tile", "23.5", "--workers", "0"]
+    for name in ("t0.laz", "t1.laz"):
+        (tmp_path / name).write_bytes((town / name).read_bytes())
+    data = (tmp_path / "t1.laz").read_bytes()
+    (tmp_path / "t1.laz").write_bytes(data[: len(data) // 2])
+    assert main(["train", str(tmp_path / "t0.laz"), str(tmp_path / "t1.laz"), *words]) == 1
+    assert "nothing was trained" in (said := capsys.readouterr().err) and "t1.laz" in said
+    assert main(["train", str(town), *words, "--writers.classifiermodel.dimensions=Nowhere"]) == 1
+    assert "'Nowhere' is missing" in capsys.readouterr().err
+    assert main(["train", str(town), *words, "--neighborhoods", "copt"]) == 1
+    assert "copt" in capsys.readouterr().err
+    points = {axis: TOWN.xyz[:, n] for n, axis in enumerate("XYZ")} | {"Classification": TOWN.classification}
+    points["Checked"] = (np.arange(len(TOWN.xyz)) < 50).astype(np.uint8)
+    write_las(tmp_path / "checked.laz", points, point_format=6)
+    assert main(["train", str(tmp_path / "checked.laz"), *words]) == 1
+    assert "checked_only=false" in capsys.readouterr().err
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"t0.laz", "t1.laz", "checked.laz"}
