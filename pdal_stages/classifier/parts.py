@@ -101,7 +101,9 @@ class CloudParts:
 
     def parts(self) -> list[TrainingCloud]:
         """All parts, row by row."""
-        return [Part(self, tile, **self._named) for tile in sorted(self.counts, key=lambda t: (t[1], t[0]))]
+        return [
+            CloudPart(self, tile, **self._named) for tile in sorted(self.counts, key=lambda t: (t[1], t[0]))
+        ]
 
     def box(self, tile: Tile) -> Box:
         """Where a part lies."""
@@ -143,7 +145,7 @@ class CloudParts:
         return out[0], out[1], out[2], out[3]
 
 
-class Part(TrainingCloud):
+class CloudPart(TrainingCloud):
     """A part of a cloud; its arrays are read when they are asked for, and not kept."""
 
     def __init__(self, parts: CloudParts, tile: Tile, name: str, survey: str | None, copy: str) -> None:
@@ -260,7 +262,7 @@ def prepared_parts(
     density = DensityOfParts()
     with Progress(sum(raw.counts.values()), "voxels", enabled=progress) as bar:
         for part in raw.parts():
-            assert isinstance(part, Part)
+            assert isinstance(part, CloudPart)
             own = _own_of(cleaned(_with_edges(part, 4.0 * options.voxel), options))
             made.put(part.tile, own)
             density.add(own.xyz, made.inner_box(part.tile))
@@ -278,7 +280,7 @@ def _thinned(made: CloudParts, wanted: float, options: TrainingOptions, folder: 
     copy = CloudParts(folder, made.side, made.most_points)
     density = DensityOfParts()
     for part in made.parts():
-        assert isinstance(part, Part)
+        assert isinstance(part, CloudPart)
         thin = thinned_copy(_loaded(part, part.xyz, part.dimensions), wanted, options.seed, made.density)
         if thin is not None:
             copy.put(part.tile, thin)
@@ -287,7 +289,7 @@ def _thinned(made: CloudParts, wanted: float, options: TrainingOptions, folder: 
     return copy
 
 
-def _with_edges(part: Part, meters: float) -> TrainingCloud:
+def _with_edges(part: CloudPart, meters: float) -> TrainingCloud:
     """A part as it is, with what lies close beside it; its own points are told by a dimension."""
     pieces = [_loaded(part, part.xyz, part.dimensions)]
     own = [np.ones(len(part), bool)]
@@ -297,7 +299,7 @@ def _with_edges(part: Part, meters: float) -> TrainingCloud:
     for tile in part.parts.touched(box) if meters else ():
         if tile == part.tile:
             continue
-        beside = Part(part.parts, tile, part.name, part.survey, part.copy)
+        beside = CloudPart(part.parts, tile, part.name, part.survey, part.copy)
         xyz = beside.xyz
         near = np.flatnonzero(((xyz[:, :2] >= box[:2]) & (xyz[:, :2] <= box[2:])).all(axis=1))
         if len(near):
@@ -307,7 +309,7 @@ def _with_edges(part: Part, meters: float) -> TrainingCloud:
 
 
 def _loaded(
-    part: Part, xyz: npt.NDArray[np.float64], dimensions: Mapping[str, npt.ArrayLike]
+    part: CloudPart, xyz: npt.NDArray[np.float64], dimensions: Mapping[str, npt.ArrayLike]
 ) -> TrainingCloud:
     return TrainingCloud(xyz, part.labels, dict(dimensions), part.name, part.mask, part.survey, part.copy)
 
