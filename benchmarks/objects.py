@@ -1,6 +1,7 @@
 """Objects of generated towns and of Delft's train part against what truly stands there.
 
-python benchmarks/objects.py [--data FOLDER [--picture FILE]] [--classified MODEL]
+python benchmarks/objects.py [--data FOLDER [--picture FILE]]
+python benchmarks/objects.py --classified MODEL... [--refuse REASON,...] [--flags FLAG,...]  (a row a model)
 """
 
 from __future__ import annotations
@@ -61,17 +62,21 @@ def true_spans(cables):
     return [shapely.LineString(span[len(span) // 2, :, :2]) for span in np.split(cables, apart) if len(span)]
 
 
-def town(seed, codes=None):
-    """Figures of a town, by its true classes or by others."""
+def town(seed, codes=None, refuse=()):
+    """Figures of a town, by its true classes or by others (`codes`: of a town its codes and reliabilities).
+
+    `refuse`: reasons of objects that are left out.
+    """
     made = make_town(SIZE, DENSITY, seed, progress=False)
     true = true_objects(TownOptions(SIZE, DENSITY, seed))
     x0, y0 = made.options.origin[:2]
     square = shapely.box(x0, y0, x0 + SIZE, y0 + SIZE)
-    codes = made.classification if codes is None else codes(made)
+    codes, told = (made.classification, None) if codes is None else codes(made)
+    cells = Cells.of(*made.xyz.T, codes, 0.5, reliability=told)
     rows = {}
-    for step in (STEP, 0.0):
+    for step in (0.0, STEP):
         started = time.process_time()
-        found = find_objects(Cells.of(*made.xyz.T, codes, 0.5), ObjectSettings(step=step), progress=False)
+        found, _ = find_objects(cells, ObjectSettings(step=step), progress=False).without(refuse)
         raw = raw_outlines(found.tables[Kind.BUILDING], 0.5)
         shapes = [shapely.transform(s, lambda xy: xy / 2) for s in straight_outlines(raw, 0.5)]
         seconds = time.process_time() - started
@@ -142,8 +147,8 @@ def draw(path, colored, around, size=(170, 140), pixels=5, finer=3):
     image.reduce(finer).quantize(64).save(path)
 
 
-def classified(model):
-    """Codes of a town by a model file, as `pdal-stages classify` gives them."""
+def classified(model, flags=()):
+    """Codes and reliabilities of a town by a model file, as `pdal-stages classify` gives them."""
 
     def codes(made):
         import tempfile
@@ -155,10 +160,23 @@ def classified(model):
 
         with tempfile.TemporaryDirectory() as folder:
             write_town(made, f"{folder}/town.laz")
-            main(["classify", f"{folder}/town.laz", f"{folder}/out.laz", "--model", model])
-            return np.asarray(laspy.read(f"{folder}/out.laz").classification)
+            main(["classify", f"{folder}/town.laz", f"{folder}/out.laz", "--model", model, *flags])
+            las = laspy.read(f"{folder}/out.laz")
+            return np.asarray(las.classification), np.asarray(las["Reliability"], float)
 
     return codes
+
+
+def row(model, seeds, refuse, flags):
+    """F1 of buildings, all trees, isolated ones in towns classified by a model: mean and least."""
+    by = classified(model, flags) if model != "true" else None
+    figures = []
+    for seed in seeds:
+        found = town(seed, by, refuse)
+        figures.append([found[f"buildings, step {STEP:g}"][0]["objects"]["f1"], *found["trees"]])
+        print(f"{model}, town {seed}: {np.round(figures[-1], 3)}", flush=True)
+    print(f"{model} {' '.join(flags)}, refuse {','.join(refuse)}: mean {np.round(np.mean(figures, axis=0), 3)}, "
+          f"least {np.min(np.round(figures, 3), axis=0)}", flush=True)  # fmt: skip
 
 
 if __name__ == "__main__":
@@ -166,12 +184,20 @@ if __name__ == "__main__":
     parser.add_argument("--data", help="folder of the real clouds")
     parser.add_argument("--picture", metavar="FILE", help="of the outlines in Delft over the official ones")
     parser.add_argument(
-        "--classified", metavar="MODEL", help="classes by this model instead of the true ones"
+        "--classified",
+        metavar="MODEL",
+        nargs="+",
+        help="classes by models instead of the true ones; 'true' for these",
     )
+    parser.add_argument("--refuse", default="", help="reasons of objects that are left out, parted by commas")
+    parser.add_argument("--flags", default="", help="more flags of classify, parted by commas: wires,towers")
     parser.add_argument("--seeds", type=int, nargs="*", default=[1, 2, 3])
     options = parser.parse_args()
-    for seed in options.seeds:
-        for name, value in town(seed, classified(options.classified) if options.classified else None).items():
+    for model in options.classified or ():
+        flags = [f"--{flag}" for flag in options.flags.split(",") if flag]
+        row(model, options.seeds, [r for r in options.refuse.split(",") if r], flags)
+    for seed in () if options.classified else options.seeds:
+        for name, value in town(seed).items():
             if name == "trees":
                 print(f"town {seed}, trees: F1 {value[0]:.3f}, isolated ones {value[1]:.3f}")
             elif name == "spans":
