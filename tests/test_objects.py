@@ -11,8 +11,10 @@ import pdal_stages as ps
 from pdal_stages.base.errors import StageError
 from pdal_stages.objects import Cells, ObjectSettings, find_objects
 from pdal_stages.objects.cells import CLASSES, Kind, cell_keys, kind_of_code, object_id, unpack
+from pdal_stages.objects.measure import median
 from pdal_stages.objects.rasters import fill_gaps
 from pdal_stages.objects.roofs import connected
+from pdal_stages.objects.walls import middles, peucker
 from pdal_stages.synthetic import TownOptions
 from pdal_stages.synthetic.truth import true_objects
 
@@ -500,3 +502,53 @@ def test_a_straight_outline_that_is_shared_out_stays_straight(degrees):
     assert parts[0].intersection(parts[1]).area == 0
     edges = np.hypot(*np.diff(shapely.get_coordinates(shapely.union_all(parts).exterior), axis=0).T)
     assert len(edges) <= 8 and edges.min() > 3
+
+
+def _slow_peucker(xy, tolerance):
+    keep, todo = {0, len(xy) - 1}, [(0, len(xy) - 1)]
+    while todo:
+        a, b = todo.pop()
+        if b - a < 2:
+            continue
+        along, between = xy[b] - xy[a], xy[a + 1 : b] - xy[a]
+        squared = float(along @ along)
+        t = np.clip(between @ along / squared, 0, 1) if squared else np.zeros(len(between))
+        away = np.hypot(*(between - t[:, None] * along).T)
+        far = int(np.argmax(away >= away.max() - 1e-9))  # the first of those as far
+        if away[far] > tolerance:
+            keep.add(a + 1 + far)
+            todo += [(a, a + 1 + far), (a + 1 + far, b)]
+    return sorted(keep)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_corners_of_lines_against_a_plain_twin(seed):
+    """Of lines of any kind, closed ones and some along a grid, whose places are often as far off as others."""
+    rng = np.random.default_rng(seed)
+    xy = rng.normal(0, 5, (rng.integers(2, 80), 2))
+    xy = np.cumsum(np.rint(xy / 5), axis=0) if seed % 2 else xy
+    xy = np.vstack([xy, xy[:1]]) if seed % 3 else xy
+    assert peucker(xy.astype(float), 1.6).tolist() == _slow_peucker(xy.astype(float), 1.6)
+
+
+def test_middles_of_steps():
+    corners = np.array([[0, 0], [0, 3], [2, 3], [2, 0], [0, 0]], float)
+    expected = [
+        [0, 0.5],
+        [0, 1.5],
+        [0, 2.5],
+        [0.5, 3],
+        [1.5, 3],
+        [2, 2.5],
+        [2, 1.5],
+        [2, 0.5],
+        [1.5, 0],
+        [0.5, 0],
+    ]
+    np.testing.assert_array_equal(middles(corners), expected)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 8, 101])
+def test_the_median_is_numpys(count):
+    values = np.random.default_rng(count).normal(0, 1e3, count)
+    assert median(values) == np.median(values)

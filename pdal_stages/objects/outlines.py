@@ -25,6 +25,8 @@ from ..base.errors import DependencyError, StageError
 from ..base.lean import imported
 from .boundaries import polygon
 from .find import Table
+from .measure import median
+from .walls import main_direction, middles, peucker
 
 #: Holes smaller than this are closed, m2.
 SMALLEST_HOLE = 4.0
@@ -269,62 +271,12 @@ def _polygon(shapely: Any, shell: NDArray | None, holes: list[NDArray | None]) -
 
 def _middles(ring: Any) -> NDArray[np.float64]:
     """Middles of the unit steps of a boundary along cells (n, 2)."""
-    corners = np.rint(vector("shapely").get_coordinates(ring))
-    away = np.diff(corners, axis=0)
-    many = np.abs(away).max(axis=1).astype(np.int64)
-    edge = np.repeat(np.arange(len(many)), many)
-    step = np.arange(len(edge)) - np.repeat(np.cumsum(many) - many, many)
-    return corners[edge] + ((step + 0.5) / many[edge])[:, None] * away[edge]
-
-
-def main_direction(places: NDArray) -> float:
-    """The angle, radians in [0, pi/2), of the frame in which the walls through places (n, 2) along boundaries run.
-
-    The one in which the steps from a place to the fifth after it are longest along one axis and shortest along the other:
-    the least sum of their extents along both.
-    """
-    away = np.roll(places, -5, axis=0) - places
-    away = away[np.hypot(*away.T) < 8.0]  # not from one ring to the next
-    if not len(away):
-        return 0.0
-    best = [(0.0, 0.0)]
-    for step, span in ((math.radians(2.0), math.pi / 4), (math.radians(0.2), math.radians(3.0))):
-        middle = best[0][1] if step < 0.01 else math.pi / 4
-        angles = middle + np.arange(-round(span / step), round(span / step) + 1) * step
-        c, s = np.cos(angles), np.sin(angles)
-        u = np.abs(np.outer(c, away[:, 0]) + np.outer(s, away[:, 1]))
-        v = np.abs(np.outer(c, away[:, 1]) - np.outer(s, away[:, 0]))
-        total = (u + v).sum(axis=1)
-        n = int(np.argmin(np.round(total, 6)))
-        best = [(float(total[n]), float(angles[n]))]
-    return best[0][1] % (math.pi / 2)
+    return middles(np.rint(vector("shapely").get_coordinates(ring)))
 
 
 def _turned(xy: NDArray, angle: float) -> NDArray[np.float64]:
     c, s = math.cos(angle), math.sin(angle)
     return np.column_stack([xy[:, 0] * c + xy[:, 1] * s, xy[:, 1] * c - xy[:, 0] * s])
-
-
-def _peucker(xy: NDArray, tolerance: float) -> list[int]:
-    """Numbers of the places that stay of a line (Douglas, Peucker 1973)."""
-    keep, todo = {0, len(xy) - 1}, [(0, len(xy) - 1)]
-    while todo:
-        a, b = todo.pop()
-        if b - a < 2:
-            continue
-        along, between = xy[b] - xy[a], xy[a + 1 : b] - xy[a]
-        length = math.hypot(*along)
-        if length > 0:
-            t = np.clip(between @ along / length**2, 0.0, 1.0)
-            away = np.hypot(*(between - t[:, None] * along).T)
-        else:
-            away = np.hypot(*between.T)
-        far = int(np.argmax(away))
-        if away[far] > tolerance:
-            n = a + 1 + far
-            keep.add(n)
-            todo += [(a, n), (n, b)]
-    return sorted(keep)
 
 
 def straight_ring(places: NDArray, angle: float) -> NDArray[np.float64] | None:
@@ -343,7 +295,7 @@ def straight_ring(places: NDArray, angle: float) -> NDArray[np.float64] | None:
     # Begun at a corner: the place farthest from the middle.
     xy = np.roll(xy, -int(np.argmax(np.round(np.hypot(*(xy - xy.mean(axis=0)).T), 6))), axis=0)
     closed = np.vstack([xy, xy[:1]])
-    at = _peucker(closed, _TOLERANCE)
+    at = peucker(closed, _TOLERANCE)
     lines = [_line(closed[a : b + 1]) for a, b in itertools.pairwise(at)]
     lines = _one_after_the_other(lines)
     if len(lines) < 3:
@@ -371,9 +323,9 @@ def _line(xy: NDArray) -> _Wall:
     along, across = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     east, north = abs(away[0]), abs(away[1])
     if north < east and north <= _SLACK:
-        return _Wall(np.array([xy[:, 0].mean(), np.median(inner[:, 1])]), along, length, end)
+        return _Wall(np.array([xy[:, 0].mean(), median(inner[:, 1])]), along, length, end)
     if east <= north and east <= _SLACK:
-        return _Wall(np.array([np.median(inner[:, 0]), xy[:, 1].mean()]), across, length, end)
+        return _Wall(np.array([median(inner[:, 0]), xy[:, 1].mean()]), across, length, end)
     if length < 6.0:  # a short slant is a corner cut by the grid
         return _Wall(xy.mean(axis=0), along if east >= north else across, length, end)
     middle = inner.mean(axis=0)
@@ -437,7 +389,7 @@ def _straight_wall(corners: NDArray, angle: float) -> NDArray[np.float64]:
         t = (np.arange(n) + 0.5)[:, None] / n
         steps.append(np.array([x0, y0]) + t * np.array([x1 - x0, y1 - y0]))
     xy = _turned(np.concatenate([corners[:1], *steps, corners[-1:]]), angle)
-    at = _peucker(xy, _TOLERANCE)
+    at = peucker(xy, _TOLERANCE)
     lines = [_line(xy[a : b + 1]) for a, b in itertools.pairwise(at)]
     if len(lines) == 1:
         place, way, length, _ = lines[0]
