@@ -2,7 +2,8 @@
 
 Before it loads anything, numba imports all that it can compile (SciPy's linear algebra among it), and of each function
 it reads the intermediate code too, for those that may yet be compiled with it. Of a small job these were a quarter of
-the time. Here both wait until a function has to be compiled.
+the time. Here both wait until a function has to be compiled. It takes the place of methods that numba does not promise:
+where one is missing, numba's own way stays. Tried with numba 0.58, 0.60, 0.61, 0.63, 0.65 and 0.68.
 """
 
 from __future__ import annotations

@@ -31,7 +31,6 @@ from typing import Any
 
 from .cachedcode import load_lightly
 from .errors import DependencyError
-from .lean import imported
 from .progress import Progress
 
 #: Flags that allow sums to be reordered and contracted, but keep NaN and infinity meaningful.
@@ -131,7 +130,6 @@ def _numba() -> Any:
         ) from None
     import numba.core.event
 
-    imported("numba.np.arraymath")  # which numba itself does at the first kernel
     Compiling.listen(numba.core.event)
     return numba
 

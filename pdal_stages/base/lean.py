@@ -9,11 +9,10 @@ from contextlib import contextmanager
 from typing import Any
 
 _lean = False
-#: What packages import to see whether it is there, and we never use through them: half a second of pyogrio's start, a
-#: quarter of numba's (for linear algebra inside kernels), a tenth of laspy's.
+#: What packages import to see whether it is there, and we never use through them: half a second of pyogrio's start,
+#: a tenth of laspy's.
 _OPTIONAL = {
     "pyogrio": ("geopandas", "pandas", "pyarrow", "pyproj"),
-    "numba.np.arraymath": ("scipy.linalg",),
     "laspy": ("requests", "pyproj"),
 }
 
