@@ -132,6 +132,22 @@ def test_errors(tmp_path, capsys):
 
 @pytest.mark.data
 @pytest.mark.pdal
+def test_files_that_lie_apart_and_trees_without_heights_are_told(tmp_path, capsys):
+    for name, x in (("one", 0), ("near", 5), ("far", 5000)):
+        write(tmp_path / f"{name}.gpkg", [shapely.box(x, 0, x + 10, 10)])
+    write(tmp_path / "bare.gpkg", [shapely.Point(1, 1)], "Point", "trees")
+    write(tmp_path / "high.gpkg", [shapely.Point(1, 1)], "Point", "trees", height=[7.0])
+
+    def said(found, reference):
+        files = [str(tmp_path / f"{name}.gpkg") for name in (found, reference)]
+        assert cli.main(["accuracy", files[0], "--objects", files[1]]) == 0
+        return " ".join(capsys.readouterr().err.split())
+
+    assert "lie apart" not in said("one", "near") + said("one", "one")
+    assert "5000 to 5010, 0 to 10" in said("one", "far") and "lie apart" in said("far", "one")
+    assert "no heights" in said("high", "bare") and "no heights" not in said("high", "high")
+
+
 def test_delft_against_official_outlines(tmp_path, capsys, data_dir):
     """Houses stand wall to wall, so they are covered rather than told apart."""
     outlines = tmp_path / "delft.gpkg"

@@ -176,6 +176,7 @@ def _compare_objects(options: argparse.Namespace) -> None:
     check_outputs(outputs, [found, reference, *([options.area] if options.area else [])])
     figures, one, two = objectaccuracy.compare_objects(found, reference, options.area)
     print(objectaccuracy.table(figures), end="")
+    print_messages(*objectaccuracy.remarks(one, two))
     if options.json:
         text = json.dumps(objectaccuracy.to_json(figures), indent=1) + "\n"
         write_whole(options.json, text.encode(), "json")

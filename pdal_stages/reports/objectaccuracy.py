@@ -131,6 +131,34 @@ def compare_objects(
     return out, one, two
 
 
+def remarks(found: Things, reference: Things) -> list[str]:
+    """What a user should know of two files before he believes their figures: that they lie apart, or heights are missing."""
+    out = []
+    boxes = [box for one in (found, reference) if (box := _box(one)) is not None]
+    if len(boxes) == 2 and (boxes[0][2:] < boxes[1][:2]).any() | (boxes[1][2:] < boxes[0][:2]).any():
+        places = [f"{w:.0f} to {e:.0f}, {s:.0f} to {n:.0f}" for w, s, e, n in boxes]
+        out.append(
+            f"objects and reference lie apart, so nothing matches: {found.path} is at {places[0]}, "
+            f"{reference.path} at {places[1]}. See whether both have the system that they say, and its order of axes"
+        )
+    if reference.trees is not None and len(reference.trees[1]) and np.isnan(reference.trees[1]).all():
+        out.append(
+            f"{reference.path}: its trees have no heights, so they are matched by place alone. "
+            f"Name a column {HEIGHT_NAMES[0]} (or {', '.join(HEIGHT_NAMES[1:])})"
+        )
+    return out
+
+
+def _box(things: Things) -> np.ndarray | None:
+    """Where a file's objects lie: west, south, east, north."""
+    shapely = vector("shapely")
+    shapes = list(things.buildings or ())
+    shapes += (
+        [] if things.trees is None or not len(things.trees[0]) else [shapely.MultiPoint(things.trees[0])]
+    )
+    return shapely.total_bounds(shapes) if shapes else None
+
+
 def _axes(crs: str) -> str:
     """Of a compound system the name of the plane one."""
     return crs.split('"')[3] if crs.startswith(("COMPD_CS", "COMPOUNDCRS")) and crs.count('"') > 3 else crs
