@@ -34,16 +34,24 @@ def count(data: Path, survey: str, model: Model) -> dict[str, Any]:
     noise = detached_noise(xyz)
     seen = noise == 0
     made = filtered_ground(*xyz.T, mask=seen, openings=(5, 17), decks=True)
-    codes = model.predict(xyz, {**returns, **made}, ignore=~seen).classification
+    said = model.predict(xyz, {**returns, **made}, ignore=~seen)
+    codes = said.classification
     codes[~seen] = noise[~seen]
     deck = (made["Deck"] != 0) & seen
     codes[deck] = BRIDGE
     changed: dict[str, Any] = {}
     after = consistent(
-        xyz, codes, height=made["HeightAboveGround"], ground=made["Ground"], mask=seen, figures=changed
+        xyz,
+        codes,
+        height=made["HeightAboveGround"],
+        ground=made["Ground"],
+        reliability=said.reliability,
+        mask=seen,
+        figures=changed,
     )
     truth = true_classes(known, xyz[:, 0], xyz[:, 1], label, made["HeightAboveGround"])
-    judged = (truth > 0) & (after != codes)
+    known_class = (truth > 0) & seen & ~deck
+    judged = known_class & (after != codes)
     return {
         "survey": survey,
         "points": len(xyz),
@@ -52,6 +60,7 @@ def count(data: Path, survey: str, model: Model) -> dict[str, Any]:
         "decks": int(np.count_nonzero(deck)),
         "decks_labeled_other": int(np.count_nonzero(deck & np.isin(label, NO_DECK))),
         "changed": {rule: int(changed[rule]) for rule in RULES},
+        "labeled": int(np.count_nonzero(known_class)),
         "judged": int(np.count_nonzero(judged)),
         "wrong_before": int(np.count_nonzero(judged & (codes != truth))),
         "wrong_after": int(np.count_nonzero(judged & (after != truth))),
@@ -61,13 +70,15 @@ def count(data: Path, survey: str, model: Model) -> dict[str, Any]:
 def table(runs: list[dict[str, Any]]) -> str:
     """As Markdown."""
     lines = [
-        f"| survey | points | noise | decks | {' | '.join(RULES)} | labeled and changed | wrong before | after |",
-        f"|---|---:|---:|---:|{'---:|' * len(RULES)}---:|---:|---:|",
+        f"| survey | points | noise | decks | {' | '.join(RULES)} | labeled and changed | wrong before | after | OA |",
+        f"|---|---:|---:|---:|{'---:|' * len(RULES)}---:|---:|---:|---:|",
     ]
     for run in runs:
         counts = [run["noise"], run["decks"], *(run["changed"][rule] for rule in RULES)]
         shares = " | ".join(_share(n, run["points"]) for n in counts)
         rest = f"{run['judged']:,} | {run['wrong_before']:,} | {run['wrong_after']:,}"
+        gained = 100 * (run["wrong_before"] - run["wrong_after"]) / run["labeled"]
+        rest += f" | {gained:+.2f}" if run["judged"] else " | –"
         lines.append(f"| {run['survey']} | {run['points']:,} | {shares} | {rest} |")
     return "\n".join(lines)
 

@@ -15,5 +15,9 @@ def objects_part() -> None:
     codes = np.full(2 * len(u), 6, np.uint8)
     codes[len(u) // 2 :: len(u)] = 5
     consistent(
-        np.concatenate([roof, wall]), codes, height=np.full(len(codes), 4.0), ground=np.zeros(len(codes))
+        np.concatenate([roof, wall]),
+        codes,
+        height=np.full(len(codes), 4.0),
+        ground=np.zeros(len(codes)),
+        reliability=np.full(len(codes), 0.5, np.float32),
     )

@@ -24,6 +24,12 @@ class Consistency(Stage):
         True,
         "A building that a ground filter calls ground, below 0.3 m and 2 m from all that stands, is ground",
     )
+    doubtful: bool = option(
+        "boolean",
+        True,
+        "A detached piece of building of 3 m² to 8 x 8 m whose mean Reliability is below 0.62 is vegetation, as clipped "
+        "hedges and dense bushes are",
+    )
     islands: bool = option(
         "boolean",
         True,
@@ -36,18 +42,20 @@ class Consistency(Stage):
     )
     vegetation_heights: list = vegetation_heights_option(
         "what becomes vegetation is low (3) below the first, medium (4) below the second and high (5) above; without "
-        "heights all of it is high"
+        "heights it is what most vegetation around it is, high where there is none"
     )
     ignore: Selection = ignore_option("Points that are neither neighbors nor changed")
     keep: Selection = keep_option()
     details = """
 The last step after a classification. Only ground (2), vegetation (3, 4, 5) and buildings (6) are changed, and only into one
-another; `ground` and `islands` need `HeightAboveGround` and `Ground` and do nothing without them, which the metadata says.
+another; `ground` and `islands` need `HeightAboveGround` and `Ground`, `doubtful` needs `Reliability`; without them they do
+nothing, which the metadata says.
 Each rule has an option of its name, and its number of changed points in the metadata.
 
-Neighbors are those in 3 x 3 x 3 voxels of 1 m on an absolute grid (5 high for walls), so a tile with its halo gets the
-classes of the whole cloud. Planes are fitted to the buildings among them, where nine in ten of what is no ground are. The
-feet of walls stay what they are: surveys label them building as often as ground.
+Neighbors are those in 3 x 3 x 3 voxels of 1 m on an absolute grid (5 high for walls), and a piece is what touches in such
+voxels, so a tile with its halo gets the classes of the whole cloud. Planes are fitted to the buildings among neighbors,
+where nine in ten of what is no ground are. The feet of walls stay what they are: surveys label them building as often as
+ground.
 """
     before = (
         {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]},
@@ -73,23 +81,29 @@ feet of walls stay what they are: surveys label them building as often as ground
             return {}
         ignored, kept = points.ignored(self.ignore), points.chosen(self.keep)
         change = points.inside & ~ignored & ~kept
-        heights = {
+        known = {
             word: points.dimension(name) if name in points.arrays else None
-            for word, name in (("height", "HeightAboveGround"), ("ground", "Ground"))
+            for word, name in (
+                ("height", "HeightAboveGround"),
+                ("ground", "Ground"),
+                ("reliability", "Reliability"),
+            )
         }
-        if any(values is None for values in heights.values()) and (self.ground or self.islands):
+        if (known["height"] is None or known["ground"] is None) and (self.ground or self.islands):
             points.report.warnings.append(
                 "there is no HeightAboveGround or no Ground: the rules ground and islands did nothing"
             )
+        if known["reliability"] is None and self.doubtful:
+            points.report.warnings.append("there is no Reliability: the rule doubtful did nothing")
         before = points.class_codes
         limits = bands(self.vegetation_heights)
         if limits:
             points.dimension("HeightAboveGround")  # refused where there is none
-        points.keep_only(["Classification", "HeightAboveGround", "Ground"])
+        points.keep_only(["Classification", "HeightAboveGround", "Ground", "Reliability"])
         codes = consistent(
             points.take_xyz(),
             before,
-            **heights,
+            **known,
             mask=~ignored,
             change=change,
             rules=[rule for rule in RULES if self.options[rule]],
