@@ -80,6 +80,18 @@ def test_with_other_options_too(town, tmp_path, capsys, more):
     assert whole == tiles
 
 
+def test_surveys_that_do_not_see_each_other(town, tmp_path, capsys):
+    more = ["--leave-one-survey-out", "--surveys", "west=*t[01].laz", "--writers.classifiermodel.thin=1.5"]
+    (whole, tiles), (one, other) = both(town, tmp_path, capsys, *more)
+    assert whole == tiles and one.out == other.out
+    info = ps.load_model(tmp_path / "tiles.model").info
+    assert [row["name"] for row in info["accuracy"]["leave_one_survey_out"]["surveys"]] == [
+        "t2",
+        "t3",
+        "west",
+    ]
+
+
 def test_one_file_and_feet(tmp_path, capsys, write_las):
     pyproj = pytest.importorskip("pyproj")
     xyz = (TOWN.xyz - (499_000.0, 5_399_000.0, 0.0)) / 0.3048

@@ -258,7 +258,8 @@ def prepared_parts(
 
     Files are written into `folder`, which is there.
     """
-    made = CloudParts(folder / f"{raw.folder.name}.points", raw.side, raw.most_points)
+    name = f"{len(list(folder.iterdir()))}.{raw.folder.name}"  # of surveys there are folders of one name
+    made = CloudParts(folder / f"{name}.points", raw.side, raw.most_points)
     density = DensityOfParts()
     with Progress(sum(raw.counts.values()), "voxels", enabled=progress) as bar:
         for part in raw.parts():
@@ -271,7 +272,7 @@ def prepared_parts(
     made.density = density.density()
     copies = [made]
     for number, wanted in enumerate(options.thin):
-        copy = _thinned(made, wanted, options, folder / f"{raw.folder.name}.thin{number}")
+        copy = _thinned(made, wanted, options, folder / f"{name}.thin{number}")
         copies += [copy] if copy.counts else []
     return [part for one in copies for part in one.parts()]
 

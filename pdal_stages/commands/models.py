@@ -98,6 +98,7 @@ def _models(options: argparse.Namespace) -> None:
 def _train(options: argparse.Namespace) -> None:
     from ..pipeline.ends import input_files
     from ..pipeline.run import Pipeline
+    from ..pipeline.surveyjob import surveys_of, train_surveys
     from ..pipeline.trainjob import train_pipeline
     from ..stages.loading import load_model
     from ..tiling.command import options_of, run_training
@@ -105,21 +106,18 @@ def _train(options: argparse.Namespace) -> None:
 
     named = ("classes", "neighborhoods", "feature_set", "count", "trees", "base")
     extra = {name: value for name in named if (value := getattr(options, name)) is not None}
+    files, surveys = input_files(options.inputs), {}
     if options.leave_one_survey_out or options.surveys:
-        from ..pipeline.surveyjob import surveys_of, train_surveys
-
-        surveys = surveys_of(input_files(options.inputs), options.surveys or ())
+        surveys = surveys_of(files, options.surveys or ())
         extra |= {"leave_one_survey_out": True} if options.leave_one_survey_out else {}
+    task = TrainTask(files, options.model, options.overrides, extra, options_of(options), surveys)
+    if not task.in_one_piece():
+        print_messages(*run_training(task))
+    elif surveys:
         print_messages(*train_surveys(surveys, options.model, options.overrides, **extra))
     else:
-        task = TrainTask(
-            input_files(options.inputs), options.model, options.overrides, extra, options_of(options)
-        )
-        if task.in_one_piece():
-            stages = train_pipeline(task.files, options.model, options.overrides, **extra)
-            run(options, Pipeline(stages, options.overrides))
-        else:
-            print_messages(*run_training(task))
+        stages = train_pipeline(files, options.model, options.overrides, **extra)
+        run(options, Pipeline(stages, options.overrides))
     if Path(options.model).is_file():  # not written into a pipe or device
         print(load_model(options.model))
 

@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import OptionError, StageError
+from ..base.jit import Compiling
 from ..base.progress import Progress
 from ..base.report import Report
 from ..classifier import TrainingCloud, train
+from ..stages import registry
 from ..stages.classifiermodel import ClassifierModel
 from ..stages.points import Points
 from . import pdal as pdal_env
@@ -68,6 +70,15 @@ def _like(file: str, pattern: str) -> bool:
     return inside or fnmatch.fnmatch(file, pattern) or fnmatch.fnmatch(Path(file).name, pattern)
 
 
+def check_surveys(given: Mapping[str, Any]) -> None:
+    """Refuse a stage that tells surveys, or groups, by a dimension as well."""
+    if given.get("survey") or given.get("groups"):
+        raise OptionError(
+            "surveys are told by files or by a dimension, not both",
+            found=", ".join(f"{k}={given[k]}" for k in ("survey", "groups") if given.get(k)),
+        )
+
+
 def train_surveys(
     surveys: Mapping[str, Sequence[str]], model: str, overrides: Sequence[Override] = (), **options: Any
 ) -> list[str]:
@@ -82,11 +93,7 @@ def train_surveys(
     files = [file for group in surveys.values() for file in group]
     writer = {"type": "writers.classifiermodel", "filename": model, "files": files, **options}
     given = overridden(writer, overrides)
-    if given.get("survey") or given.get("groups"):
-        raise OptionError(
-            "surveys are told by files or by a dimension, not both",
-            found=", ".join(f"{k}={given[k]}" for k in ("survey", "groups") if given.get(k)),
-        )
+    check_surveys(given)
     stage = lowered_writer(given)
     heights = [overridden(one, overrides) for one in heights_for(stage)]
     told: list[str] = []
@@ -120,6 +127,7 @@ def train_surveys(
         (first, group), *others = surveys.items()
         start = reading(first, group, bar)()  # what all are trained on follows from its dimensions
         clouds = (one for one in [lambda: start, *(reading(name, group, bar) for name, group in others)])
+        Compiling.expect(lambda: registry.kernels([stage.type]))
         made = train(clouds, training)
     stage.finish(made, report)
     return [*told, *report.messages]

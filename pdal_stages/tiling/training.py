@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import OptionError, StageError
+from ..base.jit import Compiling
 from ..base.memory import free_memory
 from ..base.report import Report
-from ..classifier import TrainingCloud, TrainingOptions
+from ..classifier import TrainingCloud
 from ..classifier.dimensions import CHECKED
 from ..classifier.parts import CloudParts
 from ..classifier.summary import FILE_NUMBER
@@ -27,8 +28,9 @@ from ..pipeline.callbacks import Callbacks
 from ..pipeline.ends import is_ept, is_las, overridden
 from ..pipeline.overrides import Override
 from ..pipeline.run import Pipeline
-from ..pipeline.surveyjob import points_in
+from ..pipeline.surveyjob import check_surveys, points_in
 from ..pipeline.trainjob import heights_for, lowered_writer, numbered
+from ..stages import registry
 from ..stages.classifiermodel import ClassifierModel
 from ..stages.points import HOLDS_NOWHERE
 from .kept import load_arrays, save_arrays
@@ -61,6 +63,10 @@ class TrainTask:
     given : mapping
         Options of ``writers.classifiermodel``.
     options : TilingOptions
+    surveys : mapping of str to sequence of str
+        The files of each survey, where these do not see each other.
+    survey : str
+        Of which survey all files are.
     """
 
     files: Sequence[str]
@@ -68,6 +74,8 @@ class TrainTask:
     overrides: Sequence[Override] = ()
     given: Mapping[str, Any] = field(default_factory=dict)
     options: TilingOptions = field(default_factory=TilingOptions)
+    surveys: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    survey: str = ""
 
     @cached_property
     def _writer(self) -> dict[str, Any]:
@@ -75,8 +83,20 @@ class TrainTask:
         files = list(self.files)
         writer = {"type": ClassifierModel.type, "filename": self.model, "files": files, **self.given}
         writer = overridden(writer, self.overrides)
+        if self.surveys or self.survey:
+            check_surveys(writer)
+            return writer
         by_file = numbered(lowered_writer(writer), len(files))
         return {**writer, "groups": FILE_NUMBER} if by_file else writer
+
+    def _each(self) -> list[TrainTask]:
+        """The same for each survey; this one where there are none."""
+        named = self.surveys.items()
+        return [replace(self, files=files, surveys={}, survey=name) for name, files in named] or [self]
+
+    def _points(self) -> int:
+        """How many points the files have, as their headers tell."""
+        return sum(read_extent(source).count for source in find_sources(self._readers))
 
     @cached_property
     def stage(self) -> ClassifierModel:
@@ -96,17 +116,19 @@ class TrainTask:
         ]
 
     def in_one_piece(self) -> bool:
-        """Whether all points fit into the memory, or cannot be cut into tiles, and nothing asks for tiles."""
+        """Whether all points fit into the memory, those of each survey by themselves, or cannot be cut into tiles.
+
+        Not where tiles are asked for.
+        """
         can_be_cut = all(is_las(name) or is_ept(name) for name in self.files)
         if not can_be_cut or self.stage.algorithm != "random_forest":
             return True
         if self.options.tile is not None:
             return False
         try:
-            points = sum(read_extent(source).count for source in find_sources(self._readers))
+            return all(fits_whole(one._points(), self.options.memory) for one in self._each())
         except StageError:
             return True  # said when it is read
-        return fits_whole(points, self.options.memory)
 
     # ---- in tiles ----------------------------------------------------------------------------------------
 
@@ -117,17 +139,32 @@ class TrainTask:
         told = [said] if (said := stage.follows(heights)) is not None else []
         pdal_env.bindings()  # says what is wrong with PDAL before any work
         stage.check()
-        beside = Path(self.model).absolute().parent
-        place = beside if beside.is_dir() and Path(self.model).suffix else None
+        types = [one["type"] for one in [*heights, self._writer]]
+        Compiling.expect(lambda: registry.kernels(types))
+        model = Path(self.model).absolute()
+        place = model.parent if model.is_file() or not model.exists() else None  # not beside a device
+        clouds: list[CloudParts] = []
+        report, dimensions = Report(), None
         with TemporaryDirectory(prefix=".pdal-stages-train-", dir=place) as folder:
             self._check_room(Path(folder))
-            report, clouds, training = self._in_tiles(Path(folder), heights)
-            model = train_parts(clouds, training, Path(folder))
-        stage.finish(model, report)
+            for number, task in enumerate(self._each()):
+                made = Path(folder) / f"survey{number}"
+                made.mkdir()
+                found, parts, names = task._in_tiles(made, heights)
+                if dimensions not in (None, names):
+                    raise _not_the_same(names, dimensions)
+                dimensions = names
+                report.merge(found)
+                clouds += parts
+            training = self.stage.training
+            if self.stage.automatic:
+                training = replace(training, dimensions=tuple(dimensions or ()))
+            trained = train_parts(clouds, training, Path(folder))
+        stage.finish(trained, report)
         return [*told, *report.messages]
 
     def _check_room(self, folder: Path) -> None:
-        points = sum(read_extent(source).count for source in find_sources(self._readers))
+        points = sum(one._points() for one in self._each())
         free = shutil.disk_usage(folder).free
         if free < points * _DISK:
             raise StageError(
@@ -153,8 +190,8 @@ class TrainTask:
 
     def _in_tiles(
         self, folder: Path, heights: Sequence[Mapping[str, Any]]
-    ) -> tuple[Report, list[CloudParts], TrainingOptions]:
-        """What is to be known of the points; these, with heights, as clouds in parts; and how to train on them."""
+    ) -> tuple[Report, list[CloudParts], list[str]]:
+        """What is to be known of the points; these, with heights, as clouds in parts; and the dimensions to train on."""
         tiles = folder / "tiles"
         tiles.mkdir()
         run = run_plan(self._plan(tiles, heights), replace(self.options, per="tile"))
@@ -172,24 +209,26 @@ class TrainTask:
         for job in run.tiles:
             for number, cloud in enumerate(job.record.get("clouds", ())):
                 if dimensions not in (None, cloud["dimensions"]):
-                    raise StageError(
-                        "the files do not have the same dimensions",
-                        found=f"{', '.join(cloud['dimensions'])}; before: {', '.join(dimensions or ())}",
-                        cure="Name those that all have: --writers.classifiermodel.dimensions=HeightAboveGround",
-                    )
+                    raise _not_the_same(cloud["dimensions"], dimensions)
                 dimensions = cloud["dimensions"]
                 if cloud["value"] not in clouds:
                     clouds[cloud["value"]] = CloudParts(folder / f"cloud{len(clouds)}", side, most)
                 assert job.outputs is not None
-                clouds[cloud["value"]].put(job.tile, _read_back(job.outputs[0], number, cloud["name"]))
+                points = _read_back(job.outputs[0], number, self.survey or cloud["name"], self.survey)
+                clouds[cloud["value"]].put(job.tile, points)
             for path in job.outputs or ():
                 Path(path).unlink(missing_ok=True)
         if dimensions is None:
             raise StageError("there are no points to train on", where=", ".join(self.files[:_NAMED]))
-        training = self.stage.training
-        if self.stage.automatic:
-            training = replace(training, dimensions=tuple(dimensions))
-        return report, [clouds[value] for value in sorted(clouds)], training
+        return report, [clouds[value] for value in sorted(clouds)], dimensions
+
+
+def _not_the_same(found: Sequence[str], before: Sequence[str] | None) -> StageError:
+    return StageError(
+        "the files do not have the same dimensions",
+        found=f"{', '.join(found)}; before: {', '.join(before or ())}",
+        cure="Name those that all have: --writers.classifiermodel.dimensions=HeightAboveGround",
+    )
 
 
 def _say(report: Report, run: TiledRun) -> None:
@@ -205,12 +244,13 @@ def _say(report: Report, run: TiledRun) -> None:
     report.figures["ignored"] = ignored
 
 
-def _read_back(path: str, number: int, name: str) -> TrainingCloud:
+def _read_back(path: str, number: int, name: str, survey: str) -> TrainingCloud:
     """A cloud's points of a tile, as :class:`Taking` wrote them."""
     mark = f"{number}/"
     arrays = {key.removeprefix(mark): v for key, v in load_arrays(path).items() if key.startswith(mark)}
     dimensions = {key[2:]: values for key, values in arrays.items() if key.startswith("d/")}
-    return TrainingCloud(arrays["xyz"], arrays["labels"], dimensions, name, arrays.get("mask"))
+    mask, told = arrays.get("mask"), survey or None
+    return TrainingCloud(arrays["xyz"], arrays["labels"], dimensions, name, mask, told)
 
 
 @dataclass(frozen=True)
