@@ -24,6 +24,7 @@ from ..base.shortage import check_limit
 from ..stages import registry
 from . import packing, runtime, straight
 from . import pdal as pdal_env
+from .callbacks import Callbacks, Function
 from .filenames import is_writer, named_files, readers_files, stage_files, with_outputs, writers_outputs
 from .foreseen import check_dimensions, unread_extra_dimensions
 from .groundcheck import GroundChecks
@@ -80,6 +81,8 @@ class Pipeline:
         self.log_lines: list[str] = []
         self.reports: list[tuple[str, list[Report]]] = []
         self.warnings: list[str] = []
+        #: Called with the points that go to the last writer; see :class:`.callbacks.Callbacks`.
+        self.look: Function | None = None
         self._running = False
 
     @property
@@ -205,8 +208,10 @@ class Pipeline:
         try:
             with GroundChecks() as ground, whole_files(*outputs, check=finish) as partials:
                 try:
-                    with gentle(signal.SIGINT) as interrupts:
+                    with gentle(signal.SIGINT) as interrupts, Callbacks() as callbacks:
                         run = ground.put_before(packing.unpacked(stages, partials))
+                        if self.look is not None and alone:
+                            run.insert(len(run) - 1, callbacks.filter(self.look))
                         if read is None:
                             result = pdal_env.execute(joined(run), arrays=arrays, loglevel=loglevel)
                         else:

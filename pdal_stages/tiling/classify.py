@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..base import kinds, las
 from ..base.errors import OptionError, StageError
@@ -23,6 +23,9 @@ from .settings import TilingOptions
 from .sizing import fits_whole
 from .tiledrun import run_plan
 from .tileplan import TilePlan, make_plan
+
+if TYPE_CHECKING:
+    from .outputcells import OutputCells
 
 
 @dataclass
@@ -51,6 +54,8 @@ class ClassifyTask:
     options : TilingOptions
     metadata, log : str
         Files that are written beside, empty for none.
+    cells : OutputCells, optional
+        What takes the cells of points while outputs are written.
     """
 
     inputs: tuple[str, ...]
@@ -59,6 +64,7 @@ class ClassifyTask:
     options: TilingOptions = field(default_factory=TilingOptions)
     metadata: str = ""
     log: str = ""
+    cells: OutputCells | None = None
 
     @cached_property
     def files(self) -> list[str]:
@@ -102,7 +108,7 @@ class ClassifyTask:
     def run_whole(self) -> Written:
         """Classify the only input in one piece."""
         (source,), (target,) = self.files, self.outputs()
-        return classify_file(replace(self.request), source, target, self.metadata, self.log)
+        return classify_file(replace(self.request), source, target, self.metadata, self.log, self.cells)
 
     def run_each(self, apart: bool = False) -> Iterator[tuple[str, Written | str]]:
         """Classify inputs each by itself: yields an input, and what was written or why it failed, as they finish.
@@ -156,6 +162,7 @@ class ClassifyTask:
             readers=[{**reader, "filename": files[reader["type"]]} for reader in plan.readers],
             creates=["Classification", *(beside or {})] if tail_only and plan.creates else plan.creates,
             beside=beside,
+            cells=self.cells,
             whole_names=self._in_folder and self.options.per != "tile",
             name=self.request.model,
         )
@@ -211,13 +218,23 @@ def _make_folder(folder: Path) -> None:
 
 
 def classify_file(
-    request: ClassifyRequest, source: str, target: str, metadata: str = "", log: str = ""
+    request: ClassifyRequest,
+    source: str,
+    target: str,
+    metadata: str = "",
+    log: str = "",
+    cells: OutputCells | None = None,
 ) -> Written:
-    """Classify a file in one piece; `metadata` and `log` are files that are written beside."""
+    """Classify a file in one piece; `metadata` and `log` are files that are written beside, `cells` takes its points'."""
     pipeline = request.pipeline(source, target)
+    seen = cells.begin(source) if cells is not None else None
+    if seen is not None:
+        pipeline.look = seen.look
     more = [("log", log, ""), ("metadata", metadata, kinds.JSON)]
     pipeline.check_outputs(*(Output(name, what, kind) for what, name, kind in more if name))
     count = pipeline.execute(arrays=False, loglevel=logging.WARNING)
+    if seen is not None:
+        seen.keep(target)
     if metadata:
         write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
     reports = [each[-1].figures for _, each in pipeline.reports if each]

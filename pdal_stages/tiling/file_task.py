@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from .sources import InputSource
 from .tail import run_tail
 from .tileplan import TilePlan
 
+if TYPE_CHECKING:
+    from .outputcells import CellsSeen, OutputCells
+
 
 @dataclass(frozen=True)
 class FileTask:
@@ -35,26 +38,32 @@ class FileTask:
     outputs: list[str]  #: what each of the writers writes
     scratch: str  #: folder for temporary files
     meanings: dict[str, str]  #: see TilePlan
+    cells: OutputCells | None = None  #: see TilePlan
 
     def run(self) -> dict[str, Any]:
         """Write the outputs; see :func:`~pdal_stages.tiling.tail.run_tail`. The record counts classes, too."""
         classes = np.zeros(256, np.int64)
         holds_flags = las.holds_flags(self.source.path)
+        seen = self.cells.begin(self.source.path) if self.cells is not None else None
 
         def new_values(start: int, end: int) -> NewValues:
             values = read_range(self.results, self.source, self.count, start, end)
             if start == 0:  # begun, or begun anew
                 classes[:] = 0
+                if seen is not None:
+                    seen.begin()
             if "Classification" in values.values:
                 codes = np.asarray(values.values["Classification"][1], np.uint8)
                 codes = codes & np.uint8(LEGACY_LIMIT if holds_flags else 255)
                 np.add(classes, np.bincount(codes, minlength=256), out=classes)
             return values
 
-        record = self._write(new_values)
+        record = self._write(new_values, seen)
+        if seen is not None:
+            seen.keep(self.outputs[0])
         return record | {"classes": {str(code): int(classes[code]) for code in np.flatnonzero(classes)}}
 
-    def _write(self, new_values: Callable[[int, int], NewValues]) -> dict[str, Any]:
+    def _write(self, new_values: Callable[[int, int], NewValues], seen: CellsSeen | None) -> dict[str, Any]:
         tail = with_beside(self.tail, self.beside, [self.source.path])
         writers = [stage["type"] for stage in self.tail if stage["type"].startswith("writers.")]
         kinds = {(kind, Path(path).suffix.lower()) for kind, path in zip(writers, self.outputs, strict=True)}
@@ -69,6 +78,7 @@ class FileTask:
                     self.outputs,
                     self.scratch,
                     self.meanings,
+                    seen,
                 )
             except HeadersDifferError:  # such as automatic offsets: written at once
                 pass
@@ -77,7 +87,7 @@ class FileTask:
         if header is not None and header.count:
             tail = on_one_grid(tail, header.box, half_open=False)
         return run_tail(
-            [reader], [new_values(0, self.count)], tail, self.outputs, self.meanings, self.scratch
+            [reader], [new_values(0, self.count)], tail, self.outputs, self.meanings, self.scratch, seen
         )
 
 

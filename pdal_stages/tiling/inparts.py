@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..base.complete import check_complete
 from ..base.files import whole_files
@@ -17,6 +17,9 @@ from .results import NewValues
 from .sources import InputSource
 from .store import check_run
 from .tail import run_tail, written
+
+if TYPE_CHECKING:
+    from .outputcells import CellsSeen
 
 
 class HeadersDifferError(Exception):
@@ -32,6 +35,7 @@ def write_in_parts(
     outputs: list[str],
     scratch: str,
     meanings: Mapping[str, str],
+    seen: CellsSeen | None = None,
 ) -> dict[str, Any]:
     """Write the outputs of a file with `count` points, `most` points at a time.
 
@@ -58,7 +62,7 @@ def write_in_parts(
             _copy(source.path, start, end, piece)
             parts = [os.path.join(folder, f"out{n}.las") for n in range(len(outputs))]
             reader = {**source.reader, "filename": piece}
-            run_tail([reader], [new_values(start, end)], _uncompressed(tail), parts, meanings, scratch)
+            run_tail([reader], [new_values(start, end)], _uncompressed(tail), parts, meanings, scratch, seen)
             for one, part in zip(joined, parts, strict=True):
                 one.add(part)
     return written(outputs, joined[0].count if joined else 0)

@@ -7,7 +7,6 @@ on with ``--resume``. Then objects are found block by block in the records of al
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import shutil
 from collections.abc import Iterator, Sequence
@@ -25,7 +24,6 @@ from ..base.files import write_whole
 from ..base.outputs import Output, check_outputs
 from ..base.plain import print_messages
 from ..base.progress import Progress
-from ..base.stamps import stamp
 from ..base.units import Units
 from ..base.version import __version__
 from ..objects import Cells, Objects, ObjectSettings, find_objects
@@ -40,6 +38,7 @@ from ..reports.objectlayers import check_target, object_layers, target_files, wr
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter
 from .cloudindex import BLOCK, open_las, read_block
 from .outcome import FoundObjects
+from .outputcells import OutputCells, keep_cells, kept_name
 from .store import take_lock
 
 if TYPE_CHECKING:
@@ -96,12 +95,15 @@ def refuse_tiles(task: ClassifyTask, output: str) -> None:
     check_outputs([Output(output, "objects")], task.files)
 
 
+def cells_of_outputs(stage: ObjectsWriter) -> OutputCells:
+    """What takes the cells of outputs while ``classify --objects`` writes them."""
+    return OutputCells(stage, str(_kept(stage.filename)))
+
+
 def objects_of_outputs(task: ClassifyTask, stage: ObjectsWriter) -> FoundObjects:
-    """What ``classify --objects`` does when all is classified."""
-    chosen = task.options
-    return _write(
-        outputs_of(task.files, task.output), stage, max(1, chosen.local_workers), chosen.resume, draw=True
-    )
+    """What ``classify --objects`` does when all is classified; outputs whose cells were kept are not read."""
+    workers = max(1, task.options.local_workers)
+    return _write(outputs_of(task.files, task.output), stage, workers, resume=True, draw=True)
 
 
 def _write(
@@ -175,8 +177,7 @@ def objects_of_files(
     cells = _all_cells(inputs, stage, wkt, workers)
     before, thin = cells, cells.thin()
     while stage.widens and cells.thin() and cells.size < LARGEST:
-        stage = stage.with_cell(2 * cells.size)
-        cells = _all_cells(inputs, stage, wkt, workers)
+        stage, cells = stage.with_cell(2 * cells.size), cells.doubled()
     if thin:
         too_few = f"cells of {before.size:g} m hold {thin[1]:.1f} points of {thin[0]} on average"
         print_messages(
@@ -190,12 +191,8 @@ def objects_of_files(
 def _all_cells(inputs: Sequence[str], stage: ObjectsWriter, wkt: str, workers: int) -> Cells:
     """The records of all files; each file's are kept in a file of their own."""
     folder = _kept(stage.filename)
-    what = json.dumps({k: str(v) for k, v in sorted(stage.options.items())})
     parts, failed, seen = [], [], np.zeros(256, bool)
-    work = []
-    for path in inputs:
-        mark = json.dumps([__version__, what, str(Path(path).resolve()), stamp(path)])
-        work.append((path, stage, wkt, str(folder / _digest(mark))))
+    work = [(path, stage, wkt, str(kept_name(folder, path, stage))) for path in inputs]
     sizes = [max(Path(path).stat().st_size, 1) if Path(path).exists() else 1 for path in inputs]
     size_of = dict(zip(inputs, sizes, strict=True))
     with Progress(sum(sizes) // 1000, "reading", "kB") as line:
@@ -222,7 +219,7 @@ def _all_cells(inputs: Sequence[str], stage: ObjectsWriter, wkt: str, workers: i
 
 def read_cells(path: str, stage: ObjectsWriter, wkt: str, kept: str) -> list[int]:
     """Read a file's records and keep them in a file; which class codes it has (256 of 0 or 1)."""
-    target = Path(kept + ".npz")
+    target = Path(kept)
     if not target.exists():
         seen = np.zeros(256, np.int64)
         parts = [Cells(stage.settings.cell)]
@@ -232,16 +229,13 @@ def read_cells(path: str, stage: ObjectsWriter, wkt: str, kept: str) -> list[int
             parts.append(stage.records(points))
             if len(parts) >= 8:
                 parts = [Cells.join(parts)]
-        cells = Cells.join(parts)
-        partial = target.with_name(f"partial-{target.name}")
-        np.savez(partial, key=cells.key, seen=(seen > 0).astype(np.int64), **cells.columns)  # type: ignore[arg-type]
-        partial.replace(target)
+        keep_cells(target, Cells.join(parts), seen)
     with np.load(target) as held:
         return [int(v) for v in held["seen"]]
 
 
 def _load(kept: str, size: float) -> Cells:
-    with np.load(kept + ".npz") as held:
+    with np.load(kept) as held:
         names = [name for name in held.files if name not in ("key", "seen")]
         return Cells(size, held["key"], {name: held[name] for name in names})
 
@@ -272,10 +266,6 @@ def _points_of(path: str) -> Iterator[dict[str, NDArray]]:
                 ):
                     made.setdefault(name, []).append(np.asarray(values))
             yield {name: np.concatenate(values) for name, values in made.items()}
-
-
-def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
 def _kept(output: str) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from ..pipeline.records import keep_records
 from .results import NewValues
 from .store import check_run
 
+if TYPE_CHECKING:
+    from .outputcells import CellsSeen
+
 #: PDAL's names of types that are not NumPy's with ``_t``.
 _FLOATS = {"float64": "double", "float32": "float"}
 
@@ -31,8 +34,11 @@ def run_tail(
     outputs: Sequence[str],
     meanings: Mapping[str, str],
     scratch: str,
+    seen: CellsSeen | None = None,
 ) -> dict[str, Any]:
     """Run readers, the new values of each, and the tail with its writers; what they have :func:`written`.
+
+    `seen` looks at the points with their new values.
 
     The files, `outputs`, appear under their names when all are whole, and the run goes on whose folder for temporary files
     is `scratch`; `meanings` is what they say of dimensions.
@@ -47,7 +53,7 @@ def run_tail(
 
     flags = classflags.parting([*readers, *tail], with_ours=True)
     with Callbacks() as callbacks:
-        stages = merged(callbacks, readers, new, flags)
+        stages = merged(callbacks, readers, new, flags, seen)
         tail = [{k: v for k, v in stage.items() if k != "inputs"} for stage in tail]
         if flags.way == "around":
             tail = [stage for stage, _ in classflags.around(tail)]
@@ -63,14 +69,18 @@ def run_tail(
 
 
 def merged(
-    callbacks: Callbacks, readers: list[dict[str, Any]], new: list[NewValues], flags: classflags.Parting
+    callbacks: Callbacks,
+    readers: list[dict[str, Any]],
+    new: list[NewValues],
+    flags: classflags.Parting,
+    seen: CellsSeen | None = None,
 ) -> list[dict[str, Any]]:
-    """Stages that read points, give them their new values, and merge them."""
+    """Stages that read points, give them their new values, and merge them; `seen` looks at them then."""
     stages: list[dict[str, Any]] = []
     inputs = []
     for number, (reader, values) in enumerate(zip(readers, new, strict=True)):
         stages.append({**reader, "tag": f"in{number}"})
-        stages += _put(callbacks, values, f"in{number}", f"put{number}")
+        stages += _put(callbacks, values, f"in{number}", f"put{number}", seen)
         inputs.append(f"put{number}")
         if flags.way == "split" and flags.old[number]:
             stages.append(classflags.splitter(inputs=[f"put{number}"], tag=f"split{number}"))
@@ -78,7 +88,9 @@ def merged(
     return [*stages, {"type": "filters.merge", "inputs": inputs}]
 
 
-def _put(callbacks: Callbacks, new: NewValues, after: str, tag: str) -> list[dict[str, Any]]:
+def _put(
+    callbacks: Callbacks, new: NewValues, after: str, tag: str, seen: CellsSeen | None
+) -> list[dict[str, Any]]:
     """Filters that give a reader's points their new values, and drop some; PDAL wants the two apart."""
 
     def put(module, ins, outs) -> None:
@@ -90,6 +102,8 @@ def _put(callbacks: Callbacks, new: NewValues, after: str, tag: str) -> list[dic
             else:
                 outs[name] = np.array(ins[name])
                 outs[name][rows] = values
+        if seen is not None:
+            seen.look(module, ins, outs, new.kept)
 
     def drop(module, ins, outs) -> None:
         outs["Mask"] = np.ascontiguousarray(new.kept, bool)

@@ -159,7 +159,15 @@ class Worklist:
                 count = survey.indexes[item.source.path].count
                 results = [str(store.result(job.name)) for job in item.jobs]
                 return FileTask(
-                    item.source, count, results, plan.tail, plan.beside, item.outputs, scratch, plan.meanings
+                    item.source,
+                    count,
+                    results,
+                    plan.tail,
+                    plan.beside,
+                    item.outputs,
+                    scratch,
+                    plan.meanings,
+                    plan.cells,
                 )
             sources = survey.near(item.tile, far)
             return TileTask(
