@@ -101,7 +101,7 @@ def main() -> None:
             costs["Call"] = []
             for _ in range(3):
                 began = time.process_time()
-                index_las(str(middle), survey.grid)
+                index_las(str(middle), survey.grid, str(folder / "copy"))
                 costs["Call"].append(time.process_time() - began)
             pool.costs.clear()
             for _ in range(o.runs + 1):  # the first compiles, or loads what is compiled

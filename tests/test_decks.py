@@ -508,3 +508,29 @@ def test_the_bridge_of_delft_over_a_canal_is_found(data_dir):
 
 def test_the_api_has_it():
     assert ps.Filter.bridges
+
+
+def opposite_by_hand(one, other):
+    best, found = (0, 0), None
+    for a in range(16):
+        here = np.zeros(16, bool)
+        here[(a + np.arange(-2, 3)) % 16] = True
+        there = np.roll(here, 8)
+        score = min(one[here].sum(), other[there].sum()), one[a] + other[(a + 8) % 16]
+        if score > best and score[0] > 0:
+            best, found = score, (here, there)
+    return found
+
+
+@given(st.lists(st.integers(0, 3), min_size=32, max_size=32), st.booleans())
+def test_the_ends_that_hold_the_most_lie_opposite(counts, same):
+    one, other = np.array(counts, np.int64).reshape(2, 16)
+    other = one if same else other
+    found, expected = decks._opposite(one, other), opposite_by_hand(one, other)
+    assert (found is None) == (expected is None)
+    if expected is not None:
+        assert all(np.array_equal(a, b) for a, b in zip(found, expected, strict=True))
+
+
+def test_lengths_of_ways_fit_their_type():
+    assert decks.WIDEST / decks.CELL * walkable.STRAIGHT < walkable.ENDLESS <= np.iinfo(np.int16).max

@@ -47,7 +47,7 @@ def view_of(path, tag="in0", **reader):
     small = path.with_name(f"few_{path.name}")
     few.write(small)
     reader = {"type": "readers.las", **reader, "filename": str(small)}
-    return View([(reading_of(reader, sampled(records)), records)], {}), {**reader, "tag": tag}
+    return View.of_file(reading_of(reader, sampled(records)), records), {**reader, "tag": tag}
 
 
 @pytest.mark.parametrize("point_format", [0, 1, 2, 3, 6, 7, 8])

@@ -106,6 +106,24 @@ def test_a_copy_that_is_not_whole_is_not_read(tmp_path, cloud, harm):
     assert same((made.index, made.away, made.tiles, (tmp_path / "again.las").read_bytes()), expected)
 
 
+@pytest.mark.parametrize("part", [1_000_000, 30_000])
+def test_an_input_is_unpacked_out_of_its_copy(tmp_path, cloud, monkeypatch, part):
+    monkeypatch.setattr(byplace, "_PART", part)
+    copy, plain = tmp_path / "copy", tmp_path / "plain.las"
+    count = index_las(str(cloud), GRID, str(copy)).count
+    assert extract.unpacked(str(cloud), str(copy), count, str(plain))
+    packed, made = laspy.read(cloud), laspy.read(plain)
+    assert made.points.array.tobytes() == packed.points.array.tobytes() and len(made) == count
+    assert (
+        not made.header.are_points_compressed
+        and made.header.offsets.tolist() == packed.header.offsets.tolist()
+    )
+    copy.write_bytes(copy.read_bytes()[:-5])
+    assert not extract.unpacked(str(cloud), str(copy), count, str(plain))
+    assert not extract.unpacked(str(cloud), "", count, str(plain))
+    assert not extract.unpacked(str(plain), str(copy), count, str(tmp_path / "again.las"))
+
+
 def test_no_room_for_a_copy(tmp_path, cloud, monkeypatch):
     def full(self):
         raise OSError(28, "No space left on device")
@@ -114,6 +132,12 @@ def test_no_room_for_a_copy(tmp_path, cloud, monkeypatch):
     monkeypatch.setattr(CopyByPlace, "_write", full)
     found = index_las(str(cloud), GRID, str(tmp_path / "copy"))
     assert found.tiles == expected.tiles and not list(tmp_path.iterdir())
+
+
+def test_a_copy_that_cannot_get_its_name(tmp_path, cloud):
+    (tmp_path / "copy").mkdir()
+    assert index_las(str(cloud), GRID, str(tmp_path / "copy")).count == 120_000
+    assert [p.name for p in tmp_path.iterdir()] == ["copy"]
 
 
 def test_a_damaged_input_leaves_no_copy(tmp_path, cloud):

@@ -142,26 +142,51 @@ def _ways(fields: Sequence[str], path: str) -> dict[str, Callable[[NDArray], NDA
     return {name: way for name, way in ways.items() if needs.get(name, "X") in fields}
 
 
+@dataclass(frozen=True)
+class _Part:
+    """Points of a file."""
+
+    reading: Reading
+    records: NDArray
+    mask: NDArray[np.bool_] | None = None  #: which of them are meant; None for all
+
+    @property
+    def count(self) -> int:
+        return len(self.records) if self.mask is None else int(np.count_nonzero(self.mask))
+
+    def those(self, mask: NDArray[np.bool_]) -> _Part:
+        """Some of the points."""
+        if self.mask is not None:
+            chosen = self.mask.copy()
+            chosen[self.mask] = mask
+            mask = chosen
+        return _Part(self.reading, self.records, mask)
+
+    def decoded(self, name: str) -> NDArray:
+        values = self.reading.decoded[name](self.records)
+        return values if self.mask is None else values[self.mask]
+
+
 class View(Mapping[str, NDArray]):
     """Points as a stage sees PDAL's: dimensions by name. What a file holds is decoded each time that it is asked for."""
 
-    def __init__(self, parts: Sequence[tuple[Reading, NDArray]], made: dict[str, NDArray]) -> None:
+    def __init__(self, parts: Sequence[_Part], made: dict[str, NDArray]) -> None:
         self._parts = list(parts)
         self._made = made  #: what stages changed or made
         self._places: dict[str, NDArray] = {}  #: coordinates, which one stage asks for several times
-        self.count = sum(len(records) for _, records in self._parts)
-        types = [reading.types for reading, _ in self._parts]
-        if any(one != types[0] for one in types):
-            raise NeedsPdal("inputs of several kinds")
-        self._read = types[0]
-        self.module = self._parts[0][0].module
-        if any(reading.module["spatialreference"] != self.module["spatialreference"] for reading, _ in parts):
-            raise NeedsPdal("inputs of several references")
+        self.count = sum(part.count for part in self._parts)
+        first = self._parts[0].reading
+        self._read, self.module = first.types, first.module
+        for part in self._parts:
+            if part.reading.types != first.types:
+                raise NeedsPdal("inputs of several kinds")
+            if part.reading.module["spatialreference"] != first.module["spatialreference"]:
+                raise NeedsPdal("inputs of several references")
 
     @classmethod
-    def of_file(cls, reader: Mapping[str, Any], reading: Reading, records: NDArray) -> View:
+    def of_file(cls, reading: Reading, records: NDArray) -> View:
         """All points that a reader would give."""
-        return cls([(reading, records)], {})
+        return cls([_Part(reading, records)], {})
 
     @classmethod
     def merged(cls, views: Sequence[View]) -> View:
@@ -177,9 +202,9 @@ class View(Mapping[str, NDArray]):
     def those(self, mask: NDArray[np.bool_]) -> View:
         """Some of the points."""
         parts, start = [], 0
-        for reading, records in self._parts:
-            parts.append((reading, records[mask[start : start + len(records)]]))
-            start += len(records)
+        for part in self._parts:
+            parts.append(part.those(mask[start : start + part.count]))
+            start += part.count
         return View(parts, {name: values[mask] for name, values in self._made.items()})
 
     def __getitem__(self, name: str) -> NDArray:
@@ -189,9 +214,9 @@ class View(Mapping[str, NDArray]):
             return self._places[name]
         if name not in self._read:
             raise KeyError(name)
-        if any(name not in reading.decoded for reading, _ in self._parts):
+        if not self._decodes(name):
             raise NeedsPdal(f"the dimension '{name}'")
-        decoded = [reading.decoded[name](records) for reading, records in self._parts]
+        decoded = [part.decoded(name) for part in self._parts]
         values = decoded[0] if len(decoded) == 1 else np.concatenate(decoded)
         if name in ("X", "Y", "Z"):
             self._places[name] = values
@@ -220,7 +245,7 @@ class View(Mapping[str, NDArray]):
             raise NeedsPdal(f"the dimension '{name}'")
 
     def _decodes(self, name: str) -> bool:
-        return all(name in reading.decoded for reading, _ in self._parts)
+        return all(name in part.reading.decoded for part in self._parts)
 
     def write(self, outs: Mapping[str, NDArray]) -> None:
         """Take what a filter wrote."""
@@ -260,7 +285,7 @@ def execute(stages: Sequence[dict[str, Any]], read: Mapping[str, View]) -> pdal_
         waiting.append(views)
         if "tag" in stage:
             tagged[stage["tag"]] = views
-    log = "\n".join(dict.fromkeys(part[0].log for view in read.values() for part in view._parts))
+    log = "\n".join(dict.fromkeys(part.reading.log for view in read.values() for part in view._parts))
     return pdal_env.Execution(
         count=sum(view.count for given in waiting for view in given), metadata={}, arrays=[], log=log
     )

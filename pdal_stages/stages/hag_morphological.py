@@ -188,6 +188,7 @@ of Z.
         usable = points.usable(self.ignore)
         wanted = points.wanting("HeightAboveGround", self.makes_again)
         all_wanted = bool(wanted.all())
+        cells, self.from_blocks = self.from_blocks, None  # needed once
         found = filtered_ground(
             *(points.axes if all_wanted else [axis[wanted] for axis in points.axes]),
             mask=usable if all_wanted else usable[wanted],
@@ -200,7 +201,7 @@ of Z.
             slope_too=self.terrain_slope,
             decks=self.decks,
             threads=self.threads,
-            cells=self.from_blocks,
+            cells=cells,
             figures=points.report.figures,
         )
         out = {}

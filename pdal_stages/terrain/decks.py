@@ -196,6 +196,7 @@ def _deck_levels(z, use, column, row):
     kind = surfaces(heights, start, h, w)
     way, last, end = ways(heights, start, h, w, kind, int(WIDEST / CELL) * STRAIGHT)
     deck, above = between_drops(way, last, int(WIDEST / CELL) * STRAIGHT)
+    del way, last  # the most that is held
     if not deck.any():
         return None
     raster = heights, start, h, w, kind, end
@@ -362,7 +363,7 @@ def whole_decks(raster, number, sums, box) -> NDArray[np.bool_]:
     """Levels (n,) of the parts that are decks, but for those that are too long to be judged as a whole."""
     z, start, h, w, kind, end = raster
     outward, cut, drops, ends = rims(z, start, h, w, kind, end, number, sums)
-    land, seen = np.empty((len(z), 3), np.int64), np.full(len(z), -1, np.int64)
+    land, seen = np.empty((len(z), 3), np.int32), np.full(len(z), -1, np.int32)
     good = np.zeros(len(sums) + 1, bool)
     stamp = 0
     for k in np.flatnonzero((sums[:, 0] >= SMALLEST) & (_extent(box) <= LONGEST / CELL)):
@@ -393,22 +394,19 @@ def _extent(box: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.maximum(box[:, 1] - box[:, 0], box[:, 3] - box[:, 2]) + 1
 
 
+#: The sectors of an end in each direction, and those that lie opposite them.
+_ENDS = np.array([[(a - b + NEAR) % SECTORS <= 2 * NEAR for a in range(SECTORS)] for b in range(SECTORS)])
+_OPPOSITE = np.roll(_ENDS, SECTORS // 2, axis=1)
+
+
 def _opposite(
     one: NDArray[np.int64], other: NDArray[np.int64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:
     """The sectors of two ends that lie opposite each other and hold the most: of one kind, and of the other."""
-    best, found = (0, 0), None
-    for a in range(SECTORS):
-        here = np.zeros(SECTORS, bool)
-        here[(a + np.arange(-NEAR, NEAR + 1)) % SECTORS] = True
-        there = np.roll(here, SECTORS // 2)
-        score = (
-            int(min(one[here].sum(), other[there].sum())),
-            int(one[a] + other[(a + SECTORS // 2) % SECTORS]),
-        )
-        if score > best and score[0] > 0:
-            best, found = score, (here, there)
-    return found
+    both = np.minimum(_ENDS @ one, _OPPOSITE @ other)
+    middle = one + np.roll(other, SECTORS // 2)
+    best = np.lexsort((-np.arange(SECTORS), middle, both))[-1]  # of equal ones the first
+    return (_ENDS[best], _OPPOSITE[best]) if both[best] > 0 else None
 
 
 @njit

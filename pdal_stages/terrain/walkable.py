@@ -33,7 +33,7 @@ ON, DOWN, ACROSS, NOTHING, WALLED = 0, 1, 2, 3, 4
 RIGHT, UP = np.array([1, 1, 0, -1, -1, -1, 0, 1]), np.array([0, 1, 1, 1, 0, -1, -1, -1])
 STRAIGHT, DIAGONAL = 10, 14
 #: No way.
-ENDLESS = 1 << 20
+ENDLESS = 30_000
 
 
 @device
@@ -130,7 +130,7 @@ def ways(z, start, h, w, kind, most):
 
     In tenths of cells, ENDLESS where there is neither or it is more than `most` away; ON where the way goes on.
     """
-    way, end = np.full((len(z), 8), ENDLESS, np.int32), np.zeros((len(z), 8), np.int8)
+    way, end = np.full((len(z), 8), ENDLESS, np.int16), np.zeros((len(z), 8), np.int8)
     last = np.full((len(z), 8), WALLED, np.int8)
     for d in range(8):
         di, dj = RIGHT[d], UP[d]

@@ -81,8 +81,9 @@ class CopyByPlace:
                 self._drop()
 
     def _drop(self) -> None:
-        with contextlib.suppress(OSError):
-            self._file.close()
+        if self._file is not None:
+            with contextlib.suppress(OSError):
+                self._file.close()
         self._file = None
         self._waiting = []
         with contextlib.suppress(OSError):
@@ -126,8 +127,8 @@ class CopyByPlace:
         end = np.array([(len(cells), self._width, self._count, _MAGIC)], _END)
         self._file.write(cells.tobytes() + end.tobytes())
         self._file.close()
-        self._file = None
         os.replace(self._partial, self.path)
+        self._file = None
 
 
 def points_in(path: str, count: int, box: Box) -> Iterator[tuple[NDArray[np.int64], NDArray]] | None:

@@ -243,6 +243,34 @@ def sampled(records: NDArray) -> NDArray:
     return records[np.linspace(0, len(records) - 1, min(len(records), SAMPLE)).astype(np.int64)]
 
 
+def unpacked(path: str, copy: str, count: int, target: str) -> bool:
+    """Write a LAZ file's points uncompressed, out of its copy by place; whether there is a whole one, and it is worth it.
+
+    Everything else in the file is the same. PDAL takes four times as long to read points that are compressed.
+    """
+    header = las.read_header(path)
+    if header is None or not header.compressed or not copy:
+        return False
+    everywhere = (-np.inf, -np.inf, np.inf, np.inf)
+    found = 0
+    try:
+        points = points_in(copy, count, everywhere)
+        if points is None:
+            return False
+        head, tail = plain_header(path)
+        with open(target, "wb") as out:
+            out.write(head)
+            for numbers, records in points:  # parts follow each other as in the file
+                if records.dtype.itemsize != header.point_bytes or numbers[0] != found:
+                    return False
+                out.write(records.tobytes())
+                found += len(records)
+            finish(out, head, tail, found)
+    except (OSError, ValueError):
+        return False
+    return found == count
+
+
 class _Points(NamedTuple):
     """Points as a file holds them, and their coordinates."""
 

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..base import las
 from ..base.asprs import LEGACY_LIMIT
+from ..base.errors import PipelineError
 from ..pipeline.beside import extra_dims_option
 from ..pipeline.filenames import LAS_WRITERS
 from . import sizing
+from .extract import unpacked
 from .grid import Box
 from .inparts import HeadersDifferError, write_in_parts
 from .rasters import on_one_grid
@@ -39,6 +44,7 @@ class FileTask:
     scratch: str  #: folder for temporary files
     meanings: dict[str, str]  #: see TilePlan
     cells: OutputCells | None = None  #: see TilePlan
+    copy: str = ""  #: of the input by place, see :mod:`.byplace`; empty where there is none
 
     def run(self) -> dict[str, Any]:
         """Write the outputs; see :func:`~pdal_stages.tiling.tail.run_tail`. The record counts classes, too."""
@@ -86,9 +92,17 @@ class FileTask:
         header = las.read_header(self.source.path)
         if header is not None and header.count:
             tail = on_one_grid(tail, header.box, half_open=False)
-        return run_tail(
-            [reader], [new_values(0, self.count)], tail, self.outputs, self.meanings, self.scratch, seen
-        )
+        rest = [new_values(0, self.count)], tail, self.outputs, self.meanings, self.scratch, seen
+        if not self.copy:
+            return run_tail([reader], *rest)
+        with TemporaryDirectory(prefix="file-", dir=self.scratch, ignore_cleanup_errors=True) as folder:
+            plain = os.path.join(folder, f"{Path(self.source.path).stem}.las")
+            if unpacked(self.source.path, self.copy, self.count, plain):
+                with contextlib.suppress(PipelineError):  # whose message would name this file
+                    return run_tail([{**reader, "filename": plain}], *rest)
+                if seen is not None:
+                    seen.begin()
+        return run_tail([reader], *rest)
 
 
 def write_tile(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import OrderedDict
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -65,7 +65,7 @@ class HeadRun:
 class FromBefore(NamedTuple):
     """What the rounds before the tiles made for a tile."""
 
-    from_blocks: Any  #: for the far-reaching stage
+    from_blocks: Callable[[], Any]  #: for the far-reaching stage
     #: Of each piece, new values that the stages before it gave: rows and values by dimension.
     changed: list[dict[str, tuple[NDArray[np.int64], NDArray]]]
 
@@ -122,7 +122,7 @@ def run_head(
             ours.stage.own_points = OUTSIDE
             if ours.number == from_afar:
                 assert before is not None
-                ours.stage.from_blocks = before.from_blocks
+                ours.stage.from_blocks = before.from_blocks()
             if ours.number in reaches:
                 reaches[ours.number].stage = ours.stage
         found.with_places = any(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
@@ -230,7 +230,7 @@ def _read(pipeline: Pipeline, cuts: list[Piece]) -> dict[str, View] | None:
         for number, piece in enumerate(cuts):
             if piece.records is None:
                 raise NeedsPdal("points in a file")
-            views[f"in{number}"] = View([(_reading(piece, piece.records), piece.records)], {})
+            views[f"in{number}"] = View.of_file(_reading(piece, piece.records), piece.records)
     except NeedsPdal:
         _write(cuts)
         return None

@@ -14,9 +14,9 @@ from .sources import Extent
 
 #: Memory of a worker: programs and model, a point of a tile with its halo, a point of an output file that is put
 #: together, and the `memory` option of our stages. See docs/large-areas.md.
-BASE, TILE_POINT, FILE_POINT, BLOCKS = 350 << 20, 350, 250, 512 << 20
+BASE, TILE_POINT, FILE_POINT, BLOCKS = 350 << 20, 270, 250, 512 << 20
 #: Of a cell of the raster of which a block is made before the tiles.
-_CELL = 250
+_CELL = 200
 #: Of the process that hands out the work.
 PARENT = 350 << 20
 #: Points of a larger file are put together in parts of so many.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from functools import partial
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -119,4 +120,5 @@ def _before(task: TileTask, cuts: list[Piece], halo_m: float) -> FromBefore | No
     if first is None or not task.before:
         return None
     before = Before(task.before, task.context, first)
-    return FromBefore(before.from_blocks(task.tile, halo_m), [before.changed(piece) for piece in cuts])
+    blocks = partial(before.from_blocks, task.tile, halo_m)
+    return FromBefore(blocks, [before.changed(piece) for piece in cuts])

@@ -323,6 +323,8 @@ def _narrowed(step: _Step, later: float) -> dict[str, Any]:
             seen_to = later + ours.inner_halo_m()
             seen = f"{OUTSIDE} <= {seen_to!r}" if seen_to > 0 else f"{OUTSIDE} < 0"
             stage["where"] = f"({ours.where}) && ({seen})" if ours.where else seen
+        if (memory := ours.memory_in_tiles()) is not None:
+            stage.setdefault("memory", memory)
     return stage
 
 

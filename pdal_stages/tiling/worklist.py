@@ -168,6 +168,7 @@ class Worklist:
                     scratch,
                     plan.meanings,
                     plan.cells,
+                    survey.indexes[item.source.path].copy,
                 )
             sources = survey.near(item.tile, far)
             return TileTask(
