@@ -27,10 +27,14 @@ def around(
     column: NDArray, row: NDArray, left: int, bottom: int, shape: tuple[int, int]
 ) -> NDArray[np.bool_]:
     """Cells (h, w) at which a surface is asked for: those of points, and all round them, whose planes points blend."""
-    needed = np.zeros(shape, bool)
-    for down in (-1, 0, 1):
-        for right in (-1, 0, 1):
-            needed[row - bottom + down, column - left + right] = True
+    held = np.zeros(shape, bool)
+    held[row - bottom, column - left] = True
+    needed = held.copy()
+    needed[1:] |= held[:-1]
+    needed[:-1] |= held[1:]
+    held = needed.copy()
+    needed[:, 1:] |= held[:, :-1]
+    needed[:, :-1] |= held[:, 1:]
     return needed
 
 
