@@ -14,6 +14,7 @@ from pdal_stages.pipeline.run import Pipeline
 from pdal_stages.pipeline.straight import NeedsPdal, View, may_run, reading_of
 from pdal_stages.tiling import headrun, run_tiled
 from pdal_stages.tiling.extract import SAMPLE, sampled
+from pdal_stages.tiling.tileplan import make_plan
 
 pytestmark = pytest.mark.pdal
 WKT = (
@@ -188,3 +189,12 @@ def test_tiles_of_files_with_what_stages_make_go_through_pdal(tmp_path, write_la
     whole.execute()
     made = np.asarray(laspy.read(tmp_path / "a_out.las")["HeightAboveGround"])
     assert np.array_equal(made, whole.arrays[0]["HeightAboveGround"].astype(made.dtype))
+
+
+def test_blocks_take_less_memory_in_tiles_where_nobody_says_how_much():
+    def memory(**given):
+        stages = ["in.las", {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]}]
+        stages += [{"type": "filters.modelclassifier", "model": "standard", **given}, "out.las"]
+        return make_plan(Pipeline(stages, whole=False)).head[1].get("memory")
+
+    assert memory() == 256 and memory(memory=700) == 700
