@@ -487,6 +487,7 @@ def test_bad_clouds_give_an_error_or_a_whole_file(tmp_path, codes, epsg, text, c
     target = tmp_path / "out.gpkg"
     code = cli.main(["objects", str(tmp_path / "in.laz"), str(target)])
     said = capsys.readouterr().err
+    assert not list(tmp_path.glob(".out*"))
     if text:
         assert code == 1 and text in said and not target.exists()
     else:

@@ -213,7 +213,12 @@ def _all_cells(inputs: Sequence[str], stage: ObjectsWriter, wkt: str, workers: i
         if len(parts) == 32:  # so that overlapping files are not held apart
             parts = [Cells.join(parts)]
     cells = Cells.join(parts)
-    refuse_unclassified(cells, np.flatnonzero(seen).astype(np.uint8))
+    try:
+        refuse_unclassified(cells, np.flatnonzero(seen).astype(np.uint8))
+    except StageError:  # nothing to go on with
+        for *_, kept in work:
+            Path(kept).unlink(missing_ok=True)
+        raise
     return cells
 
 
