@@ -72,26 +72,56 @@ def erode_step(source, target, square):
 
 
 @device
-def _line_maximum(one, two, dy, dx, length):
-    """Running maximum of `length` cells along (dy, dx), starting at each cell, in `one`.
+def _raise(out, other):
+    for i in range(len(out)):
+        out[i] = out[i] if out[i] > other[i] else other[i]
 
-    Doubling: a maximum of 2m cells is that of two of m cells. Returns the buffer that holds it and
-    the other one; what lies beyond the array is left out.
+
+@device
+def _row_maximum(row, spare, length):
+    """Running maximum of `length` cells of a row, starting at each cell, in place; what lies beyond it is left out.
+
+    Doubling: a maximum of 2m cells is that of two of m cells. A row stays in a core's cache meanwhile.
     """
-    h, w = one.shape
+    w = len(row)
     done = 1
     while done < length:
         step = min(done, length - done)
-        sy, sx = dy * step, dx * step
-        for j in range(h):
-            if 0 <= j + sy < h:
-                _higher(one[j][: w - sx], one[j + sy][sx:], two[j][: w - sx])
-                _copy(one[j][w - sx :], two[j][w - sx :])
-            else:
-                _copy(one[j], two[j])
-        one, two = two, one
+        if step >= w:
+            break
+        _copy(row, spare)
+        _raise(row[: w - step], spare[step:])
         done += step
-    return one, two
+
+
+@device
+def _line_maximum(one, two, dy, dx, length):
+    """The same along (dy, dx), in `one`; dy is 1 or -1, dx 0 or 1. `two` is as large, and its content is lost.
+
+    Van Herk's way [H92], row by row: lines are cut into pieces of `length` rows, and a window ends in the piece after the
+    one in which it begins. So it is the larger of the maxima to the end of the one and from the begin of the other. Windows
+    that end beyond the last column see their own piece alone.
+
+    [H92] van Herk (1992): A fast algorithm for local minimum and maximum filters on rectangular and octagonal kernels.
+    Pattern Recognition Letters 13, 517-521.
+    """
+    h, w = one.shape
+    if length < 2:
+        return
+    start = 0 if dy > 0 else h - 1
+    for k in range(h):  # from the begin of the piece
+        here = two[start + dy * k]
+        _copy(one[start + dy * k], here)
+        if k % length:
+            _raise(here[dx:], two[start + dy * (k - 1)][: w - dx])
+    for k in range(h - 2, -1, -1):  # to its end
+        if (k + 1) % length:
+            _raise(one[start + dy * k][: w - dx], one[start + dy * (k + 1)][dx:])
+    for k in range(h):
+        last = min(k + length - 1, h - 1)
+        shift = dx * (last - k)
+        if last // length != k // length and shift < w:
+            _raise(one[start + dy * k][: w - shift], two[start + dy * last][shift:])
 
 
 @njit
@@ -104,6 +134,11 @@ def dilate(eroded, raster, radius, squares, one, two, target):
     pad = radius + 1
     height, width = h + 2 * pad, w + 2 * pad
     one, two = one[: height * width].reshape(height, width), two[: height * width].reshape(height, width)
+    # Running maxima look ahead; `top` and `left` say how far the middle of the window lies behind.
+    side = 2 * squares + 1
+    top, left = squares, squares
+    diamonds = radius - squares
+    spare = np.empty(width, np.float32)
     for j in range(height):
         row = one[j]
         for i in range(width):
@@ -112,13 +147,12 @@ def dilate(eroded, raster, radius, squares, one, two, target):
             inner, e, f = row[pad : pad + w], eroded[j - pad], raster[j - pad]
             for i in range(w):
                 inner[i] = _NOTHING if f[i] == HOLE else e[i]
-    # Running maxima look ahead; `top` and `left` say how far the middle of the window lies behind.
-    side = 2 * squares + 1
-    top, left = squares, squares
-    diamonds = radius - squares
-    # Rows and columns: a square. A cross, then both diagonals: a full diamond.
-    for dy, dx, length in ((0, 1, side), (1, 0, side), (1, 1, diamonds), (-1, 1, diamonds)):
-        one, two = _line_maximum(one, two, dy, dx, length)
+            _row_maximum(row, spare, side)
+    # Rows and columns: a square. A cross, then both diagonals: a full diamond. Beyond the last of the raster's columns
+    # there is nothing in the buffer, and it has more of these than any window.
+    _line_maximum(one, two, 1, 0, side)
+    _line_maximum(one, two, 1, 1, diamonds)
+    _line_maximum(one, two, -1, 1, diamonds)
     left += max(diamonds - 1, 0)
     for j in range(h):
         y, x, out = j + pad - top, pad - left, target[j]
