@@ -200,7 +200,7 @@ def run_first_round(work: Worklist, store: Store, pool: Pool, retries: int, show
         made_of = [marks[tile] for tile in found if tile not in failed]
         mark = fingerprint(build(), before[-1], unit, block, made_of)
         items.append(_Item(block, block_file(block), mark, partial(block_task, block)))
-    for item, answer in made(items, "ground of blocks"):
+    for item, answer in made(items, "ground by blocks"):
         if answer.reason:
             x0, y0, x1, y1 = (side / unit for side in block_grid(first).box(item.at))
             fail((x0, y0, x1, y1), context.plan.halo_m + first.blocks.around, answer.reason)
@@ -224,7 +224,8 @@ def _made(
             store.forget(item.name)
             waiting.append(item)
     count, failures = len(waiting), []
-    with Progress(sum(item.points for item in waiting) or count, what, enabled=show) as progress:
+    points = sum(item.points for item in waiting)
+    with Progress(points or count, what, "points" if points else "blocks", enabled=show) as progress:
         for item, answer in last_tries(
             pool, waiting, lambda item: item.task(), retries, lambda _, cost: costs.add("first_rounds", cost)
         ):
