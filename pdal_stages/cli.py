@@ -15,7 +15,6 @@ from .base.outputs import Output, check_outputs
 from .base.plain import PlainStream, print_messages
 from .base.runlog import LoggedStream, RunLog
 from .base.version import __version__
-from .commands import about, beginning, classifying, models, pipelines, reviewing
 from .commands.adder import OVERRIDES, Adder
 from .pipeline.overrides import parse_overrides
 
@@ -137,6 +136,9 @@ def _refuse_words(command: argparse.ArgumentParser, unknown: list[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
+    # Here, where an environment that lacks something is told in a sentence.
+    from .commands import about, beginning, classifying, models, pipelines, reviewing
+
     parser = argparse.ArgumentParser(
         prog="pdal-stages",
         description="PDAL pipelines with stages that classify airborne laser scans.",

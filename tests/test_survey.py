@@ -318,5 +318,5 @@ def test_a_worker_has_room_for_the_blocks_before_the_tiles():
     assert block_bytes(blocks, 2e9) == whole and block_bytes(blocks, 1e5) < 0.1 * whole
     assert block_bytes(Blocks(2048.0, 988.0, 200.0, 4.0), 1e9) == whole  # of cells of 2 m
     assert worker_bytes(1000, 0, whole) - worker_bytes(1000, 0) == pytest.approx(
-        whole - (512 << 20) - 350_000
+        whole - (512 << 20) - 270_000
     )

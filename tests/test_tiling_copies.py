@@ -118,6 +118,7 @@ def test_an_input_is_unpacked_out_of_its_copy(tmp_path, cloud, monkeypatch, part
         not made.header.are_points_compressed
         and made.header.offsets.tolist() == packed.header.offsets.tolist()
     )
+    assert not extract.unpacked(str(cloud), str(copy), count, str(tmp_path / "nowhere" / "plain.las"))
     copy.write_bytes(copy.read_bytes()[:-5])
     assert not extract.unpacked(str(cloud), str(copy), count, str(plain))
     assert not extract.unpacked(str(cloud), "", count, str(plain))

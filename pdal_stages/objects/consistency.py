@@ -47,8 +47,8 @@ ENOUGH, SHARE, ALL = 10, 0.9, 0.9
 SCATTER, NEAR = 0.1, 0.2
 #: Coordinates within a voxel are whole numbers of this part of a meter.
 _PARTS = 1024.0
-#: Reliabilities are summed as whole numbers of this part.
-_SHARES = 65536.0
+#: Reliabilities are summed as whole numbers of this part, which is what files round them to: of rounded ones the same.
+_SHARES = 64.0
 
 
 def consistent(

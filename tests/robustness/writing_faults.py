@@ -147,6 +147,12 @@ CASES = {
         False,
         ".pdal-stages",
     ),
+    "train in tiles": Case(
+        "o.model",
+        lambda inputs, target: ["train", inputs / "in.las", "--model", target, "--tile", 30, "--workers", 0, "--count", 50, "--trees", 2, "--neighborhoods", "c1", "--feature-set", "covariance"],
+        False,
+        ".pdal-stages-train",
+    ),
     "tiles: output of a file": tiled("in_o.las", "#_o.las"),
     "tiles: output of a tile": tiled("499980_5400000_o.las", "#_o.las", "--per", "tile", exact=False),
     "tiles: what a run keeps": tiled("in_o.las", "#_o.las", folder=".pdal-stages"),
