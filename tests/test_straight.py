@@ -107,7 +107,10 @@ def test_stages_give_the_same_bits(tmp_path, write_las, where, wkt):
         },
     ]
     stages = [{name: value for name, value in stage.items() if value is not None} for stage in stages]
-    options = {"point_format": 6, "wkt": wkt} if wkt else {"point_format": 3}
+    old = (
+        6 if pdal_env.splits_class_flags() else 3
+    )  # whose classes are read by PDAL alone where it splits them
+    options = {"point_format": 6, "wkt": wkt} if wkt else {"point_format": old}
     if where and not wkt:
         where = None
     paths = [write_las(tmp_path / f"{n}.las", cloud(seed=n), **options) for n in (1, 2)]

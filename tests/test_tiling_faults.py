@@ -145,8 +145,9 @@ def test_full_disk_leaves_nothing_half_written(tmp_path, folder, expected):
 
     def limit():
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
 
+    room = max(map(len, expected.values())) // 2
     stages = pipeline(folder, tmp_path / "o_#.laz")
     run = command(tmp_path / "job.json", stages, "--workers", "0", "--retries", "0", preexec_fn=limit)
     _, err = run.communicate(timeout=300)
