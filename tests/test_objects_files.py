@@ -14,6 +14,7 @@ from pdal_stages import cli
 from pdal_stages.base.errors import StageError
 from pdal_stages.objects import Cells
 from pdal_stages.objects.outlines import main_direction, raw_outlines, straight_outlines, straight_ring
+from pdal_stages.objects.walls import blunted
 from pdal_stages.pipeline.run import Pipeline
 from pdal_stages.synthetic import write_town
 
@@ -83,6 +84,20 @@ def test_an_l_keeps_its_corner():
     places = np.array(ring.coords)[:-1] + 0.0
     assert main_direction(places) % (np.pi / 2) == pytest.approx(0, abs=0.01)
     assert straight_ring(places[:5], 0.0) is None
+
+
+def test_small_acute_corners_go_and_large_ones_stay():
+    box = np.array([[0, 0], [30, 0], [30, 20], [0, 20]], float)
+    out = np.vstack([box[:3], [[16, 20], [15, 24], [14, 20]], box[3:]])  # a thorn of 4 cells
+    dent = np.vstack([box[:3], [[16, 20], [15, 16], [14, 20]], box[3:]])
+    for ring in (out, dent):
+        mended = shapely.Polygon(blunted(ring))
+        assert mended.is_valid and mended.area == 600
+        assert {tuple(p) for p in box} <= {tuple(p) for p in blunted(ring)}
+        np.testing.assert_array_equal(blunted(-ring), -blunted(ring))
+    wing = np.vstack([box[:3], [[20, 20], [15, 40], [10, 20]], box[3:]])  # 100 cells: a wing
+    for ring in (box, wing, box[:3]):  # the last one has nothing to spare
+        np.testing.assert_array_equal(blunted(ring), ring)
 
 
 def test_holes_stay_and_small_ones_close():

@@ -26,7 +26,7 @@ from ..base.lean import imported
 from .boundaries import polygon
 from .find import Table
 from .measure import median
-from .walls import main_direction, middles, peucker
+from .walls import blunted, main_direction, middles, peucker
 
 #: Holes smaller than this are closed, m2.
 SMALLEST_HOLE = 4.0
@@ -303,7 +303,7 @@ def straight_ring(places: NDArray, angle: float) -> NDArray[np.float64] | None:
     corners: list[NDArray] = []
     for n, line in enumerate(lines):
         corners += _meeting(lines[n - 1], line)
-    return _turned(np.array(corners), -angle)
+    return _turned(blunted(np.array(corners)), -angle)
 
 
 class _Wall(NamedTuple):

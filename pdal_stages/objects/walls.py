@@ -11,6 +11,8 @@ from ..base.jit import njit
 
 #: Places of a line that are as far off, but for rounding, cells: the first is taken.
 _ALIKE = 1e-9
+#: So acute a corner (cosine) that cuts off less than so many cells is no building's: a small annex that the grid cut.
+_ACUTE, _SPIKE = math.cos(math.radians(60.0)), 16.0
 
 
 @njit
@@ -85,3 +87,17 @@ def peucker(xy: NDArray, tolerance: float) -> NDArray:
             todo.append((a, far))
             todo.append((far, b))
     return np.flatnonzero(keep)
+
+
+def blunted(corners: NDArray) -> NDArray:
+    """Corners (k, 2) of a ring without small acute ones, out or in; the most acute goes first, four stay."""
+    xy = np.asarray(corners, np.float64)
+    while len(xy) > 4:
+        back, on = np.roll(xy, 1, axis=0) - xy, np.roll(xy, -1, axis=0) - xy
+        cut = 0.5 * np.abs(back[:, 0] * on[:, 1] - back[:, 1] * on[:, 0])
+        cosine = (back * on).sum(axis=1) / np.maximum(np.hypot(*back.T) * np.hypot(*on.T), _ALIKE)
+        spike = np.where((cosine > _ACUTE) & (cut < _SPIKE), np.round(cosine, 6), -1.0)
+        if spike.max() < 0.0:
+            break
+        xy = np.delete(xy, int(np.argmax(spike)), axis=0)
+    return xy
