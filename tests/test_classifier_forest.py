@@ -8,8 +8,7 @@ from sklearn.ensemble import ExtraTreesClassifier, RandomForestClassifier
 from sklearn.tree import DecisionTreeClassifier
 
 from pdal_stages.base.errors import ModelError
-from pdal_stages.classifier import forest as forest_module
-from pdal_stages.classifier import walk
+from pdal_stages.classifier import walk, walkable
 from pdal_stages.classifier.forest import MAX_DEPTH, Forest, float32_at_most
 from pdal_stages.classifier.growing import TreeOptions, grow
 from pdal_stages.classifier.trees import Ranked
@@ -93,10 +92,10 @@ def test_words_of_64_bits_and_a_leaf_table_with_repeats_give_the_same(monkeypatc
     trees = RandomForestClassifier(9, random_state=2).fit(x, y).estimators_
     usual = Forest.from_sklearn(trees, 17).predict_proba(x)
     with monkeypatch.context() as patch:  # as where a feature and a child need more than 32 bits
-        patch.setattr(forest_module, "WORDS", forest_module.WORDS[1:] * 2)
+        patch.setattr(walkable, "WORDS", walkable.WORDS[1:] * 2)
         wide = Forest.from_sklearn(trees, 17)
     with monkeypatch.context() as patch:  # as where two different leaves have one hash
-        patch.setattr(forest_module, "hash_of", lambda columns, seed: np.zeros(columns.shape[1], np.uint64))
+        patch.setattr(walkable, "hash_of", lambda columns, seed: np.zeros(columns.shape[1], np.uint64))
         repeats = Forest.from_sklearn(trees, 17)
     assert np.array_equal(wide.predict_proba(x), usual)
     assert np.array_equal(repeats.predict_proba(x), usual)

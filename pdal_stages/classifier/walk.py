@@ -18,7 +18,7 @@ import numpy as np
 from llvmlite import ir
 
 from ..base.jit import device, intrinsic, njit
-from .forest import SPAN
+from .walkable import SPAN
 
 #: Rows that walk a tree together, one by one or in so many vectors.
 LANES = 8
