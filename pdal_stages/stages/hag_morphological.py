@@ -90,8 +90,9 @@ class HagMorphological(Stage):
         "stands on it, else 0",
     )
     details = """
-The lowest point of every cell of a grid is taken, pits (low outliers) left out, and the grid opened with windows of
-growing radius: a cell that a window lowers by more than `slope` times its radius, or by 3.5 m, belongs to an object.
+The lowest point of every cell of a grid is taken, low outliers left out, alone or in clusters, and the grid opened with
+windows of growing radius: a cell that a window lowers by more than `slope` times its radius, or by 3.5 m, belongs to an
+object.
 A surface is fitted through what is left, ground that was taken from ridges and dams is regained where it continues the
 surface, and what is higher than all around it on every side, up to 200 m wide, is taken away: a roof has no ramp.
 Points within `threshold` plus `scalar` times the terrain's slope of the surface are ground. A point's height is its Z
@@ -99,7 +100,7 @@ minus the surface through the ground points. `Classification` is read for `ignor
 are not looked at.
 
 The options mean what they mean in PDAL's `filters.smrf`. Unlike it, every step reaches a bounded way and the grid is
-anchored to absolute coordinates: a tile with its halo (about 580 m, less with a smaller `window`) gets the heights of
+anchored to absolute coordinates: a tile with its halo (about 630 m, less with a smaller `window`) gets the heights of
 the whole cloud, bit for bit. Large buildings are removed up to 200 m; what lies far from all ground, such as
 the middle of a large hall, is measured from the openings' level. A point with no usable point near has height 0;
 metadata counts these as `without_terrain`.

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from ..base.jit import njit
 from .decks import BESIDE, CELL
 from .decks import REACH as DECKS_REACH
+from .islands import FAR as ISLANDS_FAR
+from .islands import REACH as ISLANDS_REACH
 from .lowest import COMPANY, SURROUNDINGS, heights_of, lowest_points, pits, places_of
 from .openings import HOLE
 from .patches import SIDE
@@ -84,7 +86,8 @@ class FilterOptions:
         fitted through ground between.
         """
         surfaces = ROUNDS * planes_reach(self.levels(NEAR))
-        found = COMPANY + SURROUNDINGS + 2 * self.largest_radius + plateau_reach(self.cell) + surfaces + 2
+        outliers = COMPANY + SURROUNDINGS + ISLANDS_REACH
+        found = outliers + 2 * self.largest_radius + plateau_reach(self.cell) + surfaces + 2
         return max(found, self.reach_of_decks) if self.decks else found
 
     @property
@@ -95,7 +98,7 @@ class FilterOptions:
     @property
     def link(self) -> int:
         """How far one step looks, in cells: no step of the filter sees from a point to another across more empty land."""
-        return max(COMPANY, self.largest_radius, planes_reach(self.levels(FAR))) + 2
+        return max(ISLANDS_FAR, self.largest_radius, planes_reach(self.levels(FAR))) + 2
 
 
 #: Which cells (h, w) hold ground points, and where these are on average (h, w, 3), as :attr:`GroundRaster.place`.

@@ -2,7 +2,7 @@
 
 A pit is a low outlier: an echo from below the ground (multiple reflections, noise) that would pull the
 terrain down. Ground seen through a canopy lies as deep below its surroundings, but not alone, and what it
-lies below is rough.
+lies below is rough. Clusters of such echoes keep each other company: see :mod:`.islands`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..base.jit import device, njit
-from .openings import HOLE
+from .islands import mark_islands
+from .openings import HOLE, by_distance
 
 #: Cells within which a lone low cell looks for company, and within which smooth surroundings are judged.
 COMPANY, SURROUNDINGS = 20, 4
@@ -22,15 +23,6 @@ IN_VIEW = 12
 #: Or it lies `DROP` meters below all but a `SHARE` of the cells around, if these are smooth: from the lowest
 #: eighth to the middle no more than `SPREAD` meters, and `MANY`.
 DROP, SPREAD, SHARE, MANY = 3.0, 0.75, 0.15, 10
-
-
-def _by_distance(reach: int) -> tuple[np.ndarray, np.ndarray]:
-    """Offsets (row, column) within `reach` cells, nearest first, and their distances."""
-    j, i = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    squared = (j * j + i * i).ravel()
-    order = np.lexsort((i.ravel(), j.ravel(), squared))
-    order = order[(squared[order] > 0) & (squared[order] <= reach * reach)]
-    return np.column_stack([j.ravel(), i.ravel()])[order].astype(np.int64), np.sqrt(squared[order])
 
 
 @njit
@@ -139,7 +131,8 @@ def _below_smooth(raster, out):
 def pits(raster: np.ndarray, cell: float) -> np.ndarray:
     """Cells (h, w) of a minimum grid whose lowest point is a low outlier, from float32 heights, holes ``inf``; in meters."""
     out = np.zeros(raster.shape, np.uint8)
-    offsets, distances = _by_distance(COMPANY)
+    offsets, distances = by_distance(COMPANY)
     _lonely(raster, offsets, distances, cell, out)
     _below_smooth(raster, out)
+    mark_islands(raster, cell, 3, out)
     return out > 0

@@ -18,6 +18,15 @@ _NOTHING = np.float32(-np.inf)
 _SQUARES = 0.41421356
 
 
+def by_distance(reach: int) -> tuple[np.ndarray, np.ndarray]:
+    """Offsets (row, column) within `reach` cells, nearest first, and their distances."""
+    j, i = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    squared = (j * j + i * i).ravel()
+    order = np.lexsort((i.ravel(), j.ravel(), squared))
+    order = order[(squared[order] > 0) & (squared[order] <= reach * reach)]
+    return np.column_stack([j.ravel(), i.ravel()])[order].astype(np.int64), np.sqrt(squared[order])
+
+
 def square_steps(radius: int) -> int:
     """How many of the steps to an octagon of `radius` cells are squares; the others are diamonds."""
     return int(_SQUARES * radius)
