@@ -81,16 +81,24 @@ def test_dimensions_are_what_pdal_s_reader_gives(tmp_path, write_las, point_form
         decoded += 1
         assert values.dtype == expected[name].dtype and values.flags.c_contiguous, name
         assert np.array_equal(values, expected[name]), name
-    others = {"Mine"} if point_format >= 6 else set()
+    others = set()
     if point_format < 6 and pdal_env.splits_class_flags():
         others |= {"Classification", *pdal_env.FLAGS}
     assert decoded >= len(expected.dtype.names) - len(others)
-    if "Mine" in others:
-        assert "Mine" in view
-        with pytest.raises(NeedsPdal):
-            view["Mine"]
+    assert ("Mine" in view) == (point_format >= 6)  # of older formats PDAL leaves it out unless told
     with pytest.raises(KeyError):
         view["HeightAboveGround"]
+
+
+def test_a_scaled_extra_dimension_takes_pdal(tmp_path, write_las):
+    path = write_las(tmp_path / "a.las", cloud(), point_format=6)
+    las = laspy.read(path)
+    las.add_extra_dim(laspy.ExtraBytesParams("Mine", "f8", scales=np.array([2.0]), offsets=np.array([0.0])))
+    las.write(path)  # whose zeros are the same, scaled or not
+    view, _ = view_of(path)
+    assert "Mine" in view
+    with pytest.raises(NeedsPdal):
+        view["Mine"]
 
 
 @pytest.mark.parametrize("where", [None, "Classification < 10 && Z > 0"])

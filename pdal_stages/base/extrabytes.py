@@ -23,6 +23,7 @@ class _Entry(NamedTuple):
     name: str
     type: str  #: empty for what is not a number
     description: bytes
+    scaled: bool
 
 
 def _entries(path: str | os.PathLike) -> Iterator[_Entry]:
@@ -35,7 +36,8 @@ def _entries(path: str | os.PathLike) -> Iterator[_Entry]:
             name = _text(entry[_NAME]).decode("utf-8", "replace")
             known = _TYPES[kind - 1] if 1 <= kind <= len(_TYPES) else ""
             scaled = known and options & (_SCALE | _OFFSET)
-            yield _Entry(record.data + start, name, "double" if scaled else known, _text(entry[_DESCRIPTION]))
+            held = "double" if scaled else known
+            yield _Entry(record.data + start, name, held, _text(entry[_DESCRIPTION]), bool(scaled))
 
 
 def _text(field: bytes) -> bytes:
@@ -51,6 +53,14 @@ def extra_dimensions(path: str | os.PathLike) -> dict[str, str]:
         return {entry.name: entry.type for entry in _entries(path) if entry.name and entry.type}
     except (OSError, ValueError):
         return {}
+
+
+def plain_dimensions(path: str | os.PathLike) -> list[tuple[str, str]] | None:
+    """Names and types of the extra dimensions in their order; None where one is scaled, not a number or has no name."""
+    found = list(_entries(path))
+    if any(entry.scaled or not entry.type or not entry.name for entry in found):
+        return None
+    return [(entry.name, entry.type) for entry in found]
 
 
 def descriptions(path: str | os.PathLike) -> dict[str, bytes]:

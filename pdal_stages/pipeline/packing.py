@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import StageError
-from ..base.las import POINT_BYTES, read_header
+from ..base.las import POINT_BYTES, LasHeader, read_header
 from . import pdal as pdal_env
 from .filenames import is_writer, with_outputs
 from .writerlimits import compresses, las_version
 
-_UNPACKED = ".unpacked.las"
+UNPACKED = ".unpacked.las"
 #: Points that are packed at a time.
 _BLOCK = 1_000_000
 
@@ -42,7 +42,7 @@ def unpacked_writer(writer: dict[str, Any], before: Iterable[dict[str, Any]]) ->
     ):
         return writer
     plain = {key: value for key, value in writer.items() if key != "compression"}
-    return {**plain, "filename": f"{writer['filename']}{_UNPACKED}"}
+    return {**plain, "filename": f"{writer['filename']}{UNPACKED}"}
 
 
 def pack(partials: Iterable[Path]) -> dict[str, str]:
@@ -55,11 +55,26 @@ def pack(partials: Iterable[Path]) -> dict[str, str]:
     """
     names: dict[str, str] = {}
     for folder in {partial.parent for partial in partials}:
-        for made in sorted(folder.glob(f"*{_UNPACKED}")):
-            target = made.with_name(made.name.removesuffix(_UNPACKED))
+        for made in sorted(folder.glob(f"*{UNPACKED}")):
+            target = made.with_name(made.name.removesuffix(UNPACKED))
             _pack(made, target)
             names[str(made)] = str(target)
     return names
+
+
+def packed_head(head: bytes, header: LasHeader) -> tuple[bytes, Any]:
+    """All before the points of a file that is not compressed, as one has it that is, and how lazrs compresses its points."""
+    import lazrs
+
+    more = header.point_bytes - POINT_BYTES[header.point_format]
+    coding = lazrs.LazVlr.new_for_compression(header.point_format, more)
+    data = bytes(coding.record_data())
+    # As PDAL writes it (LAS 1.4 R15, table 4): two bytes, whose, number, length, title.
+    record = struct.pack("<H16sHH32s", 0, b"laszip encoded", 22204, len(data), b"http://laszip.org") + data
+    first = bytearray(head[: header.header_bytes])
+    struct.pack_into("<II", first, 96, header.offset + len(record), header.records + 1)
+    first[104] |= 0x80
+    return bytes(first) + record + head[header.header_bytes :], coding
 
 
 def _pack(made: Path, target: Path) -> None:
@@ -69,17 +84,10 @@ def _pack(made: Path, target: Path) -> None:
     header = read_header(made)
     if header is None:
         raise StageError("the output file could not be written completely", found=str(target))
-    more = header.point_bytes - POINT_BYTES[header.point_format]
-    coding = lazrs.LazVlr.new_for_compression(header.point_format, more)
-    data = bytes(coding.record_data())
-    # As PDAL writes it (LAS 1.4 R15, table 4): two bytes, whose, number, length, title.
-    record = struct.pack("<H16sHH32s", 0, b"laszip encoded", 22204, len(data), b"http://laszip.org") + data
     try:
         with open(made, "rb") as source, open(target, "x+b") as out:
-            head = bytearray(source.read(header.offset))
-            struct.pack_into("<II", head, 96, header.offset + len(record), header.records + 1)
-            head[104] |= 0x80
-            out.write(head[: header.header_bytes] + record + head[header.header_bytes :])
+            head, coding = packed_head(source.read(header.offset), header)
+            out.write(head)
             packer = lazrs.ParLasZipCompressor(out, coding)
             left = header.count * header.point_bytes
             while left > 0:
@@ -99,3 +107,12 @@ def _pack(made: Path, target: Path) -> None:
         os.unlink(made)
     except (OSError, ValueError, RuntimeError, lazrs.LazrsError) as error:
         raise StageError("the output file could not be compressed", found=f"{target}: {error}") from error
+
+
+def renamed(node: Any, names: dict[str, str]) -> Any:
+    """Metadata with the names that files have in the end."""
+    if isinstance(node, dict):
+        return {key: renamed(value, names) for key, value in node.items()}
+    if isinstance(node, list):
+        return [renamed(value, names) for value in node]
+    return names.get(node, node) if isinstance(node, str) else node

@@ -22,7 +22,7 @@ from ..base.outputs import Output, check_outputs
 from ..base.report import Report
 from ..base.shortage import check_limit
 from ..stages import registry
-from . import packing, runtime, straight
+from . import direct, packing, runtime, straight
 from . import pdal as pdal_env
 from .callbacks import Callbacks, Function
 from .filenames import is_writer, named_files, readers_files, stage_files, with_outputs, writers_outputs
@@ -213,7 +213,7 @@ class Pipeline:
                         if self.look is not None and alone:
                             run.insert(len(run) - 1, callbacks.filter(self.look))
                         if read is None:
-                            result = pdal_env.execute(joined(run), arrays=arrays, loglevel=loglevel)
+                            result = self._run(run, arrays, loglevel)
                         else:
                             result = straight.execute(run, read)
                         interrupts.check()
@@ -233,9 +233,20 @@ class Pipeline:
             raise failure or ground.failure or self._located(error) from None
         names = {str(made): final for made, final in zip(partials, outputs, strict=True)}
         names |= {made: names.get(target, target) for made, target in packed.items()}
-        self.metadata = _renamed(_named_metadata(result.metadata, self.reports), names)
+        self.metadata = packing.renamed(_named_metadata(result.metadata, self.reports), names)
         self.arrays, self.log_lines = result.arrays, pdal_env.log_lines(result.log)
         return result.count
+
+    def _run(self, run: list[dict[str, Any]], arrays: bool, loglevel: int) -> pdal_env.Execution:
+        """Run what is lowered: without PDAL's table of all points where that gives the same, which takes half the memory."""
+        writes = any(ours.stage.outputs() for ours in self.lowered.ours)  # not to be written twice
+        if not arrays and loglevel == logging.WARNING and not writes and direct.may_run(run):
+            try:
+                return direct.execute(run)
+            except straight.NeedsPdal:
+                for ours in self.lowered.ours:
+                    runtime.collect(ours.label)
+        return pdal_env.execute(joined(run), arrays=arrays, loglevel=loglevel)
 
     def _check_inputs(self) -> None:
         """Open what is read, and look at the headers of LAS files: PDAL takes damaged ones for whole, or crashes."""
@@ -313,12 +324,3 @@ def _named_metadata(metadata: dict[str, Any], reports: list[tuple[str, list[Repo
 
 def _several(node: Any) -> list[Any]:
     return node if isinstance(node, list) else [node]
-
-
-def _renamed(node: Any, names: dict[str, str]) -> Any:
-    """Metadata with the names that files have in the end."""
-    if isinstance(node, dict):
-        return {key: _renamed(value, names) for key, value in node.items()}
-    if isinstance(node, list):
-        return [_renamed(value, names) for value in node]
-    return names.get(node, node) if isinstance(node, str) else node

@@ -11,14 +11,16 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
+from ..base.extrabytes import plain_dimensions
+from ..base.las import read_header
 from . import callbacks, runtime
 from . import pdal as pdal_env
 
@@ -32,6 +34,14 @@ _TYPES = {"double": "float64", "float": "float32"}
 _LIMITS = re.compile(r"(\w+)\[:([-+.\de]+)\]")
 
 
+class Records(Protocol):
+    """Points as a file has them: arrays of their fields, by laspy's names."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, field: str, /) -> NDArray: ...
+
+
 class NeedsPdal(StageError):
     """What is asked for takes PDAL."""
 
@@ -41,7 +51,7 @@ class Reading:
     """How PDAL reads a kind of file."""
 
     types: dict[str, np.dtype]  #: the dimensions, in their order
-    decoded: dict[str, Callable[[NDArray], NDArray]]  #: of records; those that are read here as PDAL does
+    decoded: dict[str, Callable[[Records], NDArray]]  #: of records; those that are read here as PDAL does
     module: dict[str, Any]  #: what a script finds set: `metadata`, `spatialreference`
     log: str  #: what PDAL said
 
@@ -63,47 +73,69 @@ def reading_of(reader: Mapping[str, Any], records: NDArray) -> Reading:
     NeedsPdal
         If it cannot, for PDAL to say why.
     """
-    found: dict[str, NDArray] = {}
-    module: dict[str, Any] = {}
-
-    def look(given: dict[str, Any], ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
-        found.update({name: np.array(values) for name, values in ins.items()})
-        module.update({name: copy.deepcopy(given.get(name)) for name in ("metadata", "spatialreference")})
-
+    seen = Seen()
     try:
         with callbacks.Callbacks() as called:
-            log = pdal_env.execute([dict(reader), called.filter(look)], arrays=False).log
+            log = pdal_env.execute([dict(reader), called.filter(seen.look)], arrays=False).log
     except StageError as error:
         raise NeedsPdal(str(error)) from error
-    if not found or len(found["X"]) != len(records):
-        raise NeedsPdal("the reader gave no points, or others")
-    ways = _ways(records.dtype.names or (), str(reader["filename"]))
-    decoded = {}
-    for name, values in found.items():
-        way = ways.get(name)
-        if way is None:
-            continue
-        here = way(records)
-        if here.dtype == values.dtype and np.array_equal(here.view(np.uint8), values.view(np.uint8)):
-            decoded[name] = way
-    return Reading({name: values.dtype for name, values in found.items()}, decoded, module, log)
+    return seen.reading(records, str(reader["filename"]), log)
 
 
-def _ways(fields: Sequence[str], path: str) -> dict[str, Callable[[NDArray], NDArray]]:
+class Seen:
+    """What PDAL made of some points."""
+
+    def __init__(self) -> None:
+        self.found: dict[str, NDArray] = {}
+        self.module: dict[str, Any] = {}
+
+    def look(self, given: dict[str, Any], ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        """A filter's function, for a callback."""
+        self.found.update({name: np.array(values) for name, values in ins.items()})
+        for name in ("metadata", "spatialreference"):
+            self.module[name] = copy.deepcopy(given.get(name))
+
+    def reading(self, records: NDArray, path: str, log: str, added: Collection[str] = ()) -> Reading:
+        """How the file at `path` is read, of whose points that were seen the `records` are given.
+
+        `added`: dimensions that the points had, and that come from the file only where its records have them.
+        """
+        if not self.found or len(self.found["X"]) != len(records):
+            raise NeedsPdal("the reader gave no points, or others")
+        ways = _ways(records.dtype.names or (), path)
+        beside = {name for name in added if name not in ways and name != "Classification"}
+        found = {name: values for name, values in self.found.items() if name not in beside}
+        decoded = {}
+        for name, values in found.items():
+            way = ways.get(name)
+            if way is None:
+                continue
+            here = way(records)
+            if here.dtype == values.dtype and np.array_equal(here.view(np.uint8), values.view(np.uint8)):
+                decoded[name] = way
+        types = {name: values.dtype for name, values in found.items()}
+        return Reading(types, decoded, self.module, log)
+
+
+def _ways(fields: Sequence[str], path: str) -> dict[str, Callable[[Records], NDArray]]:
     """Ways of reading dimensions, by PDAL's names, of records with laspy's fields (LAS 1.4 R15, tables 7 to 18)."""
-    from ..base.las import read_header
-
     header = read_header(path)
     assert header is not None
 
-    def scaled(axis: int) -> Callable[[NDArray], NDArray]:
+    def scaled(axis: int) -> Callable[[Records], NDArray]:
         field, scale, offset = "XYZ"[axis], header.scales[axis], header.offsets[axis]
-        return lambda records: records[field] * scale + offset
 
-    def bits(field: str, first: int, count: int) -> Callable[[NDArray], NDArray]:
+        def way(records: Records) -> NDArray:
+            values = records[field] * scale
+            values += offset
+            return values
+
+        return way
+
+    def bits(field: str, first: int, count: int) -> Callable[[Records], NDArray]:
         return lambda records: records[field] >> np.uint8(first) & np.uint8((1 << count) - 1)
 
-    def plain(field: str, dtype: Any = None) -> Callable[[NDArray], NDArray]:
+    def plain(field: str, dtype: Any = None) -> Callable[[Records], NDArray]:
         return lambda records: np.ascontiguousarray(records[field], dtype)
 
     ways = {axis: scaled(number) for number, axis in enumerate("XYZ")}
@@ -139,7 +171,8 @@ def _ways(fields: Sequence[str], path: str) -> dict[str, Callable[[NDArray], NDA
         if not pdal_env.splits_class_flags():  # else a few points do not tell how flags are read
             ways["Classification"] = plain("raw_classification")
     needs = {"GpsTime": "gps_time", "Infrared": "nir", "Red": "red", "Green": "green", "Blue": "blue"}
-    return {name: way for name, way in ways.items() if needs.get(name, "X") in fields}
+    ways = {name: way for name, way in ways.items() if needs.get(name, "X") in fields}
+    return {name: plain(name) for name, _ in plain_dimensions(path) or () if name in fields} | ways
 
 
 @dataclass(frozen=True)
@@ -147,7 +180,7 @@ class _Part:
     """Points of a file."""
 
     reading: Reading
-    records: NDArray
+    records: Records
     mask: NDArray[np.bool_] | None = None  #: which of them are meant; None for all
 
     @property
@@ -184,7 +217,7 @@ class View(Mapping[str, NDArray]):
                 raise NeedsPdal("inputs of several references")
 
     @classmethod
-    def of_file(cls, reading: Reading, records: NDArray) -> View:
+    def of_file(cls, reading: Reading, records: Records) -> View:
         """All points that a reader would give."""
         return cls([_Part(reading, records)], {})
 
@@ -221,6 +254,11 @@ class View(Mapping[str, NDArray]):
         if name in ("X", "Y", "Z"):
             self._places[name] = values
         return values
+
+    @property
+    def changed(self) -> set[str]:
+        """Dimensions that stages changed or made."""
+        return set(self._made)
 
     def forget(self) -> None:
         """Let go of coordinates, which are decoded anew for whoever asks."""
