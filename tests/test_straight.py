@@ -180,11 +180,17 @@ def test_readers_that_choose_take_pdal(option):
     assert not may_run([{"type": "readers.text", "filename": "a.txt"}])
 
 
-@pytest.mark.parametrize("there", [False, True])
-def test_tiles_of_files_with_what_stages_make_go_through_pdal(tmp_path, write_las, monkeypatch, there):
-    """Heights that the input has are kept outside `where`, as in one piece; other tiles do without PDAL."""
-    extra = ["HeightAboveGround"] if there else ["Mine"]
+@pytest.mark.parametrize("there", ["Mine", "HeightAboveGround", "scaled HeightAboveGround"])
+def test_tiles_of_files_with_what_stages_make(tmp_path, write_las, monkeypatch, there):
+    """Heights that the input has are kept outside `where`, as in one piece; scaled ones are read by PDAL."""
+    extra = [there] if " " not in there else []
     path = write_las(tmp_path / "a.las", cloud(4000, extra=extra), point_format=6)
+    if not extra:
+        las = laspy.read(path)
+        params = {"scales": np.array([0.01]), "offsets": np.array([1.0])}
+        las.add_extra_dim(laspy.ExtraBytesParams("HeightAboveGround", "u2", **params))
+        las["HeightAboveGround"] = np.arange(4000) / 100 + 1
+        las.write(path)
     stage = {"type": "filters.hag_minima", "cell": 5, "where": "Classification < 10"}
     ran = []
     monkeypatch.setattr(headrun, "_write", lambda cuts: ran.append([piece.write() for piece in cuts]))
@@ -195,7 +201,7 @@ def test_tiles_of_files_with_what_stages_make_go_through_pdal(tmp_path, write_la
         "extra_dims": "all",
     }
     run = run_tiled([str(path), stage, writer], 30, workers=0, progress=False)
-    assert not run.failures and bool(ran) == there
+    assert not run.failures and bool(ran) == (not extra)
     whole = Pipeline([str(path), stage])
     whole.execute()
     made = np.asarray(laspy.read(tmp_path / "a_out.las")["HeightAboveGround"])

@@ -14,6 +14,7 @@ from ..base.errors import ModelError
 from ..base.outputs import Output
 from ..base.report import Report
 from ..features import FeaturePlan
+from ..features.index import CellGrid
 from .arrays import ArrayRule
 
 #: Each kind by its word in manifests and options: its Algorithm and its Trainer, imported when asked for.
@@ -63,6 +64,7 @@ class PredictRequest:
     threads: int | None = None
     memory_mb: float = 512.0  #: for work under way
     progress: Any = None  #: its ``update`` is called with the points done
+    grid: CellGrid | None = None  #: the index of the cloud, which lies in its order
 
     @property
     def count(self) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import DimensionError
+from ..base.lazycolumns import as_column
 from ..features import returns
 
 #: What every point has: the feature engine takes these from the coordinates.
@@ -114,7 +115,7 @@ def gather(
         if name not in dimensions:
             cure = _MAKERS.get(name, f"Put the stage that creates {name} before this one")
             raise DimensionError(f"the dimension {name} is missing", where=where, cure=cure)
-        values = np.asarray(dimensions[name])
+        values = as_column(dimensions[name])
         if values.shape != (n,):
             raise DimensionError(
                 f"the dimension {name} must have one value per point",
@@ -124,7 +125,7 @@ def gather(
         if values.dtype.kind not in "fiub":
             raise DimensionError(f"the dimension {name} is not numeric", where=where, found=str(values.dtype))
         values = values if rows is None else values[rows]
-        bad = np.count_nonzero(~np.isfinite(values)) if values.dtype.kind == "f" else 0
+        bad = np.count_nonzero(~np.isfinite(np.asarray(values))) if values.dtype.kind == "f" else 0
         if bad:
             raise DimensionError(
                 f"the dimension {name} is not finite at some points",
@@ -140,12 +141,12 @@ def gather(
         if name in COORDINATES:
             continue
         if returns.parse(name) is not None:  # made by with_returns
-            values = np.asarray(dimensions[name])
+            values = as_column(dimensions[name])
             out[name] = values if rows is None else values[rows]
         elif name != RETURN_RATIO:
             out[name] = picked(name)
         else:
-            number, total = picked("ReturnNumber"), picked("NumberOfReturns")
+            number, total = (np.asarray(picked(source)) for source in returns.SOURCES)
             there = (number > 0) & (total > 0)
             if len(total) and not there.any():
                 raise DimensionError(

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from ..base.errors import ModelError
 from ..base.report import Report
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
+from ..features.index import CellGrid
 from ..features.names import GROUPS, RELATIVE
 from .algorithms import Block, Column, PredictRequest, PredictResult
 from .arrays import ArrayRule
@@ -56,8 +57,10 @@ class Features:
         keys = ("features", "shape_bins", "copt_threshold", "feature_seed")
         return shared_features(json.dumps({key: entry[key] for key in keys}))
 
-    def engine(self, xyz: npt.NDArray[np.float64], threads: int | None = None) -> FeatureEngine:
-        """What computes them over a cloud."""
+    def engine(
+        self, xyz: npt.NDArray[np.float64], threads: int | None = None, grid: CellGrid | None = None
+    ) -> FeatureEngine:
+        """What computes them over a cloud; `grid`: its index, where there is one of the right cells."""
         return FeatureEngine(
             xyz,
             self.plan,
@@ -65,6 +68,7 @@ class Features:
             copt_threshold=self.copt_threshold,
             seed=self.seed,
             threads=threads,
+            grid=grid if grid is not None and grid.cell == self.plan.cell else None,
         )
 
 
@@ -196,7 +200,7 @@ class CloudFeatures:
         if not (len(asked.xyz) if rows is None else len(rows)):
             return
         if self._engine is None:
-            self._engine = self.features.engine(asked.xyz, asked.threads)
+            self._engine = self.features.engine(asked.xyz, asked.threads, asked.grid)
         engine = self._engine
         fed, _ = gather(self.features.plan.dimensions, self._dimensions, len(asked.xyz), rows)
         before = copy.deepcopy(engine.report)

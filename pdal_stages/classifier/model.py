@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -13,8 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import DimensionError, ModelError, OptionError
+from ..base.lazycolumns import Taken
 from ..base.report import Report
 from ..features import FeaturePlan
+from ..features.index import CellGrid, build_grid, check_xyz
 from ..features.voxels import Representatives, check_side, represent
 from . import modelfile, summary
 from .algorithms import InputPlan, PredictRequest, algorithm
@@ -228,26 +230,48 @@ class Model:
         values = known(self.plan.dimensions, given, n, there)
         representatives = represent(xyz, self.voxel, values, rows, there)
         del values, there
+        taken: npt.NDArray[Any] | None = None
         if representatives is not None:  # from here on nobody looks at the others
-            rows = representatives.wanted
-            xyz = xyz[representatives.rows]
-            given = {name: np.asarray(given[name])[representatives.rows] for name in given}
-        report = self._predict(xyz, given, rows, representatives, outcome, how, progress)
+            rows, taken = representatives.wanted, representatives.rows
+            xyz = xyz[taken]
+            representatives = replace(representatives, rows=taken[:0])
+        order, grid = None, None
+        if self._cell is not None and len(
+            xyz
+        ):  # one copy of the coordinates, in the order in which all is computed
+            grid = build_grid(check_xyz(xyz), self._cell)
+            order, xyz = grid.order, grid.coordinates
+            grid = replace(grid, order=np.arange(len(order), dtype=order.dtype))
+            rows = None if rows is None else _places(order, rows)
+            taken = order if taken is None else taken[order]
+        if taken is not None:
+            given = {name: Taken(np.asarray(values), taken) for name, values in given.items()}
+        report = self._predict(xyz, given, rows, grid, order, representatives, outcome, how, progress)
         if len(xyz) < n - ignored:
             report.figures["representatives"] = len(xyz)
         return outcome.prediction(asked, ignored, report)
+
+    @property
+    def _cell(self) -> float | None:
+        """Of the grid that its features are computed by; None where it has none."""
+        return next((one.features.plan.cell for one in self.passes if one.features is not None), None)
 
     def _predict(
         self,
         xyz: npt.NDArray[np.float64],
         dimensions: Mapping[str, npt.ArrayLike],
         rows: npt.NDArray[np.int64] | None,
+        grid: CellGrid | None,
+        order: npt.NDArray[Any] | None,
         representatives: Representatives | None,
         outcome: Outcome,
         how: PredictionOptions,
         progress: Any,
     ) -> Report:
-        """Classify the points `rows` (None: all), each for those that it represents."""
+        """Classify the points `rows` (None: all), each for those that it represents.
+
+        `order` are the points' places among the representatives, or in the cloud; None where these are their own.
+        """
         codes, factors = self.codes, self.factors
 
         def finish(p):
@@ -255,6 +279,8 @@ class Model:
             return count_shares(p) if how.smooth else decide(p, codes, how)
 
         def write(at, decided, variance=None):
+            if order is not None:
+                at = order[at]
             if representatives is not None:
                 at, place = representatives.members(at)
                 decided = None if decided is None else decided.taken(place)
@@ -263,7 +289,13 @@ class Model:
             return at
 
         request = PredictRequest(
-            xyz, dimensions, rows, how.threads, how.memory_mb, progress if representatives is None else None
+            xyz,
+            dimensions,
+            rows,
+            how.threads,
+            how.memory_mb,
+            progress if representatives is None else None,
+            grid,
         )
         predicted = self.algorithm.predict(request, finish)
         shares = np.zeros((len(xyz), len(codes)), np.uint16) if how.smooth else None
@@ -380,6 +412,13 @@ def _smoothed(
     for start in range(0, len(means), _DECIDED):
         part = slice(start, start + _DECIDED)
         yield part if rows is None else rows[part], means[part]
+
+
+def _places(order: npt.NDArray[Any], rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Where rows lie in an order, ascending."""
+    chosen = np.zeros(len(order), np.bool_)
+    chosen[rows] = True
+    return np.flatnonzero(chosen[order])
 
 
 def mask_of(name: str, mask: npt.ArrayLike, n: int) -> npt.NDArray[np.bool_]:

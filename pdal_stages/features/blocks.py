@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from ..base import checks
 from ..base.errors import DimensionError, OptionError, StageError
+from ..base.lazycolumns import as_column
 from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
 from .index import CellGrid, build_grid, check_xyz, cut_blocks
@@ -213,7 +214,7 @@ def _dimensions(
                 found=there,
                 cure=f"Give dimensions={{'{name}': values}}, or leave it out of the plan",
             )
-        values = np.asarray(given[name])
+        values = as_column(given[name])
         if values.shape != (count,) or values.dtype.kind not in "fiub":
             raise DimensionError(
                 f"the dimension '{name}' must have one number per query",

@@ -42,6 +42,8 @@ class FeatureEngine:
         Of the random pulls of the shape distributions.
     threads : int, optional
         ``None`` or 0: every core this process may use.
+    grid : CellGrid, optional
+        What :func:`build_grid` makes of the cloud and ``plan.cell``, where it is there already.
 
     Attributes
     ----------
@@ -75,6 +77,7 @@ class FeatureEngine:
         copt_threshold: float | None = None,
         seed: int = 0,
         threads: int | None = None,
+        grid: CellGrid | None = None,
     ) -> None:
         if not isinstance(plan, FeaturePlan):
             raise OptionError(
@@ -85,7 +88,7 @@ class FeatureEngine:
         self.bins, self.copt_threshold = bins, copt_threshold
         self._cloud = check_xyz(xyz)
         compile_once("index")
-        self._grid: CellGrid = build_grid(self._cloud, plan.cell)
+        self._grid = build_grid(self._cloud, plan.cell) if grid is None else grid
         self._lock = threading.RLock()
         self._parts: tuple[FixedRadius, AdaptiveNeighborhoods | None] | None = None
         self.report = Report({"points": len(self._grid), "queries": 0, "fewer_than_three": {}})

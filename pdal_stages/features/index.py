@@ -59,6 +59,11 @@ class CellGrid:
         """Sorted z, meters."""
         return self.xyz[2, : len(self)]
 
+    @property
+    def coordinates(self) -> np.ndarray:
+        """(n, 3) the sorted cloud, a view."""
+        return self.xyz[:, : len(self)].T
+
     def tables(self) -> tuple[np.ndarray, ...]:
         """The arrays kernels take: x, y, z (with spare values behind), cell_ix, cell_start, row_iy, row_start."""
         x, y, z = self.xyz

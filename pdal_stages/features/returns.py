@@ -17,11 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OptionError
-from .cells import WHOLE, cell_means, take_means
+from .cells import WHOLE, MeanColumn, cell_means
 from .neighborhoods import SIDES
 
-#: Points looked at in one go.
-_TOGETHER = 1 << 16
 #: What they are made of.
 SOURCES = ("ReturnNumber", "NumberOfReturns")
 
@@ -77,10 +75,10 @@ def return_features(
     xyz: npt.NDArray[np.float64],
     dimensions: Mapping[str, npt.ArrayLike],
     threads: int | None = None,
-) -> dict[str, npt.NDArray[Any]]:
+) -> dict[str, npt.NDArray[Any] | MeanColumn]:
     """Those of `names` that are return features, for every point of a cloud: (n,) each, 0 to 1, whole numbers or float32.
 
-    Columns may be those of a table.
+    Columns may be those of a table, or lazy: a point's cells take half the memory of its means.
 
     Of `dimensions`, ``ReturnNumber`` and ``NumberOfReturns`` are read, (n,) each; without them all is 0.
     """
@@ -91,18 +89,14 @@ def return_features(
     flags = np.empty((len(xyz), len(FLAGS)), np.uint16)
     flags[:, 0] = np.where(total > 1, WHOLE, 0)
     flags[:, 1] = np.where((number > 0) & (number < total), WHOLE, 0)
-
-    def table(scale: tuple[int, float]) -> npt.NDArray[np.float32]:
-        out = np.empty((len(xyz), len(FLAGS)), np.float32)
-        cell, means = cell_means(xyz[:, : scale[0]], flags, scale[1])
-        some = np.arange(min(len(xyz), _TOGETHER))
-        for start in range(0, len(xyz), _TOGETHER):
-            part = slice(start, start + _TOGETHER)
-            take_means(cell[part], means, some[: len(out[part])], out[part])
-        return out
-
+    del number, total
     # One after the other: each needs room for a while.
     scales = list(dict.fromkeys((one.axes, one.side) for one in wanted.values() if one.axes))
-    tables: dict[tuple[int, float], npt.NDArray[Any]] = {scale: table(scale) for scale in scales}
-    tables[0, 0.0] = (flags > 0).view(np.uint8)
-    return {name: tables[one.axes, one.side][:, list(FLAGS).index(one.flag)] for name, one in wanted.items()}
+    tables = {scale: cell_means(xyz[:, : scale[0]], flags, scale[1]) for scale in scales}
+    own = (flags > 0).view(np.uint8)
+
+    def values(one: ReturnFeature) -> Any:
+        number = list(FLAGS).index(one.flag)
+        return MeanColumn(*tables[one.axes, one.side], number) if one.axes else own[:, number]
+
+    return {name: values(one) for name, one in wanted.items()}

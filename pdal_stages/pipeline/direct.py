@@ -28,7 +28,7 @@ from . import pdal as pdal_env
 from .callbacks import Callbacks
 from .filenames import reader_files
 from .runtime import TRAMPOLINE
-from .straight import NeedsPdal, Seen, View
+from .straight import FirstSeen, NeedsPdal, View
 
 #: Options of a writer that do not look at points.
 _PLAIN = {
@@ -157,7 +157,7 @@ class _Trial:
         first: NDArray,
         adds: Mapping[str, str],
     ) -> None:
-        seen = Seen()
+        seen = FirstSeen()
         made: dict[str, NDArray] = {}
 
         def look(module: dict[str, Any], ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:

@@ -34,7 +34,7 @@ _TYPES = {"double": "float64", "float": "float32"}
 _LIMITS = re.compile(r"(\w+)\[:([-+.\de]+)\]")
 
 
-class Records(Protocol):
+class RecordFields(Protocol):
     """Points as a file has them: arrays of their fields, by laspy's names."""
 
     def __len__(self) -> int: ...
@@ -51,7 +51,9 @@ class Reading:
     """How PDAL reads a kind of file."""
 
     types: dict[str, np.dtype]  #: the dimensions, in their order
-    decoded: dict[str, Callable[[Records], NDArray]]  #: of records; those that are read here as PDAL does
+    decoded: dict[
+        str, Callable[[RecordFields], NDArray]
+    ]  #: of records; those that are read here as PDAL does
     module: dict[str, Any]  #: what a script finds set: `metadata`, `spatialreference`
     log: str  #: what PDAL said
 
@@ -73,7 +75,7 @@ def reading_of(reader: Mapping[str, Any], records: NDArray) -> Reading:
     NeedsPdal
         If it cannot, for PDAL to say why.
     """
-    seen = Seen()
+    seen = FirstSeen()
     try:
         with callbacks.Callbacks() as called:
             log = pdal_env.execute([dict(reader), called.filter(seen.look)], arrays=False).log
@@ -82,7 +84,7 @@ def reading_of(reader: Mapping[str, Any], records: NDArray) -> Reading:
     return seen.reading(records, str(reader["filename"]), log)
 
 
-class Seen:
+class FirstSeen:
     """What PDAL made of some points."""
 
     def __init__(self) -> None:
@@ -117,25 +119,25 @@ class Seen:
         return Reading(types, decoded, self.module, log)
 
 
-def _ways(fields: Sequence[str], path: str) -> dict[str, Callable[[Records], NDArray]]:
+def _ways(fields: Sequence[str], path: str) -> dict[str, Callable[[RecordFields], NDArray]]:
     """Ways of reading dimensions, by PDAL's names, of records with laspy's fields (LAS 1.4 R15, tables 7 to 18)."""
     header = read_header(path)
     assert header is not None
 
-    def scaled(axis: int) -> Callable[[Records], NDArray]:
+    def scaled(axis: int) -> Callable[[RecordFields], NDArray]:
         field, scale, offset = "XYZ"[axis], header.scales[axis], header.offsets[axis]
 
-        def way(records: Records) -> NDArray:
+        def way(records: RecordFields) -> NDArray:
             values = records[field] * scale
             values += offset
             return values
 
         return way
 
-    def bits(field: str, first: int, count: int) -> Callable[[Records], NDArray]:
+    def bits(field: str, first: int, count: int) -> Callable[[RecordFields], NDArray]:
         return lambda records: records[field] >> np.uint8(first) & np.uint8((1 << count) - 1)
 
-    def plain(field: str, dtype: Any = None) -> Callable[[Records], NDArray]:
+    def plain(field: str, dtype: Any = None) -> Callable[[RecordFields], NDArray]:
         return lambda records: np.ascontiguousarray(records[field], dtype)
 
     ways = {axis: scaled(number) for number, axis in enumerate("XYZ")}
@@ -180,7 +182,7 @@ class _Part:
     """Points of a file."""
 
     reading: Reading
-    records: Records
+    records: RecordFields
     mask: NDArray[np.bool_] | None = None  #: which of them are meant; None for all
 
     @property
@@ -217,7 +219,7 @@ class View(Mapping[str, NDArray]):
                 raise NeedsPdal("inputs of several references")
 
     @classmethod
-    def of_file(cls, reading: Reading, records: Records) -> View:
+    def of_file(cls, reading: Reading, records: RecordFields) -> View:
         """All points that a reader would give."""
         return cls([_Part(reading, records)], {})
 
