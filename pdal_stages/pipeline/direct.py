@@ -107,14 +107,11 @@ def execute(stages: Sequence[dict[str, Any]]) -> pdal_env.Execution:
     adds = dict(one.split("=") for stage in filters for one in stage.get("add_dimension", ()))
     try:
         (first,) = blocks(path, header, dtype, count=_TRIED)
-    except StageError as error:
-        raise NeedsPdal(str(error)) from error
-    tried = _Trial(reader, writer, header, first, adds)
-    try:
-        columns = RecordColumns(
-            path, header, dtype, [name for name in _FIELDS if name in (dtype.names or ())]
-        )
-    except StageError as error:
+        tried = _Trial(reader, writer, header, first, adds)
+        columns = RecordColumns(path, header, dtype, [n for n in _FIELDS if n in (dtype.names or ())])
+    except NeedsPdal:
+        raise
+    except (StageError, OSError) as error:  # no room for temporary files, say
         raise NeedsPdal(str(error)) from error
     view = View.of_file(tried.reading, columns)
     for name, kind in adds.items():  # PDAL's points have them from the beginning
@@ -127,14 +124,22 @@ def execute(stages: Sequence[dict[str, Any]]) -> pdal_env.Execution:
     del view, columns
 
     def points() -> Iterator[tuple[NDArray, dict[str, NDArray]]]:
-        start = 0
-        for records in blocks(path, header, dtype):
+        start, parts = 0, blocks(path, header, dtype)
+        while start < header.count:
             interrupts.check()
+            try:
+                records = next(parts)
+            except StageError as error:
+                raise NeedsPdal(str(error)) from error
             end = start + len(records)
             yield records, {name: values[start:end] for name, values in made.items()}
             start = end
 
-    tried.output.write(Path(tried.target), points())
+    try:
+        tried.output.write(Path(tried.target), points())
+    except NeedsPdal:
+        os.unlink(tried.target)
+        raise
     return pdal_env.Execution(header.count, tried.metadata, [], tried.reading.log)
 
 
@@ -169,10 +174,7 @@ class _Trial:
         with TemporaryDirectory(prefix="pdal-stages-") as folder, Callbacks() as called:
             target = tried = os.path.join(folder, os.path.basename(str(writer["filename"])))
             run = [{**reader, "count": len(first)}, called.filter(look, adds), {**writer, "filename": target}]
-            try:
-                ran = pdal_env.execute(run, arrays=False)
-            except StageError as error:
-                raise NeedsPdal(str(error)) from error
+            ran = pdal_env.execute(run, arrays=False)
             self.reading = seen.reading(first, str(reader["filename"]), ran.log, adds)
             self.output = _output(target, header, first.dtype, adds, self.reading)
             if others := adds.keys() & self.reading.types.keys() - self.output.holds:
