@@ -317,6 +317,17 @@ def test_dimensions(cloud):
     ):
         assert np.array_equal(values[:, 2], rows * 10)  # one value per query
         assert sorted(values[:, 1]) == [1, 2, 3]  # a Z that is given is taken
+    seen = []
+
+    def of(rows):
+        seen.append(rows)
+        return {"HeightAboveGround": own[rows]}
+
+    for queries in (None, np.array([7, 3, 9]), np.arange(0, len(cloud), 2)):
+        found = list(engine.blocks(queries, dimensions=of))  # asked for block by block
+        assert all(np.array_equal(values[:, 2], own[rows].astype(np.float32)) for rows, values in found)
+        assert sum(map(len, seen)) == sum(len(rows) for rows, _ in found)
+        seen.clear()
     table = compute_features(cloud, neighborhoods="c1", feature_set="Density", dimensions={"Intensity": own})
     assert table.names == ("Density_c1", "Intensity") and np.array_equal(table["Intensity"], own)
 

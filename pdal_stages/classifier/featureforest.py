@@ -202,11 +202,11 @@ class CloudFeatures:
         if self._engine is None:
             self._engine = self.features.engine(asked.xyz, asked.threads, asked.grid)
         engine = self._engine
-        fed, _ = gather(self.features.plan.dimensions, self._dimensions, len(asked.xyz), rows)
+        names, known, n = self.features.plan.dimensions, self._dimensions, len(asked.xyz)
         before = copy.deepcopy(engine.report)
         yield from engine.blocks(
             queries=rows,
-            dimensions=fed,
+            dimensions=lambda some: gather(names, known, n, some)[0],
             threads=asked.threads,
             memory_mb=max(asked.memory_mb * memory_share, 16.0),
             progress=asked.progress if counted and shown else None,

@@ -20,7 +20,7 @@ from ..features.index import cell_numbers
 from .context import Context, Tables
 
 #: Points of strips that are worked on together, where there are so many.
-TOGETHER = 300_000
+TOGETHER = 150_000
 
 #: Features of rows of the cloud, these rows, and the table of their context's columns -> whatever is wanted.
 Apply = Callable[[Any, npt.NDArray[np.int64], npt.NDArray[np.float32]], Any]

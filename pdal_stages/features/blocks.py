@@ -31,6 +31,9 @@ MOST_ROWS = 65_536
 ROW_BYTES = 1_000
 
 
+#: The queries' own dimensions: (m,) values each, or what gives those of a block's queries, named by their indices.
+Given = Mapping[str, npt.ArrayLike] | Callable[[np.ndarray], Mapping[str, np.ndarray]] | None
+
 #: What a block counted: by kind, then by neighborhood.
 Tally = dict[str, dict[str, int]]
 
@@ -60,14 +63,14 @@ class Run:
         grid: CellGrid,
         fit: Callable[[], Fitted],
         queries: npt.ArrayLike | None,
-        dimensions: Mapping[str, npt.ArrayLike] | None,
+        dimensions: Given,
         threads: int | None,
         memory_mb: float,
     ) -> None:
         self.plan = plan
         self.indices, coordinates = _queries(queries, cloud)
         count = len(grid) if coordinates is None else len(coordinates)
-        self.dimensions = _dimensions(plan, dimensions, count)
+        self.dimensions = dimensions if callable(dimensions) else _dimensions(plan, dimensions, count)
         self.grid = grid if coordinates is None else build_grid(coordinates, plan.cell)
         checks.number("'memory_mb'", memory_mb, 16)
         self.threads = resolve_threads(threads)
@@ -139,13 +142,19 @@ class Run:
         if len(at) < last - first:
             values = np.repeat(values, copies, axis=0)
         positions = grid.order[first:last].astype(np.int64)
+        found = self._dimensions_at(positions)
         for column, name in enumerate(plan.dimensions, width - len(plan.dimensions)):
-            given = self.dimensions.get(name)
+            given = found.get(name)
             if given is None:
                 values[:, column] = {"X": grid.x, "Y": grid.y, "Z": grid.z}[name][first:last]
             else:
-                values[:, column] = given[positions]
+                values[:, column] = given
         return positions, values, tally
+
+    def _dimensions_at(self, positions: np.ndarray) -> Mapping[str, np.ndarray]:
+        if callable(self.dimensions):
+            return self.dimensions(positions if self.indices is None else self.indices[positions])
+        return {name: values[positions] for name, values in self.dimensions.items()}
 
     def iterate(
         self,

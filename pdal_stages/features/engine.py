@@ -15,7 +15,7 @@ from ..base.errors import OptionError, StageError, optional_import, suggest
 from ..base.progress import Progress
 from ..base.report import Report
 from ..base.threads import map_blocks, resolve_threads
-from .blocks import Fitted, Run, Tally, compile_once
+from .blocks import Fitted, Given, Run, Tally, compile_once
 from .index import CellGrid, build_grid, check_xyz
 from .plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS, FeaturePlan
 from .samples import smallest_hashes
@@ -168,7 +168,7 @@ class FeatureEngine:
         self,
         queries: npt.ArrayLike | None = None,
         *,
-        dimensions: Mapping[str, npt.ArrayLike] | None = None,
+        dimensions: Given = None,
         threads: int | None = None,
         memory_mb: float = 512,
         progress: Progress | bool | None = None,
@@ -180,8 +180,9 @@ class FeatureEngine:
         ----------
         queries : array, optional
             ``None``: every point of the cloud; an array of indices into the cloud; or (m, 3) coordinates.
-        dimensions : mapping of str to (m,) array
-            One value per query for each of ``plan.dimensions``. X, Y and Z need not be given.
+        dimensions : mapping of str to (m,) array, or function
+            One value per query for each of ``plan.dimensions``. X, Y and Z need not be given. A function is called in the
+            worker's thread with a block's `rows` and gives their values: no copy of all is needed.
         threads : int, optional
             The engine's where not given.
         memory_mb : float

@@ -131,14 +131,14 @@ def levels_near_decks(
     if len(x):
         column, row = cell_numbers(x, CELL), cell_numbers(y, CELL)
         for points, own in patches(column, row, int(REACH), FAR + AHEAD):
-            at = np.arange(len(x))[points]
-            mine = np.ones(len(at), bool)[own] if isinstance(own, slice) else own
-            found = _deck_levels(z[at], use[at], column[at], row[at])
+            found = _deck_levels(z[points], use[points], column[points], row[points])
             if found is None:
                 continue
             *_, heights, lowest, start, kind, deck = found
-            near = near_decks(start, *found[2:4], deck) & mine[lowest]
-            point = at[lowest[near]]
+            near = near_decks(start, *found[2:4], deck)
+            if not isinstance(own, slice):
+                near &= own[lowest]
+            point = lowest[near] if isinstance(points, slice) else points[lowest[near]]
             rows.append(np.column_stack([column[point], row[point], heights[near], deck[near], kind[near]]))
             numbers.append(point)
     return np.concatenate(rows), np.concatenate(numbers)

@@ -336,7 +336,9 @@ class _Mark:
         self.number, self.piece, self.keep = number, piece, list(keep)
         self.keep_all = context.plan.creates is None
         self.changed: dict[str, tuple[NDArray[np.int64], NDArray]] = {}  # given by the rounds before
-        self.away = np.where(piece.away < 0, -1.0, piece.away * context.unit)
+        self.away = piece.away
+        if context.unit != 1.0:
+            self.away = np.where(piece.away < 0, -1.0, piece.away * context.unit)
         header = read_header(piece.path)
         self.old_format = header is not None and header.point_format <= 5  # one of LAS 1.0 to 1.3
         self.mixed = False  # whether there are others beside it

@@ -16,7 +16,7 @@ from .sources import Extent
 #: together, and the `memory` option of our stages. See docs/large-areas.md.
 BASE, TILE_POINT, FILE_POINT, BLOCKS = 350 << 20, 270, 250, 512 << 20
 #: Of a cell of the raster of which a block is made before the tiles.
-_CELL = 200
+_CELL = 150
 #: Of the process that hands out the work.
 PARENT = 350 << 20
 #: Points of a larger file are put together in parts of so many.
