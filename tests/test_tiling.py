@@ -20,8 +20,9 @@ from pdal_stages.synthetic.townfile import wkt
 from pdal_stages.terrain.minima import terrain_reach
 from pdal_stages.tiling import TilingOptions, run_tiled
 from pdal_stages.tiling.cloudindex import index_las
-from pdal_stages.tiling.extract import Member, cut, plain_header
+from pdal_stages.tiling.extract import Member, cut
 from pdal_stages.tiling.grid import TileGrid, inside, touching
+from pdal_stages.tiling.lasfiles import plain_header
 from pdal_stages.tiling.sources import InputSource, find_sources, las_extent
 from pdal_stages.tiling.tileplan import make_plan
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 import os
 import shutil
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from ..base.errors import StageError
 from ..base.las import POINT_BYTES, LasHeader, read_header
@@ -77,6 +77,39 @@ def packed_head(head: bytes, header: LasHeader) -> tuple[bytes, Any]:
     return bytes(first) + record + head[header.header_bytes :], coding
 
 
+def compress(out: BinaryIO, coding: Any, blocks: Iterable[bytes]) -> None:
+    """Write points, compressed as `coding` of lazrs says, where a file stands.
+
+    Raises
+    ------
+    StageError
+        If they cannot be compressed.
+    OSError
+        If the file cannot be written.
+    """
+    import lazrs
+
+    try:
+        packer = lazrs.ParLasZipCompressor(out, coding)
+        for block in blocks:
+            packer.compress_many(block)
+        packer.done()
+    except (ValueError, RuntimeError, lazrs.LazrsError) as error:
+        raise StageError(
+            "the output file could not be compressed", found=f"{getattr(out, 'name', '')}: {error}"
+        ) from error
+
+
+def _blocks(source: BinaryIO, header: LasHeader) -> Iterator[bytes]:
+    left = header.count * header.point_bytes
+    while left > 0:
+        block = source.read(min(left, _BLOCK * header.point_bytes))
+        if not block:
+            raise ValueError("it ends before its last point")
+        yield block
+        left -= len(block)
+
+
 def _pack(made: Path, target: Path) -> None:
     """The file with its points compressed; header and records stay as PDAL wrote them, and one record is added."""
     import lazrs
@@ -88,15 +121,7 @@ def _pack(made: Path, target: Path) -> None:
         with open(made, "rb") as source, open(target, "x+b") as out:
             head, coding = packed_head(source.read(header.offset), header)
             out.write(head)
-            packer = lazrs.ParLasZipCompressor(out, coding)
-            left = header.count * header.point_bytes
-            while left > 0:
-                block = source.read(min(left, _BLOCK * header.point_bytes))
-                if not block:
-                    raise StageError("the output file could not be written completely", found=str(target))
-                packer.compress_many(block)
-                left -= len(block)
-            packer.done()
+            compress(out, coding, _blocks(source, header))
             if header.records_after:
                 out.seek(0, os.SEEK_END)
                 place = out.tell()

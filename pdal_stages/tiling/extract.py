@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +16,23 @@ from numpy.typing import NDArray
 from ..base import las
 from ..base.errors import StageError
 from .byplace import points_in
-from .cloudindex import BLOCK, SMALL, CloudIndex, counted, open_las, read_block
+from .cloudindex import SMALL, CloudIndex, counted
 from .ept import fetch
 from .grid import Box, TileGrid, touching
+from .lasfiles import (
+    BLOCK,
+    Located,
+    all_points,
+    finish,
+    likeness,
+    open_las,
+    plain_header,
+    read_block,
+    read_small,
+    scaled,
+)
 from .sources import InputSource
 
-_COMPRESSOR = b"laszip encoded"
-#: Bytes of the header that decide how points are read: encoding, version, sizes, point format, scales and offsets.
-_COMPARED = ((6, 8), (24, 26), (94, 107), (131, 179))
 #: Points of a piece that its file holds while the others are held in memory.
 SAMPLE = 64
 
@@ -109,62 +117,6 @@ def cut_all(
             piece.like = like
             pieces.append(piece)
     return pieces
-
-
-def likeness(path: str) -> bytes:
-    """What is the same in files whose points may go through one reader: everything before them but counts and extents.
-
-    Name and date of the file's maker and its identifiers are not looked at.
-    """
-    status = os.stat(path)
-    return _likeness(path, status.st_mtime_ns, status.st_size)
-
-
-@lru_cache(maxsize=1 << 16)
-def _likeness(path: str, changed: int, size: int) -> bytes:
-    head, tail = plain_header(path)
-    digest = hashlib.sha256(tail)
-    for start, end in _COMPARED:
-        digest.update(head[start:end])
-    (length,) = struct.unpack_from("<H", head, 94)
-    digest.update(head[length:])
-    return digest.digest()
-
-
-def plain_header(path: str) -> tuple[bytearray, bytes]:
-    """All before the points of a file as an uncompressed one has them, and its extended records.
-
-    Counts are left as they are; :func:`finish` sets them.
-    """
-    header = las.read_header(path)
-    assert header is not None
-    with open(path, "rb") as file:
-        head = bytearray(file.read(header.offset))
-        coding = [r for r in las.records(file, header) if r.user == _COMPRESSOR and not r.after]
-        file.seek(header.after)
-        tail = file.read() if header.records_after else b""
-    for record in reversed(coding):
-        del head[record.place : record.data + record.length]
-    head[104] &= 0x3F
-    struct.pack_into("<II", head, 96, len(head), header.records - len(coding))
-    return head, tail
-
-
-def finish(file: Any, head: bytearray, tail: bytes, count: int) -> None:
-    """Write extended records after `count` points, and the header with the right counts."""
-    version = head[25]
-    (width,) = struct.unpack_from("<H", head, 105)
-    (start,) = struct.unpack_from("<I", head, 96)
-    if version >= 4:
-        struct.pack_into("<I", head, 107, count if head[104] < 6 and count < 2**32 else 0)
-        struct.pack_into("<Q", head, 247, count)
-        if tail:
-            struct.pack_into("<Q", head, 235, start + count * width)
-    else:
-        struct.pack_into("<I", head, 107, count)
-    file.write(tail)
-    file.seek(0)
-    file.write(head)
 
 
 def cut(
@@ -271,15 +223,28 @@ def unpacked(path: str, copy: str, count: int, target: str) -> bool:
     return found == count
 
 
-class _Points(NamedTuple):
-    """Points as a file holds them, and their coordinates."""
+def records_of(path: str, copy: str, count: int) -> NDArray[np.uint8] | None:
+    """All points of a file, (n, bytes) as it holds them, out of memory or its copy where it is there.
 
-    array: NDArray
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
+    None where it does not hold `count` of them.
+    """
+    header = las.read_header(path)
+    if header is None or header.count != count or not count:
+        return None
+    status = os.stat(path)
+    parts: list[NDArray] | None = None
+    if count <= SMALL:
+        parts = [_small(path, count, status.st_mtime_ns, status.st_size).array]
+    elif copy and (copied := points_in(copy, count, (-np.inf, -np.inf, np.inf, np.inf))) is not None:
+        parts = [records for _, records in copied]
+    if parts is None:
+        parts = [points.array for points in all_points(path)]
+    if sum(map(len, parts)) != count:
+        return None
+    return np.concatenate([np.ascontiguousarray(part)[:, None].view(np.uint8) for part in parts])
 
 
-def _blocks(member: Member, box: Box) -> Iterator[tuple[NDArray[np.int64], _Points]]:
+def _blocks(member: Member, box: Box) -> Iterator[tuple[NDArray[np.int64], Located]]:
     """Numbers, ascending, and points of a file, in parts: all that may lie in a box."""
     blocks = touching(member.index.boxes, box)
     if not blocks:
@@ -298,29 +263,26 @@ def _blocks(member: Member, box: Box) -> Iterator[tuple[NDArray[np.int64], _Poin
             start = block * BLOCK
             points = read_block(reader, member.path, start, member.index.count)
             numbers = np.arange(start, start + len(points))
-            yield numbers, _Points(points.array, np.asarray(points.x), np.asarray(points.y))
+            yield numbers, Located(points.array, np.asarray(points.x), np.asarray(points.y))
 
 
 def _scaled(
     path: str, copied: Iterator[tuple[NDArray[np.int64], NDArray]]
-) -> Iterator[tuple[NDArray[np.int64], _Points]]:
+) -> Iterator[tuple[NDArray[np.int64], Located]]:
     """Records of a file's copy, with coordinates as they are read from the file itself."""
-    import laspy
-
-    with open_las(path) as reader:
-        header = reader.header
     for numbers, records in copied:
-        array = records.view(header.point_format.dtype())
-        points = laspy.ScaleAwarePointRecord(array, header.point_format, header.scales, header.offsets)
-        yield numbers, _Points(array, np.asarray(points.x), np.asarray(points.y))
+        yield numbers, scaled(path, records)
 
 
 @lru_cache(maxsize=2048)
-def _small(path: str, count: int, changed: int, size: int) -> _Points:
+def _small(path: str, count: int, changed: int, size: int) -> Located:
     """All points of a small file, which tiles side by side read again and again."""
-    with open_las(path) as reader:
-        points = read_block(reader, path, 0, count)
-        return _Points(points.array, np.array(points.x), np.array(points.y))
+    points = read_small(path, count)
+    if points is not None:
+        return points
+    with open_las(path) as reader:  # which says what is wrong
+        read = read_block(reader, path, 0, count)
+        return Located(read.array, np.array(read.x), np.array(read.y))
 
 
 def outside(

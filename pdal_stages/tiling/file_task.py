@@ -17,7 +17,7 @@ from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import PipelineError
 from ..pipeline.beside import extra_dims_option
 from ..pipeline.filenames import LAS_WRITERS
-from . import sizing
+from . import alike, sizing
 from .extract import unpacked
 from .grid import Box
 from .inparts import HeadersDifferError, write_in_parts
@@ -92,7 +92,28 @@ class FileTask:
         header = las.read_header(self.source.path)
         if header is not None and header.count:
             tail = on_one_grid(tail, header.box, half_open=False)
-        rest = [new_values(0, self.count)], tail, self.outputs, self.meanings, self.scratch, seen
+        new = new_values(0, self.count)
+        kind = None
+        if seen is None and len(self.outputs) == 1:
+            kind = alike.kind_of(self.source, tail, new.values, self.outputs[0], self.meanings)
+        here = self.source, self.copy, new, self.outputs[0], self.scratch
+        record = alike.write_alike(kind, *here)
+        if record is None:
+            record = self._write_with_pdal(reader, new, tail, seen)
+            alike.learn(kind, *here, self._try_with_pdal)
+        return record
+
+    def _try_with_pdal(self, path: str, new: NewValues, output: str) -> None:
+        """Write other points than the input's as its own are written."""
+        tail = with_beside(self.tail, self.beside, [path])
+        run_tail(
+            [{**self.source.reader, "filename": path}], [new], tail, [output], self.meanings, self.scratch
+        )
+
+    def _write_with_pdal(
+        self, reader: dict[str, Any], new: NewValues, tail: list[dict[str, Any]], seen: CellsSeen | None
+    ) -> dict[str, Any]:
+        rest = [new], tail, self.outputs, self.meanings, self.scratch, seen
         if not self.copy:
             return run_tail([reader], *rest)
         with TemporaryDirectory(prefix="file-", dir=self.scratch, ignore_cleanup_errors=True) as folder:

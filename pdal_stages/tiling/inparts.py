@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..base.complete import check_complete
 from ..base.files import whole_files
-from .cloudindex import BLOCK, open_las, read_block
-from .extract import finish, plain_header
+from .lasfiles import BLOCK, finish, open_las, plain_header, read_block
 from .results import NewValues
 from .sources import InputSource
 from .store import check_run

@@ -36,7 +36,7 @@ from ..pipeline.processes import each_file
 from ..pipeline.references import check_one_reference
 from ..reports.objectlayers import check_target, object_layers, target_files, write_layers
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter
-from .cloudindex import BLOCK, open_las, read_block
+from .lasfiles import BLOCK, open_las, read_block
 from .outcome import FoundObjects
 from .outputcells import OutputCells, keep_cells, kept_name
 from .store import take_lock

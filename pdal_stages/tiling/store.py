@@ -20,7 +20,7 @@ import numpy as np
 
 from ..base import strictjson
 from ..base.errors import StageError
-from ..base.files import try_lock, write_whole
+from ..base.files import try_lock
 from .cloudindex import CloudIndex
 
 #: The folder beside the outputs.
@@ -365,8 +365,17 @@ def _opened(path: Path, text: bytes) -> dict[str, Any] | None:
 
 
 def _keep(path: Path, value: dict[str, Any], what: str) -> None:
-    """Write an object into a file."""
-    write_whole(path, _sealed(path, value).encode(), what)
+    """Write an object into a file, whole: of the run's own folder, in which nobody else writes."""
+    partial = path.with_name(f"{path.name}.partial")
+    try:
+        _forget(partial)
+        with open(partial, "xb") as file:
+            file.write(_sealed(path, value).encode())
+        os.replace(partial, path)
+    except OSError as error:
+        raise StageError(
+            f"the {what} file could not be written", found=f"{path}: {error.strerror or error}"
+        ) from error
 
 
 def _read(path: Path) -> dict[str, Any] | None:

@@ -35,6 +35,7 @@ class Worklist:
             self.options.most_points,
             self._tail if survey.per == "tile" else [],
         )
+        self._marks: dict[tuple[tuple[int, int], float], str] = {}
         self.messages_before: list[list[str]] = []  #: warnings and notes of the tasks of the rounds before
         self.jobs = self._jobs()  #: tiles with points of their own, row by row
         #: One for each input file; empty where each tile is an output.
@@ -64,8 +65,11 @@ class Worklist:
         """
         survey = self.survey
         halo_m = max(float(record.get("halo_m", 0.0)), self.plan.sees_m)
-        read = survey.near(job.tile, halo_m / survey.unit)
-        return fingerprint(self._common, job.tile, [[s.path, survey.stamps[s.path], s.reader] for s in read])
+        if (job.tile, halo_m) not in self._marks:
+            read = survey.near(job.tile, halo_m / survey.unit)
+            seen = [[s.path, survey.stamps[s.path], s.reader] for s in read]
+            self._marks[job.tile, halo_m] = fingerprint(self._common, job.tile, seen)
+        return self._marks[job.tile, halo_m]
 
     def output_mark(self, out: FileJob, marks: Mapping[tuple[int, int], str]) -> str:
         """Fingerprint of all that decides an output, given those of its tiles."""

@@ -1,0 +1,313 @@
+"""Outputs of files that are alike, written without PDAL: as PDAL wrote one of them, to the byte.
+
+A pipeline takes PDAL several milliseconds, however few points it has, most of them for the reference system; of a survey
+in thousands of small files that is as much as their features. So of inputs that say the same but for their points, with one
+writer, PDAL writes the first ones. What it made of one of them, and of points whose every bit is random, is held against
+what is made here, and only where these are the same, byte for byte, are the others made here. Whatever that cannot tell
+(other writers, filters behind the stages, octrees, waveforms) stays PDAL's.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import struct
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import StageError
+from ..base.extrabytes import plain_dimensions
+from ..base.files import whole_files
+from ..base.las import POINT_BYTES, LasHeader, read_header, records
+from ..pipeline.packing import compress
+from .extract import records_of
+from .lasfiles import finish, plain_header
+from .results import NewValues
+from .sources import InputSource
+from .store import check_run
+from .tail import written
+
+#: Writes an output as PDAL does: a reader's file, the new values, the name.
+WithPdal = Callable[[str, NewValues, str], Any]
+
+#: Bytes of a header that tell of the points alone: counts, counts by return, extents, and what LAS 1.4 has of these.
+_OF_POINTS = ((107, 131), (179, 227), (247, 375))
+#: Where class codes are, by whether the point format is one of LAS 1.4.
+_CLASS_AT = {False: 15, True: 16}
+#: Formats with waveforms, which lie elsewhere.
+_WAVES = (4, 5, 9, 10)
+_COMPRESSOR = b"laszip encoded"
+#: Points whose bits are random, and points that are put together at a time.
+_RANDOM, _BLOCK = 200, 500_000
+#: Kinds that are remembered.
+_MOST_KINDS = 64
+
+
+@dataclass(frozen=True)
+class _Way:
+    """How outputs of a kind are made."""
+
+    head: bytes  #: all before the points, of one of them
+    width: int  #: bytes of a point
+    own: int  #: bytes of a point of the format, without extra ones, which come as they are
+    copied: tuple[
+        tuple[int, int, int], ...
+    ]  #: extra bytes of inputs: where they are, where they go, how many
+    made: tuple[tuple[str, int, np.dtype], ...]  #: new values: whose, and where they go
+    coding: bytes  #: the record of how points are compressed; empty where they are not
+
+
+#: By kind: None for those that were seen once, False for those that take PDAL.
+_known: OrderedDict[bytes, _Way | bool | None] = OrderedDict()
+
+
+def kind_of(
+    source: InputSource, tail: Sequence[Mapping[str, Any]], values: Mapping[str, Any], output: str, *more: Any
+) -> bytes | None:
+    """What decides how an output is made but for points and values; None where that takes PDAL in any case."""
+    if len(tail) != 1 or tail[0].get("type") != "writers.las" or "where" in tail[0]:
+        return None
+    forward = str(tail[0].get("forward", ""))
+    if "all" not in forward and "header" not in forward:  # PDAL's own day and names
+        return None
+    header = read_header(source.path)
+    if header is None or header.point_format in _WAVES or header.records_after or header.waveforms:
+        return None
+    head, _ = plain_header(source.path)
+    for start, end in _OF_POINTS:
+        if start < header.header_bytes:
+            head[start : min(end, header.header_bytes)] = bytes(min(end, header.header_bytes) - start)
+    for start, end in _ranges(head, header):
+        head[start:end] = bytes(end - start)
+    writer = {key: value for key, value in tail[0].items() if key != "filename"}
+    kinds = {name: str(column.dtype) for name, (_, column) in values.items()}
+    suffixes = [Path(name).suffix.lower() for name in (source.path, output)]
+    return bytes(head) + json.dumps([source.reader, writer, kinds, suffixes, *more], default=str).encode()
+
+
+def _ranges(head: bytearray, header: LasHeader) -> Iterator[tuple[int, int]]:
+    """Where records say the least and most of an extra dimension (LAS 1.4 R15, table 24), which PDAL does not hand on."""
+    for record in records(io.BytesIO(head), header):
+        if (record.user, record.number) == (b"LASF_Spec", 4):
+            for start in range(record.data, record.data + record.length - 191, 192):
+                yield start + 64, start + 112
+
+
+def write_alike(
+    kind: bytes | None, source: InputSource, copy: str, new: NewValues, output: str, scratch: str
+) -> dict[str, Any] | None:
+    """Write an input's output where outputs of its kind are known; None where PDAL has to."""
+    way = _known.get(kind) if kind is not None else None
+    if not isinstance(way, _Way) or not new.kept.any():
+        return None
+    points = records_of(source.path, copy, len(new.kept))
+    if points is None:
+        return None
+    with (
+        whole_files(output, check=lambda *_: check_run(scratch)) as (partial,),
+        open(partial, "xb") as file,
+    ):
+        _write(file, way, source.path, points, new)
+        file.flush()
+        os.fsync(file.fileno())
+    return written([output], int(np.count_nonzero(new.kept)))
+
+
+def learn(
+    kind: bytes | None,
+    source: InputSource,
+    copy: str,
+    new: NewValues,
+    output: str,
+    scratch: str,
+    with_pdal: WithPdal,
+) -> None:
+    """See how PDAL wrote an output, where it is the second of its kind."""
+    if kind is None or _known.get(kind, None) is not None:
+        return
+    if kind not in _known:
+        _known[kind] = None
+        if len(_known) > _MOST_KINDS:
+            _known.popitem(last=False)
+        return
+    try:
+        way = _way(source.path, output, new)
+        same = way is not None and (
+            _same(way, source.path, records_of(source.path, copy, len(new.kept)), new, output)
+            and _tried(way, source.path, new, scratch, Path(output).suffix, with_pdal)
+        )
+    except (StageError, OSError, ValueError, struct.error):
+        same = False
+    _known[kind] = way if same and way is not None else False
+
+
+def _way(path: str, output: str, new: NewValues) -> _Way | None:
+    """How an output seems to have been made; None where its points cannot be told from input and new values."""
+    before, after = read_header(path), read_header(output)
+    if before is None or after is None or after.records_after or before.point_format != after.point_format:
+        return None
+    own = POINT_BYTES[after.point_format]
+    had = {field.name: field for field in _extra(path)}
+    copied, made = [], []
+    for field in _extra(output):
+        if field.name in new.values:
+            dtype = new.values[field.name][1].dtype
+            if dtype != field.dtype:
+                return None
+            made.append((field.name, own + field.at, dtype))
+        elif field.name in had and had[field.name].dtype == field.dtype:
+            copied.append((own + had[field.name].at, own + field.at, field.dtype.itemsize))
+        else:
+            return None
+    if "Classification" in new.values:
+        made.append(("Classification", _CLASS_AT[after.point_format >= 6], np.dtype(np.uint8)))
+    if set(new.values) != {name for name, _, _ in made}:
+        return None
+    if after.point_bytes != own + sum(width for *_, width in copied) + sum(
+        dtype.itemsize for _, at, dtype in made if at >= own
+    ):
+        return None
+    with open(output, "rb") as file:
+        coding = b""
+        for record in records(file, after):
+            if record.user == _COMPRESSOR:
+                file.seek(record.data)
+                coding = file.read(record.length)
+        file.seek(0)
+        head = file.read(after.offset)
+    if after.compressed != bool(coding):
+        return None
+    return _Way(head, after.point_bytes, own, tuple(copied), tuple(made), coding)
+
+
+class _Extra(NamedTuple):
+    name: str
+    at: int  #: bytes after those of the point format
+    dtype: np.dtype
+
+
+def _extra(path: str) -> list[_Extra]:
+    """Extra dimensions of a file as its points hold them; ValueError where one is scaled, or no number."""
+    found, at = [], 0
+    named = plain_dimensions(path)
+    if named is None:
+        raise ValueError("extra dimensions that are not plain numbers")
+    for name, kind in named:
+        dtype = np.dtype({"float": "<f4", "double": "<f8"}.get(kind, kind))
+        found.append(_Extra(name, at, dtype))
+        at += dtype.itemsize
+    return found
+
+
+def _same(way: _Way, path: str, points: NDArray | None, new: NewValues, output: str) -> bool:
+    """Whether what is made here is what PDAL made."""
+    if points is None:
+        return False
+    out = io.BytesIO()
+    _write(out, way, path, points, new)
+    with open(output, "rb") as file:
+        return file.read() == out.getvalue()
+
+
+def _tried(way: _Way, path: str, new: NewValues, scratch: str, suffix: str, with_pdal: WithPdal) -> bool:
+    """Whether that is so for points whose every bit is random, too."""
+    rng = np.random.default_rng(1)
+    head, _ = plain_header(path)
+    (width,) = struct.unpack_from("<H", head, 105)
+    points = rng.integers(0, 256, (_RANDOM, width), np.uint8)
+    places = rng.integers(-(2**30), 2**30, (_RANDOM, 3), np.int32)
+    points[:, :12] = places.view(np.uint8)
+    header = read_header(path)
+    assert header is not None
+    for start, end in _ranges(head, header):
+        head[start:end] = rng.bytes(end - start)
+    numbers = [(20 if header.point_format < 6 else 22, np.dtype("<f8"))] * (
+        header.point_format in (1, 3, 6, 7, 8)
+    )
+    numbers += [(way.own + field.at, field.dtype) for field in _extra(path) if field.dtype.kind == "f"]
+    for at, dtype in numbers:  # any bits would be such as no program writes
+        values = rng.normal(0.0, 1e5, _RANDOM).astype(dtype)
+        points[:, at : at + dtype.itemsize] = values[:, None].view(np.uint8)
+    columns: dict[str, tuple[None, NDArray]] = {}
+    for name, (_, column) in new.values.items():
+        columns[name] = (None, rng.integers(0, 100, _RANDOM).astype(column.dtype))
+    tried = NewValues(np.ones(_RANDOM, bool), columns)
+    with TemporaryDirectory(prefix="alike-", dir=scratch, ignore_cleanup_errors=True) as folder:
+        given, made = os.path.join(folder, "given.las"), os.path.join(folder, f"made{suffix}")
+        with open(given, "wb") as file:
+            file.write(head + points.tobytes())
+            finish(file, head, b"", _RANDOM)
+        with_pdal(given, tried, made)
+        return _same(way, path, points, tried, made)
+
+
+# ---- writing -----------------------------------------------------------------------------------------------
+
+
+def _write(file: BinaryIO, way: _Way, path: str, points: NDArray, new: NewValues) -> None:
+    """Write what comes out of points, (n, bytes) records of the file at `path`."""
+    header = read_header(path)
+    assert header is not None
+    kept = new.kept
+    file.write(_head(way, header, points if kept.all() else points[kept]))
+    blocks = (
+        _together(way, points[start : start + _BLOCK], new, start) for start in range(0, len(points), _BLOCK)
+    )
+    if way.coding:
+        import lazrs
+
+        compress(file, lazrs.LazVlr(way.coding), blocks)
+    else:
+        for block in blocks:
+            file.write(block)
+
+
+def _together(way: _Way, points: NDArray, new: NewValues, start: int) -> bytes:
+    """Points as they come out, from those that came in."""
+    end = start + len(points)
+    out = np.zeros((len(points), way.width), np.uint8)
+    out[:, : way.own] = points[:, : way.own]
+    for source, target, width in way.copied:
+        out[:, target : target + width] = points[:, source : source + width]
+    for name, at, dtype in way.made:
+        rows, column = new.values[name]
+        if rows is None:
+            out[:, at : at + dtype.itemsize] = _bytes_of(column[start:end], dtype)
+        else:
+            mine = np.flatnonzero((rows >= start) & (rows < end))
+            out[rows[mine] - start, at : at + dtype.itemsize] = _bytes_of(column[mine], dtype)
+    kept = new.kept[start:end]
+    return out.tobytes() if kept.all() else out[kept].tobytes()
+
+
+def _bytes_of(column: NDArray, dtype: np.dtype) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(column, dtype)[:, None].view(np.uint8)
+
+
+def _head(way: _Way, header: LasHeader, points: NDArray) -> bytes:
+    """All before the points, with their counts and extents (LAS 1.4 R15, table 3)."""
+    head = bytearray(way.head)
+    count = len(points)
+    returns = np.bincount(points[:, 14] & (15 if header.point_format >= 6 else 7), minlength=16)[1:].tolist()
+    places = np.ascontiguousarray(points[:, :12]).view("<i4")
+    ends = []
+    for axis in range(3):
+        for end in (places[:, axis].max(), places[:, axis].min()):
+            ends.append(float(end) * header.scales[axis] + header.offsets[axis])
+    if any(head[107:131]):
+        struct.pack_into("<6I", head, 107, count, *returns[:5])
+    struct.pack_into("<6d", head, 179, *ends)
+    if head[25] >= 4 and any(head[247:375]):
+        end, other = struct.unpack_from("<Q4xQ", head, 235)
+        if end:  # of the points before they were compressed, though no records are there
+            struct.pack_into("<Q", head, 235, end + (count - other) * way.width)
+        struct.pack_into("<16Q", head, 247, count, *returns)
+    return bytes(head)
