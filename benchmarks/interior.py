@@ -87,6 +87,7 @@ def main() -> None:
         (folder / "out").mkdir()
         plan = task.plan()
         survey = Survey(plan, task.options)
+        plan = survey.plan
         pool = Timed(o.threads)
         with Store(folder / "out") as store, contextlib.suppress(KeyboardInterrupt):
             survey.read_indexes(store, pool, 0, False)

@@ -18,7 +18,7 @@ from pdal_stages.stages.base import Blocks
 from pdal_stages.synthetic.townfile import wkt
 from pdal_stages.tiling import TilingOptions
 from pdal_stages.tiling.pace import Pace
-from pdal_stages.tiling.sizing import PARENT, Density, block_bytes, settled, worker_bytes
+from pdal_stages.tiling.sizing import PARENT, Density, block_bytes, settled, widened, worker_bytes
 from pdal_stages.tiling.sources import Extent
 
 pytestmark = pytest.mark.pdal
@@ -316,7 +316,18 @@ def test_a_worker_has_room_for_the_blocks_before_the_tiles():
     blocks = Blocks(1024.0, 494.0, 100.0, 2.0)
     whole = block_bytes(blocks, 1e9)
     assert block_bytes(blocks, 2e9) == whole and block_bytes(blocks, 1e5) < 0.1 * whole
-    assert block_bytes(Blocks(2048.0, 988.0, 200.0, 4.0), 1e9) == whole  # of cells of 2 m
+    assert block_bytes(Blocks(2048.0, 988.0, 200.0, 4.0, 2.0), 1e9) == whole  # of cells of 2 m
     assert worker_bytes(1000, 0, whole) - worker_bytes(1000, 0) == pytest.approx(
         whole - (512 << 20) - 270_000
     )
+
+
+def test_blocks_are_as_large_as_a_tile_allows():
+    blocks = Blocks(1024.0, 494.0, 100.0, 2.0)
+    twice = widened(blocks, 1e9, 6e6, 4)
+    assert twice == blocks._replace(side=2048.0)
+    assert block_bytes(twice, 1e9) < worker_bytes(6e6, 0) < block_bytes(twice, 1e9) * 2
+    assert widened(blocks, 1e9, 1e6, 4) == blocks  # it would take more than the tile
+    assert (
+        widened(blocks, 1e7, 6e6, 4) == blocks and widened(blocks, 1e7, 6e6, 2) == twice
+    )  # one for each worker

@@ -16,6 +16,7 @@ from pdal_stages.terrain.groundcells import BLOCK_SIDE, FilterOptions, GroundCel
 from pdal_stages.terrain.lowpoints import lowest_of_cells
 from pdal_stages.terrain.morphological import reach_of_cells
 from pdal_stages.tiling import run_tiled
+from pdal_stages.tiling.firstround import BlockTask
 
 HEIGHTS = {"type": "filters.hag_morphological", "window": 8, "ground": True, "openings": [5, 9]}
 MADE = ("HeightAboveGround", "Ground", "HeightAboveOpening_5", "HeightAboveOpening_9")
@@ -235,31 +236,33 @@ def test_what_fails_in_the_first_round_is_said_of_the_tiles_that_need_it(tmp_pat
         in_tiles(survey, [small], tmp_path / "other", retries=0)
 
 
-def blocks_of(points, options, near):
+def blocks_of(points, options, near, cells=BLOCK_SIDE):
     """The cells of all blocks that points need, each made of the lowest points that it may look at."""
     cell = options.cell
     low = points[:, lowest_of_cells(*points, np.ones(points.shape[1], bool), cell)]
-    side, around = BLOCK_SIDE * cell, (reach_of_block(options) + 1) * cell
-    inside = by_block(*points, np.ones(points.shape[1], bool), cell)
+    side, around = cells * cell, (reach_of_block(options) + 1) * cell
+    inside = by_block(*points, np.ones(points.shape[1], bool), cell, cells)
     found = []
     for i in range(int(near[0] // side), int(near[2] // side) + 1):
         for j in range(int(near[1] // side), int(near[3] // side) + 1):
             box = i * side - around, j * side - around, (i + 1) * side + around, (j + 1) * side + around
             seen = (low[0] >= box[0]) & (low[0] <= box[2]) & (low[1] >= box[1]) & (low[1] <= box[3])
             mine = inside.get((i, j), np.empty((0, 3)))
-            found.append(cells_of_block(*low[:, seen], (i, j), options, [mine[::2], mine[1::2]]))
+            found.append(cells_of_block(*low[:, seen], (i, j), options, [mine[::2], mine[1::2]], cells))
     return GroundCells.joined(found, len(options.openings))
 
 
 @pytest.mark.parametrize(
-    ("origin", "cell", "window", "strays"),
+    ("origin", "cell", "window", "strays", "side"),
     [
-        ((0.0, 0.0), 1.0, 8.0, False),
-        ((770_500.0, 6_277_550.0), 1.0, 30.0, True),
-        ((1000.0, 2000.0), 0.5, 5.0, False),
+        ((0.0, 0.0), 1.0, 8.0, False, BLOCK_SIDE),
+        ((770_500.0, 6_277_550.0), 1.0, 30.0, True, BLOCK_SIDE),
+        ((1000.0, 2000.0), 0.5, 5.0, False, BLOCK_SIDE),
+        ((770_500.0, 6_277_550.0), 1.0, 30.0, True, 2 * BLOCK_SIDE),
+        ((0.0, 0.0), 1.0, 8.0, False, 300),
     ],
 )
-def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, strays):
+def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, strays, side):
     x, y, z, _ = town(4, side=900, density=0.5, origin=origin)
     if strays:  # far from all else, and a hole in the middle
         away = np.random.default_rng(1).uniform(0, 60, (2, 400))
@@ -279,13 +282,37 @@ def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, 
         near = away <= 3.0
         wide = 3.0 + reach_of_cells(cell)
         around = [box[0] - wide, box[1] - wide, box[2] + wide, box[3] + wide]
-        around = [side + origin[n % 2] for n, side in enumerate(around)]
-        cells = blocks_of(np.array([x, y, z]), made, around).within(*(int(side // cell) for side in around))
+        around = [edge + origin[n % 2] for n, edge in enumerate(around)]
+        blocks = blocks_of(np.array([x, y, z]), made, around, side)
+        cells = blocks.within(*(int(edge // cell) for edge in around))
         some = filtered_ground(x[near], y[near], z[near], cells=cells, **options)
         core = away[near] < 0
         assert core.any()
         for name, values in some.items():
             assert np.array_equal(values[core], whole[name][near][core]), (box, name)
+
+
+@pytest.mark.pdal
+def test_larger_blocks_give_the_same(tmp_path, survey, monkeypatch):
+    stages = [{"type": "filters.detachednoise"}, HEIGHTS]
+    sides, usual = [], BlockTask.run
+
+    def run(task):
+        sides.append((task.plan.first.blocks.side, task.block))
+        return usual(task)
+
+    monkeypatch.setattr(BlockTask, "run", run)
+    for name, factor in (("usual", 1), ("larger", 2), ("smaller", 0.25)):
+        monkeypatch.setattr(
+            "pdal_stages.tiling.survey.widened",
+            lambda blocks, *_, by=factor: blocks._replace(side=by * blocks.side),
+        )
+        assert not in_tiles(survey, stages, tmp_path / name).failures
+    found = {side: {block for of, block in sides if of == side} for side, _ in sides}
+    assert set(found) == {1024.0, 2048.0, 256.0} and len(found[256.0]) >= 9
+    for name in ("larger", "smaller"):
+        for file in ("west.las", "east.las"):
+            assert (tmp_path / name / file).read_bytes() == (tmp_path / "usual" / file).read_bytes()
 
 
 @pytest.mark.parametrize("cell", [1.0, 0.7])

@@ -46,6 +46,7 @@ class Blocks(NamedTuple):
     reach: float  #: how far around a block points matter
     around: float  #: how far beyond the points that are read a tile needs blocks
     spill: float  #: how far beyond all points blocks hold something
+    cell: float = 1.0  #: side of the cells that they are rasters of
 
 
 class Left(NamedTuple):
@@ -123,6 +124,8 @@ class Stage(ABC):
 
     #: In tiles: what :meth:`made_of_blocks` gave.
     from_blocks: Any = None
+    #: Side of the blocks, meters, where it is another than :meth:`blocks` says.
+    block_side: float | None = None
     #: In tiles: a dimension below zero for points whose results are used; only they are counted in reports.
     own_points: str = ""
     #: Whether stages before it in the pipeline make what it makes too.

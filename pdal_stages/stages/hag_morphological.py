@@ -150,7 +150,7 @@ of Z.
     def blocks(self) -> Blocks:
         cell = self.cell
         reach = (reach_of_block(self._filter) + 2) * cell
-        return Blocks(BLOCK_SIDE * cell, reach, reach_of_cells(cell), 2 * cell)
+        return Blocks(BLOCK_SIDE * cell, reach, reach_of_cells(cell), 2 * cell, cell)
 
     @cached_property
     def _filter(self) -> FilterOptions:
@@ -164,6 +164,10 @@ of Z.
             self.decks,
         )
 
+    @property
+    def _block_cells(self) -> int:
+        return BLOCK_SIDE if self.block_side is None else round(self.block_side / self.cell)
+
     def left_of(self, points: Points) -> Left:
         x, y, z = points.axes
         usable = points.usable(self.ignore)
@@ -172,13 +176,16 @@ of Z.
         if self.decks:
             chosen[level_points(x, y, z, usable)] = True
         left = np.flatnonzero(chosen)
-        return Left(np.column_stack([x[left], y[left], z[left]]), by_block(x, y, z, usable, self.cell))
+        return Left(
+            np.column_stack([x[left], y[left], z[left]]),
+            by_block(x, y, z, usable, self.cell, self._block_cells),
+        )
 
     def block_of(
         self, around: NDArray[np.float64], inside: Iterable[NDArray[np.float64]], block: tuple[int, int]
     ) -> dict[str, NDArray]:
         x, y, z = around.T
-        return cells_of_block(x, y, z, block, self._filter, inside).arrays()
+        return cells_of_block(x, y, z, block, self._filter, inside, self._block_cells).arrays()
 
     def made_of_blocks(self, blocks: Sequence[Mapping[str, NDArray]], box: Sequence[float]) -> GroundCells:
         sides = [math.floor(side / self.cell) for side in box]

@@ -41,7 +41,7 @@ from .deckrims import (
 from .levels import levels
 from .longdecks import BLOCK, FAR_ENDS, stretches
 from .minima import cell_numbers
-from .patches import patches
+from .patches import LARGEST, patches
 from .walkable import (
     ACROSS,
     AHEAD,
@@ -120,17 +120,21 @@ def _raster(column, row):
 
 
 def levels_near_decks(
-    x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64], use: NDArray[np.bool_]
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    z: NDArray[np.float64],
+    use: NDArray[np.bool_],
+    largest: int = LARGEST,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """All that :func:`decks_of_levels` needs, of the points :func:`level_points` at least, and what these are numbers of.
 
     Levels in cells up to twice BESIDE from a deck (n, 5): column, row, height, whether it is a deck's, its kind; and the
-    numbers of the points that are their lowest.
+    numbers of the points that are their lowest. No raster has more than `largest` cells.
     """
     rows, numbers = [np.empty((0, 5))], [np.empty(0, np.int64)]
     if len(x):
         column, row = cell_numbers(x, CELL), cell_numbers(y, CELL)
-        for points, own in patches(column, row, int(REACH), FAR + AHEAD):
+        for points, own in patches(column, row, int(REACH), FAR + AHEAD, largest):
             found = _deck_levels(z[points], use[points], column[points], row[points])
             if found is None:
                 continue

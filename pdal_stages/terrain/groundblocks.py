@@ -24,7 +24,7 @@ from .groundcells import (
 from .groundmeans import add_ground, around, heights_above, means_of
 from .lowpoints import HIGHEST
 from .minima import cell_numbers
-from .patches import connected
+from .patches import LARGEST, connected
 from .planes import reach as planes_reach
 from .planes import surface
 
@@ -48,13 +48,14 @@ def by_block(
     z: NDArray[np.float64],
     use: NDArray[np.bool_],
     cell: float,
+    side: int = BLOCK_SIDE,
 ) -> dict[tuple[int, int], NDArray[np.float64]]:
-    """Those of points that may be ground (m, 3) by the block that holds them; meters."""
+    """Those of points that may be ground (m, 3) by the block of `side` cells that holds them; meters."""
     mine = use & (np.abs(z) < HIGHEST)
     xyz = np.column_stack([x[mine], y[mine], z[mine]])
     if not len(xyz):
         return {}
-    column, row = (cell_numbers(xyz[:, axis], cell) // BLOCK_SIDE for axis in (0, 1))
+    column, row = (cell_numbers(xyz[:, axis], cell) // side for axis in (0, 1))
     if (column == column[0]).all() and (row == row[0]).all():
         return {(int(column[0]), int(row[0])): xyz}
     order = np.lexsort((column, row))
@@ -70,15 +71,16 @@ def cells_of_block(
     block: tuple[int, int],
     options: FilterOptions,
     points: Iterable[NDArray[np.float64]] = (),
+    side: int = BLOCK_SIDE,
 ) -> GroundCells:
-    """The cells of a block, column and row of a grid of blocks of :data:`BLOCK_SIDE` cells.
+    """The cells of a block, column and row of a grid of blocks of `side` cells.
 
     x, y, z are the lowest points of cells, in meters: all within :func:`reach_of_block` cells of the block, and as many more
     as you like. `points` are all that may be ground in the block, in parts (n, 3).
     """
     column, row = cell_numbers(x, options.cell), cell_numbers(y, options.cell)
-    west, south = (BLOCK_SIDE * number for number in block)
-    east, north = west + BLOCK_SIDE - 1, south + BLOCK_SIDE - 1
+    west, south = (side * number for number in block)
+    east, north = west + side - 1, south + side - 1
 
     def within(column, row, away):
         inside = (column >= west - away) & (column <= east + away)
@@ -101,12 +103,14 @@ def cells_of_block(
         far = options.reach_of_decks + margin
         seen = within(column, row, far) if beyond(far + _FEW) else slice(None)
         use = np.ones(len(x[seen]), bool)
-        levels, lowest = levels_near_decks(x[seen], y[seen], z[seen], use)
+        levels, lowest = levels_near_decks(
+            x[seen], y[seen], z[seen], use, LARGEST * max(1, side // BLOCK_SIDE) ** 2
+        )
         deck[seen] = decks_of_levels(x[seen], y[seen], z[seen], use, levels)
         own_levels = levels[within(column[seen][lowest], row[seen][lowest], 0)]
-    ground = _GroundPoints(west, south, levels, options)
+    ground = _GroundPoints(west, south, side, levels, options)
     rasters = []
-    own = CellWindow(west, south, BLOCK_SIDE, BLOCK_SIDE)
+    own = CellWindow(west, south, side, side)
     for part, _own in connected(column, row, within(column, row, margin), options.link):
         given = x, y, z, np.ones(len(x), bool), deck, column, row
         if len(part) < len(x):
@@ -118,7 +122,7 @@ def cells_of_block(
         del raster
     for some in points:
         ground.add(some)
-    found = [_cells_of(raster, *ground.means_of(n), options) for n, raster in enumerate(rasters)]
+    found = [_cells_of(raster, west, south, *ground.means_of(n), options) for n, raster in enumerate(rasters)]
     return replace(GroundCells.joined(found, len(options.openings)), decks=own_levels)
 
 
@@ -128,13 +132,15 @@ class _GroundPoints:
     `levels`: see :func:`.decks.levels_near_decks`.
     """
 
-    def __init__(self, west: int, south: int, levels: NDArray[np.float64], options: FilterOptions) -> None:
+    def __init__(
+        self, west: int, south: int, side: int, levels: NDArray[np.float64], options: FilterOptions
+    ) -> None:
         self._west, self._south, self._levels, self._options = west, south, levels, options
         # With a ring around: points blend the four cells round them.
-        self._planes = np.full((BLOCK_SIDE + 2, BLOCK_SIDE + 2, 3), np.nan)
-        self._part = np.full((BLOCK_SIDE, BLOCK_SIDE), -1, np.int32)
+        self._planes = np.full((side + 2, side + 2, 3), np.nan)
+        self._part = np.full((side, side), -1, np.int32)
         self._parts = 0
-        self._sums = np.zeros((BLOCK_SIDE, BLOCK_SIDE, 4), np.int64)
+        self._sums = np.zeros((side, side, 4), np.int64)
 
     def look_at(self, raster: GroundRaster, column: NDArray[np.int64], row: NDArray[np.int64]) -> None:
         """The next part of the block, whose cells in it are these."""
@@ -170,10 +176,14 @@ class _GroundPoints:
 
 
 def _cells_of(
-    raster: GroundRaster, held: NDArray[np.bool_], means: NDArray[np.float64], options: FilterOptions
+    raster: GroundRaster,
+    west: int,
+    south: int,
+    held: NDArray[np.bool_],
+    means: NDArray[np.float64],
+    options: FilterOptions,
 ) -> GroundCells:
-    """Of a raster inside a block, and what ground points say on the raster of all of it."""
-    west, south = (number // BLOCK_SIDE * BLOCK_SIDE for number in (raster.left, raster.bottom))
+    """Of a raster inside a block, and what ground points say on the raster of all of it, from a column and row on."""
     h, w = raster.shape
     inside = (
         slice(raster.bottom - south, raster.bottom - south + h),

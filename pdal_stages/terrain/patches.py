@@ -19,20 +19,22 @@ _PARTS = 4
 _Piece = tuple[NDArray[np.int64] | slice, NDArray[np.bool_] | slice]
 
 
-def patches(column: NDArray[np.int64], row: NDArray[np.int64], reach: int, link: int) -> Iterator[_Piece]:
+def patches(
+    column: NDArray[np.int64], row: NDArray[np.int64], reach: int, link: int, largest: int = LARGEST
+) -> Iterator[_Piece]:
     """Yield (points, own): the points of a piece and those round it that matter, and which of them are its own.
 
     Every point is some piece's own. Points more than `reach` cells away, along either axis, do not matter; nor do
     points that no chain of others connects with steps of at most `link` cells. One piece, all points, where the whole
-    is small enough.
+    is small enough: a raster of `largest` cells.
     """
     cells = _cells(column, row)
-    if cells <= LARGEST and not _is_empty(cells, len(column)):
+    if cells <= largest and not _is_empty(cells, len(column)):
         yield slice(None), slice(None)
         return
     for group in _groups(column, row, link):
         c, r = column[group], row[group]
-        if _cells(c, r) <= LARGEST:
+        if _cells(c, r) <= largest:
             yield group, slice(None)
             continue
         for near, mine in _squares(c, r, reach):

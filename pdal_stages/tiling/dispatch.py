@@ -181,7 +181,7 @@ def run_first_round(work: Worklist, store: Store, pool: Pool, retries: int, show
             build(),
             before,
             survey.stamps_of(before),
-            [job.tile, grid.size, first.halo_m, unit, first.kept],
+            [job.tile, grid.size, first.halo_m, unit, first.kept, first.blocks.side],
             [[s.path, survey.stamps[s.path], s.reader] for s in sources],
         )
         items.append(
@@ -198,7 +198,7 @@ def run_first_round(work: Worklist, store: Store, pool: Pool, retries: int, show
     items = []
     for block, found in sorted(near.items()):
         made_of = [marks[tile] for tile in found if tile not in failed]
-        mark = fingerprint(build(), before[-1], unit, block, made_of)
+        mark = fingerprint(build(), before[-1], unit, block, first.blocks.side, made_of)
         items.append(_Item(block, block_file(block), mark, partial(block_task, block)))
     for item, answer in made(items, "ground by blocks"):
         if answer.reason:

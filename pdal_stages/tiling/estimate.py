@@ -68,7 +68,7 @@ def _kept_before(plan: TilePlan, count: int, area: float) -> float:
     """Bytes that the rounds before the tiles keep of so many points on so many square meters."""
     if plan.first is None:
         return 0.0
-    return count * _KEPT_BEFORE + area / (plan.first.blocks.side / 1024) ** 2 * _KEPT_OF_CELL
+    return count * _KEPT_BEFORE + area / plan.first.blocks.cell**2 * _KEPT_OF_CELL
 
 
 def _beside(tiles: list[TileJob], read: int) -> int:

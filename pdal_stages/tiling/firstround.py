@@ -105,7 +105,9 @@ def stage_of(plan: TilePlan) -> Stage:
     assert plan.first is not None
     given = plan.head[plan.first.at]
     options = {name: value for name, value in given.items() if name not in ("type", "tag", "inputs")}
-    return registry.get(given["type"])(options)
+    stage = registry.get(given["type"])(options)
+    stage.block_side = plan.first.blocks.side
+    return stage
 
 
 def block_grid(first: FirstRound) -> TileGrid:

@@ -183,6 +183,7 @@ def run_first(context: RunContext, cuts: list[Piece], first: FirstRound) -> Firs
         head = [_with_threads(given, context.threads) for given in context.plan.head[: first.at + 1]]
         head[0] |= _after(marks)
         wanting = Pipeline([*stages, *head], whole=False).lowered.ours[-1].stage
+        wanting.block_side = first.blocks.side
         left = _Left(wanting, marks)
         run = callbacks.filter(left, **(_after(marks) if first.at == 0 else {}))
         pipeline = Pipeline([*stages, *head[:-1], run], whole=False)

@@ -16,7 +16,7 @@ from .sources import Extent
 #: together, and the `memory` option of our stages. See docs/large-areas.md.
 BASE, TILE_POINT, FILE_POINT, BLOCKS = 350 << 20, 270, 250, 512 << 20
 #: Of a cell of the raster of which a block is made before the tiles.
-_CELL = 150
+_CELL = 200
 #: Of the process that hands out the work.
 PARENT = 350 << 20
 #: Points of a larger file are put together in parts of so many.
@@ -64,8 +64,17 @@ class Density:
 
 def block_bytes(blocks: StageBlocks, area_m2: float) -> float:
     """Memory that a block takes which is made before the tiles, of so many square meters of points at most."""
-    cell = blocks.side / 1024
-    return min((blocks.side + 2 * blocks.reach) ** 2, area_m2) / cell**2 * _CELL
+    return min((blocks.side + 2 * blocks.reach) ** 2, area_m2) / blocks.cell**2 * _CELL
+
+
+def widened(blocks: StageBlocks, area_m2: float, points_read: float, workers: int) -> StageBlocks:
+    """Blocks of twice the side, whose surroundings cost half as much, where one takes no more than a tile of so many points.
+
+    As long as each worker gets one, in a survey of so many square meters.
+    """
+    twice = blocks._replace(side=2 * blocks.side)
+    fits = block_bytes(twice, area_m2) <= points_read * TILE_POINT + BLOCKS
+    return twice if fits and workers * twice.side**2 <= area_m2 else blocks
 
 
 def worker_bytes(points_read: float, largest_file: float, block: float = 0.0) -> float:

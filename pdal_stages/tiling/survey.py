@@ -6,7 +6,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,7 @@ from .grid import Box, TileGrid, check_number, touching, union
 from .outcome import Costs
 from .pool import Pool, last_tries
 from .settings import TilingOptions
-from .sizing import Density, block_bytes, settled
+from .sizing import Density, block_bytes, settled, widened
 from .sources import Extent, InputSource, check_source, find_sources, read_ept, read_extent
 from .store import Store, fingerprint
 from .tileplan import TilePlan
@@ -68,6 +68,17 @@ class Survey:
         self.options = settled(options, density, self.halo_units, self.per == "file", self.block_bytes)
         assert self.options.tile is not None
         self.grid = TileGrid(self.options.tile)
+        #: With blocks as large as there is room for.
+        self.plan = self._widened(plan, density)
+
+    def _widened(self, plan: TilePlan, density: Density) -> TilePlan:
+        if plan.first is None:
+            return plan
+        read = density.read_by(self.grid.size, self.halo_units)
+        area = density.area * self.unit**2
+        blocks = widened(plan.first.blocks, area, read, max(1, self.options.local_workers))
+        self.block_bytes = block_bytes(blocks, area)
+        return replace(plan, first=replace(plan.first, blocks=blocks))
 
     def _read_headers(self) -> None:
         for source in self.sources:

@@ -119,7 +119,7 @@ def run_plan(
         chosen = replace(chosen, tile=Store(folder).side())
     asked = chosen
     survey = Survey(plan, chosen)
-    chosen = survey.options
+    plan, chosen = survey.plan, survey.options
     if survey.per == "tile":  # whose outputs have points of all readers
         classflags.parting([*plan.readers, *plan.tail], with_ours=True)
     survey.messages += remarks(plan.tail, chosen.tile if survey.per == "tile" else None)
