@@ -297,6 +297,8 @@ class Model:
             progress if representatives is None else None,
             grid,
         )
+        # Before the search structures are there, with which it would be the most that is held.
+        found = density(xyz) if self.info.get("densities") is not None and request.count else 0.0
         predicted = self.algorithm.predict(request, finish)
         shares = np.zeros((len(xyz), len(codes)), np.uint16) if how.smooth else None
         for block in predicted.blocks:
@@ -309,15 +311,14 @@ class Model:
             for part, p in _smoothed(xyz, rows, shares, how):
                 write(part, decide(p, codes, how))
             predicted.report.figures["smooth"] = how.smooth
-        self._report_density(predicted.report, xyz, request.count)
+        self._report_density(predicted.report, found, request.count)
         return predicted.report
 
-    def _report_density(self, report: Report, xyz: npt.NDArray[np.float64], count: int) -> None:
+    def _report_density(self, report: Report, found: float, count: int) -> None:
         """How dense the cloud is; a warning where that is not what the model was trained for."""
         trained = self.info.get("densities")
         if trained is None or not count:
             return
-        found = density(xyz)
         report.figures["density"] = round(found, 3)
         if out_of_range(found, trained):
             low, high = f"{trained['low']:.3g}", f"{trained['high']:.3g}"
