@@ -94,17 +94,6 @@ def check_same(folder: Path, expected: dict[str, bytes]) -> None:
 # ---- workers ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("own", [None, "4096"])
-def test_workers_give_back_what_is_freed(own, monkeypatch):
-    name = "MALLOC_MMAP_THRESHOLD_"
-    if own is None:
-        monkeypatch.delenv(name, raising=False)
-    else:
-        monkeypatch.setenv(name, own)
-    ((_, answer),) = processes.each_file(os.getenv, [(name,)], apart=True)
-    assert answer.result == (own or str(1 << 20))
-
-
 def test_killed_workers(tmp_path, folder):
     """One tile kills its worker once and is done again; one always does, is given up and listed."""
     flag = tmp_path / "killed"

@@ -200,8 +200,6 @@ def _environment(threads: int) -> dict[str, str]:
     out = {**os.environ, "PDAL_STAGES_PROGRESS": "0"}
     out |= {f"{name}_NUM_THREADS": str(threads) for name in ("OMP", "OPENBLAS", "MKL")}
     out["LOKY_MAX_CPU_COUNT"] = str(threads)  # which available_threads heeds
-    # glibc raises this limit to 32 MB by itself, and then keeps what was freed: a twentieth of a tile's memory.
-    out.setdefault("MALLOC_MMAP_THRESHOLD_", str(1 << 20))
     if "PYTHONPATH" in out:  # where an empty entry means the current folder
         out["PYTHONPATH"] = os.pathsep.join(filter(None, out["PYTHONPATH"].split(os.pathsep)))
     return out
