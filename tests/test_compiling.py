@@ -53,3 +53,16 @@ def test_a_first_job_says_how_many_it_compiles_and_the_next_one_nothing(tmp_path
     assert {total for _, total in first} == {wanted}
     assert first[-1][0] in range(wanted - 2, wanted + 1)  # some kernels are for clouds of other kinds
     assert said() == []
+
+
+def test_warmup_says_how_many_there_are_and_the_next_one_nothing(tmp_path):
+    words = [sys.executable, "-m", "pdal_stages.cli", "warmup"]
+    env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kernels"), "PDAL_STAGES_PROGRESS": "lines"}
+
+    def said():
+        done = subprocess.run(words, env=env, cwd=tmp_path, text=True, capture_output=True, check=True)
+        return re.findall(r": (\d+) of (\d+) kernels \(", done.stderr)
+
+    first, wanted = said(), len(registry.kernels(["warmup"]))
+    assert {int(total) for _, total in first} == {wanted} and int(first[-1][0]) == wanted
+    assert said() == []

@@ -18,13 +18,14 @@ cache ahead of time, e.g. at installation.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib
 import os
 import stat
 import tempfile
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache, update_wrapper
 from pathlib import Path
 from typing import Any
@@ -232,12 +233,7 @@ class Compiling:
         names, cls._expected = cls._expected, None
         if cls._bar is None or names is None:
             return
-        missing = 0
-        for name in names():
-            module, _, function = f"{__package__.rpartition('.')[0]}.{name}".rpartition(".")
-            kernel = getattr(importlib.import_module(module), function, None)
-            missing += isinstance(kernel, Kernel) and not kernel.kept
-        cls._bar.total = cls._bar.count + missing
+        cls._bar.total = cls._bar.count + len(_not_kept(names()))
 
     @staticmethod
     def _start(_: Any, event: Any) -> None:
@@ -253,3 +249,45 @@ class Compiling:
             if bar.total:  # more than was foreseen
                 bar.total = max(bar.total, bar.count + 1)
             bar.update()
+
+
+def _not_kept(names: Iterable[str]) -> list[Kernel]:
+    """Kernels, named as ``terrain.minima.lowest``, of which no compiled code is in the cache."""
+    found = []
+    for name in names:
+        module, _, function = f"{__package__.rpartition('.')[0]}.{name}".rpartition(".")
+        kernel = getattr(importlib.import_module(module), function, None)
+        if isinstance(kernel, Kernel) and not kernel.kept:
+            found.append(kernel)
+    return found
+
+
+@contextlib.contextmanager
+def compiled_elsewhere(names: Iterable[str]) -> Iterator[None]:
+    """Say on stderr how many of these kernels have come into the cache, whoever compiles them, until the block ends."""
+    missing = _not_kept(names)
+    before, Compiling.enabled = Compiling.enabled, False
+    if Compiling._bar is not None:
+        Compiling._bar.enabled = False
+    ended = threading.Event()
+
+    def watch(bar: Progress) -> None:
+        while not ended.wait(1.0):
+            there = [kernel for kernel in missing if kernel.kept]
+            for kernel in there:
+                missing.remove(kernel)
+            bar.update(len(there))
+
+    shown = None if missing else False
+    with Progress(len(missing), "compiling for this processor, once", "kernels", enabled=shown) as bar:
+        watcher = threading.Thread(target=watch, args=(bar,), daemon=True)
+        watcher.start()
+        try:
+            yield
+            ended.set()
+            watcher.join()
+            bar.update(len(missing))  # those of which the cache does not tell
+        finally:
+            ended.set()
+            watcher.join()
+            Compiling.enabled = before

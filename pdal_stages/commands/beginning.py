@@ -34,17 +34,20 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def _warmup(options: argparse.Namespace) -> None:
+    from ..base.jit import compiled_elsewhere
     from ..base.threads import available_threads
     from ..classifier.warmup import compile_part, features_part, other_part, warmup
     from ..objects.warmup import objects_part
     from ..pipeline.processes import each_file
+    from ..stages import registry
     from ..synthetic.demo import compile_kernels
 
     parts = [(part,) for part in (features_part, other_part, objects_part, compile_kernels)]
-    for _, answer in each_file(compile_part, parts, min(2, available_threads())):
-        if answer.reason:
-            raise StageError("the kernels cannot be compiled", found=answer.reason)
-    warmup()  # shows that all are there and work together
+    with compiled_elsewhere(registry.kernels(["warmup"])):
+        for _, answer in each_file(compile_part, parts, min(2, available_threads()), apart=True):
+            if answer.reason:
+                raise StageError("the kernels cannot be compiled", found=answer.reason)
+        warmup()  # shows that all are there and work together
     if options.all:
         from ..features import warmup as every_neighborhood
 
