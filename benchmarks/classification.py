@@ -312,6 +312,7 @@ def main() -> None:
                 trees=args.trees,
                 min_samples_leaf=args.leaf,
                 prior_weight=args.prior_weight,
+                max_samples=1.0,
                 max_features=args.max_features,
                 seed=args.seed,
                 threads=args.threads,

@@ -33,6 +33,8 @@ DIMENSIONS = (*ALWAYS, *WHERE_THERE, "returns")
 PAPERS = "c1,c2,c3,c5,s1,s2,s3,s5,kopt"
 ONE = {"passes": 1}
 FEATURES = TrainingOptions().feature_set
+#: Defaults until 2026-11-23.
+FORMER = {"count": 10_000, "context": ("own", "box1", "columnvotes2", "columnvotes8")}
 #: Table -> row -> what differs from today's defaults.
 TABLES: dict[str, dict[str, dict[str, Any]]] = {
     "features": {
@@ -57,6 +59,12 @@ TABLES: dict[str, dict[str, dict[str, Any]]] = {
         },
         "all four of k20": {"feature_set": (*FEATURES, *(f"{name}_k20" for name in SURFACES))},
     },
+    "samples": {
+        "10,000, own and around": FORMER,
+        "10,000, around": {"count": 10_000},
+        "40,000, own and around": {**FORMER, "count": 40_000},
+        "40,000, around": {"count": 40_000},
+    },
     "voxel": {
         "0.125 m": {},
         "none": {"voxel": 0.0},
@@ -75,6 +83,9 @@ TABLES: dict[str, dict[str, dict[str, Any]]] = {
             ("own", "box2", "columnvotes1", "columnvotes4", "columnvotes8"),
             ("own", "box2", "columnvotes1", "columnvotes4", "columnvotes16"),
             ("box1", "columnvotes2", "columnvotes8"),
+            ("box1", "box4", "columnvotes1", "columnvotes4", "columnvotes8"),
+            ("own", "box1", "box4", "columnvotes1", "columnvotes4", "columnvotes8"),
+            ("own", "box1", "box4", "columnvotes1", "columnvotes4", "columnvotes16"),
         )
     },
     "trees": {

@@ -30,7 +30,14 @@ HE2017: dict[str, Any] = {
     "neighborhoods": "copt", "feature_set": SIX, "dimensions": [], "voxel": 0, "prior_weight": 0,
     "count": 1000, "trees": 200, "contradicted_below": 0,
 }  # fmt: skip
-CHOSEN: dict[str, Any] = {"neighborhoods": "s1,s2,k10,k20,k50,kopt", "voxel": 0.05, "prior_weight": 0}
+#: What was default when the figures of two passes were made.
+FORMER: dict[str, Any] = {"count": 10_000, "context": "own,box1,columnvotes2,columnvotes8"}
+CHOSEN: dict[str, Any] = {
+    "neighborhoods": "s1,s2,k10,k20,k50,kopt",
+    "voxel": 0.05,
+    "prior_weight": 0,
+    **FORMER,
+}
 #: By name: options of training, and what they are in words.
 SETTINGS: dict[str, tuple[dict[str, Any], str]] = {
     "defaults": ({}, "all defaults"),
@@ -40,10 +47,10 @@ SETTINGS: dict[str, tuple[dict[str, Any], str]] = {
     "chosen, both": (CHOSEN, "the same without them, trained on the validation cloud too"),
     "he2017": ({**HE2017, "passes": 1}, "[H17]'s six features of v_c, one pass"),
     "he2017, heights": (
-        {"neighborhoods": "copt", "feature_set": SIX},
+        {"neighborhoods": "copt", "feature_set": SIX, **FORMER},
         "[H17]'s six features of v_c, all else default (two passes, heights)",
     ),
-    "he2017, two passes": ({**HE2017, "passes": 2}, "[H17]'s six features of v_c, two passes"),
+    "he2017, two passes": ({**FORMER, **HE2017, "passes": 2}, "[H17]'s six features of v_c, two passes"),
 }
 HEIGHTS = {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]}
 LABELED = {"type": "filters.range", "limits": "Classification![0:0]"}

@@ -33,6 +33,8 @@ PREPARATION = [{"type": "filters.hag_morphological", "ground": True, "openings":
 FOREST = TrainingOptions(
     dimensions=("HeightAboveGround", "Ground", "HeightAboveOpening_5", "HeightAboveOpening_17", "returns"),
     folds=0,
+    count=10_000,  # this and the context were the defaults when the figures were made
+    context=("own", "box1", "columnvotes2", "columnvotes8"),
 )
 #: Side of the squares that keep their labels, meters, and their share.
 SIDE, SHARE = 5.0, 0.01

@@ -289,3 +289,17 @@ def test_growing_does_not_depend_on_threads_and_out_of_bag_rows_are_out():
     forest = Forest.from_trees([tree for tree, _, _ in runs[0]], 17)
     mean = sum(tree.shares(ranked, np.arange(300)) for tree, _, _ in runs[0]) / 7
     assert np.array_equal(forest.predict_proba(np.asarray(x, np.float32)), mean)
+
+
+def test_of_every_so_many_rows_one_is_judged_out_of_bag():
+    x, y = data(300)
+    ranked, weight = Ranked.of(np.asarray(x, np.float32)), np.ones(300, np.int64)
+    weight[::7] = 0
+    setting = TreeOptions(min_samples_leaf=2, max_samples=0.25)
+    every = list(grow(ranked, y, weight, 5, setting, 4, score="out of bag"))
+    fourth = list(grow(ranked, y, weight, 5, setting, 4, score="out of bag", every=4))
+    for (tree, rows, shares), (same, some, judged) in zip(every, fourth, strict=True):
+        assert np.array_equal(tree.threshold, same.threshold)
+        kept = rows % 4 == 0
+        assert np.array_equal(rows[kept], some) and np.array_equal(shares[kept], judged)
+        assert 0 < len(some) < len(rows) / 3

@@ -1,14 +1,23 @@
 """Models of several passes: what they gain, and that nothing but the cloud decides what comes out."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from test_classifier_training import SMALL, scene
 
 from pdal_stages.base.errors import ModelError, OptionError
-from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, modelfile, train
+from pdal_stages.classifier import (
+    TrainingCloud,
+    TrainingOptions,
+    foresttraining,
+    load_model,
+    modelfile,
+    train,
+)
 from pdal_stages.classifier.folds import Folds
+from pdal_stages.classifier.trainoptions import CONTEXT_OF_BASE, DEFAULT_CONTEXT
 from pdal_stages.features import FeatureEngine
 
 FEW = {
@@ -255,3 +264,27 @@ def test_options():
     ):
         with pytest.raises(OptionError):
             TrainingOptions(**bad)
+
+
+def test_what_is_read_by_default_and_under_a_base(two):
+    alone, on_top = TrainingOptions(), TrainingOptions(base=two)
+    assert alone.context == DEFAULT_CONTEXT and "own" not in alone.context
+    assert on_top.context == CONTEXT_OF_BASE and "own" in on_top.context
+    assert replace(alone, seed=3).context == DEFAULT_CONTEXT
+    model = learned(context=None)
+    assert model.passes[1].context.tokens == DEFAULT_CONTEXT and model.plan.halo_m >= 16.0
+
+
+def test_of_many_samples_a_tree_draws_some(monkeypatch):
+    def drawn(**more):
+        return learned(**more).info["training"]["max_samples"]
+
+    assert drawn() == 1.0  # 150 of each class
+    monkeypatch.setattr(foresttraining, "PER_TREE", 60)
+    few = learned()
+    assert few.info["training"]["max_samples"] == 0.4
+    assert drawn(max_samples=0.9) == 0.9 and drawn(count=60) == 1.0
+    asked = learned(max_samples=0.4)
+    for one, same in zip(few.passes, asked.passes, strict=True):
+        assert np.array_equal(one.forest.threshold, same.forest.threshold)
+    assert few.info["passes"][0]["out_of_bag"]["samples"] <= few.info["training"]["samples"] // 2 + 1

@@ -32,6 +32,7 @@ OPTIONS = TrainingOptions(
     count=40_000,
     contradicted_below=0.3,
     trees=40,
+    max_samples=1.0,
     min_samples_leaf=10,
     prior_weight=0.0,
     passes=2,

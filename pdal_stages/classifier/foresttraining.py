@@ -36,7 +36,7 @@ from .sampling import Samples, draw_samples
 from .sureness import Sureness, counted
 from .surroundings import Looks, Seen, work_on
 from .thinning import density_range
-from .trainoptions import TrainingOptions
+from .trainoptions import PER_TREE, TrainingOptions
 from .trees import GrownTree, Ranked
 from .unscored import why_unscored
 
@@ -121,7 +121,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
             "seed": options.seed,
             "samples": len(samples),
             **labeled.training_notes(options),
-            "max_samples": options.max_samples,
+            "max_samples": _share_drawn(options, samples, len(classes.codes)),
             "max_features": options.max_features,
             "min_samples_leaf": chosen["min_samples_leaf"],
             "max_depth": chosen["max_depth"],
@@ -180,8 +180,17 @@ def _priors(samples: Samples, n_classes: int, weight: float) -> dict[str, Any] |
 # ---- trees -------------------------------------------------------------------------------------------------
 
 
-def _tree_options(options: TrainingOptions, max_depth: int | None, min_samples_leaf: int) -> TreeOptions:
-    return TreeOptions(max_depth, min_samples_leaf, options.max_samples, options.max_features)
+def _tree_options(
+    options: TrainingOptions, drawn: float, max_depth: int | None, min_samples_leaf: int
+) -> TreeOptions:
+    return TreeOptions(max_depth, min_samples_leaf, drawn, options.max_features)
+
+
+def _share_drawn(options: TrainingOptions, samples: Samples, classes: int) -> float:
+    """The share of the samples that each tree draws."""
+    if options.max_samples is not None:
+        return options.max_samples
+    return min(1.0, PER_TREE * classes / int(samples.weight.sum()))
 
 
 def _gap(plan: FeaturePlan, options: TrainingOptions) -> float:
@@ -235,6 +244,7 @@ def _validate(
         folds = min(options.folds or 5, len(names))
         ways.insert(0, ("groups" if options.groups else "surveys", folds, (index % folds).astype(np.int16)))
     asked = {"groups": options.groups} if options.groups else {}
+    drawn = _share_drawn(options, samples, len(codes))
     for by, folds, fold in ways:
         heard.tables.clear()
         try:
@@ -244,7 +254,7 @@ def _validate(
                 samples.weight,
                 xy,
                 codes,
-                [_tree_options(options, **candidate) for candidate in candidates],
+                [_tree_options(options, drawn, **candidate) for candidate in candidates],
                 counts,
                 folds=folds,
                 block_size=options.block_size,
@@ -343,7 +353,8 @@ class _Passes:
         self.samples, self.ranked, self.features = samples, ranked, features
         self.chosen, self.options, self.progress = chosen, options, progress
         self.context = Context(tuple(options.context))
-        self.setting = _tree_options(options, chosen["max_depth"], chosen["min_samples_leaf"])
+        drawn = _share_drawn(options, samples, len(self.codes))
+        self.setting = _tree_options(options, drawn, chosen["max_depth"], chosen["min_samples_leaf"])
         self.made: list[FeatureForest] = []
         self.scores: list[dict[str, Any]] = []
         self.notes: dict[str, Any] = {}
@@ -482,8 +493,12 @@ class _Passes:
         several = self.options.passes > 1 and self.below is None
         what = f"growing pass {number + 1}" if several else "growing"
         count, weight = self.chosen["trees"], self.samples.weight
+        # Trees that draw few of the samples leave nearly all out of their bags: a share of these is judged.
+        every = max(1, round(1.0 / self.setting.max_samples))
         with Progress(count, what, "trees", enabled=self.progress) as bar:
-            for tree, rows, shares in self._grown(ranked, weight, count, bar, score="out of bag"):
+            for tree, rows, shares in self._grown(
+                ranked, weight, count, bar, score="out of bag", every=every
+            ):
                 trees.append(tree)
                 importance += tree.importances(ranked.columns)
                 total[rows] += shares

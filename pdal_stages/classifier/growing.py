@@ -53,6 +53,7 @@ def grow(
     seed: int,
     *,
     score: npt.NDArray[np.int64] | str | None = None,
+    every: int = 1,
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Iterator[tuple[GrownTree, npt.NDArray[np.int64], npt.NDArray[np.float64]]]:
@@ -68,6 +69,8 @@ def grow(
         Times a row counts; rows of weight 0 take no part.
     score : array of rows, or "out of bag", or None
         Rows to apply each tree to. Out of bag: those of positive weight not in its bootstrap sample.
+    every : int
+        Out of bag: of every so many rows, one is judged by all trees that have not drawn it, the others by none.
 
     Yields
     ------
@@ -95,7 +98,7 @@ def grow(
         )
         rows = np.zeros(0, np.int64)
         if isinstance(score, str):
-            rows = np.flatnonzero((bag == 0) & (weight > 0))
+            rows = np.flatnonzero((bag[::every] == 0) & (weight[::every] > 0)) * every
         elif score is not None:
             rows = score
         return tree, rows, tree.shares(ranked, rows)

@@ -22,8 +22,12 @@ from .refinement import check_base
 
 #: Most passes a model can have.
 MOST_PASSES = 3
+#: Samples of a class that a tree draws on average, at most, where `max_samples` is not given.
+PER_TREE = 10_000
 #: What passes after the first read of the surroundings.
-DEFAULT_CONTEXT = ("own", "box1", "columnvotes2", "columnvotes8")
+DEFAULT_CONTEXT = ("box1", "box4", "columnvotes1", "columnvotes4", "columnvotes8")
+#: The same of a forest on top of a base.
+CONTEXT_OF_BASE = ("own", "box1", "columnvotes2", "columnvotes8")
 
 
 def setting(default: Any, kind: str, what: str, more: str = "", **rule: Any) -> Any:
@@ -79,9 +83,11 @@ class TrainingOptions:
         1, "integer", "Code given to all other classes with the binary strategy", low=0, high=255
     )
     count: int = setting(
-        10_000,
+        40_000,
         "integer",
         "Samples per class; smaller classes are filled up with duplicates",
+        "Of more than 10,000 each tree draws some (see `max_samples`): the forest sees more of the ground, at little more "
+        "time.",
         low=1,
         high=10**8,
     )
@@ -113,8 +119,15 @@ class TrainingOptions:
     min_samples_leaf: int | Sequence[int] = setting(
         3, "list", "Minimum number of samples in a leaf; of several values the best is found"
     )
-    max_samples: float = setting(
-        1.0, "number", "Share of the samples that each tree draws", low=0, high=1, above=True
+    max_samples: float | None = setting(
+        None,
+        "number",
+        f"Share of the samples that each tree draws; default: as many as there are, but no more than {PER_TREE:,} of each "
+        "class on average",
+        "So more samples show the forest more of the ground at little cost: each tree draws others.",
+        low=0,
+        high=1,
+        above=True,
     )
     max_features: str | int | float = setting(
         "auto",
@@ -201,11 +214,13 @@ class TrainingOptions:
         low=1,
         high=MOST_PASSES,
     )
-    context: Sequence[str] = setting(
-        DEFAULT_CONTEXT,
+    context: Any = setting(
+        None,
         "list",
-        "What passes after the first read: own, or box, boxvotes, column, columnvotes and a cell's side (box0.5)",
-        "See :class:`pdal_stages.classifier.context.Context`.",
+        "What passes after the first read: own, or box, boxvotes, column, columnvotes and a cell's side (box0.5); default: "
+        f"{','.join(DEFAULT_CONTEXT)}, with a base {','.join(CONTEXT_OF_BASE)}",
+        "See :class:`pdal_stages.classifier.context.Context`. The default leaves the point's own probabilities out: the "
+        "next pass sees the same features and does better by what is said around it.",
     )
     pass_folds: int = setting(
         5,
@@ -269,6 +284,8 @@ class TrainingOptions:
         if self.folds == 1:
             raise OptionError("'folds' must be 0 or at least 2", found=1)
         self._check_algorithm()
+        if self.context is None:
+            object.__setattr__(self, "context", DEFAULT_CONTEXT if self.base is None else CONTEXT_OF_BASE)
         self._check_base()
         put("context", lambda _, tokens: Context.parse(tokens).tokens)
         if self.passes > 1 and not self.context:

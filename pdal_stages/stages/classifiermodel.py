@@ -50,7 +50,7 @@ def trained(name: str, /, **other: Any) -> Any:
     rule = field.metadata
     kind: str = rule["kind"]
     default: Any = field.default
-    if kind == "list" and not isinstance(default, tuple):
+    if kind == "list" and default is not None and not isinstance(default, tuple):
         default = (default,)
     more: dict[str, Any] = {
         "default": float(default) if kind == "number" and default is not None else default
@@ -96,7 +96,7 @@ class ClassifierModel(Stage):
     trees: list = trained("trees")
     max_depth: list = trained("max_depth", default=(0,))
     min_samples_leaf: list = trained("min_samples_leaf")
-    max_samples: float = trained("max_samples")
+    max_samples: float | None = trained("max_samples")
     max_features: str = trained("max_features")
     prior_weight: float = trained("prior_weight")
     folds: int | None = trained("folds")
@@ -125,7 +125,7 @@ class ClassifierModel(Stage):
     )
     leave_one_survey_out: bool = trained("leave_one_survey_out")
     passes: int = trained("passes")
-    context: list = trained("context")
+    context: list | None = trained("context")
     pass_folds: int = trained("pass_folds")
     files: list = option("list", (), "Files that the model names; default: those of the readers")
     memory: int = trained(
