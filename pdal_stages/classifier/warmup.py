@@ -15,7 +15,7 @@ from ..features import compute_features
 from ..features.voxels import represent
 from ..terrain import detached_noise, filtered_ground, hag_minima
 from .clouds import TrainingCloud
-from .context import Context
+from .context import OWN, Context
 from .forest import Forest
 from .training import train
 from .trainoptions import TrainingOptions
@@ -53,7 +53,8 @@ def other_part() -> None:
     xyz = _cloud()
     _heights(xyz)
     shares = np.zeros((len(xyz), 2), np.uint16)
-    tables = Context.parse(TrainingOptions().context).tables(xyz, shares, threads=1)
+    tokens = (OWN, *TrainingOptions().context)  # shipped models read the point's own as well
+    tables = Context.parse(tokens).tables(xyz, shares, threads=1)
     tables.fill(np.arange(len(xyz)), np.empty((len(xyz), 2 * len(tables.tokens)), np.float32))
     leaf = np.zeros(1, np.float32), np.ones((1, 2), np.uint32)
     represent(xyz, 1.0)
