@@ -12,6 +12,7 @@ from bridge_scenes import DECK, GROUND, OTHER, SCENES, Scene, Slab, scan, viaduc
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from long_bridge_scenes import LEAF, LONG_SCENES
+from other_bridge_scenes import OTHER_SCENES, TRAPS
 
 import pdal_stages as ps
 import pdal_stages.synthetic
@@ -414,7 +415,7 @@ def test_where_no_bridge_is_heights_are_what_they_were():
 def test_the_stage_says_what_it_makes_and_how_far_it_looks():
     plain, made = HagMorphological({}), HagMorphological({"decks": True})
     assert "Deck" not in plain.creates() and made.creates()["Deck"] == "uint8_t"
-    assert plain.halo_m() <= made.halo_m() == reach(decks=True) < 650
+    assert plain.halo_m() <= made.halo_m() == reach(decks=True) < 700
     assert made.near_halo_m() == plain.near_halo_m()
     assert Bridges({}).halo_m() == 0 and Bridges({}).largest_class() == 17
 
@@ -534,3 +535,28 @@ def test_the_ends_that_hold_the_most_lie_opposite(counts, same):
 
 def test_lengths_of_ways_fit_their_type():
     assert decks.WIDEST / decks.CELL * walkable.STRAIGHT < walkable.ENDLESS <= np.iinfo(np.int16).max
+
+
+@pytest.mark.parametrize(
+    "name", [name for name in OTHER_SCENES if name not in ("600 m long", "beside flat roofs")]
+)
+def test_bridges_of_another_kind_are_found(name):
+    xyz, code = scan(OTHER_SCENES[name](), 8.0)
+    deck, known = found(xyz) > 0, code != OTHER
+    right, wrong = (deck & (code == DECK)).sum(), (deck & (code != DECK) & known).sum()
+    assert 2 * right / (2 * right + wrong + (~deck & (code == DECK)).sum()) > 0.85
+    assert wrong < 0.0005 * len(xyz)
+
+
+@pytest.mark.parametrize("name", TRAPS)
+def test_what_is_no_bridge_is_none(name):
+    xyz, code = scan(TRAPS[name](), 16.0)
+    assert (found(xyz)[code != OTHER] > 0).mean() < 0.0005
+
+
+def test_flat_roofs_beside_a_viaduct_are_no_deck():
+    """Crowns fill the gap of 3 m, across which roofs hung together with the deck."""
+    xyz, code = scan(OTHER_SCENES["beside flat roofs"](), 8.0)
+    deck = found(xyz) > 0
+    assert deck[code == DECK].mean() > 0.9
+    assert deck[code == 6].mean() < 0.2

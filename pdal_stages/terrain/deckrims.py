@@ -45,9 +45,9 @@ def leads_on(z, start, h, w, kind, number, j, i, n):
 
 @njit
 def rims(z, start, h, w, kind, end, number, sums):
-    """Of each part, by sector: cells that lead on, and ways that end at nothing; cells at a drop, and how its ways end."""
+    """Of each part, by sector: cells that lead on, ways that end at nothing, cells at a drop; and how its ways end."""
     outward, cut = np.zeros((len(sums), SECTORS), np.int64), np.zeros((len(sums), SECTORS), np.int64)
-    drops, ends = np.zeros(len(sums), np.int64), np.zeros((len(sums), ENDS), np.int64)
+    drops, ends = np.zeros((len(sums), SECTORS), np.int64), np.zeros((len(sums), ENDS), np.int64)
     for j in range(h):
         for i in range(w):
             for n in range(start[j * w + i], start[j * w + i + 1]):
@@ -60,7 +60,7 @@ def rims(z, start, h, w, kind, end, number, sums):
                     drop |= end[n, d] == DOWN or end[n, d] == ACROSS
                     if end[n, d] == NOTHING:
                         cut[k, sector_of(j, i, sums[k])] += 1
-                drops[k] += drop
+                drops[k, sector_of(j, i, sums[k])] += drop
                 if leads_on(z, start, h, w, kind, number, j, i, n):
                     outward[k, sector_of(j, i, sums[k])] += 1
     return outward, cut, drops, ends

@@ -36,6 +36,7 @@ from .deckrims import (
     is_land,
     no_ends,
     rims,
+    sector_of,
     spread,
 )  # fmt: skip
 from .levels import levels
@@ -71,6 +72,9 @@ BROAD = 18
 _FILLS = 2
 #: A deck that the rim of the cloud cuts is so large and has for each cell that leads on so many at a drop.
 CUT, CUT_RIM = 60, 3
+#: Parts of a deck more than so many cells apart stand apart; the longest that is a roof, in meters, and how much of what
+#: lies beside it must lie in one direction.
+APART, ROOF, ONE_SIDE = 2, 100, 0.3
 #: How far from the deck's surface its points lie, meters: on it; parapets and cars above; its flank below.
 ON_DECK, PARAPET, FLANK = 0.4, 1.6, 2.0
 #: Rise over run of banks, whose points are no flank of the deck above.
@@ -78,7 +82,9 @@ BANK = 0.7
 #: Cells beyond those that were found, to the deck's edge and under its cars.
 BESIDE = 2
 #: How far away points matter, in meters: cells of a deck, its rim, and land at its ends, which all look around.
-REACH = (BLOCK * (FAR_ENDS + 1) + LINK + AWAY + AHEAD + FAR + 8 + WIDEST + 2 * _FILLS + 2 * BESIDE) * CELL
+REACH = (
+    BLOCK * (FAR_ENDS + 1) + LINK + AWAY + AHEAD + FAR + 8 + WIDEST + 2 * _FILLS + 2 * BESIDE + ROOF + JOIN
+) * CELL
 #: What points are: of a deck's surface, of its parapets and flanks, or of none.
 SURFACE, PARTS = 1, 2
 
@@ -211,6 +217,41 @@ def _deck_levels(z, use, column, row):
     return (left, bottom, h, w, heights, lowest, start, kind, found) if found.any() else None
 
 
+@njit
+def _contacts(z, start, h, w, kind, deck, number, sums):
+    """Of each part: cells that lead on to what is no deck (n,); by sector, cells near another part (n, SECTORS)."""
+    land, other = np.zeros(len(sums), np.int64), np.zeros((len(sums), SECTORS), np.int64)
+    for j in range(h):
+        for i in range(w):
+            for n in range(start[j * w + i], start[j * w + i + 1]):
+                k = number[n]
+                if k < 0:
+                    continue
+                leads = beside = False
+                for b in range(max(j - JOIN, 0), min(j + JOIN + 1, h)):
+                    for a in range(max(i - JOIN, 0), min(i + JOIN + 1, w)):
+                        near = max(abs(b - j), abs(a - i)) <= LINK
+                        for m in range(start[b * w + a], start[b * w + a + 1]):
+                            if kind[m] == SOLID and walkable(z[m] - z[n], distance(a - i, b - j)):
+                                leads |= near and not deck[m]
+                                beside |= deck[m] and number[m] != k
+                land[k] += leads
+                if beside:
+                    other[k, sector_of(j, i, sums[k])] += 1
+    return land, other
+
+
+def without_roofs(raster, deck) -> NDArray[np.bool_]:
+    """The decks but for what stands apart at their side and leads on to nothing: flat roofs as high as they are."""
+    z, start, h, w, kind, _ = raster
+    number, sums, box = parts(z, start, h, w, deck, np.zeros(len(deck), bool), APART)
+    land, other = _contacts(z, start, h, w, kind, deck, number, sums)
+    turn = 2 * np.pi * (np.arange(SECTORS) + 0.5) / SECTORS
+    one_sided = np.hypot(other @ np.cos(turn), other @ np.sin(turn)) > ONE_SIDE * other.sum(axis=1)
+    roof = (land == 0) & one_sided & (sums[:, 0] >= SMALLEST) & (_extent(box) <= ROOF / CELL)
+    return deck & ~np.append(roof, False)[number]
+
+
 def _judged(raster, deck, left, bottom, least=0) -> NDArray[np.bool_]:
     """Levels (n,) of decks, of those that may be of one; the decks longer than `least` cells."""
     heights, start, h, w, kind, end = raster
@@ -224,7 +265,7 @@ def _judged(raster, deck, left, bottom, least=0) -> NDArray[np.bool_]:
         found |= whole_decks(raster, number, sums, box)
         long = np.append(_extent(box) > LONGEST / CELL, False)[number]
         found |= stretches(heights, start, h, w, kind, end, long, left, bottom)
-    return found
+    return without_roofs(raster, found) if found.any() else found
 
 
 def _find(z, use, column, row) -> NDArray[np.uint8]:
@@ -316,10 +357,10 @@ def _chasm(z, start, w, j, i, a, b, level):
 
 
 @njit
-def parts(z, start, h, w, deck, wide):
+def parts(z, start, h, w, deck, wide, join=JOIN):
     """Number the parts that hang together (n,), -1 elsewhere; their size and sums of rows and columns; their boxes.
 
-    What is broad hangs together with nothing else.
+    What is broad hangs together with nothing else; nothing does across more than `join` cells.
     """
     parent = np.arange(len(z))
     for j in range(h):
@@ -327,8 +368,8 @@ def parts(z, start, h, w, deck, wide):
             for n in range(start[j * w + i], start[j * w + i + 1]):
                 if not deck[n]:
                     continue
-                for b in range(JOIN + 1):
-                    for a in range(-JOIN if b else 1, JOIN + 1):
+                for b in range(join + 1):
+                    for a in range(-join if b else 1, join + 1):
                         if j + b >= h or i + a < 0 or i + a >= w:
                             continue
                         k = (j + b) * w + i + a
@@ -373,17 +414,19 @@ def whole_decks(raster, number, sums, box) -> NDArray[np.bool_]:
     for k in np.flatnonzero((sums[:, 0] >= SMALLEST) & (_extent(box) <= LONGEST / CELL)):
         down = ends[k, DOWN] + ends[k, ACROSS]
         most = OUTWARD_ACROSS if ends[k, ACROSS] > ends[k, DOWN] else OUTWARD
-        if outward[k].sum() > most * drops[k] or ends[k, WALLED] > WALLS * down:
+        if outward[k].sum() > most * drops[k].sum() or ends[k, WALLED] > WALLS * down:
             continue
         opposite = _opposite(outward[k], outward[k])
         whole = opposite is not None and ends[k, NOTHING] <= RIM * down
         if not whole:
-            if sums[k, 0] < CUT or outward[k].sum() * CUT_RIM > drops[k]:
+            if sums[k, 0] < CUT or outward[k].sum() * CUT_RIM > drops[k].sum():
                 continue
             opposite = _opposite(outward[k], cut[k])
             if opposite is None:
                 continue
         assert opposite is not None
+        if not _is_free(opposite[0], outward[k], drops[k]):
+            continue
         good[k] = True
         for sectors in opposite if whole else opposite[:1]:
             over = no_ends()
@@ -392,6 +435,16 @@ def whole_decks(raster, number, sums, box) -> NDArray[np.bool_]:
             stamp += 1
             good[k] &= is_land(cells, over)
     return good[number]
+
+
+def _is_free(end: NDArray[np.bool_], outward: NDArray[np.int64], drops: NDArray[np.int64]) -> bool:
+    """Whether, halfway between an end and the one opposite, on both sides more cells are at a drop than lead on."""
+    middle = int(np.flatnonzero(np.roll(end, NEAR) & np.roll(end, -NEAR))[0])
+    for quarter in (SECTORS // 4, -SECTORS // 4):
+        flank = (middle + quarter + np.arange(-1, 2)) % SECTORS
+        if drops[flank].sum() < outward[flank].sum():
+            return False
+    return True
 
 
 def _extent(box: NDArray[np.int64]) -> NDArray[np.int64]:
