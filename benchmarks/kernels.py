@@ -94,7 +94,14 @@ def main() -> int:
     with TemporaryDirectory() as folder:
         text = json.dumps(called(Path(folder)), indent=1) + "\n"
     if check:
-        return int(TARGET.read_text() != text)
+        noted, now = json.loads(TARGET.read_text()), json.loads(text)
+        for kind in sorted(noted.keys() | now.keys()):
+            more, less = (
+                set(a.get(kind, ())) - set(b.get(kind, ())) for a, b in ((now, noted), (noted, now))
+            )
+            if more or less:
+                print(f"{kind}: called and not noted {sorted(more)}, noted and not called {sorted(less)}")
+        return int(noted != now)
     TARGET.write_text(text)
     return 0
 
