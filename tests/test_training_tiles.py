@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -55,6 +57,14 @@ def test_the_model_is_the_same_to_the_byte(town, tmp_path, capsys):
     model = ps.load_model(tmp_path / "tiles.model")
     assert model.info["preparation"][0]["type"] == "filters.hag_morphological"
     assert "EarlierReturn_box2" in model.plan.names
+
+
+def test_octrees_are_read_in_tiles_too(tmp_path, capsys):
+    data = Path(__file__).parent / "data"
+    (whole, tiles), (one, other) = both(
+        data, tmp_path, capsys, "--classes", "2,4,6", files=("town.copc.laz",)
+    )
+    assert whole == tiles and one.out == other.out
 
 
 @pytest.mark.parametrize(
