@@ -42,7 +42,7 @@ from .deckrims import (
 from .levels import levels
 from .longdecks import BLOCK, FAR_ENDS, stretches
 from .minima import cell_numbers
-from .patches import LARGEST, patches
+from .patches import patches
 from .walkable import (
     ACROSS,
     AHEAD,
@@ -130,12 +130,12 @@ def levels_near_decks(
     y: NDArray[np.float64],
     z: NDArray[np.float64],
     use: NDArray[np.bool_],
-    largest: int = LARGEST,
+    largest: int | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """All that :func:`decks_of_levels` needs, of the points :func:`level_points` at least, and what these are numbers of.
 
     Levels in cells up to twice BESIDE from a deck (n, 5): column, row, height, whether it is a deck's, its kind; and the
-    numbers of the points that are their lowest. No raster has more than `largest` cells.
+    numbers of the points that are their lowest. No raster has more than `largest` cells, see :func:`.patches.patches`.
     """
     rows, numbers = [np.empty((0, 5))], [np.empty(0, np.int64)]
     if len(x):

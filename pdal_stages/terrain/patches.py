@@ -20,14 +20,15 @@ _Piece = tuple[NDArray[np.int64] | slice, NDArray[np.bool_] | slice]
 
 
 def patches(
-    column: NDArray[np.int64], row: NDArray[np.int64], reach: int, link: int, largest: int = LARGEST
+    column: NDArray[np.int64], row: NDArray[np.int64], reach: int, link: int, largest: int | None = None
 ) -> Iterator[_Piece]:
     """Yield (points, own): the points of a piece and those round it that matter, and which of them are its own.
 
     Every point is some piece's own. Points more than `reach` cells away, along either axis, do not matter; nor do
     points that no chain of others connects with steps of at most `link` cells. One piece, all points, where the whole
-    is small enough: a raster of `largest` cells.
+    is small enough: a raster of `largest` cells, by default `LARGEST`.
     """
+    largest = LARGEST if largest is None else largest
     cells = _cells(column, row)
     if cells <= largest and not _is_empty(cells, len(column)):
         yield slice(None), slice(None)
