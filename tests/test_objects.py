@@ -353,7 +353,8 @@ def test_a_class_of_two_kinds():
 
 def test_what_is_larger_than_a_window_says_that_it_was_cut(monkeypatch):
     """Memory has an end: a row of houses that goes on beyond what is looked at in one piece is cut, but not silently."""
-    from pdal_stages.objects import find
+    from pdal_stages.objects import view
+    from pdal_stages.objects.find import BLOCK
     from pdal_stages.objects.measure import CHECK, REASONS
 
     row, codes = house(0, 0, 900, 12, 6.0, 0.7)
@@ -362,8 +363,8 @@ def test_what_is_larger_than_a_window_says_that_it_was_cut(monkeypatch):
     xyz, codes = np.concatenate([row, walls, ground]), np.concatenate([codes, codes, flat])
     cells = Cells.of(*xyz.T, codes, 1.0)
     whole = find_objects(cells, block=64, progress=False).tables[Kind.BUILDING]
-    assert len(whole) == 1 and whole.columns["reason"][0] == "" and find.MOST_CELLS > find.BLOCK**2
-    monkeypatch.setattr(find, "MOST_CELLS", 1000)
+    assert len(whole) == 1 and whole.columns["reason"][0] == "" and view.MOST_CELLS > BLOCK**2
+    monkeypatch.setattr(view, "MOST_CELLS", 1000)
     cut = find_objects(cells, block=64, progress=False).tables[Kind.BUILDING]
     assert cut.columns["reason"][0] == "cut off" and cut.columns["verdict"][0] == CHECK
     assert "cut off" in REASONS
@@ -389,13 +390,13 @@ def test_boundaries_of_cells_against_their_union(seed, share):
 
 
 def test_lone_wires_are_not_looked_at_twice(monkeypatch):
-    from pdal_stages.objects import find
+    from pdal_stages.objects.view import CellView
 
     at = np.arange(60) * 3.0
     x, y = (v.ravel() for v in np.meshgrid(at, at))
     xyz = np.concatenate([np.column_stack([x, y, 0 * x + 8]), np.column_stack([x + 1, y, 0 * x])])
     codes = np.repeat([14, 2], x.size).astype(np.uint8)
-    monkeypatch.setattr(find._View, "wider", None)
+    monkeypatch.setattr(CellView, "wider", None)
     assert len(find_objects(Cells.of(*xyz.T, codes, 0.5), block=64, progress=False).tables[Kind.SPAN]) == 0
 
 

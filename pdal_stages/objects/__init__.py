@@ -5,6 +5,7 @@ added and compared. They do not depend on the order of points, nor on how these 
 """
 
 from .cells import Cells
-from .find import Objects, ObjectSettings, find_objects
+from .find import find_objects
+from .found import Objects, ObjectSettings
 
 __all__ = ["Cells", "ObjectSettings", "Objects", "find_objects"]

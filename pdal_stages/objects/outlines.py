@@ -24,7 +24,7 @@ from ..base.apart import apart
 from ..base.errors import DependencyError, StageError
 from ..base.lean import imported
 from .boundaries import polygon
-from .find import Table
+from .found import Table
 from .measure import median
 from .walls import blunted, main_direction, middles, peucker
 

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from ..objects import Objects, find_objects
 from ..objects.cells import Kind, kind_of_code
-from ..objects.find import FOUND, MARGIN
+from ..objects.find import FOUND
 from ..objects.measure import CHECK, REASONS
+from ..objects.view import MARGIN
 from .base import Stage
 from .objectoptions import ObjectOptions, check_reasons
 from .options import option

@@ -1,0 +1,187 @@
+"""What objects are told apart by, and what was found: tables of objects, by kind, and whose each cell's points are."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base import checks
+from . import measure
+from .cells import Kind, point_keys
+from .measure import Body
+
+
+def _setting(default: float, what: str, low: float, high: float, unit: str = "m"):
+    return field(default=default, metadata={"low": low, "high": high, "what": what, "unit": unit})
+
+
+@dataclass(frozen=True)
+class ObjectSettings:
+    """How objects are told apart; wrong values raise an OptionError."""
+
+    cell: float = _setting(
+        0.5,
+        "Side of the grid's cells: about 1.4 times the distance of points, so that few cells of a roof are empty; 1 for 2 "
+        "points/m2",
+        0.05,
+        100,
+    )
+    building_height: float = _setting(1.5, "A building's cells are at least so high above the ground", 0, 100)
+    building_area: float = _setting(4.0, "Smaller buildings are left out", 0, 10_000, "m2")
+    step: float = _setting(
+        2.5,
+        "Roofs that differ by more along two thirds of their border are two buildings; 0 parts none",
+        0,
+        100,
+    )
+    roof_part: float = _setting(
+        10.0, "Smaller parts of a roof (dormers) go with their neighbor", 0, 10_000, "m2"
+    )
+    tree_height: float = _setting(3.0, "Lower plants are not trees", 0, 100)
+    tree_area: float = _setting(1.5, "Trees with smaller crowns are left out", 0, 1000, "m2")
+    window: float = _setting(
+        1.5, "Radius in which a tree has no second top, for a tree of no height", 0.1, 10
+    )
+    window_slope: float = _setting(0.1, "Added to the radius per meter of height", 0, 1, "")
+    saddle: float = _setting(
+        0.1,
+        "Two tops that near are one tree where the saddle is no deeper than this share of the lower",
+        0,
+        1,
+        "",
+    )
+    smoothing: float = _setting(0.35, "Standard deviation of the Gaussian that smooths the canopy", 0, 5)
+    span_gap: float = _setting(2.0, "Wires with larger gaps are two spans", 0.5, 20)
+
+    def __post_init__(self) -> None:
+        for one in fields(self):
+            checks.number(f"'{one.name}'", getattr(self, one.name), one.metadata["low"], one.metadata["high"])
+
+
+@dataclass
+class Table:
+    """Objects of a kind, in the order of their ids."""
+
+    ids: NDArray[np.int64]
+    columns: dict[str, NDArray]
+    #: Cells of object n are those from start[n] on: row, column and height (of a path: see `paths`).
+    start: NDArray[np.int64]
+    row: NDArray[np.int64]
+    column: NDArray[np.int64]
+    z: NDArray[np.float64]
+    #: Of spans: the line (k, 3) along each.
+    paths: list[NDArray[np.float64]]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def cells_of(self, number: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Rows, columns and heights of an object's cells."""
+        part = slice(self.start[number], self.start[number + 1])
+        return self.row[part], self.column[part], self.z[part]
+
+    def having(self, reasons: Collection[str]) -> NDArray[np.bool_]:
+        """Which objects are to be checked for one of the reasons."""
+        texts = self.columns["reason"].tolist() if len(self) else []
+        return np.array([any(one in reasons for one in str(text).split(", ")) for text in texts], bool)
+
+    def only(self, kept: NDArray[np.bool_]) -> Table:
+        """Some of the objects."""
+        cells = np.repeat(kept, np.diff(self.start))
+        return Table(
+            self.ids[kept],
+            {name: values[kept] for name, values in self.columns.items()},
+            np.r_[0, np.cumsum(np.diff(self.start)[kept])].astype(np.int64),
+            self.row[cells],
+            self.column[cells],
+            self.z[cells],
+            [path for path, stays in zip(self.paths, kept, strict=True) if stays] if self.paths else [],
+        )
+
+
+@dataclass
+class Objects:
+    """All objects, by kind, and which cells' points are theirs."""
+
+    settings: ObjectSettings
+    tables: dict[Kind, Table]
+    key: NDArray[np.int64]  # sorted keys of cells
+    owner: NDArray[np.int64]  # id of the object that has their points
+
+    def without(self, reasons: Collection[str]) -> tuple[Objects, int]:
+        """The objects that are not to be checked for one of the reasons; how many are left out."""
+        left = {kind: table.having(reasons) for kind, table in self.tables.items()}
+        gone = np.concatenate([table.ids[left[kind]] for kind, table in self.tables.items()])
+        if not gone.size:
+            return self, 0
+        stays = ~np.isin(self.owner, gone)
+        tables = {kind: table.only(~left[kind]) for kind, table in self.tables.items()}
+        return Objects(self.settings, tables, self.key[stays], self.owner[stays]), gone.size
+
+    def ids_at(self, x: NDArray, y: NDArray, kinds: NDArray) -> NDArray[np.int64]:
+        """The id of each point's object, 0 where it is of none; `kinds` are numbers of :class:`Kind`, or -1."""
+        out = np.zeros(len(x), np.int64)
+        rows = np.flatnonzero(kinds >= 0)
+        if rows.size == 0 or self.key.size == 0:
+            return out
+        key = point_keys(x[rows], y[rows], kinds[rows], self.settings.cell)
+        at = np.minimum(np.searchsorted(self.key, key), len(self.key) - 1)
+        out[rows] = np.where(self.key[at] == key, self.owner[at], 0)
+        return out
+
+    def summary(self) -> dict[str, dict[str, Any]]:
+        """Of each kind (``buildings``): how many objects, how many are to be checked, and why."""
+        out = {}
+        for kind, table in self.tables.items():
+            texts = table.columns["reason"].tolist() if len(table) else []
+            reasons = [reason for text in texts for reason in text.split(", ") if reason]
+            out[kind.name.lower() + "s"] = {
+                "objects": len(table),
+                "to_be_checked": int(np.count_nonzero(table.columns["verdict"] == measure.CHECK))
+                if len(table)
+                else 0,
+                "reasons": {reason: reasons.count(reason) for reason in sorted(set(reasons))},
+            }
+        return out
+
+
+class Found:
+    """What blocks found so far."""
+
+    def __init__(self) -> None:
+        self.ids: list[int] = []
+        self.records: list[dict[str, object]] = []
+        self.cells: list[tuple[NDArray, NDArray, NDArray]] = []
+        self.paths: list[NDArray] = []
+        self.keys: list[NDArray] = []
+        self.owners: list[NDArray] = []
+
+    def table(self) -> Table:
+        order = np.argsort(np.array(self.ids, np.int64), kind="stable")
+        cells = [self.cells[n] for n in order]
+        names = list(self.records[0]) if self.records else []
+        columns = {name: np.array([self.records[n][name] for n in order]) for name in names}
+        empty = np.empty(0)
+        return Table(
+            np.array(self.ids, np.int64)[order],
+            columns,
+            np.r_[0, np.cumsum([len(row) for row, _, _ in cells])].astype(np.int64),
+            np.concatenate([row for row, _, _ in cells] or [empty]).astype(np.int64),
+            np.concatenate([column for _, column, _ in cells] or [empty]).astype(np.int64),
+            np.concatenate([z for _, _, z in cells] or [empty]),
+            [self.paths[n] for n in order] if self.paths else [],
+        )
+
+    def add(self, identity: int, record: dict[str, object], body: Body) -> None:
+        self.ids.append(identity)
+        self.records.append(record)
+        self.cells.append((body.row, body.column, body.z))
+
+    def own(self, key: NDArray[np.int64], identity: int) -> None:
+        """The points of these cells are the object's."""
+        self.keys.append(key)
+        self.owners.append(np.full(len(key), identity))
