@@ -12,7 +12,7 @@ import pytest
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.las import read_header
 from pdal_stages.base.lasrecords import blocks, record_type
-from pdal_stages.pipeline import direct
+from pdal_stages.pipeline import direct, likefile
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.run import Pipeline
 
@@ -168,9 +168,9 @@ def test_points_are_written_by_pdal_where_ours_would_be_others(tmp_path, write_l
     source = small(tmp_path, write_las)
     wanted, target = tmp_path / "wanted.las", tmp_path / "out.las"
     ran(monkeypatch, stages_of(source, wanted), within=False)
-    real = direct._Totals.put
+    real = likefile._Totals.put
     monkeypatch.setattr(
-        direct._Totals, "put", lambda self, head, end: real(self, head, end).replace(b"\1", b"\2")
+        likefile._Totals, "put", lambda self, head, end: real(self, head, end).replace(b"\1", b"\2")
     )
     without, _, pipeline = ran(monkeypatch, stages_of(source, target))
     assert not without and target.read_bytes() == wanted.read_bytes()

@@ -8,10 +8,9 @@ otherwise, and for whatever else takes PDAL, it is PDAL that runs.
 
 from __future__ import annotations
 
+import io
 import os
-import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -20,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
-from ..base.extrabytes import plain_dimensions
-from ..base.las import POINT_BYTES, LasHeader, laz_chunks, read_header
+from ..base.las import LasHeader, read_header
 from ..base.lasrecords import RecordColumns, blocks, record_type
 from . import interrupts, packing, straight
 from . import pdal as pdal_env
 from .callbacks import Callbacks
 from .filenames import reader_files
+from .likefile import Extra, LikeFile, Some
 from .runtime import TRAMPOLINE
 from .straight import FirstSeen, NeedsPdal, View
 
@@ -123,7 +122,7 @@ def execute(stages: Sequence[dict[str, Any]]) -> pdal_env.Execution:
     made = {name: view[name] for name in view.changed & tried.output.holds}
     del view, columns
 
-    def points() -> Iterator[tuple[NDArray, dict[str, NDArray]]]:
+    def points() -> Iterator[Some]:
         start, parts = 0, blocks(path, header, dtype)
         while start < header.count:
             interrupts.check()
@@ -132,11 +131,12 @@ def execute(stages: Sequence[dict[str, Any]]) -> pdal_env.Execution:
             except StageError as error:
                 raise NeedsPdal(str(error)) from error
             end = start + len(records)
-            yield records, {name: values[start:end] for name, values in made.items()}
+            yield _some(records, {name: values[start:end] for name, values in made.items()})
             start = end
 
     try:
-        tried.output.write(Path(tried.target), points())
+        with open(tried.target, "x+b") as out:
+            tried.output.write(out, points(), tried.given)
     except NeedsPdal:
         os.unlink(tried.target)
         raise
@@ -176,157 +176,49 @@ class _Trial:
             run = [{**reader, "count": len(first)}, called.filter(look, adds), {**writer, "filename": target}]
             ran = pdal_env.execute(run, arrays=False)
             self.reading = seen.reading(first, str(reader["filename"]), ran.log, adds)
-            self.output = _output(target, header, first.dtype, adds, self.reading)
+            self.output, self.given = _output(target, header, first.dtype, adds, self.reading)
             if others := adds.keys() & self.reading.types.keys() - self.output.holds:
                 raise NeedsPdal(f"what is written to {', '.join(others)}")
             for packed in packing.pack([Path(target)]).values():
                 target = packed
-            again = Path(folder, "again")
-            self.output.write(again, [(first, made)])
-            if again.read_bytes() != Path(target).read_bytes():
+            made = {name: values for name, values in made.items() if name in self.output.holds}
+            again = io.BytesIO()
+            self.output.write(again, [_some(first, made)], self.given)
+            if again.getvalue() != Path(target).read_bytes():
                 raise NeedsPdal("other bytes")
         self.target = str(writer["filename"]).removesuffix(packing.UNPACKED)
         self.metadata = packing.renamed(ran.metadata, {tried: self.target})
 
 
-@dataclass(frozen=True)
-class _Output:
-    """How a file is written."""
-
-    head: bytes  #: all before its points; counts and box, where PDAL writes them, are those of other points
-    header: LasHeader  #: as PDAL wrote it, before anybody compressed its points
-    coding: Any  #: how lazrs compresses its points, None where they are not
-    extra: list[tuple[str, np.dtype, bool]]  #: extra dimensions, and whether the input's records have them
-
-    @property
-    def holds(self) -> set[str]:
-        """Dimensions that may have changed."""
-        return {"Classification", *(name for name, *_ in self.extra)}
-
-    def write(self, path: Path, points: Iterable[tuple[NDArray, Mapping[str, NDArray]]]) -> None:
-        """Write a file of records and new values of dimensions, in parts."""
-        totals = _Totals(self.header)
-        with open(path, "x+b") as out:
-            out.write(self.head)
-            put, done = self._packer(out)
-            for records, made in points:
-                totals.add(records)
-                put(self._records(records, made).view(np.uint8))
-            done()
-            end = out.seek(0, os.SEEK_END)
-            out.seek(0)
-            out.write(totals.put(self.head, end))
-
-    def _packer(self, out: Any) -> tuple[Callable[[NDArray], Any], Callable[[], Any]]:
-        if self.coding is None:
-            return lambda raw: out.write(raw.data), lambda: None
-        import lazrs
-
-        packer = lazrs.ParLasZipCompressor(out, self.coding)
-
-        def put(raw: NDArray) -> None:
-            try:
-                packer.compress_many(raw)
-            except (ValueError, RuntimeError, lazrs.LazrsError) as error:
-                raise StageError("the output file could not be compressed", found=error) from error
-
-        def done() -> None:
-            try:
-                packer.done()
-            except (ValueError, RuntimeError, lazrs.LazrsError) as error:
-                raise StageError("the output file could not be compressed", found=error) from error
-
-        return put, done
-
-    def _records(self, records: NDArray, made: Mapping[str, NDArray]) -> NDArray:
-        base = POINT_BYTES[self.header.point_format]
-        dtype = np.dtype([("base", "V", base), *((name, kind) for name, kind, _ in self.extra)])
-        out = np.empty(len(records), dtype)
-        more = records.dtype.itemsize - base
-        out["base"] = records.view([("base", "V", base), ("more", "V", more)])["base"]
-        for name, _, _ in self.extra:
-            out[name] = made[name] if name in made else records[name]
-        if "Classification" in made:
-            place = 16 if self.header.point_format >= 6 else 15
-            out.view(np.uint8).reshape(len(out), -1)[:, place] = made["Classification"]
-        return out
-
-
 def _output(
     path: str, header: LasHeader, dtype: np.dtype, adds: Mapping[str, str], reading: straight.Reading
-) -> _Output:
-    """How PDAL wrote a file with points of a file that has `header` and records of a type."""
-    there = read_header(path)
-    extra = plain_dimensions(path)
-    if there is None or extra is None or there.records_after or there.waveforms:
+) -> tuple[LikeFile, dict[str, Extra]]:
+    """How PDAL wrote a file with points of a file that has `header` and records of a type, and what comes out of these."""
+    like = LikeFile.of(path)
+    if like is None:
         raise NeedsPdal("the output")
-    of_records = POINT_BYTES[header.point_format] + sum(np.dtype(_type(kind)).itemsize for _, kind in extra)
-    alike = (there.point_format, there.scales, there.offsets, there.point_bytes)
-    if alike != (header.point_format, header.scales, header.offsets, of_records):
+    there = like.header
+    if (there.point_format, there.scales, there.offsets) != (
+        header.point_format,
+        header.scales,
+        header.offsets,
+    ):
         raise NeedsPdal("the output's points are others")
-    columns: list[tuple[str, np.dtype, bool]] = []
-    for name, kind in extra:
-        same = np.dtype(_type(kind))
+    given: dict[str, Extra] = {}
+    for name, (_, same) in like.extra.items():
         known = name in adds and np.dtype(_type(adds[name].removesuffix("_t"))) == same
         read = name in (dtype.names or ()) and name in reading.decoded and reading.types[name] == same
         if not known and not read:
             raise NeedsPdal(f"the dimension '{name}'")
-        columns.append((name, same, read))
-    with open(path, "rb") as file:
-        head = file.read(there.offset)
-    coding: Any = None
-    if path.endswith(packing.UNPACKED):
-        head, coding = packing.packed_head(head, there)
-    elif there.compressed:
-        import lazrs
-
-        chunks = laz_chunks(path, there)
-        if chunks is None:
-            raise NeedsPdal("the output's chunks")
-        coding = lazrs.LazVlr(chunks.record)
-    return _Output(head, there, coding, columns)
+        if read:
+            given[name] = Extra(dtype.fields[name][1], same)  # type: ignore[index]
+    return like, given
 
 
 def _type(kind: str) -> str:
     return {"float": "f4", "double": "f8"}.get(kind, kind)
 
 
-class _Totals:
-    """What a header says of all points: their number, by return too, and their box."""
-
-    def __init__(self, header: LasHeader) -> None:
-        self._header = header
-        self._count = 0
-        self._returns = np.zeros(16, np.int64)
-        self._least = np.full(3, 2**31, np.int64)
-        self._most = np.full(3, -(2**31), np.int64)
-
-    def add(self, records: NDArray) -> None:
-        """Count points."""
-        mask = 15 if self._header.point_format >= 6 else 7
-        self._count += len(records)
-        self._returns += np.bincount(records["bit_fields"] & mask, minlength=16)
-        for axis, name in enumerate("XYZ"):
-            values = records[name]
-            self._least[axis] = min(self._least[axis], values.min())
-            self._most[axis] = max(self._most[axis], values.max())
-
-    def put(self, head: bytes, end: int) -> bytes:
-        """The head of a file with what was counted (LAS 1.4 R15, table 3); `end`: where the file ends."""
-        out = bytearray(head)
-        returns = self._returns[1:].tolist()
-        if any(
-            head[107:131]
-        ):  # the counts of older versions, which not every PDAL writes into files of LAS 1.4
-            struct.pack_into("<6I", out, 107, self._count, *returns[:5])
-        if self._header.minor >= 4 and any(head[235:243]):  # where records after the points would begin
-            plain = self._header.offset + self._count * self._header.point_bytes
-            struct.pack_into("<Q", out, 235, end if self._header.compressed else plain)
-        box: list[float] = []
-        for axis in range(3):
-            scale, offset = self._header.scales[axis], self._header.offsets[axis]
-            box += [float(ends[axis] * scale + offset) for ends in (self._most, self._least)]
-        struct.pack_into("<6d", out, 179, *box)
-        if self._header.minor >= 4:
-            struct.pack_into("<Q15Q", out, 247, self._count, *returns)
-        return bytes(out)
+def _some(records: NDArray, made: Mapping[str, NDArray]) -> Some:
+    raw = records.view(np.uint8).reshape(len(records), -1)
+    return Some(raw, {name: (None, values) for name, values in made.items()})

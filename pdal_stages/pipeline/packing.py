@@ -77,8 +77,8 @@ def packed_head(head: bytes, header: LasHeader) -> tuple[bytes, Any]:
     return bytes(first) + record + head[header.header_bytes :], coding
 
 
-def compress(out: BinaryIO, coding: Any, blocks: Iterable[bytes]) -> None:
-    """Write points, compressed as `coding` of lazrs says, where a file stands.
+def compress(out: BinaryIO, coding: Any, blocks: Iterable[Any]) -> None:
+    """Write points, as bytes or arrays of bytes, compressed as `coding` of lazrs says, where a file stands.
 
     Raises
     ------

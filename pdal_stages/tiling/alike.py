@@ -18,16 +18,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
-from ..base.extrabytes import plain_dimensions
 from ..base.files import whole_files
-from ..base.las import POINT_BYTES, LasHeader, read_header, records
-from ..pipeline.packing import compress
+from ..base.las import LasHeader, read_header, records
+from ..pipeline.likefile import Extra, LikeFile, Some, extra_of
 from .extract import records_of
 from .lasfiles import finish, plain_header
 from .results import NewValues
@@ -40,11 +39,8 @@ WithPdal = Callable[[str, NewValues, str], Any]
 
 #: Bytes of a header that tell of the points alone: counts, counts by return, extents, and what LAS 1.4 has of these.
 _OF_POINTS = ((107, 131), (179, 227), (247, 375))
-#: Where class codes are, by whether the point format is one of LAS 1.4.
-_CLASS_AT = {False: 15, True: 16}
 #: Formats with waveforms, which lie elsewhere.
 _WAVES = (4, 5, 9, 10)
-_COMPRESSOR = b"laszip encoded"
 #: Points whose bits are random, and points that are put together at a time.
 _RANDOM, _BLOCK = 200, 500_000
 #: Kinds that are remembered.
@@ -55,14 +51,8 @@ _MOST_KINDS = 64
 class _Way:
     """How outputs of a kind are made."""
 
-    head: bytes  #: all before the points, of one of them
-    width: int  #: bytes of a point
-    own: int  #: bytes of a point of the format, without extra ones, which come as they are
-    copied: tuple[
-        tuple[int, int, int], ...
-    ]  #: extra bytes of inputs: where they are, where they go, how many
-    made: tuple[tuple[str, int, np.dtype], ...]  #: new values: whose, and where they go
-    coding: bytes  #: the record of how points are compressed; empty where they are not
+    like: LikeFile  #: one of them
+    copied: dict[str, Extra]  #: extra dimensions that come out of an input's records
 
 
 #: By kind: None for those that were seen once, False for those that take PDAL.
@@ -113,9 +103,9 @@ def write_alike(
         return None
     with (
         whole_files(output, check=lambda *_: check_run(scratch)) as (partial,),
-        open(partial, "xb") as file,
+        open(partial, "x+b") as file,
     ):
-        _write(file, way, source.path, points, new)
+        way.like.write(file, _some(points, new), way.copied)
         file.flush()
         os.fsync(file.fileno())
     return written([output], int(np.count_nonzero(new.kept)))
@@ -151,60 +141,22 @@ def learn(
 
 def _way(path: str, output: str, new: NewValues) -> _Way | None:
     """How an output seems to have been made; None where its points cannot be told from input and new values."""
-    before, after = read_header(path), read_header(output)
-    if before is None or after is None or after.records_after or before.point_format != after.point_format:
+    before, like = read_header(path), LikeFile.of(output)
+    if before is None or like is None or before.point_format != like.header.point_format:
         return None
-    own = POINT_BYTES[after.point_format]
-    had = {field.name: field for field in _extra(path)}
-    copied, made = [], []
-    for field in _extra(output):
-        if field.name in new.values:
-            dtype = new.values[field.name][1].dtype
-            if dtype != field.dtype:
+    had = extra_of(path, before)
+    if had is None or not new.values.keys() <= like.holds:
+        return None
+    copied = {}
+    for name, (_, dtype) in like.extra.items():
+        if name in new.values:
+            if new.values[name][1].dtype != dtype:
                 return None
-            made.append((field.name, own + field.at, dtype))
-        elif field.name in had and had[field.name].dtype == field.dtype:
-            copied.append((own + had[field.name].at, own + field.at, field.dtype.itemsize))
-        else:
+        elif name not in had or had[name].dtype != dtype:
             return None
-    if "Classification" in new.values:
-        made.append(("Classification", _CLASS_AT[after.point_format >= 6], np.dtype(np.uint8)))
-    if set(new.values) != {name for name, _, _ in made}:
-        return None
-    if after.point_bytes != own + sum(width for *_, width in copied) + sum(
-        dtype.itemsize for _, at, dtype in made if at >= own
-    ):
-        return None
-    with open(output, "rb") as file:
-        coding = b""
-        for record in records(file, after):
-            if record.user == _COMPRESSOR:
-                file.seek(record.data)
-                coding = file.read(record.length)
-        file.seek(0)
-        head = file.read(after.offset)
-    if after.compressed != bool(coding):
-        return None
-    return _Way(head, after.point_bytes, own, tuple(copied), tuple(made), coding)
-
-
-class _Extra(NamedTuple):
-    name: str
-    at: int  #: bytes after those of the point format
-    dtype: np.dtype
-
-
-def _extra(path: str) -> list[_Extra]:
-    """Extra dimensions of a file as its points hold them; ValueError where one is scaled, or no number."""
-    found, at = [], 0
-    named = plain_dimensions(path)
-    if named is None:
-        raise ValueError("extra dimensions that are not plain numbers")
-    for name, kind in named:
-        dtype = np.dtype({"float": "<f4", "double": "<f8"}.get(kind, kind))
-        found.append(_Extra(name, at, dtype))
-        at += dtype.itemsize
-    return found
+        else:
+            copied[name] = had[name]
+    return _Way(like, copied)
 
 
 def _same(way: _Way, path: str, points: NDArray | None, new: NewValues, output: str) -> bool:
@@ -212,7 +164,7 @@ def _same(way: _Way, path: str, points: NDArray | None, new: NewValues, output: 
     if points is None:
         return False
     out = io.BytesIO()
-    _write(out, way, path, points, new)
+    way.like.write(out, _some(points, new), way.copied)
     with open(output, "rb") as file:
         return file.read() == out.getvalue()
 
@@ -232,7 +184,8 @@ def _tried(way: _Way, path: str, new: NewValues, scratch: str, suffix: str, with
     numbers = [(20 if header.point_format < 6 else 22, np.dtype("<f8"))] * (
         header.point_format in (1, 3, 6, 7, 8)
     )
-    numbers += [(way.own + field.at, field.dtype) for field in _extra(path) if field.dtype.kind == "f"]
+    extra = extra_of(path, header) or {}
+    numbers += [(one.at, one.dtype) for one in extra.values() if one.dtype.kind == "f"]
     for at, dtype in numbers:  # any bits would be such as no program writes
         values = rng.normal(0.0, 1e5, _RANDOM).astype(dtype)
         points[:, at : at + dtype.itemsize] = values[:, None].view(np.uint8)
@@ -249,65 +202,15 @@ def _tried(way: _Way, path: str, new: NewValues, scratch: str, suffix: str, with
         return _same(way, path, points, tried, made)
 
 
-# ---- writing -----------------------------------------------------------------------------------------------
-
-
-def _write(file: BinaryIO, way: _Way, path: str, points: NDArray, new: NewValues) -> None:
-    """Write what comes out of points, (n, bytes) records of the file at `path`."""
-    header = read_header(path)
-    assert header is not None
-    kept = new.kept
-    file.write(_head(way, header, points if kept.all() else points[kept]))
-    blocks = (
-        _together(way, points[start : start + _BLOCK], new, start) for start in range(0, len(points), _BLOCK)
-    )
-    if way.coding:
-        import lazrs
-
-        compress(file, lazrs.LazVlr(way.coding), blocks)
-    else:
-        for block in blocks:
-            file.write(block)
-
-
-def _together(way: _Way, points: NDArray, new: NewValues, start: int) -> bytes:
-    """Points as they come out, from those that came in."""
-    end = start + len(points)
-    out = np.zeros((len(points), way.width), np.uint8)
-    out[:, : way.own] = points[:, : way.own]
-    for source, target, width in way.copied:
-        out[:, target : target + width] = points[:, source : source + width]
-    for name, at, dtype in way.made:
-        rows, column = new.values[name]
-        if rows is None:
-            out[:, at : at + dtype.itemsize] = _bytes_of(column[start:end], dtype)
-        else:
-            mine = np.flatnonzero((rows >= start) & (rows < end))
-            out[rows[mine] - start, at : at + dtype.itemsize] = _bytes_of(column[mine], dtype)
-    kept = new.kept[start:end]
-    return out.tobytes() if kept.all() else out[kept].tobytes()
-
-
-def _bytes_of(column: NDArray, dtype: np.dtype) -> NDArray[np.uint8]:
-    return np.ascontiguousarray(column, dtype)[:, None].view(np.uint8)
-
-
-def _head(way: _Way, header: LasHeader, points: NDArray) -> bytes:
-    """All before the points, with their counts and extents (LAS 1.4 R15, table 3)."""
-    head = bytearray(way.head)
-    count = len(points)
-    returns = np.bincount(points[:, 14] & (15 if header.point_format >= 6 else 7), minlength=16)[1:].tolist()
-    places = np.ascontiguousarray(points[:, :12]).view("<i4")
-    ends = []
-    for axis in range(3):
-        for end in (places[:, axis].max(), places[:, axis].min()):
-            ends.append(float(end) * header.scales[axis] + header.offsets[axis])
-    if any(head[107:131]):
-        struct.pack_into("<6I", head, 107, count, *returns[:5])
-    struct.pack_into("<6d", head, 179, *ends)
-    if head[25] >= 4 and any(head[247:375]):
-        end, other = struct.unpack_from("<Q4xQ", head, 235)
-        if end:  # of the points before they were compressed, though no records are there
-            struct.pack_into("<Q", head, 235, end + (count - other) * way.width)
-        struct.pack_into("<16Q", head, 247, count, *returns)
-    return bytes(head)
+def _some(points: NDArray, new: NewValues) -> Iterator[Some]:
+    """Points, (n, bytes) records of an input, with what is new of them, in parts."""
+    for start in range(0, len(points), _BLOCK):
+        end = start + _BLOCK
+        values: dict[str, tuple[NDArray | None, NDArray]] = {}
+        for name, (rows, column) in new.values.items():
+            if rows is None:
+                values[name] = None, column[start:end]
+            else:
+                mine = (rows >= start) & (rows < end)
+                values[name] = rows[mine] - start, column[mine]
+        yield Some(points[start:end], values, new.kept[start:end])
