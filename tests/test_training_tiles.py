@@ -144,10 +144,57 @@ def test_what_is_wrong_is_said_and_no_model_is_written(town, tmp_path, capsys, w
     assert "'Nowhere' is missing" in capsys.readouterr().err
     assert main(["train", str(town), *words, "--neighborhoods", "copt"]) == 1
     assert "copt" in capsys.readouterr().err
-    points = {axis: TOWN.xyz[:, n] for n, axis in enumerate("XYZ")} | {"Classification": TOWN.classification}
-    points["Checked"] = (np.arange(len(TOWN.xyz)) < 50).astype(np.uint8)
-    write_las(tmp_path / "checked.laz", points, point_format=6)
-    assert main(["train", str(tmp_path / "checked.laz"), *words]) == 1
-    assert "checked_only=false" in capsys.readouterr().err
     left = {path.name for path in tmp_path.iterdir()}
-    assert left == {"t0.laz", "t1.laz", "checked.laz"}
+    assert left == {"t0.laz", "t1.laz"}
+
+
+@pytest.fixture(scope="module")
+def corrected(tmp_path_factory, write_las):
+    """Four files that adjoin; of one nobody looked at any point, and it does not say so. Some points are there twice."""
+    folder = tmp_path_factory.mktemp("corrected")
+    random = np.random.default_rng(3)
+    twice = random.permutation(len(TOWN.xyz))[:400]
+    xyz = np.concatenate([TOWN.xyz, TOWN.xyz[twice]])
+    codes = np.concatenate([TOWN.classification, TOWN.classification[twice]]).astype(np.uint8)
+    codes[random.random(len(codes)) < 0.02] = 7
+    east, north = xyz[:, 0] > 500_038.0, xyz[:, 1] > 5_400_043.0
+    near = np.hypot(xyz[:, 0] - 500_025.0, xyz[:, 1] - 5_400_030.0) < 22.0
+    for k in range(4):
+        mine = (east * 2 + north) == k
+        points = {axis: xyz[mine, n] for n, axis in enumerate("XYZ")} | {"Classification": codes[mine]}
+        points["Reliability"] = random.choice([0.5, 0.96, 1.0], mine.sum()).astype(np.float32)
+        if k < 3:
+            points["Checked"] = near[mine].astype(np.uint8)
+        write_las(folder / f"c{k}.laz", points, point_format=6, offset=(500_000 + k, 5_400_000, k))
+    return folder
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        (),
+        ("--base", "BASE"),
+        ("--base", "BASE", "--writers.classifiermodel.where=HeightAboveGround < 6 && X < 500040"),
+        ("--base", "BASE", "--surveys", "west=*c[01].laz"),
+        ("--writers.classifiermodel.checked_only=false",),
+    ],
+    ids=["alone", "base", "where", "surveys", "as all others"],
+)
+def test_corrections_are_trained_on(town, corrected, tmp_path, capsys, more):
+    if "BASE" in more:
+        base = tmp_path / "base.model"
+        assert main(["train", str(town / "t0.laz"), "--model", str(base), *WORDS]) == 0
+        more = tuple(str(base) if word == "BASE" else word for word in more)
+        capsys.readouterr()
+    (whole, tiles), (one, other) = both(corrected, tmp_path, capsys, *more)
+    assert whole == tiles
+    assert one.out == other.out
+    assert ("were checked by a person" in one.out + one.err) == ("=false" not in "".join(more))
+
+
+def test_corrections_outside_of_what_is_drawn_from(corrected, tmp_path, capsys):
+    words = ["train", str(corrected), *WORDS, "--model", str(tmp_path / "m.model")]
+    words += ["--writers.classifiermodel.where=X > 500070"]
+    for tiles in ((), ("--tile", "23.5", "--workers", "0")):
+        assert main([*words, *tiles]) == 1
+        assert "no checked point lies inside 'where'" in capsys.readouterr().err

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from ..base import kinds
 from ..base.errors import ModelError, OptionError, StageError
 from ..base.files import check_writable
-from ..base.hashing import coordinate_hash
 from ..base.outputs import Output
 from ..base.report import Report
 from ..classifier import Model, TrainingCloud, TrainingOptions, summary, train
@@ -26,6 +25,7 @@ from ..classifier.samplefeatures import SHORT
 from ..classifier.sureness import of_the_base
 from ..models import find
 from .base import Stage, files_read
+from .checked import Choice, Looked
 from .loading import digest_of, loaded_model
 from .options import option
 from .points import Points
@@ -38,8 +38,6 @@ _TRAINING = {field.name: field for field in fields(TrainingOptions)}
 _SHOWN = ("strategy", "classes", "accuracy", "parameters")
 #: Most files that a model names.
 _NAMED = 20
-#: A base is sure of a point from this reliability on.
-_SURE = 0.95
 #: The word for the dimensions that follow from what the points have.
 AUTO = "auto"
 
@@ -257,6 +255,16 @@ holds the classes.
 
     def cloud_of(self, points: Points, training: TrainingOptions) -> TrainingCloud:
         """The points as a cloud to train on, all of one survey."""
+        return self.cloud_drawn(points, training, self._mask(points))
+
+    def cloud_drawn(
+        self,
+        points: Points,
+        training: TrainingOptions,
+        mask: NDArray[np.bool_] | None,
+        more: Mapping[str, NDArray] | None = None,
+    ) -> TrainingCloud:
+        """The same, where samples are drawn from the points of a mask; with `more` dimensions."""
         cloud = TrainingCloud(
             xyz=points.xyz,
             labels=points.codes_of(self.label),
@@ -264,11 +272,12 @@ holds the classes.
                 name: points.dimension(name)
                 for name in required((*training.inputs, *filter(None, [self.groups])))
             }
-            | {name: points.arrays[name] for name in welcome(training.inputs) if name in points.arrays},
+            | {name: points.arrays[name] for name in welcome(training.inputs) if name in points.arrays}
+            | dict(more or {}),
             name=", ".join(Path(name).name for name in self.files[:_NAMED])
             + ", ..." * (len(self.files) > _NAMED)
             or "the points",
-            mask=self._mask(points),
+            mask=mask,
         )
         gone = points.ignored(replace(self.ignore, codes=()))  # the labels among them are left to the trainer
         return cloud.part(np.flatnonzero(~gone)) if gone.any() else cloud
@@ -317,55 +326,29 @@ holds the classes.
         if self._trainer.reports_training:
             report.figures["training"] = model.info["training"]
 
+    def choice(self) -> Choice:
+        """What chooses points to draw samples from, where some were checked by a person."""
+        return Choice(None if self.base is None else loaded_model(self.base).codes.tolist(), self.seed)
+
+    def looked(self, points: Points) -> Looked:
+        """Which points a person checked, and of which others the base is sure."""
+        arrays = points.arrays
+        checked = np.asarray(arrays[CHECKED]) > 0 if CHECKED in arrays else np.zeros(points.count, np.bool_)
+        sure = np.asarray(arrays["Reliability"]) if self.base and "Reliability" in arrays else None
+        return Looked.at(checked, points.inside, sure, points.codes_of(self.label))
+
     def _mask(self, points: Points) -> NDArray[np.bool_] | None:
         """The points that samples are drawn from: those inside `where`, and where any was checked by a person, of these
         the checked ones alone."""
         if CHECKED not in points.arrays or not self.checked_only:
             return points.mask
-        checked = np.asarray(points.arrays[CHECKED]) > 0
-        if not checked.any():
+        looked, choice = self.looked(points), self.choice()
+        choice.count(points.count, looked.checked, looked.told())
+        if not choice:
             return points.mask
-        wanted = checked & points.inside
-        if not wanted.any():
-            raise StageError(
-                "no checked point lies inside 'where'", found=f"{int(checked.sum()):,} checked points"
-            )
-        number = int(np.count_nonzero(wanted))
-        points.report.figures["checked"] = number
-        said = f"{number:,} of {points.count:,} points were checked by a person ({CHECKED}): samples are drawn from these"
-        if self.base is None:
-            points.report.notes.append(f"{said} alone, the others are neighbors")
-            return wanted
-        anchors = self._anchors(points, wanted, points.inside & ~checked)
-        count = int(np.count_nonzero(anchors))
-        points.report.figures["anchors"] = count
-        points.report.notes.append(
-            f"{said}, and from {count:,} others of which the base is sure, so that it is kept where nobody looked"
-            if count
-            else f"{said} alone, the others are neighbors; nothing keeps the base where nobody looked, as no other point "
-            f"has a Reliability of {_SURE:g} or more"
-        )
-        return wanted | anchors
-
-    def _anchors(
-        self, points: Points, checked: NDArray[np.bool_], free: NDArray[np.bool_]
-    ) -> NDArray[np.bool_]:
-        """Points of which the base is sure, of each class as many as there are checked ones of the most frequent.
-
-        What is corrected lies where the base was unsure: from these alone a forest does not learn what the rest looks like.
-        """
-        out = np.zeros(points.count, np.bool_)
-        if self.base is None or "Reliability" not in points.arrays:
-            return out
-        codes = points.codes_of(self.label)
-        told, number = np.unique(codes[checked], return_counts=True)
-        known = np.isin(told, loaded_model(self.base).codes)
-        sure = free & (np.asarray(points.arrays["Reliability"]) >= _SURE)
-        for code in told[known]:
-            mine = np.flatnonzero(sure & (codes == code))
-            order = np.argsort(coordinate_hash(points.xyz[mine], self.seed), kind="stable")
-            out[mine[order[: number[known].max()]]] = True
-        return out
+        choice.settle([(looked.codes[looked.sure], choice.hashes(points.xyz[looked.sure]))])
+        choice.say(points.report)
+        return choice.mask(looked, points.xyz)
 
     def surveys(self, cloud: TrainingCloud, points: Points) -> list[tuple[float, TrainingCloud]]:
         """The points as one cloud, or one for each value of the dimension `survey`, after that value."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import OptionError, StageError
+from ..base.errors import StageError
+from ..base.extrabytes import extra_dimensions
 from ..base.jit import Compiling
 from ..base.memory import free_memory
 from ..base.report import Report
@@ -31,10 +32,11 @@ from ..pipeline.run import Pipeline
 from ..pipeline.surveyjob import check_surveys, points_in
 from ..pipeline.trainjob import heights_for, lowered_writer, numbered
 from ..stages import registry
+from ..stages.checked import Choice, Looked
 from ..stages.classifiermodel import ClassifierModel
 from ..stages.points import HOLDS_NOWHERE
 from .kept import load_arrays, save_arrays
-from .outcome import TiledRun
+from .outcome import TiledRun, TileJob
 from .results import NewValues, PieceResults, of_own_points
 from .settings import TilingOptions
 from .sizing import BASE, BLOCKS, TILE_POINT, fits_whole
@@ -45,6 +47,13 @@ from .tileplan import TilePlan, make_plan
 
 #: Bytes of a point on the disk at most: as read, with heights, prepared.
 _DISK = 200
+#: Of points that a person checked, and of others of which a base is sure: see :mod:`..stages.checked`.
+_WANTED, _SURE, _SURE_CODES, _SURE_HASHES = (
+    "PdalStagesWanted",
+    "PdalStagesSure",
+    "sure/codes",
+    "sure/hashes",
+)
 #: Failed tiles that a message names.
 _NAMED = 3
 
@@ -186,7 +195,28 @@ class TrainTask:
                 kind = "readers.ept" if is_ept(name) else "readers.las"
                 (source,) = find_sources([{"type": kind, "filename": [name]}])
                 numbers[source.path] = number
-        return replace(plan, readers=readers, takes=Taking(self._writer, numbers), name=self.model)
+        return replace(
+            plan, readers=readers, takes=Taking(self._writer, numbers, self._looks), name=self.model
+        )
+
+    @property
+    def _looks(self) -> bool:
+        """Whether points may have been checked by a person."""
+        known = (is_ept(name) or CHECKED in extra_dimensions(name) for name in self.files)
+        return self.stage.checked_only and any(known)
+
+    def _choice(self, jobs: Iterable[TileJob], report: Report) -> Choice | None:
+        """What points samples are drawn from, where a person checked any."""
+        choice = self.stage.choice()
+        jobs = [job for job in jobs if "looked" in job.record]
+        for job in jobs:
+            choice.count(**job.record["looked"])
+        if not choice:
+            return None
+        kept = (load_arrays(job.outputs[0], [_SURE_CODES, _SURE_HASHES]) for job in jobs if job.outputs)
+        choice.settle((arrays[_SURE_CODES], arrays[_SURE_HASHES]) for arrays in kept)
+        choice.say(report)
+        return choice
 
     def _in_tiles(
         self, folder: Path, heights: Sequence[Mapping[str, Any]]
@@ -206,6 +236,7 @@ class TrainTask:
         side = run.summary["tile"] * run.summary["meters_per_unit"]
         clouds: dict[float, CloudParts] = {}
         dimensions: list[str] | None = None
+        choice = self._choice(run.tiles, report)
         for job in run.tiles:
             for number, cloud in enumerate(job.record.get("clouds", ())):
                 if dimensions not in (None, cloud["dimensions"]):
@@ -214,7 +245,7 @@ class TrainTask:
                 if cloud["value"] not in clouds:
                     clouds[cloud["value"]] = CloudParts(folder / f"cloud{len(clouds)}", side, most)
                 assert job.outputs is not None
-                points = _read_back(job.outputs[0], number, self.survey or cloud["name"], self.survey)
+                points = _read_back(job.outputs[0], number, self.survey or cloud["name"], self.survey, choice)
                 clouds[cloud["value"]].put(job.tile, points)
             for path in job.outputs or ():
                 Path(path).unlink(missing_ok=True)
@@ -244,12 +275,15 @@ def _say(report: Report, run: TiledRun) -> None:
     report.figures["ignored"] = ignored
 
 
-def _read_back(path: str, number: int, name: str, survey: str) -> TrainingCloud:
+def _read_back(path: str, number: int, name: str, survey: str, choice: Choice | None) -> TrainingCloud:
     """A cloud's points of a tile, as :class:`Taking` wrote them."""
     mark = f"{number}/"
     arrays = {key.removeprefix(mark): v for key, v in load_arrays(path).items() if key.startswith(mark)}
     dimensions = {key[2:]: values for key, values in arrays.items() if key.startswith("d/")}
     mask, told = arrays.get("mask"), survey or None
+    wanted, sure = (dimensions.pop(mark, np.zeros(0, np.bool_)) for mark in (_WANTED, _SURE))
+    if choice is not None:
+        mask = choice.mask(Looked(0, wanted, sure, arrays["labels"]), arrays["xyz"])
     return TrainingCloud(arrays["xyz"], arrays["labels"], dimensions, name, mask, told)
 
 
@@ -259,6 +293,7 @@ class Taking:
 
     writer: Mapping[str, Any]  #: the stage that trains
     numbers: Mapping[str, int]  #: of inputs by path, where points are to have the number of theirs
+    looks: bool  #: whether points may have been checked by a person
 
     def __call__(self, results: list[PieceResults], outputs: list[str], scratch: str) -> dict[str, Any]:
         stage = lowered_writer(self.writer)
@@ -272,16 +307,19 @@ class Taking:
             return {"outputs": []}
         points = points_in(stage, run.arrays, run.metadata)
         run.arrays.clear()
-        if stage.checked_only and CHECKED in points.arrays and points.arrays[CHECKED].any():
-            raise OptionError(
-                f"points that a person checked ({CHECKED}) are weighed against all others, which do not fit in the memory "
-                "that was given",
-                cure="Give more --memory, or --writers.classifiermodel.checked_only=false to take them as all others",
-            )
         training = stage.training_on(points)
         arrays: dict[str, NDArray] = {}
+        marks: dict[str, NDArray] = {}
+        looked: dict[str, Any] = {}
+        if self.looks:
+            found = stage.looked(points)
+            marks = {_WANTED: found.wanted, _SURE: found.sure}
+            hashes = stage.choice().hashes(points.xyz[found.sure])
+            arrays |= {_SURE_CODES: found.codes[found.sure], _SURE_HASHES: hashes}
+            looked = {"points": points.count, "checked": found.checked, "told": found.told()}
         clouds = []
-        for number, (value, cloud) in enumerate(stage.surveys(stage.cloud_of(points, training), points)):
+        whole = stage.cloud_drawn(points, training, points.mask, marks)
+        for number, (value, cloud) in enumerate(stage.surveys(whole, points)):
             arrays |= {f"{number}/xyz": cloud.xyz, f"{number}/labels": np.asarray(cloud.labels)}
             if cloud.mask is not None:
                 arrays[f"{number}/mask"] = np.asarray(cloud.mask)
@@ -290,6 +328,7 @@ class Taking:
         save_arrays(outputs[0], arrays, scratch)
         report = points.report
         said = {"said": report.messages, "ignored": int(report.figures.get("ignored", 0)), "clouds": clouds}
+        said |= {"looked": looked} if looked else {}
         return written(outputs, run.count) | said
 
     def _new_values(self, result: PieceResults) -> NewValues:
