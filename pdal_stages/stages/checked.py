@@ -51,7 +51,7 @@ class Looked(NamedTuple):
         return {str(code): n for code, n in zip(found.tolist(), number.tolist(), strict=True)}
 
 
-class Choice:
+class CheckedChoice:
     """What samples are drawn from, of a cloud whose parts are counted first; `known`: the classes of the base, if any."""
 
     def __init__(self, known: Collection[int] | None, seed: int) -> None:

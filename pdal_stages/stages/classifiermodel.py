@@ -25,7 +25,7 @@ from ..classifier.samplefeatures import SHORT
 from ..classifier.sureness import of_the_base
 from ..models import find
 from .base import Stage, files_read
-from .checked import Choice, Looked
+from .checked import CheckedChoice, Looked
 from .loading import digest_of, loaded_model
 from .options import option
 from .points import Points
@@ -326,9 +326,9 @@ holds the classes.
         if self._trainer.reports_training:
             report.figures["training"] = model.info["training"]
 
-    def choice(self) -> Choice:
+    def choice(self) -> CheckedChoice:
         """What chooses points to draw samples from, where some were checked by a person."""
-        return Choice(None if self.base is None else loaded_model(self.base).codes.tolist(), self.seed)
+        return CheckedChoice(None if self.base is None else loaded_model(self.base).codes.tolist(), self.seed)
 
     def looked(self, points: Points) -> Looked:
         """Which points a person checked, and of which others the base is sure."""

@@ -32,7 +32,7 @@ from ..pipeline.run import Pipeline
 from ..pipeline.surveyjob import check_surveys, points_in
 from ..pipeline.trainjob import heights_for, lowered_writer, numbered
 from ..stages import registry
-from ..stages.checked import Choice, Looked
+from ..stages.checked import CheckedChoice, Looked
 from ..stages.classifiermodel import ClassifierModel
 from ..stages.points import HOLDS_NOWHERE
 from .kept import load_arrays, save_arrays
@@ -205,7 +205,7 @@ class TrainTask:
         known = (is_ept(name) or CHECKED in extra_dimensions(name) for name in self.files)
         return self.stage.checked_only and any(known)
 
-    def _choice(self, jobs: Iterable[TileJob], report: Report) -> Choice | None:
+    def _choice(self, jobs: Iterable[TileJob], report: Report) -> CheckedChoice | None:
         """What points samples are drawn from, where a person checked any."""
         choice = self.stage.choice()
         jobs = [job for job in jobs if "looked" in job.record]
@@ -275,7 +275,7 @@ def _say(report: Report, run: TiledRun) -> None:
     report.figures["ignored"] = ignored
 
 
-def _read_back(path: str, number: int, name: str, survey: str, choice: Choice | None) -> TrainingCloud:
+def _read_back(path: str, number: int, name: str, survey: str, choice: CheckedChoice | None) -> TrainingCloud:
     """A cloud's points of a tile, as :class:`Taking` wrote them."""
     mark = f"{number}/"
     arrays = {key.removeprefix(mark): v for key, v in load_arrays(path).items() if key.startswith(mark)}
