@@ -15,6 +15,9 @@ import pytest
 
 from pdal_stages.cli import main
 from pdal_stages.pipeline import pdal as pdal_env
+from pdal_stages.pipeline.classifying import ClassifyRequest
+from pdal_stages.tiling import TilingOptions, sizing
+from pdal_stages.tiling.classify import ClassifyTask
 
 pytestmark = pytest.mark.pdal
 
@@ -293,3 +296,22 @@ def test_copc_or_a_refusal(folder, classify, tmp_path, capsys):
     (tmp_path / "job.json").write_text(plain)
     assert main(["pipeline", str(tmp_path / "job.json")]) == 1
     assert "writers.copc" in capsys.readouterr().err
+
+
+def test_what_goes_past_pdal_fits_where_other_files_do_not(folder, tmp_path, write_las):
+    """190 bytes a point, or 285: the file is worked on in one piece where PDAL shows on its first points that it can be."""
+    rng = np.random.default_rng(0)
+    arrays = {axis: rng.uniform(0, 30, 500) for axis in "XYZ"} | {"Classification": np.ones(500, np.uint8)}
+    source = write_las(tmp_path / "one.laz", arrays, point_format=6)
+
+    def in_one_piece(a_point, target):
+        memory = TilingOptions(memory=sizing.BASE + sizing.BLOCKS + 500 * a_point)
+        request = ClassifyRequest(str(folder / "m.model"))
+        return ClassifyTask((str(source),), str(tmp_path / target), request, memory).in_one_piece()
+
+    assert sizing.DIRECT_POINT < 200 < sizing.TILE_POINT
+    assert in_one_piece(200, "out.laz") and in_one_piece(200, "out/")
+    assert not in_one_piece(180, "out.laz")
+    assert not in_one_piece(200, "out.ply")  # which PDAL writes
+    assert in_one_piece(300, "out.ply")
+    assert [path.name for path in tmp_path.iterdir()] == ["one.laz"]

@@ -18,7 +18,16 @@ from pdal_stages.stages.base import Blocks
 from pdal_stages.synthetic.townfile import wkt
 from pdal_stages.tiling import TilingOptions
 from pdal_stages.tiling.pace import Pace
-from pdal_stages.tiling.sizing import PARENT, Density, block_bytes, settled, widened, worker_bytes
+from pdal_stages.tiling.sizing import (
+    BASE,
+    PARENT,
+    Density,
+    block_bytes,
+    room_of_worker,
+    settled,
+    widened,
+    worker_bytes,
+)
 from pdal_stages.tiling.sources import Extent
 
 pytestmark = pytest.mark.pdal
@@ -318,16 +327,24 @@ def test_a_worker_has_room_for_the_blocks_before_the_tiles():
     assert block_bytes(blocks, 2e9) == whole and block_bytes(blocks, 1e5) < 0.1 * whole
     assert block_bytes(Blocks(2048.0, 988.0, 200.0, 4.0, 2.0), 1e9) == whole  # of cells of 2 m
     assert worker_bytes(1000, 0, whole) - worker_bytes(1000, 0) == pytest.approx(
-        whole - (512 << 20) - 270_000
+        whole - (512 << 20) - 285_000
     )
 
 
-def test_blocks_are_as_large_as_a_tile_allows():
+def test_blocks_are_as_large_as_the_memory_allows():
     blocks = Blocks(1024.0, 494.0, 100.0, 2.0)
-    twice = widened(blocks, 1e9, 6e6, 4)
-    assert twice == blocks._replace(side=2048.0)
-    assert block_bytes(twice, 1e9) < worker_bytes(6e6, 0) < block_bytes(twice, 1e9) * 2
-    assert widened(blocks, 1e9, 1e6, 4) == blocks  # it would take more than the tile
-    assert (
-        widened(blocks, 1e7, 6e6, 4) == blocks and widened(blocks, 1e7, 6e6, 2) == twice
-    )  # one for each worker
+    twice, again = (blocks._replace(side=side) for side in (2048.0, 4096.0))
+    least = BASE + block_bytes(twice, 1e9)
+    assert widened(blocks, 1e9, least, 4) == twice and widened(blocks, 1e9, least - 1, 4) == blocks
+    assert widened(blocks, 1e9, 1e10, 4) == again
+    assert widened(blocks, 1e9, 1e10, 4, 2048.0) == twice  # which an earlier run has begun with
+    # One for each worker.
+    assert widened(blocks, 1e7, 1e10, 4) == blocks and widened(blocks, 1e7, 1e10, 2) == twice
+
+
+def test_each_worker_has_its_share_of_the_memory():
+    def room(**options):
+        return room_of_worker(TilingOptions(100.0, memory=8 << 30, **options))
+
+    assert room(workers=1) == (8 << 30) - PARENT and room(workers=0) == 8 << 30
+    assert room(scheduler="tcp://one:1") == 8 << 30  # of each worker there

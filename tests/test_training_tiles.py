@@ -123,8 +123,7 @@ def test_tiles_where_the_points_do_not_fit(town, tmp_path, monkeypatch):
         ).in_one_piece()
 
     assert in_one_piece() and in_one_piece(memory=10**9) and not in_one_piece(tile=30.0)
-    monkeypatch.setattr(training, "TILE_POINT", 10**6)
-    monkeypatch.setattr("pdal_stages.tiling.sizing.TILE_POINT", 10**6)
+    monkeypatch.setattr(training, "TRAIN_POINT", 10**6)
     assert not in_one_piece(memory=2 * 10**9)
     network = {"algorithm": "alsnet", "dimensions": []}
     assert training.TrainTask(

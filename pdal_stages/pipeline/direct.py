@@ -97,23 +97,15 @@ def execute(stages: Sequence[dict[str, Any]]) -> pdal_env.Execution:
     StageError
         Of a stage, or where the output cannot be written.
     """
-    reader, *filters, writer = stages
+    reader, *filters, _ = stages
     path = str(reader["filename"])
-    header = read_header(path)
-    dtype = record_type(path, header) if header is not None else None
-    if header is None or dtype is None or not 0 < header.count < 2**32 or not _comes_back(header):
-        raise NeedsPdal("the file")
-    adds = dict(one.split("=") for stage in filters for one in stage.get("add_dimension", ()))
+    header, dtype, tried = _tried(stages)
     try:
-        (first,) = blocks(path, header, dtype, count=_TRIED)
-        tried = _Trial(reader, writer, header, first, adds)
         columns = RecordColumns(path, header, dtype, [n for n in _FIELDS if n in (dtype.names or ())])
-    except NeedsPdal:
-        raise
-    except (StageError, OSError) as error:  # no room for temporary files, say
+    except (StageError, OSError) as error:
         raise NeedsPdal(str(error)) from error
     view = View.of_file(tried.reading, columns)
-    for name, kind in adds.items():  # PDAL's points have them from the beginning
+    for name, kind in _added(filters).items():  # PDAL's points have them from the beginning
         view.add(name, kind)
     tag = reader.get("tag", "input")
     straight.execute([{**reader, "tag": tag}, *filters], {tag: view})
@@ -141,6 +133,37 @@ def execute(stages: Sequence[dict[str, Any]]) -> pdal_env.Execution:
         os.unlink(tried.target)
         raise
     return pdal_env.Execution(header.count, tried.metadata, [], tried.reading.log)
+
+
+def goes(stages: Sequence[dict[str, Any]]) -> bool:
+    """Whether such a pipeline is run so, as far as PDAL tells on the first points."""
+    try:
+        _tried(stages)
+    except NeedsPdal:
+        return False
+    return True
+
+
+def _tried(stages: Sequence[dict[str, Any]]) -> tuple[LasHeader, np.dtype, _Trial]:
+    """The file and its records, and what PDAL made of the first of them; NeedsPdal where it takes PDAL."""
+    reader, *filters, writer = stages
+    path = str(reader["filename"])
+    header = read_header(path)
+    dtype = record_type(path, header) if header is not None else None
+    if header is None or dtype is None or not 0 < header.count < 2**32 or not _comes_back(header):
+        raise NeedsPdal("the file")
+    try:
+        (first,) = blocks(path, header, dtype, count=_TRIED)
+        return header, dtype, _Trial(reader, writer, header, first, _added(filters))
+    except NeedsPdal:
+        raise
+    except (StageError, OSError) as error:  # no room for temporary files, say
+        raise NeedsPdal(str(error)) from error
+
+
+def _added(filters: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Dimensions that filters make, and their types."""
+    return dict(one.split("=") for stage in filters for one in stage.get("add_dimension", ()))
 
 
 def _comes_back(header: LasHeader) -> bool:

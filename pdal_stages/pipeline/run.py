@@ -248,6 +248,15 @@ class Pipeline:
                     runtime.collect(ours.label)
         return pdal_env.execute(joined(run), arrays=arrays, loglevel=loglevel)
 
+    def goes_past_pdal(self) -> bool:
+        """Whether all points go past PDAL's table of them, as far as the first ones tell; nothing is written."""
+        stages = self.lowered.stages
+        outputs = [Path(output.path) for output in writers_outputs(stages)]
+        if any(ours.stage.outputs() for ours in self.lowered.ours):
+            return False
+        run = packing.unpacked(stages, outputs)
+        return direct.may_run(run) and direct.goes(run)
+
     def _check_inputs(self) -> None:
         """Open what is read, and look at the headers of LAS files: PDAL takes damaged ones for whole, or crashes."""
         for path in readers_files(self.lowered.stages):

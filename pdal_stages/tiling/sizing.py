@@ -14,7 +14,10 @@ from .sources import Extent
 
 #: Memory of a worker: programs and model, a point of a tile with its halo, a point of an output file that is put
 #: together, and the `memory` option of our stages. See docs/large-areas.md.
-BASE, TILE_POINT, FILE_POINT, BLOCKS = 350 << 20, 270, 250, 512 << 20
+BASE, TILE_POINT, FILE_POINT, BLOCKS = 350 << 20, 285, 250, 512 << 20
+#: Of a point of a file that is classified in one piece past PDAL's table of points (:mod:`..pipeline.direct`), and of one
+#: that is trained on in one piece, voxels and samples' surroundings included.
+DIRECT_POINT, TRAIN_POINT = 190, 400
 #: Of a cell of the raster of which a block is made before the tiles.
 _CELL = 200
 #: Of the process that hands out the work.
@@ -22,7 +25,7 @@ PARENT = 350 << 20
 #: Points of a larger file are put together in parts of so many.
 MOST_AT_ONCE = 4_000_000
 #: Points of a tile at most where its size is chosen here: it is lost when it fails, and progress goes by tiles.
-_MOST_OF_A_TILE = 3_000_000
+_MOST_OF_A_TILE = 12_000_000
 #: Sides to choose from, in units of the coordinates: round numbers, from 1 to 800,000.
 _SIDES = [
     round(mantissa * 10**power, 6) for power in range(0, 6) for mantissa in (1, 1.5, 2, 2.5, 3, 4, 5, 6, 8)
@@ -67,14 +70,30 @@ def block_bytes(blocks: StageBlocks, area_m2: float) -> float:
     return min((blocks.side + 2 * blocks.reach) ** 2, area_m2) / blocks.cell**2 * _CELL
 
 
-def widened(blocks: StageBlocks, area_m2: float, points_read: float, workers: int) -> StageBlocks:
-    """Blocks of twice the side, whose surroundings cost half as much, where one takes no more than a tile of so many points.
+def widened(
+    blocks: StageBlocks, area_m2: float, room: float, workers: int, most: float = math.inf
+) -> StageBlocks:
+    """Blocks of twice the side, and twice again, as far as a worker has room for one; their surroundings cost half as much.
 
-    As long as each worker gets one, in a survey of so many square meters.
+    As long as each worker gets one, in a survey of so many square meters, up to a side of `most` meters. `room`: see
+    :func:`room_of_worker`.
     """
-    twice = blocks._replace(side=2 * blocks.side)
-    fits = block_bytes(twice, area_m2) <= points_read * TILE_POINT + BLOCKS
-    return twice if fits and workers * twice.side**2 <= area_m2 else blocks
+    while True:
+        twice = blocks._replace(side=2 * blocks.side)
+        if (
+            twice.side > most
+            or BASE + block_bytes(twice, area_m2) > room
+            or workers * twice.side**2 > area_m2
+        ):
+            return blocks
+        blocks = twice
+
+
+def room_of_worker(options: TilingOptions) -> float:
+    """Memory that each worker may take, bytes."""
+    whole = options.memory or free_memory() // 2
+    workers = 0 if options.scheduler else options.local_workers
+    return (whole - PARENT) / workers if workers else whole
 
 
 def worker_bytes(points_read: float, largest_file: float, block: float = 0.0) -> float:
@@ -83,9 +102,9 @@ def worker_bytes(points_read: float, largest_file: float, block: float = 0.0) ->
     return BASE + max(points_read * TILE_POINT + BLOCKS, of_file, block)
 
 
-def fits_whole(points: int, memory: int | None) -> bool:
-    """Whether a cloud can be worked on in one piece."""
-    return BASE + BLOCKS + points * TILE_POINT <= (memory or free_memory() // 2)
+def fits_whole(points: int, memory: int | None, point: int = TILE_POINT) -> bool:
+    """Whether a cloud can be worked on in one piece, which takes so many bytes a point."""
+    return BASE + BLOCKS + points * point <= (memory or free_memory() // 2)
 
 
 def settled(

@@ -131,12 +131,12 @@ class Store:
         self.files.unlink(missing_ok=True)
         self._written = {}
 
-    def keep_side(self, side: float) -> None:
-        """Remember the side of the tiles, for :meth:`side`."""
+    def keep_sides(self, tile: float, block: float | None) -> None:
+        """Remember the sides of tiles, and of what is made before them, for :meth:`side`."""
         path = self.folder / "run.json"
         if path.is_dir():
             _remove(path)
-        _keep(path, {"tile": side}, "result")
+        _keep(path, {"tile": tile, "block": block}, "result")
 
     def keep_complete(self, run: dict[str, Any]) -> None:
         """Remember a run of which all is done."""
@@ -151,10 +151,9 @@ class Store:
         """Something is to be done, or may be."""
         _forget(self.folder / "complete.json")
 
-    def side(self) -> float | None:
-        """The side of the last run's tiles, where it is known."""
-        known = _read(self.folder / "run.json")
-        return known["tile"] if known else None
+    def side(self, what: str = "tile") -> float | None:
+        """The side of the last run's tiles, or its ``block``, where it is known."""
+        return (_read(self.folder / "run.json") or {}).get(what)
 
     def result(self, name: str) -> Path:
         """The file of a tile's results."""

@@ -25,16 +25,19 @@ from .grid import Box, TileGrid, check_number, touching, union
 from .outcome import Costs
 from .pool import Pool, last_tries
 from .settings import TilingOptions
-from .sizing import Density, block_bytes, settled, widened
+from .sizing import Density, block_bytes, room_of_worker, settled, widened
 from .sources import Extent, InputSource, check_source, find_sources, read_ept, read_extent
 from .store import Store, fingerprint
 from .tileplan import TilePlan
 
+#: Workers that a cluster is taken to have at most where it matters before it is asked.
+_OF_A_CLUSTER = 64
+
 
 class Survey:
-    """The inputs of a run."""
+    """The inputs of a run; `block`: the side of what an earlier run made before the tiles, which goes on with it."""
 
-    def __init__(self, plan: TilePlan, options: TilingOptions) -> None:
+    def __init__(self, plan: TilePlan, options: TilingOptions, block: float | None = None) -> None:
         self.started = time.strftime("%Y-%m-%d %H:%M")
         self.messages = list(plan.messages)
         self._whole_names = plan.whole_names
@@ -69,14 +72,15 @@ class Survey:
         assert self.options.tile is not None
         self.grid = TileGrid(self.options.tile)
         #: With blocks as large as there is room for.
-        self.plan = self._widened(plan, density)
+        self.plan = self._widened(plan, density, block or math.inf)
 
-    def _widened(self, plan: TilePlan, density: Density) -> TilePlan:
+    def _widened(self, plan: TilePlan, density: Density, most: float) -> TilePlan:
         if plan.first is None:
             return plan
-        read = density.read_by(self.grid.size, self.halo_units)
         area = density.area * self.unit**2
-        blocks = widened(plan.first.blocks, area, read, max(1, self.options.local_workers))
+        # How many workers a cluster has is not known yet.
+        workers = _OF_A_CLUSTER if self.options.scheduler else max(1, self.options.local_workers)
+        blocks = widened(plan.first.blocks, area, room_of_worker(self.options), workers, most)
         self.block_bytes = block_bytes(blocks, area)
         return replace(plan, first=replace(plan.first, blocks=blocks))
 

@@ -118,7 +118,7 @@ def run_plan(
     if chosen.resume and chosen.tile is None:  # the free memory may be another today
         chosen = replace(chosen, tile=Store(folder).side())
     asked = chosen
-    survey = Survey(plan, chosen)
+    survey = Survey(plan, chosen, Store(folder).side("block") if chosen.resume else None)
     plan, chosen = survey.plan, survey.options
     if survey.per == "tile":  # whose outputs have points of all readers
         classflags.parting([*plan.readers, *plan.tail], with_ours=True)
@@ -136,7 +136,7 @@ def run_plan(
         if not chosen.resume:
             store.clear()
         store.forget_complete()
-        store.keep_side(survey.grid.size)
+        store.keep_sides(survey.grid.size, None if plan.first is None else plan.first.blocks.side)
         try:
             with open_pool(chosen, str(store.folder)) as pool:
                 survey.read_indexes(store, pool, chosen.retries, progress)

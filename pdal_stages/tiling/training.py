@@ -39,7 +39,7 @@ from .kept import load_arrays, save_arrays
 from .outcome import TiledRun, TileJob
 from .results import NewValues, PieceResults, of_own_points
 from .settings import TilingOptions
-from .sizing import BASE, BLOCKS, TILE_POINT, fits_whole
+from .sizing import BASE, BLOCKS, TILE_POINT, TRAIN_POINT, fits_whole
 from .sources import find_sources, read_extent
 from .tail import merged, written
 from .tiledrun import run_plan
@@ -135,7 +135,7 @@ class TrainTask:
         if self.options.tile is not None:
             return False
         try:
-            return all(fits_whole(one._points(), self.options.memory) for one in self._each())
+            return all(fits_whole(one._points(), self.options.memory, TRAIN_POINT) for one in self._each())
         except StageError:
             return True  # said when it is read
 
