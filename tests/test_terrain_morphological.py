@@ -12,7 +12,7 @@ from test_ground_islands import slow_marks
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.stages.hag_morphological import HagMorphological
-from pdal_stages.terrain import filtered_ground, groundcells, patches
+from pdal_stages.terrain import filtered_ground, groundcells, patches, progressive
 from pdal_stages.terrain.lowest import pits
 from pdal_stages.terrain.morphological import reach
 from pdal_stages.terrain.openings import HOLE, opening_radii, square_steps
@@ -68,9 +68,15 @@ def raster_with_holes(seed, shape, holes=0.3):
     return raster
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (33, 2), (45, 38)])
-def test_openings_and_objects_equal_the_slow_reference(shape):
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (33, 2), (45, 38), (45, 200)])
+@pytest.mark.parametrize("in_numbers", [False, True])
+def test_openings_and_objects_equal_the_slow_reference(shape, in_numbers, monkeypatch):
     raster = raster_with_holes(1, shape)
+    if in_numbers:
+        raster = np.round(raster, 2)
+        assert progressive.numbered(raster) is not None
+    else:
+        monkeypatch.setattr(progressive, "numbered", lambda _: None)
     window = 21
     objects, floor, openings = objects_of(raster, 1.0, 0.15, window, keep=range(1, 25))
     for radius in range(1, 25):
@@ -86,6 +92,42 @@ def test_openings_and_objects_equal_the_slow_reference(shape):
         before = after
     assert np.array_equal(objects, want)
     assert np.array_equal(floor[np.isfinite(raster)], want_floor[np.isfinite(raster)])
+
+
+@pytest.mark.parametrize("in_numbers", [False, True])
+def test_openings_in_strips_equal_the_slow_reference(in_numbers, monkeypatch):
+    raster = np.round(raster_with_holes(2, (9, 2500), 0.6), 2)
+    if not in_numbers:
+        monkeypatch.setattr(progressive, "numbered", lambda _: None)
+    _, _, openings = objects_of(raster, 1.0, 0.15, 2, keep=(3, 12))
+    for radius in (3, 12):
+        assert np.array_equal(openings[radius], slow_opening(raster, radius)), radius
+
+
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([1e-6, 0.001, 0.01, 0.3, 1.0]),
+    st.sampled_from([1.0, 30.0, 640.0]),
+)
+@settings(max_examples=40, deadline=None)
+def test_numbers_are_in_the_order_of_heights(seed, step, relief):
+    rng = np.random.default_rng(seed)
+    raster = (rng.integers(-50, 50) + step * np.round(rng.uniform(0, relief, (7, 60)) / step)).astype(
+        np.float32
+    )
+    raster[rng.random(raster.shape) < 0.2] = HOLE
+    found = progressive.numbered(raster)
+    assert found is not None or step < 0.01
+    if found is None:
+        return
+    assert np.array_equal(found.heights[found.grid], raster)
+    heights, numbers = np.unique(raster[raster != HOLE]), np.unique(found.grid[raster != HOLE])
+    assert np.array_equal(found.heights[numbers], heights)
+    for drop in (0.0, 0.15, 3.5):
+        lowered = np.subtract.outer(heights, heights) > np.float32(drop)
+        assert (
+            np.subtract.outer(numbers.astype(int), numbers.astype(int))[lowered] > found.least(drop)
+        ).all()
 
 
 def slow_pits(raster, cell):
@@ -189,9 +231,10 @@ def slow_planes(cells, left, bottom, level, floor, at):
     return prior + np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0]
 
 
-def test_planes_equal_the_slow_reference():
+@pytest.mark.parametrize("w", [26, 160])
+def test_planes_equal_the_slow_reference(w):
     rng = np.random.default_rng(4)
-    left, bottom, h, w = -13, 40, 30, 26
+    left, bottom, h = -13, 40, 30
     ground = rng.random((h, w)) < 0.05
     place = rng.uniform(-0.5, 0.5, (h, w, 3)) * [1, 1, 40]
     floor = rng.normal(0, 5, (h, w)).astype(np.float32)
@@ -219,6 +262,42 @@ def test_planes_equal_the_slow_reference():
                 share = (1 - abs(uv[0] - parent[0])) * (1 - abs(uv[1] - parent[1]))
                 want += share * (plane[0] + plane[1:] @ d)
         assert planes[j, i, 0] == pytest.approx(want, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_planes_are_the_same_wherever_few_are_asked_for(seed):
+    """Whole stretches of a row are done at once; a plane depends on none of them."""
+    rng = np.random.default_rng(seed)
+    h, w = rng.integers(1, 300, 2)
+    left, bottom = rng.integers(-1000, 1000, 2)
+    ground = rng.random((h, w)) < [0.3, 0.05, 0.002, 0.0][seed]
+    place = rng.uniform(-0.5, 0.5, (h, w, 3)) * [1, 1, 40]
+    floor = rng.normal(0, 5, (h, w)).astype(np.float32)
+    raster = np.where(rng.random((h, w)) < [0.5, 0.1, 0.004, 0.0005][seed], floor, HOLE)
+    raster[ground] = floor[ground]
+    whole = surface(ground, place, floor, raster, left, bottom, 3, np.ones_like(ground))
+    for share in (0.5, 0.01):
+        asked = rng.random((h, w)) < share
+        some = surface(ground, place, floor, raster, left, bottom, 3, asked)
+        assert np.array_equal(some[asked], whole[asked], equal_nan=True)
+
+
+def test_only_cells_near_what_was_regained_are_asked_again(monkeypatch):
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, 240, (2, 17_280))
+    z = 8 * np.sin(x / 9) * np.cos(y / 11) + 0.3 * x * np.sin(y / 40)
+    z = np.round(z + np.where(rng.random(len(x)) < 0.2, rng.uniform(0, 9, len(x)), 0.0), 2)
+    some = filtered_ground(x, y, z, **SMALL)
+    found_near, regained = groundcells._still_asked, []
+
+    def all_of(cells, found, *raster):
+        assert len(found_near(cells, found, *raster)) <= len(cells) - found.sum()
+        regained.append(found.sum())
+        return cells[~found]
+
+    monkeypatch.setattr(groundcells, "_still_asked", all_of)
+    same(some, filtered_ground(x, y, z, **SMALL))
+    assert len(regained) == 3 and min(regained) > 0
 
 
 def slow_plateaus(ground, raster, cell):
@@ -574,8 +653,6 @@ def test_feet_in_feet_out(data_dir):
 @pytest.mark.parametrize("seed", range(5))
 def test_openings_from_cell_to_cell_are_those_of_the_raster(seed, monkeypatch):
     """Where few cells were measured, only these are looked at: the same objects, floors and openings."""
-    from pdal_stages.terrain import progressive
-
     rng = np.random.default_rng(seed)
     h, w = rng.integers(1, 90, 2)
     raster = np.full((h, w), HOLE)
@@ -597,7 +674,7 @@ def test_openings_from_cell_to_cell_are_those_of_the_raster(seed, monkeypatch):
 @pytest.mark.parametrize("spacing", [40, 90])
 def test_the_cost_of_sparse_points_is_that_of_their_surroundings(spacing, monkeypatch):
     """The raster between them is not gone over: the same bits, whichever way, and empty land is left alone."""
-    from pdal_stages.terrain import planes, progressive
+    from pdal_stages.terrain import planes
 
     rng = np.random.default_rng(spacing)
     x, y = rng.uniform(0, 6 * spacing, (2, 36))

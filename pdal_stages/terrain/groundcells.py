@@ -22,8 +22,8 @@ from .islands import REACH as ISLANDS_REACH
 from .lowest import COMPANY, SURROUNDINGS, heights_of, lowest_points, pits, places_of
 from .openings import HOLE
 from .patches import SIDE
+from .planes import plane_of_cell, planes_of_blocks
 from .planes import reach as planes_reach
-from .planes import surface
 from .plateaus import reach as plateau_reach
 from .plateaus import remove_plateaus
 from .profile import opening_radius
@@ -199,12 +199,21 @@ def ground_raster(
     on_deck = (deck != 0)[lowest] & (lowest >= 0)
     del lowest, bad
     ground = np.isfinite(raster) & ~objects
-    levels = options.levels(NEAR)
+    asked = np.flatnonzero(np.isfinite(raster) & ~ground)  # cells
     for number in range(1, ROUNDS + 1):
-        measured, seen = np.zeros(shape, bool), grown(plateaus + (ROUNDS - number) * step)
-        measured[seen] = np.isfinite(raster[seen])
-        planes = surface(ground, place, floor, raster, left, bottom, levels, measured)
-        _regain(ground, measured, place, planes, cell, options.threshold, options.scalar)
+        rows, columns = grown(plateaus + (ROUNDS - number) * step)
+        seen = np.zeros(shape, bool)
+        seen[rows, columns] = True
+        asked = asked[seen.ravel()[asked]]
+        if not asked.size:
+            break
+        seen[:] = False
+        seen.ravel()[asked] = True
+        blocks = planes_of_blocks(ground, place, floor, raster, left, bottom, options.levels(NEAR), seen)
+        found = np.zeros(len(asked), bool)
+        _near(asked, place, *blocks, left, bottom, cell, options.threshold, options.scalar, found)
+        ground.ravel()[asked[found]] = True
+        asked = _still_asked(asked, found, left, bottom, shape, options.levels(NEAR))
     remove_plateaus(ground, floor, raster, cell)
     # The terrain runs below: no level of a deck stands for it either.
     ground &= ~on_deck
@@ -213,16 +222,37 @@ def ground_raster(
 
 
 @njit
-def _regain(ground, measured, place, planes, cell, threshold, scalar):
-    """Make ground what lies near the surface of the ground found so far."""
-    for j in range(ground.shape[0]):
-        for i in range(ground.shape[1]):
-            if not ground[j, i] and measured[j, i]:
-                height, across, along = planes[j, i, 0], planes[j, i, 1], planes[j, i, 2]
-                x, y, z = place[j, i, 0], place[j, i, 1], place[j, i, 2]
-                gradient = np.sqrt(across * across + along * along) / cell
-                if abs(z - height - x * across - y * along) <= threshold + scalar * gradient:
-                    ground[j, i] = True
+def _near(cells, place, blocks, blocks_left, blocks_bottom, left, bottom, cell, threshold, scalar, out):
+    """Which of the cells (n,), numbered row by row, lie near the surface of the ground found so far (see :mod:`.planes`)."""
+    w = place.shape[1]
+    for k in range(len(cells)):
+        j, i = cells[k] // w, cells[k] % w
+        height, across, along = plane_of_cell(blocks, blocks_left, blocks_bottom, i + left, j + bottom)
+        x, y, z = place[j, i, 0], place[j, i, 1], place[j, i, 2]
+        gradient = np.sqrt(across * across + along * along) / cell
+        out[k] = abs(z - height - x * across - y * along) <= threshold + scalar * gradient
+
+
+def _still_asked(
+    cells: NDArray[np.int64],
+    found: NDArray[np.bool_],
+    left: int,
+    bottom: int,
+    shape: tuple[int, int],
+    levels: int,
+) -> NDArray[np.int64]:
+    """The cells that were not found to be ground but may be once those found are: those near them.
+
+    A surface takes what it knows from the coarsest blocks beside a cell's own, and these from those beside them.
+    """
+    j, i = np.divmod(cells, shape[1])
+    j, i = (j + bottom >> levels) - (bottom >> levels), (i + left >> levels) - (left >> levels)
+    near = np.zeros((j.max() + 5, i.max() + 5), bool)
+    near[j[found], i[found]] = True
+    for step in (1, 1, 1, 1):
+        near[step:] |= near[:-step].copy()
+        near[:, step:] |= near[:, :-step].copy()
+    return cells[~found & near[j + 2, i + 2]]
 
 
 @dataclass(frozen=True)

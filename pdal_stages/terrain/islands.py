@@ -139,15 +139,10 @@ def _has_company(raster, kind, cell, j, i, height, across, along):
 
 
 @njit
-def _mark_deep(raster, cell, kind, mark, out):
+def _mark_deep(raster, base, cell, kind, mark, out):
     h, w = raster.shape
     size = (2 * WIDER + 1) ** 2
     u, v, zs, weight = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
-    base = np.full((h, w), np.inf)
-    for j in range(h):
-        for i in range(w):
-            if kind[j, i] == _LARGE:
-                base[j, i] = raster[j, i]
     for j in range(h):
         for i in range(w):
             if kind[j, i] <= _LARGE:
@@ -177,4 +172,5 @@ def mark_islands(raster: NDArray[np.float32], cell: float, mark: int, out: NDArr
     """
     steps = (STEP + GRADE * cell * _DISTANCES).astype(np.float32)
     kind = _islands(raster, _OFFSETS, steps, out)
-    _mark_deep(raster, cell, kind, mark, out)
+    base = np.where(kind == _LARGE, raster, HOLE)
+    _mark_deep(raster, base, cell, kind, mark, out)

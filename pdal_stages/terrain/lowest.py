@@ -68,25 +68,37 @@ def places_of(x, y, z, cell, grid):
     return place
 
 
-@njit
-def _lonely(raster, offsets, distances, cell, out):
+def framed(raster: np.ndarray) -> np.ndarray:
+    """The raster (h, w) with holes around it, as far as company is looked for: no step has to look where it ends."""
     h, w = raster.shape
+    out = np.full((h + 2 * COMPANY, w + 2 * COMPANY), HOLE)
+    out[COMPANY : COMPANY + h, COMPANY : COMPANY + w] = raster
+    return out
+
+
+@njit
+def _lonely(wide, offsets, levels, out):
+    """Mark cells without enough others at `offsets` (in numbers of the framed raster, row by row), each within its level."""
+    h, w = out.shape
+    stride = wide.shape[1]
+    flat = wide.ravel()
     for j in range(h):
         for i in range(w):
-            here = raster[j, i]
+            at = (j + COMPANY) * stride + i + COMPANY
+            here = flat[at]
             if here == HOLE:
                 continue
-            company, seen = 0, 0
+            company = 0
             for k in range(len(offsets)):
-                a, b = j + offsets[k, 0], i + offsets[k, 1]
-                if a < 0 or b < 0 or a >= h or b >= w or raster[a, b] == HOLE:
-                    continue
-                seen += 1
-                if abs(raster[a, b] - here) <= LEVEL + GRADE * cell * distances[k]:
+                if abs(flat[at + offsets[k]] - here) <= levels[k]:  # nor a hole
                     company += 1
                     if company == NEED:
                         break
-            out[j, i] = company < NEED and seen >= IN_VIEW
+            if company < NEED:
+                seen = 0
+                for k in range(len(offsets)):
+                    seen += flat[at + offsets[k]] != HOLE
+                out[j, i] = seen >= IN_VIEW
 
 
 @device
@@ -101,28 +113,52 @@ def _sort(values, n):
         values[j] = value
 
 
+@device
+def _lower(row, first, level):
+    """How many of the cells of a window's row lie lower."""
+    low = 0
+    for i in range(first, first + 2 * SURROUNDINGS + 1):
+        low += row[i] < level
+    return low
+
+
 @njit
-def _below_smooth(raster, out):
-    h, w = raster.shape
-    higher = np.empty((2 * SURROUNDINGS + 1) ** 2)
+def _below_smooth(wide, out):
+    h, w = out.shape
+    near = 2 * SURROUNDINGS + 1
+    higher = np.empty(near * near)
+    columns = np.zeros(wide.shape[1], np.int64)  # cells with points in those rows of each
+    for b in range(COMPANY - SURROUNDINGS, COMPANY + SURROUNDINGS):
+        for a in range(len(columns)):
+            columns[a] += wide[b, a] != HOLE
     for j in range(h):
+        y = j + COMPANY
+        for a in range(len(columns)):
+            columns[a] += (wide[y + SURROUNDINGS, a] != HOLE) - (wide[y - SURROUNDINGS - 1, a] != HOLE)
+        first = COMPANY - SURROUNDINGS
+        seen = columns[first - 1 : first + near - 1].sum()
         for i in range(w):
-            here = raster[j, i]
-            if here == HOLE or out[j, i]:
+            first = i + COMPANY - SURROUNDINGS
+            seen += columns[first + near - 1] - columns[first - 1]
+            here = wide[y, i + COMPANY]
+            if here == HOLE:
                 continue
-            low, n = 0, 0
-            for a in range(max(j - SURROUNDINGS, 0), min(j + SURROUNDINGS + 1, h)):
-                for b in range(max(i - SURROUNDINGS, 0), min(i + SURROUNDINGS + 1, w)):
-                    value = raster[a, b]
-                    if value == HOLE or out[a, b] == 1:
-                        continue
-                    if value < here + DROP:
-                        low += 1
-                    else:
-                        higher[n] = value
+            # Most cells have enough others near that are no higher.
+            level, most = here + DROP, SHARE * seen
+            low = _lower(wide[y], first, level)
+            step = 1
+            while low <= most and step <= SURROUNDINGS:
+                low += _lower(wide[y - step], first, level) + _lower(wide[y + step], first, level)
+                step += 1
+            n = seen - low
+            if low > most or n < MANY:
+                continue
+            n = 0
+            for b in range(y - SURROUNDINGS, y + SURROUNDINGS + 1):
+                for a in range(first, first + near):
+                    if level <= wide[b, a] < HOLE:
+                        higher[n] = wide[b, a]
                         n += 1
-            if n < MANY or low > SHARE * (low + n):
-                continue
             _sort(higher, n)
             if higher[n // 2] - higher[n // 8] <= SPREAD:
                 out[j, i] = 2
@@ -132,7 +168,9 @@ def pits(raster: np.ndarray, cell: float) -> np.ndarray:
     """Cells (h, w) of a minimum grid whose lowest point is a low outlier, from float32 heights, holes ``inf``; in meters."""
     out = np.zeros(raster.shape, np.uint8)
     offsets, distances = by_distance(COMPANY)
-    _lonely(raster, offsets, distances, cell, out)
-    _below_smooth(raster, out)
+    wide = framed(raster)
+    _lonely(wide, offsets @ [wide.shape[1], 1], LEVEL + GRADE * cell * distances, out)
+    wide[COMPANY:-COMPANY, COMPANY:-COMPANY][out != 0] = HOLE
+    _below_smooth(wide, out)
     mark_islands(raster, cell, 3, out)
     return out > 0

@@ -13,7 +13,8 @@ import numpy as np
 from ..base.jit import device, njit
 
 HOLE = np.float32(np.inf)
-_NOTHING = np.float32(-np.inf)
+#: Columns that are opened at once.
+_STRIP = 1024
 #: Share of squares among the steps of a regular octagon, tan(22.5 degrees).
 _SQUARES = 0.41421356
 
@@ -38,13 +39,6 @@ def opening_radii(largest: int) -> list[int]:
 
 
 @device
-def _higher(a, b, out):
-    """Element by element maximum; a function of its own, or the compiler does not vectorize it."""
-    for i in range(len(out)):
-        out[i] = a[i] if a[i] > b[i] else b[i]
-
-
-@device
 def _copy(source, out):
     for i in range(len(out)):
         out[i] = source[i]
@@ -52,9 +46,22 @@ def _copy(source, out):
 
 @device
 def _lowest_of_three(a, b, c, out):
+    """Element by element; a function of its own, or the compiler does not vectorize it."""
     for i in range(len(out)):
         low = a[i] if a[i] < b[i] else b[i]
         out[i] = low if low < c[i] else c[i]
+
+
+@device
+def _higher(a, b, out):
+    for i in range(len(out)):
+        out[i] = a[i] if a[i] > b[i] else b[i]
+
+
+@device
+def _raise(out, other):
+    for i in range(len(out)):
+        out[i] = out[i] if out[i] > other[i] else other[i]
 
 
 @device
@@ -66,13 +73,19 @@ def _highest_of_cross(a, b, c, d, e, out):
         out[i] = high if high > e[i] else e[i]
 
 
+@device
+def _measured(values, raster, hole, nothing, out):
+    for i in range(len(out)):
+        out[i] = nothing if raster[i] == hole else values[i]
+
+
 @njit
-def erode_step(source, target, square):
-    """Minimum over the 3 x 3 cells round each cell, or over the cross of five."""
+def erode_step(source, target, square, hole):
+    """Minimum over the 3 x 3 cells round each cell, or over the cross of five; beyond the raster are holes."""
     h, w = source.shape
     column = np.empty(w + 2, source.dtype)
     middle = np.empty(w, source.dtype)
-    column[0] = column[-1] = HOLE
+    column[0] = column[-1] = hole
     for j in range(h):
         above, here, below = source[max(j - 1, 0)], source[j], source[min(j + 1, h - 1)]
         _lowest_of_three(above, here, below, middle)
@@ -81,93 +94,109 @@ def erode_step(source, target, square):
 
 
 @device
-def _raise(out, other):
-    for i in range(len(out)):
-        out[i] = out[i] if out[i] > other[i] else other[i]
-
-
-@device
 def _row_maximum(row, spare, length):
-    """Running maximum of `length` cells of a row, starting at each cell, in place; what lies beyond it is left out.
+    """Running maximum of `length` cells of a row, starting at each cell; what lies beyond it is left out.
 
-    Doubling: a maximum of 2m cells is that of two of m cells. A row stays in a core's cache meanwhile.
+    Doubling: a maximum of 2m cells is that of two of m cells. A row stays in a core's cache meanwhile. Returns the one of
+    both rows that holds it.
     """
     w = len(row)
     done = 1
     while done < length:
-        step = min(done, length - done)
-        if step >= w:
-            break
-        _copy(row, spare)
-        _raise(row[: w - step], spare[step:])
+        step = min(done, length - done, w)
+        _higher(row[: w - step], row[step:], spare[: w - step])
+        _copy(row[w - step :], spare[w - step :])
+        row, spare = spare, row
         done += step
+    return row
 
 
 @device
-def _line_maximum(one, two, dy, dx, length):
-    """The same along (dy, dx), in `one`; dy is 1 or -1, dx 0 or 1. `two` is as large, and its content is lost.
+def _line_maximum(row, at, length, dx, pieces, running, out):
+    """Running maximum of `length` cells along (1, dx), row by row: takes row number `at`, gives that `length` - 1 before.
 
-    Van Herk's way [H92], row by row: lines are cut into pieces of `length` rows, and a window ends in the piece after the
-    one in which it begins. So it is the larger of the maxima to the end of the one and from the begin of the other. Windows
-    that end beyond the last column see their own piece alone.
+    Van Herk's way [H92]: lines are cut into pieces of `length` rows, and a window ends in the piece after the one in which
+    it begins. So it is the larger of the maxima to the end of the one and from the begin of the other. `pieces`
+    (2 x length, w) hold the former and the rows of the piece that comes, `running` (2, w) the latter; `dx` is 1, 0 or -1.
+    What lies beyond the columns is left out.
 
     [H92] van Herk (1992): A fast algorithm for local minimum and maximum filters on rectangular and octagonal kernels.
     Pattern Recognition Letters 13, 517-521.
     """
-    h, w = one.shape
-    if length < 2:
+    w = len(row)
+    if length == 1:
+        _copy(row, out)
         return
-    start = 0 if dy > 0 else h - 1
-    for k in range(h):  # from the begin of the piece
-        here = two[start + dy * k]
-        _copy(one[start + dy * k], here)
-        if k % length:
-            _raise(here[dx:], two[start + dy * (k - 1)][: w - dx])
-    for k in range(h - 2, -1, -1):  # to its end
-        if (k + 1) % length:
-            _raise(one[start + dy * k][: w - dx], one[start + dy * (k + 1)][dx:])
-    for k in range(h):
-        last = min(k + length - 1, h - 1)
-        shift = dx * (last - k)
-        if last // length != k // length and shift < w:
-            _raise(one[start + dy * k][: w - shift], two[start + dy * last][shift:])
+    k, piece = at % length, at // length % 2
+    come, held = pieces[piece * length :], pieces[(1 - piece) * length :]
+    left, right = max(dx, 0), max(-dx, 0)
+    _copy(row, come[k])
+    here, before = running[at % 2], running[(at + 1) % 2]
+    _copy(row, here)
+    if k > 0:
+        _raise(here[left : w - right], before[right : w - left])
+    if k == length - 1:
+        for n in range(length - 2, -1, -1):
+            _raise(come[n][right : w - left], come[n + 1][left : w - right])
+        _copy(come[0], out)
+    elif at >= length:
+        left, right = min(left * (length - 1), w), min(right * (length - 1), w)
+        _copy(held[k + 1], out)
+        _raise(out[right : w - left], here[left : w - right])
+
+
+def room_for(radius: int, height: int, width: int) -> int:
+    """Numbers that :func:`dilate` keeps meanwhile."""
+    squares = square_steps(radius)
+    rows = 2 * (2 * squares + 1) + 4 * (radius - squares) + 3 * 2 + 3 + 4
+    return rows * (min(width, _STRIP) + 2 * (radius + 1))
 
 
 @njit
-def dilate(eroded, raster, radius, squares, one, two, target):
-    """Maximum over the octagon round each cell of `eroded` at measured cells of `raster`.
+def dilate(eroded, raster, radius, squares, hole, nothing, room, target):
+    """Maximum over the octagon round each cell of `eroded` at measured cells of `raster`, those that are no `hole`.
 
-    `one` and `two` are flat buffers of at least the raster's size with `radius` + 1 cells more on every side.
+    Elsewhere is `nothing`, the least of all values. `room` is flat, and its content is lost: see :func:`room_for`. All steps
+    are taken row by row, in strips of columns, so that what they need of each other stays in a core's cache.
     """
     h, w = eroded.shape
-    pad = radius + 1
-    height, width = h + 2 * pad, w + 2 * pad
-    one, two = one[: height * width].reshape(height, width), two[: height * width].reshape(height, width)
-    # Running maxima look ahead; `top` and `left` say how far the middle of the window lies behind.
-    side = 2 * squares + 1
-    top, left = squares, squares
-    diamonds = radius - squares
-    spare = np.empty(width, np.float32)
-    for j in range(height):
-        row = one[j]
-        for i in range(width):
-            row[i] = _NOTHING
-        if pad <= j < pad + h:
-            inner, e, f = row[pad : pad + w], eroded[j - pad], raster[j - pad]
-            for i in range(w):
-                inner[i] = _NOTHING if f[i] == HOLE else e[i]
-            _row_maximum(row, spare, side)
-    # Rows and columns: a square. A cross, then both diagonals: a full diamond. Beyond the last of the raster's columns
-    # there is nothing in the buffer, and it has more of these than any window.
-    _line_maximum(one, two, 1, 0, side)
-    _line_maximum(one, two, 1, 1, diamonds)
-    _line_maximum(one, two, -1, 1, diamonds)
-    left += max(diamonds - 1, 0)
-    for j in range(h):
-        y, x, out = j + pad - top, pad - left, target[j]
-        here = one[y][x : x + w]
-        if diamonds > 0:
-            before, after = one[y][x - 1 : x - 1 + w], one[y][x + 1 : x + 1 + w]
-            _highest_of_cross(one[y - 1][x : x + w], one[y + 1][x : x + w], before, after, here, out)
-        else:
-            _copy(here, out)
+    side, diamonds, pad = 2 * squares + 1, radius - squares, radius + 1
+    for begin in range(0, w, _STRIP):
+        end = min(begin + _STRIP, w)
+        width = end - begin + 2 * pad
+        rows = room[: len(room) // width * width].reshape(-1, width)
+        upright, rows = rows[: 2 * side], rows[2 * side :]
+        down, rows = rows[: 2 * diamonds], rows[2 * diamonds :]
+        up, rows = rows[: 2 * diamonds], rows[2 * diamonds :]
+        one, two, three, cross, spare = rows[:2], rows[2:4], rows[4:6], rows[6:9], rows[9:13]
+        first, last = max(begin - pad, 0), min(end + pad, w)
+        inside = first - begin + pad
+        # Rows and columns: a square. Both diagonals, then a cross: a full diamond. Each step looks ahead, to rows that
+        # come after and columns that lie right, the second diagonal left: a window's middle is as far behind.
+        for at in range(h + 2 * radius):
+            row = spare[0]
+            row[:] = nothing
+            j = at - radius
+            if 0 <= j < h:
+                mine = row[inside : inside + last - first]
+                _measured(eroded[j][first:last], raster[j][first:last], hole, nothing, mine)
+                row = _row_maximum(row, spare[1], side)
+            _line_maximum(row, at, side, 0, upright, one, spare[2])
+            at -= side - 1
+            if at < 0:
+                continue
+            _line_maximum(spare[2], at, diamonds, 1, down, two, spare[3])
+            at -= diamonds - 1
+            if at < 0:
+                continue
+            _line_maximum(spare[3], at, diamonds, -1, up, three, cross[(at - diamonds + 1) % 3])
+            at -= diamonds - 1
+            if at < 2:
+                continue
+            x, wide = pad - squares, end - begin
+            here = cross[(at - 1) % 3]
+            _highest_of_cross(
+                cross[at % 3][x : x + wide], cross[(at - 2) % 3][x : x + wide],
+                here[x - 1 : x - 1 + wide], here[x + 1 : x + 1 + wide], here[x : x + wide],
+                target[at - 2][begin:end],
+            )  # fmt: skip

@@ -9,6 +9,8 @@ in a fixed tree, so the same ground gives the same bits whatever lies further aw
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ..base.jit import device, njit
@@ -18,6 +20,9 @@ from ..base.jit import device, njit
 _STIFFNESS = 0.02
 #: Weight of the coarser height, in ground cells.
 _HOLD = 0.1
+#: Blocks of a row that are done at once; and of those with others on both sides, and on one.
+_SPAN = 64
+_WINDOW, _BESIDE = _SPAN + 2, _SPAN + 1
 
 
 def reach(levels: int) -> int:
@@ -26,49 +31,48 @@ def reach(levels: int) -> int:
     return 3 * 2**levels
 
 
-@device
-def _add(total, m, dx, dy, weight):
-    """Add moments whose origin lies at (dx, dy)."""
-    n = m[0]
-    if n > 0:
-        total[0] += weight * n
-        total[1] += weight * (m[1] + n * dx)
-        total[2] += weight * (m[2] + n * dy)
-        total[3] += weight * (m[3] + 2 * dx * m[1] + n * dx * dx)
-        total[4] += weight * (m[4] + dx * m[2] + dy * m[1] + n * dx * dy)
-        total[5] += weight * (m[5] + 2 * dy * m[2] + n * dy * dy)
-        total[6] += weight * m[6]
-        total[7] += weight * (m[7] + dx * m[6])
-        total[8] += weight * (m[8] + dy * m[6])
-
-
 @njit
 def _moments_of_cells(ground, place, left, bottom, out, held, out_left, out_bottom):
     """n, x, y, xx, xy, yy, z, xz, yz of the ground of each block of 2 x 2 cells, about its center; which hold any."""
-    one = np.ones(9)
     for j in range(ground.shape[0]):
+        dy, row = ((j + bottom) & 1) - 0.5, ((j + bottom) >> 1) - out_bottom
+        target, here = out[row], held[row]
         for i in range(ground.shape[1]):
             if ground[j, i]:
                 x, y, z = place[j, i, 0], place[j, i, 1], place[j, i, 2]
-                one[1], one[2], one[3], one[4], one[5] = x, y, x * x, x * y, y * y
-                one[6], one[7], one[8] = z, x * z, y * z
-                column, row = i + left, j + bottom
-                target = out[(row >> 1) - out_bottom, (column >> 1) - out_left]
-                held[(row >> 1) - out_bottom, (column >> 1) - out_left] = True
-                _add(target, one, (column & 1) - 0.5, (row & 1) - 0.5, 1.0)
+                dx, k = ((i + left) & 1) - 0.5, ((i + left) >> 1) - out_left
+                here[k] = True
+                target[0, k] += 1.0
+                target[1, k] += x + dx
+                target[2, k] += y + dy
+                target[3, k] += x * x + 2 * dx * x + dx * dx
+                target[4, k] += x * y + dx * y + dy * x + dx * dy
+                target[5, k] += y * y + 2 * dy * y + dy * dy
+                target[6, k] += z
+                target[7, k] += x * z + dx * z
+                target[8, k] += y * z + dy * z
 
 
 @njit
 def _moments_of_blocks(fine, held_fine, left, bottom, size, out, held, out_left, out_bottom):
     """The same of blocks of twice the `size`, from their four parts."""
-    for j in range(fine.shape[0]):
-        for i in range(fine.shape[1]):
-            if not held_fine[j, i]:
-                continue
-            column, row = i + left, j + bottom
-            target = out[(row >> 1) - out_bottom, (column >> 1) - out_left]
-            held[(row >> 1) - out_bottom, (column >> 1) - out_left] = True
-            _add(target, fine[j, i], ((column & 1) - 0.5) * size, ((row & 1) - 0.5) * size, 1.0)
+    for j in range(held_fine.shape[0]):
+        dy, row = (((j + bottom) & 1) - 0.5) * size, ((j + bottom) >> 1) - out_bottom
+        target, here, m = out[row], held[row], fine[j]
+        for i in range(held_fine.shape[1]):
+            if held_fine[j, i]:
+                dx, k = (((i + left) & 1) - 0.5) * size, ((i + left) >> 1) - out_left
+                here[k] = True
+                n, x, y, z = m[0, i], m[1, i], m[2, i], m[6, i]
+                target[0, k] += n
+                target[1, k] += x + n * dx
+                target[2, k] += y + n * dy
+                target[3, k] += m[3, i] + 2 * dx * x + n * dx * dx
+                target[4, k] += m[4, i] + dx * y + dy * x + n * dx * dy
+                target[5, k] += m[5, i] + 2 * dy * y + n * dy * dy
+                target[6, k] += z
+                target[7, k] += m[7, i] + dx * z
+                target[8, k] += m[8, i] + dy * z
 
 
 @device
@@ -106,11 +110,18 @@ def _coarsest(floor, raster, left, bottom, level, out, out_left, out_bottom):
     h, w = out.shape[:2]
     sums = np.zeros((h, w, 2))
     for j in range(raster.shape[0]):
-        for i in range(raster.shape[1]):
-            if np.isfinite(raster[j, i]):
-                block = sums[((j + bottom) >> level) - out_bottom, ((i + left) >> level) - out_left]
-                block[0] += floor[j, i]
-                block[1] += 1.0
+        row = sums[((j + bottom) >> level) - out_bottom]
+        i = 0
+        while i < raster.shape[1]:
+            block = ((i + left) >> level) - out_left
+            end = min(((block + out_left + 1) << level) - left, raster.shape[1])
+            total, n = row[block, 0], row[block, 1]
+            for k in range(i, end):
+                if np.isfinite(raster[j, k]):
+                    total += floor[j, k]
+                    n += 1.0
+            row[block, 0], row[block, 1] = total, n
+            i = end
     for j in range(h):
         for i in range(w):
             total, n = 0.0, 0.0
@@ -123,82 +134,169 @@ def _coarsest(floor, raster, left, bottom, level, out, out_left, out_bottom):
             out[j, i, 1] = out[j, i, 2] = 0.0
 
 
+@device
+def _add_row(m, size, dy, near, sums):
+    """Add to `_SPAN` sums of moments those of the blocks of a row beside, in front, and behind, whose row lies at dy.
+
+    Sums are one after the other, as moments are, at places that the compiler knows, and there are no branches, so that it
+    does several at a time: blocks without ground have zeros, which change nothing.
+    """
+    for i in range(_SPAN):
+        n, x, y, z = sums[i], sums[i + _SPAN], sums[i + 2 * _SPAN], sums[i + 6 * _SPAN]
+        xx, xy, yy = sums[i + 3 * _SPAN], sums[i + 4 * _SPAN], sums[i + 5 * _SPAN]
+        xz, yz = sums[i + 7 * _SPAN], sums[i + 8 * _SPAN]
+        for a in range(3):
+            at, dx, weight = i + a, (a - 1) * size, near * (0.5 if a != 1 else 1.0)
+            k, mx, my, mz = m[at], m[at + _WINDOW], m[at + 2 * _WINDOW], m[at + 6 * _WINDOW]
+            n += weight * k
+            x += weight * (mx + k * dx)
+            y += weight * (my + k * dy)
+            xx += weight * (m[at + 3 * _WINDOW] + 2 * dx * mx + k * dx * dx)
+            xy += weight * (m[at + 4 * _WINDOW] + dx * my + dy * mx + k * dx * dy)
+            yy += weight * (m[at + 5 * _WINDOW] + 2 * dy * my + k * dy * dy)
+            z += weight * mz
+            xz += weight * (m[at + 7 * _WINDOW] + dx * mz)
+            yz += weight * (m[at + 8 * _WINDOW] + dy * mz)
+        sums[i], sums[i + _SPAN], sums[i + 2 * _SPAN], sums[i + 6 * _SPAN] = n, x, y, z
+        sums[i + 3 * _SPAN], sums[i + 4 * _SPAN], sums[i + 5 * _SPAN] = xx, xy, yy
+        sums[i + 7 * _SPAN], sums[i + 8 * _SPAN] = xz, yz
+
+
+@device
+def _correct(sums, size, planes):
+    """Correct `_SPAN` planes, given one after the other as heights and gradients, by sums of moments."""
+    for i in range(_SPAN):
+        n, x, y, z = sums[i], sums[i + _SPAN], sums[i + 2 * _SPAN], sums[i + 6 * _SPAN]
+        xx, xy, yy = sums[i + 3 * _SPAN], sums[i + 4 * _SPAN], sums[i + 5 * _SPAN]
+        xz, yz = sums[i + 7 * _SPAN], sums[i + 8 * _SPAN]
+        height, across, along = planes[i], planes[i + _SPAN], planes[i + 2 * _SPAN]
+        # Residuals of the coarser plane; the offset is eliminated, two unknowns are left.
+        r = z - n * height - across * x - along * y
+        rx = xz - height * x - across * xx - along * xy
+        ry = yz - height * y - across * xy - along * yy
+        n_held = n + _HOLD
+        stiff = _STIFFNESS * n * size * size
+        xx = xx + stiff - x * x / n_held
+        xy -= x * y / n_held
+        yy = yy + stiff - y * y / n_held
+        rx -= x * r / n_held
+        ry -= y * r / n_held
+        determinant = xx * yy - xy * xy
+        gx = (rx * yy - ry * xy) / determinant
+        gy = (ry * xx - rx * xy) / determinant
+        up = height + (r - x * gx - y * gy) / n_held
+        planes[i] = up if n > 0.0 else height
+        planes[i + _SPAN] = across + gx if n > 0.0 else across
+        planes[i + 2 * _SPAN] = along + gy if n > 0.0 else along
+
+
+@device
+def _copy(source, first, last, target, at):
+    for i in range(last - first):
+        target[at + i] = source[first + i]
+
+
 @njit
 def _fit(moments, size, needed, planes):
     """Correct the needed planes (given: what the coarser level says) by the ground of 3 x 3 blocks."""
-    h, w = planes.shape[:2]
+    h, w = needed.shape
+    window, sums, some = np.zeros(9 * _WINDOW), np.empty(9 * _SPAN), np.zeros(3 * _SPAN)
     for j in range(h):
-        for i in range(w):
-            if not needed[j, i]:
+        for begin in range(0, w, _SPAN):
+            end = min(begin + _SPAN, w)
+            if not needed[j, begin:end].any():
                 continue
-            height, across, along = planes[j, i, 0], planes[j, i, 1], planes[j, i, 2]
-            if np.isnan(height):
-                continue
-            # As in _add, but in registers: this is what terrain takes longest for where points are sparse.
-            n = x = y = xx = xy = yy = z = xz = yz = 0.0
+            first, last = max(begin - 1, 0), min(end + 1, w)
+            if last - first < _WINDOW:
+                window[:] = 0.0
+            sums[:] = 0.0
             for b in range(max(j - 1, 0), min(j + 2, h)):
-                dy, near = (b - j) * size, 1.0 - 0.5 * abs(b - j)
-                for a in range(max(i - 1, 0), min(i + 2, w)):
-                    m = moments[b, a]
-                    k = m[0]
-                    if k > 0:
-                        dx, weight = (a - i) * size, near * (1.0 - 0.5 * abs(a - i))
-                        n += weight * k
-                        x += weight * (m[1] + k * dx)
-                        y += weight * (m[2] + k * dy)
-                        xx += weight * (m[3] + 2 * dx * m[1] + k * dx * dx)
-                        xy += weight * (m[4] + dx * m[2] + dy * m[1] + k * dx * dy)
-                        yy += weight * (m[5] + 2 * dy * m[2] + k * dy * dy)
-                        z += weight * m[6]
-                        xz += weight * (m[7] + dx * m[6])
-                        yz += weight * (m[8] + dy * m[6])
-            if n == 0.0:
-                continue
-            # Residuals of the coarser plane; the offset is eliminated, two unknowns are left.
-            r = z - n * height - across * x - along * y
-            rx = xz - height * x - across * xx - along * xy
-            ry = yz - height * y - across * xy - along * yy
-            n_held = n + _HOLD
-            stiff = _STIFFNESS * n * size * size
-            xx = xx + stiff - x * x / n_held
-            xy -= x * y / n_held
-            yy = yy + stiff - y * y / n_held
-            rx -= x * r / n_held
-            ry -= y * r / n_held
-            determinant = xx * yy - xy * xy
-            gx = (rx * yy - ry * xy) / determinant
-            gy = (ry * xx - rx * xy) / determinant
-            planes[j, i, 0] = height + (r - x * gx - y * gy) / n_held
-            planes[j, i, 1], planes[j, i, 2] = across + gx, along + gy
+                for q in range(9):
+                    _copy(moments[b, q], first, last, window, q * _WINDOW + first - begin + 1)
+                _add_row(window, size, (b - j) * size, 1.0 - 0.5 * abs(b - j), sums)
+            for i in range(begin, end):
+                plane, at = planes[j, i], i - begin
+                some[at], some[at + _SPAN], some[at + 2 * _SPAN] = plane[0], plane[1], plane[2]
+            _correct(sums, size, some)
+            for i in range(begin, end):
+                plane, at = planes[j, i], i - begin
+                plane[0], plane[1], plane[2] = some[at], some[at + _SPAN], some[at + 2 * _SPAN]
 
 
-@njit
-def _needed_parents(needed, left, bottom, out, out_left, out_bottom):
-    """Mark the blocks of twice the size whose planes are asked for those of the needed ones."""
-    for j in range(needed.shape[0]):
-        for i in range(needed.shape[1]):
-            if needed[j, i]:
-                before, below = ((i + left + 1) >> 1) - 1 - out_left, ((j + bottom + 1) >> 1) - 1 - out_bottom
-                for b in range(max(below, 0), min(below + 2, out.shape[0])):
-                    for a in range(max(before, 0), min(before + 2, out.shape[1])):
-                        out[b, a] = True
+def _needed_parents(
+    needed: np.ndarray, left: int, bottom: int, shape: tuple[int, int], out_left: int, out_bottom: int
+) -> np.ndarray:
+    """Blocks of twice the size, on a raster of that `shape`, whose planes are asked for those of the needed ones."""
+    h, w = shape
+    j, i = bottom - 2 * out_bottom + 1, left - 2 * out_left + 1
+    padded = np.zeros((2 * h + 2, 2 * w + 2), bool)
+    padded[j : j + needed.shape[0], i : i + needed.shape[1]] = needed
+    rows = padded[0:-2:2] | padded[1:-2:2]
+    rows |= padded[2::2]
+    rows |= padded[3::2]
+    out = rows[:, 0:-2:2] | rows[:, 1:-2:2]
+    out |= rows[:, 2::2]
+    out |= rows[:, 3::2]
+    return out
+
+
+@device
+def _shared(parents, size, s, t, out):
+    """As `blend`, at a place between each two of `_SPAN` + 1 parents in two rows, all known: weights add up to 1.
+
+    `parents` are heights and gradients, one after the other, as in `_add_row`.
+    """
+    for i in range(_SPAN):
+        height, across, along = 0.0, 0.0, 0.0
+        for b in range(2):
+            for a in range(2):
+                at, weight = i + a + b * _BESIDE, (s if a else 1.0 - s) * (t if b else 1.0 - t)
+                p1, p2 = parents[at + 2 * _BESIDE], parents[at + 4 * _BESIDE]
+                height += weight * (parents[at] + size * (p1 * (s - a) + p2 * (t - b)))
+                across += weight * p1
+                along += weight * p2
+        out[i], out[i + _SPAN], out[i + 2 * _SPAN] = height, across, along
 
 
 @njit
 def _from_parents(parents, parents_left, parents_bottom, size, left, bottom, needed, planes):
-    """What the planes of blocks of twice the `size` say at the centers of the needed blocks of `size`."""
-    for j in range(planes.shape[0]):
-        for i in range(planes.shape[1]):
-            if not needed[j, i]:
+    """What the planes of blocks of twice the `size` say at the centers of the needed blocks of `size`, and others near."""
+    h, w = needed.shape
+    rows, columns = parents.shape[:2]
+    some, one, other = np.zeros(6 * _BESIDE), np.zeros(3 * _SPAN), np.zeros(3 * _SPAN)
+    start = ((left + 1) >> 1) - 1 - parents_left
+    for j in range(h):
+        # A left child lies 3/4 of the way from the block before its parent's, a right one 1/4 beyond its parent.
+        t = 0.25 + 0.5 * (1 - ((j + bottom) & 1))
+        below = ((j + bottom + 1) >> 1) - 1 - parents_bottom
+        for before in range(start, ((left + w) >> 1) - parents_left, _SPAN):
+            first = 2 * (before + parents_left) + 1 - left  # of the two between it and the next parent
+            begin, end = max(first, 0), min(first + 2 * _SPAN, w)
+            if not needed[j, begin:end].any():
                 continue
-            # A left child lies 3/4 of the way from the block before its parent's, a right one 1/4 beyond its parent.
-            column, row = i + left, j + bottom
-            s, t = 0.25 + 0.5 * (1 - (column & 1)), 0.25 + 0.5 * (1 - (row & 1))
-            before = ((column + 1) >> 1) - 1 - parents_left
-            below = ((row + 1) >> 1) - 1 - parents_bottom
-            planes[j, i, 0], planes[j, i, 1], planes[j, i, 2] = blend(
-                parents, before, below, s, t, 2.0 * size
-            )
+            last = before + (end - 1 - first) // 2 + 2
+            known = below >= 0 and below + 2 <= rows and before >= 0 and last <= columns
+            if known:
+                for b in range(2):
+                    for k in range(before, last):
+                        plane, at = parents[below + b, k], b * _BESIDE + k - before
+                        known = known and plane[0] == plane[0]
+                        some[at] = plane[0]
+                        some[at + 2 * _BESIDE], some[at + 4 * _BESIDE] = plane[1], plane[2]
+            if known:
+                _shared(some, 2.0 * size, 0.25, t, one)
+                _shared(some, 2.0 * size, 0.75, t, other)
+                for k in range(begin, end):
+                    found, at = other if (k - first) & 1 else one, (k - first) >> 1
+                    plane = planes[j, k]
+                    plane[0], plane[1], plane[2] = found[at], found[at + _SPAN], found[at + 2 * _SPAN]
+                continue
+            for k in range(begin, end):
+                if needed[j, k]:
+                    s = 0.75 if (k - first) & 1 else 0.25
+                    planes[j, k, 0], planes[j, k, 1], planes[j, k, 2] = blend(
+                        parents, before + ((k - first) >> 1), below, s, t, 2.0 * size
+                    )
 
 
 @njit
@@ -209,6 +307,67 @@ def _through_ground(ground, place, planes):
             if ground[j, i]:
                 x, y, z = place[j, i, 0], place[j, i, 1], place[j, i, 2]
                 planes[j, i, 0] = z - x * planes[j, i, 1] - y * planes[j, i, 2]
+
+
+class Planes(NamedTuple):
+    """Of blocks of 2 x 2 cells."""
+
+    values: np.ndarray  #: (h, w, 3) at their centers, where asked for: height, gradient per cell
+    left: int  #: number of the first column
+    bottom: int  #: of the first row
+
+
+def planes_of_blocks(
+    ground: np.ndarray,
+    place: np.ndarray,
+    floor: np.ndarray,
+    raster: np.ndarray,
+    left: int,
+    bottom: int,
+    levels: int,
+    needed: np.ndarray,
+) -> Planes:
+    """The pyramid down to blocks of 2 x 2 cells, where those cells that are `needed` ask for it; see :func:`surface`."""
+    h, w = ground.shape
+    spans = [(left, bottom, w, h)]
+    for _ in range(levels):
+        a, b, w, h = spans[-1]
+        low_a, low_b = (a >> 1) - 1, (b >> 1) - 1
+        spans.append((low_a, low_b, ((a + w - 1) >> 1) + 2 - low_a, ((b + h - 1) >> 1) + 2 - low_b))
+    wanted = [needed]
+    for level in range(1, levels + 1):
+        a, b, w, h = spans[level]
+        wanted.append(_needed_parents(wanted[-1], *spans[level - 1][:2], (h, w), a, b))
+    # Memory that is zero and never touched costs nothing: empty land is not gone over with all its numbers.
+    moments, held = [], []
+    for level in range(1, levels + 1):
+        a, b, w, h = spans[level]
+        moments.append(np.zeros((h, 9, w)))
+        held.append(np.zeros((h, w), bool))
+        before = spans[level - 1][:2]
+        if level == 1:
+            _moments_of_cells(ground, place, *before, moments[-1], held[-1], a, b)
+        else:
+            size = 2.0 ** (level - 1)
+            _moments_of_blocks(moments[-2], held[-2], *before, size, moments[-1], held[-1], a, b)
+    planes = np.empty((0, 0, 3))
+    for level in range(levels, 0, -1):
+        a, b, w, h = spans[level]
+        coarser, planes = planes, np.zeros((h, w, 3))
+        if level == levels:
+            _coarsest(floor, raster, left, bottom, level, planes, a, b)
+        else:
+            _from_parents(coarser, *spans[level + 1][:2], 2.0**level, a, b, wanted[level], planes)
+        _fit(moments[level - 1], 2.0**level, wanted[level], planes)
+    return Planes(planes, *spans[1][:2])
+
+
+@device
+def plane_of_cell(blocks, blocks_left, blocks_bottom, column, row):
+    """Height at the center of a cell and gradient, of the planes of blocks of 2 x 2 cells."""
+    s, t = 0.25 + 0.5 * (1 - (column & 1)), 0.25 + 0.5 * (1 - (row & 1))
+    before, below = ((column + 1) >> 1) - 1 - blocks_left, ((row + 1) >> 1) - 1 - blocks_bottom
+    return blend(blocks, before, below, s, t, 2.0)
 
 
 def surface(
@@ -228,39 +387,8 @@ def surface(
     measured. `left` and `bottom` number the first column and row from the origin of the coordinates. There are
     `levels` coarser levels, at least 1. `needed` (h, w) says at which cells planes are wanted; elsewhere stands none.
     """
-    h, w = ground.shape
-    spans = [(left, bottom, w, h)]
-    for _ in range(levels):
-        a, b, w, h = spans[-1]
-        low_a, low_b = (a >> 1) - 1, (b >> 1) - 1
-        spans.append((low_a, low_b, ((a + w - 1) >> 1) + 2 - low_a, ((b + h - 1) >> 1) + 2 - low_b))
-    wanted = [needed]
-    for level in range(1, levels + 1):
-        a, b, w, h = spans[level]
-        wanted.append(np.zeros((h, w), bool))
-        _needed_parents(wanted[-2], *spans[level - 1][:2], wanted[-1], a, b)
-    # Memory that is zero and never touched costs nothing: empty land is not gone over with all its numbers.
-    moments, held = [], []
-    for level in range(1, levels + 1):
-        a, b, w, h = spans[level]
-        moments.append(np.zeros((h, w, 9)))
-        held.append(np.zeros((h, w), bool))
-        before = spans[level - 1][:2]
-        if level == 1:
-            _moments_of_cells(ground, place, *before, moments[-1], held[-1], a, b)
-        else:
-            size = 2.0 ** (level - 1)
-            _moments_of_blocks(moments[-2], held[-2], *before, size, moments[-1], held[-1], a, b)
-    planes = np.empty((0, 0, 3))
-    for level in range(levels, -1, -1):
-        a, b, w, h = spans[level]
-        coarser, planes = planes, np.zeros((h, w, 3))
-        if level == levels:
-            _coarsest(floor, raster, left, bottom, level, planes, a, b)
-        else:
-            _from_parents(coarser, *spans[level + 1][:2], 2.0**level, a, b, wanted[level], planes)
-        if level == 0:
-            _through_ground(ground, place, planes)
-        else:
-            _fit(moments[level - 1], 2.0**level, wanted[level], planes)
+    blocks = planes_of_blocks(ground, place, floor, raster, left, bottom, levels, needed)
+    planes = np.zeros((*ground.shape, 3))
+    _from_parents(blocks.values, blocks.left, blocks.bottom, 1.0, left, bottom, needed, planes)
+    _through_ground(ground, place, planes)
     return planes

@@ -33,35 +33,49 @@ def reach(cell: float) -> int:
     return int(WIDEST / cell) + 1 + LINK + BEYOND
 
 
+def _ways(cell):
+    """Offsets (row, column) of the cells that one is linked to and that come after it, and across which step."""
+    j, i = np.mgrid[: LINK + 1, -LINK : LINK + 1]
+    after = ((j > 0) | (i > 0)) & (j * j + i * i <= LINK * LINK)
+    steps = np.maximum(STEP, GRADE * cell * np.sqrt((j * j + i * i).astype(float)))
+    return np.column_stack([j[after], i[after]]), steps[after]
+
+
 @njit
-def _linked(raster, cell, number):
+def _linked(raster, offsets, steps, number):
     """Number the measured cells of each linked set alike; returns how many sets there are."""
     h, w = raster.shape
+    heights, numbers = raster.ravel(), number.ravel()
     parent = np.arange(h * w)
     for j in range(h):
         for i in range(w):
-            here = raster[j, i]
+            at = j * w + i
+            here = heights[at]
             if here == HOLE:
                 continue
-            for b in range(LINK + 1):
-                for a in range(-LINK if b else 1, LINK + 1):
-                    y, x = j + b, i + a
-                    if b * b + a * a > LINK * LINK or y >= h or x < 0 or x >= w or raster[y, x] == HOLE:
-                        continue
-                    if abs(raster[y, x] - here) <= max(STEP, GRADE * cell * np.sqrt(float(a * a + b * b))):
-                        one, other = root_of(parent, j * w + i), root_of(parent, y * w + x)
-                        parent[max(one, other)] = min(one, other)
+            mine = root_of(parent, at)
+            for k in range(len(steps)):
+                b, a = offsets[k, 0], offsets[k, 1]
+                if j + b >= h or i + a < 0 or i + a >= w:
+                    continue
+                other = at + b * w + a
+                if abs(heights[other] - here) <= steps[k] and parent[other] != mine:  # nor a hole
+                    other = root_of(parent, other)
+                    if other > mine:
+                        parent[other] = mine
+                    elif other < mine:
+                        parent[mine] = other
+                        mine = other
     count = 0
-    for j in range(h):
-        for i in range(w):
-            number[j, i] = -1
-            if raster[j, i] != HOLE:
-                root = root_of(parent, j * w + i)
-                if root == j * w + i:
-                    number[j, i] = count
-                    count += 1
-                else:
-                    number[j, i] = number[root // w, root % w]
+    for at in range(h * w):
+        numbers[at] = -1
+        if heights[at] != HOLE:
+            root = root_of(parent, at)
+            if root == at:
+                numbers[at] = count
+                count += 1
+            else:
+                numbers[at] = numbers[root]
     return count
 
 
@@ -123,7 +137,7 @@ def remove_plateaus(ground: np.ndarray, floor: np.ndarray, raster: np.ndarray, c
     `raster` (h, w) holds the heights, in meters like `cell`, a cell's side; ground is measured everywhere.
     """
     number = np.empty(ground.shape, np.int64)
-    count = _linked(raster, cell, number)
+    count = _linked(raster, *_ways(cell), number)
     box, sums, grounds = (np.zeros((count, *rest), np.int64) for rest in ((4,), (3,), ()))
     _extents(number, ground, box, sums, grounds)
     widest = int(WIDEST / cell)
