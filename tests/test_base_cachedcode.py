@@ -72,6 +72,17 @@ def test_other_arguments_are_compiled_after_cached_ones(say):
     assert say(f"print(inner(np.arange(9.0)), inner(np.arange(9)))\n{COMPILED}") == ["204.0 204.0", "1"]
 
 
+def test_changed_code_is_compiled_again_also_where_it_is_called_by_way_of_what_stands_below(say, tmp_path):
+    below = "from pdal_stages.base.jit import device, njit\n"
+    outer = "from below import deepest\nfrom pdal_stages.base.jit import device, njit\n\n"
+    (tmp_path / "above.py").write_text(
+        outer + "@njit\ndef top(x):\n    return middle(x)\n\n@device\ndef middle(x):\n    return deepest(x)\n"
+    )
+    for factor in (2, 30):
+        (tmp_path / "below.py").write_text(f"{below}\n@device\ndef deepest(x):\n    return {factor} * x\n")
+        assert say("from above import top\nprint(top(7))") == [str(7 * factor)]
+
+
 @pytest.mark.pdal
 def test_a_job_that_compiles_nothing_imports_no_linear_algebra(tmp_path):
     town = tmp_path / "town.laz"

@@ -51,8 +51,8 @@ def neighbors_of(tree, qx, qy, qz, need, cap2, index, d2, found):
             r = min(j - lo, count - 1)
             found[q] = rows.found[r]
             for i in range(rows.found[r]):
-                index[q, i] = rows.at[r, i]
-                d2[q, i] = rows.d2[r, i]
+                index[q, i] = rows.at[i, r]
+                d2[q, i] = rows.d2[i, r]
 
 
 CHECKED = [*oracle.COVARIANCE, *oracle.GEOMETRIC]

@@ -40,7 +40,8 @@ FAST = frozenset({"reassoc", "contract", "nsz", "arcp"})
 #: Divisions as in NumPy.
 _ERRORS = {"error_model": "numpy"}
 
-_stamps: dict[Any, frozenset[str]] = {}
+#: Kernels, device functions and intrinsics, and what each was made of.
+_functions: dict[Any, Callable] = {}
 
 #: Device functions that numba has not heard of yet, with their options.
 _unregistered: list[tuple[Callable, dict[str, Any]]] = []
@@ -54,7 +55,7 @@ class Kernel:
         update_wrapper(self, function)
         self._function, self._options = function, options
         self._dispatcher: Any = None
-        _stamp(self, function)
+        _functions[self] = function
 
     def __call__(self, *arguments: Any) -> Any:
         return (self._dispatcher or self.dispatcher)(*arguments)
@@ -68,7 +69,7 @@ class Kernel:
                 made = _dispatcher(self._function, self._options)
                 file: Any = getattr(getattr(made, "_cache", None), "_cache_file", None)
                 if hasattr(file, "_source_stamp"):
-                    file._source_stamp = "-".join(sorted(_stamps[self]))
+                    file._source_stamp = "-".join(sorted(_sources(self)))
                 load_lightly(made)
                 self._dispatcher = made
             return self._dispatcher
@@ -100,7 +101,7 @@ def device(function: Callable | None = None, **options):
     """
     if function is None:
         return lambda f: device(f, **options)
-    _stamp(function, function)
+    _functions[function] = function
     _unregistered.append((function, {**_ERRORS, **options}))
     return function
 
@@ -110,7 +111,7 @@ def intrinsic(function: Callable) -> Any:
     numba = _numba()
     typed = update_wrapper(lambda context, *given: function(numba.types, *given), function)
     made = numba.extending.intrinsic(typed)
-    _stamp(made, function)
+    _functions[made] = function
     return made
 
 
@@ -186,16 +187,24 @@ def _file_digest(path: str) -> str:
         return path
 
 
-def _stamp(kernel: Any, function: Callable) -> None:
-    """Note the sources that the code of a kernel (or device function) is made of: its own, and of all it names."""
-    parts = {_file_digest(function.__code__.co_filename)}
-    for name in function.__code__.co_names:
-        called = function.__globals__.get(name)
-        try:
-            parts |= _stamps.get(called, frozenset())
-        except TypeError:  # a global that cannot be hashed is no kernel
-            continue
-    _stamps[kernel] = frozenset(parts)
+def _sources(kernel: Any) -> set[str]:
+    """Digests of the sources that the code of a kernel is made of: its own, and of all that it calls.
+
+    Asked when the kernel is first called, since what it calls may stand below it.
+    """
+    digests, seen, todo = set(), {kernel}, [kernel]
+    while todo:
+        function = _functions[todo.pop()]
+        digests.add(_file_digest(function.__code__.co_filename))
+        for name in function.__code__.co_names:
+            called = function.__globals__.get(name)
+            try:
+                if called in _functions and called not in seen:
+                    seen.add(called)
+                    todo.append(called)
+            except TypeError:  # a global that cannot be hashed is no kernel
+                continue
+    return digests
 
 
 class Compiling:

@@ -17,12 +17,13 @@ from .index import CellGrid
 from .kdtree import KdTree, build_tree
 from .moments import BATCH, FEATURES, MOMENTS, WIDTH, finish
 from .names import MOMENT_FEATURES, SHAPE_FEATURES, SURFACES
-from .neighborhoods import AROUND, LEAST_RADIUS
-from .optimal import kopt_block, nearest_block
+from .nearest import nearest_block, surfaces_block
+from .neighborhoods import LEAST_RADIUS
+from .optimal import kopt_block
 from .plan import Columns, FeaturePlan
 from .ropt import COPT_RADII, copt_block, curvature_block, radii_of, ropt_block
 from .shapes import Shapes, count_shapes, list_shapes, no_shapes, point_seeds
-from .surfaces import MADE, write_surfaces
+from .surfaces import MADE
 from .surfaces import WIDTH as SURFACE
 
 #: Queries computed at a time when curvatures of a whole cloud are.
@@ -87,16 +88,33 @@ class AdaptiveNeighborhoods:
     def _touch(self) -> None:
         """Compile what the plan needs, on one point, before threads do."""
         one = self.grid.x[:1], self.grid.y[:1], self.grid.z[:1]
-        together = self._compute_nearest(*one) if self._nearest else {}
+        copies, out = np.ones(1, np.int64), np.zeros((1, 1), np.float32)
+        if self._nearest:
+            nothing = [np.full((len(self._nearest), width), -1, np.int64) for width in (FEATURES, MADE)]
+            ks, unwanted = np.ones(len(nothing[0]), np.int64), np.zeros(len(nothing[0]), np.bool_)
+            few = np.zeros(len(ks), np.int64)
+            nearest_block(
+                self._tree,
+                *one,
+                copies,
+                ks,
+                nothing[0],
+                self._surfaces,
+                unwanted,
+                nothing[1],
+                0.0,
+                few,
+                few,
+                out,
+            )
         for number, spec in enumerate(self.specs):
+            if number in self._nearest and not spec.shaped:
+                continue
             shapes = count_shapes(np.zeros((5, 9)), 1) if spec.shaped else no_shapes()
-            if number in together and not spec.shaped:
-                table, radius, *_ = together[number]
-            else:
-                table, radius, _ = self._compute(spec, *one, 0, 0.0, shapes)
-            few, copies = np.zeros(1, np.int64), np.ones(1, np.int64)
-            nowhere = np.full(len(spec.columns), -1, np.int64)
-            write_columns(table, radius, one[2], few, copies, nowhere, np.zeros((1, 1), np.float32))
+            table, radius, _ = self._compute(spec, *one, 0, 0.0, shapes)
+            if number not in self._nearest:
+                nowhere = np.full(len(spec.columns), -1, np.int64)
+                write_columns(table, radius, one[2], np.zeros(1, np.int64), copies, nowhere, out)
 
     def curvatures(self, threads: int | None = None) -> np.ndarray:
         """The curvature of every point of the cloud, in the order of the grid, (n,) float64 [H17]."""
@@ -116,19 +134,10 @@ class AdaptiveNeighborhoods:
         """The surface of every point of the cloud, in the order of the grid, (n, surfaces.WIDTH) float32."""
         grid = self.grid
         out = np.empty((len(grid), SURFACE), np.float32)
-        ks, unwanted = np.array([AROUND], np.int64), np.zeros(1, np.bool_)
 
         def compute(start: int) -> None:
             part = slice(start, start + CHUNK)
-            x, y, z = grid.x[part], grid.y[part], grid.z[part]
-            tables, radius, reach = (
-                np.empty((1, MOMENTS, len(x))),
-                np.empty((1, len(x))),
-                np.empty((1, len(x))),
-            )
-            nothing = np.empty((1, 0, MADE))
-            nearest_block(self._tree, x, y, z, ks, tables, radius, reach, self._surfaces, unwanted, nothing)
-            write_surfaces(tables[0], reach[0], out[part])
+            surfaces_block(self._tree, grid.x[part], grid.y[part], grid.z[part], self._surfaces, out[part])
 
         compute(len(out) - 1)  # compiled before threads want it
         for _ in map_blocks(compute, range(0, len(out), CHUNK), threads):
@@ -161,40 +170,49 @@ class AdaptiveNeighborhoods:
         copt. For each neighborhood, `few` is raised by the number of queries with fewer than three points, and `far` by
         that of queries whose result depends on points farther than the plan's halo.
         """
-        together = self._compute_nearest(qx, qy, qz) if self._nearest else {}
+        if self._nearest:
+            self._fill_nearest(qx, qy, qz, copies, few, far, out)
         for number, spec in enumerate(self.specs):
+            done = number in self._nearest
+            if done and not spec.shaped:
+                continue
             if spec.shaped:
                 assert bins is not None
                 shapes = count_shapes(bins.comparable([spec.token])[0], len(qx))
             else:
                 shapes = no_shapes()
-            if number in together and not spec.shaped:
-                table, radius, reach, made = together[number]
-            else:
-                table, radius, reach = self._compute(spec, qx, qy, qz, seed, copt_threshold, shapes)
-                if spec.surfaced:
-                    *_, reach, made = together[number]
-            write_columns(table, radius, qz, few[number : number + 1], copies, spec.columns, out)
+            table, radius, reach = self._compute(spec, qx, qy, qz, seed, copt_threshold, shapes)
+            if not done:
+                write_columns(table, radius, qz, few[number : number + 1], copies, spec.columns, out)
             if spec.shaped:
                 wanted = spec.shape_columns >= 0
                 out[:, spec.shape_columns[wanted]] = shapes.counts[:, wanted]
-            if spec.surfaced:
-                wanted = spec.surface_columns >= 0
-                out[:, spec.surface_columns[wanted]] = made[:, wanted]
-            if spec.unbounded:
+            if spec.unbounded and not done:
                 far[number] += int(copies[reach > self.halo_m].sum())
 
-    def _compute_nearest(
-        self, qx: np.ndarray, qy: np.ndarray, qz: np.ndarray
-    ) -> dict[int, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-        """What :meth:`_compute` gives, for all of ``_nearest``, and what surfaces make of them (m, 4)."""
-        ks = np.array([int(self.specs[n].parameters[0]) for n in self._nearest], np.int64)
-        tables = np.empty((len(ks), MOMENTS, len(qx)))
-        radius, reach = np.empty((len(ks), len(qx))), np.empty((len(ks), len(qx)))
-        wanted = np.array([self.specs[n].surfaced for n in self._nearest])
-        made = np.empty((len(ks), len(qx) if wanted.any() else 0, MADE))
-        nearest_block(self._tree, qx, qy, qz, ks, tables, radius, reach, self._surfaces, wanted, made)
-        return {n: (tables[j], radius[j], reach[j], made[j]) for j, n in enumerate(self._nearest)}
+    def _fill_nearest(
+        self,
+        qx: np.ndarray,
+        qy: np.ndarray,
+        qz: np.ndarray,
+        copies: np.ndarray,
+        few: np.ndarray,
+        far: np.ndarray,
+        out: np.ndarray,
+    ) -> None:
+        """What :meth:`fill` does, for all of ``_nearest``; of shaped ones all but their shapes."""
+        specs = [self.specs[number] for number in self._nearest]
+        ks = np.array([int(spec.parameters[0]) for spec in specs], np.int64)
+        wanted = np.array([spec.surfaced for spec in specs])
+        columns = np.stack([spec.columns[:FEATURES] for spec in specs])
+        surface_columns = np.stack([spec.surface_columns for spec in specs])
+        counted = np.zeros((2, len(ks)), np.int64)
+        nearest_block(
+            self._tree, qx, qy, qz, copies, ks, columns, self._surfaces, wanted, surface_columns, self.halo_m,
+            counted[0], counted[1], out,
+        )  # fmt: skip
+        few[self._nearest] += counted[0]
+        far[self._nearest] += counted[1]
 
     def _compute(
         self,

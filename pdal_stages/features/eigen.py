@@ -26,7 +26,7 @@ LINE = 1e-12
 
 
 @intrinsic
-def _bits(types, value):
+def bits_of(types, value):
     """The 64 bits of a float64 as int64 (a register move; a view through memory would not vectorize)."""
 
     def codegen(context, builder, signature, args):
@@ -36,7 +36,7 @@ def _bits(types, value):
 
 
 @intrinsic
-def _from_bits(types, value):
+def from_bits(types, value):
     """The float64 of 64 bits."""
 
     def codegen(context, builder, signature, args):
@@ -48,11 +48,11 @@ def _from_bits(types, value):
 @device(forceinline=True)
 def log_fast(x):
     """Natural logarithm of a positive normal float64 to 1e-15 relative (fdlibm's scheme, no branches)."""
-    bits = _bits(x)
+    bits = bits_of(x)
     # Mantissa into [sqrt(1/2), sqrt(2)).
     shifted = bits - 0x3FE6A09E667F3BCD
     exponent = shifted >> 52
-    m = _from_bits(bits - (exponent << 52))
+    m = from_bits(bits - (exponent << 52))
     f = m - 1.0
     s = f / (2.0 + f)
     z = s * s
@@ -74,7 +74,7 @@ def cbrt_fast(x):
     big = x > 1e-290
     y = x if big else 1.0
     # Exponent divided by three (as a float: integer division is no vector instruction).
-    t = _from_bits(int(float(_bits(y)) * (1.0 / 3.0)) + 0x2A9F789300000000)
+    t = from_bits(int(float(bits_of(y)) * (1.0 / 3.0)) + 0x2A9F789300000000)
     t = t - (t * t * t - y) / (3.0 * t * t)
     t = t - (t * t * t - y) / (3.0 * t * t)
     t = t - (t * t * t - y) / (3.0 * t * t)
@@ -121,30 +121,41 @@ def eigenvalues3(xx, xy, xz, yy, yz, zz):
 
 
 @device(forceinline=True)
-def eigen3(xx, xy, xz, yy, yz, zz):
-    """Eigenvalues as :func:`eigenvalues3`, and abs(nz) of the unit eigenvector of l3.
+def rotate_columns(m, count):
+    """Make the matrices in the first `count` columns of `m` diagonal, turning the z components of their eigenvectors along.
 
-    Only the z components of the three eigenvectors are carried along. For points on a line (l2 below
-    1e-12 of l1) every perpendicular is a normal; the steepest is taken, so a horizontal line has
-    verticality 0 and a vertical line 1.
+    Rows of `m` are xx, yy, zz, xy, xz, yz and the z components of the three vectors (0, 0, 1 at first). Four sweeps as in
+    :func:`eigenvalues3`, each rotation over all columns before the next: a rotation waits for two roots and two
+    divisions one after the other, and so the processor has others to work at meanwhile.
     """
-    vx, vy, vz = 0.0, 0.0, 1.0
     for _ in range(4):
-        c, s, t = _rotation(xx, yy, xy)
-        xx, yy = xx - t * xy, yy + t * xy
-        xy = 0.0
-        xz, yz = c * xz - s * yz, s * xz + c * yz
-        vx, vy = c * vx - s * vy, s * vx + c * vy
-        c, s, t = _rotation(xx, zz, xz)
-        xx, zz = xx - t * xz, zz + t * xz
-        xz = 0.0
-        xy, yz = c * xy - s * yz, s * xy + c * yz
-        vx, vz = c * vx - s * vz, s * vx + c * vz
-        c, s, t = _rotation(yy, zz, yz)
-        yy, zz = yy - t * yz, zz + t * yz
-        yz = 0.0
-        xy, xz = c * xy - s * xz, s * xy + c * xz
-        vy, vz = c * vy - s * vz, s * vy + c * vz
+        for j in range(count):
+            c, s, t = _rotation(m[0, j], m[1, j], m[3, j])
+            m[0, j], m[1, j] = m[0, j] - t * m[3, j], m[1, j] + t * m[3, j]
+            m[3, j] = 0.0
+            m[4, j], m[5, j] = c * m[4, j] - s * m[5, j], s * m[4, j] + c * m[5, j]
+            m[6, j], m[7, j] = c * m[6, j] - s * m[7, j], s * m[6, j] + c * m[7, j]
+        for j in range(count):
+            c, s, t = _rotation(m[0, j], m[2, j], m[4, j])
+            m[0, j], m[2, j] = m[0, j] - t * m[4, j], m[2, j] + t * m[4, j]
+            m[4, j] = 0.0
+            m[3, j], m[5, j] = c * m[3, j] - s * m[5, j], s * m[3, j] + c * m[5, j]
+            m[6, j], m[8, j] = c * m[6, j] - s * m[8, j], s * m[6, j] + c * m[8, j]
+        for j in range(count):
+            c, s, t = _rotation(m[1, j], m[2, j], m[5, j])
+            m[1, j], m[2, j] = m[1, j] - t * m[5, j], m[2, j] + t * m[5, j]
+            m[5, j] = 0.0
+            m[3, j], m[4, j] = c * m[3, j] - s * m[4, j], s * m[3, j] + c * m[4, j]
+            m[7, j], m[8, j] = c * m[7, j] - s * m[8, j], s * m[7, j] + c * m[8, j]
+
+
+@device(forceinline=True)
+def steepness(xx, yy, zz, vx, vy, vz):
+    """Eigenvalues l1 >= l2 >= l3 >= 0 and abs(nz) of the unit eigenvector of l3, from :func:`rotate_columns`.
+
+    For points on a line (l2 below 1e-12 of l1) every perpendicular is a normal; the steepest is taken, so a
+    horizontal line has verticality 0 and a vertical line 1.
+    """
     xx, yy, zz = max(xx, 0.0), max(yy, 0.0), max(zz, 0.0)
     # Sort downwards, the vector components with their values.
     swap = xx < yy
@@ -170,7 +181,7 @@ def _turn(c, s, a, b):
 def normal3(xx, xy, xz, yy, yz, zz):
     """Eigenvalues as :func:`eigenvalues3`, and the unit eigenvector of l3, of either sign.
 
-    Of points on a line (l2 below 1e-12 of l1) the steepest perpendicular, as in :func:`eigen3`; (1, 0, 0) where the line
+    Of points on a line (l2 below 1e-12 of l1) the steepest perpendicular, as in :func:`steepness`; (1, 0, 0) where the line
     is vertical.
     """
     ax, ay, az = 1.0, 0.0, 0.0

@@ -221,20 +221,15 @@ def gather(tree, box, reach2, copies, limit, stack, cx, cy, cz, ci):
     """
     x, y, z, perm, boxes = tree.x, tree.y, tree.z, tree.perm, tree.boxes
     x0, y0, z0, x1, y1, z1 = box
-    count = 0
+    # Unsigned: what may be negative is looked up with a detour.
+    count, one = np.uint64(0), np.uint64(1)
     stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = 0, 0, len(perm), tree.depth
     top = 1
     while top > 0:
         top -= 1
         node, lo, hi, depth = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
-        a0, b0, c0, a1, b1, c1 = (
-            boxes[node, 0],
-            boxes[node, 1],
-            boxes[node, 2],
-            boxes[node, 3],
-            boxes[node, 4],
-            boxes[node, 5],
-        )
+        n = np.uint64(node)
+        a0, b0, c0, a1, b1, c1 = boxes[n, 0], boxes[n, 1], boxes[n, 2], boxes[n, 3], boxes[n, 4], boxes[n, 5]
         dx, dy, dz = _gap(x0, x1, a0, a1), _gap(y0, y1, b0, b1), _gap(z0, z1, c0, c1)
         if dx * dx + dy * dy + dz * dz > reach2:
             continue
@@ -242,22 +237,22 @@ def gather(tree, box, reach2, copies, limit, stack, cx, cy, cz, ci):
             hi = lo + copies
             depth = 0
         if depth == 0:
-            if count + (hi - lo) > limit:
+            if np.int64(count) + (hi - lo) > limit:
                 return -1
             for i in range(lo, hi):
-                p = perm[i]
+                p = np.uint64(perm[np.uint64(i)])
                 a, b, c = x[p], y[p], z[p]
                 dx, dy, dz = _gap(x0, x1, a, a), _gap(y0, y1, b, b), _gap(z0, z1, c, c)
                 cx[count] = a
                 cy[count] = b
                 cz[count] = c
-                ci[count] = p
+                ci[count] = np.uint32(p)
                 # Written always, kept if near: no branch to mispredict.
-                count += 1 if dx * dx + dy * dy + dz * dz <= reach2 else 0
+                count += one if dx * dx + dy * dy + dz * dz <= reach2 else np.uint64(0)
             continue
         mid = (lo + hi) // 2
         stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = 2 * node + 2, mid, hi, depth - 1
         top += 1
         stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = 2 * node + 1, lo, mid, depth - 1
         top += 1
-    return count
+    return np.int64(count)

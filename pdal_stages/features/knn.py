@@ -21,10 +21,12 @@ import numpy as np
 
 from ..base.jit import device
 from ..base.lending import lent
+from .abreast import CODES, MOST, make_networks, sort_abreast
 from .kdtree import STACK, bounding_box, farthest2, gather, halve
+from .lanes import LANES
 
 #: Queries that share one set of candidates.
-GROUP = 8
+GROUP = LANES
 
 #: Bins of squared distance; the first half of them lies within the reach.
 BINS = 256
@@ -240,6 +242,22 @@ def _count_bins(bins, count, need, hist):
     return BINS
 
 
+@device
+def _write_row(qx, qy, qz, r, found, scratch, rows):
+    """One query's neighbors, from the front of `scratch`'s d and pos."""
+    for i in range(found):
+        p = scratch.pos[i]
+        rows.d2[i, r] = scratch.d[i]
+        rows.at[i, r] = scratch.ci[p]
+        rows.x[i, r] = scratch.cx[p] - qx
+        rows.y[i, r] = scratch.cy[p] - qy
+        rows.z[i, r] = scratch.cz[p] - qz
+        rows.height[i, r] = scratch.cz[p]
+    for i in range(found, len(rows.d2)):
+        rows.x[i, r] = rows.y[i, r] = rows.z[i, r] = 0.0
+        rows.height[i, r] = rows.height[0, r]
+
+
 class Scratch(NamedTuple):
     """Room for the candidates of one group and for sorting them."""
 
@@ -256,11 +274,24 @@ class Scratch(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """The sorted neighbors of the queries of one group, one row a query."""
+    """The sorted neighbors of the queries of one group, a column a query, and room to sort them abreast."""
 
     found: np.ndarray  # (GROUP,) int64: how many
-    d2: np.ndarray  # (GROUP, need) float64: squared distances
-    at: np.ndarray  # (GROUP, need) uint32: positions in the cloud
+    d2: np.ndarray  # (need, GROUP) float64: squared distances
+    at: np.ndarray  # (need, GROUP) uint32: positions in the cloud
+    x: np.ndarray  # (need, GROUP) float64: offsets from the query; 0 behind the last
+    y: np.ndarray
+    z: np.ndarray
+    height: np.ndarray  # (need, GROUP) float64: z; behind the last that of the first
+    keys: np.ndarray  # ((CODES + 1) * GROUP,) float64
+    codes: np.ndarray  # (CODES,) int64
+    query: np.ndarray  # (3, GROUP) float64
+    length: np.ndarray  # (GROUP,) int64
+    ok: np.ndarray  # (GROUP,) bool
+    tied: np.ndarray  # (GROUP,) bool
+    low: np.ndarray  # networks, see abreast.make_networks
+    high: np.ndarray
+    starts: np.ndarray
 
 
 class Search(NamedTuple):
@@ -293,7 +324,13 @@ def make_scratch(room):
 
 @device
 def make_rows(need):
-    return Rows(np.zeros(GROUP, np.int64), np.empty((GROUP, need)), np.empty((GROUP, need), np.uint32))
+    low, high, starts = make_networks(need)
+    return Rows(
+        np.zeros(GROUP, np.int64), np.empty((need, GROUP)), np.empty((need, GROUP), np.uint32),
+        np.empty((need, GROUP)), np.empty((need, GROUP)), np.empty((need, GROUP)), np.empty((need, GROUP)),
+        np.empty((CODES + 1) * GROUP), np.empty(CODES, np.int64), np.zeros((3, GROUP)), np.zeros(GROUP, np.int64),
+        np.zeros(GROUP, np.bool_), np.zeros(GROUP, np.bool_), low, high, starts,
+    )  # fmt: skip
 
 
 @device
@@ -382,6 +419,13 @@ def _search_group(tree, search, lo, hi, need, cap2, reach2, scratch, rows):
             reach2 = math.sqrt(low * high) if high < np.inf else 4.0 * max(reach2, TINY)
             continue
         more2 = 0.0
+        if pending == count and count > 1 and c <= CODES and need == len(rows.d2) <= MOST:
+            sort_abreast(order, lo, count, search.qx, search.qy, search.qz, need, reach2, scratch, c, rows)
+            for r in range(count):
+                pending -= 1 if rows.found[r] >= 0 else 0
+            for r in range(count):
+                if rows.found[r] >= 0:
+                    kth2 = max(kth2, rows.d2[need - 1, r])
         for r in range(count):
             if rows.found[r] >= 0:
                 continue
@@ -395,9 +439,7 @@ def _search_group(tree, search, lo, hi, need, cap2, reach2, scratch, rows):
                 continue
             rows.found[r] = found
             pending -= 1
-            for i in range(found):
-                rows.d2[r, i] = scratch.d[i]
-                rows.at[r, i] = scratch.ci[scratch.pos[i]]
+            _write_row(search.qx[q], search.qy[q], search.qz[q], r, found, scratch, rows)
             if found > 0:
                 kth2 = max(kth2, scratch.d[found - 1])
         if pending > 0:

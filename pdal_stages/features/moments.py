@@ -13,13 +13,25 @@ import math
 
 import numpy as np
 
-from ..base.jit import device, intrinsic
-from .candidates import from_order_bits, order_bits
-from .eigen import covariance_features, eigen3
-
-#: Rows of a moment table: count, sums, products, lowest and highest height (as ordered integers).
-N, SX, SY, SZ, SXX, SXY, SXZ, SYY, SYZ, SZZ, LOW, HIGH = range(12)
-MOMENTS = 12
+from ..base.jit import device
+from .eigen import covariance_features, rotate_columns, steepness
+from .lanes import (
+    HIGH,
+    LOW,
+    MOMENTS,
+    SX,
+    SXX,
+    SXY,
+    SXZ,
+    SY,
+    SYY,
+    SYZ,
+    SZ,
+    SZZ,
+    N,
+    sums_in_cylinder,
+    sums_in_sphere,
+)
 
 #: Features made of them.
 FEATURES = 13
@@ -30,81 +42,29 @@ BATCH = 256
 #: Columns of a moment table: not a power of two, whose rows would compete for the same cache lines.
 WIDTH = BATCH + 8
 
-#: Ordered bits of +infinity and -infinity: the extremes of no point at all.
-TOP = np.int64(0x7FF0000000000000)
-BOTTOM = np.int64(-0x7FF0000000000001)
 
 #: A variance below this part of the mean squared distance to the query is rounding: the points coincide. Where moments were
 #: taken about another point than the query first, the squared distance to that counts as well.
 COINCIDENT = 1e-13
 
 
-@intrinsic
-def _add(types, a, b):
-    """a + b that may be reordered in a sum and contracted with a product: what lets LLVM vectorize it."""
-
-    def codegen(context, builder, signature, args):
-        return builder.fadd(args[0], args[1], flags=("reassoc", "contract", "nsz"))
-
-    return types.float64(types.float64, types.float64), codegen
-
-
-@intrinsic
-def _mul(types, a, b):
-    """a * b that may be contracted with the sum it goes into."""
-
-    def codegen(context, builder, signature, args):
-        return builder.fmul(args[0], args[1], flags=("contract",))
-
-    return types.float64(types.float64, types.float64), codegen
-
-
 @device(forceinline=True)
 def cylinder_sums(px, py, pz, qx, qy, qz, r2, out, j):
-    """Moments about (qx, qy, qz) of the candidates within sqrt(r2) of it in x and y, into ``out[:, j]``."""
-    n = sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
-    low, high = TOP, BOTTOM
-    for i in range(len(px)):
-        dx, dy, dz = px[i] - qx, py[i] - qy, pz[i] - qz
-        inside = dx * dx + dy * dy <= r2
-        mx = dx if inside else 0.0
-        my = dy if inside else 0.0
-        mz = dz if inside else 0.0
-        n = _add(n, 1.0 if inside else 0.0)
-        sx, sy, sz = _add(sx, mx), _add(sy, my), _add(sz, mz)
-        sxx, sxy, sxz = _add(sxx, _mul(mx, dx)), _add(sxy, _mul(mx, dy)), _add(sxz, _mul(mx, dz))
-        syy, syz, szz = _add(syy, _mul(my, dy)), _add(syz, _mul(my, dz)), _add(szz, _mul(mz, dz))
-        key = order_bits(pz[i])
-        low = min(low, key if inside else TOP)
-        high = max(high, key if inside else BOTTOM)
-    out[N, j], out[SX, j], out[SY, j], out[SZ, j] = n, sx, sy, sz
-    out[SXX, j], out[SXY, j], out[SXZ, j] = sxx, sxy, sxz
-    out[SYY, j], out[SYZ, j], out[SZZ, j] = syy, syz, szz
-    out[LOW, j], out[HIGH, j] = from_order_bits(low), from_order_bits(high)
+    """Moments about (qx, qy, qz) of the candidates within sqrt(r2) of it in x and y, into ``out[:, j]``.
+
+    As many candidates as whole vectors of LANES, as ``candidates.gather`` leaves them.
+    """
+    sums = sums_in_cylinder(px, py, pz, qx, qy, qz, r2)
+    for row in range(MOMENTS):
+        out[row, j] = sums[row]
 
 
 @device(forceinline=True)
 def sphere_sums(px, py, pz, qx, qy, qz, r2, out, j):
-    """Moments about (qx, qy, qz) of the candidates within sqrt(r2) of it, into ``out[:, j]``."""
-    n = sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
-    low, high = TOP, BOTTOM
-    for i in range(len(px)):
-        dx, dy, dz = px[i] - qx, py[i] - qy, pz[i] - qz
-        inside = dx * dx + dy * dy + dz * dz <= r2
-        mx = dx if inside else 0.0
-        my = dy if inside else 0.0
-        mz = dz if inside else 0.0
-        n = _add(n, 1.0 if inside else 0.0)
-        sx, sy, sz = _add(sx, mx), _add(sy, my), _add(sz, mz)
-        sxx, sxy, sxz = _add(sxx, _mul(mx, dx)), _add(sxy, _mul(mx, dy)), _add(sxz, _mul(mx, dz))
-        syy, syz, szz = _add(syy, _mul(my, dy)), _add(syz, _mul(my, dz)), _add(szz, _mul(mz, dz))
-        key = order_bits(pz[i])
-        low = min(low, key if inside else TOP)
-        high = max(high, key if inside else BOTTOM)
-    out[N, j], out[SX, j], out[SY, j], out[SZ, j] = n, sx, sy, sz
-    out[SXX, j], out[SXY, j], out[SXZ, j] = sxx, sxy, sxz
-    out[SYY, j], out[SYZ, j], out[SZZ, j] = syy, syz, szz
-    out[LOW, j], out[HIGH, j] = from_order_bits(low), from_order_bits(high)
+    """Moments about (qx, qy, qz) of the candidates within sqrt(r2) of it, into ``out[:, j]``, as :func:`cylinder_sums`."""
+    sums = sums_in_sphere(px, py, pz, qx, qy, qz, r2)
+    for row in range(MOMENTS):
+        out[row, j] = sums[row]
 
 
 @device(forceinline=True)
@@ -158,21 +118,30 @@ def finish(moments, count, volumes, moved, heights, few, copies):
     SurfaceVariation is 1/3 [H17]; the heights are what the points there are have; with none
     (queries that are not points of the cloud) they are 0.
     """
-    # Made here and of a constant shape: rows known not to overlap let the loop be vectorized.
-    out = np.empty((FEATURES, WIDTH))
+    # Made here and of constant shapes: rows known not to overlap let the loops be vectorized.
+    out, m = np.empty((FEATURES, WIDTH)), np.empty((9, WIDTH))
     for j in range(count):
         n = moments[N, j]
         inverse = 1.0 / (n if n > 0.0 else 1.0)
         mx, my, mz = moments[SX, j] * inverse, moments[SY, j] * inverse, moments[SZ, j] * inverse
         ax, ay, az = moments[SXX, j] * inverse, moments[SYY, j] * inverse, moments[SZZ, j] * inverse
         xx, yy, zz = ax - mx * mx, ay - my * my, az - mz * mz
-        xy = moments[SXY, j] * inverse - mx * my
-        xz = moments[SXZ, j] * inverse - mx * mz
-        yz = moments[SYZ, j] * inverse - my * mz
         apart = xx + yy + zz > COINCIDENT * (ax + ay + az + moved)
-        l1, l2, l3, nz = eigen3(xx, xy, xz, yy, yz, zz)
-        real = (n >= 3.0) & apart
-        f = covariance_features(n if apart else 0.0, l1, l2, l3)
+        m[0, j], m[1, j], m[2, j] = xx, yy, zz
+        m[3, j] = moments[SXY, j] * inverse - mx * my
+        m[4, j] = moments[SXZ, j] * inverse - mx * mz
+        m[5, j] = moments[SYZ, j] * inverse - my * mz
+        m[6, j], m[7, j], m[8, j] = 0.0, 0.0, 1.0
+        out[8, j] = n / volumes[j]
+        out[9, j] = 1.0 if apart else 0.0
+        out[10, j] = moments[HIGH, j] - moments[LOW, j] if n > 0.0 else 0.0
+        out[11, j] = math.sqrt(max(zz, 0.0)) if apart else 0.0
+        out[12, j] = heights[j] - moments[LOW, j] if n > 0.0 else 0.0
+    rotate_columns(m, count)
+    for j in range(count):
+        n = moments[N, j] * out[9, j]  # 0 where the points coincide
+        l1, l2, l3, nz = steepness(m[0, j], m[1, j], m[2, j], m[6, j], m[7, j], m[8, j])
+        f = covariance_features(n, l1, l2, l3)
         out[0, j] = f[0]
         out[1, j] = f[1]
         out[2, j] = f[2]
@@ -181,11 +150,7 @@ def finish(moments, count, volumes, moved, heights, few, copies):
         out[5, j] = f[5]
         out[6, j] = f[6]
         out[7, j] = f[7]
-        out[8, j] = n / volumes[j]
-        out[9, j] = 1.0 - nz if real else 0.0
-        out[10, j] = moments[HIGH, j] - moments[LOW, j] if n > 0.0 else 0.0
-        out[11, j] = math.sqrt(max(zz, 0.0)) if apart else 0.0
-        out[12, j] = heights[j] - moments[LOW, j] if n > 0.0 else 0.0
+        out[9, j] = 1.0 - nz if n >= 3.0 else 0.0
     for j in range(count):
         if moments[N, j] < 3.0:
             few[0] += copies[j]

@@ -22,14 +22,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ..base.jit import FAST, device, njit
-from ..base.lending import lent
 from .candidates import from_order_bits, order_bits
 from .eigen import eigenentropy, eigenvalues3, log_fast
 from .knn import CROWD, ROOM, make_rows, make_scratch, next_rows, start_search
 from .moments import COINCIDENT, HIGH, LOW, SX, SXX, SXY, SXZ, SY, SYY, SYZ, SZ, SZZ, N
-from .neighborhoods import AROUND
 from .shapes import COUNTS, VALUES, shape_counts, shape_values
-from .surfaces import NX, NY, NZ, agreement, surface
 
 #: Estimated entropies are off by less than half of this.
 MARGIN = 2e-6
@@ -219,6 +216,14 @@ def take_members(tree, index, count, qx, qy, qz, members):
 
 
 @device
+def take_row(rows, row, count, members):
+    """The first `count` neighbors of one of ``knn.Rows``."""
+    for i in range(count):
+        members.x[i], members.y[i], members.z[i] = rows.x[i, row], rows.y[i, row], rows.z[i, row]
+        members.height[i] = order_bits(rows.height[i, row])
+
+
+@device
 def running_sums(x, y, z, count, s):
     """Moments of the first 1, 2, ... `count` members."""
     sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
@@ -314,110 +319,21 @@ def kopt_into(tree, qx, qy, qz, target, k_min, k_max, cap2, table, radius, reach
         for row in range(count):
             q = target[search.order[lo + row]]
             found = rows.found[row]
-            reach[q] = math.sqrt(rows.d2[row, found - 1]) if found == need else math.inf
+            reach[q] = math.sqrt(rows.d2[found - 1, row]) if found == need else math.inf
             if found == 0:  # a query that is no point of the cloud, farther than the bound from all
                 write_nothing(table, radius, shapes, q)
                 continue
-            take_members(tree, rows.at[row], found, qx[q], qy[q], qz[q], members)
+            take_row(rows, row, found, members)
             running_sums(members.x, members.y, members.z, found, s)
             best = lowest_entropy(s, min(k_min, found - 1), found, LEAST)
             write_moments(s, best, members, best + 1, table, q)
-            radius[q] = math.sqrt(rows.d2[row, best])
+            radius[q] = math.sqrt(rows.d2[best, row])
             if shapes.mode:
                 write_shapes(members, best + 1, s, best, seeds[q], shapes, q)
         for j in range(lo + count, hi):  # queries that coincide with the first
             q = target[search.order[j]]
             copy_column(table, radius, shapes, target[search.order[lo]], q)
             reach[q] = reach[target[search.order[lo]]]
-
-
-@njit
-def nearest_block(tree, qx, qy, qz, ks, tables, radius, reach, surfaces, wanted, made):
-    """Moments, radius and reach of several numbers of nearest neighbors at once, from one search.
-
-    The bits are those of :func:`kopt_block` for each k by itself.
-
-    Parameters
-    ----------
-    tree, qx, qy, qz
-        As for :func:`kopt_block`.
-    ks : ndarray of int64, shape (s,)
-        Neighbors besides the point itself, ascending.
-    tables : ndarray of float64, shape (s, 12, m)
-    radius, reach : ndarray of float64, shape (s, m)
-        Out, as for :func:`kopt_block`.
-    surfaces : ndarray of float32, shape (n, surfaces.WIDTH)
-        Of the cloud, see :func:`surfaces.surfaces_of`; not used where none is wanted.
-    wanted : ndarray of bool, shape (s,)
-        Which numbers of neighbors are summed up by their surfaces.
-    made : ndarray of float64, shape (s, m, surfaces.MADE)
-        Out: what their surfaces make of these.
-    """
-    need = max(ks[len(ks) - 1], AROUND if _any(wanted) else 0) + 1
-    search, scratch = start_search(qx, qy, qz), make_scratch(CROWD * need + ROOM)
-    rows, members, s = make_rows(need), make_members(need), make_sums(need)
-    _nearest_block(
-        lent(tree), search, ks, lent(tables), lent(radius), lent(reach), lent(surfaces), wanted, lent(made),
-        need, scratch, rows, members, s,
-    )  # fmt: skip
-
-
-@device
-def _nearest_block(
-    tree, search, ks, tables, radius, reach, surfaces, wanted, made, need, scratch, rows, members, s
-):  # fmt: skip
-    some = _any(wanted)
-    # Kept by the caller.
-    search, rows, members, s = lent(search), lent(rows), lent(members), lent(s)
-    qx, qy, qz = search.qx, search.qy, search.qz
-    while True:
-        lo, hi, count, scratch = next_rows(tree, search, need, math.inf, scratch, rows)
-        if lo < 0:
-            return
-        for row in range(count):
-            q = search.order[lo + row]
-            found = rows.found[row]
-            take_members(tree, rows.at[row], found, qx[q], qy[q], qz[q], members)
-            running_sums(members.x, members.y, members.z, found, s)
-            for j in range(len(ks)):
-                last = min(ks[j], found - 1)
-                write_moments(s, last, members, last + 1, tables[j], q)
-                radius[j, q] = math.sqrt(rows.d2[row, last])
-                reach[j, q] = radius[j, q] if last == ks[j] else math.inf
-            if not some:
-                continue
-            at, d2 = rows.at[row], rows.d2[row]
-            own = surfaces[at[0]]
-            nx, ny, nz = np.float64(own[NX]), np.float64(own[NY]), np.float64(own[NZ])
-            around = 0.0
-            if d2[0] > 0.0:  # a query that is no point of the cloud
-                t = min(AROUND, found - 1)
-                nx, ny, nz, _ = surface(
-                    s.n[t], s.x[t], s.y[t], s.z[t], s.xx[t], s.xy[t], s.xz[t], s.yy[t], s.yz[t], s.zz[t]
-                )
-                around = math.sqrt(d2[t]) if t == AROUND else math.inf
-            for j in range(len(ks)):
-                if wanted[j]:
-                    far = agreement(surfaces, at, d2, min(ks[j], found - 1) + 1, nx, ny, nz, made[j, q])
-                    reach[j, q] = max(reach[j, q], far, around)
-        for i in range(lo + count, hi):  # queries that coincide with the first
-            source, target = search.order[lo], search.order[i]
-            for j in range(len(ks)):
-                for row in range(tables.shape[1]):
-                    tables[j, row, target] = tables[j, row, source]
-                radius[j, target] = radius[j, source]
-                reach[j, target] = reach[j, source]
-                if wanted[j]:
-                    made[j, target] = made[j, source]
-
-
-@device
-def _any(flags):
-    # numba's own brings SciPy's linear algebra into every job.
-    found = False
-    for flag in flags:
-        found |= flag
-    return found
 
 
 @device

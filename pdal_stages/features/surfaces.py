@@ -17,9 +17,9 @@ import math
 
 import numpy as np
 
-from ..base.jit import device, njit
+from ..base.jit import device
 from .eigen import covariance_features, normal3
-from .moments import BATCH, COINCIDENT, MOMENTS, SX, SXX, SXY, SXZ, SY, SYY, SYZ, SZ, SZZ, N
+from .moments import COINCIDENT, SX, SXX, SXY, SXZ, SY, SYY, SYZ, SZ, SZZ, N
 from .moments import WIDTH as ROW
 from .names import SURFACES
 
@@ -50,29 +50,24 @@ def surface(n, x, y, z, xx, xy, xz, yy, yz, zz):
     return (nx if real else 0.0), (ny if real else 0.0), (nz if real else 0.0), variation
 
 
-@njit
-def write_surfaces(table, reach, out):
-    """Surfaces (m, WIDTH) float32 of neighborhoods of 10 from their moments (12, m) and reaches (m,)."""
-    # Of a constant shape and made here: rows known not to overlap let the loop be vectorized.
-    moments, made = np.empty((MOMENTS, ROW)), np.empty((4, ROW))
-    for start in range(0, len(reach), BATCH):
-        count = min(BATCH, len(reach) - start)
-        for row in range(MOMENTS):
-            for j in range(count):
-                moments[row, j] = table[row, start + j]
-        for j in range(count):
-            f = surface(
-                moments[N, j], moments[SX, j], moments[SY, j], moments[SZ, j], moments[SXX, j], moments[SXY, j],
-                moments[SXZ, j], moments[SYY, j], moments[SYZ, j], moments[SZZ, j],
-            )  # fmt: skip
-            made[NX, j] = f[0]
-            made[NY, j] = f[1]
-            made[NZ, j] = f[2]
-            made[VARIATION, j] = f[3]
-        for j in range(count):
-            for column in range(4):
-                out[start + j, column] = made[column, j]
-            out[start + j, REACH] = reach[start + j] * UP
+@device
+def write_surfaces(moments, reach, query, count, out):
+    """Write the surfaces of the queries `query` to their rows of `out` (m, WIDTH) float32, from moments and reaches."""
+    # Made here and of a constant shape: rows known not to overlap let the loop be vectorized.
+    made = np.empty((4, ROW))
+    for j in range(count):
+        f = surface(
+            moments[N, j], moments[SX, j], moments[SY, j], moments[SZ, j], moments[SXX, j], moments[SXY, j],
+            moments[SXZ, j], moments[SYY, j], moments[SYZ, j], moments[SZZ, j],
+        )  # fmt: skip
+        made[NX, j] = f[0]
+        made[NY, j] = f[1]
+        made[NZ, j] = f[2]
+        made[VARIATION, j] = f[3]
+    for j in range(count):
+        for column in range(4):
+            out[query[j], column] = made[column, j]
+        out[query[j], REACH] = reach[j] * UP
 
 
 @device
