@@ -131,7 +131,7 @@ def test_resume_makes_what_is_missing_alone(tmp_path, survey, monkeypatch):
 
 def note_of(path):
     """What a run notes of a file that it keeps: of tiles under their name, of the rounds before under the file's."""
-    before = path.name.endswith((".first.npz", ".block.npz"))
+    before = path.name.endswith((".first.npz", ".cells.npz"))
     return path.with_name(f"{path.name}.json") if before else path.with_suffix(".json")
 
 
@@ -361,3 +361,42 @@ def test_decks_of_blocks_are_those_of_the_whole(name):
     some = filtered_ground(x, y, z, mask=use, cells=GroundCells.joined(parts, 1), **options)
     for key, values in some.items():
         assert np.array_equal(values, whole[key]), key
+
+
+@pytest.mark.parametrize("count", [0, 1, 3000])
+def test_cells_in_parts_are_the_cells(count):
+    """Those of any box, out of the parts that it needs alone; levels of decks once."""
+    random = np.random.default_rng(count)
+    number = random.permutation(200 * 150)[:count]
+    column, row = number % 200 - 90, number // 200 + 70_000
+    ground, held = random.random((2, count)) < 0.6
+    cells = GroundCells(
+        column, row, *random.random((2, count)).astype(np.float32), ground, random.random((ground.sum(), 3)),
+        random.random((2, count)).astype(np.float32), held, random.random((held.sum(), 3)), random.random((4, 5)),
+    )  # fmt: skip
+    kept = cells.in_parts(32)
+    for box in [
+        (-90, 70_000, 109, 70_149),
+        (-33, 70_031, 0, 70_064),
+        (7, 70_100, 7, 70_100),
+        (500, 0, 600, 9),
+    ]:
+        needed = GroundCells.names_within(32, *box)
+        parts = [
+            one.within(*box) for one in GroundCells.of_parts({n: v for n, v in kept.items() if n in needed})
+        ]
+        found, expected = GroundCells.joined(parts, 2), cells.within(*box)
+        for one in (order := [np.lexsort((g.column, g.row)) for g in (found, expected)]):
+            assert len(one) == len(order[0])
+        for name in ("column", "row", "lowest", "floor", "ground", "opened", "held"):
+            assert np.array_equal(
+                getattr(found, name)[..., order[0]], getattr(expected, name)[..., order[1]]
+            ), name
+        for name, mask in (("place", "ground"), ("means", "held")):
+            given = [np.column_stack([g.column, g.row])[getattr(g, mask)].tolist() for g in (found, expected)]
+            values = [
+                sorted(zip(g, getattr(c, name).tolist(), strict=True))
+                for g, c in zip(given, (found, expected), strict=True)
+            ]
+            assert values[0] == values[1], name
+        assert len(found.decks) == (4 if parts else 0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -203,8 +203,12 @@ class Stage(ABC):
         """
         raise NotImplementedError
 
-    def made_of_blocks(self, blocks: Sequence[Mapping[str, NDArray]], box: Sequence[float]) -> Any:
-        """At last, :attr:`from_blocks` in a box (min x, min y, max x, max y), meters, out of the blocks that it touches."""
+    def needed_of_blocks(self, box: Sequence[float]) -> Collection[str]:
+        """Names of the arrays that a box (min x, min y, max x, max y) needs, as far as blocks have them."""
+        raise NotImplementedError
+
+    def made_of_blocks(self, blocks: Iterable[Mapping[str, NDArray]], box: Sequence[float]) -> Any:
+        """At last, :attr:`from_blocks` in a box, meters, out of these arrays of the blocks that it touches."""
         raise NotImplementedError
 
     def inner_halo_m(self) -> float:

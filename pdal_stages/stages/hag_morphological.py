@@ -22,6 +22,9 @@ from .options import ignore_option, option
 from .points import Points
 from .selection import Selection
 
+#: Cells along the side of squares of a block that a tile reads by themselves.
+_PART = 256
+
 
 class HagMorphological(Stage):
     type = "filters.hag_morphological"
@@ -185,12 +188,19 @@ of Z.
         self, around: NDArray[np.float64], inside: Iterable[NDArray[np.float64]], block: tuple[int, int]
     ) -> dict[str, NDArray]:
         x, y, z = around.T
-        return cells_of_block(x, y, z, block, self._filter, inside, self._block_cells).arrays()
+        return cells_of_block(x, y, z, block, self._filter, inside, self._block_cells).in_parts(_PART)
 
-    def made_of_blocks(self, blocks: Sequence[Mapping[str, NDArray]], box: Sequence[float]) -> GroundCells:
-        sides = [math.floor(side / self.cell) for side in box]
-        parts = [GroundCells(**block).within(*sides) for block in blocks]
+    def needed_of_blocks(self, box: Sequence[float]) -> set[str]:
+        return GroundCells.names_within(_PART, *self._cells_in(box))
+
+    def made_of_blocks(self, blocks: Iterable[Mapping[str, NDArray]], box: Sequence[float]) -> GroundCells:
+        cells = self._cells_in(box)
+        parts = [part.within(*cells) for block in blocks for part in GroundCells.of_parts(block)]
         return GroundCells.joined(parts, len(self.windows))
+
+    def _cells_in(self, box: Sequence[float]) -> list[int]:
+        """Columns and rows of a box in meters."""
+        return [math.floor(side / self.cell) for side in box]
 
     def run(self, points: Points) -> dict[str, NDArray]:
         usable = points.usable(self.ignore)

@@ -7,14 +7,15 @@ it is done once for each block of a grid of blocks, out of the lowest points of 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import njit
+from ..base.runs import begins_run
 from .decks import BESIDE, CELL
 from .decks import REACH as DECKS_REACH
 from .islands import FAR as ISLANDS_FAR
@@ -255,6 +256,15 @@ def _still_asked(
     return cells[~found & near[j + 2, i + 2]]
 
 
+#: Arrays of :class:`GroundCells` that have rows for some of the cells, or for none.
+_OF_SOME = ("place", "means", "decks")
+
+
+def _part(column: int, row: int) -> str:
+    """The name of a square of cells."""
+    return f"{column}_{row}"
+
+
 @dataclass(frozen=True)
 class GroundCells:
     """Cells of :class:`GroundRaster`, one by one: all with a height, an opening, or ground points."""
@@ -273,9 +283,53 @@ class GroundCells:
     #: (number of levels near bridge decks, 5): see :func:`.decks.levels_near_decks`
     decks: NDArray[np.float64]
 
-    def arrays(self) -> dict[str, NDArray]:
-        """All by name, for files."""
-        return vars(self).copy()
+    def in_parts(self, side: int) -> dict[str, NDArray]:
+        """All arrays by name, for files: those of squares of so many columns and rows by themselves."""
+        part_row, part = self.row // side, self.column // side
+        if len(part):
+            part += (part_row - part_row.min()) * (int(np.ptp(part)) + 1) - part.min()
+        if part.max(initial=0) < 2**16:
+            part = part.astype(np.uint16)  # sorted digit by digit
+        order = np.argsort(part, kind="stable")
+        starts = np.flatnonzero(begins_run(part[order]))
+        named = {name: values[..., order] for name, values in vars(self).items() if name not in _OF_SOME}
+        out = {"decks": self.decks}
+        ends = np.append(starts, len(order))[1:]
+        of_some = {}
+        for name, (which, values) in {
+            "place": (self.ground, self.place),
+            "means": (self.held, self.means),
+        }.items():
+            number = np.cumsum(which) - 1
+            taken = which[order]
+            before = np.concatenate([[0], np.cumsum(taken)])
+            of_some[name] = before, values[number[order][taken]]
+        for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
+            mark = _part(named["column"][start] // side, named["row"][start] // side)
+            out |= {f"{mark}/{name}": values[..., start:end] for name, values in named.items()}
+            out |= {f"{mark}/{name}": v[before[start] : before[end]] for name, (before, v) in of_some.items()}
+        return out
+
+    @classmethod
+    def of_parts(cls, arrays: Mapping[str, NDArray]) -> Iterator[GroundCells]:
+        """Cells of those squares that are there, out of some of the arrays of :meth:`in_parts`."""
+        decks = arrays["decks"]
+        for mark in dict.fromkeys(name.partition("/")[0] for name in arrays if "/" in name):
+            yield cls(**{name: arrays[f"{mark}/{name}"] for name in cls._of_parts()}, decks=decks)
+            decks = decks[:0]  # once
+
+    @classmethod
+    def names_within(cls, side: int, west: int, south: int, east: int, north: int) -> set[str]:
+        """Names of the arrays that :meth:`of_parts` needs for the cells of these columns and rows."""
+        columns, rows = (range(low // side, high // side + 1) for low, high in ((west, east), (south, north)))
+        return {
+            "decks",
+            *(f"{_part(i, j)}/{name}" for i in columns for j in rows for name in cls._of_parts()),
+        }
+
+    @classmethod
+    def _of_parts(cls) -> list[str]:
+        return [field.name for field in fields(cls) if field.name != "decks"]
 
     def within(self, west: int, south: int, east: int, north: int) -> GroundCells:
         """The cells of these columns and rows, the last ones included."""

@@ -136,8 +136,10 @@ class Before:
         x0, y0, x1, y1 = (side * context.unit for side in context.grid.box(tile))
         box = (x0 - around, y0 - around, x1 + around, y1 + around)
         paths = [os.path.join(self.folder, block_file(block)) for block in block_grid(first).covering(box)]
-        found = (load_arrays(path) for path in paths if os.path.exists(path))  # others have no points
-        return stage_of(context.plan).made_of_blocks(list(found), box)
+        stage = stage_of(context.plan)
+        needed = stage.needed_of_blocks(box)
+        found = (load_arrays(path, needed) for path in paths if os.path.exists(path))  # others have no points
+        return stage.made_of_blocks(found, box)
 
     def changed(self, piece: Piece) -> dict[str, tuple[NDArray[np.int64], NDArray]]:
         """New values of a piece's points that the stages before the far-reaching one gave: rows and values by dimension."""

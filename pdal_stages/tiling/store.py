@@ -58,7 +58,7 @@ def left_file(tile: str) -> str:
 
 def block_file(block: tuple[int, int]) -> str:
     """The name of the file of a block that is made of what is left."""
-    return f"{block[0]}_{block[1]}.block.npz"
+    return f"{block[0]}_{block[1]}.cells.npz"
 
 
 class Store:
@@ -170,7 +170,7 @@ class Store:
     def forget_left(self, but: Collection[str] = (), but_blocks: Collection[tuple[int, int]] = ()) -> None:
         """Remove what the first rounds left, of all tiles and blocks but these."""
         kept = {left_file(name) for name in but} | {block_file(block) for block in but_blocks}
-        for path in [*self.tiles.glob("*.first.npz"), *self.tiles.glob("*.block.npz")]:
+        for path in [*self.tiles.glob("*.first.npz"), *self.tiles.glob("*.cells.npz")]:
             if path.name not in kept:
                 path.unlink(missing_ok=True)
 
