@@ -16,7 +16,7 @@ from pdal_stages.terrain import filtered_ground, groundcells, patches, progressi
 from pdal_stages.terrain.lowest import pits
 from pdal_stages.terrain.morphological import reach
 from pdal_stages.terrain.openings import HOLE, opening_radii, square_steps
-from pdal_stages.terrain.planes import surface
+from pdal_stages.terrain.planes import GroundPyramid, surface
 from pdal_stages.terrain.plateaus import remove_plateaus
 from pdal_stages.terrain.progressive import LARGEST_DROP, objects_of
 
@@ -280,6 +280,32 @@ def test_planes_are_the_same_wherever_few_are_asked_for(seed):
         asked = rng.random((h, w)) < share
         some = surface(ground, place, floor, raster, left, bottom, 3, asked)
         assert np.array_equal(some[asked], whole[asked], equal_nan=True)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_pyramid_that_learns_of_more_ground_is_the_one_that_knew_it(seed):
+    rng = np.random.default_rng(seed)
+    h, w = rng.integers(5, 120, 2)
+    left, bottom = rng.integers(-1000, 1000, 2)
+    ground = rng.random((h, w)) < [0.3, 0.02, 0.0][seed]
+    place = rng.uniform(-0.5, 0.5, (h, w, 3)) * [1, 1, 40]
+    floor = rng.normal(0, 5, (h, w)).astype(np.float32)
+    learning = GroundPyramid(ground, place, floor, floor, left, bottom, 4)
+    for share in (0.01, 0.2):
+        learning.planes(rng.random((h, w)) < 0.1)
+        more = np.flatnonzero(~ground & (rng.random((h, w)) < share))
+        ground.ravel()[more] = True
+        learning.add(more)
+        asked = rng.random((h, w)) < 0.3
+        knew = GroundPyramid(ground, place, floor, floor, left, bottom, 4)
+        for one, other in zip(learning._moments, knew._moments, strict=True):
+            assert np.array_equal(one, other)
+        found, parents = learning.planes(asked), knew.planes(asked)
+        j, i = np.nonzero(asked)
+        for b in (0, 1):
+            for a in (0, 1):
+                at = ((j + bottom + 1) // 2 - 1 + b - found.bottom, (i + left + 1) // 2 - 1 + a - found.left)
+                assert np.array_equal(found.values[at], parents.values[at])
 
 
 def test_only_cells_near_what_was_regained_are_asked_again(monkeypatch):

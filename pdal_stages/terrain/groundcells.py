@@ -23,7 +23,7 @@ from .islands import REACH as ISLANDS_REACH
 from .lowest import COMPANY, SURROUNDINGS, heights_of, lowest_points, pits, places_of
 from .openings import HOLE
 from .patches import SIDE
-from .planes import plane_of_cell, planes_of_blocks
+from .planes import GroundPyramid, plane_of_cell
 from .planes import reach as planes_reach
 from .plateaus import reach as plateau_reach
 from .plateaus import remove_plateaus
@@ -201,6 +201,7 @@ def ground_raster(
     del lowest, bad
     ground = np.isfinite(raster) & ~objects
     asked = np.flatnonzero(np.isfinite(raster) & ~ground)  # cells
+    pyramid = GroundPyramid(ground, place, floor, raster, left, bottom, options.levels(NEAR))
     for number in range(1, ROUNDS + 1):
         rows, columns = grown(plateaus + (ROUNDS - number) * step)
         seen = np.zeros(shape, bool)
@@ -210,11 +211,13 @@ def ground_raster(
             break
         seen[:] = False
         seen.ravel()[asked] = True
-        blocks = planes_of_blocks(ground, place, floor, raster, left, bottom, options.levels(NEAR), seen)
+        blocks = pyramid.planes(seen)
         found = np.zeros(len(asked), bool)
         _near(asked, place, *blocks, left, bottom, cell, options.threshold, options.scalar, found)
         ground.ravel()[asked[found]] = True
+        pyramid.add(asked[found])
         asked = _still_asked(asked, found, left, bottom, shape, options.levels(NEAR))
+    del pyramid
     remove_plateaus(ground, floor, raster, cell)
     # The terrain runs below: no level of a deck stands for it either.
     ground &= ~on_deck

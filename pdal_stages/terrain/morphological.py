@@ -275,7 +275,7 @@ def _measured(
         means_of(sums, ground, place)
     else:
         ground, place = means
-    planes = surface(ground, place, raster.floor, raster.lowest, left, bottom, options.levels(FAR), needed)
+    surface(ground, place, raster.floor, raster.lowest, left, bottom, options.levels(FAR), needed, planes)
     each(above)
     nowhere = np.isnan(height)
     counts["without_terrain"] += int(np.count_nonzero(nowhere[own]))

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..base.jit import device, njit
+from .moments import moments_of_blocks, moments_of_blocks_again, moments_of_cells, moments_of_cells_again
 
 #: Weight of the coarser gradient per ground cell, for a lever of one block: it decides where all
 #: ground of a fit lies to one side or on a line.
@@ -31,50 +32,6 @@ def reach(levels: int) -> int:
     return 3 * 2**levels
 
 
-@njit
-def _moments_of_cells(ground, place, left, bottom, out, held, out_left, out_bottom):
-    """n, x, y, xx, xy, yy, z, xz, yz of the ground of each block of 2 x 2 cells, about its center; which hold any."""
-    for j in range(ground.shape[0]):
-        dy, row = ((j + bottom) & 1) - 0.5, ((j + bottom) >> 1) - out_bottom
-        target, here = out[row], held[row]
-        for i in range(ground.shape[1]):
-            if ground[j, i]:
-                x, y, z = place[j, i, 0], place[j, i, 1], place[j, i, 2]
-                dx, k = ((i + left) & 1) - 0.5, ((i + left) >> 1) - out_left
-                here[k] = True
-                target[0, k] += 1.0
-                target[1, k] += x + dx
-                target[2, k] += y + dy
-                target[3, k] += x * x + 2 * dx * x + dx * dx
-                target[4, k] += x * y + dx * y + dy * x + dx * dy
-                target[5, k] += y * y + 2 * dy * y + dy * dy
-                target[6, k] += z
-                target[7, k] += x * z + dx * z
-                target[8, k] += y * z + dy * z
-
-
-@njit
-def _moments_of_blocks(fine, held_fine, left, bottom, size, out, held, out_left, out_bottom):
-    """The same of blocks of twice the `size`, from their four parts."""
-    for j in range(held_fine.shape[0]):
-        dy, row = (((j + bottom) & 1) - 0.5) * size, ((j + bottom) >> 1) - out_bottom
-        target, here, m = out[row], held[row], fine[j]
-        for i in range(held_fine.shape[1]):
-            if held_fine[j, i]:
-                dx, k = (((i + left) & 1) - 0.5) * size, ((i + left) >> 1) - out_left
-                here[k] = True
-                n, x, y, z = m[0, i], m[1, i], m[2, i], m[6, i]
-                target[0, k] += n
-                target[1, k] += x + n * dx
-                target[2, k] += y + n * dy
-                target[3, k] += m[3, i] + 2 * dx * x + n * dx * dx
-                target[4, k] += m[4, i] + dx * y + dy * x + n * dx * dy
-                target[5, k] += m[5, i] + 2 * dy * y + n * dy * dy
-                target[6, k] += z
-                target[7, k] += m[7, i] + dx * z
-                target[8, k] += m[8, i] + dy * z
-
-
 @device
 def blend(planes, i, j, s, t, size):
     """Height and gradient of the four planes round a place, weighted by nearness; NaN where none is known.
@@ -83,6 +40,20 @@ def blend(planes, i, j, s, t, size):
     rounding does not depend on where the array begins.
     """
     height, across, along, total = 0.0, 0.0, 0.0, 0.0
+    if 0 <= j < planes.shape[0] - 1 and 0 <= i < planes.shape[1] - 1:
+        first, second = planes[j], planes[j + 1]
+        if not np.isnan(first[i, 0] + first[i + 1, 0] + second[i, 0] + second[i + 1, 0]):
+            # All are known, and none that weighs nothing changes a sum.
+            for b in range(2):
+                row = second if b else first
+                for a in range(2):
+                    weight = (s if a else 1.0 - s) * (t if b else 1.0 - t)
+                    p1, p2 = row[i + a, 1], row[i + a, 2]
+                    height += weight * (row[i + a, 0] + size * (p1 * (s - a) + p2 * (t - b)))
+                    across += weight * p1
+                    along += weight * p2
+                    total += weight
+            return height / total, across / total, along / total
     for b in range(2):
         wv = t if b else 1.0 - t
         if j + b < 0 or j + b >= planes.shape[0] or wv == 0.0:
@@ -117,9 +88,9 @@ def _coarsest(floor, raster, left, bottom, level, out, out_left, out_bottom):
             end = min(((block + out_left + 1) << level) - left, raster.shape[1])
             total, n = row[block, 0], row[block, 1]
             for k in range(i, end):
-                if np.isfinite(raster[j, k]):
-                    total += floor[j, k]
-                    n += 1.0
+                there = np.isfinite(raster[j, k])
+                total += floor[j, k] if there else np.float32(0.0)
+                n += 1.0 if there else 0.0
             row[block, 0], row[block, 1] = total, n
             i = end
     for j in range(h):
@@ -317,49 +288,72 @@ class Planes(NamedTuple):
     bottom: int  #: of the first row
 
 
-def planes_of_blocks(
-    ground: np.ndarray,
-    place: np.ndarray,
-    floor: np.ndarray,
-    raster: np.ndarray,
-    left: int,
-    bottom: int,
-    levels: int,
-    needed: np.ndarray,
-) -> Planes:
-    """The pyramid down to blocks of 2 x 2 cells, where those cells that are `needed` ask for it; see :func:`surface`."""
-    h, w = ground.shape
-    spans = [(left, bottom, w, h)]
-    for _ in range(levels):
-        a, b, w, h = spans[-1]
-        low_a, low_b = (a >> 1) - 1, (b >> 1) - 1
-        spans.append((low_a, low_b, ((a + w - 1) >> 1) + 2 - low_a, ((b + h - 1) >> 1) + 2 - low_b))
-    wanted = [needed]
-    for level in range(1, levels + 1):
-        a, b, w, h = spans[level]
-        wanted.append(_needed_parents(wanted[-1], *spans[level - 1][:2], (h, w), a, b))
-    # Memory that is zero and never touched costs nothing: empty land is not gone over with all its numbers.
-    moments, held = [], []
-    for level in range(1, levels + 1):
-        a, b, w, h = spans[level]
-        moments.append(np.zeros((h, 9, w)))
-        held.append(np.zeros((h, w), bool))
-        before = spans[level - 1][:2]
-        if level == 1:
-            _moments_of_cells(ground, place, *before, moments[-1], held[-1], a, b)
-        else:
-            size = 2.0 ** (level - 1)
-            _moments_of_blocks(moments[-2], held[-2], *before, size, moments[-1], held[-1], a, b)
-    planes = np.empty((0, 0, 3))
-    for level in range(levels, 0, -1):
-        a, b, w, h = spans[level]
-        coarser, planes = planes, np.zeros((h, w, 3))
-        if level == levels:
-            _coarsest(floor, raster, left, bottom, level, planes, a, b)
-        else:
-            _from_parents(coarser, *spans[level + 1][:2], 2.0**level, a, b, wanted[level], planes)
-        _fit(moments[level - 1], 2.0**level, wanted[level], planes)
-    return Planes(planes, *spans[1][:2])
+class GroundPyramid:
+    """Blocks of cells, and blocks of these, and what they know of the ground; arguments as of :func:`surface`.
+
+    `ground` may be added to: the cells that are ground since are given to :meth:`add`.
+    """
+
+    def __init__(
+        self,
+        ground: np.ndarray,
+        place: np.ndarray,
+        floor: np.ndarray,
+        raster: np.ndarray,
+        left: int,
+        bottom: int,
+        levels: int,
+    ) -> None:
+        self._ground, self._place = ground, place
+        h, w = ground.shape
+        spans = [(left, bottom, w, h)]
+        for _ in range(levels):
+            a, b, w, h = spans[-1]
+            low_a, low_b = (a >> 1) - 1, (b >> 1) - 1
+            spans.append((low_a, low_b, ((a + w - 1) >> 1) + 2 - low_a, ((b + h - 1) >> 1) + 2 - low_b))
+        self._spans = spans
+        # Memory that is zero and never touched costs nothing: empty land is not gone over with all its numbers.
+        self._moments = [np.zeros((h, 9, w)) for _, _, w, h in spans[1:]]
+        self._held = [np.zeros((h, w), bool) for _, _, w, h in spans[1:]]
+        self._planes = [np.zeros((h, w, 3)) for _, _, w, h in spans[1:]]
+        for level in range(1, levels + 1):
+            into = self._moments[level - 1], self._held[level - 1], *spans[level][:2]
+            if level == 1:
+                moments_of_cells(ground, place, left, bottom, *into)
+            else:
+                fine = self._moments[level - 2], self._held[level - 2], *spans[level - 1][:2]
+                moments_of_blocks(*fine, 2.0 ** (level - 1), *into)
+        self._coarsest = np.empty_like(self._planes[-1])
+        _coarsest(floor, raster, left, bottom, levels, self._coarsest, *spans[-1][:2])
+
+    def add(self, cells: np.ndarray) -> None:
+        """Cells (n,), numbered row by row, have become ground."""
+        left, bottom, width, _ = self._spans[0]
+        fine: tuple = ()
+        for level in range(1, len(self._spans)):
+            into = self._moments[level - 1], self._held[level - 1], *self._spans[level][:2]
+            if level == 1:
+                moments_of_cells_again(cells, self._ground, self._place, left, bottom, *into)
+            else:
+                moments_of_blocks_again(cells, width, left, bottom, level, *fine, *into)
+            fine = into
+
+    def planes(self, needed: np.ndarray) -> Planes:
+        """Planes of blocks of 2 x 2 cells, where cells (h, w) that are `needed` ask for them; good until the next call."""
+        wanted = [needed]
+        for before, span in zip(self._spans, self._spans[1:], strict=False):
+            a, b, w, h = span
+            wanted.append(_needed_parents(wanted[-1], *before[:2], (h, w), a, b))
+        top = len(self._spans) - 1
+        for level in range(top, 0, -1):
+            planes, span = self._planes[level - 1], self._spans[level]
+            if level == top:
+                planes[:] = self._coarsest
+            else:
+                coarser = self._planes[level], *self._spans[level + 1][:2]
+                _from_parents(*coarser, 2.0**level, *span[:2], wanted[level], planes)
+            _fit(self._moments[level - 1], 2.0**level, wanted[level], planes)
+        return Planes(self._planes[0], *self._spans[1][:2])
 
 
 @device
@@ -379,6 +373,7 @@ def surface(
     bottom: int,
     levels: int,
     needed: np.ndarray,
+    planes: np.ndarray | None = None,
 ) -> np.ndarray:
     """Planes at the centers of all cells (h, w, 3): height, gradient per cell; NaN beyond the reach of all measured cells.
 
@@ -386,9 +381,11 @@ def surface(
     height; `floor` (h, w) is the level to take where no ground is near, `raster` (h, w) is not finite where nothing was
     measured. `left` and `bottom` number the first column and row from the origin of the coordinates. There are
     `levels` coarser levels, at least 1. `needed` (h, w) says at which cells planes are wanted; elsewhere stands none.
+    They are put into `planes` where that is given: those at the same cells, made before.
     """
-    blocks = planes_of_blocks(ground, place, floor, raster, left, bottom, levels, needed)
-    planes = np.zeros((*ground.shape, 3))
+    blocks = GroundPyramid(ground, place, floor, raster, left, bottom, levels).planes(needed)
+    if planes is None:
+        planes = np.zeros((*ground.shape, 3))
     _from_parents(blocks.values, blocks.left, blocks.bottom, 1.0, left, bottom, needed, planes)
     _through_ground(ground, place, planes)
     return planes

@@ -45,20 +45,22 @@ def _ways(cell):
 def _linked(raster, offsets, steps, number):
     """Number the measured cells of each linked set alike; returns how many sets there are."""
     h, w = raster.shape
-    heights, numbers = raster.ravel(), number.ravel()
-    parent = np.arange(h * w)
+    # With holes beside and below, so that no step has to look where the raster ends.
+    stride = w + 2 * LINK
+    heights = np.full((h + LINK) * stride + LINK, HOLE)
     for j in range(h):
         for i in range(w):
-            at = j * w + i
+            heights[j * stride + LINK + i] = raster[j, i]
+    parent = np.arange(len(heights))
+    ahead = offsets[:, 0] * stride + offsets[:, 1]
+    for j in range(h):
+        for at in range(j * stride + LINK, j * stride + LINK + w):
             here = heights[at]
             if here == HOLE:
                 continue
             mine = root_of(parent, at)
             for k in range(len(steps)):
-                b, a = offsets[k, 0], offsets[k, 1]
-                if j + b >= h or i + a < 0 or i + a >= w:
-                    continue
-                other = at + b * w + a
+                other = at + ahead[k]
                 if abs(heights[other] - here) <= steps[k] and parent[other] != mine:  # nor a hole
                     other = root_of(parent, other)
                     if other > mine:
@@ -67,15 +69,17 @@ def _linked(raster, offsets, steps, number):
                         parent[mine] = other
                         mine = other
     count = 0
-    for at in range(h * w):
-        numbers[at] = -1
-        if heights[at] != HOLE:
-            root = root_of(parent, at)
-            if root == at:
-                numbers[at] = count
-                count += 1
-            else:
-                numbers[at] = numbers[root]
+    names = np.empty(len(heights), np.int32)  # of those who stand for sets, each the first of its own
+    for j in range(h):
+        for i in range(w):
+            at = j * stride + LINK + i
+            number[j, i] = -1
+            if heights[at] != HOLE:
+                root = root_of(parent, at)
+                if root == at:
+                    names[at] = count
+                    count += 1
+                number[j, i] = names[root]
     return count
 
 

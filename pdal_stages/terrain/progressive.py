@@ -97,7 +97,7 @@ def _mark_numbered(before, after, heights, least, drop, settled, floor):
             ):
                 continue
             for i in range(begin, end):
-                if not settled[j, i]:
+                if (before[j, i] > after[j, i] + least) & (not settled[j, i]):  # few, so told at once
                     level = heights[after[j, i]]
                     if heights[before[j, i]] - level > drop:
                         settled[j, i] = True
