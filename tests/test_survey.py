@@ -17,6 +17,7 @@ from pdal_stages.cli import main
 from pdal_stages.stages.base import Blocks
 from pdal_stages.synthetic.townfile import wkt
 from pdal_stages.tiling import TilingOptions
+from pdal_stages.tiling.classify import ClassifyTask
 from pdal_stages.tiling.pace import Pace
 from pdal_stages.tiling.sizing import (
     BASE,
@@ -29,6 +30,7 @@ from pdal_stages.tiling.sizing import (
     worker_bytes,
 )
 from pdal_stages.tiling.sources import Extent
+from pdal_stages.tiling.survey import Survey
 
 pytestmark = pytest.mark.pdal
 OPTIONS = ("--filters.hag_minima.cell=5", "--no-progress")
@@ -340,6 +342,24 @@ def test_blocks_are_as_large_as_the_memory_allows():
     assert widened(blocks, 1e9, 1e10, 4, 2048.0) == twice  # which an earlier run has begun with
     # One for each worker.
     assert widened(blocks, 1e7, 1e10, 4) == blocks and widened(blocks, 1e7, 1e10, 2) == twice
+
+
+@pytest.mark.pdal
+def test_blocks_of_a_survey(tmp_path, write_las):
+    """30 x 30 km, as the header says: as large as this machine's workers have room for, and as a cluster's are said to."""
+    points = {axis: np.array([0.0, 30_000.0]) for axis in "XYZ"}
+    path = write_las(tmp_path / "wide.las", points, point_format=6)
+    plan = ClassifyTask((str(path),), str(tmp_path / "out.las")).plan()
+
+    def side(block=None, **options):
+        survey = Survey(plan, TilingOptions(500.0, **options), block)
+        assert survey.plan.first is not None
+        return survey.plan.first.blocks.side
+
+    assert side(memory=64 << 30, workers=1) == 4096.0 and side(2048.0, memory=64 << 30, workers=1) == 2048.0
+    assert side(memory=2 << 30, workers=1) == 1024.0
+    assert side(scheduler="tcp://host:1") == 1024.0
+    assert side(scheduler="tcp://host:1", memory=16 << 30) == 2048.0  # one each for 64 workers
 
 
 def test_each_worker_has_its_share_of_the_memory():

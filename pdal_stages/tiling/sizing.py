@@ -20,6 +20,8 @@ BASE, TILE_POINT, FILE_POINT, BLOCKS = 350 << 20, 285, 250, 512 << 20
 DIRECT_POINT, TRAIN_POINT = 190, 400
 #: Of a cell of the raster of which a block is made before the tiles.
 _CELL = 200
+#: Blocks are at most so many times as wide as they would be by themselves: what is beyond gains little, and one takes long.
+_WIDEST = 4
 #: Of the process that hands out the work.
 PARENT = 350 << 20
 #: Points of a larger file are put together in parts of so many.
@@ -78,6 +80,7 @@ def widened(
     As long as each worker gets one, in a survey of so many square meters, up to a side of `most` meters. `room`: see
     :func:`room_of_worker`.
     """
+    most = min(most, _WIDEST * blocks.side)
     while True:
         twice = blocks._replace(side=2 * blocks.side)
         if (

@@ -25,7 +25,7 @@ from .grid import Box, TileGrid, check_number, touching, union
 from .outcome import Costs
 from .pool import Pool, last_tries
 from .settings import TilingOptions
-from .sizing import Density, block_bytes, room_of_worker, settled, widened
+from .sizing import Density, block_bytes, room_of_worker, settled, widened, worker_bytes
 from .sources import Extent, InputSource, check_source, find_sources, read_ept, read_extent
 from .store import Store, fingerprint
 from .tileplan import TilePlan
@@ -78,9 +78,14 @@ class Survey:
         if plan.first is None:
             return plan
         area = density.area * self.unit**2
-        # How many workers a cluster has is not known yet.
-        workers = _OF_A_CLUSTER if self.options.scheduler else max(1, self.options.local_workers)
-        blocks = widened(plan.first.blocks, area, room_of_worker(self.options), workers, most)
+        workers, room = max(1, self.options.local_workers), room_of_worker(self.options)
+        if (
+            self.options.scheduler
+        ):  # of a cluster it is not known yet how many workers it has, nor their memory
+            workers = _OF_A_CLUSTER
+            if self.options.memory is None:
+                room = worker_bytes(density.read_by(self.grid.size, self.halo_units), 0, self.block_bytes)
+        blocks = widened(plan.first.blocks, area, room, workers, most)
         self.block_bytes = block_bytes(blocks, area)
         return replace(plan, first=replace(plan.first, blocks=blocks))
 
