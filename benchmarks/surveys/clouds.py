@@ -1,5 +1,5 @@
-"""The open, labeled surveys that the shipped models are trained on, and copies of them that are thinner, steeper, or
-without return numbers.
+"""The open, labeled surveys that the shipped models are trained on, and copies of them that are thinner, steeper, without
+return numbers, or have one return of each pulse.
 
 Labels become 2 ground, 5 vegetation, 6 building and 0, which is left out of training and scoring. Low vegetation (3) is
 left out: in these surveys most of it lies on the ground, and where it begins is a matter of taste.
@@ -298,6 +298,14 @@ def without_returns(cloud: Cloud) -> Cloud:
         name=f"{cloud.name}, no returns",
         dimensions={**cloud.dimensions, "ReturnNumber": none, "NumberOfReturns": none},
     )
+
+
+def one_return(cloud: Cloud, last: bool) -> Cloud:
+    """A copy with the first or the last return of each pulse alone, without numbers: as some files are delivered."""
+    number, of = cloud.dimensions["ReturnNumber"], cloud.dimensions["NumberOfReturns"]
+    kept = number >= of if last else number <= 1
+    name = f"{cloud.name}, {'last' if last else 'first'} returns"
+    return without_returns(cloud.part(np.flatnonzero(kept), name))
 
 
 def on_slopes(cloud: Cloud, slope: float, seed: int, terraces: bool = False, most: int = 250_000) -> Cloud:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from clouds import SURVEYS, Cloud, load, on_slopes, thinned, without_returns
+from clouds import SURVEYS, Cloud, load, on_slopes, one_return, thinned, without_returns
 
 from pdal_stages.base.hashing import coordinate_hash
 from pdal_stages.classifier import Model, TrainingCloud, TrainingOptions, train
@@ -19,6 +19,8 @@ from pdal_stages.stages.heights import PREPARATION
 DENSITIES = (8.0, 2.0, 0.6)
 #: (slope, points per square meter, whether in terraces) of copies on synthetic terrain.
 SLOPES = ((0.3, 8.0, False), (0.6, 3.0, False), (0.9, 1.0, False), (0.5, 0.3, False), (0.5, 1.0, True))
+#: Points per square meter, at most, of copies that have one return of each pulse, the first or the last.
+ONE_RETURN = (12.0, 3.0)
 #: Points of a copy at most: a strip of it, each copy's somewhere else.
 MOST = 50_000
 #: Steps by this share of a whole, over and over, fall evenly everywhere.
@@ -37,7 +39,7 @@ OPTIONS = TrainingOptions(
     prior_weight=0.0,
     passes=2,
     pass_folds=len(SURVEYS),
-    context=("own", "box1", "columnvotes2", "columnvotes8"),
+    context=("own", "box1", "box4", "columnvotes2", "columnvotes8"),
     scale=False,
     folds=0,
     voxel=0.25,
@@ -45,7 +47,8 @@ OPTIONS = TrainingOptions(
 
 
 def copies(cloud: Cloud) -> Iterator[Cloud]:
-    """A survey and its thinned and tilted copies; each once more without return numbers, where it has them."""
+    """A survey and its thinned and tilted copies; where it has return numbers, each once more without these, and copies with
+    one return of each pulse."""
     made = [cloud, *(thinned(cloud, density) for density in DENSITIES)]
     for number, (slope, density, terraces) in enumerate(SLOPES):
         steep = on_slopes(cloud, slope, number, terraces)
@@ -56,6 +59,10 @@ def copies(cloud: Cloud) -> Iterator[Cloud]:
         yield one
         if SURVEYS[cloud.survey].returns:
             yield without_returns(one)
+    if SURVEYS[cloud.survey].returns:
+        for density in ONE_RETURN:
+            for last in (False, True):
+                yield one_return(thinned(cloud, density) or cloud, last)
 
 
 def training_cloud(cloud: Cloud, number: int) -> TrainingCloud:
