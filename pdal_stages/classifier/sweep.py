@@ -77,16 +77,21 @@ class Sweep:
         if number.max(initial=0) < 2**16:
             number = number.astype(np.uint16)  # sorted digit by digit
         small = np.int32 if len(xyz) < 2**31 else np.int64
-        order = np.argsort(number, kind="stable").astype(small)
-        number = number[order]
+        # In an index's order the strips follow each other already, and nothing has to say where a point is.
+        self._order: npt.NDArray[Any] | None = None
+        self._place: npt.NDArray[Any] | None = None
+        if coming is not None or (number[1:] < number[:-1]).any():
+            order = np.argsort(number, kind="stable").astype(small)
+            number = number[order]
+            self._order = order if coming is None else coming[order].astype(small)
+            self._place = np.zeros(len(xyz), small)  # of each row in the order of strips
+            self._place[self._order] = np.arange(len(self._order), dtype=small)
+            del order
         first = np.flatnonzero(begins_run(number))
         self._numbers = number[first].astype(np.int64) + least
         self._start = np.append(first, len(number))
+        self._shares = np.zeros((len(number), classes), np.uint16)
         del number
-        self._order = order if coming is None else coming[order].astype(small)
-        self._place = np.zeros(len(xyz), small)  # of each row in the order of strips
-        self._place[self._order] = np.arange(len(self._order), dtype=small)
-        self._shares = np.zeros((len(self._order), classes), np.uint16)
         self._wanted = None
         if wanted is not None:
             self._wanted = np.zeros(len(xyz), np.bool_)
@@ -111,7 +116,7 @@ class Sweep:
 
     def _take(self, block: Passed) -> None:
         """Store a block's shares, and what is wanted of it with the strips it lies in."""
-        at = self._place[block.rows]
+        at = block.rows if self._place is None else self._place[block.rows]
         self._shares[at] = block.shares
         strip = np.searchsorted(self._start, at, side="right") - 1
         self._left -= np.bincount(strip, minlength=len(self._left))
@@ -147,7 +152,8 @@ class Sweep:
         first = self._start[max(strips[0] - 1, 0)]
         last = self._start[min(strips[-1] + 2, len(self._numbers))]
         window = slice(first, last)
-        tables = self._context.tables(self._xyz[self._order[window]], self._shares[window], self._threads)
+        xyz = self._xyz[window if self._order is None else self._order[window]]
+        tables = self._context.tables(xyz, self._shares[window], self._threads)
         kept = [part for part in parts if part[1] is not None or self._again is None]
         missing = [part[0] for part in parts if part[1] is None and self._again is not None]
 
@@ -165,5 +171,6 @@ class Sweep:
 
     def _columns(self, tables: Tables, rows: npt.NDArray[np.int64], first: int) -> npt.NDArray[np.float32]:
         out = np.empty((len(rows), len(self._context.tokens) * self._shares.shape[1]), np.float32)
-        tables.fill(self._place[rows].astype(np.int64) - first, out)
+        place = rows if self._place is None else self._place[rows].astype(np.int64)
+        tables.fill(place - first, out)
         return out

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -118,15 +118,24 @@ def consistent(
     may = seen if change is None else seen & np.asarray(change, bool)
     counts = dict.fromkeys(rules, 0)
     there = np.flatnonzero(seen)
+    if len(out) < 2**31:
+        there = there.astype(np.int32)
     if len(there):
         kinds = np.full(256, _OTHER, np.uint8)
         kinds[GROUND], kinds[list(VEGETATION)], kinds[BUILDING] = _GROUND, _VEGETATION, _BUILDING
-        xyz = xyz if len(there) == len(xyz) else xyz[there]
+        place, part = _placed(xyz, there)
+        del xyz  # where the caller does not keep them, coordinates are let go of
         sure = None if reliability is None else np.asarray(reliability)[there]
-        work = _Neighborhoods(xyz, kinds[out[there]], sure)
+        work = _Neighborhoods(place, part, kinds[out[there]], sure)
+        del place, part, sure
         free = may[there] & (work.kind != _OTHER)
+        del seen, may
         flat = None if ground is None else np.asarray(ground)[there] != 0
-        above = None if height is None else np.asarray(height, np.float64)[there]
+        above = (
+            None
+            if height is None
+            else _Above((np.asarray(height) < LOW)[there], (np.asarray(height) > HIGH)[there])
+        )
         before = work.kind.copy()
         for rule in RULES:
             if rule in rules:
@@ -136,8 +145,9 @@ def consistent(
                 work.kind = np.where(changed, new, work.kind)
         other = work.kind != before
         new = np.array([GROUND, HIGH_VEGETATION, BUILDING, 0], np.uint8)[work.kind[other]]
-        if vegetation_heights is not None and above is not None:
-            by_height(new, np.ones(len(new), bool), above[other], vegetation_heights)
+        if vegetation_heights is not None:
+            heights = np.asarray(height, np.float64)[there[other]]
+            by_height(new, np.ones(len(new), bool), heights, vegetation_heights)
         else:
             leaves = new == HIGH_VEGETATION
             new[leaves] = work.vegetation_near(np.flatnonzero(other)[leaves], out[there])
@@ -147,31 +157,47 @@ def consistent(
     return out
 
 
+class _Above(NamedTuple):
+    """Points below LOW and above HIGH, meters above ground."""
+
+    low: NDArray[np.bool_]
+    high: NDArray[np.bool_]
+
+
+def _placed(xyz: NDArray[np.float64], rows: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int16]]:
+    """Columns, rows and levels (3, m) of these points' voxels, and (m, 3) where in these they lie."""
+    ends = np.array([[math.inf] * 3, [-math.inf] * 3])
+    _bounds(xyz, rows, ends)
+    small = np.abs(ends).max() < 2**30
+    place = np.empty((3, len(rows)), np.int32 if small else np.int64)
+    part = np.empty((len(rows), 3), np.int16)
+    _split(xyz, rows, place, part)
+    return place, part
+
+
 class _Neighborhoods:
     """Points sorted into voxels, and what is round these."""
 
     def __init__(
         self,
-        xyz: NDArray[np.float64],
+        place: NDArray[Any],
+        part: NDArray[np.int16],
         kind: NDArray[np.uint8],
         reliability: NDArray[np.floating] | None = None,
     ) -> None:
-        self.xyz, self.kind, self.reliability = xyz, kind, reliability
-        place = np.empty((3, len(xyz)), np.int64)
-        self.part = np.empty((len(xyz), 3), np.int16)
-        _split(xyz, place, self.part)
+        self.part, self.kind, self.reliability = part, kind, reliability
         column, row, level = place
-        self.left, self.bottom = column.min() - 2, row.min() - 2
-        self.width = int(column.max() - self.left + 3)
+        self.left, self.bottom = int(column.min()) - 2, int(row.min()) - 2
+        self.width = int(column.max()) - self.left + 3
         self.voxel, self.keys, _, self.table = voxels(column, row, level, self.left, self.bottom, self.width)
 
-    def counts(self) -> NDArray[np.int64]:
+    def counts(self) -> NDArray[np.int32]:
         """Points of each kind in each voxel, (voxels, 4)."""
-        own = np.zeros((len(self.keys), 4), np.int64)
+        own = np.zeros((len(self.keys), 4), np.int32)
         _count(self.voxel, self.kind, own)
         return own
 
-    def shares(self, own: NDArray[np.int64], wanted: NDArray[np.bool_]) -> NDArray[np.int64]:
+    def shares(self, own: NDArray[np.int32], wanted: NDArray[np.bool_]) -> NDArray[np.int32]:
         """Points of each kind in the cube of 3 x 3 x 3 voxels round each wanted voxel, (voxels, 4); 0 for the others."""
         sums = np.zeros_like(own)
         _add_round(self.keys, self.table, self.width, own, wanted, sums)
@@ -189,7 +215,7 @@ class _Neighborhoods:
         """The commonest class of vegetation round each of these points, the higher of two; where there is none, 5."""
         if not len(rows):
             return np.empty(0, np.uint8)
-        own, wanted = np.zeros((len(self.keys), 4), np.int64), np.zeros(len(self.keys), bool)
+        own, wanted = np.zeros((len(self.keys), 4), np.int32), np.zeros(len(self.keys), bool)
         which = np.full(256, len(VEGETATION), np.uint8)
         which[list(VEGETATION[::-1])] = range(len(VEGETATION))
         _count(self.voxel, which[codes], own)
@@ -217,34 +243,44 @@ class _Neighborhoods:
     def in_planes(self, levels: int, upright: bool) -> NDArray[np.bool_]:
         """Vegetation in planes of buildings near: leaning ones of roofs, or `upright` ones of walls."""
         own = self.counts()
-        moments = np.zeros((len(self.keys), 10), np.int64)
-        _add_moments(self.voxel, self.kind, self.part, moments)
-        planes = np.full((len(self.keys), 4), np.nan)
-        _fit(self.keys, self.table, self.width, levels, upright, own, moments, planes)
+        # Only voxels with buildings have moments, and only those with vegetation are asked for a plane.
+        built, green = _numbers(own[:, _BUILDING] > 0), _numbers(own[:, _VEGETATION] > 0)
+        moments = np.zeros((int(built.max(initial=-1)) + 1, 10), np.int64)
+        _add_moments(self.voxel, self.kind, self.part, built, moments)
+        planes = np.full((int(green.max(initial=-1)) + 1, 4), np.nan)
+        _fit(self.keys, self.table, self.width, levels, upright, own, built, moments, green, planes)
         near = np.zeros(len(self.voxel), bool)
-        _near_planes(self.voxel, self.kind, self.part, planes, near)
+        _near_planes(self.voxel, self.kind, self.part, green, planes, near)
         return near
 
 
-def _ground(work: _Neighborhoods, height, flat) -> NDArray[np.uint8]:
-    if height is None or flat is None:
+def _numbers(chosen: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """The chosen ones numbered from 0; -1 for the others."""
+    numbers = np.cumsum(chosen, dtype=np.int32)
+    numbers -= 1
+    numbers[~chosen] = -1
+    return numbers
+
+
+def _ground(work: _Neighborhoods, above: _Above | None, flat) -> NDArray[np.uint8]:
+    if above is None or flat is None:
         return work.kind
-    wrong = (work.kind == _BUILDING) & flat & (height < LOW)
+    wrong = (work.kind == _BUILDING) & flat & above.low
     if not wrong.any():
         return work.kind
     # Feet of walls are labeled building as often as ground, so only what is away from all buildings.
-    stands = (work.kind == _BUILDING) & ~flat & (height > HIGH)
+    stands = (work.kind == _BUILDING) & ~flat & above.high
     return np.where(wrong & ~work.beside(stands), np.uint8(_GROUND), work.kind)
 
 
-def _doubtful(work: _Neighborhoods, height, flat) -> NDArray[np.uint8]:
+def _doubtful(work: _Neighborhoods, above, flat) -> NDArray[np.uint8]:
     return np.where(work.doubtful_pieces(), np.uint8(_VEGETATION), work.kind)
 
 
-def _islands(work: _Neighborhoods, height, flat) -> NDArray[np.uint8]:
-    if height is None or flat is None:
+def _islands(work: _Neighborhoods, above: _Above | None, flat) -> NDArray[np.uint8]:
+    if above is None or flat is None:
         return work.kind
-    wrong = (work.kind == _GROUND) & ~flat & (height > HIGH)
+    wrong = (work.kind == _GROUND) & ~flat & above.high
     if not wrong.any():
         return work.kind
     wanted = np.zeros(len(work.keys), bool)
@@ -255,15 +291,15 @@ def _islands(work: _Neighborhoods, height, flat) -> NDArray[np.uint8]:
     return np.where(wrong & (building + vegetation > 0), new, work.kind)
 
 
-def _roofs(work: _Neighborhoods, height, flat) -> NDArray[np.uint8]:
+def _roofs(work: _Neighborhoods, above, flat) -> NDArray[np.uint8]:
     return np.where(work.in_planes(1, False), np.uint8(_BUILDING), work.kind)
 
 
-def _facades(work: _Neighborhoods, height, flat) -> NDArray[np.uint8]:
+def _facades(work: _Neighborhoods, above, flat) -> NDArray[np.uint8]:
     return np.where(work.in_planes(2, True), np.uint8(_BUILDING), work.kind)
 
 
-def _lone(work: _Neighborhoods, height, flat) -> NDArray[np.uint8]:
+def _lone(work: _Neighborhoods, above, flat) -> NDArray[np.uint8]:
     new, own = work.kind.copy(), work.counts()
     alone = (own[:, [_VEGETATION, _BUILDING]] == 1).any(axis=1)
     _take_sides(work.voxel, work.kind, work.shares(own, alone), new)
@@ -284,13 +320,23 @@ _RULES = {
 
 
 @njit
-def _split(xyz, place, part):
-    """Fill `place` (3, n) with voxels' columns, rows and levels, `part` (n, 3) with coordinates within these."""
-    for p in range(len(xyz)):
+def _bounds(xyz, rows, ends):
+    """Widen `ends` (2, 3), lowest and highest, by these points, in voxels."""
+    for p in rows:
         for axis in range(3):
             number = math.floor(xyz[p, axis] * (1.0 / SIDE))
-            place[axis, p] = number
-            part[p, axis] = np.int16(np.rint((xyz[p, axis] - number * SIDE) * _PARTS))
+            ends[0, axis], ends[1, axis] = min(ends[0, axis], number), max(ends[1, axis], number)
+
+
+@njit
+def _split(xyz, rows, place, part):
+    """Fill `place` (3, m) with voxels' columns, rows and levels, `part` (m, 3) with coordinates within these."""
+    for i in range(len(rows)):
+        p = rows[i]
+        for axis in range(3):
+            number = math.floor(xyz[p, axis] * (1.0 / SIDE))
+            place[axis, i] = number
+            part[i, axis] = np.int16(np.rint((xyz[p, axis] - number * SIDE) * _PARTS))
 
 
 @njit
@@ -368,10 +414,10 @@ def _add_round(keys, table, w, own, wanted, sums):
 
 
 @njit
-def _add_moments(voxel, kind, part, moments):
+def _add_moments(voxel, kind, part, built, moments):
     for p in range(len(voxel)):
         if kind[p] == _BUILDING:
-            m = moments[voxel[p]]
+            m = moments[built[voxel[p]]]
             x, y, z = np.int64(part[p, 0]), np.int64(part[p, 1]), np.int64(part[p, 2])
             m[0] += 1
             m[1] += x
@@ -402,7 +448,7 @@ def _shifted(m, dx, dy, dz, total):
 
 
 @njit
-def _fit(keys, table, w, levels, upright, own, moments, planes):
+def _fit(keys, table, w, levels, upright, own, built, moments, green, planes):
     """Fill `planes` (normal, distance from the voxel's corner; meters) of buildings round voxels with vegetation."""
     total = np.empty(10, np.int64)
     side = np.int64(SIDE * _PARTS)
@@ -417,7 +463,8 @@ def _fit(keys, table, w, levels, upright, own, moments, planes):
                     q = find(table, keys, keys[k] + ((dj * w + di) << BITS) + dl)
                     if q >= 0:
                         points += own[q, _VEGETATION] + own[q, _BUILDING] + own[q, _OTHER]
-                        _shifted(moments[q], di * side, dj * side, dl * side, total)
+                        if built[q] >= 0:
+                            _shifted(moments[built[q]], di * side, dj * side, dl * side, total)
         n = total[0]
         if n < ENOUGH or n < SHARE * points:
             continue
@@ -447,15 +494,16 @@ def _fit(keys, table, w, levels, upright, own, moments, planes):
             if scatter > (SCATTER * _PARTS) ** 2 or gx * gx + gy * gy > 4.0:
                 continue
             a, b, c = -gx / length, -gy / length, 1.0 / length
-        planes[k, 0], planes[k, 1], planes[k, 2] = a, b, c
-        planes[k, 3] = a * x + b * y + c * z
+        at = green[k]
+        planes[at, 0], planes[at, 1], planes[at, 2] = a, b, c
+        planes[at, 3] = a * x + b * y + c * z
 
 
 @njit
-def _near_planes(voxel, kind, part, planes, near):
+def _near_planes(voxel, kind, part, green, planes, near):
     for p in range(len(voxel)):
         if kind[p] == _VEGETATION:
-            k = voxel[p]
+            k = green[voxel[p]]
             away = (
                 planes[k, 0] * part[p, 0]
                 + planes[k, 1] * part[p, 1]

@@ -103,7 +103,9 @@ ground.
         codes = consistent(
             points.take_xyz(),
             before,
-            **known,
+            height=known["height"],  # by name: unpacked, they would keep the coordinates alive
+            ground=known["ground"],
+            reliability=known["reliability"],
             mask=~ignored,
             change=change,
             rules=[rule for rule in RULES if self.options[rule]],
