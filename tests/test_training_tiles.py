@@ -78,8 +78,9 @@ def test_octrees_are_read_in_tiles_too(tmp_path, capsys):
         ("--writers.classifiermodel.dimensions=", "--writers.classifiermodel.passes=1"),
         ("--writers.classifiermodel.ignore=ReturnNumber[2:2]", "--filters.hag_morphological.window=20"),
         ("--classes", '{"2": 2, "6": 6}', "--base", "BASE"),
+        ("--neighborhoods", "copt,s1", "--feature-set", "covariance,D1", "--writers.classifiermodel.thin=2"),
     ],
-    ids=["groups", "surveys", "no heights", "ignore", "base"],
+    ids=["groups", "surveys", "no heights", "ignore", "base", "copt"],
 )
 def test_with_other_options_too(town, tmp_path, capsys, more):
     if "BASE" in more:
@@ -88,6 +89,15 @@ def test_with_other_options_too(town, tmp_path, capsys, more):
         more = (*more[:-1], str(base))
     (whole, tiles), _ = both(town, tmp_path, capsys, *more)
     assert whole == tiles
+
+
+def test_curvatures_that_the_memory_does_not_hold(town, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(
+        "pdal_stages.classifier.parts.CloudPart.holds_numbers", lambda self, count: count < 20_000
+    )
+    words = ["train", str(town), *WORDS, "--neighborhoods", "copt", "--tile", "23.5", "--workers", "0"]
+    assert main([*words, "--model", str(tmp_path / "m.model")]) == 1
+    assert "the threshold of copt" in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
 def test_surveys_that_do_not_see_each_other(town, tmp_path, capsys):
@@ -141,8 +151,6 @@ def test_what_is_wrong_is_said_and_no_model_is_written(town, tmp_path, capsys, w
     assert "nothing was trained" in (said := capsys.readouterr().err) and "t1.laz" in said
     assert main(["train", str(town), *words, "--writers.classifiermodel.dimensions=Nowhere"]) == 1
     assert "'Nowhere' is missing" in capsys.readouterr().err
-    assert main(["train", str(town), *words, "--neighborhoods", "copt"]) == 1
-    assert "copt" in capsys.readouterr().err
     left = {path.name for path in tmp_path.iterdir()}
     assert left == {"t0.laz", "t1.laz"}
 

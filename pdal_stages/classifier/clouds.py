@@ -81,6 +81,10 @@ class TrainingCloud:
         """Whether the memory suffices to see that."""
         return True
 
+    def holds_numbers(self, count: int) -> bool:
+        """Whether the memory suffices for numbers of so many points, a few of each."""
+        return True
+
     def part(self, rows: npt.NDArray[np.int64], copy: str = "") -> TrainingCloud:
         """Some of its points, as a cloud of the same survey."""
         return TrainingCloud(

@@ -220,6 +220,10 @@ class CloudPart(TrainingCloud):
         """Whether these are not too many points."""
         return self.parts.within(_around(self.xyz[rows], reach)) <= self.parts.most_points
 
+    def holds_numbers(self, count: int) -> bool:
+        """Whether these are not too many: a point that is seen takes ten times as much."""
+        return count <= 10 * self.parts.most_points
+
 
 class _Dimensions(Mapping[str, npt.ArrayLike]):
     """Dimensions of a part, read when they are asked for."""

@@ -48,22 +48,16 @@ def must_fit(columns: int, n: int) -> None:
 def fitted(
     clouds: Sequence[TrainingCloud], samples: Samples, plan: FeaturePlan, options: TrainingOptions
 ) -> tuple[ShapeBins | None, float | None]:
-    """Shape thresholds and the threshold of copt, fitted to the clouds that have samples; see :func:`fit_clouds`.
-
-    Of clouds in parts there are shape thresholds alone: copt needs every point's curvature at once.
-    """
+    """Shape thresholds and the threshold of copt, fitted to the clouds that have samples; see :func:`fit_clouds`."""
     if not (plan.shapes or plan.copt):
         return None, None
     used = {clouds[number].whole for number in np.unique(samples.cloud).tolist()}
     views = [cloud for cloud in clouds if cloud.whole in used]
     if len(views) == len(used):
         return fit_clouds([one.xyz for one in views], plan, seed=options.seed, threads=options.threads)
-    if plan.copt:
-        raise OptionError(
-            "the threshold of copt is fitted to the curvatures of all points at once [H17], and these do not fit in the "
-            "memory that was given",
-            cure="Give more memory, or choose other neighborhoods",
-        )
+    threshold = _threshold_of_parts(views, plan, options.threads) if plan.copt else None
+    if not plan.shapes:
+        return None, threshold
     each = [smallest_hashes(one.xyz, options.seed) for one in views]
     of_whole: dict[object, list[npt.NDArray[np.uint64]]] = {}
     for one, (hashes, _) in zip(views, each, strict=True):
@@ -77,7 +71,9 @@ def fitted(
         if plan.unbounded and not seen.whole:
             narrow, _ = Looks(plan).too_narrow(seen, options.threads)
         if not narrow.all():
-            engine = FeatureEngine(seen.xyz, plan, seed=options.seed, threads=options.threads)
+            engine = FeatureEngine(
+                seen.xyz, plan, copt_threshold=threshold, seed=options.seed, threads=options.threads
+            )
             for token, some in engine.shape_values(seen.rows[~narrow]).items():
                 values.setdefault(token, []).append(some)
         return bool(narrow.any())  # which come again
@@ -86,7 +82,26 @@ def fitted(
         rows = np.sort(rows[hashes <= last])
         if len(rows):
             work_on(one, rows, Looks(plan), compute, options.threads)
-    return ShapeBins.fit({token: np.concatenate(parts) for token, parts in values.items()}), None
+    return ShapeBins.fit({token: np.concatenate(parts) for token, parts in values.items()}), threshold
+
+
+def _threshold_of_parts(parts: Sequence[TrainingCloud], plan: FeaturePlan, threads: int | None) -> float:
+    """The threshold of copt, of the curvatures of all points of clouds in parts, which are held at once."""
+    from ..features.ropt import curvature_threshold  # numba is loaded here, not when the package is
+
+    count = sum(map(len, parts))
+    if not all(one.holds_numbers(count) for one in parts):
+        raise OptionError(
+            "the threshold of copt is fitted to the curvatures of all points at once [H17], and these do not fit in the "
+            "memory that was given",
+            found=f"{count:,} points",
+            cure="Give more memory, or choose other neighborhoods",
+        )
+    each = []
+    for one in parts:
+        seen = one.seen(np.arange(len(one)), plan.halo_m)
+        each.append(FeatureEngine(seen.xyz, plan, threads=threads).curvatures(seen.rows))
+    return curvature_threshold(np.concatenate(each))
 
 
 def sample_features(

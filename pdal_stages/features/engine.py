@@ -125,11 +125,19 @@ class FeatureEngine:
                 self.bins = ShapeBins.fit(self.shape_values(smallest_hashes(self._cloud, self.seed)[1]))
         return self
 
-    def curvatures(self) -> np.ndarray:
-        """The curvature of every point, in the order of the index, (n,) float64 [H17 eq. 1]; for plans with copt."""
+    def curvatures(self, rows: np.ndarray | None = None) -> np.ndarray:
+        """The curvature of every point, in the order of the index, (n,) float64 [H17 eq. 1]; for plans with copt.
+
+        Of `rows` of the cloud alone in their order, where they are given.
+        """
         _, adaptive = self._prepared()
         assert adaptive is not None
-        return adaptive.curvatures(self.threads)
+        found = adaptive.curvatures(self.threads)
+        if rows is None:
+            return found
+        out = np.empty(len(found))
+        out[self._grid.order] = found
+        return out[rows]
 
     def shape_values(self, rows: np.ndarray) -> dict[str, np.ndarray]:
         """Neighborhood token -> metrics of all pulls round some points of the cloud, (m, 5, 255) float32, comparable."""
