@@ -74,21 +74,17 @@ def first_land(z, start, h, w, kind, number, sums, box, part, sector, land, seen
         for i in range(box[2], box[3] + 1):
             for n in range(start[j * w + i], start[j * w + i + 1]):
                 if number[n] == part and sector[sector_of(j, i, sums)]:
-                    length = step_on(z, start, h, w, kind, number, -1, j, i, n, land, seen, stamp, length)
+                    length = step_on(z, start, h, w, kind, number, j, i, n, land, seen, stamp, length)
     return length
 
 
 @device
-def step_on(z, start, h, w, kind, number, only, j, i, n, land, seen, stamp, length):
-    """Add the land that one can walk on to: of no part, or, where `only` is none, of all but this one."""
+def step_on(z, start, h, w, kind, number, j, i, n, land, seen, stamp, length):
+    """Add the land that one can walk on to, which is of no part."""
     for b in range(max(j - LINK, 0), min(j + LINK + 1, h)):
         for a in range(max(i - LINK, 0), min(i + LINK + 1, w)):
             for m in range(start[b * w + a], start[b * w + a + 1]):
-                if (
-                    kind[m] != SOLID
-                    or seen[m] == stamp
-                    or (number[m] >= 0 and (only < 0 or number[m] == only))
-                ):
+                if kind[m] != SOLID or seen[m] == stamp or number[m] >= 0:
                     continue
                 if walkable(z[m] - z[n], distance(a - i, b - j)):
                     seen[m] = stamp
@@ -98,7 +94,7 @@ def step_on(z, start, h, w, kind, number, only, j, i, n, land, seen, stamp, leng
 
 
 @njit
-def spread(z, start, h, w, kind, end, number, part, land, seen, stamp, length, ends):
+def spread(z, start, h, w, kind, end, number, land, seen, stamp, length, ends):
     """Add all one walks on to from there, up to AWAY cells, and count how its ways end, and at drops by direction.
 
     Returns how many cells that are.
@@ -116,7 +112,7 @@ def spread(z, start, h, w, kind, end, number, part, land, seen, stamp, length, e
         for d in range(DIRECTIONS):
             ends[end[n, d]] += 1
             ends[ENDS + d] += end[n, d] == DOWN or end[n, d] == ACROSS
-        length = step_on(z, start, h, w, kind, number, part, j, i, n, land, seen, stamp, length)
+        length = step_on(z, start, h, w, kind, number, j, i, n, land, seen, stamp, length)
     return length
 
 

@@ -408,33 +408,44 @@ def whole_decks(raster, number, sums, box) -> NDArray[np.bool_]:
     """Levels (n,) of the parts that are decks, but for those that are too long to be judged as a whole."""
     z, start, h, w, kind, end = raster
     outward, cut, drops, ends = rims(z, start, h, w, kind, end, number, sums)
+    opposite = {}
+    for k in np.flatnonzero((sums[:, 0] >= SMALLEST) & (_extent(box) <= LONGEST / CELL)):
+        found = _ends(int(sums[k, 0]), outward[k], cut[k], drops[k], ends[k])
+        if found:
+            opposite[int(k)] = found
+    # The deck beside one, as of a motorway, is no land that it leads on to.
+    likely = np.zeros(len(sums) + 1, bool)
+    likely[list(opposite)] = True
+    other = np.where(likely[number], number, -1)
     land, seen = np.empty((len(z), 3), np.int32), np.full(len(z), -1, np.int32)
     good = np.zeros(len(sums) + 1, bool)
     stamp = 0
-    for k in np.flatnonzero((sums[:, 0] >= SMALLEST) & (_extent(box) <= LONGEST / CELL)):
-        down = ends[k, DOWN] + ends[k, ACROSS]
-        most = OUTWARD_ACROSS if ends[k, ACROSS] > ends[k, DOWN] else OUTWARD
-        if outward[k].sum() > most * drops[k].sum() or ends[k, WALLED] > WALLS * down:
-            continue
-        opposite = _opposite(outward[k], outward[k])
-        whole = opposite is not None and ends[k, NOTHING] <= RIM * down
-        if not whole:
-            if sums[k, 0] < CUT or outward[k].sum() * CUT_RIM > drops[k].sum():
-                continue
-            opposite = _opposite(outward[k], cut[k])
-            if opposite is None:
-                continue
-        assert opposite is not None
-        if not _is_free(opposite[0], outward[k], drops[k]):
-            continue
+    for k, found in opposite.items():
         good[k] = True
-        for sectors in opposite if whole else opposite[:1]:
+        for sectors in found:
             over = no_ends()
             cells = first_land(z, start, h, w, kind, number, sums[k], box[k], k, sectors, land, seen, stamp)
-            cells = spread(z, start, h, w, kind, end, number, k, land, seen, stamp, cells, over)
+            cells = spread(z, start, h, w, kind, end, other, land, seen, stamp, cells, over)
             stamp += 1
             good[k] &= is_land(cells, over)
     return good[number]
+
+
+def _ends(size: int, outward, cut, drops, ends) -> list[NDArray[np.bool_]]:
+    """Sectors of the ends at which a part must lead on to land, by what is at its rim; none where it is no deck."""
+    down = ends[DOWN] + ends[ACROSS]
+    most = OUTWARD_ACROSS if ends[ACROSS] > ends[DOWN] else OUTWARD
+    if outward.sum() > most * drops.sum() or ends[WALLED] > WALLS * down:
+        return []
+    opposite = _opposite(outward, outward)
+    whole = opposite is not None and ends[NOTHING] <= RIM * down
+    if not whole:
+        if size < CUT or outward.sum() * CUT_RIM > drops.sum():
+            return []
+        opposite = _opposite(outward, cut)
+    if opposite is None or not _is_free(opposite[0], outward, drops):
+        return []
+    return list(opposite if whole else opposite[:1])
 
 
 def _is_free(end: NDArray[np.bool_], outward: NDArray[np.int64], drops: NDArray[np.int64]) -> bool:

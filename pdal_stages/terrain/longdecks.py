@@ -41,7 +41,7 @@ def stretches(z, start, h, w, kind, end, long, left, bottom) -> NDArray[np.bool_
         own = leads & (block[:, 0] == b) & (block[:, 1] == a)
         low = max((b + low_b) * BLOCK - bottom, 0), max((a + low_a) * BLOCK - left, 0)
         cells = _land_of_block(z, start, h, w, kind, number, own, *low, land, seen, stamp)
-        cells = spread(z, start, h, w, kind, end, number, 0, land, seen, stamp, cells, over)
+        cells = spread(z, start, h, w, kind, end, number, land, seen, stamp, cells, over)
         ends_here[b, a] = is_land(cells, over)
     good &= (_around(ends_here[..., None], FAR_ENDS)[..., 0] > 0) | _passed(sums[..., 2] + sums[..., 5] > 0)
     return long & good[block[:, 0], block[:, 1]]
@@ -103,5 +103,5 @@ def _land_of_block(z, start, h, w, kind, number, own, low_j, low_i, land, seen, 
         for i in range(low_i, min(low_i + BLOCK, w)):
             for n in range(start[j * w + i], start[j * w + i + 1]):
                 if own[n]:
-                    length = step_on(z, start, h, w, kind, number, -1, j, i, n, land, seen, stamp, length)
+                    length = step_on(z, start, h, w, kind, number, j, i, n, land, seen, stamp, length)
     return length
