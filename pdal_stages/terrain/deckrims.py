@@ -6,12 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from .walkable import ACROSS, DOWN, NOTHING, RIGHT, SOLID, UP, distance, walkable
+from .walkable import ACROSS, DOWN, NOTHING, ON, RIGHT, SOLID, UP, WALLED, distance, walkable
 
 #: Cells across which one walks on from a deck, and across which its parts belong together.
 LINK, JOIN = 2, 4
 #: The smallest deck and the smallest land at its ends, in cells, and how far land is looked for.
 SMALLEST, LAND, AWAY = 20, 100, 40
+#: Patches that decks alone lead on to are holes in these, not land, if they have fewer cells and lie in so many rows and
+#: columns; a part goes on behind what ends a way so many cells on.
+ISLET, WITHIN, BEHIND = 32, 10, 16
 #: For each cell of a deck's rim at a drop, at most so many that lead on, and across water, where bridges are short; for each
 #: way that ends at a drop, so many that end at something else, and so many at nothing.
 OUTWARD, OUTWARD_ACROSS, WALLS, RIM = 0.7, 1.75, 0.7, 0.3
@@ -43,9 +46,24 @@ def leads_on(z, start, h, w, kind, number, j, i, n):
     return False
 
 
+@device
+def goes_on(start, h, w, number, j, i, n, d):
+    """Whether a part goes on behind what ends a way in a direction: a car, a lamp, a hole."""
+    for s in range(1, BEHIND + 1):
+        b, a = j + s * UP[d], i + s * RIGHT[d]
+        if b < 0 or a < 0 or b >= h or a >= w:
+            return False
+        for m in range(start[b * w + a], start[b * w + a + 1]):
+            if number[m] == number[n]:
+                return True
+    return False
+
+
 @njit
 def rims(z, start, h, w, kind, end, number, sums):
-    """Of each part, by sector: cells that lead on, ways that end at nothing, cells at a drop; and how its ways end."""
+    """Of each part, by sector: cells that lead on, ways that end at nothing, cells at a drop; and how its ways end, but for
+    what only stands on it.
+    """
     outward, cut = np.zeros((len(sums), SECTORS), np.int64), np.zeros((len(sums), SECTORS), np.int64)
     drops, ends = np.zeros((len(sums), SECTORS), np.int64), np.zeros((len(sums), ENDS), np.int64)
     for j in range(h):
@@ -56,7 +74,8 @@ def rims(z, start, h, w, kind, end, number, sums):
                     continue
                 drop = False
                 for d in range(DIRECTIONS):
-                    ends[k, end[n, d]] += 1
+                    on = end[n, d] == WALLED and goes_on(start, h, w, number, j, i, n, d)
+                    ends[k, ON if on else end[n, d]] += 1
                     drop |= end[n, d] == DOWN or end[n, d] == ACROSS
                     if end[n, d] == NOTHING:
                         cut[k, sector_of(j, i, sums[k])] += 1
@@ -64,6 +83,47 @@ def rims(z, start, h, w, kind, end, number, sums):
                 if leads_on(z, start, h, w, kind, number, j, i, n):
                     outward[k, sector_of(j, i, sums[k])] += 1
     return outward, cut, drops, ends
+
+
+@njit
+def islets(z, start, h, w, kind, deck):
+    """Levels (n,) of small patches that one reaches from decks alone: no land, but holes in these."""
+    out, seen = np.zeros(len(z), np.bool_), np.full(len(z), -1, np.int32)
+    number, land = np.zeros(len(z), np.int8), np.empty((len(z), 3), np.int32)
+    known = np.zeros(len(z), np.bool_)
+    for n in range(len(z)):
+        number[n] = 0 if deck[n] else -1
+    for j in range(h):
+        for i in range(w):
+            for n in range(start[j * w + i], start[j * w + i + 1]):
+                if not deck[n]:
+                    continue
+                for b in range(max(j - LINK, 0), min(j + LINK + 1, h)):
+                    for a in range(max(i - LINK, 0), min(i + LINK + 1, w)):
+                        for m in range(start[b * w + a], start[b * w + a + 1]):
+                            if deck[m] or known[m] or kind[m] != SOLID:
+                                continue
+                            if not walkable(z[m] - z[n], distance(a - i, b - j)):
+                                continue
+                            land[0, 0], land[0, 1], land[0, 2] = m, b, a
+                            seen[m] = m
+                            length, at, large = 1, 0, False
+                            low_j, high_j, low_i, high_i = b, b, a, a
+                            while at < length and not large:
+                                q, row, column = land[at, 0], land[at, 1], land[at, 2]
+                                low_j, high_j = min(low_j, row), max(high_j, row)
+                                low_i, high_i = min(low_i, column), max(high_i, column)
+                                # An islet would have been seen whole.
+                                large = known[q] or max(high_j - low_j, high_i - low_i) >= WITHIN
+                                length = step_on(
+                                    z, start, h, w, kind, number, row, column, q, land, seen, m, length
+                                )
+                                large |= length >= ISLET
+                                at += 1
+                            for q in range(length):
+                                known[land[q, 0]] = True
+                                out[land[q, 0]] = not large
+    return out
 
 
 @njit
@@ -132,3 +192,18 @@ def is_land(cells: int, ends: NDArray[np.int64]) -> bool:
     length = np.hypot(RIGHT, UP)
     side = np.hypot(np.sum(ends[ENDS:] * RIGHT / length), np.sum(ends[ENDS:] * UP / length))
     return bool(cells >= QUAY and any_down <= QUAY_DROPS and side >= ONE_SIDED * ends[ENDS:].sum())
+
+
+#: The sectors of an end in each direction, and those that lie opposite them.
+_ENDS = np.array([[(a - b + NEAR) % SECTORS <= 2 * NEAR for a in range(SECTORS)] for b in range(SECTORS)])
+_OPPOSITE = np.roll(_ENDS, SECTORS // 2, axis=1)
+
+
+def opposite_ends(
+    one: NDArray[np.int64], other: NDArray[np.int64]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:
+    """The sectors of two ends that lie opposite each other and hold the most: of one kind, and of the other."""
+    both = np.minimum(_ENDS @ one, _OPPOSITE @ other)
+    middle = one + np.roll(other, SECTORS // 2)
+    best = np.lexsort((-np.arange(SECTORS), middle, both))[-1]  # of equal ones the first
+    return (_ENDS[best], _OPPOSITE[best]) if both[best] > 0 else None

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from ..base.unionfind import root as root_of
+from .deckparts import LONGEST, extent, parts
 from .deckrims import (
     AWAY,
     JOIN,
@@ -32,13 +32,16 @@ from .deckrims import (
     SECTORS,
     SMALLEST,
     WALLS,
+    WITHIN,
     first_land,
     is_land,
+    islets,
     no_ends,
+    opposite_ends,
     rims,
-    sector_of,
     spread,
 )  # fmt: skip
+from .deckroofs import NEXT, ROOF, without_roofs
 from .levels import levels
 from .longdecks import BLOCK, FAR_ENDS, stretches
 from .minima import cell_numbers
@@ -48,7 +51,6 @@ from .walkable import (
     AHEAD,
     DIAGONAL,
     DOWN,
-    DROP,
     FAR,
     NOTHING,
     ROUGH,
@@ -64,26 +66,36 @@ from .walkable import (
 
 #: Side of the cells, meters: what is said of cells below is said of meters.
 CELL = 1.0
-#: The widest deck, and the longest that is judged as a whole.
-WIDEST, LONGEST = 60, 250
+#: The widest deck.
+WIDEST = 60
 #: Of 5 x 5 cells, so many are of something broad.
 BROAD = 18
 #: How often what is walked on between deck cells becomes deck as well.
 _FILLS = 2
 #: A deck that the rim of the cloud cuts is so large and has for each cell that leads on so many at a drop.
 CUT, CUT_RIM = 60, 3
-#: Parts of a deck more than so many cells apart stand apart; the longest that is a roof, in meters, and how much of what
-#: lies beside it must lie in one direction.
-APART, ROOF, ONE_SIDE = 2, 100, 0.3
 #: How far from the deck's surface its points lie, meters: on it; parapets and cars above; its flank below.
 ON_DECK, PARAPET, FLANK = 0.4, 1.6, 2.0
 #: Rise over run of banks, whose points are no flank of the deck above.
 BANK = 0.7
 #: Cells beyond those that were found, to the deck's edge and under its cars.
 BESIDE = 2
+#: More than NEXT squared cells away only among cells of a deck, whose mean is at most so many cells away.
+AMONG = 1.5
 #: How far away points matter, in meters: cells of a deck, its rim, and land at its ends, which all look around.
 REACH = (
-    BLOCK * (FAR_ENDS + 1) + LINK + AWAY + AHEAD + FAR + 8 + WIDEST + 2 * _FILLS + 2 * BESIDE + ROOF + JOIN
+    BLOCK * (FAR_ENDS + 1)
+    + LINK
+    + AWAY
+    + AHEAD
+    + FAR
+    + 8
+    + WIDEST
+    + 2 * _FILLS
+    + 2 * BESIDE
+    + ROOF
+    + JOIN
+    + WITHIN
 ) * CELL
 #: What points are: of a deck's surface, of its parapets and flanks, or of none.
 SURFACE, PARTS = 1, 2
@@ -217,53 +229,19 @@ def _deck_levels(z, use, column, row):
     return (left, bottom, h, w, heights, lowest, start, kind, found) if found.any() else None
 
 
-@njit
-def _contacts(z, start, h, w, kind, deck, number, sums):
-    """Of each part: cells that lead on to what is no deck (n,); by sector, cells near another part (n, SECTORS)."""
-    land, other = np.zeros(len(sums), np.int64), np.zeros((len(sums), SECTORS), np.int64)
-    for j in range(h):
-        for i in range(w):
-            for n in range(start[j * w + i], start[j * w + i + 1]):
-                k = number[n]
-                if k < 0:
-                    continue
-                leads = beside = False
-                for b in range(max(j - JOIN, 0), min(j + JOIN + 1, h)):
-                    for a in range(max(i - JOIN, 0), min(i + JOIN + 1, w)):
-                        near = max(abs(b - j), abs(a - i)) <= LINK
-                        for m in range(start[b * w + a], start[b * w + a + 1]):
-                            if kind[m] == SOLID and walkable(z[m] - z[n], distance(a - i, b - j)):
-                                leads |= near and not deck[m]
-                                beside |= deck[m] and number[m] != k
-                land[k] += leads
-                if beside:
-                    other[k, sector_of(j, i, sums[k])] += 1
-    return land, other
-
-
-def without_roofs(raster, deck) -> NDArray[np.bool_]:
-    """The decks but for what stands apart at their side and leads on to nothing: flat roofs as high as they are."""
-    z, start, h, w, kind, _ = raster
-    number, sums, box = parts(z, start, h, w, deck, np.zeros(len(deck), bool), APART)
-    land, other = _contacts(z, start, h, w, kind, deck, number, sums)
-    turn = 2 * np.pi * (np.arange(SECTORS) + 0.5) / SECTORS
-    one_sided = np.hypot(other @ np.cos(turn), other @ np.sin(turn)) > ONE_SIDE * other.sum(axis=1)
-    roof = (land == 0) & one_sided & (sums[:, 0] >= SMALLEST) & (_extent(box) <= ROOF / CELL)
-    return deck & ~np.append(roof, False)[number]
-
-
 def _judged(raster, deck, left, bottom, least=0) -> NDArray[np.bool_]:
     """Levels (n,) of decks, of those that may be of one; the decks longer than `least` cells."""
     heights, start, h, w, kind, end = raster
     for _ in range(_FILLS):
         deck = filled(heights, start, h, w, kind, deck)
+    deck = deck | islets(heights, start, h, w, kind, deck)
     number, sums, box = parts(heights, start, h, w, deck, np.zeros(len(deck), bool))
-    long = np.append(_extent(box) > LONGEST / CELL, False)[number]
-    found = whole_decks(raster, number, sums, box) & np.append(_extent(box) > least, False)[number]
+    long = np.append(extent(box) > LONGEST, False)[number]
+    found = whole_decks(raster, number, sums, box) & np.append(extent(box) > least, False)[number]
     if long.any():  # wires may join roofs to something long
         number, sums, box = parts(heights, start, h, w, long, broad(heights, start, h, w, long))
         found |= whole_decks(raster, number, sums, box)
-        long = np.append(_extent(box) > LONGEST / CELL, False)[number]
+        long = np.append(extent(box) > LONGEST, False)[number]
         found |= stretches(heights, start, h, w, kind, end, long, left, bottom)
     return without_roofs(raster, found) if found.any() else found
 
@@ -343,73 +321,12 @@ def broad(z, start, h, w, deck):
     return out
 
 
-@device
-def _chasm(z, start, w, j, i, a, b, level):
-    """Whether on the way to a cell some cells on there is one with nothing but what lies much lower, as between a deck and a
-    roof beside it.
-    """
-    steps = max(abs(a), b)
-    for s in range(1, steps):
-        k = (j + (2 * b * s + steps) // (2 * steps)) * w + i + (2 * a * s + steps) // (2 * steps)
-        if start[k] < start[k + 1] and z[start[k + 1] - 1] < level - DROP:
-            return True
-    return False
-
-
-@njit
-def parts(z, start, h, w, deck, wide, join=JOIN):
-    """Number the parts that hang together (n,), -1 elsewhere; their size and sums of rows and columns; their boxes.
-
-    What is broad hangs together with nothing else; nothing does across more than `join` cells.
-    """
-    parent = np.arange(len(z))
-    for j in range(h):
-        for i in range(w):
-            for n in range(start[j * w + i], start[j * w + i + 1]):
-                if not deck[n]:
-                    continue
-                for b in range(join + 1):
-                    for a in range(-join if b else 1, join + 1):
-                        if j + b >= h or i + a < 0 or i + a >= w:
-                            continue
-                        k = (j + b) * w + i + a
-                        for m in range(start[k], start[k + 1]):
-                            if not deck[m] or wide[m] != wide[n] or not walkable(z[m] - z[n], distance(a, b)):
-                                continue
-                            if not _chasm(z, start, w, j, i, a, b, min(z[m], z[n])):
-                                one, other = root_of(parent, n), root_of(parent, m)
-                                parent[max(one, other)] = min(one, other)
-    number = np.full(len(z), -1, np.int64)
-    count = 0
-    for n in range(len(z)):
-        if deck[n]:
-            root = root_of(parent, n)
-            if root == n:
-                number[n] = count
-                count += 1
-            else:
-                number[n] = number[root]
-    sums, box = np.zeros((count, 3), np.int64), np.zeros((count, 4), np.int64)
-    box[:, 0], box[:, 2] = h, w
-    for j in range(h):
-        for i in range(w):
-            for n in range(start[j * w + i], start[j * w + i + 1]):
-                k = number[n]
-                if k >= 0:
-                    sums[k, 0] += 1
-                    sums[k, 1] += j
-                    sums[k, 2] += i
-                    box[k, 0], box[k, 1] = min(box[k, 0], j), max(box[k, 1], j)
-                    box[k, 2], box[k, 3] = min(box[k, 2], i), max(box[k, 3], i)
-    return number, sums, box
-
-
 def whole_decks(raster, number, sums, box) -> NDArray[np.bool_]:
     """Levels (n,) of the parts that are decks, but for those that are too long to be judged as a whole."""
     z, start, h, w, kind, end = raster
     outward, cut, drops, ends = rims(z, start, h, w, kind, end, number, sums)
     opposite = {}
-    for k in np.flatnonzero((sums[:, 0] >= SMALLEST) & (_extent(box) <= LONGEST / CELL)):
+    for k in np.flatnonzero((sums[:, 0] >= SMALLEST) & (extent(box) <= LONGEST)):
         found = _ends(int(sums[k, 0]), outward[k], cut[k], drops[k], ends[k])
         if found:
             opposite[int(k)] = found
@@ -420,14 +337,16 @@ def whole_decks(raster, number, sums, box) -> NDArray[np.bool_]:
     land, seen = np.empty((len(z), 3), np.int32), np.full(len(z), -1, np.int32)
     good = np.zeros(len(sums) + 1, bool)
     stamp = 0
-    for k, found in opposite.items():
-        good[k] = True
+    for part, found in opposite.items():
+        good[part] = True
         for sectors in found:
             over = no_ends()
-            cells = first_land(z, start, h, w, kind, number, sums[k], box[k], k, sectors, land, seen, stamp)
+            cells = first_land(
+                z, start, h, w, kind, number, sums[part], box[part], part, sectors, land, seen, stamp
+            )
             cells = spread(z, start, h, w, kind, end, other, land, seen, stamp, cells, over)
             stamp += 1
-            good[k] &= is_land(cells, over)
+            good[part] &= is_land(cells, over)
     return good[number]
 
 
@@ -437,12 +356,12 @@ def _ends(size: int, outward, cut, drops, ends) -> list[NDArray[np.bool_]]:
     most = OUTWARD_ACROSS if ends[ACROSS] > ends[DOWN] else OUTWARD
     if outward.sum() > most * drops.sum() or ends[WALLED] > WALLS * down:
         return []
-    opposite = _opposite(outward, outward)
+    opposite = opposite_ends(outward, outward)
     whole = opposite is not None and ends[NOTHING] <= RIM * down
     if not whole:
         if size < CUT or outward.sum() * CUT_RIM > drops.sum():
             return []
-        opposite = _opposite(outward, cut)
+        opposite = opposite_ends(outward, cut)
     if opposite is None or not _is_free(opposite[0], outward, drops):
         return []
     return list(opposite if whole else opposite[:1])
@@ -458,33 +377,16 @@ def _is_free(end: NDArray[np.bool_], outward: NDArray[np.int64], drops: NDArray[
     return True
 
 
-def _extent(box: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.maximum(box[:, 1] - box[:, 0], box[:, 3] - box[:, 2]) + 1
-
-
-#: The sectors of an end in each direction, and those that lie opposite them.
-_ENDS = np.array([[(a - b + NEAR) % SECTORS <= 2 * NEAR for a in range(SECTORS)] for b in range(SECTORS)])
-_OPPOSITE = np.roll(_ENDS, SECTORS // 2, axis=1)
-
-
-def _opposite(
-    one: NDArray[np.int64], other: NDArray[np.int64]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:
-    """The sectors of two ends that lie opposite each other and hold the most: of one kind, and of the other."""
-    both = np.minimum(_ENDS @ one, _OPPOSITE @ other)
-    middle = one + np.roll(other, SECTORS // 2)
-    best = np.lexsort((-np.arange(SECTORS), middle, both))[-1]  # of equal ones the first
-    return (_ENDS[best], _OPPOSITE[best]) if both[best] > 0 else None
-
-
 @njit
 def _mark(z, use, column, row, left, bottom, h, w, heights, start, kind, deck, out):
-    """Say of points whether they are on a deck, up to BESIDE cells from those that were found, or of its parts."""
+    """Say of points whether they are on a deck, or of its parts: in cells next to those that were found, and BESIDE cells
+    away among them, as around cars.
+    """
     for p in range(len(z)):
         if not use[p]:
             continue
         j, i = row[p] - bottom, column[p] - left
-        weights = 0
+        count = across = along = 0
         nearest = (BESIDE + 1) ** 2 * 2
         level = 0.0
         for b in range(max(j - BESIDE, 0), min(j + BESIDE + 1, h)):
@@ -492,10 +394,14 @@ def _mark(z, use, column, row, left, bottom, h, w, heights, start, kind, deck, o
                 squared = (a - i) ** 2 + (b - j) ** 2
                 for m in range(start[b * w + a], start[b * w + a + 1]):
                     if deck[m] and -FLANK - 1.0 <= z[p] - heights[m] <= PARAPET + 1.0:
-                        weights += 1
+                        count += 1
+                        across += a - i
+                        along += b - j
                         if squared < nearest or (squared == nearest and heights[m] > level):
                             nearest, level = squared, heights[m]
-        if weights == 0 or not -FLANK <= z[p] - level <= PARAPET:
+        if count == 0 or not -FLANK <= z[p] - level <= PARAPET:
+            continue
+        if nearest > NEXT and across * across + along * along > (AMONG * count) ** 2:
             continue
         if not _on_land(z[p], j, i, h, w, heights, start, kind, deck, nearest, level):
             out[p] = SURFACE if abs(z[p] - level) <= ON_DECK else PARTS

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import njit
-from .deckrims import OUTWARD, WALLS, is_land, leads_on, no_ends, spread, step_on
+from .deckrims import OUTWARD, WALLS, goes_on, is_land, leads_on, no_ends, spread, step_on
 from .walkable import ACROSS, DOWN, NOTHING, WALLED
 
 #: Blocks in which long decks are judged, cells, and how many blocks away land must be seen at an end.
@@ -84,7 +84,7 @@ def _count_blocks(z, start, h, w, kind, end, number, left, bottom, low_a, low_b,
                     if end[n, d] == DOWN or end[n, d] == ACROSS:
                         own[0] += 1
                         drop = True
-                    elif end[n, d] == WALLED:
+                    elif end[n, d] == WALLED and not goes_on(start, h, w, number, j, i, n, d):
                         own[1] += 1
                     elif end[n, d] == NOTHING:
                         own[4] += 1
