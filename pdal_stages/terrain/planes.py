@@ -40,20 +40,6 @@ def blend(planes, i, j, s, t, size):
     rounding does not depend on where the array begins.
     """
     height, across, along, total = 0.0, 0.0, 0.0, 0.0
-    if 0 <= j < planes.shape[0] - 1 and 0 <= i < planes.shape[1] - 1:
-        first, second = planes[j], planes[j + 1]
-        if not np.isnan(first[i, 0] + first[i + 1, 0] + second[i, 0] + second[i + 1, 0]):
-            # All are known, and none that weighs nothing changes a sum.
-            for b in range(2):
-                row = second if b else first
-                for a in range(2):
-                    weight = (s if a else 1.0 - s) * (t if b else 1.0 - t)
-                    p1, p2 = row[i + a, 1], row[i + a, 2]
-                    height += weight * (row[i + a, 0] + size * (p1 * (s - a) + p2 * (t - b)))
-                    across += weight * p1
-                    along += weight * p2
-                    total += weight
-            return height / total, across / total, along / total
     for b in range(2):
         wv = t if b else 1.0 - t
         if j + b < 0 or j + b >= planes.shape[0] or wv == 0.0:
