@@ -21,12 +21,15 @@ import numpy as np
 
 from ..base.jit import device
 from ..base.lending import lent
-from .abreast import CODES, MOST, make_networks, sort_abreast
+from .abreast import CODES, make_networks, sort_abreast
 from .kdtree import STACK, bounding_box, farthest2, gather, halve
 from .lanes import LANES
 
 #: Queries that share one set of candidates.
 GROUP = LANES
+
+#: The most neighbors that are looked for abreast: of more, too many candidates lie within reach for a network.
+ABREAST = 72
 
 #: Bins of squared distance; the first half of them lies within the reach.
 BINS = 256
@@ -249,6 +252,10 @@ def _write_row(qx, qy, qz, r, found, scratch, rows):
         p = scratch.pos[i]
         rows.d2[i, r] = scratch.d[i]
         rows.at[i, r] = scratch.ci[p]
+    if len(rows.x) == 0:
+        return
+    for i in range(found):
+        p = scratch.pos[i]
         rows.x[i, r] = scratch.cx[p] - qx
         rows.y[i, r] = scratch.cy[p] - qy
         rows.z[i, r] = scratch.cz[p] - qz
@@ -323,11 +330,13 @@ def make_scratch(room):
 
 
 @device
-def make_rows(need):
+def make_rows(need, offsets=True):
+    """Rows for `need` neighbors; without `offsets` (and heights) where nobody reads them and no network needs them."""
     low, high, starts = make_networks(need)
+    room = need if offsets or need <= ABREAST else 0
     return Rows(
         np.zeros(GROUP, np.int64), np.empty((need, GROUP)), np.empty((need, GROUP), np.uint32),
-        np.empty((need, GROUP)), np.empty((need, GROUP)), np.empty((need, GROUP)), np.empty((need, GROUP)),
+        np.empty((room, GROUP)), np.empty((room, GROUP)), np.empty((room, GROUP)), np.empty((room, GROUP)),
         np.empty((CODES + 1) * GROUP), np.empty(CODES, np.int64), np.zeros((3, GROUP)), np.zeros(GROUP, np.int64),
         np.zeros(GROUP, np.bool_), np.zeros(GROUP, np.bool_), low, high, starts,
     )  # fmt: skip
@@ -419,7 +428,7 @@ def _search_group(tree, search, lo, hi, need, cap2, reach2, scratch, rows):
             reach2 = math.sqrt(low * high) if high < np.inf else 4.0 * max(reach2, TINY)
             continue
         more2 = 0.0
-        if pending == count and count > 1 and c <= CODES and need == len(rows.d2) <= MOST:
+        if pending == count and count > 1 and c <= CODES and need == len(rows.d2) <= ABREAST:
             sort_abreast(order, lo, count, search.qx, search.qy, search.qz, need, reach2, scratch, c, rows)
             for r in range(count):
                 pending -= 1 if rows.found[r] >= 0 else 0

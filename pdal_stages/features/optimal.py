@@ -309,7 +309,7 @@ def kopt_into(tree, qx, qy, qz, target, k_min, k_max, cap2, table, radius, reach
     need = k_max + 1
     search = start_search(qx[target], qy[target], qz[target])
     scratch = make_scratch(CROWD * need + ROOM)
-    rows = make_rows(need)
+    rows = make_rows(need, False)
     members = make_members(need)
     s = make_sums(need)
     while True:
@@ -323,7 +323,10 @@ def kopt_into(tree, qx, qy, qz, target, k_min, k_max, cap2, table, radius, reach
             if found == 0:  # a query that is no point of the cloud, farther than the bound from all
                 write_nothing(table, radius, shapes, q)
                 continue
-            take_row(rows, row, found, members)
+            if len(rows.x):
+                take_row(rows, row, found, members)
+            else:
+                take_members(tree, rows.at[:, row], found, qx[q], qy[q], qz[q], members)
             running_sums(members.x, members.y, members.z, found, s)
             best = lowest_entropy(s, min(k_min, found - 1), found, LEAST)
             write_moments(s, best, members, best + 1, table, q)
