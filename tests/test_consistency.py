@@ -279,7 +279,7 @@ def arrays_of(seed=8, **size):
 
 def test_the_stage_counts_by_rule_and_says_what_it_lacks():
     arrays, truth = arrays_of()
-    stage = Consistency({"lone": False})
+    stage = Consistency({"lone": False, "doubtful": True})
     points = stage.points(arrays)
     codes = stage.run(points)["Classification"]
     assert (
@@ -291,10 +291,17 @@ def test_the_stage_counts_by_rule_and_says_what_it_lacks():
     assert points.report.figures["changed"] == (codes != arrays["Classification"]).sum()
     assert points.report.figures["classes"] == {str(c): int((codes == c).sum()) for c in (2, 5, 6)}
     assert (codes != truth).sum() < (arrays["Classification"] != truth).sum()
-    bare = Consistency({}).points({k: v for k, v in arrays.items() if k in ("X", "Y", "Z", "Classification")})
-    Consistency({}).run(bare)
+    bare = Consistency({"doubtful": True}).points({k: v for k, v in arrays.items() if k in ("X", "Y", "Z", "Classification")})
+    Consistency({"doubtful": True}).run(bare)
     assert bare.report.figures["ground"] == 0 and "no HeightAboveGround" in bare.report.warnings[0]
     assert bare.report.figures["doubtful"] == 0 and "no Reliability" in bare.report.warnings[1]
+
+
+def test_doubtful_is_off_unless_asked_for():
+    arrays, _ = arrays_of()
+    points = Consistency({}).points(arrays)
+    Consistency({}).run(points)
+    assert "doubtful" not in points.report.figures and points.report.figures["ground"] > 100
 
 
 def test_overlap_noise_and_where_keep_their_class():

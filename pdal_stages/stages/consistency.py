@@ -26,9 +26,9 @@ class Consistency(Stage):
     )
     doubtful: bool = option(
         "boolean",
-        True,
+        False,
         "A detached piece of building of 3 m² to 8 x 8 m whose mean Reliability is below 0.62 is vegetation, as clipped "
-        "hedges and dense bushes are",
+        "hedges and dense bushes are; sheds of which the model is unsure become so too",
     )
     islands: bool = option(
         "boolean",
