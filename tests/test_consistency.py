@@ -291,7 +291,9 @@ def test_the_stage_counts_by_rule_and_says_what_it_lacks():
     assert points.report.figures["changed"] == (codes != arrays["Classification"]).sum()
     assert points.report.figures["classes"] == {str(c): int((codes == c).sum()) for c in (2, 5, 6)}
     assert (codes != truth).sum() < (arrays["Classification"] != truth).sum()
-    bare = Consistency({"doubtful": True}).points({k: v for k, v in arrays.items() if k in ("X", "Y", "Z", "Classification")})
+    bare = Consistency({"doubtful": True}).points(
+        {k: v for k, v in arrays.items() if k in ("X", "Y", "Z", "Classification")}
+    )
     Consistency({"doubtful": True}).run(bare)
     assert bare.report.figures["ground"] == 0 and "no HeightAboveGround" in bare.report.warnings[0]
     assert bare.report.figures["doubtful"] == 0 and "no Reliability" in bare.report.warnings[1]
