@@ -78,7 +78,7 @@ class Progress(AbstractContextManager):
             text += f", {seconds:.1f} s"
         elif self.seconds_left is not None:
             text += f", {duration(self.seconds_left)} left"
-        elif self.total and rate > 0:
+        elif self.total and 100 * self.count >= self.total:  # before, it is mostly what starting took
             text += f", {duration(max(self.total - self.count, 0) / rate)} left"
         if self.stream is None:
             return
