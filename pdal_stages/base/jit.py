@@ -300,3 +300,12 @@ def compiled_elsewhere(names: Iterable[str]) -> Iterator[None]:
             ended.set()
             watcher.join()
             Compiling.enabled = before
+
+
+@device
+def any_of(flags):
+    """Whether any is true; numba's own brings SciPy's linear algebra into every job."""
+    found = False
+    for flag in flags:
+        found |= flag
+    return found

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.jit import device, njit
+from ..base.jit import any_of, device, njit
 from ..base.lending import lent
 from .knn import CROWD, ROOM, make_rows, make_scratch, next_rows, start_search
 from .lanes import LANES, SUMS, add_members
@@ -129,15 +129,6 @@ def copy_query(batch, source, target, query):
     batch.radius[:, target] = batch.radius[:, source]
     batch.reach[:, target] = batch.reach[:, source]
     batch.made[:, target] = batch.made[:, source]
-
-
-@device
-def any_of(flags):
-    # numba's own brings SciPy's linear algebra into every job.
-    found = False
-    for flag in flags:
-        found |= flag
-    return found
 
 
 @njit

@@ -136,7 +136,9 @@ def _below_smooth(wide, out):
         for a in range(len(columns)):
             columns[a] += (wide[y + SURROUNDINGS, a] != HOLE) - (wide[y - SURROUNDINGS - 1, a] != HOLE)
         first = COMPANY - SURROUNDINGS
-        seen = columns[first - 1 : first + near - 1].sum()
+        seen = np.int64(0)  # summed here: numba's own sum brings linear algebra into every job
+        for a in range(first - 1, first + near - 1):
+            seen += columns[a]
         for i in range(w):
             first = i + COMPANY - SURROUNDINGS
             seen += columns[first + near - 1] - columns[first - 1]

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.jit import device, njit
+from ..base.jit import any_of, device, njit
 from .moments import moments_of_blocks, moments_of_blocks_again, moments_of_cells, moments_of_cells_again
 
 #: Weight of the coarser gradient per ground cell, for a lever of one block: it decides where all
@@ -161,7 +161,7 @@ def _fit(moments, size, needed, planes):
     for j in range(h):
         for begin in range(0, w, _SPAN):
             end = min(begin + _SPAN, w)
-            if not needed[j, begin:end].any():
+            if not any_of(needed[j, begin:end]):
                 continue
             first, last = max(begin - 1, 0), min(end + 1, w)
             if last - first < _WINDOW:
@@ -229,7 +229,7 @@ def _from_parents(parents, parents_left, parents_bottom, size, left, bottom, nee
         for before in range(start, ((left + w) >> 1) - parents_left, _SPAN):
             first = 2 * (before + parents_left) + 1 - left  # of the two between it and the next parent
             begin, end = max(first, 0), min(first + 2 * _SPAN, w)
-            if not needed[j, begin:end].any():
+            if not any_of(needed[j, begin:end]):
                 continue
             last = before + (end - 1 - first) // 2 + 2
             known = below >= 0 and below + 2 <= rows and before >= 0 and last <= columns

@@ -49,7 +49,7 @@ SITES = {
     "base/apart:answer": "opens a pipe",
     "pipeline/correcting:_write": _WHOLE,
     "pipeline/reviewing:write_review": _WHOLE,
-    "pipeline/direct:_Output.write": "writers.las .las",
+    "pipeline/direct:execute": "writers.las .las",
     "pipeline/run:Pipeline._execute": "writers.las .las",
     "plugin/building:install": "a shared library, by the compiler; test_plugin",
     "plugin/declarations:write": "a header that a compiler reads; test_plugin",
