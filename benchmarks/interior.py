@@ -71,6 +71,11 @@ def main() -> None:
     p.add_argument("--around", type=int, default=3, help="Files on each side of the middle one")
     p.add_argument("--threads", type=int, default=2)
     p.add_argument(
+        "--memory",
+        type=float,
+        help="Of a run with one worker, GB: what blocks may take; without, no more than a tile",
+    )
+    p.add_argument(
         "--runs", type=int, default=1, help="Of the tile in the middle, and of its file in one piece"
     )
     p.add_argument("--folder", type=Path, help="Where the town is kept for another time")
@@ -83,7 +88,9 @@ def main() -> None:
             write_town(TownOptions(size=o.side, density=o.density, seed=11), town)
         middle = repeated(town, folder / "in", o.side, o.around)
 
-        task = ClassifyTask((str(folder / "in"),), f"{folder / 'out'}/", options=TilingOptions(o.side))
+        memory = None if o.memory is None else int(o.memory * 1e9)
+        options = TilingOptions(o.side, workers=1, memory=memory)
+        task = ClassifyTask((str(folder / "in"),), f"{folder / 'out'}/", options=options)
         (folder / "out").mkdir()
         plan = task.plan()
         survey = Survey(plan, task.options)

@@ -358,6 +358,7 @@ def test_blocks_of_a_survey(tmp_path, write_las):
 
     assert side(memory=64 << 30, workers=1) == 4096.0 and side(2048.0, memory=64 << 30, workers=1) == 2048.0
     assert side(memory=2 << 30, workers=1) == 1024.0
+    assert side(workers=1) == 1024.0  # without a word about memory, no more than tiles take
     assert side(scheduler="tcp://host:1") == 1024.0
     assert side(scheduler="tcp://host:1", memory=16 << 30) == 2048.0  # one each for 64 workers
 

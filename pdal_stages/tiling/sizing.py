@@ -27,7 +27,7 @@ PARENT = 350 << 20
 #: Points of a larger file are put together in parts of so many.
 MOST_AT_ONCE = 4_000_000
 #: Points of a tile at most where its size is chosen here: it is lost when it fails, and progress goes by tiles.
-_MOST_OF_A_TILE = 12_000_000
+_MOST_OF_A_TILE = 3_000_000
 #: Sides to choose from, in units of the coordinates: round numbers, from 1 to 800,000.
 _SIDES = [
     round(mantissa * 10**power, 6) for power in range(0, 6) for mantissa in (1, 1.5, 2, 2.5, 3, 4, 5, 6, 8)

@@ -79,12 +79,11 @@ class Survey:
             return plan
         area = density.area * self.unit**2
         workers, room = max(1, self.options.local_workers), room_of_worker(self.options)
-        if (
-            self.options.scheduler
-        ):  # of a cluster it is not known yet how many workers it has, nor their memory
+        if self.options.scheduler:
             workers = _OF_A_CLUSTER
-            if self.options.memory is None:
-                room = worker_bytes(density.read_by(self.grid.size, self.halo_units), 0, self.block_bytes)
+        if self.options.memory is None:  # nobody said that there may be more than tiles take
+            of_tile = density.read_by(self.grid.size, self.halo_units)
+            room = min(room, worker_bytes(of_tile, 0, self.block_bytes))
         blocks = widened(plan.first.blocks, area, room, workers, most)
         self.block_bytes = block_bytes(blocks, area)
         return replace(plan, first=replace(plan.first, blocks=blocks))
