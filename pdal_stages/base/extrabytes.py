@@ -9,6 +9,8 @@ import os
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
+import numpy as np
+
 from .las import records_of
 
 #: Bytes of an entry, and where in it the name and the description are; both are texts of at most 32 bytes.
@@ -61,6 +63,11 @@ def plain_dimensions(path: str | os.PathLike) -> list[tuple[str, str]] | None:
     if any(entry.scaled or not entry.type or not entry.name for entry in found):
         return None
     return [(entry.name, entry.type) for entry in found]
+
+
+def number_type(kind: str) -> np.dtype:
+    """The NumPy type of one that PDAL writes so: ``double``, ``float``, ``uint8`` or ``uint8_t``."""
+    return np.dtype({"float": "f4", "double": "f8"}.get(kind, kind.removesuffix("_t")))
 
 
 def descriptions(path: str | os.PathLike) -> dict[str, bytes]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import StageError
-from .extrabytes import plain_dimensions
+from .extrabytes import number_type, plain_dimensions
 from .las import POINT_BYTES, LasHeader, laz_chunks
 
 _OLD = [
@@ -38,7 +38,6 @@ _FIELDS: dict[int, list[tuple[str, str]]] = {
     7: [*_NEW, *_COLORS],
     8: [*_NEW, *_COLORS, ("nir", "<u2")],
 }
-_TYPES = {"float": "f4", "double": "f8"}
 #: Points that are read at a time: whole chunks of LAZ, for all cores.
 _BLOCK = 200_000
 
@@ -49,7 +48,7 @@ def record_type(path: str | os.PathLike, header: LasHeader) -> np.dtype | None:
     extra = plain_dimensions(path)
     if fields is None or extra is None:
         return None
-    named = [(name, np.dtype(_TYPES.get(kind, kind)).newbyteorder("<")) for name, kind in extra]
+    named = [(name, number_type(kind).newbyteorder("<")) for name, kind in extra]
     if {name for name, _ in named} & {name for name, _ in fields} or len(dict(named)) < len(named):
         return None
     dtype = np.dtype([*fields, *named])

@@ -23,7 +23,6 @@ from .optimal import kopt_block
 from .plan import Columns, FeaturePlan
 from .ropt import COPT_RADII, copt_block, curvature_block, radii_of, ropt_block
 from .shapes import Shapes, count_shapes, list_shapes, no_shapes, point_seeds
-from .surfaces import MADE
 from .surfaces import WIDTH as SURFACE
 
 #: Queries computed at a time when curvatures of a whole cloud are.
@@ -80,33 +79,18 @@ class AdaptiveNeighborhoods:
             self._tree = build_tree(grid.x, grid.y, grid.z, lambda f, b: list(map_blocks(f, b, threads)))
             if any(spec.surfaced for spec in self.specs):
                 self._surfaces = self._surfaces_of_all(threads)
-            self._touch()
+            self._touch(len(plan.names))
 
     def __len__(self) -> int:
         return len(self.specs)
 
-    def _touch(self) -> None:
-        """Compile what the plan needs, on one point, before threads do."""
+    def _touch(self, columns: int) -> None:
+        """Compile what the plan, of so many columns, needs, on one point, before threads do."""
         one = self.grid.x[:1], self.grid.y[:1], self.grid.z[:1]
-        copies, out = np.ones(1, np.int64), np.zeros((1, 1), np.float32)
+        copies, counted = np.ones(1, np.int64), np.zeros((2, len(self.specs)), np.int64)
+        out = np.zeros((1, columns), np.float32)
         if self._nearest:
-            nothing = [np.full((len(self._nearest), width), -1, np.int64) for width in (FEATURES, MADE)]
-            ks, unwanted = np.ones(len(nothing[0]), np.int64), np.zeros(len(nothing[0]), np.bool_)
-            few = np.zeros(len(ks), np.int64)
-            nearest_block(
-                self._tree,
-                *one,
-                copies,
-                ks,
-                nothing[0],
-                self._surfaces,
-                unwanted,
-                nothing[1],
-                0.0,
-                few,
-                few,
-                out,
-            )
+            self._fill_nearest(*one, copies, counted[0], counted[1], out)
         for number, spec in enumerate(self.specs):
             if number in self._nearest and not spec.shaped:
                 continue

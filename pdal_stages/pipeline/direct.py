@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
+from ..base.extrabytes import number_type
 from ..base.las import LasHeader, read_header
 from ..base.lasrecords import RecordColumns, blocks, record_type
 from . import interrupts, packing, straight
@@ -229,17 +230,13 @@ def _output(
         raise NeedsPdal("the output's points are others")
     given: dict[str, Extra] = {}
     for name, (_, same) in like.extra.items():
-        known = name in adds and np.dtype(_type(adds[name].removesuffix("_t"))) == same
+        known = name in adds and number_type(adds[name]) == same
         read = name in (dtype.names or ()) and name in reading.decoded and reading.types[name] == same
         if not known and not read:
             raise NeedsPdal(f"the dimension '{name}'")
         if read:
             given[name] = Extra(dtype.fields[name][1], same)  # type: ignore[index]
     return like, given
-
-
-def _type(kind: str) -> str:
-    return {"float": "f4", "double": "f8"}.get(kind, kind)
 
 
 def _some(records: NDArray, made: Mapping[str, NDArray]) -> Some:

@@ -16,11 +16,9 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.extrabytes import plain_dimensions
+from ..base.extrabytes import number_type, plain_dimensions
 from ..base.las import POINT_BYTES, LasHeader, laz_chunks, read_header
 from . import packing
-
-_TYPES = {"float": "<f4", "double": "<f8"}
 
 
 class Extra(NamedTuple):
@@ -55,7 +53,7 @@ def extra_of(path: str | os.PathLike, header: LasHeader) -> dict[str, Extra] | N
     at = POINT_BYTES[header.point_format]
     named = plain_dimensions(path)
     for name, kind in named or ():
-        dtype = np.dtype(_TYPES.get(kind, kind)).newbyteorder("<")
+        dtype = number_type(kind).newbyteorder("<")
         found[name] = Extra(at, dtype)
         at += dtype.itemsize
     return found if named is not None and len(found) == len(named) and at == header.point_bytes else None

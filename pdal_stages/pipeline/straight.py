@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
-from ..base.extrabytes import plain_dimensions
+from ..base.extrabytes import number_type, plain_dimensions
 from ..base.las import read_header
 from . import callbacks, runtime
 from . import pdal as pdal_env
@@ -30,7 +30,6 @@ _PLAIN = {
     *("use_eb_vlr", "extra_dims"),
 }
 #: NumPy's types of PDAL's, where they have other names.
-_TYPES = {"double": "float64", "float": "float32"}
 _LIMITS = re.compile(r"(\w+)\[:([-+.\de]+)\]")
 
 
@@ -278,7 +277,7 @@ class View(Mapping[str, NDArray]):
 
     def add(self, name: str, kind: str) -> None:
         """A dimension of PDAL's type, 0 where it is new."""
-        dtype = np.dtype(_TYPES.get(kind, kind.removesuffix("_t")))
+        dtype = number_type(kind)
         if name not in self:
             self._made[name] = np.zeros(self.count, dtype)
         elif name not in self._made and (self._read[name] != dtype or not self._decodes(name)):

@@ -15,6 +15,35 @@ LONGEST = 250
 
 
 @device
+def first_like(z, start, k, deck, height, far):
+    """The lowest deck of cell k that one at a `height`, so `far` away, leads on to; -1 where none is."""
+    for m in range(start[k], start[k + 1]):
+        if deck[m] and walkable(z[m] - height, far):
+            return m
+    return -1
+
+
+@njit
+def amid(z, start, h, w, deck, reach, least):
+    """Levels (n,) of decks that lead on to others in at least so many of the cells up to `reach` away, their own included.
+
+    A seam beside them, such as the gap before a roof, parts these.
+    """
+    out = np.zeros(len(z), np.bool_)
+    for j in range(h):
+        for i in range(w):
+            for n in range(start[j * w + i], start[j * w + i + 1]):
+                if not deck[n]:
+                    continue
+                count = 0
+                for b in range(max(j - reach, 0), min(j + reach + 1, h)):
+                    for a in range(max(i - reach, 0), min(i + reach + 1, w)):
+                        count += first_like(z, start, b * w + a, deck, z[n], distance(a - i, b - j)) >= 0
+                out[n] = count >= least
+    return out
+
+
+@device
 def _chasm(z, start, w, j, i, a, b, level):
     """Whether on the way to a cell some cells on there is one with nothing but what lies much lower, as between a deck and a
     roof beside it.

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import njit
-from .deckparts import LONGEST, extent, parts
+from .deckparts import LONGEST, amid, extent, parts
 from .deckrims import (
     JOIN,
     SECTORS,
@@ -27,26 +27,6 @@ from .walkable import ENDLESS, distance, walkable
 APART, MIDST, SPANS, ROOF, ONE_SIDE = 2, 7, 0.75, 100, 0.3
 #: How far from cores, in squared cells, what hangs on to them is deck where a roof was beside it.
 NEXT = 2
-
-
-@njit
-def cores(z, start, h, w, deck):
-    """Levels (n,) of decks in the midst of others: a seam beside them, such as the gap before a roof, parts these."""
-    out = np.zeros(len(z), np.bool_)
-    for j in range(h):
-        for i in range(w):
-            for n in range(start[j * w + i], start[j * w + i + 1]):
-                if not deck[n]:
-                    continue
-                count = 0
-                for b in range(max(j - 1, 0), min(j + 2, h)):
-                    for a in range(max(i - 1, 0), min(i + 2, w)):
-                        for m in range(start[b * w + a], start[b * w + a + 1]):
-                            if deck[m] and walkable(z[m] - z[n], distance(a - i, b - j)):
-                                count += 1
-                                break
-                out[n] = count >= MIDST
-    return out
 
 
 @njit
@@ -107,7 +87,7 @@ def without_roofs(raster, deck) -> NDArray[np.bool_]:
     They stand apart, or a seam parts them from a deck that goes on from end to end without them.
     """
     z, start, h, w = raster[:4]
-    for core, join in ((deck, APART), (cores(z, start, h, w, deck), 1)):
+    for core, join in ((deck, APART), (amid(z, start, h, w, deck, 1, MIDST), 1)):
         number, sums, box = parts(z, start, h, w, core, np.zeros(len(deck), bool), join)
         roof = _roofs(raster, deck, number, sums, box)
         if roof.any():

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from .deckparts import LONGEST, extent, parts
+from .deckparts import LONGEST, amid, extent, first_like, parts
 from .deckrims import (
     AWAY,
     JOIN,
@@ -299,26 +299,24 @@ def filled(z, start, h, w, kind, deck):
 
 
 @njit
-def broad(z, start, h, w, deck):
-    """Levels (n,) of what may be deck that is broad, at least near: no wires that join roofs."""
-    core, out = np.zeros(len(z), np.bool_), np.zeros(len(z), np.bool_)
-    for again in range(2):
-        for j in range(h):
-            for i in range(w):
-                for n in range(start[j * w + i], start[j * w + i + 1]):
-                    if not deck[n]:
-                        continue
-                    count = 0
-                    for b in range(max(j - 2, 0), min(j + 3, h)):
-                        for a in range(max(i - 2, 0), min(i + 3, w)):
-                            for m in range(start[b * w + a], start[b * w + a + 1]):
-                                if deck[m] and walkable(z[m] - z[n], distance(a - i, b - j)):
-                                    count += 1
-                                    out[n] |= core[m]
-                                    break
-                    if again == 0:
-                        core[n] = count >= BROAD
+def _near_broad(z, start, h, w, deck, core):
+    """Levels (n,) of decks that lead on to some of the `core` within two cells."""
+    out = np.zeros(len(z), np.bool_)
+    for j in range(h):
+        for i in range(w):
+            for n in range(start[j * w + i], start[j * w + i + 1]):
+                if not deck[n]:
+                    continue
+                for b in range(max(j - 2, 0), min(j + 3, h)):
+                    for a in range(max(i - 2, 0), min(i + 3, w)):
+                        m = first_like(z, start, b * w + a, deck, z[n], distance(a - i, b - j))
+                        out[n] |= m >= 0 and core[m]
     return out
+
+
+def broad(z, start, h, w, deck) -> NDArray[np.bool_]:
+    """Levels (n,) of what may be deck that is broad, at least near: no wires that join roofs."""
+    return _near_broad(z, start, h, w, deck, amid(z, start, h, w, deck, 2, BROAD))
 
 
 def whole_decks(raster, number, sums, box) -> NDArray[np.bool_]:

@@ -253,9 +253,9 @@ def _still_asked(
     j, i = (j + bottom >> levels) - (bottom >> levels), (i + left >> levels) - (left >> levels)
     near = np.zeros((j.max() + 5, i.max() + 5), bool)
     near[j[found], i[found]] = True
-    for step in (1, 1, 1, 1):
-        near[step:] |= near[:-step].copy()
-        near[:, step:] |= near[:, :-step].copy()
+    for _ in range(4):  # two blocks to each side, read two farther on
+        near[1:] |= near[:-1].copy()
+        near[:, 1:] |= near[:, :-1].copy()
     return cells[~found & near[j + 2, i + 2]]
 
 
