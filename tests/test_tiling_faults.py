@@ -196,7 +196,9 @@ def test_unreadable_input(tmp_path, folder, expected):
     stages = pipeline(inputs, tmp_path / "o_#.laz")
     run = run_tiled(stages, 20, workers=0, retries=1)
     ((what, why),) = run.failures  # told once, whatever waits for it
-    assert "east.laz" in what and "damaged" in why and "o_east.laz, o_west.laz" in why
+    assert (
+        "east.laz" in what and "damaged" in why and "o_east.laz, o_west.laz. They are made without it" in why
+    )
     # West of x = 20 no tile sees the broken file; beside it, neighbors would be missing.
     states = {job.name: job.state for job in run.tiles}
     assert states["0_0"] == states["0_20"] == "done" and states["20_0"] == "failed"
@@ -211,6 +213,24 @@ def test_unreadable_input(tmp_path, folder, expected):
     (inputs / "west.laz").write_bytes(b"gone")
     with pytest.raises(StageError, match="none of the inputs"):
         run_tiled(stages, 20, workers=0)
+
+
+def test_an_input_without_points_gets_what_the_others_get(tmp_path, folder, expected, write_las):
+    """Its extra dimensions too, though no tile made any of its points."""
+    inputs = tmp_path / "in"
+    shutil.copytree(folder, inputs)
+    write_las(inputs / "nothing.laz", {name: np.empty(0) for name in "XYZ"}, point_format=6)
+    named = [
+        {"type": "readers.las", "filename": str(inputs / "*.laz")},
+        {"type": "filters.hag_minima", "cell": 2},
+    ]
+    for number, chosen in enumerate(("all", "HeightAboveGround=double")):
+        writer = {"type": "writers.las", "filename": str(tmp_path / f"{number}_#.laz"), "forward": "all"}
+        run = run_tiled([*named, {**writer, "extra_dims": chosen}], 20, workers=0)
+        assert not run.failures
+        east, nothing = (laspy.read(tmp_path / f"{number}_{name}.laz") for name in ("east", "nothing"))
+        assert len(nothing.points) == 0 and nothing.header.point_format == east.header.point_format
+    assert (tmp_path / "0_west.laz").read_bytes() == expected["west"]
 
 
 def test_resume_does_only_what_changed(tmp_path, folder, expected):

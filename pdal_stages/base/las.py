@@ -24,7 +24,12 @@ from .errors import StageError
 
 #: Bytes of a point of each format, without extra bytes (LAS 1.4 R15, tables 7 to 18).
 POINT_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
-_CURE = "Get the file again from its source, or repair it with a tool made for that (e.g. lasinfo -repair)"
+#: What to do about a damaged file.
+DAMAGED = "Get the file again from its source, or repair it with a tool made for that (e.g. lasinfo -repair)"
+
+
+#: Steps of the coordinates that points may lie beyond the box: programs round it differently.
+_BOX_STEPS = 100
 
 
 @dataclass(frozen=True)
@@ -108,10 +113,12 @@ def check_readable(path: str | os.PathLike) -> str | None:
         raise StageError("the file cannot be read", where=str(path), found=error) from None
     if header is None:
         raise StageError(
-            "not a LAS file", where=str(path), found=f"{size:,} bytes without a LAS header", cure=_CURE
+            "not a LAS file", where=str(path), found=f"{size:,} bytes without a LAS header", cure=DAMAGED
         )
     if wrong:
-        raise StageError(f"the LAS file is damaged: {wrong[0]}", where=str(path), found=wrong[1], cure=_CURE)
+        raise StageError(
+            f"the LAS file is damaged: {wrong[0]}", where=str(path), found=wrong[1], cure=DAMAGED
+        )
     beyond = _bytes_beyond(header, size)
     if beyond >= header.point_bytes:
         return (
@@ -124,6 +131,25 @@ def check_readable(path: str | os.PathLike) -> str | None:
             "the points lie where they should"
         )
     return None
+
+
+def beyond_box(path: str | os.PathLike, lie: tuple[float, float, float, float]) -> str | None:
+    """A warning where a file's points lie (min x, min y, max x, max y) beyond the box in its header: None where they do not.
+
+    LAZ has no checksums: a damaged file may decode to points anywhere, without an error.
+    """
+    header = read_header(path)
+    if header is None or not header.count or not header.boxed:
+        return None
+    room = [_BOX_STEPS * scale for scale in header.scales[:2]] * 2
+    over = (header.box[0] - lie[0], header.box[1] - lie[1], lie[2] - header.box[2], lie[3] - header.box[3])
+    if all(far <= most for far, most in zip(over, room, strict=True)):
+        return None
+    say = "x {0:.12g} to {2:.12g}, y {1:.12g} to {3:.12g}"
+    return (
+        f"{path}: points lie beyond the box in the header, so the file may be damaged (found {say.format(*lie)}; the header "
+        f"says {say.format(*header.box)}). {DAMAGED}"
+    )
 
 
 def _bytes_beyond(header: LasHeader, size: int) -> int:

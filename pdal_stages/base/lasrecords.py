@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from .errors import StageError
 from .extrabytes import number_type, plain_dimensions
-from .las import POINT_BYTES, LasHeader, laz_chunks
+from .las import DAMAGED, POINT_BYTES, LasHeader, laz_chunks
 
 _OLD = [
     *(("X", "<i4"), ("Y", "<i4"), ("Z", "<i4"), ("intensity", "<u2"), ("bit_fields", "u1")),
@@ -40,6 +40,18 @@ _FIELDS: dict[int, list[tuple[str, str]]] = {
 }
 #: Points that are read at a time: whole chunks of LAZ, for all cores.
 _BLOCK = 200_000
+
+
+class DamagedError(StageError):
+    """Points that cannot be decoded."""
+
+    def __init__(self, path: str, found: str) -> None:
+        super().__init__(
+            "the LAS file is damaged: its points cannot be decoded", where=path, found=found, cure=DAMAGED
+        )
+
+    def __reduce__(self):
+        return type(self), (self.where, self.found)
 
 
 def record_type(path: str | os.PathLike, header: LasHeader) -> np.dtype | None:
@@ -69,8 +81,10 @@ def blocks(
 
     Raises
     ------
+    DamagedError
+        If they cannot be decoded.
     StageError
-        If they cannot be read.
+        If they cannot be read for another reason.
     """
     left = header.count if count is None else min(count, header.count)
     try:
@@ -93,7 +107,9 @@ def blocks(
         raise
     except BaseException as error:  # lazrs panics at damaged points, which is no Exception
         if isinstance(error, Exception) or type(error).__name__ == "PanicException":
-            raise StageError("the points cannot be read", where=str(path), found=error) from error
+            if isinstance(error, MemoryError):
+                raise StageError("the points cannot be read", where=str(path), found=error) from error
+            raise DamagedError(str(path), str(error)) from error
         raise
 
 

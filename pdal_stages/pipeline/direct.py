@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..base.errors import StageError
 from ..base.extrabytes import number_type
 from ..base.las import LasHeader, read_header
-from ..base.lasrecords import RecordColumns, blocks, record_type
+from ..base.lasrecords import DamagedError, RecordColumns, blocks, record_type
 from . import interrupts, packing, straight
 from . import pdal as pdal_env
 from .callbacks import Callbacks
@@ -103,6 +103,8 @@ def execute(stages: Sequence[dict[str, Any]]) -> pdal_env.Execution:
     header, dtype, tried = _tried(stages)
     try:
         columns = RecordColumns(path, header, dtype, [n for n in _FIELDS if n in (dtype.names or ())])
+    except DamagedError:
+        raise  # newer PDAL takes them for points
     except (StageError, OSError) as error:
         raise NeedsPdal(str(error)) from error
     view = View.of_file(tried.reading, columns)
@@ -121,6 +123,8 @@ def execute(stages: Sequence[dict[str, Any]]) -> pdal_env.Execution:
             interrupts.check()
             try:
                 records = next(parts)
+            except DamagedError:
+                raise
             except StageError as error:
                 raise NeedsPdal(str(error)) from error
             end = start + len(records)
@@ -156,7 +160,7 @@ def _tried(stages: Sequence[dict[str, Any]]) -> tuple[LasHeader, np.dtype, _Tria
     try:
         (first,) = blocks(path, header, dtype, count=_TRIED)
         return header, dtype, _Trial(reader, writer, header, first, _added(filters))
-    except NeedsPdal:
+    except (NeedsPdal, DamagedError):
         raise
     except (StageError, OSError) as error:  # no room for temporary files, say
         raise NeedsPdal(str(error)) from error

@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
-from ..base.errors import DependencyError, PipelineError
-from ..base.las import check_readable
+from ..base.errors import DependencyError, PipelineError, StageError
+from ..base.las import DAMAGED, check_readable
 from ..base.shortage import is_short, shortage
 from .filenames import readers_files
 from .interrupts import fragile
@@ -136,7 +136,9 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
         count = pipeline.execute()
     except (RuntimeError, ValueError, IndexError, OverflowError) as error:  # C++'s errors, as Python has them
         keep(stdout)
-        raise translate(str(error), log_lines(_log(pipeline))[-3:]) from None
+        raise _of_damaged(stages, str(error)) or translate(
+            str(error), log_lines(_log(pipeline))[-3:]
+        ) from None
     except MemoryError:
         raise PipelineError(
             "memory ran out", cure="Work in tiles (--tile), or read less, e.g. with filters.crop"
@@ -152,6 +154,22 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
         metadata=_metadata(pipeline),
         arrays=list(pipeline.arrays) if arrays else [],
         log=log,
+    )
+
+
+_CUT_POINTS = re.compile(r"readers\.las: .*(reading point \d+ of \d+|[Cc]ouldn't read .*point)")
+
+
+def _of_damaged(stages: list[dict[str, Any]], message: str) -> StageError | None:
+    """What PDAL says of points that cannot be decoded, with the file; None where it speaks of something else."""
+    read = readers_files(stages, las=True)
+    if not read or not _CUT_POINTS.search(message):
+        return None
+    return StageError(
+        "the LAS file is damaged: its points cannot be decoded",
+        where=read[0] if len(read) == 1 else "one of " + ", ".join(read),
+        found=message.strip(),
+        cure=DAMAGED,
     )
 
 

@@ -17,7 +17,7 @@ from ..base.complete import check_complete
 from ..base.errors import InterruptedStage, PipelineError, StageError
 from ..base.files import whole_files
 from ..base.jit import Compiling
-from ..base.las import check_readable, odd_text, supersede_copc
+from ..base.las import beyond_box, check_readable, odd_text, read_header, supersede_copc
 from ..base.outputs import Output, check_outputs
 from ..base.report import Report
 from ..base.shortage import check_limit
@@ -189,12 +189,17 @@ class Pipeline:
         self.check_outputs()
         stages = self.lowered.stages
         outputs = [output.path for output in writers_outputs(stages)]
+        sources = readers_files(stages, las=True)
         writers = [stage for stage in stages if is_writer(stage, stages)]
         alone = len(writers) == 1 and writers[0] is stages[-1] and "where" not in writers[0]
 
         def finish(made: Path, final: Path, number: int) -> None:
             count = result.count if alone and "#" not in outputs[0] else None
             check_complete(made, final, writers[number], count)
+            if alone and len(sources) == 1 and len(stages) == 2 + len(self.lowered.ours):  # none moves points
+                written = read_header(made)
+                if written is not None and written.count:
+                    self.warnings += filter(None, [beyond_box(sources[0], written.box)])
             supersede_copc(made)
             if self.lowered.ours:  # else the file is as PDAL writes it, to the byte
                 keep_records(made, writers[number], stages, self.lowered.meanings)

@@ -171,6 +171,7 @@ class ClassifyTask:
             plan,
             readers=[{**reader, "filename": files[reader["type"]]} for reader in plan.readers],
             creates=["Classification", *(beside or {})] if tail_only and plan.creates else plan.creates,
+            makes=plan.makes if beside is None else beside,
             beside=beside,
             cells=self.cells,
             whole_names=self._in_folder and self.options.per != "tile",

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ import numpy as np
 from ..base import las
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import PipelineError
+from ..base.extrabytes import number_type
 from ..pipeline.beside import extra_dims_option
 from ..pipeline.filenames import LAS_WRITERS
 from . import alike, sizing
@@ -45,6 +46,7 @@ class FileTask:
     meanings: dict[str, str]  #: see TilePlan
     cells: OutputCells | None = None  #: see TilePlan
     copy: str = ""  #: of the input by place, see :mod:`.byplace`; empty where there is none
+    makes: Mapping[str, str] = field(default_factory=dict)  #: see TilePlan
 
     def run(self) -> dict[str, Any]:
         """Write the outputs; see :func:`~pdal_stages.tiling.tail.run_tail`. The record counts classes, too."""
@@ -54,6 +56,9 @@ class FileTask:
 
         def new_values(start: int, end: int) -> NewValues:
             values = read_range(self.results, self.source, self.count, start, end)
+            if not self.count:  # no tile tells which dimensions its points would have got
+                nothing = {name: np.empty(0, number_type(kind)) for name, kind in self.makes.items()}
+                values = NewValues(values.kept, {name: (None, column) for name, column in nothing.items()})
             if start == 0:  # begun, or begun anew
                 classes[:] = 0
                 if seen is not None:

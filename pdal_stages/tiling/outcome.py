@@ -151,7 +151,10 @@ class TiledRun:
         outputs = [Path(out.outputs[0]).name for out in self.outputs if out.blocked_by == path]
         parts = [f"{tiles} tile{'s' * (tiles != 1)} there"] if tiles else []
         parts += [*outputs[:5], *([f"{len(outputs) - 5} more outputs"] if len(outputs) > 5 else [])]
-        return f" (not made because of it: {', '.join(parts)})" if parts else ""
+        if not parts:
+            return ""
+        cure = ". They are made without it where it is moved out of the inputs" if tiles else ""
+        return f" (not made because of it: {', '.join(parts)}{cure})"
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON-able report."""

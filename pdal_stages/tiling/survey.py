@@ -100,9 +100,10 @@ class Survey:
         lost = len(self.sources) - len(self.extents)
         if lost:
             which = "1 input has" if lost == 1 else f"{lost} inputs have"
+            its, it = ("its", "it") if lost == 1 else ("their", "them")
             self.messages.append(
-                f"{which} no readable header, so its place is not known: tiles beside it may lack neighbors. Once "
-                "it can be read, --resume runs those tiles again"
+                f"{which} no readable header, so {its} place is not known: tiles beside {it} may lack neighbors. "
+                f"Once {it if lost == 1 else 'they'} can be read, --resume runs those tiles again"
             )
 
     def _none_readable(self) -> StageError:
@@ -239,6 +240,8 @@ class Survey:
                     self.unreadable[reading.path] = answer.reason
                     continue
                 self.indexes[reading.path] = answer.result
+                if answer.result.count and (odd := las.beyond_box(reading.path, union(answer.result.boxes))):
+                    self.messages.append(odd)
                 store.keep_index(reading.mark, answer.result)
                 progress.update(answer.result.count)
         self._place()

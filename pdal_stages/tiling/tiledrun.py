@@ -158,8 +158,9 @@ def run_plan(
     short = [job.name for job in work.jobs if job.state == "done" and job.record.get("short")]
     if short:
         survey.messages.append(
-            f"{len(short)} tiles have points whose neighborhoods or terrain reach farther than could be read within "
-            f"{chosen.most_points:,} points; they may differ from an untiled run: " + ", ".join(short[:5])
+            f"{len(short)} tile{'s have' if len(short) > 1 else ' has'} points whose neighborhoods or terrain reach farther "
+            f"than could be read within {chosen.most_points:,} points; they may differ from an untiled run: "
+            + ", ".join(short[:5])
         )
     run = TiledRun(work.jobs, work.outputs, survey.unreadable, changed, survey.messages, summary)
     if not chosen.scheduler:

@@ -83,6 +83,8 @@ class TilePlan:
     #: temporary files, it gives the record of what it wrote.
     takes: Callable[[list[Any], list[str], str], dict[str, Any]] | None = None
     cells: OutputCells | None = None  #: what takes the cells of points while outputs are written
+    #: Dimensions that our stages make and outputs hold, with PDAL's types: what a file without points gets, too.
+    makes: dict[str, str] = field(default_factory=dict)
     whole_names: bool = False  #: '#' in an output's name is the whole name of the input file, with its suffix
 
     @property
@@ -157,6 +159,7 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
     first, wider = _first_round(readers, head, reaches)
     later = [sum(reaches[n + 1 :]) for n in range(len(head))]
     stages = [step.ours for step in head if step.ours is not None]
+    makes = {name: kind for stage in stages for name, kind in stage.creates().items()}
     foreign = any(step.ours is None and step.type != "filters.merge" for step in head)
     messages = [*pipeline.lowered.warnings, *([wider] if wider else [])]
     if any(step.ours is None and step.sees_neighbors for step in head):
@@ -172,9 +175,8 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
         halo_m=sum(reaches),
         sees_m=sees_m,
         first=first,
-        creates=None
-        if foreign
-        else list(dict.fromkeys(name for stage in stages for name in stage.creates())),
+        creates=None if foreign else list(makes),
+        makes=makes,
         unit=next(filter(None, (stage.horizontal_unit for stage in stages)), ""),
         messages=messages,
         meanings=pipeline.lowered.meanings,

@@ -173,6 +173,7 @@ class Worklist:
                     plan.meanings,
                     plan.cells,
                     survey.indexes[item.source.path].copy,
+                    plan.makes,
                 )
             sources = survey.near(item.tile, far)
             return TileTask(
