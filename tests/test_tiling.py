@@ -19,10 +19,12 @@ from pdal_stages.pipeline.tindex import locations
 from pdal_stages.synthetic.townfile import wkt
 from pdal_stages.terrain.minima import terrain_reach
 from pdal_stages.tiling import TilingOptions, run_tiled
+from pdal_stages.tiling.classify import ClassifyTask
 from pdal_stages.tiling.cloudindex import index_las
 from pdal_stages.tiling.extract import Member, cut
 from pdal_stages.tiling.grid import TileGrid, inside, touching
 from pdal_stages.tiling.lasfiles import plain_header
+from pdal_stages.tiling.oneformat import one_format
 from pdal_stages.tiling.sources import InputSource, find_sources, las_extent
 from pdal_stages.tiling.tileplan import make_plan
 
@@ -659,3 +661,54 @@ def test_points_far_away_do_not_stop_a_tile(tmp_path, random_cloud, write_las):
     run = run_tiled(stages, 100, workers=0)
     assert not run.failures and not any(job.record["short"] for job in run.tiles)
     clouds.same_points(tmp_path / "a.las", tmp_path / "b.las")
+
+
+def test_outputs_of_tiles_hold_all_that_inputs_of_several_kinds_hold(tmp_path, write_las):
+    """The finest scale and the richest format: PDAL forwards only what a tile's inputs have in common."""
+    rng = np.random.default_rng(8)
+    folder = tmp_path / "in"
+    folder.mkdir()
+    kinds_of = {"a": (6, 0.01, 500_000.0), "b": (8, 0.001, 500_040.0), "c": (3, 0.01, 0.0)}
+    made = {}
+    for number, (name, (kind, scale, offset)) in enumerate(kinds_of.items()):
+        xyz = (
+            np.round((rng.uniform(0, 1, (800, 3)) * (30, 30, 4) + (500_000 + 30 * number, 0, 0)) / scale)
+            * scale
+        )
+        arrays = dict(zip("XYZ", xyz.T, strict=True)) | {"UserData": rng.integers(0, 256, 800)}
+        if kind != 6:
+            arrays["Red"] = rng.integers(0, 65536, 800)
+        if kind == 8:
+            arrays["Infrared"] = rng.integers(0, 65536, 800)
+        write_las(folder / f"{name}.laz", arrays, kind, offset=(offset, 0, 0), scale=scale)
+        made[name] = arrays
+    task = ClassifyTask(
+        (str(folder),), str(tmp_path / "out"), options=TilingOptions(tile=40, per="tile", workers=0)
+    )
+    run = task.run_tiles()
+    assert not run.failures
+    tiles = [laspy.read(path) for path in sorted((tmp_path / "out").glob("*.laz"))]
+    assert sum(len(tile.points) for tile in tiles) == 2400 and len(tiles) > 1
+    assert {(tile.header.version.minor, tile.point_format.id, tile.header.scales[0]) for tile in tiles} == {
+        (4, 8, 0.001)
+    }
+    got = np.concatenate([np.round(np.asarray(tile.x) * 1000) for tile in tiles])
+    want = np.concatenate([np.round(arrays["X"] * 1000) for arrays in made.values()])
+    assert np.array_equal(np.sort(got), np.sort(want))
+    for field, name, of in (("nir", "Infrared", "b"), ("red", "Red", "bc")):
+        kept = np.concatenate([np.asarray(tile[field]) for tile in tiles])
+        assert kept.astype(int).sum() == sum(int(made[each][name].sum()) for each in of)
+
+
+def test_inputs_that_are_alike_ask_for_nothing(tmp_path, write_las):
+    paths = [
+        str(write_las(tmp_path / f"{n}.las", {axis: np.arange(9.0) for axis in "XYZ"}, 6, offset=(7, 8, 0)))
+        for n in range(2)
+    ]
+    assert one_format([*paths, "https://example.org/ept.json"]) == {}
+    far = str(
+        write_las(
+            tmp_path / "far.las", {axis: np.arange(9.0) + 5e8 for axis in "XYZ"}, 6, offset=(5e8, 5e8, 5e8)
+        )
+    )
+    assert one_format([*paths, far])["offset_x"] == "auto"

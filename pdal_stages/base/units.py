@@ -106,7 +106,8 @@ def reprojection_cure(name: str = "", place: tuple[float, float] | None = None) 
         else "the UTM zone or national grid of the area in place of CODE"
     )
     stage = f'{{"type": "filters.reprojection", "out_srs": "EPSG:{zone or "CODE"}"}}'
-    return f"Add a reprojection before this stage, {stage}, with {what}"
+    reproject = f"pdal translate IN OUT reprojection --filters.reprojection.out_srs=EPSG:{zone or 'CODE'}"
+    return f"Add a reprojection before this stage, {stage}, or reproject the files first, {reproject}; with {what}"
 
 
 def utm_code(longitude: float, latitude: float, name: str = "") -> int | None:

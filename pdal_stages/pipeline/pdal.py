@@ -192,7 +192,8 @@ def log_lines(log: str) -> list[str]:
 
 
 #: How PDAL begins a line of its log.
-_BY_PROGRAM = re.compile(r"^\((?:pypipeline|pdal pipeline)\s+(\S+?)\s+\w+\)\s*", re.IGNORECASE)
+#: Some stages say their name once more.
+_BY_PROGRAM = re.compile(r"^\((?:pypipeline|pdal pipeline)\s+(\S+?)\s+\w+\)\s*(?:\1:\s*)?", re.IGNORECASE)
 
 
 def python_object(stages: list[dict[str, Any]], type_name: str, given: dict[str, Any], made_from: Any):

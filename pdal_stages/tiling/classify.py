@@ -18,6 +18,7 @@ from ..pipeline.classifying import ClassifyRequest
 from ..pipeline.ends import input_files, is_ept, is_folder, is_las, outputs_of
 from ..pipeline.processes import each_file
 from ..pipeline.run import Pipeline
+from .oneformat import one_format
 from .outcome import FileJob, TiledRun, TileJob, left_alone
 from .settings import TilingOptions
 from .sizing import DIRECT_POINT, fits_whole
@@ -148,7 +149,8 @@ class ClassifyTask:
             raise OptionError("outputs of tiles are plain LAS or LAZ", found=target, cure="Name them .laz")
         # In a folder '#' may stand for a name with its suffix: always that of a LAS file.
         named = "x.laz" if self._in_folder else target
-        writer = {**self.request.writer(named), "filename": target}
+        alike = one_format(self.files) if self.options.per == "tile" else {}
+        writer = {**self.request.writer(named), "filename": target, **alike}
         return Pipeline([*heads, *self.request.stages, writer], self.request.overrides, whole=False)
 
     def plan(self) -> TilePlan:
