@@ -16,6 +16,7 @@ import pytest
 from pdal_stages.cli import main
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.classifying import ClassifyRequest
+from pdal_stages.pipeline.ends import overlooked
 from pdal_stages.tiling import TilingOptions, sizing
 from pdal_stages.tiling.classify import ClassifyTask
 
@@ -315,3 +316,18 @@ def test_what_goes_past_pdal_fits_where_other_files_do_not(folder, tmp_path, wri
     assert not in_one_piece(200, "out.ply")  # which PDAL writes
     assert in_one_piece(300, "out.ply")
     assert [path.name for path in tmp_path.iterdir()] == ["one.laz"]
+
+
+def test_files_in_folders_below_are_said(tmp_path):
+    """Of a folder its own files are read; what lies below, other than the output, is not passed over in silence."""
+    survey = tmp_path / "survey"
+    for name in ("a.laz", "strip 2/b.LAZ", "strip 2/deeper/c.laz", "out/a.laz", ".hidden/d.laz"):
+        (survey / name).parent.mkdir(parents=True, exist_ok=True)
+        (survey / name).touch()
+    (said,) = overlooked([str(survey), "https://example.org/ept.json", "a.laz"], str(survey / "out"))
+    assert said.startswith(f"{survey}: 2 LAS or LAZ files in folders below are not read; '{survey}/**/*.")
+    assert not overlooked([str(survey / "out"), str(survey / "strip 2/*.LAZ")])
+    (survey / "out/ept.json").touch()
+    (survey / "out/ept-data").mkdir()
+    (survey / "out/ept-data/0-0-0-0.laz").touch()
+    assert not overlooked([str(survey / "out")])

@@ -105,6 +105,7 @@ def add_commands(add: Adder) -> None:
 def _classify(options: argparse.Namespace) -> int:
     from ..pipeline.classifying import WRITTEN, ClassifyRequest
     from ..tiling.classify import ClassifyTask
+    from ..pipeline.ends import overlooked
     from ..tiling.command import classify, options_of
 
     own, others = [], list(options.overrides)
@@ -129,7 +130,7 @@ def _classify(options: argparse.Namespace) -> int:
         vegetation_heights=options.vegetation_heights,
         keep_sure=options.keep_sure,
     )
-    print_messages(*request.cost)
+    print_messages(*request.cost, *overlooked(options.inputs, options.output))
     task = ClassifyTask(
         tuple(options.inputs),
         options.output,

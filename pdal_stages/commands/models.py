@@ -96,7 +96,7 @@ def _models(options: argparse.Namespace) -> None:
 
 
 def _train(options: argparse.Namespace) -> None:
-    from ..pipeline.ends import input_files
+    from ..pipeline.ends import input_files, overlooked
     from ..pipeline.run import Pipeline
     from ..pipeline.surveyjob import surveys_of, train_surveys
     from ..pipeline.trainjob import train_pipeline
@@ -107,6 +107,7 @@ def _train(options: argparse.Namespace) -> None:
     named = ("classes", "neighborhoods", "feature_set", "count", "trees", "base")
     extra = {name: value for name in named if (value := getattr(options, name)) is not None}
     files, surveys = input_files(options.inputs), {}
+    print_messages(*overlooked(options.inputs))
     if options.leave_one_survey_out or options.surveys:
         surveys = surveys_of(files, options.surveys or ())
         extra |= {"leave_one_survey_out": True} if options.leave_one_survey_out else {}
@@ -124,7 +125,7 @@ def _train(options: argparse.Namespace) -> None:
 
 def _accuracy(options: argparse.Namespace) -> None:
     from ..pipeline.comparing import accuracy_pipeline, compare_files
-    from ..pipeline.ends import input_files
+    from ..pipeline.ends import input_files, overlooked
     from ..pipeline.run import Pipeline
 
     reference_dimension = options.reference_dimension or (
@@ -137,6 +138,7 @@ def _accuracy(options: argparse.Namespace) -> None:
     if options.area:
         raise StageError("--area needs --objects", found=options.area)
     several = len(input_files(options.inputs)) > 1
+    print_messages(*overlooked(options.inputs))
     if options.reference or options.model or several:
         if options.reference and options.model:
             raise StageError("--reference and --model exclude each other", found=options.model)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from ..base.plain import print_messages
 from .adder import Adder
 
 
@@ -80,6 +81,7 @@ def add_commands(add: Adder) -> None:
 
 
 def _review(options: argparse.Namespace) -> None:
+    from ..pipeline.ends import overlooked
     from ..pipeline.reviewing import request_of, write_review
     from ..reports.reviewpage import lines
 
@@ -94,6 +96,7 @@ def _review(options: argparse.Namespace) -> None:
         cell=options.cell,
         workers=options.workers,
     )
+    print_messages(*overlooked(options.inputs))
     print("\n".join(lines(write_review(request).to_dict())))
     print(f"written to {', '.join(name for name in (request.output, request.html, request.json) if name)}")
 

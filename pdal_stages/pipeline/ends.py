@@ -82,6 +82,34 @@ def _inside(folder: Path) -> list[str]:
     return inside
 
 
+def overlooked(names: Sequence[str], but: str = "") -> list[str]:
+    """A message for each input that is a folder with LAS or LAZ files further down, which are not read.
+
+    `but`: an output, whose folder is not looked into; nor are hidden ones.
+    """
+    beside = os.path.realpath(but) if but else ""
+    found = []
+    for name in names:
+        if "://" in name or not os.path.isdir(name) or os.path.isfile(os.path.join(name, EPT)):
+            continue
+        suffixes: list[str] = []
+        for folder, below, files in os.walk(name):
+            below[:] = [
+                each
+                for each in below
+                if each[0] != "." and os.path.realpath(os.path.join(folder, each)) != beside
+            ]
+            if folder != name:
+                suffixes += [end for each in files if (end := Path(each).suffix).lower() in (".las", ".laz")]
+        if suffixes:
+            every = os.path.join(name, "**", "*" + max(suffixes, key=suffixes.count))
+            found.append(
+                f"{name}: {len(suffixes):,} LAS or LAZ file{'s' * (len(suffixes) > 1)} in folders below are not read; "
+                f"'{every}' names them, too"
+            )
+    return found
+
+
 def is_ept(name: str) -> bool:
     """Whether an input is an EPT source."""
     return name.startswith("ept://") or Path(name).name == EPT

@@ -43,7 +43,7 @@ def one_format(paths: Iterable[str]) -> dict[str, Any]:
         if len(scales) <= 1 and len(offsets) <= 1:
             continue
         scale = min(scales)
-        ends = (-_HIGHEST, _HIGHEST)
+        ends = (-float(_HIGHEST), float(_HIGHEST))
         if axis < 2:
             ends = min(box[axis] for box in boxes), max(box[axis + 2] for box in boxes)
         middle = round((ends[0] + ends[1]) / 2 / _ROUND) * _ROUND
