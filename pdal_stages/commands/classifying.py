@@ -104,8 +104,8 @@ def add_commands(add: Adder) -> None:
 
 def _classify(options: argparse.Namespace) -> int:
     from ..pipeline.classifying import WRITTEN, ClassifyRequest
-    from ..tiling.classify import ClassifyTask
     from ..pipeline.ends import overlooked
+    from ..tiling.classify import ClassifyTask
     from ..tiling.command import classify, options_of
 
     own, others = [], list(options.overrides)

@@ -103,10 +103,8 @@ def overlooked(names: Sequence[str], but: str = "") -> list[str]:
                 suffixes += [end for each in files if (end := Path(each).suffix).lower() in (".las", ".laz")]
         if suffixes:
             every = os.path.join(name, "**", "*" + max(suffixes, key=suffixes.count))
-            found.append(
-                f"{name}: {len(suffixes):,} LAS or LAZ file{'s' * (len(suffixes) > 1)} in folders below are not read; "
-                f"'{every}' names them, too"
-            )
+            what = "file in folders below is" if len(suffixes) == 1 else "files in folders below are"
+            found.append(f"{name}: {len(suffixes):,} LAS or LAZ {what} not read; '{every}' names them, too")
     return found
 
 
