@@ -8,6 +8,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 from .base.errors import StageError, suggest
 from .base.lean import import_lean
@@ -135,11 +136,23 @@ def _refuse_words(command: argparse.ArgumentParser, unknown: list[str]) -> None:
     command.error(f"unrecognized arguments: {' '.join(unknown)}. {near}".rstrip(". "))
 
 
+class _Parser(argparse.ArgumentParser):
+    """Says which of the choices may have been meant."""
+
+    def error(self, message: str) -> NoReturn:
+        if chosen := _NO_CHOICE.search(message):
+            message += f". {suggest(chosen[1], re.findall(r'[a-z_-]+', chosen[2]))}".rstrip(". ")
+        super().error(message)
+
+
+_NO_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)")
+
+
 def _parser() -> argparse.ArgumentParser:
     # Here, where an environment that lacks something is told in a sentence.
     from .commands import about, beginning, classifying, models, pipelines, reviewing
 
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="pdal-stages",
         description="PDAL pipelines with stages that classify airborne laser scans.",
         epilog=OVERRIDES + " --debug shows tracebacks.",

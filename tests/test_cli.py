@@ -353,3 +353,43 @@ def test_a_mistyped_flag_is_named_with_its_command(capsys):
     said = capsys.readouterr().err
     assert left.value.code == 2 and "usage: pdal-stages classify" in said
     assert "unrecognized arguments: --modle x. Did you mean '--model'?" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["pipline", "{job}"], "Did you mean 'pipeline'?"),
+        (["classify", "{job}", "out", "--per", "fil"], "Did you mean 'file'?"),
+    ],
+)
+def test_choices_are_suggested(job, capsys, words, message):
+    with pytest.raises(SystemExit):
+        main([word.format(job=job) for word in words])
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ["pipeline", "{job}", "--writers.las.skale_x=1"],
+            "Did you mean 'scale_x'? List its options with: pdal-stages",
+        ),
+        (["accuracy", "{cloud}"], "--reference FILE, of the same points"),
+        (["accuracy", "{cloud}", "{cloud2}"], "--reference FILE, of the same points"),
+        (
+            ["accuracy", "{cloud}", "{cloud2}", "--reference-dimension", "Clasification"],
+            "Did you mean 'Classification'?",
+        ),
+        (
+            ["classify", "{cloud}", "{folder}/o", "--scheduler", "localhost"],
+            "For example tcp://localhost:8786",
+        ),
+    ],
+)
+def test_what_to_do_is_said(job, tmp_path, write_las, capsys, words, message):
+    rng = np.random.default_rng(0)
+    clouds = [write_las(tmp_path / f"{n}.las", {axis: rng.random(50) for axis in "XYZ"}) for n in "ab"]
+    names = {"job": job, "cloud": clouds[0], "cloud2": clouds[1], "folder": tmp_path}
+    code, _, err = run(capsys, *(word.format(**names) for word in words))
+    assert code == 1 and message in err, err

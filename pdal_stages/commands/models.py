@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 from ..base import kinds
-from ..base.errors import StageError
+from ..base.errors import DimensionError, StageError
 from ..base.outputs import Output, check_outputs
 from ..base.plain import print_messages
 from ..tiling.command import add_tile_arguments
@@ -124,7 +124,7 @@ def _train(options: argparse.Namespace) -> None:
 
 
 def _accuracy(options: argparse.Namespace) -> None:
-    from ..pipeline.comparing import accuracy_pipeline, compare_files
+    from ..pipeline.comparing import WHAT_IS_TRUE, accuracy_pipeline, compare_files
     from ..pipeline.ends import input_files, overlooked
     from ..pipeline.run import Pipeline
 
@@ -157,7 +157,12 @@ def _accuracy(options: argparse.Namespace) -> None:
         )
         return
     stages = accuracy_pipeline(options.inputs, options.dimension, reference_dimension, **outputs)
-    run(options, Pipeline(stages, options.overrides))
+    try:
+        run(options, Pipeline(stages, options.overrides))
+    except DimensionError as error:
+        if f"'{reference_dimension}'" in error.what:
+            error.cure = WHAT_IS_TRUE
+        raise
 
 
 def _compare_objects(options: argparse.Namespace) -> None:

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import DimensionError, StageError
+from ..base.errors import DimensionError, StageError, suggest
 from ..base.outputs import check_outputs
 from ..base.progress import Progress
 from ..base.report import Report
@@ -22,6 +22,12 @@ from .lowering import lower_stage
 from .overrides import Override, apply_overrides
 from .run import Pipeline
 from .runtime import wkt_of
+
+#: What to do where nothing tells the true classes.
+WHAT_IS_TRUE = (
+    "Say where the true classes are: --reference FILE, of the same points, or --reference-dimension NAME, which "
+    "filters.ferry may have kept before classifying"
+)
 
 
 def accuracy_pipeline(
@@ -85,6 +91,7 @@ def compare_files(
                     f"the dimension '{reference_name}' is missing",
                     where=source,
                     found=", ".join(true.dtype.names or ()),
+                    cure=f"{suggest(reference_name, true.dtype.names or ())}{WHAT_IS_TRUE}",
                 )
             kept = [n for n in ("X", "Y", "Z", "Reliability", "Margin", *named) if n in mine.dtype.names]
             judged = mine["Classification" if model else dimension]
@@ -161,7 +168,10 @@ def _read(
     array: Any = np.concatenate(pipeline.arrays) if pipeline.arrays else np.empty(0)
     names = array.dtype.names or ()
     if dimension not in names:
-        raise DimensionError(f"the dimension '{dimension}' is missing", where=name, found=", ".join(names))
+        cure = suggest(dimension, names).strip() or None
+        raise DimensionError(
+            f"the dimension '{dimension}' is missing", where=name, found=", ".join(names), cure=cure
+        )
     points = Points(
         {n: array[n] for n in names},
         legacy_flags=pdal_env.flags_inside_classification(names, pipeline.metadata),

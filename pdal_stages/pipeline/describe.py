@@ -74,6 +74,15 @@ def stage_options(type_name: str, *, as_json: bool = False) -> str:
     return "\n".join(lines)
 
 
+def nearest_option(type_name: str, option: str) -> str:
+    """``Did you mean ...?`` among the options of a stage of PDAL's, and where they are listed."""
+    known: list[str] = []
+    with contextlib.suppress(DependencyError, PipelineError, ValueError, OSError):
+        _, options = json.loads(pdal_env.ask_program("--options", type_name, "--showjson"))
+        known += [entry["name"] for entry in options]
+    return f"{suggest(option, known)}List its options with: pdal-stages options {type_name}"
+
+
 def nearest_stage(type_name: str) -> str:
     """``Did you mean ...?`` among PDAL's stages and ours, and where they are listed."""
     known = list(registry.stages())

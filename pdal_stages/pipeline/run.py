@@ -297,8 +297,12 @@ class Pipeline:
         if named is None:
             return error
         given = [s.get("type") if isinstance(s, dict) else None for s in self.source.stages]
-        if given.count(named.group()) == 1:
+        if given.count(named.group()) == 1 and self.source.lines[given.index(named.group())]:
             error.where = self.source.where(given.index(named.group()))
+        if error.cure is None and (option := _NO_OPTION.search(str(error.found))):
+            from . import describe
+
+            error.cure = describe.nearest_option(named.group(), option.group(1))
         if error.cure is None and _NO_STAGE.search(str(error.found)):
             from . import describe
 
@@ -315,6 +319,9 @@ def run_pipeline(source: str | Path | list | dict, overrides: Iterable[Override]
 
 
 _STAGE_TYPE = re.compile(r"\b(?:readers|filters|writers)\.\w+")
+
+
+_NO_OPTION = re.compile(r"Unexpected argument '([^']*)'")
 
 
 _NO_STAGE = re.compile(r"Couldn't create (?:reader|filter|writer) stage")

@@ -47,9 +47,11 @@ class OnDask:
                 with contextlib.suppress(TimeoutError, AttributeError):
                     self._client.wait_for_workers(1, timeout=_WAIT)
                 threads = self._client.nthreads()
-            except OSError as error:
+            except (OSError, ValueError) as error:  # ValueError: an address of another kind
                 raise StageError(
-                    "the Dask scheduler cannot be reached", found=f"{self.address}: {error}"
+                    "the Dask scheduler cannot be reached",
+                    found=f"{self.address}: {error}",
+                    cure="Is dask scheduler running there, and is that the address it printed?",
                 ) from None
             if not threads:
                 raise StageError(

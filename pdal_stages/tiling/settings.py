@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 from ..base import checks
@@ -60,6 +61,12 @@ class TilingOptions:
             checks.whole("--memory", self.memory, 1, unit="bytes")
         if self.workers is not None:
             checks.whole("--workers", self.workers, 0)
+        if self.scheduler and "inproc" not in self.scheduler and not re.search(r":\d+$", self.scheduler):
+            raise OptionError(
+                "--scheduler needs an address with its port",
+                found=self.scheduler,
+                cure="For example tcp://localhost:8786",
+            )
         if self.workers is not None and self.scheduler:
             raise OptionError(
                 "--workers starts processes on this machine, and --scheduler uses others",
