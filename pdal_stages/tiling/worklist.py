@@ -127,6 +127,7 @@ class Worklist:
         if not any(job.state in ("waiting", "failed") for job in self.jobs):
             store.forget_left()
             store.forget_copies()
+            store.forget_edges()
 
     def keep(self, store: Store, item: TileJob | FileJob) -> None:
         """Remember what was finished, for runs to come."""
@@ -156,7 +157,10 @@ class Worklist:
         plan, survey, scratch = self.plan, self.survey, str(store.scratch)
         context = self.context(store, threads)
         far = self.farthest
-        before = str(store.tiles) if plan.first is not None and len(self.jobs) > 1 else ""
+        several = len(self.jobs) > 1
+        before = str(store.tiles) if plan.first is not None and several else ""
+        edges = str(store.tiles) if plan.shares is not None and several else ""
+        store.forget_edges()
 
         def task_of(item: TileJob | FileJob) -> TileTask | FileTask:
             if isinstance(item, FileJob):
@@ -184,6 +188,7 @@ class Worklist:
                 str(store.result(item.name)),
                 item.outputs,
                 before,
+                edges,
             )
 
         return task_of
