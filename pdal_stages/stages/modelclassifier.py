@@ -330,6 +330,10 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         if self.reject_below is not None:
             low = wanted & (found.reliability < np.float32(self.reject_below))
             points.report.figures["rejected"] = points.counted(low)
+        elif self.limits is not None and self._rejected not in dict(self.model.classes):
+            points.report.figures["rejected"] = points.counted(
+                wanted & (found.classification == self._rejected)
+            )
         points.report.merge(found.report)
         points.report.figures["outside_where"] = points.counted(~inside)
         return values
