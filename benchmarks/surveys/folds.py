@@ -1,8 +1,8 @@
 """Models that miss one survey each, at little more than the cost of one.
 
 What is computed of the points does not depend on who is left out, so it is computed once, for every point of every copy, and
-kept in a folder. The surroundings that the second pass reads of survey B where A is left out come from a forest grown
-without both, which serves where B is left out and A is read, too.
+kept in a folder. The surroundings that a later pass reads of survey B where A is left out come from forests grown
+without both; that of the first pass serves where B is left out and A is read, too.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from pdal_stages.classifier.context import Context
 from pdal_stages.classifier.featureforest import CloudFeatures, Features
 from pdal_stages.classifier.foresttraining import FOLD_TREES, feature_plan
 from pdal_stages.classifier.growing import TreeOptions, grow
+from pdal_stages.classifier.passes import joined
 from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.classifier.smoothing import count_shares
 from pdal_stages.classifier.trees import Ranked
@@ -33,6 +34,8 @@ from pdal_stages.stages.loading import load_model
 TREES = 20
 FEATURES = Features(feature_plan(OPTIONS))
 CONTEXT = Context(tuple(OPTIONS.context))
+#: What a pass said of all points of a cloud, (n, classes), by the cloud's number.
+Votes = dict[int, npt.NDArray[np.uint16]]
 
 
 def features_of(cloud: TrainingCloud) -> npt.NDArray[np.float32]:
@@ -74,32 +77,75 @@ class LeaveOneOut:
 
     def _grown_without(self, one: int, other: int) -> Forest:
         kept = (self.survey != one) & (self.survey != other)
-        return self._grow(self.ranked, kept, max(1, round(FOLD_TREES * self.trees)))
+        return self._grow(self.ranked, kept, self._few)
+
+    @property
+    def _few(self) -> int:
+        """Trees of a forest whose votes the next pass is trained on."""
+        return max(1, round(FOLD_TREES * self.trees))
 
     def without(self, name: str) -> Model:
         """The model of all surveys but this one."""
         left = self.names.index(name)
         kept = self.survey != left
-        first = self._grow(self.ranked, kept, self.trees)
-        around = np.zeros((len(self.samples), len(CONTEXT.tokens) * len(self.classes)), np.float32)
-        for number, (cloud, table) in enumerate(zip(self.clouds, self.tables, strict=True)):
-            at, rows = self.samples.of_cloud(number)
-            if not len(at) or cloud.flight == name:
-                continue
-            forest = self._pair(*sorted((left, self.names.index(cloud.flight))))
-            part = np.empty((len(at), around.shape[1]), np.float32)
-            shares = count_shares(forest.predict_proba(np.ascontiguousarray(table)))
-            CONTEXT.tables(cloud.xyz, shares).fill(rows, part)
-            around[at] = part
-        both = self.ranked.beside(Ranked.of(around))
-        second = self._grow(both, kept, self.trees)
-        passes = FeatureForest(FEATURES, first), FeatureForest(FEATURES, second, CONTEXT)
+        passes, scores, ranked = [], [], self.ranked
+        votes: Votes = {}
+        for number in range(OPTIONS.passes):
+            if number:
+                votes = self._votes(left, ranked, votes)
+                ranked = self.ranked.beside(Ranked.of(self._around(votes)))
+            forest = self._grow(ranked, kept, self.trees)
+            passes.append(FeatureForest(FEATURES, forest, CONTEXT if number else None))
+            scores.append(ranked.limits(0))
         # What is known of the shipped model, which is of the same make, but for what is known of its samples.
         info = {**copy.deepcopy(load_model("standard").info), "training": self._training(name)}
-        for one, ranked in zip(info["passes"], (self.ranked, both), strict=True):
-            low, high = ranked.limits(0)
-            one.update(percentiles={"low": low, "high": high, "limited": False}, importances=None)
-        return Model(passes, self.classes, {**info, "voxel": OPTIONS.voxel})
+        info["passes"] = [
+            {
+                **info["passes"][0],
+                "percentiles": {"low": low, "high": high, "limited": False},
+                "importances": None,
+            }
+            for low, high in scores
+        ]
+        return Model(tuple(passes), self.classes, {**info, "voxel": OPTIONS.voxel})
+
+    def _votes(self, left: int, ranked: Ranked, before: Votes) -> Votes:
+        """What a pass says of all points of the clouds that are trained on where a survey is left out, by forests that have
+        seen neither that nor the cloud's own: `ranked` is what the pass reads of the samples, `before` what the pass before
+        said, nothing of the first pass."""
+        found = {}
+        for other in range(len(self.names)):
+            if other == left:
+                continue
+            if before:
+                kept = (self.survey != left) & (self.survey != other)
+                forest = self._grow(ranked, kept, self._few)
+            else:
+                forest = self._pair(*sorted((left, other)))
+            for number, (cloud, table) in enumerate(zip(self.clouds, self.tables, strict=True)):
+                if cloud.flight != self.names[other] or not len(self.samples.of_cloud(number)[0]):
+                    continue
+                read = np.ascontiguousarray(table)
+                if before:
+                    read = joined(read, self._context(cloud, before[number], np.arange(len(cloud.xyz))))
+                found[number] = count_shares(forest.predict_proba(read))
+        return found
+
+    def _around(self, votes: Votes) -> npt.NDArray[np.float32]:
+        """The samples' context; 0 of those of clouds without votes."""
+        out = np.zeros((len(self.samples), len(CONTEXT.tokens) * len(self.classes)), np.float32)
+        for number, shares in votes.items():
+            at, rows = self.samples.of_cloud(number)
+            out[at] = self._context(self.clouds[number], shares, rows)
+        return out
+
+    def _context(
+        self, cloud: TrainingCloud, shares: npt.NDArray[np.uint16], rows: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.float32]:
+        """(m, columns) of some of a cloud's points."""
+        out = np.empty((len(rows), len(CONTEXT.tokens) * len(self.classes)), np.float32)
+        CONTEXT.tables(cloud.xyz, shares).fill(rows, out)
+        return out
 
     def _training(self, without: str) -> dict[str, Any]:
         """What a model file says of its training."""
