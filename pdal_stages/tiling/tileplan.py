@@ -318,7 +318,7 @@ def _check_local(step: _Step, buffer: float | None) -> None:
         raise PipelineError(
             f"{step.type} needs all points at once, so it cannot be run in tiles",
             where=step.where,
-            cure=instead or None,
+            cure=instead or "Leave it out, or run the pipeline without --tile",
         )
     if step.ours is not None:
         try:
