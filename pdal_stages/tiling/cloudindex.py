@@ -40,8 +40,12 @@ def index_las(path: str, grid: TileGrid, copy: str = "") -> CloudIndex:
     with CopyByPlace(copy) as copying:
         for array, x, y in all_points(path):
             boxes.append((float(x.min()), float(y.min()), float(x.max()), float(y.max())))
-            for i, j, number in counted(grid.index(x), grid.index(y)):
-                tiles[i, j] += number
+            only = grid.only(x, y)
+            if only is not None:
+                tiles[only] += len(x)
+            else:
+                for i, j, number in counted(grid.index(x), grid.index(y)):
+                    tiles[i, j] += number
             check_number(len(tiles), f"{path}, tiles of {grid.size:g}")
             copying.add(array, x, y)
             total += len(x)

@@ -155,7 +155,7 @@ def cut(
                         continue
                     away, others = outside(x[rows], y[rows], grid, tile)
                     tiles |= others
-                    raw = points.array if len(rows) == len(x) else points.array[rows]
+                    raw = points.array if len(rows) == len(x) else np.take(points.array, rows)
                     if raw.dtype.itemsize != width:
                         raise StageError(
                             "the points have another length than the header says", where=member.path
@@ -289,8 +289,13 @@ def outside(
     x: NDArray, y: NDArray, grid: TileGrid, tile: tuple[int, int]
 ) -> tuple[NDArray[np.float64], set[tuple[int, int]]]:
     """Distance of points from a tile along the farther axis, -1 for its own points; and all tiles they belong to."""
+    only = grid.only(x, y)
+    if only == tile:
+        return np.full(len(x), -1.0), {tile}
     x0, y0, x1, y1 = grid.box(tile)
     away = np.maximum(np.maximum(x0 - x, x - x1), np.maximum(y0 - y, y - y1))
+    if only is not None:
+        return np.maximum(away, 0.0), {only}
     column, row = grid.index(x), grid.index(y)
     mine = (column == tile[0]) & (row == tile[1])
     tiles = {(int(i), int(j)) for i, j, _ in counted(column, row)}
