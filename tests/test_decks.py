@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from long_bridge_scenes import LEAF, LONG_SCENES
 from other_bridge_scenes import OTHER_SCENES, TRAPS
 from roof_bridge_scenes import ROOF_SCENES
+from walled_scenes import walled_ramps, walled_road
 
 import pdal_stages as ps
 import pdal_stages.synthetic
@@ -23,6 +24,7 @@ from pdal_stages.stages.hag_morphological import HagMorphological
 from pdal_stages.terrain import decks, walkable
 from pdal_stages.terrain.deckrims import ISLET, LINK, WITHIN, is_land, islets, opposite_ends
 from pdal_stages.terrain.decks import PARTS, SURFACE, find_decks, level_points
+from pdal_stages.terrain.deckwalls import around
 from pdal_stages.terrain.levels import GAP, levels
 from pdal_stages.terrain.morphological import filtered_ground, reach
 from pdal_stages.terrain.walkable import ACROSS, DOWN, NOTHING, ON, ROUGH, SMOOTH, SOLID, WALLED
@@ -416,7 +418,7 @@ def test_where_no_bridge_is_heights_are_what_they_were():
 def test_the_stage_says_what_it_makes_and_how_far_it_looks():
     plain, made = HagMorphological({}), HagMorphological({"decks": True})
     assert "Deck" not in plain.creates() and made.creates()["Deck"] == "uint8_t"
-    assert plain.halo_m() <= made.halo_m() == reach(decks=True) < 700
+    assert plain.halo_m() <= made.halo_m() == reach(decks=True) < 820
     assert made.near_halo_m() == plain.near_halo_m()
     assert Bridges({}).halo_m() == 0 and Bridges({}).largest_class() == 17
 
@@ -613,3 +615,47 @@ def test_islets_equal_a_slow_reference(seed, share, held):
     deck &= kind == SOLID
     cells = [(k // w, k % w) for k in np.repeat(np.arange(h * w), count)]
     assert np.array_equal(islets(z, start, h, w, kind, deck), islets_by_hand(z, start, w, kind, deck, cells))
+
+
+def test_ramps_between_upright_walls_are_land_and_the_bridge_between_them_is_found():
+    xyz, code = scan(walled_ramps(), 16.0)
+    deck = found(xyz) > 0
+    assert f1(deck, code == DECK, code != OTHER) > 0.95
+    assert (deck & (code == GROUND)).sum() < 0.001 * len(xyz)  # without a look at walls 3.5 %
+
+
+@pytest.mark.parametrize("density", [8.0, 16.0])
+def test_a_road_between_upright_walls_is_no_bridge(density):
+    xyz, _ = scan(walled_road(), density)
+    assert (found(xyz) > 0).sum() < 0.001 * len(xyz)  # without a look at walls 4.8 %
+
+
+def test_walls_in_squares_of_a_large_cloud_as_in_the_whole(monkeypatch):
+    xyz, _ = scan(walled_ramps(), 4.0)
+    xyz = np.vstack([xyz + step * np.array([480.0, 200.0, 0.0]) for step in range(3)])
+    whole = found(xyz)
+    with monkeypatch.context() as patch:
+        patch.setattr(decks, "without_walls", lambda raster, deck: deck)
+        assert (found(xyz) > 0).sum() > 1.5 * (whole > 0).sum() > 0
+    monkeypatch.setattr("pdal_stages.terrain.patches.LARGEST", 100)
+    monkeypatch.setattr("pdal_stages.terrain.patches.SIDE", 200)
+    assert np.array_equal(found(xyz), whole)
+
+
+def around_by_hand(values, reach):
+    h, w = values.shape[:2]
+    return np.array(
+        [
+            [
+                values[max(j - reach, 0) : j + reach + 1, max(i - reach, 0) : i + reach + 1].sum(axis=(0, 1))
+                for i in range(w)
+            ]
+            for j in range(h)
+        ]
+    )
+
+
+@given(st.integers(0, 1000), st.integers(1, 30), st.integers(1, 30), st.integers(0, 12))
+def test_sums_over_squares_equal_those_by_hand(seed, h, w, reach):
+    values = np.random.default_rng(seed).integers(0, 9, (h, w, 2))
+    assert np.array_equal(around(values, reach), around_by_hand(values, reach))

@@ -42,6 +42,7 @@ from .deckrims import (
     spread,
 )  # fmt: skip
 from .deckroofs import NEXT, ROOF, without_roofs
+from .deckwalls import LOW, WINDOW, without_walls
 from .levels import levels
 from .longdecks import BLOCK, FAR_ENDS, stretches
 from .minima import cell_numbers
@@ -96,6 +97,8 @@ REACH = (
     + ROOF
     + JOIN
     + WITHIN
+    + 2 * WINDOW
+    + LOW
 ) * CELL
 #: What points are: of a deck's surface, of its parapets and flanks, or of none.
 SURFACE, PARTS = 1, 2
@@ -226,6 +229,8 @@ def _deck_levels(z, use, column, row):
     # Where a river without returns is wider than one sees, decks lead on over nothing.
     if above.any():
         found |= _judged(raster, deck | above, left, bottom, FAR)
+    if found.any():
+        found = without_walls(raster, found)
     return (left, bottom, h, w, heights, lowest, start, kind, found) if found.any() else None
 
 
