@@ -1,6 +1,9 @@
 """A few labels on top of a trained model: nothing is forgotten, and a file holds all of it."""
 
 import json
+import re
+import zipfile
+from importlib import resources
 
 import numpy as np
 import pytest
@@ -13,7 +16,8 @@ from test_classifier_training import scene
 import pdal_stages as ps
 from pdal_stages.base.errors import ModelError, OptionError
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, train
-from pdal_stages.classifier.refinement import EVEN, blended, trust
+from pdal_stages.classifier.refinement import EVEN, MOST_BELOW, blended, trust
+from pdal_stages.models import shipped
 
 BEFORE = (2, 5, 6)
 
@@ -244,3 +248,26 @@ def test_through_pdal(tmp_path, write_las):
     assert made.codes.tolist() == [2, 5, 6, 11]
     assert made.info["base"]["name"] == "standard" and len(made.info["base"]["sha256"]) == 64
     assert made.info["preparation"] == ps.load_model("standard").info["preparation"]
+
+
+def test_a_shipped_model_can_be_a_base():
+    """With its own passes and the one on top, a model file must still be valid."""
+    schema = json.loads(resources.files("pdal_stages.classifier").joinpath("model.json").read_text())
+    properties = schema["properties"]
+    assert properties["passes"]["maxItems"] == MOST_BELOW + 1
+    named = re.compile(properties["arrays"]["propertyNames"]["pattern"])
+    assert all(named.search(f"{number + 1}.tree_sizes") for number in range(MOST_BELOW + 1))
+    for path in shipped().values():
+        passes = ps.load_model(path).passes
+        assert len(passes) <= MOST_BELOW
+        held = sum(len(one) for one in _arrays_by_pass(path))
+        assert held / len(passes) * (MOST_BELOW + 1) <= properties["arrays"]["maxProperties"]
+
+
+def _arrays_by_pass(path):
+    with zipfile.ZipFile(path) as file:
+        arrays = json.loads(file.read("manifest.json"))["arrays"]
+    by_pass = {}
+    for name in arrays:
+        by_pass.setdefault(name.partition(".")[0], []).append(name)
+    return by_pass.values()
