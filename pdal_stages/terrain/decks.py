@@ -75,8 +75,9 @@ BROAD = 18
 _FILLS = 2
 #: A deck that the rim of the cloud cuts is so large and has for each cell that leads on so many at a drop.
 CUT, CUT_RIM = 60, 3
-#: How far from the deck's surface its points lie, meters: on it; parapets and cars above; its flank below.
-ON_DECK, PARAPET, FLANK = 0.4, 1.6, 2.0
+#: How far from the deck's surface its points lie, meters: on it, and in cells beside it, where leaves are; parapets and cars
+#: above; its flank below.
+ON_DECK, ON_RIM, PARAPET, FLANK = 0.4, 0.25, 1.6, 2.0
 #: Rise over run of banks, whose points are no flank of the deck above.
 BANK = 0.7
 #: Cells beyond those that were found, to the deck's edge and under its cars.
@@ -407,7 +408,7 @@ def _mark(z, use, column, row, left, bottom, h, w, heights, start, kind, deck, o
         if nearest > NEXT and across * across + along * along > (AMONG * count) ** 2:
             continue
         if not _on_land(z[p], j, i, h, w, heights, start, kind, deck, nearest, level):
-            out[p] = SURFACE if abs(z[p] - level) <= ON_DECK else PARTS
+            out[p] = SURFACE if abs(z[p] - level) <= (ON_RIM if nearest else ON_DECK) else PARTS
 
 
 @device
