@@ -51,31 +51,32 @@ def _drop(z, start, h, w, kind, deck, j, i, n, d):
 
 
 @njit
-def _drops(z, start, h, w, kind, end, deck):
-    """Of the decks' drops straight ahead, by cell (h, w, 4): how many there are, how many show the ground below, how many
-    have something between, how many are tall.
+def _drops(z, start, h, w, kind, end, deck, box):
+    """Of the decks' drops straight ahead, by cell of a box (first row, last, first column, last; 4): how many there are, how
+    many show the ground below, how many have something between, how many are tall.
     """
-    out = np.zeros((h, w, 4), np.int64)
-    for j in range(h):
-        for i in range(w):
+    out = np.zeros((box[1] - box[0] + 1, box[3] - box[2] + 1, 4), np.int32)
+    for j in range(box[0], box[1] + 1):
+        for i in range(box[2], box[3] + 1):
+            own = out[j - box[0], i - box[2]]
             for n in range(start[j * w + i], start[j * w + i + 1]):
                 if not deck[n]:
                     continue
                 for d in range(0, 8, 2):
                     if end[n, d] == DOWN:
                         counts, shown, face, tall = _drop(z, start, h, w, kind, deck, j, i, n, d)
-                        out[j, i, 0] += counts
-                        out[j, i, 1] += shown
-                        out[j, i, 2] += face
-                        out[j, i, 3] += tall
+                        own[0] += counts
+                        own[1] += shown
+                        own[2] += face
+                        own[3] += tall
     return out
 
 
-def around(values: NDArray[np.int64], reach: int) -> NDArray[np.int64]:
+def around(values: NDArray[np.int32], reach: int) -> NDArray[np.int32]:
     """Sums over squares of cells (h, w, ...) that go `reach` cells to all sides."""
     for axis in (0, 1):
         length = values.shape[axis]
-        total = np.cumsum(values, axis=axis)
+        total = np.cumsum(values, axis=axis, dtype=np.int32)
         total = np.concatenate([np.zeros_like(np.take(total, [0], axis)), total], axis=axis)
         at = np.arange(length)
         high, low = np.minimum(at + reach + 1, length), np.maximum(at - reach, 0)
@@ -93,13 +94,17 @@ def _are_walls(drops, reach, least, faced, open_):
 def without_walls(raster, deck) -> NDArray[np.bool_]:
     """The decks (n,) but for what stands on walls, and their low ends."""
     z, start, h, w, kind, end = raster
-    drops = _drops(z, start, h, w, kind, end, deck)
+    row, column = np.divmod(np.repeat(np.arange(h * w, dtype=np.int32), np.diff(start))[deck], np.int32(w))
+    box = np.array([row.min(), row.max(), column.min(), column.max()])
+    drops = _drops(z, start, h, w, kind, end, deck, box)
     walls, _ = _are_walls(drops, WINDOW, _MANY, *_SURE)
     if not walls.any():
         return deck
     close, enough = _are_walls(drops, _CLOSE, _FEW, *_NEAR)
-    walls = np.where(enough, close & (around(walls.astype(np.int64), WINDOW) > 0), walls)
+    walls = np.where(enough, close & (around(walls.astype(np.int32), WINDOW) > 0), walls)
     count, shown, _, tall = np.moveaxis(around(drops, WINDOW), -1, 0)
     low = (count >= _FEW) & (2 * tall < count) & (shown <= _OPEN_LOW * count)
-    walls |= low & (around(walls.astype(np.int64), LOW) > 0)
-    return deck & ~walls.ravel()[np.repeat(np.arange(h * w), np.diff(start))]
+    walls |= low & (around(walls.astype(np.int32), LOW) > 0)
+    out = deck.copy()
+    out[deck] = ~walls[row - box[0], column - box[2]]
+    return out
