@@ -35,47 +35,6 @@ def test_surfaces_are_the_oracle_s(cloud):
                 assert got[f"{name}_k{k}"][i] == pytest.approx(value, rel=1e-4, abs=2e-5), (name, k, i)
 
 
-@pytest.mark.parametrize("density", [0.02, 0.5, 6.0])
-@pytest.mark.parametrize("way", [0.0, 4.0])
-def test_surfaces_are_made_where_they_are_asked_for(density, way, monkeypatch):
-    """Those of a part of the cloud, and all where neighbors lie beyond it: a town with open water and far strays."""
-    from pdal_stages.features import adaptive
-
-    monkeypatch.setattr(adaptive, "NEAR_ASKED", way)
-    rng = np.random.default_rng(int(100 * density))
-    xyz = rng.uniform(0, 100, (int(1e4 * density), 3)) * [1, 1, 0.05] - 30.0
-    xyz = xyz[(xyz[:, 0] < 10) | (xyz[:, 0] > 30)]
-    xyz = np.vstack([xyz, [[9e5, -8e5, 0.0], [20.0, 20.0, 0.0], [20.0, 20.0, 0.0]]])
-    plan = FeaturePlan.parse("k10,k20,s1", "Linearity,surfaces")
-    whole = FeatureEngine(xyz, plan).table().values
-    made = []
-    of_some = adaptive.AdaptiveNeighborhoods._surfaces_of
-
-    def noted(self, points):
-        made.append(len(points))
-        return of_some(self, points)
-
-    monkeypatch.setattr(adaptive.AdaptiveNeighborhoods, "_surfaces_of", noted)
-    for rows in (
-        np.flatnonzero((np.abs(xyz[:, :2]) < 8).all(axis=1)),
-        np.flatnonzero(xyz[:, 0] > 29),
-        np.flatnonzero(rng.random(len(xyz)) < 0.05),
-        np.array([len(xyz) - 1]),
-        np.arange(len(xyz)),
-    ):
-        engine = FeatureEngine(xyz, plan)
-        made.clear()
-        assert np.array_equal(engine.table(rows).values, whole[rows])
-        assert sum(made) <= len(xyz) + 1
-        again = rng.permutation(len(xyz))[:50]  # others than were asked for first
-        assert np.array_equal(engine.table(again, threads=1).values, whole[again])
-    if density > 1 and way:
-        some = np.flatnonzero((np.abs(xyz[:, :2] + 10) < 8).all(axis=1))
-        made.clear()
-        FeatureEngine(xyz, plan, threads=1).table(some)
-        assert sum(made) < 0.3 * len(xyz)
-
-
 def test_queries_that_are_no_points_of_the_cloud():
     xyz = CLOUDS["town"]
     queries = np.vstack([some(xyz, 30) + 0.07, [[200.0, 0.0, 0.0]]])

@@ -6,7 +6,6 @@ The counterpart of ``fixed.FixedRadius``: prepared once for a grid, called by th
 from __future__ import annotations
 
 import math
-import threading
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,10 +27,6 @@ from .surfaces import WIDTH as SURFACE
 
 #: Queries computed at a time when curvatures of a whole cloud are.
 CHUNK = 16_384
-
-#: Meters around points that are asked for within which the surfaces of others are made at once.
-NEAR_ASKED = 4.0
-NO_SURFACES = np.empty((0, SURFACE), np.float32)
 
 #: Estimated cost of one query on one core, nanoseconds, to cut blocks of about equal time.
 NS_QUERY = {"knn": 2000.0, "kopt": 4500.0, "ropt": 3500.0, "copt": 5500.0}
@@ -55,15 +50,9 @@ class _Spec:
 
 
 class AdaptiveNeighborhoods:
-    """A tree over a grid's cloud, built by `threads`, and the adaptive neighborhoods of a plan.
+    """A tree over a grid's cloud, built by `threads`, and the adaptive neighborhoods of a plan."""
 
-    Surfaces are made of the points near those `asked` for, (n,) bool in the order of the grid, and of all as soon as one
-    wants another's.
-    """
-
-    def __init__(
-        self, grid: CellGrid, plan: FeaturePlan, threads: int | None = None, asked: np.ndarray | None = None
-    ) -> None:
+    def __init__(self, grid: CellGrid, plan: FeaturePlan, threads: int | None = None) -> None:
         self.grid, self.halo_m, self.least = grid, plan.halo_m, plan.least_members
         fixed = ("cylinder", "sphere")
         self.specs = [_spec(c) for c in plan.layout if c.at and c.neighborhood.kind not in fixed]
@@ -86,20 +75,18 @@ class AdaptiveNeighborhoods:
         self._nearest = nearest
         self._tree: KdTree | None = None
         self._surfaces = np.empty((0, SURFACE), np.float32)
-        self._without = np.empty(0, np.int64)  # points without one, far from all that is asked for
-        self._lock = threading.Lock()
         if len(grid):
             self._tree = build_tree(grid.x, grid.y, grid.z, lambda f, b: list(map_blocks(f, b, threads)))
             if any(spec.surfaced for spec in self.specs):
-                self._surfaces = self._surfaces_near(asked, threads)
-            self._touch(len(plan.names), 0 if asked is None else int(np.argmax(asked)))
+                self._surfaces = self._surfaces_of_all(threads)
+            self._touch(len(plan.names))
 
     def __len__(self) -> int:
         return len(self.specs)
 
-    def _touch(self, columns: int, at: int) -> None:
+    def _touch(self, columns: int) -> None:
         """Compile what the plan, of so many columns, needs, on one point, before threads do."""
-        one = self.grid.x[at : at + 1], self.grid.y[at : at + 1], self.grid.z[at : at + 1]
+        one = self.grid.x[:1], self.grid.y[:1], self.grid.z[:1]
         copies, counted = np.ones(1, np.int64), np.zeros((2, len(self.specs)), np.int64)
         out = np.zeros((1, columns), np.float32)
         if self._nearest:
@@ -127,42 +114,19 @@ class AdaptiveNeighborhoods:
             pass
         return curvatures
 
-    def _surfaces_near(self, asked: np.ndarray | None, threads: int | None) -> np.ndarray:
-        """The surfaces of the cloud's points, in the order of the grid, (n, surfaces.WIDTH) float32."""
+    def _surfaces_of_all(self, threads: int | None) -> np.ndarray:
+        """The surface of every point of the cloud, in the order of the grid, (n, surfaces.WIDTH) float32."""
         grid = self.grid
-        near = np.ones(len(grid), np.bool_) if asked is None else grid.around(asked, NEAR_ASKED)
-        self._without = np.flatnonzero(~near)
         out = np.empty((len(grid), SURFACE), np.float32)
-        out[self._without] = np.inf  # who meets such a one says that it looked too far
 
         def compute(start: int) -> None:
             part = slice(start, start + CHUNK)
-            some = near[part]
-            if some.all():
-                surfaces_block(self._tree, grid.x[part], grid.y[part], grid.z[part], NO_SURFACES, out[part])
-            elif some.any():
-                out[start + np.flatnonzero(some)] = self._surfaces_of(start + np.flatnonzero(some))
+            surfaces_block(self._tree, grid.x[part], grid.y[part], grid.z[part], self._surfaces, out[part])
 
-        self._surfaces_of(np.arange(1))  # compiled before threads want it
+        compute(len(out) - 1)  # compiled before threads want it
         for _ in map_blocks(compute, range(0, len(out), CHUNK), threads):
             pass
         return out
-
-    def _surfaces_of(self, points: np.ndarray) -> np.ndarray:
-        """The surfaces of some of the cloud's points, (m, surfaces.WIDTH) float32."""
-        x, y, z = self.grid.x[points], self.grid.y[points], self.grid.z[points]
-        out = np.empty((len(points), SURFACE), np.float32)
-        surfaces_block(self._tree, x, y, z, NO_SURFACES, out)
-        return out
-
-    def _complete(self) -> None:
-        """Make the surfaces that are missing."""
-        with self._lock:
-            if len(self._without):
-                surfaces = self._surfaces.copy()  # others may be reading it
-                surfaces[self._without] = self._surfaces_of(self._without)
-                self._surfaces = surfaces
-                self._without = self._without[:0]
 
     def shape_values(self, token: str, points: Point, seed: int, copt_threshold: float | None) -> np.ndarray:
         """Metrics of all pulls of a neighborhood for a few points, (m, 5, 255) float32, comparable."""
@@ -226,16 +190,11 @@ class AdaptiveNeighborhoods:
         wanted = np.array([spec.surfaced for spec in specs])
         columns = np.stack([spec.columns[:FEATURES] for spec in specs])
         surface_columns = np.stack([spec.surface_columns for spec in specs])
-        while True:
-            counted = np.zeros((2, len(ks)), np.int64)
-            partial = len(self._without) > 0
-            nearest_block(
-                self._tree, qx, qy, qz, copies, ks, columns, self._surfaces, wanted, surface_columns, self.halo_m,
-                counted[0], counted[1], out,
-            )  # fmt: skip
-            if not (partial and counted[1].any()):
-                break
-            self._complete()
+        counted = np.zeros((2, len(ks)), np.int64)
+        nearest_block(
+            self._tree, qx, qy, qz, copies, ks, columns, self._surfaces, wanted, surface_columns, self.halo_m,
+            counted[0], counted[1], out,
+        )  # fmt: skip
         few[self._nearest] += counted[0]
         far[self._nearest] += counted[1]
 

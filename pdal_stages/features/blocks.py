@@ -52,8 +52,8 @@ class Fitted:
 class Run:
     """One run over queries: sorted like the cloud, cut into blocks.
 
-    `grid` is the index of the `cloud`; `fit` gives what was fitted, and is called with the queries' indices once these are
-    found to be right; all else is as for ``FeatureEngine.blocks``.
+    `grid` is the index of the `cloud`; `fit` gives what was fitted, and is called once the queries are found to be right;
+    all else is as for ``FeatureEngine.blocks``.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class Run:
         plan: FeaturePlan,
         cloud: np.ndarray,
         grid: CellGrid,
-        fit: Callable[[np.ndarray | None], Fitted],
+        fit: Callable[[], Fitted],
         queries: npt.ArrayLike | None,
         dimensions: Given,
         threads: int | None,
@@ -79,7 +79,7 @@ class Run:
             return
         if not len(grid):
             raise StageError("the cloud has no points", found=f"{count} queries")
-        self.fitted = fit(self.indices)
+        self.fitted = fit()
         if len(self.fitted.fixed):
             compile_once("shapes" if self.fitted.fixed.shaped.any() else "fixed")
         self.candidates = self.fitted.fixed.candidates(self.grid.rows_of_cells(), self.grid.cell_ix)

@@ -153,7 +153,7 @@ class FeatureEngine:
 
         return dict(zip(tokens, map_blocks(values, tokens, self.threads), strict=True))
 
-    def _prepared(self, asked: np.ndarray | None = None) -> tuple[FixedRadius, AdaptiveNeighborhoods | None]:
+    def _prepared(self) -> tuple[FixedRadius, AdaptiveNeighborhoods | None]:
         with self._lock:
             if self._parts is None:
                 from .fixed import FixedRadius
@@ -162,18 +162,13 @@ class FeatureEngine:
                 if any(c.at and c.neighborhood.kind not in ("cylinder", "sphere") for c in self.plan.layout):
                     from .adaptive import AdaptiveNeighborhoods
 
-                    if asked is not None:
-                        chosen = np.zeros(len(self._grid), np.bool_)
-                        chosen[asked] = True
-                        asked = chosen[self._grid.order]
-                    adaptive = AdaptiveNeighborhoods(self._grid, self.plan, self.threads, asked)
+                    adaptive = AdaptiveNeighborhoods(self._grid, self.plan, self.threads)
                 self._parts = FixedRadius(self._grid, self.plan), adaptive
             return self._parts
 
-    def _fitted(self, asked: np.ndarray | None) -> Fitted:
-        """What features are computed with; `asked`: numbers of the cloud's points, None for all or others."""
+    def _fitted(self) -> Fitted:
         self.fit()
-        return Fitted(*self._prepared(asked), self.bins, self.copt_threshold, self.seed)
+        return Fitted(*self._prepared(), self.bins, self.copt_threshold, self.seed)
 
     # ---- computing -----------------------------------------------------------------------------------------
 

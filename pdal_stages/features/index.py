@@ -69,25 +69,6 @@ class CellGrid:
         x, y, z = self.xyz
         return x, y, z, self.cell_ix, self.cell_start, self.row_iy, self.row_start
 
-    def around(self, chosen: np.ndarray, way: float) -> np.ndarray:
-        """(n,) bool: the points in cells up to `way` meters beside those with a chosen point, (n,) bool in the grid's order.
-
-        All points, where cells lie too far apart to be counted.
-        """
-        if not len(self):
-            return chosen
-        steps = int(np.ceil(way / self.cell))
-        iy = self.rows_of_cells()
-        iy, ix = iy - int(iy.min()) + steps, self.cell_ix - int(self.cell_ix.min()) + steps
-        width = int(ix.max()) + 2 * steps + 1
-        if width * (int(iy.max()) + 2 * steps + 1) >= 2**62:
-            return np.ones(len(self), np.bool_)
-        keys = iy * width + ix
-        found = keys[np.logical_or.reduceat(chosen, self.cell_start[:-1])]
-        for step in (1, width):  # along a row, then along columns
-            found = np.unique(np.add.outer(np.arange(-steps, steps + 1) * step, found))
-        return np.repeat(np.isin(keys, found), np.diff(self.cell_start))
-
     def rows_of_cells(self) -> np.ndarray:
         """Row number of every occupied cell, (m,) int64."""
         return np.repeat(self.row_iy, np.diff(self.row_start))
