@@ -5,8 +5,7 @@
 A generated town of --side meters is repeated in files side by side, --around of them on each side of the one in the middle,
 which is a tile. `classify` with the model that comes with the package runs on the tile in the middle of the survey, then on
 its file in one piece: all rounds in this process, CPU seconds of each task. Of blocks of the ground's raster a tile pays its
-share by area. Tiles run row by row, so the four before the one in the middle, of those around it, have left what they found
-along its edges; --alone measures it without them. The program's start is left out of both.
+share by area. The program's start is left out of both.
 """
 
 from __future__ import annotations
@@ -79,7 +78,6 @@ def main() -> None:
     p.add_argument(
         "--runs", type=int, default=1, help="Of the tile in the middle, and of its file in one piece"
     )
-    p.add_argument("--alone", action="store_true", help="The tile has no others beside it that ran before")
     p.add_argument("--folder", type=Path, help="Where the town is kept for another time")
     p.add_argument("--json", type=Path)
     o = p.parse_args()
@@ -102,13 +100,10 @@ def main() -> None:
             survey.read_indexes(store, pool, 0, False)
             work = Worklist(plan, survey)
             inside = next(out for out in work.outputs if out.source.path == str(middle))
-            assert len(inside.jobs) == 1, "the file in the middle is not one tile"
-            (i, j), row = inside.jobs[0].tile, [(-1, -1), (0, -1), (1, -1), (-1, 0)]
-            tiles = [] if o.alone else [(i + di, j + dj) for di, dj in row]
-            ran = [job for job in work.jobs if job.tile in (*tiles, (i, j))]
             for item in [*work.jobs, *work.outputs]:
-                if item is not inside and item not in ran:
+                if item is not inside and item not in inside.jobs:
                     item.state = "kept"
+            assert len(inside.jobs) == 1, "the file in the middle is not one tile"
             run_first_round(work, store, pool, 0, False)
             costs = {kind: list(values) for kind, values in pool.costs.items()}
             costs["Call"] = []
@@ -118,14 +113,12 @@ def main() -> None:
                 costs["Call"].append(time.process_time() - began)
             pool.costs.clear()
             for _ in range(o.runs + 1):  # the first compiles, or loads what is compiled
-                for item in (inside, *ran):
+                for item in (inside, *inside.jobs):
                     item.state = "waiting"
                 run_all(work, store, pool, 0, False)
                 if inside.state != "done":
                     sys.exit(inside.reason)
             costs |= {kind: values[1:] for kind, values in pool.costs.items()}
-            each = len(ran)
-            costs["TileTask"] = costs["TileTask"][2 * each - 2 :: each]  # the last of each run
         whole = []
         for number in range(o.runs + 1):
             began = time.process_time()

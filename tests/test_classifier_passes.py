@@ -16,7 +16,6 @@ from pdal_stages.classifier import (
     modelfile,
     train,
 )
-from pdal_stages.classifier.featureforest import CloudFeatures
 from pdal_stages.classifier.folds import Folds
 from pdal_stages.classifier.trainoptions import CONTEXT_OF_BASE, DEFAULT_CONTEXT
 from pdal_stages.features import FeatureEngine
@@ -116,37 +115,6 @@ def test_where_and_tiles_change_nothing(name, other, request):
     same(whole, tile, inner, inner[near])
     none = everything(model, xyz, dimensions, np.zeros(len(xyz), bool))
     assert none.classified == 0 and not none.classification.any()
-
-
-@pytest.mark.parametrize("name", ["two", "three"])
-@pytest.mark.parametrize("voxel", [0.0, 0.5])
-def test_votes_that_are_known_change_nothing(name, voxel, other, request, monkeypatch):
-    model = request.getfixturevalue(name)
-    model = replace(model, info={**model.info, "voxel": voxel})
-    xyz, _, dimensions = other
-    west, east = xyz[:, 0] < 30, xyz[:, 0] >= 30
-    one = everything(model, xyz, dimensions, west, keep_votes=True)
-    votes = one.votes
-    assert len(np.unique(votes.rows)) == len(votes.rows) and (~west[votes.rows]).any()
-    asked = []
-    blocks = CloudFeatures.blocks
-
-    def noted(self, rows, *more, **named):
-        asked.append(len(xyz) if rows is None else len(rows))
-        return blocks(self, rows, *more, **named)
-
-    monkeypatch.setattr(CloudFeatures, "blocks", noted)
-    whole = everything(model, xyz, dimensions, east, keep_votes=True)
-    first = asked.copy()
-    asked.clear()
-    part = everything(model, xyz, dimensions, east, votes=votes, keep_votes=True)
-    same(whole, part)
-    assert asked[0] < first[0] and asked[1:] == first[1:]
-    rows, other_rows = np.argsort(whole.votes.rows), np.argsort(part.votes.rows)
-    assert np.array_equal(whole.votes.rows[rows], part.votes.rows[other_rows])
-    assert np.array_equal(whole.votes.shares[rows], part.votes.shares[other_rows])
-    same(everything(model, xyz, dimensions), everything(model, xyz, dimensions, votes=votes))
-    assert everything(model, xyz, dimensions).votes is None
 
 
 def test_features_that_are_not_kept_are_computed_again(two, other, monkeypatch):

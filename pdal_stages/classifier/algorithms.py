@@ -53,13 +53,6 @@ class Column(NamedTuple):
     neighborhood: str
 
 
-class Votes(NamedTuple):
-    """What the first of several passes says of points: the same in any cloud that holds all around them."""
-
-    rows: npt.NDArray[np.int64]  #: (k,) of the cloud, each once
-    shares: npt.NDArray[np.uint16]  #: (k, classes) see ``smoothing.count_shares``
-
-
 @dataclass(frozen=True, eq=False)
 class PredictRequest:
     """A cloud, and the points of it that are to be classified."""
@@ -72,9 +65,6 @@ class PredictRequest:
     memory_mb: float = 512.0  #: for work under way
     progress: Any = None  #: its ``update`` is called with the points done
     grid: CellGrid | None = None  #: the index of the cloud, which lies in its order
-    votes: Votes | None = (
-        None  #: what the first of several passes says of some points, where that is known before
-    )
 
     @property
     def count(self) -> int:
@@ -100,8 +90,6 @@ class PredictResult:
 
     blocks: Iterable[Block]
     report: Report = field(default_factory=Report)
-    #: What the first of several passes said, when all blocks are read; None where there is but one.
-    votes: Callable[[], Votes] | None = None
 
 
 class Algorithm(Protocol):

@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from ..base import checks
 from ..base.report import Report
-from .algorithms import Votes
 from .smoothing import FARTHEST
 
 #: The class of a rejected point where its old class is not known: ASPRS "Unclassified".
@@ -78,8 +77,6 @@ class Prediction:
         Points looked at, and those of them whose reliability was below `reject_below`.
     report : Report
         Counts, notes and warnings for the metadata.
-    votes : Votes or None
-        On request, what the first of several passes said of points, here and around.
     """
 
     classification: npt.NDArray[np.uint8]
@@ -90,7 +87,6 @@ class Prediction:
     classified: int
     rejected: int
     report: Report
-    votes: Votes | None = None
 
 
 class Decided(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -19,7 +19,7 @@ from ..features import FeaturePlan
 from ..features.index import CellGrid, build_grid, check_xyz
 from ..features.voxels import Representatives, check_side, represent
 from . import modelfile, summary
-from .algorithms import InputPlan, PredictRequest, Votes, algorithm
+from .algorithms import InputPlan, PredictRequest, algorithm
 from .deciding import Outcome, Prediction, PredictionOptions, decide
 from .dimensions import known, required, welcome
 from .passes import Passes, weighed
@@ -167,8 +167,6 @@ class Model:
         *,
         current: npt.ArrayLike | None = None,
         ignore: npt.ArrayLike | None = None,
-        votes: Votes | None = None,
-        keep_votes: bool = False,
         progress: Any = None,
         **options: Any,
     ) -> Prediction:
@@ -190,11 +188,6 @@ class Model:
             the former get 0 (never classified) and the latter 1 (unclassified).
         ignore : (n,) bool, optional
             Points that are not there for the model: not classified, and not even neighbors. For noise.
-        votes : Votes, optional
-            What a model of several passes is known to say of points in its first one, from clouds that held all around
-            them: it changes no bit, but these need not be computed.
-        keep_votes : bool
-            Whether :attr:`Prediction.votes` is wanted.
         progress : object, optional
             Its ``update`` is called with the points done.
         **options
@@ -253,22 +246,10 @@ class Model:
             taken = order if taken is None else taken[order]
         if taken is not None:
             given = {name: Taken(np.asarray(values), taken) for name, values in given.items()}
-        if votes is not None and taken is not None:
-            place = np.full(n, -1, order.dtype if order is not None else np.int64)
-            place[taken] = np.arange(len(taken))
-            at = place[votes.rows]
-            votes = Votes(at[at >= 0].astype(np.int64), votes.shares[at >= 0])
-        report, said = self._predict(
-            xyz, given, rows, grid, order, representatives, outcome, how, progress, votes
-        )
+        report = self._predict(xyz, given, rows, grid, order, representatives, outcome, how, progress)
         if len(xyz) < n - ignored:
             report.figures["representatives"] = len(xyz)
-        prediction = outcome.prediction(asked, ignored, report)
-        if keep_votes and said is not None:
-            kept = said()
-            rows = kept.rows if taken is None else taken[kept.rows].astype(np.int64)
-            prediction = replace(prediction, votes=Votes(rows, kept.shares))
-        return prediction
+        return outcome.prediction(asked, ignored, report)
 
     @property
     def _cell(self) -> float | None:
@@ -286,9 +267,8 @@ class Model:
         outcome: Outcome,
         how: PredictionOptions,
         progress: Any,
-        votes: Votes | None,
-    ) -> tuple[Report, Callable[[], Votes] | None]:
-        """Classify the points `rows` (None: all), each for those that it represents; what was counted, and what votes.
+    ) -> Report:
+        """Classify the points `rows` (None: all), each for those that it represents.
 
         `order` are the points' places among the representatives, or in the cloud; None where these are their own.
         """
@@ -316,7 +296,6 @@ class Model:
             how.memory_mb,
             progress if representatives is None else None,
             grid,
-            votes,
         )
         # Before the search structures are there, with which it would be the most that is held.
         found = density(xyz) if self.info.get("densities") is not None and request.count else 0.0
@@ -333,7 +312,7 @@ class Model:
                 write(part, decide(p, codes, how))
             predicted.report.figures["smooth"] = how.smooth
         self._report_density(predicted.report, found, request.count)
-        return predicted.report, predicted.votes
+        return predicted.report
 
     def _report_density(self, report: Report, found: float, count: int) -> None:
         """How dense the cloud is; a warning where that is not what the model was trained for."""

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.report import Report
-from .algorithms import Algorithm, Block, InputPlan, PredictRequest, PredictResult, Votes
+from .algorithms import Algorithm, Block, InputPlan, PredictRequest, PredictResult
 from .context import Context, around
 from .featureforest import CloudFeatures, Features
 from .smoothing import count_shares
@@ -79,8 +79,7 @@ class Passes:
         def last(values, rows, context):
             return finish(self.members[-1].probabilities(joined(values, context), rows))
 
-        blocks = (Block(rows, result) for rows, result in run.blocks(last))
-        return PredictResult(blocks, run.report, run.votes)
+        return PredictResult((Block(rows, result) for rows, result in run.blocks(last)), run.report)
 
 
 class PassRun:
@@ -104,35 +103,10 @@ class PassRun:
         for one in members[:0:-1]:
             rows.insert(0, around(request.xyz, rows[0], _context_of(one)))
         self._rows = rows
-        self._known, self._asked = self._told(request.votes)
-        self._first_sweep: Sweep | None = None
         self._of_clouds: list[CloudFeatures] = []
         for one in members:
             if one.features is not None:
                 self._features_of(one.features)
-
-    def _told(self, votes: Votes | None) -> tuple[Votes | None, npt.NDArray[np.int64] | None]:
-        """The votes that need not be asked for, and whose are asked of the first pass: all, where these are None.
-
-        Features of what the next pass wants are computed in any case.
-        """
-        coming, wanted = self._rows[:2]
-        if votes is None or wanted is None or self._members[0].features is None:
-            return None, coming
-        asked = np.zeros(len(self._request.xyz), np.bool_)
-        asked[slice(None) if coming is None else coming] = True
-        known = asked.copy()
-        known[wanted] = False
-        some = known[votes.rows]
-        asked[votes.rows[some]] = False
-        return Votes(votes.rows[some], votes.shares[some]), np.flatnonzero(asked)
-
-    def votes(self) -> Votes:
-        """What the first pass said, and what was known of it before, when all blocks are read."""
-        sweep = self._first_sweep
-        if sweep is None:
-            return Votes(np.empty(0, np.int64), np.empty((0, self._classes[0]), np.uint16))
-        return Votes(*sweep.votes)
 
     def _features_of(self, features: Features) -> CloudFeatures:
         """One for passes that read the same features, so that these are computed once."""
@@ -172,10 +146,8 @@ class PassRun:
                 yield Passed(every[block.rows], block.result, None)
             self.report.merge(predicted.report)
             return
-        if self._known is not None and len(self._known.rows):
-            yield Passed(*self._known, None)
         blocks = self._features_of(first.features).blocks(
-            self._asked, self._handing_on(0), 1.0 - _KEPT, shown=False
+            self._rows[0], self._handing_on(0), 1.0 - _KEPT, shown=False
         )
         yield from _passed(blocks)
 
@@ -214,8 +186,6 @@ class PassRun:
             keep_bytes=asked.memory_mb * 2**20 * _KEPT / (len(self._members) - 1),
             again=again,
         )
-        if number == 1:
-            self._first_sweep = sweep
         return sweep.run(stream, apply)
 
 

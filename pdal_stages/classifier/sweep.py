@@ -114,12 +114,6 @@ class Sweep:
             most = np.searchsorted(np.cumsum(np.diff(self._start)[ready]), TOGETHER) + 1
             yield from self._work(ready[:most], apply)
 
-    @property
-    def votes(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.uint16]]:
-        """Rows of all points that were handed over, and their shares."""
-        rows = np.arange(len(self._shares)) if self._order is None else self._order.astype(np.int64)
-        return rows, self._shares
-
     def _take(self, block: Passed) -> None:
         """Store a block's shares, and what is wanted of it with the strips it lies in."""
         at = block.rows if self._place is None else self._place[block.rows]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,27 +55,6 @@ class Left(NamedTuple):
     around: NDArray[np.float64]  #: (n, 3) of points that blocks need that are far away
     #: (m, 3) what blocks need of points inside them alone, by block (column, row)
     inside: dict[tuple[int, int], NDArray[np.float64]]
-
-
-class AtEdges(NamedTuple):
-    """What is found of points near the edges of tiles, which tiles on both sides need.
-
-    All of it is the same in each tile that holds what it depends on.
-    """
-
-    votes: tuple[NDArray[np.int64], NDArray]  #: rows (k,), and what is found on the way (k, ...)
-    rows: NDArray[np.int64]  #: (m,) ascending
-    results: dict[str, NDArray]  #: by name, (m, ...) of these; of all points where they are handed over
-
-
-class Edges(Protocol):
-    """What tiles share along their edges."""
-
-    def found(self, arrays: Mapping[str, NDArray], names: Sequence[str]) -> AtEdges:
-        """What those beside found of points whose dimensions these are, with results of these names."""
-
-    def take(self, found: AtEdges) -> None:
-        """What was found of the same points."""
 
 
 class Stage(ABC):
@@ -147,8 +126,6 @@ class Stage(ABC):
     from_blocks: Any = None
     #: Side of the blocks, meters, where it is another than :meth:`blocks` says.
     block_side: float | None = None
-    #: In tiles: what those beside found along their edges, and what takes what is found here; see :meth:`shares_m`.
-    edges: Edges | None = None
     #: In tiles: a dimension below zero for points whose results are used; only they are counted in reports.
     own_points: str = ""
     #: Whether stages before it in the pipeline make what it makes too.
@@ -241,10 +218,6 @@ class Stage(ABC):
     def largest_class(self) -> int:
         """The largest class code the stage may write to `Classification` (0: none)."""
         return 0
-
-    def shares_m(self) -> float | None:
-        """How far around points, in meters, others are computed on the way, for a stage that takes :attr:`edges`."""
-        return None
 
     def most_neighbors(self) -> int:
         """The most neighbors a point is asked for, where their number decides how far away they are; 0: none."""

@@ -13,13 +13,12 @@ from ..base.progress import Progress
 from ..base.vegetation import HIGH as HIGH_VEGETATION
 from ..base.vegetation import LOW, MEDIUM, bands, by_height
 from ..classifier import Model, Prediction
-from ..classifier.algorithms import Votes
 from ..classifier.deciding import UNCLASSIFIED
 from ..classifier.smoothing import FARTHEST
 from ..classifier.sureness import Limit, Sureness, said, sureness_of
 from ..classifier.sweep import TOGETHER
 from ..models import find
-from .base import AtEdges, Stage
+from .base import Stage
 from .dimensions import meaning, parts_of
 from .loading import loaded_model
 from .options import ignore_option, keep_option, option, vegetation_heights_option
@@ -232,14 +231,6 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
     def inner_halo_m(self) -> float:
         return self.smooth + 0.001 if self.smooth else 0.0  # a distance rounds
 
-    def shares_m(self) -> float | None:
-        # A point's result is its own but for these options, two of which count what they do.
-        own = not self.smooth and self.reject_below is None and self.keep_sure is None and not self.variance
-        passes = self.model.passes
-        if not own or len(passes) < 2 or passes[0].features is None:
-            return None
-        return sum(one.context.reach for one in passes[1:])
-
     def largest_class(self) -> int:
         return max([code for code, _ in self.model.classes] + [self._rejected or 0])
 
@@ -270,21 +261,14 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         wanted = inside & ~ignored & ~kept
         self._refuse_codes_that_stay(points, wanted)
         dimensions, current = self._dimensions(points), points.class_codes
-        shared, computed = None, wanted
-        if self.edges is not None:
-            shared = self.edges.found(points.arrays, self._shared)
-            computed = wanted.copy()
-            computed[shared.rows] = False
         points.keep_only([*dimensions, *self.creates(), HEIGHT])
-        with Progress(int(np.count_nonzero(computed)), self.type) as progress:
+        with Progress(int(np.count_nonzero(wanted)), self.type) as progress:
             found = self.model.predict(
                 points.take_xyz(),
                 dimensions,
-                None if computed.all() else computed,
+                None if wanted.all() else wanted,
                 current=current,
                 ignore=ignored if ignored.any() else None,
-                votes=None if shared is None or not len(shared.rows) else Votes(*shared.votes),
-                keep_votes=self.edges is not None,
                 threads=self.threads,
                 memory_mb=self.memory,
                 probabilities=self.probabilities,
@@ -298,8 +282,6 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
                 smooth=self.smooth,
                 progress=progress,
             )
-        if shared is not None:
-            self._share(found, shared, wanted)
         if self.bands:
             self._split_vegetation(points, found, wanted, self.bands)
         values: dict[str, NDArray] = {
@@ -337,24 +319,6 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         points.report.merge(found.report)
         points.report.figures["outside_where"] = points.counted(~inside)
         return values
-
-    @property
-    def _shared(self) -> list[str]:
-        """What tiles share of a prediction."""
-        asked = {"margin": self.margin, "probabilities": self.probabilities}
-        return ["classification", "reliability", *(name for name, wanted in asked.items() if wanted)]
-
-    def _share(self, found: Prediction, shared: AtEdges, wanted: NDArray[np.bool_]) -> None:
-        """Fill in what tiles beside found of points that are wanted here, and hand over what was found."""
-        assert self.edges is not None
-        results = {name: getattr(found, name) for name in self._shared}
-        here = wanted[shared.rows]
-        for name, values in shared.results.items():
-            results[name][shared.rows[here]] = values[here]
-        votes = found.votes
-        if votes is None:
-            votes = Votes(np.empty(0, np.int64), np.empty((0, len(self.model.classes)), np.uint16))
-        self.edges.take(AtEdges(votes, np.flatnonzero(wanted), results))
 
     def _split_vegetation(
         self, points: Points, found: Prediction, wanted: NDArray[np.bool_], limits: tuple[float, float]

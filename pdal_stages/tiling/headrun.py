@@ -24,7 +24,6 @@ from ..stages import registry
 from ..stages.base import Left, Stage
 from ..stages.points import HOLDS_NOWHERE
 from ..stages.polygons import THE_PLACES, TOUCH_NONE
-from .edges import TileEdges
 from .extract import Piece, sampled
 from .grid import Box, TileGrid
 from .outcome import left_alone
@@ -77,7 +76,6 @@ def run_head(
     cuts: list[Piece],
     everything: bool,
     before: FromBefore | None = None,
-    edges: TileEdges | None = None,
     narrowing: bool = True,
 ) -> HeadRun:
     """Run the head once.
@@ -86,7 +84,6 @@ def run_head(
     With `narrowing`, stages after one that reaches far get the points alone
     that they can reach themselves. Where that turns out to be too few (the k nearest neighbors of sparse points), it is
     done again without.
-    `edges`: what is taken of the tiles beside, and left to them.
     """
     plan = context.plan
     if not plan.head:
@@ -99,7 +96,7 @@ def run_head(
             mark.changed = changed
     reaches: dict[int, _Reach] = {}
     narrowed = False
-    from_afar = sharing = None
+    from_afar = None
     found = _Found(plan.creates)
     with Callbacks() as callbacks:
         stages = _marked(callbacks, cuts, marks)
@@ -110,8 +107,6 @@ def run_head(
             stages.append(stage if number > begin else {**stage, **_after(marks)})
             if before is not None and plan.first is not None and number == plan.first.at:
                 from_afar = len(stages) - 1
-            if edges is not None and number == edges.shared.at:
-                sharing = len(stages) - 1
             kind = registry.stages().get(stage["type"])
             if kind is not None and kind.open_ended and not everything:
                 reach = reaches[len(stages) - 1] = _Reach(context.grid.box(tile), later)
@@ -128,8 +123,6 @@ def run_head(
             if ours.number == from_afar:
                 assert before is not None
                 ours.stage.from_blocks = before.from_blocks()
-            if ours.number == sharing:
-                ours.stage.edges = edges
             if ours.number in reaches:
                 reaches[ours.number].stage = ours.stage
         found.with_places = any(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
@@ -138,12 +131,12 @@ def run_head(
             pipeline.execute(arrays=False, read=read)
         except NeedsPdal:
             _write(cuts)
-            return run_head(context, tile, cuts, everything, before, edges, narrowing)
+            return run_head(context, tile, cuts, everything, before, narrowing)
     results = _collect(found.views, cuts, plan.creates, marks)
     need = max((reach.need for reach in reaches.values()), default=0.0)
     far = any(report.beyond_halo for _, reports in pipeline.reports for report in reports)
     if far and narrowed:
-        return run_head(context, tile, cuts, everything, before, edges, narrowing=False)
+        return run_head(context, tile, cuts, everything, before, narrowing=False)
     if far and not everything:
         most = max(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
         second = max(ours.stage.second_neighbors() for ours in pipeline.lowered.ours)

@@ -61,11 +61,6 @@ def block_file(block: tuple[int, int]) -> str:
     return f"{block[0]}_{block[1]}.cells.npz"
 
 
-def edges_file(tile: str) -> str:
-    """The name of the file of what a tile leaves to those beside."""
-    return f"{tile}.edges.npz"
-
-
 class Store:
     """The folder of one run, locked while it is used.
 
@@ -178,11 +173,6 @@ class Store:
         for path in [*self.tiles.glob("*.first.npz"), *self.tiles.glob("*.cells.npz")]:
             if path.name not in kept:
                 path.unlink(missing_ok=True)
-
-    def forget_edges(self) -> None:
-        """Remove what tiles left to those beside, which may have been of other inputs."""
-        for path in self.tiles.glob("*.edges.npz"):
-            path.unlink(missing_ok=True)
 
     def has_result(self, name: str, record: dict[str, Any]) -> bool:
         """Whether the file of a tile's results is there, as long as the tile's record says."""

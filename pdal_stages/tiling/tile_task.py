@@ -12,7 +12,6 @@ import numpy as np
 
 from ..base.errors import NoTerrainError
 from .cloudindex import CloudIndex
-from .edges import TileEdges
 from .extract import Piece, cut_all
 from .file_task import write_tile
 from .firstround import Before
@@ -37,7 +36,6 @@ class TileTask:
     result: str  #: file for the results, where outputs are put together from tiles
     outputs: list[str] | None  #: otherwise: what each of the writers writes
     before: str  #: the folder of what the rounds before made; empty where there were none
-    edges: str = ""  #: the folder of what tiles leave to those beside; empty where they share nothing
 
     def run(self) -> dict[str, Any]:
         """Run the head; write its results, or the outputs. The record says which."""
@@ -66,7 +64,6 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
     context, tile, least_m = task.context, task.tile, task.context.plan.halo_m
     side, halo_m, short = context.grid.size * context.unit, least_m, False
     head: HeadRun | None = None
-    edges: TileEdges | None = None
     for attempt in range(_WIDENINGS + 1):
         cuts = cut_all(
             context.grid,
@@ -83,8 +80,7 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
             break
         everything = inside(context.bounds, context.grid.box(tile, halo_m / context.unit))
         try:
-            edges = _edges(task, cuts)
-            head = run_head(context, tile, cuts, everything, _before(task, cuts, halo_m), edges)
+            head = run_head(context, tile, cuts, everything, _before(task, cuts, halo_m))
             need = head.need
         except NoTerrainError:
             if everything:
@@ -101,8 +97,6 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
                 )
             break
         halo_m, short = need + 1e-6, False
-    if head is not None and edges is not None and not short:
-        edges.save()
     if head is None:
         empty = np.empty(0, np.int64)
         head = HeadRun([PieceResults(piece, empty, {}) for piece in cuts], 0.0)
@@ -118,16 +112,6 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
         "left_alone": head.left_alone,
     }
     return head.results, record
-
-
-def _edges(task: TileTask, cuts: list[Piece]) -> TileEdges | None:
-    """What the tile takes of those beside and leaves them, where they share anything."""
-    context = task.context
-    if context.plan.shares is None or not task.edges:
-        return None
-    return TileEdges(
-        context.plan.shares, context.grid, context.unit, task.tile, cuts, task.edges, context.scratch
-    )
 
 
 def _before(task: TileTask, cuts: list[Piece], halo_m: float) -> FromBefore | None:

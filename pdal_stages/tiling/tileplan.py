@@ -59,15 +59,6 @@ class FirstRound:
 
 
 @dataclass(frozen=True)
-class SharedEdges:
-    """What tiles share along their edges, and how far around a tile in meters: see :mod:`.edges`."""
-
-    at: int  #: number of the stage in the head
-    results_m: float  #: of its results
-    votes_m: float  #: of what it finds on the way
-
-
-@dataclass(frozen=True)
 class TilePlan:
     """What a tiled run does to each tile."""
 
@@ -86,7 +77,6 @@ class TilePlan:
     #: Of the dimensions that stages make, those that LAS files get beside the input's own; None leaves it to the writer.
     beside: dict[str, str] | None = None
     first: FirstRound | None = None  #: what is made of the points before any tile
-    shares: SharedEdges | None = None  #: what tiles share with those beside
     #: What LAS files say of dimensions that stages make.
     meanings: dict[str, str] = field(default_factory=dict)
     #: What takes each tile's own points in place of the tail: called with their results, the outputs and the folder for
@@ -185,7 +175,6 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
         halo_m=sum(reaches),
         sees_m=sees_m,
         first=first,
-        shares=None if foreign else _shares(readers, head, later),
         creates=None if foreign else list(makes),
         makes=makes,
         unit=next(filter(None, (stage.horizontal_unit for stage in stages)), ""),
@@ -235,18 +224,6 @@ def _kept(readers: list[_Step], before: list[_Step]) -> list[str] | None:
         return None  # whose points have no numbers
     made = {name for step in before if step.ours is not None for name in step.ours.creates()}
     return sorted(made) if made <= {"Classification"} else None
-
-
-def _shares(readers: list[_Step], head: list[_Step], later: list[float]) -> SharedEdges | None:
-    """The only stage that shares what it finds along edges, where points have numbers in their inputs."""
-    if any(step.type == "readers.ept" for step in readers):
-        return None
-    found = [
-        SharedEdges(number, later[number], later[number] + way)
-        for number, step in enumerate(head)
-        if step.ours is not None and (way := step.ours.shares_m()) is not None
-    ]
-    return found[0] if len(found) == 1 else None
 
 
 def _object(stage: Any, index: int, count: int) -> dict[str, Any]:

@@ -127,7 +127,6 @@ class Worklist:
         if not any(job.state in ("waiting", "failed") for job in self.jobs):
             store.forget_left()
             store.forget_copies()
-            store.forget_edges()
 
     def keep(self, store: Store, item: TileJob | FileJob) -> None:
         """Remember what was finished, for runs to come."""
@@ -157,10 +156,7 @@ class Worklist:
         plan, survey, scratch = self.plan, self.survey, str(store.scratch)
         context = self.context(store, threads)
         far = self.farthest
-        several = len(self.jobs) > 1
-        before = str(store.tiles) if plan.first is not None and several else ""
-        edges = str(store.tiles) if plan.shares is not None and several else ""
-        store.forget_edges()
+        before = str(store.tiles) if plan.first is not None and len(self.jobs) > 1 else ""
 
         def task_of(item: TileJob | FileJob) -> TileTask | FileTask:
             if isinstance(item, FileJob):
@@ -188,7 +184,6 @@ class Worklist:
                 str(store.result(item.name)),
                 item.outputs,
                 before,
-                edges,
             )
 
         return task_of
