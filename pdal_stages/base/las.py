@@ -26,8 +26,6 @@ from .errors import StageError
 POINT_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
 #: What to do about a damaged file.
 DAMAGED = "Get the file again from its source, or repair it with a tool made for that (e.g. lasinfo -repair)"
-
-
 #: Steps of the coordinates that points may lie beyond the box: programs round it differently.
 _BOX_STEPS = 100
 

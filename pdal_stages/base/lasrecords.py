@@ -45,13 +45,11 @@ _BLOCK = 200_000
 class DamagedError(StageError):
     """Points that cannot be decoded."""
 
-    def __init__(self, path: str, found: str) -> None:
-        super().__init__(
-            "the LAS file is damaged: its points cannot be decoded", where=path, found=found, cure=DAMAGED
-        )
 
-    def __reduce__(self):
-        return type(self), (self.where, self.found)
+def damaged(where: str, found: str) -> DamagedError:
+    """What is said of them, and what to do."""
+    what = "the LAS file is damaged: its points cannot be decoded"
+    return DamagedError(what, where=where, found=found, cure=DAMAGED)
 
 
 def record_type(path: str | os.PathLike, header: LasHeader) -> np.dtype | None:
@@ -107,9 +105,9 @@ def blocks(
         raise
     except BaseException as error:  # lazrs panics at damaged points, which is no Exception
         if isinstance(error, Exception) or type(error).__name__ == "PanicException":
-            if isinstance(error, MemoryError):
+            if isinstance(error, (MemoryError, OSError)):  # of the machine, not of the file
                 raise StageError("the points cannot be read", where=str(path), found=error) from error
-            raise DamagedError(str(path), str(error)) from error
+            raise damaged(str(path), str(error)) from error
         raise
 
 

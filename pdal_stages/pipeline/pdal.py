@@ -17,7 +17,8 @@ from functools import cache
 from typing import Any
 
 from ..base.errors import DependencyError, PipelineError, StageError
-from ..base.las import DAMAGED, check_readable
+from ..base.las import check_readable
+from ..base.lasrecords import damaged
 from ..base.shortage import is_short, shortage
 from .filenames import readers_files
 from .interrupts import fragile
@@ -165,12 +166,7 @@ def _of_damaged(stages: list[dict[str, Any]], message: str) -> StageError | None
     read = readers_files(stages, las=True)
     if not read or not _CUT_POINTS.search(message):
         return None
-    return StageError(
-        "the LAS file is damaged: its points cannot be decoded",
-        where=read[0] if len(read) == 1 else "one of " + ", ".join(read),
-        found=message.strip(),
-        cure=DAMAGED,
-    )
+    return damaged(read[0] if len(read) == 1 else "one of " + ", ".join(read), message.strip())
 
 
 _kept: list[Any] = []

@@ -29,7 +29,6 @@ _PLAIN = {
     *("type", "filename", "tag", "default_srs", "override_srs", "spatialreference", "nosrs"),
     *("use_eb_vlr", "extra_dims"),
 }
-#: NumPy's types of PDAL's, where they have other names.
 _LIMITS = re.compile(r"(\w+)\[:([-+.\de]+)\]")
 
 

@@ -84,9 +84,9 @@ def around(values: NDArray[np.int32], reach: int) -> NDArray[np.int32]:
     return values
 
 
-def _are_walls(drops, reach, least, faced, open_):
-    """Of each cell (h, w), whether walls are below the rims around, and whether there is enough to say so."""
-    count, shown, faces, tall = np.moveaxis(around(drops, reach), -1, 0)
+def _are_walls(near, least, faced, open_):
+    """Of each cell (h, w), whether walls are below the rims `near` it, and whether there is enough to say so."""
+    count, shown, faces, tall = near
     enough = tall >= least
     return enough & (faces >= faced * tall) & (shown <= open_ * count), enough
 
@@ -97,12 +97,13 @@ def without_walls(raster, deck) -> NDArray[np.bool_]:
     row, column = np.divmod(np.repeat(np.arange(h * w, dtype=np.int32), np.diff(start))[deck], np.int32(w))
     box = np.array([row.min(), row.max(), column.min(), column.max()])
     drops = _drops(z, start, h, w, kind, end, deck, box)
-    walls, _ = _are_walls(drops, WINDOW, _MANY, *_SURE)
+    near = np.moveaxis(around(drops, WINDOW), -1, 0)
+    walls, _ = _are_walls(near, _MANY, *_SURE)
     if not walls.any():
         return deck
-    close, enough = _are_walls(drops, _CLOSE, _FEW, *_NEAR)
+    close, enough = _are_walls(np.moveaxis(around(drops, _CLOSE), -1, 0), _FEW, *_NEAR)
     walls = np.where(enough, close & (around(walls.astype(np.int32), WINDOW) > 0), walls)
-    count, shown, _, tall = np.moveaxis(around(drops, WINDOW), -1, 0)
+    count, shown, _, tall = near
     low = (count >= _FEW) & (2 * tall < count) & (shown <= _OPEN_LOW * count)
     walls |= low & (around(walls.astype(np.int32), LOW) > 0)
     out = deck.copy()
