@@ -127,6 +127,21 @@ def test_links_between_pages_lead_somewhere():
             assert path.exists() or inside in made, f"{page.name}: {target}"
 
 
+def test_the_card_of_the_shipped_model_is_of_what_was_measured_of_it():
+    measured = ROOT / "benchmarks" / "results"
+    command = [sys.executable, str(ROOT / "benchmarks" / "surveys" / "card.py")]
+    command += ["--model", str(ROOT / "pdal_stages" / "models" / "standard.model")]
+    command += ["--scores", str(measured / "surveys.json"), "--rules", str(measured / "surveys-rules.json")]
+    made = subprocess.run(command, capture_output=True, text=True, encoding="utf-8", timeout=300)
+    assert made.returncode == 0, made.stderr
+    card = (ROOT / "docs" / "models.md").read_text(encoding="utf-8")
+    assert made.stdout == card, "write it anew: docs/models.md, Made anew"
+    spec = importlib.util.spec_from_file_location("survey_table", ROOT / "docs" / "survey_table.py")
+    short = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(short)
+    assert short.table().strip() in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize(
     "script", sorted((ROOT / "docs" / "gallery").glob("[0-9]*.py")), ids=lambda p: p.stem
 )
