@@ -262,6 +262,28 @@ def test_dimensions_are_chosen(folder, classify, tmp_path, words, made):
     assert sorted(d.name for d in extra) == made and all(d.dtype == np.float32 for d in extra)
 
 
+def test_a_second_record_of_extra_dimensions_is_named_and_left_out(classify, tmp_path, write_las):
+    # As files have that two programs gave dimensions: PDAL reads the first record.
+    rng = np.random.default_rng(0)
+    arrays = {**dict(zip("XY", rng.uniform(0, 30, (2, 500)), strict=True)), "Z": rng.normal(0, 0.02, 500)}
+    for name in ("Amplitude", "Width"):
+        arrays[name] = rng.random(500).astype("f4")
+    write_las(tmp_path / "a.las", arrays, point_format=6)
+    data = (tmp_path / "a.las").read_bytes()
+    at = data.index(b"Amplitude") - 4 - 54  # one record of two entries becomes two of one
+    head, entries, rest = data[at : at + 54], data[at + 54 : at + 54 + 384], data[at + 54 + 384 :]
+    one = head[:20] + (192).to_bytes(2, "little") + head[22:]
+    start = bytearray(data[:at])
+    start[96:100] = (int.from_bytes(data[96:100], "little") + 54).to_bytes(4, "little")
+    start[100:104] = (int.from_bytes(data[100:104], "little") + 1).to_bytes(4, "little")
+    (tmp_path / "b.las").write_bytes(start + one + entries[:192] + one + entries[192:] + rest)
+    code, _, err = classify(tmp_path / "b.las", tmp_path / "o.las")
+    assert code == 0 and "second record" in err and "Width" in err, err
+    made = laspy.read(tmp_path / "o.las")
+    assert set(made.point_format.extra_dimension_names) == {"Amplitude", "HeightAboveGround", "Reliability"}
+    assert np.array_equal(made["Amplitude"], arrays["Amplitude"])
+
+
 @pytest.mark.parametrize("suffix", ["txt", "ply"])
 @pytest.mark.parametrize(("words", "made"), [("none", []), ("Margin", ["margin"]), (None, ["reliability"])])
 def test_dimensions_are_chosen_for_text_and_ply(folder, classify, tmp_path, suffix, words, made):

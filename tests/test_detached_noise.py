@@ -243,6 +243,15 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
             level = plane[0] - least - detached.JUST_SCATTERS * plane[3]
             mine = (at[:, 0] == c[0]) & (at[:, 1] == c[1]) & (out == 0) & (xyz[:, 2] < level)
             out[mine] = 7
+    points, low = np.zeros((2, h, w), np.int64)
+    np.add.at(points, (at[:, 0], at[:, 1]), 1)
+    np.add.at(low, (at[:, 0], at[:, 1]), out == 7)
+    for c in zip(*np.nonzero(low), strict=True):
+        near = (j - c[0]) ** 2 + (i - c[1]) ** 2 <= envelope.FAR**2
+        held, filled = (low[near] > 0).sum(), (points[near] > 0).sum()
+        share = min(held / filled, low[near].sum() / points[near].sum())
+        if held >= detached.COLUMNS and share > detached.TOO_MANY:
+            out[(at[:, 0] == c[0]) & (at[:, 1] == c[1]) & (out == 7)] = 0
     return out
 
 
@@ -349,6 +358,20 @@ def test_a_ditch_and_a_pit_stay():
 
 def arrays_of(xyz, codes):
     return {"X": xyz[:, 0], "Y": xyz[:, 1], "Z": xyz[:, 2], "Classification": codes.astype(np.uint8)}
+
+
+def test_ground_of_which_a_closed_wood_shows_single_points_is_no_noise():
+    rng = np.random.default_rng(4)
+    x, y = rng.uniform(0, 300, (2, 40_000))  # 0.44 points/m2
+    ground = 0.05 * x + 3 * np.sin(y / 40)
+    seen = rng.random(len(x)) < 0.08
+    z = ground + np.where(seen, 0.0, 16 + np.sin(x / 5) * np.sin(y / 5) + rng.normal(0, 0.4, len(x)))
+    wood = detached_noise(x, y, z)
+    assert (wood == 7).mean() < 0.002
+    # The same points where all else is ground: as many deep ones are no noise, one in a hundred is.
+    few = seen & (rng.random(len(x)) < 0.1)
+    plain = np.where(few, ground - 16, ground)
+    assert (detached_noise(x, y, plain)[few] == 7).mean() > 0.95
 
 
 def test_the_stage_keeps_classes_and_where_and_takes_codes():

@@ -28,10 +28,10 @@ class _Entry(NamedTuple):
     scaled: bool
 
 
-def _entries(path: str | os.PathLike) -> Iterator[_Entry]:
-    for record, data in records_of(path, b"LASF_Spec"):
-        if record.number != 4:
-            continue
+def _entries(path: str | os.PathLike, later: bool = False) -> Iterator[_Entry]:
+    """What the file's one record of them says, or what `later` ones say, which PDAL passes over."""
+    described = [(r, data) for r, data in records_of(path, b"LASF_Spec") if r.number == 4]
+    for record, data in described[1:] if later else described[:1]:
         for start in range(0, len(data) - _ENTRY + 1, _ENTRY):
             entry = data[start : start + _ENTRY]
             kind, options = entry[2], entry[3]
@@ -55,6 +55,14 @@ def extra_dimensions(path: str | os.PathLike) -> dict[str, str]:
         return {entry.name: entry.type for entry in _entries(path) if entry.name and entry.type}
     except (OSError, ValueError):
         return {}
+
+
+def passed_over(path: str | os.PathLike) -> list[str]:
+    """Names of extra dimensions that a LAS file describes in a second record, where it may have one: PDAL reads the first."""
+    try:
+        return [entry.name for entry in _entries(path, later=True) if entry.name]
+    except (OSError, ValueError):
+        return []
 
 
 def plain_dimensions(path: str | os.PathLike) -> list[tuple[str, str]] | None:

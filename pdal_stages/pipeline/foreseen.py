@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..base.errors import DimensionError, PipelineError
-from ..base.extrabytes import extra_dimensions
+from ..base.extrabytes import extra_dimensions, passed_over
 from ..base.las import read_header
 from ..stages import preparation
 from ..stages.points import MAKERS
@@ -77,17 +77,27 @@ def _reader_may_have(name: str, stage: dict[str, Any]) -> bool:
     return name in str(stage.get("extra_dims", "")) or any(name in extra_dimensions(path) for path in files)
 
 
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:5]) + ", ..." * (len(names) > 5)
+
+
 def unread_extra_dimensions(stages: Sequence[dict[str, Any]]) -> list[str]:
-    """A warning for each LAS 1.0-1.3 file whose extra dimensions PDAL does not read unless told."""
+    """A warning for each LAS file with extra dimensions that PDAL does not read: of LAS 1.0-1.3 unless told."""
     warnings = []
     for stage in stages:
+        for path in reader_files(stage, las=True):
+            if names := passed_over(path):
+                warnings.append(
+                    f"{path}: extra dimensions that it describes in a second record are not read, and not written: "
+                    f"{_some(names)}. PDAL reads the first record alone"
+                )
         if str(stage.get("use_eb_vlr", "")).lower() == "true" or "extra_dims" in stage:
             continue
         for path in reader_files(stage, las=True):
             header, names = read_header(path), list(extra_dimensions(path))
             if header is not None and header.minor < 4 and names:
                 warnings.append(
-                    f"{path}: its extra dimensions are not read: {', '.join(names[:5])}{', ...' * (len(names) > 5)}. Of LAS "
+                    f"{path}: its extra dimensions are not read: {_some(names)}. Of LAS "
                     f'1.{header.minor} PDAL reads them where the reader has "use_eb_vlr": true'
                 )
     return warnings
