@@ -58,7 +58,7 @@ def extra_dimensions(path: str | os.PathLike) -> dict[str, str]:
 
 
 def passed_over(path: str | os.PathLike) -> list[str]:
-    """Names of extra dimensions that a LAS file describes in a second record, where it may have one: PDAL reads the first."""
+    """Names of extra dimensions that a LAS file describes in records after the first, which PDAL passes over."""
     try:
         return [entry.name for entry in _entries(path, later=True) if entry.name]
     except (OSError, ValueError):
