@@ -239,13 +239,16 @@ def test_order_and_shifts_change_nothing(seed, steps):
     assert np.array_equal(moved, found)
 
 
-def test_a_tile_with_its_surroundings_gets_what_the_whole_gets():
+@pytest.mark.parametrize(
+    "rules", [RULES, [rule for rule in RULES if rule != "doubtful"], ["ground"], ["lone"], []]
+)
+def test_a_tile_with_its_surroundings_gets_what_the_whole_gets(rules):
     xyz, codes, height, ground, _ = scene(6, 60, 8)
-    found = mended(xyz, codes, height, ground)
+    found = mended(xyz, codes, height, ground, rules=rules)
     for x0, y0 in ((5.3, 3.1), (20, 10), (28.5, 0), (23, 31.2), (12.5, 33.5)):
         beyond = np.max([[x0, y0] - xyz[:, :2], xyz[:, :2] - [x0 + 8, y0 + 8]], axis=(0, 2))
-        inside, near = beyond < 0, beyond < consistency.REACH
-        part = mended(xyz[near], codes[near], height[near], ground[near])
+        inside, near = beyond < 0, beyond < consistency.reach(rules)
+        part = mended(xyz[near], codes[near], height[near], ground[near], rules=rules)
         assert np.array_equal(part[inside[near]], found[inside])
 
 

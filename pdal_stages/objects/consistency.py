@@ -10,7 +10,7 @@ whole numbers, so neither the order of points nor the tile matters.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,9 +32,8 @@ SIDE = 1.0
 #: the mean reliability of its points is below this. As found on labeled surveys that a model had not seen: of those from
 #: 0.6 to 0.7 all gain; a survey's own model loses from 0.7 on.
 PIECE, AREA, DOUBTFUL = 8, 3, 0.62
-#: How far away points can change a point's class, meters: one voxel for each of the last four rules, a small piece and what
-#: it does not touch, two columns round what the ground rule looks at, and the point's own voxel.
-REACH = (4.0 + PIECE + 2 + 1) * SIDE
+#: How far each rule looks around a voxel, in voxels: a small piece, and what it does not touch, is the farthest.
+_LOOKS = {"ground": 2, "doubtful": PIECE, "islands": 1, "roofs": 1, "facades": 1, "lone": 1}
 GROUND, VEGETATION, BUILDING = 2, (3, 4, 5), 6
 #: Kinds of points that rules know.
 _GROUND, _VEGETATION, _BUILDING, _OTHER = range(4)
@@ -49,6 +48,11 @@ SCATTER, NEAR = 0.1, 0.2
 _PARTS = 1024.0
 #: Reliabilities are summed as whole numbers of this part, which is what files round them to: of rounded ones the same.
 _SHARES = 64.0
+
+
+def reach(rules: Iterable[str] = RULES) -> float:
+    """How far away points can change a point's class, meters: each rule reads what those before it made."""
+    return (sum(_LOOKS[rule] for rule in rules) + 1) * SIDE  # and the point's own voxel
 
 
 def consistent(

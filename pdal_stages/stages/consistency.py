@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.vegetation import bands
-from ..objects.consistency import REACH, RULES, consistent
+from ..objects.consistency import RULES, consistent, reach
 from .base import Stage
 from .options import ignore_option, keep_option, option, vegetation_heights_option
 from .points import Points
@@ -67,11 +67,15 @@ ground.
     def check(self) -> None:
         bands(self.vegetation_heights)  # refused here where it means nothing
 
+    @property
+    def _rules(self) -> list[str]:
+        return [rule for rule in RULES if self.options[rule]]
+
     def creates(self) -> dict[str, str]:
         return {"Classification": "uint8_t"}
 
     def halo_m(self) -> float:
-        return REACH
+        return reach(self._rules)
 
     def largest_class(self) -> int:
         return 6
@@ -108,7 +112,7 @@ ground.
             reliability=known["reliability"],
             mask=~ignored,
             change=change,
-            rules=[rule for rule in RULES if self.options[rule]],
+            rules=self._rules,
             vegetation_heights=limits,
             figures=points.report.figures,
         )
