@@ -176,22 +176,18 @@ def _given(
     rows = np.concatenate([row, cells.row])
     around = planes_reach(options.levels(NEAR)) + planes_reach(options.levels(FAR)) + 4
     for members, own in patches(columns, rows, around, options.link):
-        if isinstance(members, slice):
-            members = np.arange(len(columns))
-        mine = members < number
-        points = members[mine]
-        if not points.size:
-            continue
+        points: Any = slice(None)
+        chosen = cells
+        if not isinstance(members, slice):  # else no copies of all
+            mine = members < number
+            points, own = members[mine], own if isinstance(own, slice) else own[mine]
+            chosen = cells[members[~mine] - number]
+            if not points.size:
+                continue
         left, bottom = int(columns[members].min()) - 1, int(rows[members].min()) - 1
         shape = int(rows[members].max()) + 2 - bottom, int(columns[members].max()) + 2 - left
-        chosen = cells[members[~mine] - number]
         raster = chosen.raster(left, bottom, shape, options.opening_radii)
-        yield (
-            points,
-            own if isinstance(own, slice) else own[mine],
-            raster,
-            chosen.means_on(left, bottom, shape),
-        )
+        yield points, own, raster, chosen.means_on(left, bottom, shape)
 
 
 def reach(
