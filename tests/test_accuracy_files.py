@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from test_training_scores import QUICK_WORDS, scene
 
+from pdal_stages.base.errors import StageError
 from pdal_stages.cli import main
+from pdal_stages.pipeline.comparing import paired
 from pdal_stages.reports.accuracypage import Place, places
 
 
@@ -97,3 +99,12 @@ def test_a_model_is_scored_by_one_option(tmp_path, write_las, capsys):
         == 1
     )
     assert "exclude each other" in capsys.readouterr().err
+
+
+def test_files_of_one_name_are_compared_by_their_folders():
+    made = ["out/2023/c_t1.laz", "out/2024/c_t1.laz", "out/2024/t2.laz"]
+    true = ["truth/2024/t1.laz", "truth/2023/t1.laz", "truth/2024/t2.laz"]
+    assert sorted(paired(made, true)) == sorted(zip(made, [true[1], true[0], true[2]], strict=True))
+    with pytest.raises(StageError, match="no reference of its name") as caught:
+        paired(made, [*true[:2], "truth/2023/t2.laz"])
+    assert "2023/t2" in str(caught.value)

@@ -93,6 +93,20 @@ def test_units_of_one_kind(tmp_path, inputs, references):
     assert (tmp_path / "whole.las").exists() and len(list(tmp_path.glob("o_*"))) == 2
 
 
+@pytest.mark.parametrize("references", [(METERS, None, METERS, None), (None, None)])
+def test_inputs_without_a_reference_beside_others_are_said(tmp_path, inputs, references):
+    inputs(*references)
+    stages = [{"type": "readers.las", "filename": str(tmp_path / "in*.las")}, {"type": "filters.hag_minima"}]
+    whole = ps.Pipeline(stages)
+    whole.execute()
+    writer = {"type": "writers.las", "filename": str(tmp_path / "o_#.las")}
+    for messages in (whole.messages, run_tiled([*stages, writer], 40, workers=0).messages):
+        said = [one for one in messages if "taken to have that of the other inputs" in one]
+        assert len(said) == (1 if any(references) else 0)
+        for line in said:
+            assert f"{tmp_path / 'in1.las'}, {tmp_path / 'in3.las'} have no spatial reference" in line
+
+
 def test_references_in_files(tmp_path, inputs):
     inputs(METERS, FEET, METERS, None)
     found = [projection(tmp_path / f"in{number}.las") for number in range(4)]

@@ -588,6 +588,8 @@ def test_ept_source(tmp_path, town_file, model_file, whole):
     assert not run.failures and run.summary["per"] == "tile"
     got = np.concatenate([_table(path) for path in sorted(tmp_path.glob("e_*.laz"))])
     assert np.array_equal(np.sort(got), np.sort(_table(whole)))
+    # what `classify` says of it to writers, which hold all class codes then
+    assert one_format([str(root / "ept.json")]) == {"minor_version": 4, "dataformat_id": 6}
 
 
 # ---- telling ---------------------------------------------------------------------------------------------
@@ -698,6 +700,21 @@ def test_outputs_of_tiles_hold_all_that_inputs_of_several_kinds_hold(tmp_path, w
     for field, name, of in (("nir", "Infrared", "b"), ("red", "Red", "bc")):
         kept = np.concatenate([np.asarray(tile[field]) for tile in tiles])
         assert kept.astype(int).sum() == sum(int(made[each][name].sum()) for each in of)
+    # a pipeline of one's own, as far as its writer is to forward what the inputs have
+    for forward, options, wanted in (
+        ("all", {}, (4, 8, 0.001, 0.001)),
+        ("scale, offset", {"scale_y": 0.1, "minor_version": 4, "dataformat_id": 7}, (4, 7, 0.001, 0.1)),
+        ("vlr", {"minor_version": 4, "dataformat_id": 6}, (4, 6, 0.01, 0.01)),
+    ):
+        writer = {"type": "writers.las", "filename": f"{tmp_path}/own_#.las", "forward": forward, **options}
+        stages = [{"type": "readers.las", "filename": f"{folder}/*.laz"}, {"type": "filters.hag_minima"}]
+        for resume in (False, True):
+            run = run_tiled([*stages, writer], 40, per="tile", workers=0, resume=resume, brief=True)
+            assert not run.failures
+        assert any("nothing is to be done" in message for message in run.messages)
+        for path in tmp_path.glob("own_*.las"):
+            header = laspy.read(path).header
+            assert (header.version.minor, header.point_format.id, *header.scales[:2]) == wanted
 
 
 def test_inputs_that_are_alike_ask_for_nothing(tmp_path, write_las):
@@ -705,7 +722,7 @@ def test_inputs_that_are_alike_ask_for_nothing(tmp_path, write_las):
         str(write_las(tmp_path / f"{n}.las", {axis: np.arange(9.0) for axis in "XYZ"}, 6, offset=(7, 8, 0)))
         for n in range(2)
     ]
-    assert one_format([*paths, "https://example.org/ept.json"]) == {}
+    assert one_format([*paths, str(tmp_path / "none.laz"), "cloud.ply"]) == {}
     far = str(
         write_las(
             tmp_path / "far.las", {axis: np.arange(9.0) + 5e8 for axis in "XYZ"}, 6, offset=(5e8, 5e8, 5e8)

@@ -24,6 +24,8 @@ from .errors import StageError
 
 #: Bytes of a point of each format, without extra bytes (LAS 1.4 R15, tables 7 to 18).
 POINT_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
+#: Point formats with waveforms, and what has all else that they have.
+WAVES = {4: 1, 5: 3, 9: 6, 10: 8}
 #: What to do about a damaged file.
 DAMAGED = "Get the file again from its source, or repair it with a tool made for that (e.g. lasinfo -repair)"
 #: Steps of the coordinates that points may lie beyond the box: programs round it differently.
@@ -96,7 +98,8 @@ def check_readable(path: str | os.PathLike) -> str | None:
     Raises
     ------
     StageError
-        What is wrong with the file, or why it cannot be opened: PDAL says little then, or crashes.
+        What is wrong with the file, or why it cannot be opened: PDAL says little then, or crashes. Or that no PDAL reads
+        its point format.
     """
     try:
         size = Path(path).stat().st_size
@@ -116,6 +119,14 @@ def check_readable(path: str | os.PathLike) -> str | None:
     if wrong:
         raise StageError(
             f"the LAS file is damaged: {wrong[0]}", where=str(path), found=wrong[1], cure=DAMAGED
+        )
+    if without := WAVES.get(header.point_format):
+        raise StageError(
+            "PDAL does not read points with waveforms",
+            where=str(path),
+            found=f"point format {header.point_format}",
+            cure=f"Write the file anew in format {without}, which has all but the waveforms: "
+            f"laspy.convert(laspy.read(IN), point_format_id={without}).write(OUT)",
         )
     beyond = _bytes_beyond(header, size)
     if beyond >= header.point_bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -16,7 +17,7 @@ from ..base.report import Report
 from ..stages.accuracy import AccuracyStage
 from ..stages.points import Points
 from . import pdal as pdal_env
-from .ends import input_files, reader_of
+from .ends import in_folders, input_files, reader_of
 from .filenames import stage_files
 from .lowering import lower_stage
 from .overrides import Override, apply_overrides
@@ -129,6 +130,8 @@ def _classified(
 def paired(sources: Sequence[str], references: Sequence[str]) -> list[tuple[str, str]]:
     """Files with their references: of the same name, or the longest name inside theirs (c_town: town).
 
+    Names are looked for in the same folder (`in_folders`) where a name comes twice.
+
     Raises
     ------
     StageError
@@ -136,23 +139,29 @@ def paired(sources: Sequence[str], references: Sequence[str]) -> list[tuple[str,
     """
     if len(sources) == len(references) == 1:
         return [(sources[0], references[0])]
-    by_name = {Path(name).stem: name for name in references}
+    by_name = dict(zip(_places_and_names(references), references, strict=True))
     pairs: dict[str, str] = {}
-    for source in sources:
-        inside = [name for name in by_name if name in Path(source).stem]
+    for source, (place, stem) in zip(sources, _places_and_names(sources), strict=True):
+        inside = [one for one in by_name if one[0] == place and one[1] in stem]
         if not inside:
             raise StageError(
                 "a file has no reference of its name",
                 found=source,
-                cure=f"Name the references like the files they belong to, not {', '.join(list(by_name)[:5])}",
+                cure="Name the references like the files they belong to, not "
+                + ", ".join([os.path.join(*one) for one in by_name][:5]),
             )
-        reference = by_name[max(inside, key=len)]
+        reference = by_name[max(inside, key=lambda one: len(one[1]))]
         if reference in pairs:
             raise StageError(
                 "two files have the same reference", found=f"{pairs[reference]} and {source}: {reference}"
             )
         pairs[reference] = source
     return [(source, reference) for reference, source in pairs.items()]
+
+
+def _places_and_names(files: Sequence[str]) -> list[tuple[str, str]]:
+    """The folders, empty where no name comes twice, and names without suffix."""
+    return [os.path.split(name) for name in in_folders(files, [Path(file).stem for file in files])]
 
 
 def _points_of(name: str, dimension: str) -> tuple[Any, str, NDArray]:

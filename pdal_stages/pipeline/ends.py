@@ -132,8 +132,18 @@ def _output_name(source: str) -> str:
     return name[: -len(".copc.laz")] + ".laz" if plain else name
 
 
+def in_folders(sources: Sequence[str], names: Sequence[str]) -> list[str]:
+    """What outputs are called in a folder; where two names are one, with the inputs' folders below the one they share."""
+    if len(set(names)) == len(names) or any("://" in source for source in sources):
+        return list(names)
+    folders = [os.path.dirname(os.path.abspath(source)) for source in sources]
+    shared = os.path.commonpath(folders)
+    inside = (os.path.relpath(folder, shared) for folder in folders)
+    return [os.path.normpath(os.path.join(folder, name)) for folder, name in zip(inside, names, strict=True)]
+
+
 def outputs_of(sources: Sequence[str], target: str) -> list[str]:
-    """An output for each input: in a folder under the input's name, or with the input's name for ``#``.
+    """An output for each input: in a folder under the input's name (see :func:`in_folders`), or with that name for ``#``.
 
     Raises
     ------
@@ -142,7 +152,7 @@ def outputs_of(sources: Sequence[str], target: str) -> list[str]:
     """
     path = Path(target)
     if is_folder(target):
-        outputs = [str(path / _output_name(source)) for source in sources]
+        outputs = [str(path / n) for n in in_folders(sources, [_output_name(source) for source in sources])]
     elif "#" in path.name:
         outputs = [str(path.with_name(path.name.replace("#", Path(source).stem))) for source in sources]
     elif len(sources) > 1:
@@ -160,7 +170,7 @@ def outputs_of(sources: Sequence[str], target: str) -> list[str]:
             raise StageError(
                 "two inputs have one name and would be written to one file",
                 found=f"{other} and {source}: {output}",
-                cure="Classify them into different folders, or rename one",
+                cure="Name a folder (with a slash at its end), in which each lies in the folder of its input; or rename one",
             )
     return outputs
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..base.extrabytes import extra_dimensions
-from ..base.las import read_header
+from ..base.las import WAVES, read_header
 from . import pdal as pdal_env
 from .filenames import is_writer, reader_files, writes_las
 from .writerlimits import las_version
@@ -103,7 +103,7 @@ def _of_reader(stage: Mapping[str, Any]) -> dict[str, str] | None:
     found: dict[str, str] = {}
     for path in files:
         header = read_header(path)
-        if header is None or header.point_format in (4, 5, 9, 10):
+        if header is None or header.point_format in WAVES:
             return None
         found |= {n: kind for n, (ids, kind) in _OF_FORMATS.items() if header.point_format in ids}
         if header.point_format >= 6:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,6 +28,10 @@ _ASIDE = (
     "+type",
     "+wktext",
 )
+
+
+#: In what is said of inputs that have none, beside others.
+NO_REFERENCE = "no spatial reference;"
 
 
 @dataclass(frozen=True)
@@ -76,10 +80,10 @@ def _place(path: str) -> tuple[float, float] | None:
     return None
 
 
-def check_one_reference(found: Mapping[str, Reference]) -> None:
+def check_one_reference(found: Mapping[str, Reference]) -> list[str]:
     """Refuse inputs of different units or reference systems; where one names none, only units are compared.
 
-    `found` has one input of each kind, by path.
+    `found` has one input of each kind, by path. Those are given back that name none while others do.
     """
     units: dict[object, str] = {}
     planes: dict[object, str] = {}
@@ -104,12 +108,24 @@ def check_one_reference(found: Mapping[str, Reference]) -> None:
                 cure="Give them one spatial reference first: pdal translate IN OUT reprojection "
                 "--filters.reprojection.out_srs=EPSG:CODE",
             )
+    without = [path for path, one in found.items() if not one.name]
+    return without if len(without) < len(found) else []
 
 
-def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> None:
-    """Refuse a pipeline whose LAS readers read different references, unless a stage moves points."""
+def without_reference(paths: Sequence[str]) -> str:
+    """What is said of inputs that have no spatial reference while others have one; nothing where there are none."""
+    if not paths:
+        return ""
+    named = ", ".join(paths[:3]) + (f" and {len(paths) - 3:,} more" if len(paths) > 3 else "")
+    has, taken = ("has", "it is") if len(paths) == 1 else ("have", "they are")
+    return f"{named} {has} {NO_REFERENCE} {taken} taken to have that of the other inputs"
+
+
+def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> str:
+    """Refuse a pipeline whose LAS readers read different references, unless a stage moves points; what is to be told."""
     if any(stage.get("type") in MOVING for stage in stages):
-        return
+        return ""
+    alike: dict[str, list[str]] = {}
     first: dict[str, dict[str, Any]] = {}
     for stage in stages:
         if is_writer(stage, stages):
@@ -118,6 +134,10 @@ def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> None:
         options.setdefault("type", "readers.las")
         for path in readers_files([stage], las=True):
             reader = {**options, "filename": path, "count": 1}
-            first.setdefault(f"{projection(path)} {options}", reader)
-    if len(first) > 1:
-        check_one_reference({r["filename"]: reference_of(r, horizontal) for r in first.values()})
+            kind = f"{projection(path)} {options}"
+            first.setdefault(kind, reader)
+            alike.setdefault(kind, []).append(path)
+    if len(first) < 2:
+        return ""
+    without = check_one_reference({r["filename"]: reference_of(r, horizontal) for r in first.values()})
+    return without_reference([path for paths in alike.values() if paths[0] in without for path in paths])

@@ -39,8 +39,6 @@ WithPdal = Callable[[str, NewValues, str], Any]
 
 #: Bytes of a header that tell of the points alone: counts, counts by return, extents, and what LAS 1.4 has of these.
 _OF_POINTS = ((107, 131), (179, 227), (247, 375))
-#: Formats with waveforms, which lie elsewhere.
-_WAVES = (4, 5, 9, 10)
 #: Points whose bits are random, and points that are put together at a time.
 _RANDOM, _BLOCK = 200, 500_000
 #: Kinds that are remembered.
@@ -69,7 +67,7 @@ def kind_of(
     if "all" not in forward and "header" not in forward:  # PDAL's own day and names
         return None
     header = read_header(source.path)
-    if header is None or header.point_format in _WAVES or header.records_after or header.waveforms:
+    if header is None or header.records_after or header.waveforms:
         return None
     head, _ = plain_header(source.path)
     for start, end in _OF_POINTS:

@@ -110,11 +110,22 @@ class ClassifyTask:
         StageError
             If one cannot be written, or is an input.
         """
-        if self._in_folder:
-            _make_folder(Path(self.output))
         outputs = outputs_of(self.files, self.output)
+        self._make_folders(outputs)
         check_outputs([Output(name) for name in outputs], self.files)
         return outputs
+
+    def _make_folders(self, outputs: list[str]) -> None:
+        """Make the output folder, and those in it that outputs lie in."""
+        if not self._in_folder:
+            return
+        for folder in sorted({Path(self.output), *(Path(name).parent for name in outputs)}):
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise StageError(
+                    "the output folder cannot be made", found=f"{folder}: {error.strerror}"
+                ) from None
 
     def run_whole(self) -> Written:
         """Classify the only input in one piece."""
@@ -149,7 +160,8 @@ class ClassifyTask:
             raise OptionError("outputs of tiles are plain LAS or LAZ", found=target, cure="Name them .laz")
         # In a folder '#' may stand for a name with its suffix: always that of a LAS file.
         named = "x.laz" if self._in_folder else target
-        alike = one_format(self.files) if self.options.per == "tile" else {}
+        per_tile = self.options.per == "tile" or any(map(is_ept, self.files))
+        alike = one_format(self.files) if per_tile else {}
         writer = {**self.request.writer(named), "filename": target, **alike}
         return Pipeline([*heads, *self.request.stages, writer], self.request.overrides, whole=False)
 
@@ -199,11 +211,12 @@ class ClassifyTask:
         brief: bool = False,
     ) -> TiledRun:
         """Classify all inputs in tiles; `finished` hears of every output that was written; `brief`: see :func:`run_plan`."""
+        outputs: list[str] = []
         if self.options.per != "tile" and not any(map(is_ept, self.files)):
-            outputs_of(self.files, self.output)  # which says what is wrong with names
+            outputs = outputs_of(self.files, self.output)  # which says what is wrong with names
         plan = self.plan()
-        if self._in_folder and not dry_run:
-            _make_folder(Path(self.output))
+        if not dry_run:
+            self._make_folders(outputs)
         more = [("metadata", self.metadata, kinds.JSON), ("log", self.log, "")]
         check_outputs([Output(name, what, kind) for what, name, kind in more if name], self.files)
 
@@ -221,13 +234,6 @@ class ClassifyTask:
             brief=brief,
             source=self._pipeline.source,
         )
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StageError("the output folder cannot be made", found=f"{folder}: {error.strerror}") from None
 
 
 def classify_file(

@@ -201,7 +201,7 @@ def classify(
         end_at_once(options)
         written = task.run_whole()
         print_messages(*written.messages)
-        print(f"{written.points:,} points written to {written.path}")
+        print(f"{_counted(written.points, 'point')} written to {written.path}")
         _print_classes([written], names)
         if then is not None:
             then()
@@ -215,7 +215,7 @@ def classify(
 
     def finished(written: Written) -> None:
         done.append(written)
-        print(f"{written.path}: {written.points:,} points{_shares(written, names)}", flush=True)
+        print(f"{written.path}: {_counted(written.points, 'point')}{_shares(written, names)}", flush=True)
 
     interrupted = False
     with _terminated_as_interrupted():
@@ -270,7 +270,7 @@ def _classify_each(task: ClassifyTask, options: argparse.Namespace, names: Mappi
         for source, what in task.run_each(apart=options.is_program):
             if isinstance(what, Written):
                 done[source] = what
-                print(f"{what.path}: {what.points:,} points{_shares(what, names)}", flush=True)
+                print(f"{what.path}: {_counted(what.points, 'point')}{_shares(what, names)}", flush=True)
             else:
                 failed[source] = what
             for line in [what] if isinstance(what, str) else what.messages:

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from ..pipeline import pdal as pdal_env
 from .cloudindex import CloudIndex, index_las
 from .grid import TileGrid
 from .sources import InputSource, las_extent, read_ept
+
+
+def format_of(described: Mapping[str, Any]) -> int:
+    """The LAS point format that has the colors of an EPT source."""
+    names = {dimension["name"] for dimension in described["schema"]}
+    return 8 if "Infrared" in names else 7 if "Red" in names else 6
 
 
 def fetch(
@@ -23,7 +30,7 @@ def fetch(
         "type": "writers.las",
         "filename": target,
         "minor_version": 4,
-        "dataformat_id": 7 if any(d["name"] == "Red" for d in described["schema"]) else 6,
+        "dataformat_id": format_of(described),
         "extra_dims": "all",
     }
     for dimension in described["schema"]:

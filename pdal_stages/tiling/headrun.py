@@ -16,6 +16,7 @@ from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import PipelineError, StageError
 from ..base.las import read_header
 from ..pipeline.callbacks import Callbacks
+from ..pipeline.references import NO_REFERENCE
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import points_of
 from ..pipeline.straight import NeedsPdal, Reading, View, may_run, reading_of
@@ -167,9 +168,9 @@ def _messages(pipeline: Pipeline) -> list[str]:
         nowhere = _NOWHERE.search(text)
         if TOUCH_NONE in text:  # the places differ from tile to tile
             lines.append(text[text.index(TOUCH_NONE) :].partition(THE_PLACES)[0])
-        elif nowhere is None:
+        elif nowhere is None and NO_REFERENCE not in text:  # which the run says of its inputs
             lines.append(text)
-        elif nowhere[1] is not None:
+        elif nowhere is not None and nowhere[1] is not None:
             lines.append(f"{HOLDS_NOWHERE} points: {nowhere[1]}")
         # Otherwise the tile has no point of its own: nothing that the user asked for.
     return lines

@@ -16,8 +16,9 @@ from ..base.errors import OptionError, PipelineError, StageError
 from ..base.progress import Progress
 from ..base.stamps import stamp
 from ..base.units import Units
+from ..pipeline.ends import in_folders
 from ..pipeline.filenames import named_files
-from ..pipeline.references import Reference, check_one_reference, reference_of
+from ..pipeline.references import Reference, check_one_reference, reference_of, without_reference
 from ..pipeline.work import Call
 from .byplace import copy_bytes
 from .cloudindex import SMALL, CloudIndex, index_las
@@ -134,7 +135,10 @@ class Survey:
         if not found:
             raise self._none_readable()
         if needed:
-            check_one_reference(found)
+            without = check_one_reference(found)
+            paths = [[source.path for source in group] for group in groups.values()]
+            told = without_reference([path for group in paths if set(group) & set(without) for path in group])
+            self.messages += [told] if told else []
         return next(iter(found.values())).units.horizontal
 
     def _tells(self, source: InputSource) -> str:
@@ -167,7 +171,9 @@ class Survey:
     @property
     def names(self) -> list[str]:
         """What outputs of files are called, in place of '#'."""
-        return [s.plain_name if self._whole_names else s.stem for s in self.sources]
+        if self._whole_names:
+            return in_folders(self.paths, [source.plain_name for source in self.sources])
+        return [source.stem for source in self.sources]
 
     def stamps_of(self, stages: list[dict[str, Any]]) -> list[Any]:
         """Names and stamps of the files that stages read."""

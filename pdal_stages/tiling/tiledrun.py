@@ -22,6 +22,7 @@ from . import measured
 from .complete import remember, told_again
 from .dispatch import run_all, run_first_round
 from .estimate import estimate
+from .oneformat import following
 from .outcome import FileJob, InterruptedRun, TiledRun, TileJob, summarize
 from .pool import open_pool
 from .rasters import remarks
@@ -121,6 +122,7 @@ def run_plan(
     survey = Survey(plan, chosen, Store(folder).side("block") if chosen.resume else None)
     plan, chosen = survey.plan, survey.options
     if survey.per == "tile":  # whose outputs have points of all readers
+        plan = replace(plan, tail=following(plan.tail, survey.paths))
         classflags.parting([*plan.readers, *plan.tail], with_ours=True)
     survey.messages += remarks(plan.tail, chosen.tile if survey.per == "tile" else None)
     if source is not None:
@@ -130,8 +132,10 @@ def run_plan(
         return estimate(plan, survey)
     if not folder.is_dir():
         raise StageError("the folder of the output does not exist", found=str(folder), cure="Create it first")
+    folders = {folder}
     if survey.per == "file":  # refused now, not after reading all inputs
-        outputs_for(plan, survey.names, survey.paths)
+        named = outputs_for(plan, survey.names, survey.paths)
+        folders |= {Path(path).parent for paths in named for path in paths}
     with Store(folder) as store:
         if not chosen.resume:
             store.clear()
@@ -149,9 +153,10 @@ def run_plan(
                     run_all(work, store, pool, chosen.retries, progress, finished)
                     interrupted = False
                     work.forget_results(store)
-            changed = remember(store, plan, asked, work)
+            changed = remember(store, replace(plan, tail=survey.plan.tail), asked, work)
         finally:
-            sweep(folder)  # what workers left that were killed
+            for each in folders:
+                sweep(each)  # what workers left that were killed
     summary = survey.figures(plan) | {"workers": pool.slots, "threads_per_worker": pool.threads}
     summary |= summarize(work.jobs, survey.costs, time.monotonic() - started)
     survey.messages += _messages_of_tiles(work)

@@ -357,7 +357,7 @@ def outputs_for(plan: TilePlan, names: list[str], inputs: Iterable[str]) -> list
             )
         kind = kinds.LAS if writes_las(writer) else ""
         path = path.absolute()
-        found.append([Output(str(path.with_name(path.name.replace("#", n))), "output", kind) for n in names])
+        found.append([Output(str(path.parent / path.name.replace("#", n)), "output", kind) for n in names])
     flat = [output for outputs in found for output in outputs]
     twice = sorted(path for path, n in Counter(output.path for output in flat).items() if n > 1)
     if twice:
@@ -366,6 +366,7 @@ def outputs_for(plan: TilePlan, names: list[str], inputs: Iterable[str]) -> list
             found=twice[0],
             cure="Give input files different names, or use --per tile",
         )
-    if not flat or Path(flat[0].path).parent.is_dir():  # otherwise it will be made: a dry run looks ahead
-        check_outputs(flat, inputs)
+    there = {folder for folder in {Path(output.path).parent for output in flat} if folder.is_dir()}
+    # Others will be made: a dry run looks ahead.
+    check_outputs([output for output in flat if Path(output.path).parent in there], inputs)
     return [[outputs[n].path for outputs in found] for n in range(len(names))]

@@ -75,7 +75,8 @@ class Worklist:
         """Fingerprint of all that decides an output, given those of its tiles."""
         source = out.source
         mine = [marks[job.tile] for job in out.jobs]
-        return fingerprint(source.path, self.survey.stamps[source.path], source.reader, self._tail, mine)
+        made_of = [source.path, self.survey.stamps[source.path], source.reader, self._tail, mine]
+        return fingerprint(*made_of, out.outputs)
 
     def _outputs(self) -> list[FileJob]:
         survey = self.survey
