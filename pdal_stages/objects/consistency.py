@@ -209,11 +209,16 @@ class _Neighborhoods:
 
     def beside(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Points with one of the chosen in the 5 x 5 columns round their own, at any height."""
+        held = np.zeros(len(self.keys), bool)
+        held[self.voxel[chosen]] = True
+        return self._near(held, 2)[self.voxel]
+
+    def _near(self, held: NDArray[np.bool_], columns: int) -> NDArray[np.bool_]:
+        """Voxels with one that is held in the columns around their own, so many to each side, at any height."""
         column = self.keys >> BITS
-        held = np.unique(column[self.voxel[chosen]])
-        steps = np.array([dj * self.width + di for dj in range(-2, 3) for di in range(-2, 3)])
-        near = np.isin(column, (held[:, None] + steps).ravel())
-        return near[self.voxel]
+        around = range(-columns, columns + 1)
+        steps = np.array([dj * self.width + di for dj in around for di in around])
+        return np.isin(column, (np.unique(column[held])[:, None] + steps).ravel())
 
     def vegetation_near(self, rows: NDArray[np.int64], codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The commonest class of vegetation round each of these points, the higher of two; where there is none, 5."""
@@ -247,8 +252,9 @@ class _Neighborhoods:
     def in_planes(self, levels: int, upright: bool) -> NDArray[np.bool_]:
         """Vegetation in planes of buildings near: leaning ones of roofs, or `upright` ones of walls."""
         own = self.counts()
-        # Only voxels with buildings have moments, and only those with vegetation are asked for a plane.
-        built, green = _numbers(own[:, _BUILDING] > 0), _numbers(own[:, _VEGETATION] > 0)
+        # Only voxels with buildings have moments, and only those with vegetation beside some are asked for a plane.
+        held = own[:, _BUILDING] > 0
+        built, green = _numbers(held), _numbers((own[:, _VEGETATION] > 0) & self._near(held, 1))
         moments = np.zeros((int(built.max(initial=-1)) + 1, 10), np.int64)
         _add_moments(self.voxel, self.kind, self.part, built, moments)
         planes = np.full((int(green.max(initial=-1)) + 1, 4), np.nan)
@@ -457,7 +463,7 @@ def _fit(keys, table, w, levels, upright, own, built, moments, green, planes):
     total = np.empty(10, np.int64)
     side = np.int64(SIDE * _PARTS)
     for k in range(len(keys)):
-        if own[k, _VEGETATION] == 0:
+        if green[k] < 0:
             continue
         total[:] = 0
         points = 0
@@ -508,6 +514,8 @@ def _near_planes(voxel, kind, part, green, planes, near):
     for p in range(len(voxel)):
         if kind[p] == _VEGETATION:
             k = green[voxel[p]]
+            if k < 0:
+                continue
             away = (
                 planes[k, 0] * part[p, 0]
                 + planes[k, 1] * part[p, 1]
