@@ -209,13 +209,19 @@ def test_ctrl_c_says_what_is_done_and_how_to_go_on(survey, classify, tmp_path, m
 
 @pytest.mark.parametrize(
     ("text", "size"),
-    [("4GB", 4 * 10**9), ("4 GiB", 4 * 2**30), ("1.5g", 15 * 10**8), ("500M", 5 * 10**8), ("77", 77)],
+    [
+        ("4GB", 4 * 10**9),
+        ("4 GiB", 4 * 2**30),
+        ("1.5g", 15 * 10**8),
+        ("500M", 5 * 10**8),
+        ("77000000", 77 * 10**6),
+    ],
 )
 def test_amounts_of_memory(text, size):
     assert parse_size(text) == size
 
 
-@pytest.mark.parametrize("text", ["", "GB", "-1GB", "0", "4 apples", "1e9"])
+@pytest.mark.parametrize("text", ["", "GB", "-1GB", "0", "4", "4 apples", "1e9"])
 def test_what_is_no_amount_of_memory(text):
     with pytest.raises(OptionError, match="a number and a unit"):
         parse_size(text)

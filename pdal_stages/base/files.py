@@ -32,6 +32,8 @@ from .links import followed
 PREFIX, _LOCK = ".pdal-stages-partial-", ".lock"
 #: Seconds after which a hidden folder without that file is no longer taken for one just made.
 _GRACE = 3600.0
+#: What the system says where a file has no room, or none is left to this user.
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 #: Bytes a file's name may have, on every usual file system.
 _LONGEST_NAME = 255
 _swept: set[str] = set()
@@ -213,9 +215,7 @@ def whole_files(
         raise StageError(
             f"the {what} file could not be written",
             found=f"{at or paths[-1]}: {error.strerror or error}",
-            cure="Make room on the disk"
-            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-            else None,
+            cure="Make room on the disk" if error.errno in NO_ROOM else None,
         ) from error
     finally:
         for place in places:

@@ -19,8 +19,12 @@ _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 _UNKNOWN = 4 * 10**9
 
 
+#: Nobody means so few bytes.
+_FEWEST = 1e6
+
+
 def parse_size(text: str) -> int:
-    """Bytes of ``4GB``, ``500 MB``, ``4GiB`` or a plain number.
+    """Bytes of ``4GB``, ``500 MB``, ``4GiB`` or a plain number, which is large.
 
     Raises
     ------
@@ -31,6 +35,12 @@ def parse_size(text: str) -> int:
     if match is None or float(match[1]) <= 0:
         raise OptionError("an amount of memory is a number and a unit", found=text, cure="For example 4GB")
     letter = match[2].upper()
+    if not letter and float(match[1]) < _FEWEST:
+        raise OptionError(
+            "an amount of memory is a number and a unit",
+            found=text,
+            cure=f"Write {match[1]}GB, if that is meant",
+        )
     unit = 1024 ** "KMGT".index(letter) * 1024 if match[3] and letter else _UNITS[letter]
     return int(float(match[1]) * unit)
 

@@ -18,6 +18,7 @@ from ..base.errors import (
     OptionError,
     StageError,
 )
+from ..base.files import NO_ROOM
 from ..base.shortage import is_short, shortage
 
 #: One tile at a time in a process: PDAL's threads are ours, and memory is stated for one.
@@ -69,7 +70,12 @@ def perform(task: Task) -> TaskResult:
         except MemoryError:
             answer = TaskResult(reason="memory ran out. Take smaller tiles or fewer workers", again=True)
         except (ImportError, OSError) as error:
-            if not is_short(error):
+            if getattr(error, "errno", None) in NO_ROOM:
+                answer = TaskResult(
+                    reason=f"a temporary file beside the outputs could not be written ({error}). Make room on the disk",
+                    again=True,
+                )
+            elif not is_short(error):
                 answer = _unforeseen(error)
             else:
                 answer = TaskResult(reason=str(shortage(f"{type(error).__name__}: {error}")), again=True)

@@ -149,8 +149,8 @@ class Points:
             raise StageError(
                 "coordinates are not finite (NaN or infinite)",
                 found=f"{bad:,} of {self.count:,} points",
-                cure='Drop them before this stage: {"type": "filters.expression", "expression": "X < 1e9 && Y < 1e9 '
-                '&& Z < 1e9"} (filters.range with "limits": "Z[-1000:10000]" in PDAL 2.2)',
+                cure="Drop them first: pdal translate IN OUT range --filters.range.limits='X[:1e9],Y[:1e9],Z[-1e5:1e5]'; "
+                'in a pipeline: {"type": "filters.range", "limits": "X[:1e9],Y[:1e9],Z[-1e5:1e5]"}',
             )
         return x, y, z
 

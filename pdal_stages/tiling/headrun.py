@@ -61,6 +61,7 @@ class HeadRun:
     need: float  #: the halo that it took, meters
     messages: list[str] = field(default_factory=list)  #: warnings and notes
     left_alone: dict[str, int] = field(default_factory=dict)  #: of the tile's own points, see :mod:`.outcome`
+    narrowing: bool = True  #: whether stages after one that reaches far may be given fewer points
 
 
 class FromBefore(NamedTuple):
@@ -143,9 +144,8 @@ def run_head(
         second = max(ours.stage.second_neighbors() for ours in pipeline.lowered.ours)
         need = max(need, _far_neighbors(found.places, most, second, context, tile))
     messages = _messages(pipeline)
-    return HeadRun(
-        results, need, messages, left_alone(each[-1].figures for _, each in pipeline.reports if each)
-    )
+    alone = left_alone(each[-1].figures for _, each in pipeline.reports if each)
+    return HeadRun(results, need, messages, alone, narrowing)
 
 
 class FirstResults(NamedTuple):

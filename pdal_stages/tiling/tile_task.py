@@ -80,7 +80,8 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
             break
         everything = inside(context.bounds, context.grid.box(tile, halo_m / context.unit))
         try:
-            head = run_head(context, tile, cuts, everything, _before(task, cuts, halo_m))
+            narrowing = head is None or head.narrowing  # which was in vain with less around
+            head = run_head(context, tile, cuts, everything, _before(task, cuts, halo_m), narrowing)
             need = head.need
         except NoTerrainError:
             if everything:
