@@ -333,13 +333,18 @@ def test_points_left_out_are_as_good_as_not_there():
     assert np.array_equal(found[inside], detached_noise(xyz[inside]))
 
 
-@pytest.mark.parametrize("spacing", [0.3, 2.0, 6.0])
-def test_a_wire_stays_however_thin_the_cloud(spacing):
+@pytest.mark.parametrize(
+    ("spacing", "wires", "density"),
+    [(0.3, 1, 1.3), (2.0, 1, 0.2), (6.0, 1, 0.07), (1.7, 2, 8.0)],
+)
+def test_wires_stay_however_thin_the_cloud(spacing, wires, density):
     rng = np.random.default_rng(1)
-    x, y = rng.uniform(0, 150, (2, int(150 * 150 * 0.4 / spacing)))
+    x, y = rng.uniform(0, 150, (2, int(150 * 150 * density)))
     ground = np.column_stack([x, y, rng.normal(0, 0.05, len(x))])
-    along = np.arange(2, 148, spacing) + rng.uniform(-0.2, 0.2, len(np.arange(2, 148, spacing)))
-    wire = np.column_stack([along, 40 + 0.5 * along, 30 + 0.001 * (along - 75) ** 2])
+    along = np.tile(np.arange(2, 148, spacing), wires)
+    apart = np.repeat(6.0 * np.arange(wires), len(along) // wires)
+    along += rng.uniform(-0.7, 0.7, len(along)) * spacing
+    wire = np.column_stack([along, 40 + 0.5 * along + apart, 30 + 0.001 * (along - 75) ** 2])
     found = detached_noise(np.vstack([ground, wire]))
     assert (found[len(ground) :] > 0).mean() <= 0.05
 

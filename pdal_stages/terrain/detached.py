@@ -39,8 +39,9 @@ GAP_OF_POINT, GAP_GROWTH, DENSE = 0.1, 10.0, 0.55
 ASIDE, SPACINGS_ASIDE = 3, 2.5
 #: Columns within which wires are looked for, so many of which show one, and how high they hang at least, meters.
 IN_LINE, WIRES, HANGING = 14, 4, 5.0
-#: A line has others at so many places of three columns each, and such a share of all that is suspect near.
-STRUNG, STRUNG_SHARE = 4, 0.5
+#: A line has others at so many places of three columns each, and such a share of all that is suspect near: two
+#: wires hang side by side, as over pylons.
+STRUNG, STRUNG_SHARE = 4, 0.3
 #: How far below the plane a suspect lies at least, in units of the scatter.
 SCATTERS = 4.0
 #: More than such a share of the points around, and of the columns that hold any, so many at least, is no noise.
