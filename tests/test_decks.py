@@ -22,7 +22,7 @@ from pdal_stages.cli import main
 from pdal_stages.stages.bridges import Bridges
 from pdal_stages.stages.hag_morphological import HagMorphological
 from pdal_stages.terrain import decks, walkable
-from pdal_stages.terrain.deckrims import ISLET, LINK, WITHIN, is_land, islets, opposite_ends
+from pdal_stages.terrain.deckrims import ISLET, LINK, WITHIN, is_land, islets, may_be_land, opposite_ends
 from pdal_stages.terrain.decks import PARTS, SURFACE, find_decks, level_points
 from pdal_stages.terrain.deckwalls import around
 from pdal_stages.terrain.levels import GAP, levels
@@ -316,6 +316,29 @@ def test_a_deck_that_the_rim_of_the_cloud_cuts():
     cut = xyz[:, 0] < 85_010
     deck = found(xyz[cut]) > 0
     assert f1(deck, codes[cut] == DECK, codes[cut] != OTHER) > 0.9
+
+
+@pytest.mark.parametrize(("name", "behind"), [("footbridge", 12.0), ("river", 8.0)])
+def test_a_deck_behind_one_end_of_which_the_cloud_soon_ends(name, behind):
+    xyz, codes = seen(name)
+    deck = xyz[codes == DECK, :2]
+    along = np.linalg.svd(deck - deck.mean(axis=0), full_matrices=False)[2][0]
+    far, aside = np.array([along, [-along[1], along[0]]]) @ (xyz[:, :2] - deck.mean(axis=0)).T
+    end, half = far[codes == DECK].max(), np.abs(aside[codes == DECK]).max()
+    kept = (far < end + behind) & ((np.abs(aside) < half + 8) | (far < end - 6))
+    assert f1(found(xyz[kept]) > 0, codes[kept] == DECK, codes[kept] != OTHER) > 0.9
+
+
+def test_the_beginning_of_land_is_cut_or_clear_of_drops():
+    def ends(down, nothing, walled):
+        return np.array([0, down, 0, nothing, walled, *[0] * 8])
+
+    assert may_be_land(30, ends(2, 3, 95))
+    assert not may_be_land(20, ends(2, 3, 95))  # anything
+    assert not may_be_land(30, ends(10, 3, 87))  # a roof
+    assert may_be_land(20, ends(10, 30, 60))  # cut by the rim of the cloud
+    assert not may_be_land(90, ends(30, 30, 40))
+    assert not may_be_land(0, ends(0, 0, 0))
 
 
 # ---- properties -----------------------------------------------------------------------------------------

@@ -12,6 +12,8 @@ from .walkable import ACROSS, DOWN, NOTHING, ON, RIGHT, SOLID, UP, WALLED, dista
 LINK, JOIN = 2, 4
 #: The smallest deck and the smallest land at its ends, in cells, and how far land is looked for.
 SMALLEST, LAND, AWAY = 20, 100, 40
+#: Of land that the rim of the cloud cuts so many of the ways end at nothing; and what is clear of drops is land of so few cells.
+_CUT_OFF, _LITTLE, _LITTLE_DROPS = 0.1, 25, 0.05
 #: Patches that decks alone lead on to are holes in these, not land, if they have fewer cells and lie in so many rows and
 #: columns; a part goes on behind what ends a way so many cells on.
 ISLET, WITHIN, BEHIND = 32, 10, 16
@@ -179,6 +181,15 @@ def spread(z, start, h, w, kind, end, number, land, seen, stamp, length, ends):
 def no_ends() -> NDArray[np.int64]:
     """What :func:`spread` counts in."""
     return np.zeros(ENDS + DIRECTIONS, np.int64)
+
+
+def may_be_land(cells: int, ends: NDArray[np.int64]) -> bool:
+    """Whether what is too small for land may be the beginning of it: cut by the rim of the cloud, or clear of drops."""
+    over = max(int(ends[1:ENDS].sum()), 1)
+    down, any_down, nothing = ends[DOWN] / over, (ends[DOWN] + ends[ACROSS]) / over, ends[NOTHING] / over
+    if nothing >= _CUT_OFF:
+        return bool(down <= _LAND_DROPS[0] and any_down <= _LAND_DROPS[1])
+    return bool(cells >= _LITTLE and any_down <= _LITTLE_DROPS)
 
 
 def is_land(cells: int, ends: NDArray[np.int64]) -> bool:

@@ -36,6 +36,7 @@ from .deckrims import (
     first_land,
     is_land,
     islets,
+    may_be_land,
     no_ends,
     opposite_ends,
     rims,
@@ -342,7 +343,7 @@ def whole_decks(raster, number, sums, box) -> NDArray[np.bool_]:
     good = np.zeros(len(sums) + 1, bool)
     stamp = 0
     for part, found in opposite.items():
-        good[part] = True
+        there, maybe = 0, 0
         for sectors in found:
             over = no_ends()
             cells = first_land(
@@ -350,8 +351,17 @@ def whole_decks(raster, number, sums, box) -> NDArray[np.bool_]:
             )
             cells = spread(z, start, h, w, kind, end, other, land, seen, stamp, cells, over)
             stamp += 1
-            good[part] &= is_land(cells, over)
+            land_here = is_land(cells, over)
+            there += land_here
+            maybe += not land_here and may_be_land(cells, over)
+        cut_off = maybe == 1 and there == 1 and _is_long(int(sums[part, 0]), outward[part], drops[part])
+        good[part] = there == len(found) or cut_off
     return good[number]
+
+
+def _is_long(size: int, outward: NDArray[np.int64], drops: NDArray[np.int64]) -> bool:
+    """Whether a deck shows enough of its rim to do with land at one end."""
+    return bool(size >= CUT and outward.sum() * CUT_RIM <= drops.sum())
 
 
 def _ends(size: int, outward, cut, drops, ends) -> list[NDArray[np.bool_]]:
@@ -363,7 +373,7 @@ def _ends(size: int, outward, cut, drops, ends) -> list[NDArray[np.bool_]]:
     opposite = opposite_ends(outward, outward)
     whole = opposite is not None and ends[NOTHING] <= RIM * down
     if not whole:
-        if size < CUT or outward.sum() * CUT_RIM > drops.sum():
+        if not _is_long(size, outward, drops):
             return []
         opposite = opposite_ends(outward, cut)
     if opposite is None or not _is_free(opposite[0], outward, drops):
