@@ -12,7 +12,7 @@ from .walkable import ACROSS, DOWN, NOTHING, ON, RIGHT, SOLID, UP, WALLED, dista
 LINK, JOIN = 2, 4
 #: The smallest deck and the smallest land at its ends, in cells, and how far land is looked for.
 SMALLEST, LAND, AWAY = 20, 100, 40
-#: Of land that the rim of the cloud cuts so many of the ways end at nothing; and what is clear of drops is land of so few cells.
+#: Of land that the rim of the cloud cuts so many of the ways end at nothing; what is clear of drops may have so few cells.
 _CUT_OFF, _LITTLE, _LITTLE_DROPS = 0.1, 25, 0.05
 #: Patches that decks alone lead on to are holes in these, not land, if they have fewer cells and lie in so many rows and
 #: columns; a part goes on behind what ends a way so many cells on.
