@@ -17,6 +17,7 @@ from functools import cache
 from typing import Any
 
 from ..base.errors import DependencyError, PipelineError, StageError
+from ..base.extrabytes import extra_dimensions
 from ..base.las import check_readable
 from ..base.lasrecords import damaged
 from ..base.shortage import is_short, shortage
@@ -137,8 +138,10 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
         count = pipeline.execute()
     except (RuntimeError, ValueError, IndexError, OverflowError) as error:  # C++'s errors, as Python has them
         keep(stdout)
-        raise _of_damaged(stages, str(error)) or translate(
-            str(error), log_lines(_log(pipeline))[-3:]
+        raise (
+            _of_damaged(stages, str(error))
+            or _of_names(stages, str(error))
+            or translate(str(error), log_lines(_log(pipeline))[-3:])
         ) from None
     except MemoryError:
         raise PipelineError(
@@ -167,6 +170,24 @@ def _of_damaged(stages: list[dict[str, Any]], message: str) -> StageError | None
     if not read or not _CUT_POINTS.search(message):
         return None
     return damaged(read[0] if len(read) == 1 else "one of " + ", ".join(read), message.strip())
+
+
+_NO_NAME = re.compile(r"Can't create dimension with invalid name '(.*)'")
+
+
+def _of_names(stages: list[dict[str, Any]], message: str) -> PipelineError | None:
+    """What older PDAL says of an extra dimension such as ``Pulse width``, with its file; None of anything else."""
+    name = found[1] if (found := _NO_NAME.search(message)) else None
+    for path in readers_files(stages, las=True) if name else ():
+        if name in extra_dimensions(path):
+            return PipelineError(
+                "this PDAL does not read an extra dimension of that name",
+                where=path,
+                found=name,
+                cure="Newer ones do, such as 2.9; or write the file without it: "
+                f"las = laspy.read(IN); las.remove_extra_dim({name!r}); las.write(OUT)",
+            )
+    return None
 
 
 _kept: list[Any] = []
