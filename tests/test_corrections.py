@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import laspy
 import numpy as np
 import pytest
@@ -114,6 +116,26 @@ def test_all_around_a_change_was_seen(town, tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:.crs. was not provided")
+def test_a_copc_file_becomes_a_plain_one(tmp_path):
+    """As `classify` writes it from COPC, where PDAL can."""
+    before = Path(__file__).parent / "data/town.copc.laz"
+    las = laspy.read(before)
+    plain = laspy.LasHeader(version="1.4", point_format=6)
+    plain.scales, plain.offsets = las.header.scales, las.header.offsets
+    after = laspy.LasData(plain)
+    after.x, after.y, after.z = las.x, las.y, las.z
+    after.classification = np.where(np.arange(len(las)) < 50, 9, las.classification)
+    after.write(tmp_path / "after.laz")
+    out = tmp_path / "checked.laz"
+    found = write_corrections(CorrectionRequest(str(before), str(out), str(tmp_path / "after.laz")))
+    made = laspy.read(out)
+    assert found.changed == (np.asarray(las.classification)[:50] != 9).sum() > 0
+    assert np.array_equal(made.xyz, las.xyz) and np.array_equal(made.classification, after.classification)
+    assert made.header.parse_crs() == las.header.parse_crs()
+    assert "copc" not in {one.user_id for one in [*made.header.vlrs, *(made.evlrs or [])]}
+    assert len(ps.run_pipeline([str(out)]).arrays[0]) == len(las)
+
+
 def test_areas_that_were_looked_at(town, tmp_path):
     shapely, pyogrio = pytest.importorskip("shapely"), pytest.importorskip("pyogrio")
     xyz = np.asarray(laspy.read(town).xyz)

@@ -150,11 +150,14 @@ def write_corrections(request: CorrectionRequest) -> Corrections:
 
 
 def _read(path: str) -> Any:
-    """A whole file, as laspy holds it."""
+    """A whole file, as laspy holds it; a COPC file as the LAZ file that it is."""
     import laspy
 
     with laspy.open(path) as reader:
         header = reader.header
+    header.vlrs[:] = [one for one in header.vlrs if one.user_id != "copc"]
+    if header.evlrs:
+        header.evlrs[:] = [one for one in header.evlrs if one.user_id != "copc"]
     records = list(las_chunks(path))
     out = laspy.LasData(header)
     if records:
