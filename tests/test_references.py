@@ -8,6 +8,7 @@ import pytest
 import pdal_stages as ps
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.las import projection
+from pdal_stages.cli import main
 from pdal_stages.tiling import run_tiled
 
 pytestmark = pytest.mark.pdal
@@ -105,6 +106,13 @@ def test_inputs_without_a_reference_beside_others_are_said(tmp_path, inputs, ref
         assert len(said) == (1 if any(references) else 0)
         for line in said:
             assert f"{tmp_path / 'in1.las'}, {tmp_path / 'in3.las'} have no spatial reference" in line
+
+
+def test_objects_of_files_without_a_reference_beside_others(tmp_path, inputs, capsys):
+    inputs(METERS, None)
+    files = [str(tmp_path / f"in{number}.las") for number in range(2)]
+    assert main(["objects", *files, str(tmp_path / "town.geojson")]) == 1  # which have no classes
+    assert f"{files[1]} has no spatial reference; it is taken to have" in capsys.readouterr().err
 
 
 def test_references_in_files(tmp_path, inputs):

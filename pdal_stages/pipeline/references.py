@@ -112,19 +112,19 @@ def check_one_reference(found: Mapping[str, Reference]) -> list[str]:
     return without if len(without) < len(found) else []
 
 
-def without_reference(paths: Sequence[str]) -> str:
-    """What is said of inputs that have no spatial reference while others have one; nothing where there are none."""
+def without_reference(paths: Sequence[str]) -> list[str]:
+    """What is said of inputs that have no spatial reference while others have one."""
     if not paths:
-        return ""
+        return []
     named = ", ".join(paths[:3]) + (f" and {len(paths) - 3:,} more" if len(paths) > 3 else "")
     has, taken = ("has", "it is") if len(paths) == 1 else ("have", "they are")
-    return f"{named} {has} {NO_REFERENCE} {taken} taken to have that of the other inputs"
+    return [f"{named} {has} {NO_REFERENCE} {taken} taken to have that of the other inputs"]
 
 
-def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> str:
+def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> list[str]:
     """Refuse a pipeline whose LAS readers read different references, unless a stage moves points; what is to be told."""
     if any(stage.get("type") in MOVING for stage in stages):
-        return ""
+        return []
     alike: dict[str, list[str]] = {}
     first: dict[str, dict[str, Any]] = {}
     for stage in stages:
@@ -138,6 +138,6 @@ def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> str:
             first.setdefault(kind, reader)
             alike.setdefault(kind, []).append(path)
     if len(first) < 2:
-        return ""
+        return []
     without = check_one_reference({r["filename"]: reference_of(r, horizontal) for r in first.values()})
     return without_reference([path for paths in alike.values() if paths[0] in without for path in paths])

@@ -42,7 +42,7 @@ from ..stages.loading import loaded_model
 from .ends import input_files
 from .parts import Part, parts_of, reads_in_parts, reference_and_wkt
 from .processes import each_file
-from .references import check_one_reference
+from .references import check_one_reference, without_reference
 
 #: Classes by which a model's own class is known under another code.
 _SAME = {3: 5, 4: 5}
@@ -202,7 +202,8 @@ def review_files(request: ReviewRequest) -> Review:
         If a file cannot be read, or there is nothing to judge.
     """
     references = {path: reference_and_wkt(path) for path in request.files}
-    check_one_reference({path: one for path, (one, _) in references.items()})
+    without = check_one_reference({path: one for path, (one, _) in references.items()})
+    print_messages(*without_reference(without))
     side = request.settings.cell or side_for(*_extent(request.files, references))
     records: list[Records] = []
     work = [

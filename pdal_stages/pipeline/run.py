@@ -277,8 +277,8 @@ class Pipeline:
             r for path in readers_files(self.lowered.stages, las=True) if (r := check_readable(path))
         ]
         units = [ours.stage.horizontal_unit for ours in self.lowered.ours]
-        if units and (told := check_readers(self.lowered.stages, next(filter(None, units), ""))):
-            self.warnings.append(told)
+        if units:
+            self.warnings += check_readers(self.lowered.stages, next(filter(None, units), ""))
 
     def _located(self, error: StageError) -> StageError:
         """PDAL's words, with the line of the stage that they name and the nearest stage there is."""

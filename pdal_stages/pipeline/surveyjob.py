@@ -141,13 +141,15 @@ def _points(
 ) -> Points:
     """A survey's points, with heights."""
     readers = [reader_of(file, f"input{i}") for i, file in enumerate(group, 1)]
-    check_readers(readers)
+    told = check_readers(readers)
     own = [one for one in overrides if one.selector != stage.type]
     pipeline = Pipeline([*readers, *map(dict, heights)], own)
     pipeline.execute()
     if not any(map(len, pipeline.arrays)):
         raise StageError("there are no points to train on", where=", ".join(group[:3]))
-    return points_in(stage, pipeline.arrays, pipeline.metadata)
+    points = points_in(stage, pipeline.arrays, pipeline.metadata)
+    points.report.warnings += told
+    return points
 
 
 def points_in(stage: ClassifierModel, arrays: Sequence[NDArray], metadata: dict[str, Any]) -> Points:

@@ -33,7 +33,7 @@ from ..pipeline.ends import input_files, outputs_of, overlooked
 from ..pipeline.overrides import Override
 from ..pipeline.parts import reads_in_parts, reference_and_wkt
 from ..pipeline.processes import each_file
-from ..pipeline.references import check_one_reference
+from ..pipeline.references import check_one_reference, without_reference
 from ..reports.objectlayers import check_target, object_layers, target_files, write_layers
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter
 from .lasfiles import BLOCK, open_las, read_block
@@ -170,7 +170,8 @@ def objects_of_files(
     The folder for what is read (see `_own`) is there, and ours.
     """
     references = {path: reference_and_wkt(path, stage.horizontal_unit) for path in inputs}
-    check_one_reference({path: one for path, (one, _) in references.items()})
+    without = check_one_reference({path: one for path, (one, _) in references.items()})
+    print_messages(*without_reference(without))
     units, wkt = references[inputs[0]][0].units, references[inputs[0]][1]
     if not resume:
         for file in _kept(stage.filename).glob("*.npz"):

@@ -136,9 +136,9 @@ class Survey:
             raise self._none_readable()
         if needed:
             without = check_one_reference(found)
-            paths = [[source.path for source in group] for group in groups.values()]
-            told = without_reference([path for group in paths if set(group) & set(without) for path in group])
-            self.messages += [told] if told else []
+            alike = [[source.path for source in group] for group in groups.values()]
+            told = without_reference([path for group in alike if set(group) & set(without) for path in group])
+            self.messages += told
         return next(iter(found.values())).units.horizontal
 
     def _tells(self, source: InputSource) -> str:
