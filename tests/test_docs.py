@@ -132,7 +132,10 @@ def test_the_card_of_the_shipped_model_is_of_what_was_measured_of_it():
     command = [sys.executable, str(ROOT / "benchmarks" / "surveys" / "card.py")]
     command += ["--model", str(ROOT / "pdal_stages" / "models" / "standard.model")]
     command += ["--scores", str(measured / "surveys.json"), "--rules", str(measured / "surveys-rules.json")]
-    made = subprocess.run(command, capture_output=True, text=True, encoding="utf-8", timeout=300)
+    environment = {**os.environ, "PYTHONUTF8": "1"}
+    made = subprocess.run(
+        command, env=environment, capture_output=True, text=True, encoding="utf-8", timeout=300
+    )
     assert made.returncode == 0, made.stderr
     card = (ROOT / "docs" / "models.md").read_text(encoding="utf-8")
     assert made.stdout == card, "write it anew: docs/models.md, Made anew"
