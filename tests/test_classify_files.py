@@ -135,6 +135,11 @@ def test_inputs_of_one_name_lie_in_their_folders(folder, classify, tmp_path):
     assert code == 0 and "3 files written" in said, err  # one that is named twice is read once
 
 
+def test_a_suffix_that_pdal_does_not_know(folder, classify, tmp_path):
+    code, _, err = classify(folder / "in/t0.laz", tmp_path / "out.lax")
+    assert code == 1 and "out.lax" in err and "Is the suffix mistyped (.laz, .las)?" in err
+
+
 def test_metadata_of_many(folder, classify, tmp_path):
     (tmp_path / "bad.laz").write_bytes(b"LASF")
     words = (folder / "in", tmp_path / "bad.laz", tmp_path / "out", "--metadata", tmp_path / "m.json")

@@ -717,6 +717,18 @@ def test_outputs_of_tiles_hold_all_that_inputs_of_several_kinds_hold(tmp_path, w
             assert (header.version.minor, header.point_format.id, *header.scales[:2]) == wanted
 
 
+def test_an_odd_header_is_said_of_the_input_alone(tmp_path, town_file):
+    """Pieces that are cut out for tiles have the input's header."""
+    data = bytearray(town_file.read_bytes())
+    data[179:227] = bytes(48)  # no box
+    odd = tmp_path / f"odd{town_file.suffix}"
+    odd.write_bytes(data)
+    writer = {"type": "writers.las", "filename": str(tmp_path / "o_#.las")}
+    run = run_tiled([str(odd), {"type": "filters.hag_minima", "cell": 5}, writer], 30, workers=0)
+    said = [message for message in run.messages if "box in its header" in message]
+    assert not run.failures and len(said) == 1 and said[0].startswith(f"{odd}: ")
+
+
 def test_inputs_that_are_alike_ask_for_nothing(tmp_path, write_las):
     paths = [
         str(write_las(tmp_path / f"{n}.las", {axis: np.arange(9.0) for axis in "XYZ"}, 6, offset=(7, 8, 0)))

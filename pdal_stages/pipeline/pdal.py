@@ -317,7 +317,13 @@ def translate(message: str, before: Sequence[str] = ()) -> PipelineError | Depen
         return PipelineError("a script of filters.python failed", found="; ".join([last, *place]))
     # On one line: what PDAL says quotes names of files, which may hold line breaks.
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    return PipelineError("PDAL could not run the pipeline", found="; ".join([*lines, *before]))
+    unknown = re.search(r"[Cc]annot determine (reader|writer) for", text)
+    cure = (
+        f'Is the suffix mistyped (.laz, .las)? Otherwise give the stage a type: "{unknown[1]}s.las"'
+        if unknown
+        else None
+    )
+    return PipelineError("PDAL could not run the pipeline", found="; ".join([*lines, *before]), cure=cure)
 
 
 def _log(pipeline) -> str:

@@ -143,7 +143,7 @@ def run_head(
         most = max(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
         second = max(ours.stage.second_neighbors() for ours in pipeline.lowered.ours)
         need = max(need, _far_neighbors(found.places, most, second, context, tile))
-    messages = _messages(pipeline)
+    messages = _messages(pipeline, context.scratch)
     alone = left_alone(each[-1].figures for _, each in pipeline.reports if each)
     return HeadRun(results, need, messages, alone, narrowing)
 
@@ -161,10 +161,12 @@ class FirstResults(NamedTuple):
 _NOWHERE = re.compile(rf"{HOLDS_NOWHERE} [\d,]+ points: (?:\((.*)\) && \()?{OUTSIDE} <", re.DOTALL)
 
 
-def _messages(pipeline: Pipeline) -> list[str]:
-    """What is said of a tile, in the same words of every tile, as a run says it once."""
+def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
+    """What is said of a tile, in the same words of every tile, as a run says it once; nothing of files in `scratch`."""
     lines = [f"PDAL says: {line}" for line in pipeline.log_lines]
     for text in pipeline.messages:
+        if text.startswith(scratch):  # of a piece, as is said of the input
+            continue
         nowhere = _NOWHERE.search(text)
         if TOUCH_NONE in text:  # the places differ from tile to tile
             lines.append(text[text.index(TOUCH_NONE) :].partition(THE_PLACES)[0])
@@ -193,7 +195,7 @@ def run_first(context: RunContext, cuts: list[Piece], first: FirstRound) -> Firs
         except NeedsPdal:
             _write(cuts)
             return run_first(context, cuts, first)
-    messages = _messages(pipeline)
+    messages = _messages(pipeline, context.scratch)
     return FirstResults(left.found, _changes(left.values, marks), messages)
 
 

@@ -139,8 +139,10 @@ def read_extent(source: InputSource) -> Extent:
     return Extent(int(described["points"]), (x0, y0, x1, y1))
 
 
-def check_source(source: InputSource) -> None:
-    """Refuse an input whose header does not fit its file, or whose name is not text. Where it lies is known all the same.
+def check_source(source: InputSource) -> str | None:
+    """Refuse an input whose header does not fit its file, or whose name is not text; a warning where it only looks odd.
+
+    Where it lies is known all the same.
 
     Raises
     ------
@@ -149,8 +151,7 @@ def check_source(source: InputSource) -> None:
     """
     if any("\ud800" <= character <= "\udfff" for character in source.path):
         raise StageError("the name of the file is not UTF-8", where=source.path, cure="Rename the file")
-    if source.kind == "las":
-        las.check_readable(source.path)
+    return las.check_readable(source.path) if source.kind == "las" else None
 
 
 def las_extent(path: str) -> Extent:

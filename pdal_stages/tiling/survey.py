@@ -93,7 +93,8 @@ class Survey:
         for source in self.sources:
             try:
                 self.extents[source.path] = read_extent(source)
-                check_source(source)
+                if (odd := check_source(source)) is not None:
+                    self.messages.append(odd)
             except StageError as error:
                 self.unreadable[source.path] = str(error)
         if len(self.unreadable) == len(self.sources):
