@@ -115,7 +115,6 @@ def test_all_around_a_change_was_seen(town, tmp_path):
     assert (np.asarray(second["Checked"])[np.asarray(second.classification) == 21] == 1).all()
 
 
-@pytest.mark.filterwarnings("ignore:.crs. was not provided")
 def test_a_copc_file_becomes_a_plain_one(tmp_path):
     """As `classify` writes it from COPC, where PDAL can."""
     before = Path(__file__).parent / "data/town.copc.laz"
@@ -136,6 +135,7 @@ def test_a_copc_file_becomes_a_plain_one(tmp_path):
     assert len(ps.run_pipeline([str(out)]).arrays[0]) == len(las)
 
 
+@pytest.mark.filterwarnings("ignore:.crs. was not provided")
 def test_areas_that_were_looked_at(town, tmp_path):
     shapely, pyogrio = pytest.importorskip("shapely"), pytest.importorskip("pyogrio")
     xyz = np.asarray(laspy.read(town).xyz)
