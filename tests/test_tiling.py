@@ -729,6 +729,19 @@ def test_an_odd_header_is_said_of_the_input_alone(tmp_path, town_file):
     assert not run.failures and len(said) == 1 and said[0].startswith(f"{odd}: ")
 
 
+def test_many_odd_headers_are_counted(tmp_path, town_file):
+    data = bytearray(town_file.read_bytes())
+    data[179:227] = bytes(48)
+    for n in range(8):
+        (tmp_path / f"odd{n}{town_file.suffix}").write_bytes(data)
+    stages = [str(tmp_path / f"odd*{town_file.suffix}"), {"type": "filters.hag_minima", "cell": 5}]
+    run = run_tiled(
+        [*stages, {"type": "writers.las", "filename": str(tmp_path / "o_#.las")}], 30, dry_run=True
+    )
+    assert sum("box in its header" in message for message in run.messages) == 5
+    assert any("3 more inputs: their headers are odd" in message for message in run.messages)
+
+
 def test_inputs_that_are_alike_ask_for_nothing(tmp_path, write_las):
     paths = [
         str(write_las(tmp_path / f"{n}.las", {axis: np.arange(9.0) for axis in "XYZ"}, 6, offset=(7, 8, 0)))

@@ -33,6 +33,8 @@ from .tileplan import TilePlan
 
 #: Workers that a cluster is taken to have at most where it matters before it is asked.
 _OF_A_CLUSTER = 64
+#: Inputs with odd headers that are named.
+_ODD = 5
 
 
 class Survey:
@@ -90,13 +92,16 @@ class Survey:
         return replace(plan, first=replace(plan.first, blocks=blocks))
 
     def _read_headers(self) -> None:
+        odd = []
         for source in self.sources:
             try:
                 self.extents[source.path] = read_extent(source)
-                if (odd := check_source(source)) is not None:
-                    self.messages.append(odd)
+                odd += filter(None, [check_source(source)])
             except StageError as error:
                 self.unreadable[source.path] = str(error)
+        self.messages += odd[:_ODD]
+        if len(odd) > _ODD:
+            self.messages.append(f"so it is with {len(odd) - _ODD:,} more inputs: their headers are odd, too")
         if len(self.unreadable) == len(self.sources):
             raise self._none_readable()
         lost = len(self.sources) - len(self.extents)
