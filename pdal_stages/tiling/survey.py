@@ -92,7 +92,7 @@ class Survey:
         return replace(plan, first=replace(plan.first, blocks=blocks))
 
     def _read_headers(self) -> None:
-        odd = []
+        odd: list[str] = []
         for source in self.sources:
             try:
                 self.extents[source.path] = read_extent(source)
