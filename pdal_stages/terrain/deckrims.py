@@ -183,18 +183,22 @@ def no_ends() -> NDArray[np.int64]:
     return np.zeros(ENDS + DIRECTIONS, np.int64)
 
 
+def _shares(ends: NDArray[np.int64]) -> tuple[float, float, float]:
+    """Of the ways over land that end, those at a drop right ahead, at any drop, at nothing."""
+    over = max(int(ends[1:ENDS].sum()), 1)
+    return ends[DOWN] / over, (ends[DOWN] + ends[ACROSS]) / over, ends[NOTHING] / over
+
+
 def may_be_land(cells: int, ends: NDArray[np.int64]) -> bool:
     """Whether what is too small for land may be the beginning of it: cut by the rim of the cloud, or clear of drops."""
-    over = max(int(ends[1:ENDS].sum()), 1)
-    down, any_down, nothing = ends[DOWN] / over, (ends[DOWN] + ends[ACROSS]) / over, ends[NOTHING] / over
+    down, any_down, nothing = _shares(ends)
     if nothing >= _CUT_OFF:
         return bool(down <= _LAND_DROPS[0] and any_down <= _LAND_DROPS[1])
     return bool(cells >= _LITTLE and any_down <= _LITTLE_DROPS)
 
 
 def is_land(cells: int, ends: NDArray[np.int64]) -> bool:
-    over = max(int(ends[1:ENDS].sum()), 1)
-    down, any_down, nothing = ends[DOWN] / over, (ends[DOWN] + ends[ACROSS]) / over, ends[NOTHING] / over
+    down, any_down, nothing = _shares(ends)
     if cells < LAND or nothing > _LAND_DROPS[2]:
         return False
     if down <= _LAND_DROPS[0] and any_down <= _LAND_DROPS[1]:
