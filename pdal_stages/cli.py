@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from .base.errors import StageError, suggest
-from .base.lean import import_lean
+from .base.lean import be_lean
 from .base.outputs import Output, check_outputs
 from .base.plain import PlainStream, print_messages
 from .base.runlog import LoggedStream, RunLog
@@ -37,6 +37,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     code = 1
     try:
         overrides, rest = parse_overrides(arguments)
+        if argv is None and rest and rest[0] in _OWN_CODE:
+            be_lean()
         options, unknown = _parser().parse_known_args(rest)
         command = vars(options).pop("parser")  # it cannot travel to workers
         if unknown and not _taken(options, unknown):
@@ -45,8 +47,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise StageError(f"'{options.command}' takes no stage options", found=overrides[0].flag)
         options.overrides, options.arguments = overrides, arguments
         options.is_program = argv is None
-        if options.is_program and options.command in _OWN_CODE:
-            import_lean()
         if getattr(options, "progress", None) is not None:
             os.environ["PDAL_STAGES_PROGRESS"] = "1" if options.progress else "0"
         if getattr(options, "log", None):

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pdal_stages.base import checks
+from pdal_stages.base import checks, threads
 from pdal_stages.base.errors import OptionError
 from pdal_stages.base.memory import give_back
 
@@ -98,3 +98,25 @@ def test_only_whole_pages_inside_an_array_are_given_back():
     assert (part == 3).all()
     give_back(room[::2])
     assert room[:page].all()
+
+
+def test_cores_are_bounded_by_affinity_quota_and_what_a_worker_is_told(tmp_path, monkeypatch):
+    count = threads.available_threads.__wrapped__
+    monkeypatch.setattr(threads.os, "cpu_count", lambda: 16)
+    monkeypatch.setattr(threads.os, "sched_getaffinity", lambda _: range(12), raising=False)
+    monkeypatch.delenv(threads.CORES, raising=False)
+    quota = threads._quota
+    monkeypatch.setattr(threads, "_quota", lambda: quota(str(tmp_path)))
+    assert count() == 12
+    for told, cores in (("3", 3), ("0", 1), ("many", 12), ("40", 12)):
+        monkeypatch.setenv(threads.CORES, told)
+        assert count() == cores
+    (tmp_path / "cpu").mkdir()
+    (tmp_path / "cpu/cpu.cfs_quota_us").write_text("-1\n")
+    (tmp_path / "cpu/cpu.cfs_period_us").write_text("100000\n")
+    assert count() == 12
+    for text, cores in (("max 100000\n", 12), ("250000 100000\n", 3), ("1000 100000\n", 1), ("", 12)):
+        (tmp_path / "cpu.max").write_text(text)
+        assert count() == cores
+    (tmp_path / "cpu/cpu.cfs_quota_us").write_text("400000\n")
+    assert count() == 4

@@ -32,7 +32,7 @@ def test_conda_asks_for_what_pip_asks_for(file):
     block = re.search(r"\ndependencies = \[\n(.*?)\n\]", PYPROJECT, re.DOTALL)
     wanted = re.findall(r'"([^">]+)>=([^"]+)"', block[1])
     text = (ROOT / file).read_text()
-    assert len(wanted) >= 9
+    assert len(wanted) >= 8
     for name, bound in wanted:
         assert f"- {_CONDA.get(name, name)} >={bound}\n" in text, name
 

@@ -1,8 +1,11 @@
-"""Imports without what the imported would only look for: in a process that runs nobody's code but ours."""
+"""Without what is only looked for, or waited for: for a process that runs nobody's code but ours."""
 
 from __future__ import annotations
 
+import atexit
+import gc
 import importlib
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,10 +20,17 @@ _OPTIONAL = {
 }
 
 
-def import_lean() -> None:
-    """From now on leave out what is not needed. In a notebook, or with stages of the user's, somebody may need it."""
+def be_lean() -> None:
+    """From now on leave out what is not needed. In a notebook, or with stages of the user's, somebody may need it.
+
+    Call it before NumPy is imported: the threads of its linear algebra, of which we do next to none, spin while they wait.
+    """
     global _lean
     _lean = True
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    atexit.register(
+        gc.freeze
+    )  # Python looks at all objects once more before the process ends, and the memory with it
 
 
 def imported(name: str) -> Any:

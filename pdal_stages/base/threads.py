@@ -7,21 +7,43 @@ Python threads enter it together, and users do run pipelines in threads.
 
 from __future__ import annotations
 
+import contextlib
+import math
+import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from functools import cache
+from pathlib import Path
 from threading import Event
 from typing import Any
 
 from . import checks
 
+#: Where a cgroup of version 2, and one of version 1, says how many microseconds of CPU it may use in how many.
+_QUOTAS = ("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us")
+
+#: By which a worker is told how many cores are its own; joblib, and so scikit-learn, heeds it too.
+CORES = "LOKY_MAX_CPU_COUNT"
+
 
 @cache
 def available_threads() -> int:
-    """Cores this process may use: its CPU affinity, bounded by a cgroup quota."""
-    import joblib  # scikit-learn's own; not needed where the number is given
+    """Cores this process may use: its CPU affinity, bounded by a cgroup quota and by :data:`CORES`."""
+    bounds = [os.cpu_count() or 1, *_quota()]
+    if hasattr(os, "sched_getaffinity"):
+        bounds.append(len(os.sched_getaffinity(0)))
+    with contextlib.suppress(ValueError):
+        bounds.append(int(os.environ.get(CORES, "")))
+    return max(1, min(bounds))
 
-    return joblib.cpu_count()
+
+def _quota(folder: str = "/sys/fs/cgroup") -> Iterator[int]:
+    """The cores that a cgroup's quota is worth, where there is one."""
+    for files in _QUOTAS:
+        with contextlib.suppress(OSError, ValueError, ArithmeticError):  # no such file; "max": no bound
+            quota, period = (int(word) for file in files for word in Path(folder, file).read_text().split())
+            if quota > 0:
+                yield math.ceil(quota / period)
 
 
 def resolve_threads(threads: int | None) -> int:

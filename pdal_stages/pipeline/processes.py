@@ -20,7 +20,7 @@ from ..base.errors import StageError
 from ..base.plain import print_messages
 from ..base.runlog import LoggedStream
 from ..base.shortage import check_limit
-from ..base.threads import available_threads
+from ..base.threads import CORES, available_threads
 from . import lifesigns
 from .work import Call, Task, TaskResult, perform
 
@@ -199,7 +199,7 @@ def _command() -> list[str]:
 def _environment(threads: int) -> dict[str, str]:
     out = {**os.environ, "PDAL_STAGES_PROGRESS": "0"}
     out |= {f"{name}_NUM_THREADS": str(threads) for name in ("OMP", "OPENBLAS", "MKL")}
-    out["LOKY_MAX_CPU_COUNT"] = str(threads)  # which available_threads heeds
+    out[CORES] = str(threads)
     if "PYTHONPATH" in out:  # where an empty entry means the current folder
         out["PYTHONPATH"] = os.pathsep.join(filter(None, out["PYTHONPATH"].split(os.pathsep)))
     return out
