@@ -350,20 +350,22 @@ def slow_plateaus(ground, raster, cell):
         own = [c for c in members if ground[c]]
         if len(own) <= 0.05 * len(members) or np.ptp(at, axis=0).max() >= int(200 / cell):
             continue
-        middle, lower, level, directions = at.mean(axis=0), [], 0, set()
+        middle, lower, level, directions, uphill = at.mean(axis=0), [], 0, set(), 0
         for j, i in members:
             for b in range(-8, 9):
                 for a in range(-8, 9):
                     other = (j + b, i + a)
                     if other in cells and ground[other] and other not in members:
-                        drop = cells[j, i] - cells[other]
-                        if drop > max(1.5, 0.75 * cell * np.hypot(a, b)):
+                        drop, jump = cells[j, i] - cells[other], max(1.5, 0.75 * cell * np.hypot(a, b))
+                        if ground[j, i]:
+                            uphill += 1.0 if drop < -jump else -0.5 if drop > jump else 0.0
+                        if drop > jump:
                             lower.append(cells[other])
                             turn = np.arctan2(other[0] - middle[0], other[1] - middle[1]) / (2 * np.pi)
                             directions.add(int(np.floor(16 * (turn + 1))) % 16)
                         elif abs(drop) < 0.75:
                             level += 1
-        if len(directions) >= 14 and len(lower) >= 0.8 * (len(lower) + level):
+        if len(directions) >= 14 and len(lower) >= 0.8 * (len(lower) + level) and uphill <= 0:
             taken |= dict.fromkeys(own, np.mean(lower))
     return taken
 
@@ -411,6 +413,30 @@ def test_a_roof_is_no_ground_whatever_its_width_and_steps():
     assert ground[far < 30].mean() > 0.99
     ground, _ = ground_of(np.where(far < 130, 6.0, 0.0))
     assert ground[far < 40].mean() > 0.99
+
+
+def forest_on_a_slope(slope, turn=0.0, scarp=0.0, seed=0):
+    """6 points/m2 of 100 x 100 m, of which few reach the ground, in gaps: coordinates, and which are ground."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0, 100, (2, 60_000))
+    c, s = np.cos(turn), np.sin(turn)
+    up, across = c * (x - 50) + s * (y - 50), c * (y - 50) - s * (x - 50)
+    z = slope * up + np.sin(up / 9) * np.cos(across / 13) + rng.normal(0, 0.05, len(x))
+    z += scarp / (1 + np.exp((10 - up) / 1.8))
+    gaps, crowns = rng.beta(1.2, 1.2, (20, 20)), rng.uniform(12, 26, (20, 20))
+    at = (y / 6).astype(int), (x / 6).astype(int)
+    hit = rng.random(len(x)) > 0.1 * gaps[at]
+    share = np.where(rng.random(len(x)) < 0.85, rng.beta(5, 1.3, len(x)), rng.random(len(x)))
+    return x, y, z + np.where(hit, crowns[at] * share, 0.0), ~hit
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_steep_wooded_slope_is_no_plateau(seed):
+    """From cells of ground that are not linked to the others it goes down in all directions, but up as well."""
+    x, y, z, ground = forest_on_a_slope(1.0, seed=seed)
+    found = filtered_ground(x, y, z)
+    assert found["Ground"][ground].mean() > 0.99
+    assert np.abs(found["HeightAboveGround"][ground]).mean() < 0.2
 
 
 # ---- what must hold --------------------------------------------------------------------------------------

@@ -24,7 +24,8 @@ JUMP, WALL = 1.5, 0.75
 #: The share of a set's cells that must have been taken for ground: a few are more likely ground among treetops.
 FOOTING = 0.05
 #: Lower ground must lie in so many of 16 directions from the middle, and be such a share of the ground that is lower or
-#: less than a step away, where there may be a way up; a higher story does not count.
+#: less than a step away, where there may be a way up; a higher story does not count. Around ground on a steep slope as
+#: much lies a jump higher as lower: from a plateau's ground, the former is no more than half of the latter.
 DIRECTIONS, SHARE = 14, 0.8
 
 
@@ -101,8 +102,11 @@ def _extents(number, ground, box, sums, grounds):
 
 
 @njit
-def _look_around(number, asked, ground, raster, cell, sums, sectors, around, level):
-    """Of each set asked for: in which directions ground lies a jump lower, how often, how high, and how often level."""
+def _look_around(number, asked, ground, raster, cell, sums, sectors, around, level, uphill):
+    """Of each set asked for: in which directions ground lies a jump lower, how often, how high, and how often level.
+
+    And of the set's own ground, twice how often other ground lies a jump higher, less how often it lies a jump lower.
+    """
     h, w = number.shape
     for j in range(h):
         for i in range(w):
@@ -114,7 +118,10 @@ def _look_around(number, asked, ground, raster, cell, sums, sectors, around, lev
                     if not ground[y, x] or number[y, x] == k:
                         continue
                     drop = raster[j, i] - raster[y, x]
-                    if drop > max(JUMP, WALL * cell * np.sqrt(float((y - j) ** 2 + (x - i) ** 2))):
+                    jump = max(JUMP, WALL * cell * np.sqrt(float((y - j) ** 2 + (x - i) ** 2)))
+                    if ground[j, i]:
+                        uphill[k] += 2 * (drop < -jump) - (drop > jump)
+                    if drop > jump:
                         around[k, 0] += 1
                         level[k] += raster[y, x]
                         # From the set's middle, times its size: whole numbers, the same wherever the array begins.
@@ -148,8 +155,9 @@ def remove_plateaus(ground: np.ndarray, floor: np.ndarray, raster: np.ndarray, c
     asked = grounds > FOOTING * sums[:, 2]
     asked &= (box[:, 1] - box[:, 0] < widest) & (box[:, 3] - box[:, 2] < widest)
     sectors, around, level = np.zeros((count, 16), bool), np.zeros((count, 2), np.int64), np.zeros(count)
-    _look_around(number, asked, ground, raster, cell, sums, sectors, around, level)
+    uphill = np.zeros(count, np.int64)
+    _look_around(number, asked, ground, raster, cell, sums, sectors, around, level, uphill)
     lower = around[:, 0]
-    plateau = (sectors.sum(axis=1) >= DIRECTIONS) & (lower >= SHARE * around.sum(axis=1))
+    plateau = (sectors.sum(axis=1) >= DIRECTIONS) & (lower >= SHARE * around.sum(axis=1)) & (uphill <= 0)
     level[plateau] /= lower[plateau]
     _take(number, plateau, level, ground, floor)
