@@ -58,6 +58,18 @@ def test_degrees_are_refused_with_the_cure():
 
 
 @pytest.mark.parametrize(
+    "wkt",
+    [
+        'GEOCCS["WGS 84",DATUM["d",SPHEROID["e",6378137,298.2]],UNIT["metre",1],AXIS["Geocentric X",OTHER]]',
+        'GEODCRS["WGS 84",DATUM["d",ELLIPSOID["e",6378137,298.2]],CS[Cartesian,3],AXIS["x",geocentricX],UNIT["metre",1]]',
+    ],
+)
+def test_the_center_of_the_earth_is_no_place_to_measure_heights_from(wkt):
+    with pytest.raises(StageError, match=r"geocentric .*EPSG:CODE"):
+        units_of_wkt(wkt, place=(9.0, 50.0))
+
+
+@pytest.mark.parametrize(
     ("place", "name", "code"),
     [
         ((-5.99, 37.39), "ETRS89", 25830),  # Seville

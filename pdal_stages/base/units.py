@@ -74,12 +74,8 @@ def units_of_wkt(
     root = parse_wkt(wkt) if wkt.strip() else None
     if root is not None:
         projected = root.find("PROJCS", "PROJCRS", "PROJECTEDCRS", "LOCAL_CS", "ENGCRS")
-        if projected is None and root.find("GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "GEODCRS", "GEODETICCRS"):
-            raise StageError(
-                "the coordinates are geographic (degrees); neighborhoods and grids need meters",
-                found=root.name or wkt[:60],
-                cure=reprojection_cure(root.name, place),
-            )
+        if projected is None:
+            _refuse_globe(root, wkt, place)
         if across is None and projected is not None:
             across = projected.unit()
         height = root.find("VERT_CS", "VERTCRS", "VERTICALCRS")
@@ -95,6 +91,22 @@ def units_of_wkt(
                 cure="Set horizontal_unit and vertical_unit",
             )
     return Units(across, across if upward is None else upward, assumed)
+
+
+def _refuse_globe(root: WktNode, wkt: str, place: tuple[float, float] | None) -> None:
+    """Refuse a reference in which no axis is up: degrees, or meters from the earth's center."""
+    geodetic = root.find("GEOCCS", "GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "GEODCRS", "GEODETICCRS")
+    if geodetic is None:
+        return
+    system = geodetic.find("CS")  # WKT 2 has one keyword for both
+    centered = geodetic.keyword == "GEOCCS" or (system is not None and system.name.lower() == "cartesian")
+    raise StageError(
+        "the coordinates are geocentric (from the earth's center); heights need an axis that is up"
+        if centered
+        else "the coordinates are geographic (degrees); neighborhoods and grids need meters",
+        found=root.name or wkt[:60],
+        cure=reprojection_cure(root.name, None if centered else place),
+    )
 
 
 def reprojection_cure(name: str = "", place: tuple[float, float] | None = None) -> str:

@@ -296,6 +296,9 @@ WKT = {
     "degree": 'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],'
     'PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433]]',
 }
+WKT["geocentric"] = (
+    'GEOCCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],UNIT["metre",1]]'
+)
 WKT["us-ft"] = WKT["metre"].replace('UNIT["metre",1]', 'UNIT["US survey foot",0.304800609601219]')
 UP = 'VERT_CS["height",VERT_DATUM["sea",2005],UNIT["%s",%s],AXIS["Up",UP]]'
 WKT["compound, feet up"] = f'COMPD_CS["both",{WKT["metre"]},{UP % ("foot", "0.3048")}]'
@@ -335,14 +338,22 @@ def test_references(cell, tmp_path, write_las, case, wkt, across, up):
 
 @pytest.mark.parametrize(
     ("case", "wkt"),
-    [("a geographic reference", "degree"), ("a compound reference with degrees", "compound, geographic")],
+    [
+        ("a geographic reference", "degree"),
+        ("a compound reference with degrees", "compound, geographic"),
+        ("a geocentric reference", "geocentric"),
+    ],
 )
 def test_degrees(cell, tmp_path, write_las, case, wkt):
     xyz = random(100, size=(0.001, 0.001, 5.0)) + [9.0, 50.0, 0.0]
     arrays = {"X": xyz[:, 0], "Y": xyz[:, 1], "Z": xyz[:, 2]}
     source = write_las(tmp_path / "in.las", arrays, point_format=6, wkt=WKT[wkt], scale=1e-7)
     path = job(tmp_path, str(source), HAG, str(tmp_path / "out.las"))
-    cell("Clouds", case).refused(["pipeline", path], "geographic (degrees)", "filters.reprojection")
+    cell("Clouds", case).refused(
+        ["pipeline", path],
+        "geocentric" if wkt == "geocentric" else "geographic (degrees)",
+        "filters.reprojection",
+    )
 
 
 def test_degrees_without_a_reference(cell, tmp_path, write_las):
