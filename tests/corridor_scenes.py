@@ -21,12 +21,13 @@ class Line:
     stations: tuple[float, ...]
     wires: tuple[tuple[float, float], ...]
     sag: float  # per squared meter of span: 8 sag / span^2 is the curvature
-    kind: str  # lattice, pole, frame
+    kind: str  # lattice, wide, pole, frame
     tall: float
 
 
 HIGH = ((-7.0, 22.0), (7.0, 22.0), (-9.0, 28.0), (9.0, 28.0), (-6.0, 34.0), (6.0, 34.0), (0.0, 40.0))
 MEDIUM = ((-1.2, 10.2), (0.0, 10.6), (1.2, 10.2))
+HIGHEST = ((-15.0, 38.0), (0.0, 38.0), (15.0, 38.0))
 LOW = ((-0.4, 7.6), (0.0, 8.0), (0.4, 7.6))
 DOUBLE = ((-4.0, 15.0), (4.0, 15.0), (-4.5, 18.5), (4.5, 18.5), (-3.5, 22.0), (3.5, 22.0))
 
@@ -53,6 +54,28 @@ def _lattice(rng, foot, turn, tall, wires, density):
             parts.append(
                 np.column_stack([rng.uniform(-0.5, 0.5, m), t, level + 1.5 + rng.uniform(-0.4, 0.6, m)])
             )
+    return _placed(np.vstack(parts), foot, turn)
+
+
+def _wide(rng, foot, turn, tall, wires, density):
+    """Points of legs that stand 0.36 of its height apart, a beam above the wires, and the insulators these hang from."""
+    n = int(tall * density * 3.0)
+    u = rng.uniform(0.02, 1, n)
+    half = np.where(u < 0.7, 0.18 * tall + (2.5 - 0.18 * tall) * u / 0.7, 2.5)
+    side = rng.integers(0, 4, n)
+    along = rng.choice([-1.0, 1.0], n) * np.where(rng.random(n) < 0.7, 1.0, rng.uniform(-1, 1, n))
+    a, b = along * half, np.where(side % 2, 1.0, -1.0) * half
+    a, b = np.where(side < 2, a, b), np.where(side < 2, b, a)
+    parts = [np.column_stack([a, b, u * tall])]
+    reach, level = max(abs(t) for t, _ in wires), max(z for _, z in wires)
+    m = int(2 * reach * density * 0.9)
+    t = rng.uniform(-reach - 1, reach + 1, m)
+    parts.append(np.column_stack([rng.uniform(-1, 1, m), t, level + 7.0 + rng.uniform(-0.5, 1.0, m)]))
+    for aside, _ in wires:
+        u = rng.uniform(0.1, 1, int(density))
+        parts.append(
+            np.column_stack([np.zeros(len(u)), aside + rng.choice([-3, 3], len(u)) * u, level + 7 * u])
+        )
     return _placed(np.vstack(parts), foot, turn)
 
 
@@ -84,7 +107,7 @@ def _placed(q, foot, turn):
     return np.column_stack([q[:, 0] * c - q[:, 1] * s, q[:, 0] * s + q[:, 1] * c, q[:, 2]]) + np.asarray(foot)
 
 
-_SUPPORTS = {"lattice": _lattice, "pole": _pole, "frame": _frame}
+_SUPPORTS = {"lattice": _lattice, "wide": _wide, "pole": _pole, "frame": _frame}
 
 
 def _crown(rng, foot, radius, tall, density):
@@ -181,6 +204,9 @@ def _every(step, length=700.0, start=0.0):
 CORRIDORS = {
     "high voltage": lambda d=8.0, seed=0: corridor(
         [Line(0.0, _every(280.0, 840.0), HIGH, 1.1e-4, "lattice", 42.0)], d, seed
+    ),
+    "highest voltage": lambda d=8.0, seed=6: corridor(
+        [Line(0.0, _every(300.0, 900.0), HIGHEST, 1.0e-4, "wide", 48.0)], d, seed, clear=10.0, turn=0.5
     ),
     "high voltage, uphill": lambda d=8.0, seed=1: corridor(
         [Line(5.0, _every(240.0, 720.0, 30.0), DOUBLE, 1.2e-4, "lattice", 25.0)], d, seed, slope=0.2, turn=1.1

@@ -35,6 +35,7 @@ def found(xyz, height, wire):
     ("name", "share"),
     [
         ("high voltage", 1.0),
+        ("highest voltage", 1.0),
         ("high voltage, uphill", 1.0),
         ("two lines beside each other", 1.0),
         ("low voltage along a street", 0.85),
@@ -69,7 +70,9 @@ def test_wires_that_do_not_rise_have_no_support():
     assert not found(np.column_stack([xyz[:, :2], level]), np.where(wire, 8.0, height), wire).any()
 
 
-@pytest.mark.parametrize("name", ["two lines beside each other", "low voltage along a street"])
+@pytest.mark.parametrize(
+    "name", ["two lines beside each other", "low voltage along a street", "highest voltage"]
+)
 def test_order_of_points_and_tiles_change_nothing(name):
     xyz, _, height, wire = scene(name)
     whole = found(xyz, height, wire)

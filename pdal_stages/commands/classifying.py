@@ -68,7 +68,7 @@ def add_commands(add: Adder) -> None:
         "--towers",
         action=argparse.BooleanOptionalAction,
         default=False,
-        help="Find wires, and towers and poles (15) where they meet; tiles are read with 135 m more around them",
+        help="Find wires, and towers and poles (15) where they meet; tiles are read with 145 m more around them",
     )
     takes(
         "--consistency",

@@ -21,14 +21,19 @@ CELL = 1.0
 FOOT, FROM = 0.7, 2.0
 #: The lowest wires of poles and of towers, and how far from the axis the wires are, meters.
 LOW_WIRE, HIGH_WIRE, AT_POLE, AT_TOWER = 5.0, 14.0, 2, 10
-#: Half the width of a pole's surroundings and of a tower's body, in cells, and those of the ring that is clear round them.
-SLIM, BODY = (1, 1, 1), (4, 6, 8)
+#: Half the width of a pole's surroundings and of a tower's body, at least and at most, in cells.
+SLIM, BODY = 1, (4, 10)
+#: A body ends where so many rings of cells are as good as clear: at most that share of the points inside. Where no ring is,
+#: or what widens it lies on one side of it, as a tree does, a slim body does, with the other share in the rings of `ROUND`.
+CLEAR, TIDY, ONE_SIDED, CROWDED, ROUND = 3, 0.05, 0.5, 0.5, (6, 8)
+#: A body of so many cells is wider than a slim one, and arms reach further in proportion, up to so much.
+WIDE, WIDEST = 4.0, 2.0
 #: Of the meters up to the wires, such a share is filled; of a pole at least so many.
 POLE_FILLED, TOWER_FILLED, LEAST = 0.25, 0.6, 2
-#: Part of the height in which nothing else is near: below a tower's arms, and below a pole's.
-TRUNK, POLE_TRUNK = (0.2, 0.5), (0.25, 0.85)
-#: Points in the ring, of those inside, at most; and how far those of a pole scatter round its axis, meters.
-RING, SCATTER, CENTER = 0.5, 0.35, 0.8
+#: Part of the height in which nothing else is near: below the arms.
+TRUNK = (0.2, 0.5)
+#: How far the points of a pole scatter round its axis, and their middle from that of its cell; meters.
+SCATTER, CENTER = 0.35, 0.8
 #: Wires are looked at from `NEAR` to `FAR` meters from the axis, in pieces of `PIECE`; from both sides together they rise so
 #: much, rise over run, and that is known from so many pairs of points.
 NEAR, FAR, PIECE, RISE, PAIRS = 2.0, 15.0, 4.0, 0.015, 4
@@ -36,10 +41,10 @@ NEAR, FAR, PIECE, RISE, PAIRS = 2.0, 15.0, 4.0, 0.015, 4
 APART = (3, 15)
 #: How far round an axis its points lie: a pole's, those that were taken for a wire's, and those of its arms; a tower's at
 #: the top, and so much more at its foot per meter of height; arms beyond the outermost wire, and along the wires; how far
-#: above these. Meters.
-STEM, OWN, POLE_ARM, TOP, SPREAD, BESIDE, ALONG, OVER = 0.8, 0.3, 2.2, 1.5, 0.12, 1.5, 2.5, 4.0
+#: above these, meters, and of a tower's height, as wires hang from long insulators.
+STEM, OWN, POLE_ARM, TOP, SPREAD, BESIDE, ALONG, OVER, ABOVE = 0.8, 0.3, 2.2, 1.5, 0.12, 1.5, 2.5, 4.0, 0.3
 #: How far away wires and points matter, meters.
-REACH = AT_TOWER + BESIDE + APART[1] + FAR + PIECE + 4.0
+REACH = AT_TOWER * WIDEST + BESIDE + APART[1] + FAR + PIECE + 4.0
 _PARTS = 1 << 16
 _HIGHEST = 256
 
@@ -76,7 +81,7 @@ def find_towers(
 
 def _near(column: NDArray[np.int64], row: NDArray[np.int64], wires: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Points in blocks at wires, and in those around."""
-    side = int(AT_TOWER + BODY[2] + BESIDE) + 2
+    side = int(AT_TOWER * WIDEST + BESIDE) + BODY[1] + CLEAR
     across, along = column // side, row // side
     key = (along << 32) + across
     steps = np.array([(b << 32) + a for b in (-1, 0, 1) for a in (-1, 0, 1)])
@@ -85,8 +90,8 @@ def _near(column: NDArray[np.int64], row: NDArray[np.int64], wires: NDArray[np.i
 
 @njit
 def _axes(x, y, z, height, wire, order, start, h, w, left, bottom):
-    """Cells that may be the axis of a support (m, 8): row, column, whether it is a tower, how high its wires hang, score,
-    its middle, and the direction of its wires as an angle.
+    """Cells that may be the axis of a support (m, 9): row, column, whether it is a tower, how high its wires hang, score,
+    its middle, the direction of its wires as an angle, and half its width in cells.
     """
     top = np.full(h * w, -1.0)
     there = np.zeros(h * w, np.bool_)
@@ -96,10 +101,10 @@ def _axes(x, y, z, height, wire, order, start, h, w, left, bottom):
                 top[k] = max(top[k], height[order[q]])
             else:
                 there[k] = True
-    out = np.empty((64, 8))
+    out = np.empty((64, 9))
     n = 0
     filled = np.empty(_HIGHEST, np.bool_)
-    sums = np.empty(8, np.int64)
+    sums, rings = np.empty(4, np.int64), np.empty((BODY[1] + CLEAR + 1, 3), np.int64)
     for j in range(h):
         for i in range(w):
             if not there[j * w + i]:
@@ -112,8 +117,13 @@ def _axes(x, y, z, height, wire, order, start, h, w, left, bottom):
                         high = max(high, top[b * w + a])
                 if high < (HIGH_WIRE if tall else LOW_WIRE) or high >= _HIGHEST:
                     continue
+                half = SLIM
+                if tall:
+                    half = _half_width(height, wire, order, start, h, w, j, i, high, rings)
+                    if half == 0:
+                        continue
                 score = _upright(
-                    x, y, height, wire, order, start, h, w, left, bottom, j, i, tall, high, filled, sums
+                    x, y, height, wire, order, start, h, w, left, bottom, j, i, tall, half, high, filled, sums
                 )
                 if score <= 0:
                     continue
@@ -122,37 +132,60 @@ def _axes(x, y, z, height, wire, order, start, h, w, left, bottom):
                 if rise < RISE:
                     continue
                 if n == len(out):
-                    out = np.concatenate((out, np.empty((n, 8))))
+                    out = np.concatenate((out, np.empty((n, 9))))
                 out[n, 0], out[n, 1], out[n, 2], out[n, 3] = j, i, tall, high
                 out[n, 4], out[n, 5], out[n, 6], out[n, 7] = score, middle_x, middle_y, turn
+                out[n, 8] = half
                 n += 1
     return out[:n].copy()
 
 
 @device
-def _upright(x, y, height, wire, order, start, h, w, left, bottom, j, i, tall, high, filled, sums):
+def _half_width(height, wire, order, start, h, w, j, i, high, rings):
+    """How many cells a tower's body reaches from its axis, below its arms; 0 where it stands among other things."""
+    rings[:] = 0
+    reach = len(rings) - 1
+    for b in range(max(j - reach, 0), min(j + reach + 1, h)):
+        for a in range(max(i - reach, 0), min(i + reach + 1, w)):
+            far = max(abs(b - j), abs(a - i))
+            for q in range(start[b * w + a], start[b * w + a + 1]):
+                p = order[q]
+                if not wire[p] and TRUNK[0] * high <= height[p] <= TRUNK[1] * high:
+                    rings[far, 0] += 1
+                    rings[far, 1] += a - i
+                    rings[far, 2] += b - j
+    inside = slim = around = way = across = along = 0
+    for k in range(BODY[1] + 1):
+        inside += rings[k, 0]
+        if k <= BODY[0]:
+            slim = inside
+        else:
+            way += k * rings[k, 0]
+            across += rings[k, 1]
+            along += rings[k, 2]
+        around += rings[k, 0] if ROUND[0] <= k <= ROUND[1] else 0
+        beyond = 0
+        for far in range(k + 1, k + CLEAR + 1):
+            beyond += rings[far, 0]
+        aside = abs(across) + abs(along) > ONE_SIDED * way  # a tree
+        if k >= BODY[0] and inside > 0 and beyond <= TIDY * inside and not aside:
+            return k
+    return BODY[0] if slim > 0 and around <= CROWDED * slim else 0
+
+
+@device
+def _upright(x, y, height, wire, order, start, h, w, left, bottom, j, i, tall, half, high, filled, sums):
     """How well the points round a cell fill a narrow column up to the wires, 0 where they do not; fills `sums` of its middle
     (how many, x, y, their squares).
     """
-    inner, low_ring, ring = BODY if tall else SLIM
-    low, up = TRUNK if tall else POLE_TRUNK
     filled[:] = False
     sums[:] = 0
-    inside = around = 0
-    for b in range(max(j - ring, 0), min(j + ring + 1, h)):
-        for a in range(max(i - ring, 0), min(i + ring + 1, w)):
-            far = max(abs(b - j), abs(a - i))
-            if inner < far < low_ring:
-                continue
+    for b in range(max(j - half, 0), min(j + half + 1, h)):
+        for a in range(max(i - half, 0), min(i + half + 1, w)):
             for q in range(start[b * w + a], start[b * w + a + 1]):
                 p = order[q]
                 if wire[p]:
                     continue
-                trunk = low * high <= height[p] <= up * high
-                if far > inner:
-                    around += trunk
-                    continue
-                inside += trunk
                 if FROM <= height[p] < min(high + 1.0, float(_HIGHEST)):
                     filled[int(height[p])] = True
                 if (0.5 * high if tall else FROM) <= height[p] <= high:
@@ -169,11 +202,11 @@ def _upright(x, y, height, wire, order, start, h, w, left, bottom, j, i, tall, h
             lower += 2 * s < high
             upper += 4 * s >= 3 * high - 4
     share = count / (last - first + 1)
-    if sums[0] == 0 or lower == 0 or (tall and upper == 0) or (tall and around > RING * inside):
+    if sums[0] == 0 or lower == 0 or (tall and upper == 0):
         return 0.0
     if tall:  # the better, the nearer to its middle
-        away = min(sums[3] / sums[0] / _PARTS, 100.0)
-        return 1000.0 * share - away if share >= TOWER_FILLED and inside > 0 else 0.0
+        away = min((sums[1] ** 2 + sums[2] ** 2) / (float(sums[0]) * _PARTS) ** 2, 100.0)
+        return half * 1000.0 - away if share >= TOWER_FILLED else 0.0
     spread = sums[3] / sums[0] / _PARTS - (sums[1] ** 2 + sums[2] ** 2) / (float(sums[0]) * _PARTS) ** 2
     far = max(abs(sums[1]), abs(sums[2])) / sums[0] / _PARTS
     if far > CENTER or count < LEAST or share < POLE_FILLED or spread > SCATTER**2:
@@ -186,20 +219,29 @@ def _rise(x, y, z, wire, order, start, h, w, left, bottom, j, i, middle_x, middl
     """How wires rise towards an axis, from both sides together, and their direction there."""
     reach = int(FAR / CELL) + 1
     cx, cy = (left + i + 0.5) * CELL + middle_x, (bottom + j + 0.5) * CELL + middle_y
+    step = int(PIECE / CELL) + 1
     xx = xy = yy = 0
     for b in range(max(j - reach, 0), min(j + reach + 1, h)):
         for a in range(max(i - reach, 0), min(i + reach + 1, w)):
             for q in range(start[b * w + a], start[b * w + a + 1]):
                 p = order[q]
-                dx, dy = x[p] - cx, y[p] - cy
-                if wire[p] and dx * dx + dy * dy <= FAR * FAR:
-                    xx += int(np.rint(dx * dx * 1024))
-                    xy += int(np.rint(dx * dy * 1024))
-                    yy += int(np.rint(dy * dy * 1024))
+                if not wire[p] or (x[p] - cx) ** 2 + (y[p] - cy) ** 2 > FAR * FAR:
+                    continue
+                for d in range(
+                    max(b - step, 0), min(b + step + 1, h)
+                ):  # of pieces of one wire: wires may lie far apart
+                    for c in range(max(a - step, 0), min(a + step + 1, w)):
+                        for t in range(start[d * w + c], start[d * w + c + 1]):
+                            o = order[t]
+                            dx, dy = x[o] - x[p], y[o] - y[p]
+                            out = np.sqrt(dx * dx + dy * dy)
+                            if wire[o] and out <= PIECE and abs(z[o] - z[p]) <= 0.3 * out + 0.1:
+                                xx += int(np.rint(dx * dx * 1024))
+                                xy += int(np.rint(dx * dy * 1024))
+                                yy += int(np.rint(dy * dy * 1024))
     turn = 0.5 * np.arctan2(2.0 * float(xy), float(xx - yy))
     ux, uy = np.cos(turn), np.sin(turn)
     total, count = np.zeros(2, np.int64), np.zeros(2, np.int64)
-    step = int(PIECE / CELL) + 1
     for b in range(max(j - reach, 0), min(j + reach + 1, h)):
         for a in range(max(i - reach, 0), min(i + reach + 1, w)):
             for q in range(start[b * w + a], start[b * w + a + 1]):
@@ -231,10 +273,10 @@ def _rise(x, y, z, wire, order, start, h, w, left, bottom, j, i, middle_x, middl
 
 
 def _best(axes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of axes near each other the one that is filled best: the highest, then the one first by row and column."""
+    """Of axes near each other the best one: a tower's before a pole's, and then the one first by row and column."""
     from scipy.spatial import cKDTree
 
-    order = np.lexsort((axes[:, 1], axes[:, 0], -axes[:, 4], -np.floor(axes[:, 3])))
+    order = np.lexsort((axes[:, 1], axes[:, 0], -axes[:, 4]))
     axes = axes[order]
     tree, beside = cKDTree(axes[:, :2]), np.zeros(len(axes), bool)
     for tall, apart in enumerate(APART):
@@ -248,9 +290,11 @@ def _mark(x, y, z, height, wire, order, start, h, w, left, bottom, axes, out):
     """Say which points are of the supports at axes."""
     for n in range(len(axes)):
         j, i, tall, high = int(axes[n, 0]), int(axes[n, 1]), axes[n, 2] > 0, axes[n, 3]
+        size = min(max(axes[n, 8] / WIDE, 1.0), WIDEST)
+        over = max(OVER, ABOVE * high) if tall else OVER
         cx, cy = (left + i + 0.5) * CELL + axes[n, 5], (bottom + j + 0.5) * CELL + axes[n, 6]
         ux, uy = np.cos(axes[n, 7]), np.sin(axes[n, 7])
-        reach = int(AT_TOWER + BESIDE) + 1
+        reach = int(AT_TOWER * size + BESIDE) + 1
         widest, low = 0.0, high
         for part in range(2):
             for b in range(max(j - reach, 0), min(j + reach + 1, h)):
@@ -261,15 +305,17 @@ def _mark(x, y, z, height, wire, order, start, h, w, left, bottom, axes, out):
                         along, aside = abs(dx * ux + dy * uy), abs(dy * ux - dx * uy)
                         if wire[p]:
                             out[p] |= part == 1 and not tall and dx * dx + dy * dy <= OWN * OWN
-                            if part == 0 and along <= 4.0 and aside <= AT_TOWER:
+                            if part == 0 and along <= 4.0 and aside <= AT_TOWER * size:
                                 widest, low = max(widest, aside), min(low, height[p])
                             continue
-                        if part == 0 or height[p] > high + OVER:
+                        if part == 0 or height[p] > high + over:
                             continue
                         far = np.sqrt(dx * dx + dy * dy)
                         if tall:
-                            body = TOP + SPREAD * max(high - height[p], 0.0)
-                            arm = height[p] >= low - 1.5 and along <= ALONG and aside <= widest + BESIDE
+                            body = (TOP + SPREAD * max(high - height[p], 0.0)) * size
+                            arm = (
+                                height[p] >= low - 1.5 and along <= ALONG * size and aside <= widest + BESIDE
+                            )
                             out[p] |= far <= body or arm
                         else:
                             arm = height[p] >= low - 1.0 and along <= STEM and aside <= POLE_ARM
