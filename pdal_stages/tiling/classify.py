@@ -160,8 +160,8 @@ class ClassifyTask:
             raise OptionError(
                 "outputs of tiles are plain LAS or LAZ",
                 found=target,
-                cure="Name them .laz and convert them afterwards, pdal translate o.laz o.copc.laz. Tiles are for several inputs, "
-                "clouds too large for the memory, --tile, --per, --resume and --report",
+                cure="Name them .laz and convert them afterwards, pdal translate o.laz o.copc.laz. Tiles are for "
+                "several inputs, clouds too large for the memory, --tile, --per, --resume and --report",
             )
         # In a folder '#' may stand for a name with its suffix: always that of a LAS file.
         named = "x.laz" if self._in_folder else target
