@@ -78,19 +78,21 @@ def test_openings_and_objects_equal_the_slow_reference(shape, in_numbers, monkey
     else:
         monkeypatch.setattr(progressive, "numbered", lambda _: None)
     window = 21
-    objects, floor, openings = objects_of(raster, 1.0, 0.15, window, keep=range(1, 25))
+    objects, floor, openings, wide = objects_of(raster, 1.5, 0.1, window, keep=range(1, 25))
     for radius in range(1, 25):
         assert np.array_equal(openings[radius], slow_opening(raster, radius)), radius
-    want, want_floor, before = np.zeros(shape, bool), raster.copy(), raster
+    want, want_wide, want_floor, before = np.zeros(shape, bool), np.zeros(shape, bool), raster.copy(), raster
     for radius in opening_radii(window):
         after = slow_opening(raster, radius)
         with np.errstate(invalid="ignore"):
-            drop = before - after > np.float32(min(0.15 * radius, LARGEST_DROP))
+            drop = before - after > np.float32(min(0.1 * radius * 1.5, LARGEST_DROP))
         new = drop & ~want & np.isfinite(raster)
         want_floor[new] = after[new]
         want |= new
+        if 1.5 * radius > 24:
+            want_wide |= new
         before = after
-    assert np.array_equal(objects, want)
+    assert np.array_equal(objects, want) and np.array_equal(wide, want_wide)
     assert np.array_equal(floor[np.isfinite(raster)], want_floor[np.isfinite(raster)])
 
 
@@ -99,7 +101,7 @@ def test_openings_in_strips_equal_the_slow_reference(in_numbers, monkeypatch):
     raster = np.round(raster_with_holes(2, (9, 2500), 0.6), 2)
     if not in_numbers:
         monkeypatch.setattr(progressive, "numbered", lambda _: None)
-    _, _, openings = objects_of(raster, 1.0, 0.15, 2, keep=(3, 12))
+    _, _, openings, _ = objects_of(raster, 1.0, 0.15, 2, keep=(3, 12))
     for radius in (3, 12):
         assert np.array_equal(openings[radius], slow_opening(raster, radius)), radius
 
@@ -300,12 +302,15 @@ def test_a_pyramid_that_learns_of_more_ground_is_the_one_that_knew_it(seed):
         knew = GroundPyramid(ground, place, floor, floor, left, bottom, 4)
         for one, other in zip(learning._moments, knew._moments, strict=True):
             assert np.array_equal(one, other)
-        found, parents = learning.planes(asked), knew.planes(asked)
+        low = GroundPyramid(ground, place, floor, floor, left, bottom, 2)
         j, i = np.nonzero(asked)
-        for b in (0, 1):
-            for a in (0, 1):
-                at = ((j + bottom + 1) // 2 - 1 + b - found.bottom, (i + left + 1) // 2 - 1 + a - found.left)
-                assert np.array_equal(found.values[at], parents.values[at])
+        for levels, other in ((None, knew), (2, low)):  # of fewer levels as one that has no others
+            found, parents = learning.planes(asked, levels), other.planes(asked)
+            for b in (0, 1):
+                for a in (0, 1):
+                    row, column = (j + bottom + 1) // 2 - 1 + b, (i + left + 1) // 2 - 1 + a
+                    here = found.values[row - found.bottom, column - found.left]
+                    assert np.array_equal(here, parents.values[row - parents.bottom, column - parents.left])
 
 
 def test_only_cells_near_what_was_regained_are_asked_again(monkeypatch):
@@ -384,7 +389,7 @@ def test_plateaus_equal_the_slow_reference(seed):
     raster[rng.random((h, w)) < (0.2 + 0.1 * seed)] = np.inf
     ground = np.isfinite(raster) & (rng.random((h, w)) < 0.7)
     left, floor = ground.copy(), raster.copy()
-    remove_plateaus(left, floor, raster, cell)
+    remove_plateaus(left, floor, raster, cell, np.empty(0, np.int64))
     want = slow_plateaus(ground, raster, cell)
     assert {tuple(map(int, at)) for at in np.argwhere(ground & ~left)} == set(want)
     for at, height in want.items():
@@ -437,6 +442,15 @@ def test_a_steep_wooded_slope_is_no_plateau(seed):
     found = filtered_ground(x, y, z)
     assert found["Ground"][ground].mean() > 0.99
     assert np.abs(found["HeightAboveGround"][ground]).mean() < 0.2
+
+
+@pytest.mark.parametrize("slope", [0.46, 0.7])
+def test_land_above_a_scarp_that_the_rim_cuts_off_is_ground(slope):
+    """All windows round it reach below the scarp, as there is nothing uphill to center others on."""
+    x, y, z, ground = forest_on_a_slope(slope, 0.5, 12.0)
+    found = filtered_ground(x, y, z)
+    assert (found["Ground"][ground] == 0).mean() < 0.03
+    assert (np.abs(found["HeightAboveGround"][ground]) > 1).mean() < 0.02
 
 
 # ---- what must hold --------------------------------------------------------------------------------------
@@ -497,6 +511,22 @@ def test_a_tile_with_its_halo_gives_the_same_bits(origin):
     assert near.sum() < 0.9 * len(x)
     tile = filtered_ground(x[near], y[near], z[near], **options)
     same({k: a[core[near]] for k, a in tile.items()}, {k: a[core] for k, a in whole.items()})
+
+
+def test_a_tile_above_a_scarp_at_the_rim_gives_the_same_bits(monkeypatch):
+    rng = np.random.default_rng(0)
+    x, y = np.round(rng.uniform([[400], [0]], [[640], [1400]], (2, 168_000)), 2)
+    z = 0.3 * x + 16 / (1 + np.exp((570 - x) / 1.8)) + np.sin(x / 9) * np.cos(y / 13)
+    z = np.round(z + rng.normal(0, 0.1, len(x)), 2)
+    whole, halo = filtered_ground(x, y, z), reach()
+    core = (x >= 560) & (y >= 670) & (y < 730)
+    near = (y >= 670 - halo) & (y < 730 + halo)
+    assert near.sum() < 0.96 * len(x)
+    tile = filtered_ground(x[near], y[near], z[near])
+    same({k: a[core[near]] for k, a in tile.items()}, {k: a[core] for k, a in whole.items()})
+    monkeypatch.setattr(progressive, "WIDE", 100.0)
+    less = filtered_ground(x[near], y[near], z[near])["Ground"][core[near]]
+    assert less.mean() + 0.1 < whole["Ground"][core].mean()
 
 
 def test_pieces_and_threads_change_nothing(monkeypatch):
@@ -717,7 +747,7 @@ def test_openings_from_cell_to_cell_are_those_of_the_raster(seed, monkeypatch):
         whole = progressive.objects_of(raster, *case)
         monkeypatch.setattr(progressive, "are_few", lambda *_: True)
         some = progressive.objects_of(raster, *case)
-        assert np.array_equal(whole[0], some[0]) and np.array_equal(whole[1], some[1])
+        assert all(np.array_equal(whole[k], some[k]) for k in (0, 1, 3))
         assert whole[2].keys() == some[2].keys()
         for radius in case[3]:
             assert np.array_equal(whole[2][radius], some[2][radius]), (case, radius)

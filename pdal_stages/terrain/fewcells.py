@@ -93,11 +93,12 @@ def _mark(before, after, drop, objects, floor):
 
 
 def objects_among(
-    raster: np.ndarray, drops: dict[int, np.float32], keep: set[int]
-) -> tuple[np.ndarray, np.ndarray, dict[int, np.ndarray]]:
+    raster: np.ndarray, drops: dict[int, np.float32], keep: set[int], narrowest: int
+) -> tuple[np.ndarray, np.ndarray, dict[int, np.ndarray], np.ndarray]:
     """Objects, what is left there, and the openings of `keep`, as :func:`.progressive.objects_of` gives them.
 
-    `raster` (h, w) is the minimum grid, `drops` holds for each radius, ascending, what an opening lowers an object by.
+    `raster` (h, w) is the minimum grid, `drops` holds for each radius, ascending, what an opening lowers an object by, and
+    `narrowest` is the first radius of windows that are wide.
     """
     row, column = np.nonzero(raster != HOLE)
     level = raster[row, column]
@@ -111,17 +112,19 @@ def objects_among(
     one, other, ends = one[order], other[order], np.searchsorted(far[order], np.arange(largest + 2))
     eroded, before, after = level.copy(), level.copy(), np.empty_like(level)
     found, left = np.zeros(len(level), bool), level.copy()
-    openings = {}
+    openings, narrow = {}, found
     for radius in range(1, largest + 1):
         part = slice(ends[radius], ends[radius + 1])
         _erode(one[part], other[part], level, eroded)
         if radius in keep:
             openings[radius] = np.full(raster.shape, _NOTHING)
             _spread(row, column, eroded, radius, squares[radius], openings[radius])
+        if radius == narrowest:
+            narrow = found.copy()
         if radius in drops:
             _open(one[: part.stop], other[: part.stop], eroded, after)
             _mark(before, after, drops[radius], found, left)
             before, after = after, before
-    objects, floor = np.zeros(raster.shape, bool), raster.copy()
-    objects[row, column], floor[row, column] = found, left
-    return objects, floor, openings
+    objects, wide, floor = np.zeros(raster.shape, bool), np.zeros(raster.shape, bool), raster.copy()
+    objects[row, column], wide[row, column], floor[row, column] = found, found & ~narrow, left
+    return objects, floor, openings, wide

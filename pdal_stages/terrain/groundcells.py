@@ -184,7 +184,9 @@ def ground_raster(
     bad = pits(raster, cell)
     pit_points = lowest[bad]
     raster[bad] = HOLE
-    objects, floor, opened = objects_of(raster, cell, options.slope, options.radius, options.opening_radii)
+    objects, floor, opened, wide = objects_of(
+        raster, cell, options.slope, options.radius, options.opening_radii
+    )
     step = planes_reach(options.levels(NEAR))
     plateaus = plateau_reach(cell)
 
@@ -193,32 +195,47 @@ def ground_raster(
         return (slice(None), slice(None)) if wanted is None else wanted.grown(by).on(left, bottom, *shape)
 
     part = grown(plateaus + ROUNDS * step)
-    lowest, raster, objects, floor = (np.ascontiguousarray(a[part]) for a in (lowest, raster, objects, floor))
+    lowest, raster, objects, floor, wide = (
+        np.ascontiguousarray(a[part]) for a in (lowest, raster, objects, floor, wide)
+    )
     opened = {radius: np.ascontiguousarray(values[part]) for radius, values in opened.items()}
     left, bottom, shape = left + (part[1].start or 0), bottom + (part[0].start or 0), raster.shape
     place = places_of(x, y, z, cell, lowest)
     on_deck = (deck != 0)[lowest] & (lowest >= 0)
     del lowest, bad
     ground = np.isfinite(raster) & ~objects
-    asked = np.flatnonzero(np.isfinite(raster) & ~ground)  # cells
-    pyramid = GroundPyramid(ground, place, floor, raster, left, bottom, options.levels(NEAR))
-    for number in range(1, ROUNDS + 1):
-        rows, columns = grown(plateaus + (ROUNDS - number) * step)
+
+    def near(pyramid: GroundPyramid, cells: NDArray[np.int64], block: float) -> NDArray[np.bool_]:
+        """Which of the cells lie near the surface that is made from such blocks of the ground found so far."""
         seen = np.zeros(shape, bool)
-        seen[rows, columns] = True
-        asked = asked[seen.ravel()[asked]]
+        seen.ravel()[cells] = True
+        blocks = pyramid.planes(seen, options.levels(block))
+        found = np.zeros(len(cells), bool)
+        _near(cells, place, *blocks, left, bottom, cell, options.threshold, options.scalar, found)
+        return found
+
+    def within(cells: NDArray[np.int64], by: int) -> NDArray[np.int64]:
+        """Those of the cells that are wanted, or so many away."""
+        seen = np.zeros(shape, bool)
+        seen[grown(by)] = True
+        return cells[seen.ravel()[cells]]
+
+    pyramid = GroundPyramid(ground, place, floor, raster, left, bottom, options.levels(FAR))
+    asked = np.flatnonzero(np.isfinite(raster) & ~ground)  # cells
+    for number in range(1, ROUNDS + 1):
+        asked = within(asked, plateaus + (ROUNDS - number) * step)
         if not asked.size:
             break
-        seen[:] = False
-        seen.ravel()[asked] = True
-        blocks = pyramid.planes(seen)
-        found = np.zeros(len(asked), bool)
-        _near(asked, place, *blocks, left, bottom, cell, options.threshold, options.scalar, found)
+        found = near(pyramid, asked, NEAR)
         ground.ravel()[asked[found]] = True
         pyramid.add(asked[found])
         asked = _still_asked(asked, found, left, bottom, shape, options.levels(NEAR))
+    # What lies above a scarp may be cut off uphill by the rim of the cloud. It looks no farther than plateaus do.
+    cut = within(np.flatnonzero(wide & ~ground), 0)
+    if cut.size:
+        cut = cut[near(pyramid, cut, FAR)]
     del pyramid
-    remove_plateaus(ground, floor, raster, cell)
+    remove_plateaus(ground, floor, raster, cell, cut)
     # The terrain runs below: no level of a deck stands for it either.
     ground &= ~on_deck
     raster[on_deck] = HOLE

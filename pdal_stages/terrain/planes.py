@@ -309,8 +309,8 @@ class GroundPyramid:
             else:
                 fine = self._moments[level - 2], self._held[level - 2], *spans[level - 1][:2]
                 moments_of_blocks(*fine, 2.0 ** (level - 1), *into)
-        self._coarsest = np.empty_like(self._planes[-1])
-        _coarsest(floor, raster, left, bottom, levels, self._coarsest, *spans[-1][:2])
+        self._floor, self._raster = floor, raster
+        self._coarsest: dict[int, np.ndarray] = {}
 
     def add(self, cells: np.ndarray) -> None:
         """Cells (n,), numbered row by row, have become ground."""
@@ -324,17 +324,24 @@ class GroundPyramid:
                 moments_of_blocks_again(cells, width, left, bottom, level, *fine, *into)
             fine = into
 
-    def planes(self, needed: np.ndarray) -> Planes:
-        """Planes of blocks of 2 x 2 cells, where cells (h, w) that are `needed` ask for them; good until the next call."""
+    def planes(self, needed: np.ndarray, levels: int | None = None) -> Planes:
+        """Planes of blocks of 2 x 2 cells, where cells (h, w) that are `needed` ask for them; good until the next call.
+
+        As of a pyramid of so many `levels`, by default all.
+        """
         wanted = [needed]
         for before, span in zip(self._spans, self._spans[1:], strict=False):
             a, b, w, h = span
             wanted.append(_needed_parents(wanted[-1], *before[:2], (h, w), a, b))
-        top = len(self._spans) - 1
+        top = len(self._planes) if levels is None else levels
+        if top not in self._coarsest:
+            self._coarsest[top] = np.empty_like(self._planes[top - 1])
+            origin, coarsest = self._spans[0][:2], self._coarsest[top]
+            _coarsest(self._floor, self._raster, *origin, top, coarsest, *self._spans[top][:2])
         for level in range(top, 0, -1):
             planes, span = self._planes[level - 1], self._spans[level]
             if level == top:
-                planes[:] = self._coarsest
+                planes[:] = self._coarsest[top]
             else:
                 coarser = self._planes[level], *self._spans[level + 1][:2]
                 _from_parents(*coarser, 2.0**level, *span[:2], wanted[level], planes)

@@ -142,10 +142,13 @@ def _take(number, plateau, level, ground, floor):
                 floor[j, i] = level[number[j, i]]
 
 
-def remove_plateaus(ground: np.ndarray, floor: np.ndarray, raster: np.ndarray, cell: float) -> None:
+def remove_plateaus(
+    ground: np.ndarray, floor: np.ndarray, raster: np.ndarray, cell: float, more: np.ndarray
+) -> None:
     """Take plateaus from the `ground` (h, w) of a minimum grid; what lies around them becomes their `floor`.
 
-    `raster` (h, w) holds the heights, in meters like `cell`, a cell's side; ground is measured everywhere.
+    `raster` (h, w) holds the heights, in meters like `cell`, a cell's side; ground is measured everywhere. `more` cells,
+    numbered row by row, become ground where they are of no plateau, and show none.
     """
     number = np.empty(ground.shape, np.int64)
     count = _linked(raster, *_ways(cell), number)
@@ -160,4 +163,5 @@ def remove_plateaus(ground: np.ndarray, floor: np.ndarray, raster: np.ndarray, c
     lower = around[:, 0]
     plateau = (sectors.sum(axis=1) >= DIRECTIONS) & (lower >= SHARE * around.sum(axis=1)) & (uphill <= 0)
     level[plateau] /= lower[plateau]
+    ground.ravel()[more] = True
     _take(number, plateau, level, ground, floor)

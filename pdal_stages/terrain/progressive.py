@@ -13,6 +13,8 @@ from .openings import HOLE, dilate, erode_step, opening_radii, room_for, square_
 
 #: Drops beyond this are objects however large the window: halls are not higher for being wider.
 LARGEST_DROP = 3.5
+#: What only windows of a larger radius show, in meters, is a hall, or it is land that the rim of the cloud cuts off uphill.
+WIDE = 24.0
 
 
 #: Numbers of heights: of none, of the highest that is numbered, and of holes.
@@ -106,12 +108,13 @@ def _mark_numbered(before, after, heights, least, drop, settled, floor):
 
 def objects_of(
     raster: np.ndarray, cell: float, slope: float, window: int, keep: Collection[int] = ()
-) -> tuple[np.ndarray, np.ndarray, Mapping[int, np.ndarray]]:
+) -> tuple[np.ndarray, np.ndarray, Mapping[int, np.ndarray], np.ndarray]:
     """Cells that an opening lowers by more than `slope` times its radius, or than `LARGEST_DROP`.
 
     `raster` is the minimum grid (h, w), float32, with holes; it and `cell`, a cell's side, are in meters. `window` is the
     largest radius and `keep` lists radii whose openings are wanted, in cells. Returned are the objects (h, w), what the
-    opening that showed an object left there (elsewhere the cell's own height), and the openings of `keep`.
+    opening that showed an object left there (elsewhere the cell's own height), the openings of `keep`, and which objects
+    only windows beyond `WIDE` show.
     """
     h, w = raster.shape
     radii = set(opening_radii(window))
@@ -121,12 +124,13 @@ def objects_of(
     keep = set(wanted.values())
     largest = min(max(radii.union(keep)), h + w)
     drops = {radius: np.float32(min(slope * radius * cell, LARGEST_DROP)) for radius in sorted(radii)}
+    narrowest = min((radius for radius in radii if radius * cell > WIDE), default=largest + 1)  # of the wide
     if are_few(int(np.count_nonzero(raster != HOLE)), h, w, largest):
-        objects, floor, openings = objects_among(
-            raster, {r: d for r, d in drops.items() if r <= largest}, keep
-        )
-        return objects, floor, {radius: openings[held] for radius, held in wanted.items()}
+        drops = {r: d for r, d in drops.items() if r <= largest}
+        objects, floor, openings, wide = objects_among(raster, drops, keep, narrowest)
+        return objects, floor, {radius: openings[held] for radius, held in wanted.items()}, wide
     settled, floor, openings = raster == HOLE, raster.copy(), {}
+    narrow = settled
     coded = numbered(raster)
     grid = raster if coded is None else coded.grid
     hole, nothing = (HOLE, -HOLE) if coded is None else (_HOLE, _NOTHING)
@@ -140,6 +144,8 @@ def objects_of(
             dilate(eroded, grid, radius, squares, hole, nothing, room, after)
         if radius in keep:
             openings[radius] = after.copy() if coded is None else coded.heights[after]
+        if radius == narrowest:
+            narrow = settled.copy()
         if radius in radii:
             if coded is None:
                 _mark(before, after, drops[radius], settled, floor)
@@ -147,5 +153,6 @@ def objects_of(
                 least = coded.least(float(drops[radius]))
                 _mark_numbered(before, after, coded.heights, least, drops[radius], settled, floor)
             before, after = after, before
+    wide = settled & ~narrow
     settled &= raster != HOLE
-    return settled, floor, {radius: openings[held] for radius, held in wanted.items()}
+    return settled, floor, {radius: openings[held] for radius, held in wanted.items()}, wide
