@@ -6,6 +6,7 @@ The counterpart of ``fixed.FixedRadius``: prepared once for a grid, called by th
 from __future__ import annotations
 
 import math
+import threading
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,8 +18,8 @@ from .index import CellGrid
 from .kdtree import KdTree, build_tree
 from .moments import BATCH, FEATURES, MOMENTS, WIDTH, finish
 from .names import MOMENT_FEATURES, SHAPE_FEATURES, SURFACES
-from .nearest import nearest_block, surfaces_block
-from .neighborhoods import LEAST_RADIUS
+from .nearest import agreement_block, nearest_block, store_surfaces, surfaces_block
+from .neighborhoods import AROUND, LEAST_RADIUS
 from .optimal import kopt_block
 from .plan import Columns, FeaturePlan
 from .ropt import COPT_RADII, copt_block, curvature_block, radii_of, ropt_block
@@ -74,11 +75,12 @@ class AdaptiveNeighborhoods:
         #: for their surfaces alone.
         self._nearest = nearest
         self._tree: KdTree | None = None
-        self._surfaces = np.empty((0, SURFACE), np.float32)
+        #: Surfaces of the cloud's points, in the order of the grid, and which of them are there; under the lock.
+        count = len(grid) if any(spec.surfaced for spec in self.specs) else 0
+        self._surfaces, self._known = np.empty((count, SURFACE), np.float32), np.zeros(count, np.uint8)
+        self._lock = threading.Lock()
         if len(grid):
             self._tree = build_tree(grid.x, grid.y, grid.z, lambda f, b: list(map_blocks(f, b, threads)))
-            if any(spec.surfaced for spec in self.specs):
-                self._surfaces = self._surfaces_of_all(threads)
             self._touch(len(plan.names))
 
     def __len__(self) -> int:
@@ -91,6 +93,7 @@ class AdaptiveNeighborhoods:
         out = np.zeros((1, columns), np.float32)
         if self._nearest:
             self._fill_nearest(*one, copies, counted[0], counted[1], out)
+            self._surfaces_of(np.zeros(len(self._known[:1]), np.uint32))
         for number, spec in enumerate(self.specs):
             if number in self._nearest and not spec.shaped:
                 continue
@@ -113,20 +116,6 @@ class AdaptiveNeighborhoods:
         for _ in map_blocks(compute, range(0, len(grid), CHUNK), threads):
             pass
         return curvatures
-
-    def _surfaces_of_all(self, threads: int | None) -> np.ndarray:
-        """The surface of every point of the cloud, in the order of the grid, (n, surfaces.WIDTH) float32."""
-        grid = self.grid
-        out = np.empty((len(grid), SURFACE), np.float32)
-
-        def compute(start: int) -> None:
-            part = slice(start, start + CHUNK)
-            surfaces_block(self._tree, grid.x[part], grid.y[part], grid.z[part], self._surfaces, out[part])
-
-        compute(len(out) - 1)  # compiled before threads want it
-        for _ in map_blocks(compute, range(0, len(out), CHUNK), threads):
-            pass
-        return out
 
     def shape_values(self, token: str, points: Point, seed: int, copt_threshold: float | None) -> np.ndarray:
         """Metrics of all pulls of a neighborhood for a few points, (m, 5, 255) float32, comparable."""
@@ -186,17 +175,45 @@ class AdaptiveNeighborhoods:
     ) -> None:
         """What :meth:`fill` does, for all of ``_nearest``; of shaped ones all but their shapes."""
         specs = [self.specs[number] for number in self._nearest]
-        ks = np.array([int(spec.parameters[0]) for spec in specs], np.int64)
-        wanted = np.array([spec.surfaced for spec in specs])
-        columns = np.stack([spec.columns[:FEATURES] for spec in specs])
-        surface_columns = np.stack([spec.surface_columns for spec in specs])
+        mine = [int(spec.parameters[0]) for spec in specs]
+        surfaced = [n for n, spec in enumerate(specs) if spec.surfaced]
+        ks = np.array(sorted({*mine, AROUND} if surfaced else mine), np.int64)
+        place = np.searchsorted(ks, mine)
+        columns = np.full((len(ks), FEATURES), -1, np.int64)
+        columns[place] = [spec.columns[:FEATURES] for spec in specs]
+        most = min(max((mine[n] + 1 for n in surfaced), default=0), len(self.grid))
+        near, own = np.empty((len(qx), most), np.uint32), np.empty((len(qx), SURFACE))
         counted = np.zeros((2, len(ks)), np.int64)
         nearest_block(
-            self._tree, qx, qy, qz, copies, ks, columns, self._surfaces, wanted, surface_columns, self.halo_m,
-            counted[0], counted[1], out,
-        )  # fmt: skip
-        few[self._nearest] += counted[0]
-        far[self._nearest] += counted[1]
+            self._tree, qx, qy, qz, copies, ks, columns, self.halo_m, near, own, counted[0], counted[1], out
+        )
+        few[self._nearest] += counted[0, place]
+        reached = counted[1, place]
+        if surfaced:
+            with self._lock:  # what others have written is seen behind it
+                missing = store_surfaces(near, own, self._surfaces, self._known)
+            self._surfaces_of(missing)
+            wanted = np.array(surfaced)
+            agree = np.zeros(len(wanted), np.int64)
+            agreement_block(
+                self._tree, qx, qy, qz, copies, np.array(mine, np.int64)[wanted],
+                np.stack([specs[n].surface_columns for n in surfaced]), self.halo_m, near, own, self._surfaces,
+                agree, out,
+            )  # fmt: skip
+            reached[wanted] = agree
+        far[self._nearest] += reached
+
+    def _surfaces_of(self, missing: np.ndarray) -> None:
+        """Put the surfaces of some points, which may be made elsewhere at the same time, into the table."""
+        if not len(missing):
+            return
+        found = np.empty((len(missing), SURFACE))
+        surfaces_block(
+            self._tree, *(axis[missing] for axis in (self.grid.x, self.grid.y, self.grid.z)), found
+        )
+        with self._lock:
+            self._surfaces[missing] = found
+            self._known[missing] = 1
 
     def _compute(
         self,

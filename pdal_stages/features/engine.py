@@ -65,7 +65,7 @@ class FeatureEngine:
     threads, any block size, and in a tile whose halo is ``plan.halo_m`` meters or more.
 
     Memory over the cloud's own: 28 bytes a point for the index (about 52 while it is being sorted), about 10 more with
-    neighborhoods of k points, 20 more with their surfaces, and the block budget of :meth:`blocks`.
+    neighborhoods of k points, 21 more with their surfaces, and the block budget of :meth:`blocks`.
     """
 
     def __init__(

@@ -12,13 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.jit import any_of, device, njit
+from ..base.jit import device, njit
 from ..base.lending import lent
 from .knn import CROWD, ROOM, make_rows, make_scratch, next_rows, start_search
 from .lanes import LANES, SUMS, add_members
 from .moments import BATCH, FEATURES, MOMENTS, SX, WIDTH, N, finish
 from .neighborhoods import AROUND, LEAST_RADIUS
-from .surfaces import MADE, NX, NY, NZ, agreement, surface, write_surfaces
+from .surfaces import MADE, REACH, UP, VARIATION, agreement, surfaces_of
 
 
 class Batch(NamedTuple):
@@ -28,7 +28,7 @@ class Batch(NamedTuple):
     moments: np.ndarray  # (s, 12, WIDTH) float64
     radius: np.ndarray  # (s, WIDTH) float64
     reach: np.ndarray  # (s, WIDTH) float64
-    made: np.ndarray  # (s, WIDTH, MADE) float64
+    apart: np.ndarray  # (WIDTH,) float64: squared distance to the nearest point, 0 for a point of the cloud
     sums: np.ndarray  # (SUMS, LANES) float64
     state: np.ndarray  # (3,) int64: queries in it; those that coincide with its last: from, to
 
@@ -37,21 +37,23 @@ class Batch(NamedTuple):
 def make_batch(count):
     return Batch(
         np.empty(WIDTH, np.int64), np.empty((count, MOMENTS, WIDTH)), np.empty((count, WIDTH)),
-        np.empty((count, WIDTH)), np.empty((count, WIDTH, MADE)), np.empty((SUMS, LANES)), np.zeros(3, np.int64),
+        np.empty((count, WIDTH)), np.empty(WIDTH), np.empty((SUMS, LANES)), np.zeros(3, np.int64),
     )  # fmt: skip
 
 
 @device
-def fill_batch(tree, search, ks, need, surfaces, wanted, scratch, rows, batch):
-    """Add queries until the batch is full or none is left; the scratch, to be passed next time."""
-    some = any_of(wanted)
+def fill_batch(tree, search, ks, need, scratch, rows, batch, near):
+    """Add queries until the batch is full or none is left; the scratch, to be passed next time.
+
+    The rows of `near` (m, w) uint32 get the nearest points of queries.
+    """
     state, order = batch.state, search.order
     state[0] = 0
     while state[0] <= BATCH - LANES:
         n = state[0]
         if state[1] < state[2]:  # queries that coincide with one before, which the last column keeps
             while state[1] < state[2] and n < BATCH:
-                copy_query(batch, WIDTH - 1, n, np.int64(order[state[1]]))
+                copy_query(batch, near, WIDTH - 1, n, np.int64(order[state[1]]))
                 state[1] += 1
                 n += 1
             state[0] = n
@@ -63,18 +65,19 @@ def fill_batch(tree, search, ks, need, surfaces, wanted, scratch, rows, batch):
         for r in range(count):
             q = order[lo + r]
             batch.query[n + r] = q
+            batch.apart[n + r] = rows.d2[0, r]
             found = rows.found[r]
             for j in range(len(ks)):
                 last = min(ks[j], found - 1)
                 radius = math.sqrt(rows.d2[last, r])
                 batch.radius[j, n + r] = radius
                 batch.reach[j, n + r] = radius if last == ks[j] else math.inf
-            if some:
-                sum_surfaces(tree, ks, surfaces, wanted, r, rows, batch)
+            for i in range(near.shape[1]):
+                near[q, i] = rows.at[i, r]
         state[0] = n + count
         if hi > lo + count:
             state[1], state[2] = lo + count, hi
-            copy_query(batch, n, WIDTH - 1, np.int64(order[lo]))
+            copy_query(batch, near, n, WIDTH - 1, np.int64(order[lo]))
     return scratch
 
 
@@ -98,43 +101,18 @@ def sum_rows(ks, count, rows, batch):
 
 
 @device
-def sum_surfaces(tree, ks, surfaces, wanted, r, rows, batch):
-    """What the surfaces of one query's neighbors make, where it is wanted."""
-    n, found = batch.state[0] + r, rows.found[r]
-    at, d2 = rows.at[:, r], rows.d2[:, r]
-    own = surfaces[at[0]]
-    nx, ny, nz = np.float64(own[NX]), np.float64(own[NY]), np.float64(own[NZ])
-    around = 0.0
-    if d2[0] > 0.0:  # a query that is no point of the cloud
-        t = min(AROUND, found - 1)
-        sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
-        for i in range(t + 1):
-            a, b, c = rows.x[i, r], rows.y[i, r], rows.z[i, r]
-            sx, sy, sz = sx + a, sy + b, sz + c
-            sxx, sxy, sxz = sxx + a * a, sxy + a * b, sxz + a * c
-            syy, syz, szz = syy + b * b, syz + b * c, szz + c * c
-        nx, ny, nz, _ = surface(t + 1.0, sx, sy, sz, sxx, sxy, sxz, syy, syz, szz)
-        around = math.sqrt(d2[t]) if t == AROUND else math.inf
-    for j in range(len(ks)):
-        if wanted[j]:
-            far = agreement(surfaces, at, d2, min(ks[j], found - 1) + 1, nx, ny, nz, batch.made[j, n])
-            batch.reach[j, n] = max(batch.reach[j, n], far, around)
-
-
-@device
-def copy_query(batch, source, target, query):
+def copy_query(batch, near, source, target, query):
     """Query number `query`, of which the same is true as of another, in column `target`."""
-    batch.query[target] = query
     batch.moments[:, :, target] = batch.moments[:, :, source]
     batch.radius[:, target] = batch.radius[:, source]
     batch.reach[:, target] = batch.reach[:, source]
-    batch.made[:, target] = batch.made[:, source]
+    batch.apart[target] = batch.apart[source]
+    near[query] = near[batch.query[source]]
+    batch.query[target] = query
 
 
 @njit
-def nearest_block(
-    tree, qx, qy, qz, copies, ks, columns, surfaces, wanted, surface_columns, halo, few, far, out
-):  # fmt: skip
+def nearest_block(tree, qx, qy, qz, copies, ks, columns, halo, near, own, few, far, out):
     """Write the features of several numbers of nearest neighbors for a block of queries.
 
     Parameters
@@ -148,28 +126,23 @@ def nearest_block(
         Neighbors besides the point itself, ascending.
     columns : ndarray of int64, shape (s, 13)
         Where in `out` each feature of ``moments.finish`` goes; -1: nowhere.
-    surfaces : ndarray of float32, shape (n, surfaces.WIDTH)
-        Of the cloud, see :func:`surfaces.surface`; not used where none is wanted.
-    wanted : ndarray of bool, shape (s,)
-        Which numbers of neighbors are summed up by their surfaces.
-    surface_columns : ndarray of int64, shape (s, surfaces.MADE)
-        Where in `out` these go; -1: nowhere.
     halo : float
         Meters from a query that count as near.
+    near : ndarray of uint32, shape (m, w)
+        Gets the nearest points of each query, at most as many as the cloud has; w = 0 where no surfaces are wanted.
+    own : ndarray of float64, shape (m, surfaces.WIDTH)
+        With these, gets the surface of each query, for which AROUND is among `ks`.
     few, far : ndarray of int64, shape (s,)
-        Raised by the number of queries with fewer than three members, and of those whose result depends on points
-        farther than `halo`.
+        Raised by the number of queries with fewer than three members, and of those that reach farther than `halo`.
     out : ndarray of float32, shape (m, F)
     """
-    need = max(ks[len(ks) - 1], AROUND if any_of(wanted) else 0) + 1
+    need = ks[len(ks) - 1] + 1
     search, scratch = start_search(qx, qy, qz), make_scratch(CROWD * need + ROOM)
     rows, batch = make_rows(need), make_batch(len(ks))
     volumes, heights, counts = np.empty(BATCH), np.empty(BATCH), np.empty(BATCH, np.int64)
-    cloud, kept = lent(tree), lent(surfaces)
+    cloud, places = lent(tree), lent(near)
     while True:
-        scratch = fill_batch(
-            cloud, lent(search), ks, need, kept, wanted, scratch, lent(rows), lent(batch)
-        )  # fmt: skip
+        scratch = fill_batch(cloud, lent(search), ks, need, scratch, lent(rows), lent(batch), places)
         count = batch.state[0]
         if count == 0:
             return
@@ -187,26 +160,86 @@ def nearest_block(
                         out[batch.query[i], column] = values[f, i]
             for i in range(count):
                 far[j] += counts[i] if batch.reach[j, i] > halo else 0
-            if wanted[j]:
-                for f in range(MADE):
-                    column = surface_columns[j, f]
-                    if column >= 0:
-                        for i in range(count):
-                            out[batch.query[i], column] = batch.made[j, i, f]
+            if near.shape[1] > 0 and ks[j] == AROUND:
+                write_surfaces(batch, j, own)
+
+
+@device
+def write_surfaces(batch, j, out):
+    """Write the surfaces of a batch, from the moments of its AROUND nearest, to the rows of `out` (m, WIDTH) float64.
+
+    Of points of the cloud, which others look at, they are rounded as a table of float32 holds them; of other queries the
+    reach is negative.
+    """
+    made = surfaces_of(batch.moments[j], batch.state[0])
+    for i in range(batch.state[0]):
+        q, cloud = batch.query[i], batch.apart[i] == 0.0
+        for column in range(VARIATION + 1):
+            value = made[column, i]
+            out[q, column] = np.float64(np.float32(value)) if cloud else value
+        out[q, REACH] = batch.reach[j, i] * UP if cloud else -batch.reach[j, i]
 
 
 @njit
-def surfaces_block(tree, qx, qy, qz, none, out):
-    """Surfaces (m, surfaces.WIDTH) float32 of queries, of the AROUND nearest of each; `none` is an empty table of them."""
-    ks, unwanted, need = np.array([AROUND]), np.zeros(1, np.bool_), AROUND + 1
+def surfaces_block(tree, qx, qy, qz, out):
+    """Write the surfaces of points of the cloud, of the AROUND nearest of each, to `out` (m, surfaces.WIDTH) float64."""
+    ks, need = np.array([AROUND]), AROUND + 1
     search, scratch = start_search(qx, qy, qz), make_scratch(CROWD * need + ROOM)
     rows, batch = make_rows(need), make_batch(1)
-    cloud, kept = lent(tree), lent(none)
+    cloud, nowhere = lent(tree), np.empty((len(qx), 0), np.uint32)
     while True:
-        scratch = fill_batch(
-            cloud, lent(search), ks, need, kept, unwanted, scratch, lent(rows), lent(batch)
-        )  # fmt: skip
-        count = batch.state[0]
-        if count == 0:
+        scratch = fill_batch(cloud, lent(search), ks, need, scratch, lent(rows), lent(batch), lent(nowhere))
+        if batch.state[0] == 0:
             return
-        write_surfaces(batch.moments[0], batch.reach[0], batch.query, count, out)
+        write_surfaces(batch, 0, out)
+
+
+@njit
+def store_surfaces(near, own, surfaces, known):
+    """Put the queries' own surfaces into the cloud's table; which points beside them have none there, (u,) uint32."""
+    count = 0
+    missing = np.empty(near.size, np.uint32)
+    for q in range(len(near)):
+        if own[q, REACH] >= 0.0:
+            for column in range(surfaces.shape[1]):
+                surfaces[near[q, 0], column] = own[q, column]
+            known[near[q, 0]] = 1
+    for q in range(len(near)):
+        for i in range(near.shape[1]):
+            p = near[q, i]
+            if known[p] == 0:
+                known[p] = 2  # listed
+                missing[count] = p
+                count += 1
+    for i in range(count):
+        known[missing[i]] = 0
+    return missing[:count].copy()
+
+
+@njit
+def agreement_block(tree, qx, qy, qz, copies, ks, columns, halo, near, own, surfaces, far, out):
+    """Write what neighbors' surfaces make; parameters as of :func:`nearest_block`, of the numbers `ks` of neighbors.
+
+    Parameters
+    ----------
+    columns : ndarray of int64, shape (s, surfaces.MADE)
+        Where in `out` they go; -1: nowhere.
+    near, own : ndarray
+        As :func:`nearest_block` left them.
+    surfaces : ndarray of float32, shape (n, surfaces.WIDTH)
+        Of the cloud, with all that is in `near`.
+    """
+    made, d2 = np.empty(MADE), np.empty(near.shape[1])
+    places, mine, table = lent(near), lent(own), lent(surfaces)
+    for q in range(len(qx)):
+        at = places[q]
+        for i in range(len(at)):
+            x, y, z = tree.x[at[i]] - qx[q], tree.y[at[i]] - qy[q], tree.z[at[i]] - qz[q]
+            d2[i] = x * x + y * y + z * z
+        for j in range(len(ks)):
+            reach = agreement(table, at, d2, min(ks[j] + 1, len(at)), mine[q], made)
+            reach = math.inf if ks[j] >= len(tree.perm) else max(reach, -own[q, REACH])
+            far[j] += copies[q] if reach > halo else 0
+            for f in range(MADE):
+                if columns[j, f] >= 0:
+                    out[q, columns[j, f]] = made[f]

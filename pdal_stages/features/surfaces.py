@@ -1,9 +1,9 @@
 """Features of features: how the points of a neighborhood agree on the surface they lie on.
 
-Every point of the cloud gets, once, what its 10 nearest neighbors make of it: the unit normal (eigenvector of l3) and the
-surface variation (e3), 20 bytes a point. A neighborhood is then summed up by the mean |n . n'| of its points' normals with
-the query's own, and by lowest, mean and standard deviation of their surface variations: a roof's points agree, those of a
-crown do not, however flat any one of them may look.
+A point of the cloud gets what its 10 nearest neighbors make of it: the unit normal (eigenvector of l3) and the surface
+variation (e3), 20 bytes a point, from the search for its own features where these are asked for. A neighborhood is then
+summed up by the mean |n . n'| of its points' normals with the query's own, and by lowest, mean and standard deviation of
+their surface variations: a roof's points agree, those of a crown do not, however flat any one of them may look.
 
 A result depends on two steps of neighbors, so it reaches as far as the farthest of the neighbors' neighbors may lie. It
 follows from the cloud as a set alone: neighbors come in the order of ``knn.py``, and all moments are taken about the point.
@@ -51,8 +51,8 @@ def surface(n, x, y, z, xx, xy, xz, yy, yz, zz):
 
 
 @device
-def write_surfaces(moments, reach, query, count, out):
-    """Write the surfaces of the queries `query` to their rows of `out` (m, WIDTH) float32, from moments and reaches."""
+def surfaces_of(moments, count):
+    """Normals and surface variations of so many columns of moments, (4, ROW) float64."""
     # Made here and of a constant shape: rows known not to overlap let the loop be vectorized.
     made = np.empty((4, ROW))
     for j in range(count):
@@ -64,21 +64,19 @@ def write_surfaces(moments, reach, query, count, out):
         made[NY, j] = f[1]
         made[NZ, j] = f[2]
         made[VARIATION, j] = f[3]
-    for j in range(count):
-        for column in range(4):
-            out[query[j], column] = made[column, j]
-        out[query[j], REACH] = reach[j] * UP
+    return made
 
 
 @device
-def agreement(surfaces, at, d2, count, nx, ny, nz, out):
-    """The four features of the points ``at[:count]`` around a query of that normal, into ``out[:MADE]``.
+def agreement(surfaces, at, d2, count, own, out):
+    """The four features of the points ``at[:count]`` around a query of that surface, into ``out[:MADE]``.
 
     Returns
     -------
     float
         How far from the query points lie on which these depend, meters.
     """
+    nx, ny, nz = own[NX], own[NY], own[NZ]
     first = np.float64(surfaces[at[0], VARIATION])
     agree = total = squares = far = 0.0
     low = first
