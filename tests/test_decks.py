@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from long_bridge_scenes import LEAF, LONG_SCENES
 from other_bridge_scenes import OTHER_SCENES, TRAPS
 from roof_bridge_scenes import ROOF_SCENES
+from upright_bridge_scenes import UPRIGHT_SCENES
 from walled_scenes import walled_ramps, walled_road
 
 import pdal_stages as ps
@@ -572,6 +573,14 @@ def test_bridges_of_another_kind_are_found(name):
     right, wrong = (deck & (code == DECK)).sum(), (deck & (code != DECK) & known).sum()
     assert 2 * right / (2 * right + wrong + (~deck & (code == DECK)).sum()) > 0.85
     assert wrong < 0.0005 * len(xyz)
+
+
+@pytest.mark.parametrize("name", UPRIGHT_SCENES)
+def test_bridges_whose_ground_is_seen_or_whose_river_is_not_are_found(name):
+    xyz, code = UPRIGHT_SCENES[name](8.0)
+    deck = found(xyz) > 0
+    assert (deck & (code == DECK)).sum() > 0.9 * (code == DECK).sum()
+    assert (deck & (code != DECK)).mean() < 0.0005
 
 
 @pytest.mark.parametrize("name", TRAPS)

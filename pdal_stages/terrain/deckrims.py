@@ -6,10 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from .walkable import ACROSS, DOWN, NOTHING, ON, RIGHT, SOLID, UP, WALLED, distance, walkable
+from .walkable import ACROSS, DOWN, DROP, NOTHING, ON, RIGHT, SOLID, UP, WALLED, distance, walkable
 
-#: Cells across which one walks on from a deck, and across which its parts belong together.
-LINK, JOIN = 2, 4
+#: Cells across which one walks on from a deck, and from one below which the ground is seen, as if there were no deck, up to
+#: its end; and across which parts belong together.
+LINK, LINK_THROUGH, JOIN = 2, 5, 4
+#: Of such a deck, so many cells show what lies below.
+THROUGH = 0.5
 #: The smallest deck and the smallest land at its ends, in cells, and how far land is looked for.
 SMALLEST, LAND, AWAY = 20, 100, 40
 #: Of land that the rim of the cloud cuts so many of the ways end at nothing; what is clear of drops may have so few cells.
@@ -38,10 +41,10 @@ def sector_of(j, i, sums):
 
 
 @device
-def leads_on(z, start, h, w, kind, number, j, i, n):
-    """Whether one can walk on from a level of a part to what is of none."""
-    for b in range(max(j - LINK, 0), min(j + LINK + 1, h)):
-        for a in range(max(i - LINK, 0), min(i + LINK + 1, w)):
+def leads_on(z, start, h, w, kind, number, j, i, n, link):
+    """Whether one can walk on from a level of a part to what is of none, so many cells away."""
+    for b in range(max(j - link, 0), min(j + link + 1, h)):
+        for a in range(max(i - link, 0), min(i + link + 1, w)):
             for m in range(start[b * w + a], start[b * w + a + 1]):
                 if number[m] < 0 and kind[m] == SOLID and walkable(z[m] - z[n], distance(a - i, b - j)):
                     return True
@@ -61,10 +64,19 @@ def goes_on(start, h, w, number, j, i, n, d):
     return False
 
 
+def through(z, start, end, number, count) -> NDArray[np.bool_]:
+    """Of each part, whether most of its cells that are not at its rim show what lies below."""
+    lowest = np.repeat(z[np.minimum(start[:-1], len(z) - 1)], np.diff(start))
+    within = (number >= 0) & ~np.any((end == DOWN) | (end == ACROSS), axis=1)
+    cells = np.bincount(number[within], minlength=count)
+    shown = np.bincount(number[within & (lowest < z - DROP)], minlength=count)
+    return (cells >= SMALLEST) & (shown >= THROUGH * cells)
+
+
 @njit
-def rims(z, start, h, w, kind, end, number, sums):
-    """Of each part, by sector: cells that lead on, ways that end at nothing, cells at a drop; and how its ways end, but for
-    what only stands on it.
+def rims(z, start, h, w, kind, end, number, sums, link=LINK):
+    """Of each part, by sector: cells that lead on across `link` cells, ways that end at nothing, cells at a drop; and how
+    its ways end, but for what only stands on it.
     """
     outward, cut = np.zeros((len(sums), SECTORS), np.int64), np.zeros((len(sums), SECTORS), np.int64)
     drops, ends = np.zeros((len(sums), SECTORS), np.int64), np.zeros((len(sums), ENDS), np.int64)
@@ -82,7 +94,7 @@ def rims(z, start, h, w, kind, end, number, sums):
                     if end[n, d] == NOTHING:
                         cut[k, sector_of(j, i, sums[k])] += 1
                 drops[k, sector_of(j, i, sums[k])] += drop
-                if leads_on(z, start, h, w, kind, number, j, i, n):
+                if leads_on(z, start, h, w, kind, number, j, i, n, link):
                     outward[k, sector_of(j, i, sums[k])] += 1
     return outward, cut, drops, ends
 
@@ -129,22 +141,22 @@ def islets(z, start, h, w, kind, deck):
 
 
 @njit
-def first_land(z, start, h, w, kind, number, sums, box, part, sector, land, seen, stamp):
+def first_land(z, start, h, w, kind, number, sums, box, part, sector, land, seen, stamp, link=LINK):
     """Put what a part leads on to in some sectors into `land` (number, row, column); returns how many cells that are."""
     length = 0
     for j in range(box[0], box[1] + 1):
         for i in range(box[2], box[3] + 1):
             for n in range(start[j * w + i], start[j * w + i + 1]):
                 if number[n] == part and sector[sector_of(j, i, sums)]:
-                    length = step_on(z, start, h, w, kind, number, j, i, n, land, seen, stamp, length)
+                    length = step_on(z, start, h, w, kind, number, j, i, n, land, seen, stamp, length, link)
     return length
 
 
 @device
-def step_on(z, start, h, w, kind, number, j, i, n, land, seen, stamp, length):
+def step_on(z, start, h, w, kind, number, j, i, n, land, seen, stamp, length, link=LINK):
     """Add the land that one can walk on to, which is of no part."""
-    for b in range(max(j - LINK, 0), min(j + LINK + 1, h)):
-        for a in range(max(i - LINK, 0), min(i + LINK + 1, w)):
+    for b in range(max(j - link, 0), min(j + link + 1, h)):
+        for a in range(max(i - link, 0), min(i + link + 1, w)):
             for m in range(start[b * w + a], start[b * w + a + 1]):
                 if kind[m] != SOLID or seen[m] == stamp or number[m] >= 0:
                     continue
@@ -197,7 +209,8 @@ def may_be_land(cells: int, ends: NDArray[np.int64]) -> bool:
     return bool(cells >= _LITTLE and any_down <= _LITTLE_DROPS)
 
 
-def is_land(cells: int, ends: NDArray[np.int64]) -> bool:
+def is_land(cells: int, ends: NDArray[np.int64], bare: bool = False) -> bool:
+    """Whether it is land; a `bare` plain is, where nothing but its quay ends a way."""
     down, any_down, nothing = _shares(ends)
     if cells < LAND or nothing > _LAND_DROPS[2]:
         return False
@@ -206,7 +219,8 @@ def is_land(cells: int, ends: NDArray[np.int64]) -> bool:
     # A quay, unlike a roof, ends at a drop to one side.
     length = np.hypot(RIGHT, UP)
     side = np.hypot(np.sum(ends[ENDS:] * RIGHT / length), np.sum(ends[ENDS:] * UP / length))
-    return bool(cells >= QUAY and any_down <= QUAY_DROPS and side >= ONE_SIDED * ends[ENDS:].sum())
+    enough = cells >= QUAY and (bare or any_down <= QUAY_DROPS)
+    return bool(enough and side >= ONE_SIDED * ends[ENDS:].sum())
 
 
 #: The sectors of an end in each direction, and those that lie opposite them.

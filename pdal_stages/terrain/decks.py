@@ -25,6 +25,7 @@ from .deckrims import (
     AWAY,
     JOIN,
     LINK,
+    LINK_THROUGH,
     NEAR,
     OUTWARD,
     OUTWARD_ACROSS,
@@ -41,11 +42,12 @@ from .deckrims import (
     opposite_ends,
     rims,
     spread,
+    through,
 )  # fmt: skip
 from .deckroofs import NEXT, ROOF, without_roofs
 from .deckwalls import LOW, WINDOW, without_walls
 from .levels import levels
-from .longdecks import BLOCK, FAR_ENDS, stretches
+from .longdecks import BLOCK, FAR_ENDS, LONG_RIM, OVER_NOTHING, stretches
 from .minima import cell_numbers
 from .patches import patches
 from .walkable import (
@@ -88,7 +90,7 @@ AMONG = 1.5
 #: How far away points matter, in meters: cells of a deck, its rim, and land at its ends, which all look around.
 REACH = (
     BLOCK * (FAR_ENDS + 1)
-    + LINK
+    + LINK_THROUGH
     + AWAY
     + AHEAD
     + FAR
@@ -329,12 +331,22 @@ def broad(z, start, h, w, deck) -> NDArray[np.bool_]:
 def whole_decks(raster, number, sums, box) -> NDArray[np.bool_]:
     """Levels (n,) of the parts that are decks, but for those that are too long to be judged as a whole."""
     z, start, h, w, kind, end = raster
-    outward, cut, drops, ends = rims(z, start, h, w, kind, end, number, sums)
-    opposite = {}
-    for k in np.flatnonzero((sums[:, 0] >= SMALLEST) & (extent(box) <= LONGEST)):
-        found = _ends(int(sums[k, 0]), outward[k], cut[k], drops[k], ends[k])
-        if found:
-            opposite[int(k)] = found
+    opposite, long, link = {}, np.zeros(len(sums), bool), np.full(len(sums), LINK)
+    judged = (sums[:, 0] >= SMALLEST) & (extent(box) <= LONGEST)
+    clear = through(z, start, end, number, len(sums))
+    for across in (LINK, LINK_THROUGH):
+        if not judged.any():
+            break
+        outward, cut, drops, ends = rims(z, start, h, w, kind, end, number, sums, across)
+        for k in map(int, np.flatnonzero(judged)):
+            # What leads on no nearer must do so at both ends.
+            rim = cut[k] * (across == LINK)
+            found = _ends(int(sums[k, 0]), outward[k], rim, drops[k], ends[k])
+            if found:
+                opposite[k], link[k] = found, across
+                long[k] = _is_long(int(sums[k, 0]), outward[k], drops[k])
+        judged &= clear & (link == LINK)
+        judged[list(opposite)] = False
     # The deck beside one, as of a motorway, is no land that it leads on to.
     likely = np.zeros(len(sums) + 1, bool)
     likely[list(opposite)] = True
@@ -347,15 +359,14 @@ def whole_decks(raster, number, sums, box) -> NDArray[np.bool_]:
         for sectors in found:
             over = no_ends()
             cells = first_land(
-                z, start, h, w, kind, number, sums[part], box[part], part, sectors, land, seen, stamp
-            )
+                z, start, h, w, kind, number, sums[part], box[part], part, sectors, land, seen, stamp, link[part]
+            )  # fmt: skip
             cells = spread(z, start, h, w, kind, end, other, land, seen, stamp, cells, over)
             stamp += 1
-            land_here = is_land(cells, over)
+            land_here = is_land(cells, over, bool(clear[part]))
             there += land_here
             maybe += not land_here and may_be_land(cells, over)
-        cut_off = maybe == 1 and there == 1 and _is_long(int(sums[part, 0]), outward[part], drops[part])
-        good[part] = there == len(found) or cut_off
+        good[part] = there == len(found) or (maybe == 1 and there == 1 and long[part])
     return good[number]
 
 
@@ -368,17 +379,21 @@ def _ends(size: int, outward, cut, drops, ends) -> list[NDArray[np.bool_]]:
     """Sectors of the ends at which a part must lead on to land, by what is at its rim; none where it is no deck."""
     down = ends[DOWN] + ends[ACROSS]
     most = OUTWARD_ACROSS if ends[ACROSS] > ends[DOWN] else OUTWARD
-    if outward.sum() > most * drops.sum() or ends[WALLED] > WALLS * down:
+    if outward.sum() > most * drops.sum():
         return []
     opposite = opposite_ends(outward, outward)
-    whole = opposite is not None and ends[NOTHING] <= RIM * down
-    if not whole:
-        if not _is_long(size, outward, drops):
-            return []
-        opposite = opposite_ends(outward, cut)
-    if opposite is None or not _is_free(opposite[0], outward, drops):
+    over_nothing = ends[NOTHING] > RIM * down
+    walled = ends[WALLED] > WALLS * down
+    if (over_nothing or opposite is None) and not walled and _is_long(size, outward, drops):
+        cut_off = opposite_ends(outward, cut)
+        if cut_off is not None and _is_free(cut_off[0], outward, drops):
+            return [cut_off[0]]
+    if over_nothing:
+        # Over a wide river without returns drops are seen near the ends.
+        walled = drops.sum() < LONG_RIM or ends[WALLED] > OVER_NOTHING * (down + ends[NOTHING])
+    if opposite is None or walled or not _is_free(opposite[0], outward, drops):
         return []
-    return list(opposite if whole else opposite[:1])
+    return list(opposite)
 
 
 def _is_free(end: NDArray[np.bool_], outward: NDArray[np.int64], drops: NDArray[np.int64]) -> bool:

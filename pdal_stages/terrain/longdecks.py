@@ -8,8 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import njit
-from .deckrims import OUTWARD, WALLS, goes_on, is_land, leads_on, no_ends, spread, step_on
-from .walkable import ACROSS, DOWN, NOTHING, WALLED
+from .deckrims import (
+    LINK,
+    LINK_THROUGH,
+    OUTWARD,
+    THROUGH,
+    WALLS,
+    goes_on,
+    is_land,
+    leads_on,
+    no_ends,
+    spread,
+    step_on,
+)
+from .walkable import ACROSS, DOWN, DROP, NOTHING, WALLED
 
 #: Blocks in which long decks are judged, cells, and how many blocks away land must be seen at an end.
 BLOCK, FAR_ENDS = 64, 3
@@ -25,9 +37,12 @@ def stretches(z, start, h, w, kind, end, long, left, bottom) -> NDArray[np.bool_
     number = np.where(long, 0, -1)
     low_a, low_b = left // BLOCK - 1, bottom // BLOCK - 1
     shape = (bottom + h) // BLOCK + 2 - low_b, (left + w) // BLOCK + 2 - low_a
-    sums, block = np.zeros((*shape, 6), np.int64), np.full((len(z), 2), -1, np.int64)
-    leads = np.zeros(len(z), bool)
+    sums, block = np.zeros((*shape, 9), np.int64), np.full((len(z), 2), -1, np.int64)
+    leads = np.zeros(len(z), np.int8)
     _count_blocks(z, start, h, w, kind, end, number, left, bottom, low_a, low_b, sums, block, leads)
+    clear = (sums[..., 6] >= THROUGH * sums[..., 7]) & (sums[..., 7] > 0)
+    link = np.where(clear, LINK_THROUGH, LINK)
+    leading = (leads > 0) & (leads <= link[block[:, 0], block[:, 1]])
     near = _around(sums, 1)
     # Over nothing, such as a wide river, drops are seen farther away.
     far = _around(sums, FAR_ENDS)[..., 2] >= LONG_RIM
@@ -36,13 +51,13 @@ def stretches(z, start, h, w, kind, end, long, left, bottom) -> NDArray[np.bool_
     good = (ways > 0) & (near[..., 1] <= walls * ways) & (near[..., 3] <= OUTWARD * cells)
     ends_here = np.zeros(shape, np.int64)
     land, seen = np.empty((len(z), 3), np.int64), np.full(len(z), -1, np.int64)
-    for stamp, (b, a) in enumerate(np.argwhere(sums[..., 3] > 0)):
+    for stamp, (b, a) in enumerate(np.argwhere((sums[..., 3] > 0) | (clear & (sums[..., 8] > 0)))):
         over = no_ends()
-        own = leads & (block[:, 0] == b) & (block[:, 1] == a)
+        own = leading & (block[:, 0] == b) & (block[:, 1] == a)
         low = max((b + low_b) * BLOCK - bottom, 0), max((a + low_a) * BLOCK - left, 0)
-        cells = _land_of_block(z, start, h, w, kind, number, own, *low, land, seen, stamp)
+        cells = _land_of_block(z, start, h, w, kind, number, own, *low, land, seen, stamp, link[b, a])
         cells = spread(z, start, h, w, kind, end, number, land, seen, stamp, cells, over)
-        ends_here[b, a] = is_land(cells, over)
+        ends_here[b, a] = is_land(cells, over, bool(clear[b, a]))
     good &= (_around(ends_here[..., None], FAR_ENDS)[..., 0] > 0) | _passed(sums[..., 2] + sums[..., 5] > 0)
     return long & good[block[:, 0], block[:, 1]]
 
@@ -70,7 +85,8 @@ def _around(values: NDArray[np.int64], reach: int) -> NDArray[Any]:
 @njit
 def _count_blocks(z, start, h, w, kind, end, number, left, bottom, low_a, low_b, sums, block, leads):
     """Of each block: ways that end at a drop, and at something else; cells at a drop, and cells that lead on; ways that
-    end at nothing, and cells at nothing but no drop.
+    end at nothing, and cells at nothing but no drop; of those at no drop, cells that show what lies below, and all; cells
+    that lead on across more.
     """
     for j in range(h):
         for i in range(w):
@@ -91,17 +107,24 @@ def _count_blocks(z, start, h, w, kind, end, number, left, bottom, low_a, low_b,
                         nothing = True
                 own[2] += drop
                 own[5] += nothing and not drop
-                leads[n] = leads_on(z, start, h, w, kind, number, j, i, n)
-                own[3] += leads[n]
+                if not drop:
+                    own[6] += z[start[j * w + i]] < z[n] - DROP
+                    own[7] += 1
+                if leads_on(z, start, h, w, kind, number, j, i, n, LINK):
+                    leads[n] = LINK
+                    own[3] += 1
+                elif leads_on(z, start, h, w, kind, number, j, i, n, LINK_THROUGH):
+                    leads[n] = LINK_THROUGH
+                    own[8] += 1
 
 
 @njit
-def _land_of_block(z, start, h, w, kind, number, own, low_j, low_i, land, seen, stamp):
+def _land_of_block(z, start, h, w, kind, number, own, low_j, low_i, land, seen, stamp, link):
     """What the cells `own` of a block lead on to, as :func:`first_land` has it."""
     length = 0
     for j in range(low_j, min(low_j + BLOCK, h)):
         for i in range(low_i, min(low_i + BLOCK, w)):
             for n in range(start[j * w + i], start[j * w + i + 1]):
                 if own[n]:
-                    length = step_on(z, start, h, w, kind, number, j, i, n, land, seen, stamp, length)
+                    length = step_on(z, start, h, w, kind, number, j, i, n, land, seen, stamp, length, link)
     return length
