@@ -2,11 +2,13 @@
 
     python benchmarks/defaults.py --data DIR                       # every table
     python benchmarks/defaults.py --data DIR --table trees --json FILE
+    python benchmarks/defaults.py --data DIR --table base --count 40000 --bases MODELS
 
 Each training tile of Montpellier, and each third of Delft's training part, of Seville and of the hamlet, is classified by
 a model of the rest of that survey, with one thing of the defaults changed. Cross-validation over small blocks amid the
 training points is flattered by what neighbors share; a tile never seen is what a user's next tile is. Test parts are
-not touched. CPU seconds are those of training, and microseconds a point those of classifying, both with one thread.
+not touched. MODELS holds shipped models that have not seen the survey, as ``benchmarks/surveys/leave_one_out.py --save``
+writes them. CPU seconds are those of training, and microseconds a point those of classifying, both with one thread.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from pdal_stages.accuracy import Accuracy
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 from pdal_stages.classifier.dimensions import ALWAYS, WHERE_THERE
 from pdal_stages.features.names import SURFACES
+from pdal_stages.stages.loading import load_model
 from pdal_stages.terrain import filtered_ground
 
 #: What ``pdal-stages train`` takes where points have it.
@@ -35,6 +38,8 @@ ONE = {"passes": 1}
 FEATURES = TrainingOptions().feature_set
 #: Defaults until 2026-11-23.
 FORMER = {"count": 10_000, "context": ("own", "box1", "columnvotes2", "columnvotes8")}
+#: The table of models built on another, and the option.
+BASE = "base"
 #: Table -> row -> what differs from today's defaults.
 TABLES: dict[str, dict[str, dict[str, Any]]] = {
     "features": {
@@ -95,6 +100,12 @@ TABLES: dict[str, dict[str, dict[str, Any]]] = {
         "50, leaves of 5": {"min_samples_leaf": 5},
         "50, leaves of 3, 10,000 samples of a class": {"count": 10_000},
     },
+    BASE: {
+        "no base": {},
+        "base, one pass on top": {BASE: True, "passes": 1},
+        "base, two passes on top": {BASE: True, "passes": 2},
+        "base, three passes on top": {BASE: True, "passes": 3},
+    },
 }
 CODES = {
     "Montpellier": (2, 3, 4, 5, 6),
@@ -140,7 +151,9 @@ def options(changes: dict[str, Any], codes: tuple[int, ...], count: int) -> Trai
     return TrainingOptions(**{**given, **changes})
 
 
-def run(data: Path, rows: dict[str, dict[str, Any]], count: int) -> list[dict[str, Any]]:
+def run(
+    data: Path, rows: dict[str, dict[str, Any]], count: int, bases: Path | None = None
+) -> list[dict[str, Any]]:
     """A line for each row."""
     found = {
         name: {scene: np.zeros((len(codes), len(codes)), np.int64) for scene, codes in CODES.items()}
@@ -151,6 +164,8 @@ def run(data: Path, rows: dict[str, dict[str, Any]], count: int) -> list[dict[st
     for scene, rest, held in held_out(data):
         codes = CODES[scene]
         for name, changes in rows.items():
+            if BASE in changes:
+                changes = {**changes, BASE: load_model(bases / f"{scene}.model")}
             began = time.process_time()
             model = train([rest], options(changes, codes, count), progress=False)
             trained = time.process_time()
@@ -158,7 +173,7 @@ def run(data: Path, rows: dict[str, dict[str, Any]], count: int) -> list[dict[st
             seconds[name][0] += trained - began
             seconds[name][1] += time.process_time() - trained
             seconds[name][2] += len(held.xyz)
-            columns[name] = len(model.passes[0].plan.names)
+            columns[name] = len(model.passes[-1].plan.names)
             known = np.isin(held.labels, codes)
             pair = np.searchsorted(codes, held.labels[known]), np.searchsorted(codes, given[known])
             np.add.at(found[name][scene], pair, 1)
@@ -216,10 +231,14 @@ def main() -> None:
     parser.add_argument("--table", nargs="+", choices=list(TABLES), default=list(TABLES))
     parser.add_argument("--count", type=int, default=2500, help="samples of each class")
     parser.add_argument("--json", type=Path, help="where the figures go")
+    parser.add_argument("--bases", type=Path, help="folder of models, for the table of bases")
     given = parser.parse_args()
     tables = {}
     for title in given.table:
-        tables[title] = run(given.data, TABLES[title], given.count)
+        if title == BASE and given.bases is None:
+            print("the table of bases needs --bases")
+            continue
+        tables[title] = run(given.data, TABLES[title], given.count, given.bases)
         print(text({title: tables[title]}), flush=True)
     if given.json:
         given.json.write_text(json.dumps(tables, indent=1) + "\n")

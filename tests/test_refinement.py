@@ -15,8 +15,14 @@ from test_classifier_training import scene
 
 import pdal_stages as ps
 from pdal_stages.base.errors import ModelError, OptionError
-from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, train
+from pdal_stages.classifier import TrainingCloud, TrainingOptions, foresttraining, load_model, train
+from pdal_stages.classifier.algorithms import PredictRequest
+from pdal_stages.classifier.passes import weighed
 from pdal_stages.classifier.refinement import EVEN, MOST_BELOW, blended, trust
+from pdal_stages.classifier.smoothing import count_shares
+from pdal_stages.classifier.trainoptions import MOST_PASSES
+from pdal_stages.features import FeatureEngine
+from pdal_stages.features.cells import WHOLE
 from pdal_stages.models import shipped
 
 BEFORE = (2, 5, 6)
@@ -103,10 +109,13 @@ def on_top(base, keep=None, n=40, **more):
     return train([TrainingCloud(xyz, label, dimensions, "b.laz", mask)], options, progress=False)
 
 
-def test_a_file_holds_the_base(base, tmp_path):
-    model = on_top(base)
-    assert [one.name for one in model.passes] == ["random_forest", "random_forest", "refined_forest"]
-    assert model.voxel == base.voxel and model.halo_m > base.halo_m
+@pytest.mark.parametrize("more", [1, 2, 3])
+def test_a_file_holds_the_base(base, tmp_path, more):
+    model = on_top(base, passes=more, prior_weight=0.3)
+    assert [one.name for one in model.passes] == ["random_forest"] * 2 + ["refined_forest"] * more
+    assert model.voxel == (base.voxel if more == 1 else FEW["voxel"]) and model.halo_m > base.halo_m
+    assert [one.factors is not None for one in model.passes[2:]] == [False] * (more - 1) + [more > 1]
+    assert model.passes[2].context.tokens == (("own",) if more > 1 else model.passes[-1].context.tokens)
     model.save(tmp_path / "m.model")
     again = load_model(tmp_path / "m.model")
     xyz, _, dimensions = scene(seed=7, n=4000)
@@ -117,8 +126,9 @@ def test_a_file_holds_the_base(base, tmp_path):
     assert "refined_forest" in str(again)
 
 
-def test_any_order_and_any_part(base):
-    model = on_top(base)
+@pytest.mark.parametrize("passes", [1, 2])
+def test_any_order_and_any_part(base, passes):
+    model = on_top(base, passes=passes)
     xyz, _, dimensions = scene(seed=7, n=4000)
     whole = model.predict(xyz, dimensions, probabilities=True).probabilities
     order = np.random.default_rng(1).permutation(len(xyz))
@@ -131,10 +141,11 @@ def test_any_order_and_any_part(base):
     assert np.array_equal(part[where], whole[where])
 
 
-def test_a_class_without_labels_is_kept(base):
+@pytest.mark.parametrize("passes", [1, 2, 3])
+def test_a_class_without_labels_is_kept(base, passes):
     codes = base.codes.tolist()
     gone, *rest = codes[::-1]
-    model = on_top(base, keep=rest)
+    model = on_top(base, keep=rest, passes=passes, voxel=base.voxel, prior_weight=0.5)
     assert model.codes.tolist() == codes
     xyz, _, dimensions = scene(seed=7, n=4000)
     before = base.predict(xyz, dimensions, probabilities=True).probabilities[:, codes.index(gone)]
@@ -142,23 +153,25 @@ def test_a_class_without_labels_is_kept(base):
     assert np.abs(after - before).max() < 1e-3  # of what the base hands on in 65535ths
 
 
-def test_a_new_class_is_learnt(base):
+@pytest.mark.parametrize("passes", [1, 2])
+def test_a_new_class_is_learnt(base, passes):
     xyz, label, dimensions = scene(seed=3)
     tall = (label == 6) & ((xyz[:, 0] // 10 + xyz[:, 1] // 10) % 2 == 0)
     xyz[tall, 2] += 6
     dimensions["HeightAboveGround"] = xyz[:, 2].copy()
     label[tall] = 17
     cloud = TrainingCloud(xyz, label, dimensions, "b.laz")
-    model = train([cloud], TrainingOptions(**FEW, base=base, folds=0), progress=False)
+    model = train([cloud], TrainingOptions(**FEW, base=base, folds=0, passes=passes), progress=False)
     assert set(model.codes.tolist()) == {*base.codes.tolist(), 17}
     found = model.predict(xyz, dimensions).classification
     assert (found == label).mean() > (base.predict(xyz, dimensions).classification == label).mean() + 0.05
 
 
-def test_one_class_alone_changes(base):
+@pytest.mark.parametrize("passes", [1, 2])
+def test_one_class_alone_changes(base, passes):
     codes = base.codes.tolist()
     target = codes[-1]
-    model = on_top(base, strategy="binary", target=target)
+    model = on_top(base, strategy="binary", target=target, passes=passes, voxel=base.voxel)
     assert model.codes.tolist() == codes
     xyz, _, dimensions = scene(seed=7, n=4000)
     before = base.predict(xyz, dimensions).classification
@@ -204,6 +217,9 @@ def test_what_cannot_be_built_on(base):
         lambda p: p[-1]["parameters"].update(trusted=2.0),
         lambda p: p[-1]["parameters"].update(target=5),
         lambda p: p[-1]["parameters"].pop("before"),
+        lambda p: p[-1]["parameters"].update(factors=[1.0]),
+        lambda p: p[-1]["parameters"].update(factors=[1.0, -1.0, float("nan")]),
+        lambda p: p[-1].update(context=["box1"]),
         lambda p: p[0].update(codes=[2, 5]),
         lambda p: p[1].update(codes=[2, 5, 64]),
         lambda p: p[1].update(factors=[1.0]),
@@ -219,6 +235,100 @@ def test_a_manifest_that_contradicts_itself(base, tmp_path, change):
     change(manifest["passes"])
     with pytest.raises(ModelError):
         assemble(manifest, [one.arrays() for one in model.passes])
+
+
+def of_the_base(base, xyz, dimensions):
+    """What a base hands on of every point of a cloud without voxels, as it is counted."""
+    out = np.empty((len(xyz), len(base.classes)), np.uint16)
+    request = PredictRequest(xyz, dimensions)
+    for rows, shares, _ in base.algorithm.predict(
+        request, lambda p: count_shares(weighed(p, base.factors))
+    ).blocks:
+        out[rows] = shares
+    return out
+
+
+def computed(features, xyz, dimensions):
+    """The features of every point."""
+    engine = FeatureEngine(xyz, features.plan, bins=features.bins)
+    return engine.table(dimensions={name: dimensions[name] for name in features.plan.dimensions}).values
+
+
+def test_two_passes_equal_the_passes_by_hand(base):
+    """The base, the point's own probabilities, the first forest on top, context by loops, the second."""
+    from test_classifier_context import reference
+
+    model = on_top(base, keep=base.codes.tolist()[:-1], passes=2, voxel=0, n=200, prior_weight=0.5)
+    xyz, _, dimensions = scene(seed=7, n=4000)
+    first, second = model.passes[-2:]
+    values, labeled = computed(first.features, xyz, dimensions), list(first.labeled)
+    said = of_the_base(base, xyz, dimensions)
+    read = np.hstack([values, (said / WHOLE).astype(np.float32)])
+    own = read[:, values.shape[1] :].astype(float)
+    own /= own.sum(axis=1, keepdims=True)
+    grown = first.forest.predict_proba(read)
+    shares = count_shares(by_hand(own, grown, first.before, labeled, first.trusted))
+    rows = np.arange(0, len(xyz), 9)
+    columns = reference(xyz, shares, rows, second.context)
+    grown = weighed(second.forest.predict_proba(np.hstack([values[rows], columns])), np.array(second.factors))
+    own = columns[:, : len(model.codes)].astype(float)
+    own /= own.sum(axis=1, keepdims=True)
+    p = by_hand(own, grown, second.before, labeled, second.trusted)
+    got = model.predict(xyz, dimensions, probabilities=True).probabilities[rows]
+    assert np.allclose(got, p, atol=1e-6)
+
+
+def test_the_second_is_trained_on_ground_that_the_first_has_not_seen(base, monkeypatch):
+    from test_classifier_context import reference
+
+    kept, inner = [], foresttraining._Passes._context
+
+    def keep(self, held_out):
+        kept.append((self, held_out, inner(self, held_out)))
+        return kept[-1][2]
+
+    monkeypatch.setattr(foresttraining._Passes, "_context", keep)
+    model = on_top(base, passes=2, voxel=0, n=300)
+    ((passes, (forests,), context),) = kept
+    (cloud,) = passes.clouds
+    xyz, fold = cloud.xyz, passes.folds.points(cloud.xyz, cloud.flight)
+    values = computed(passes.features, xyz, cloud.dimensions)
+    read = np.hstack([values, (of_the_base(base, xyz, cloud.dimensions) / WHOLE).astype(np.float32)])
+    grown = np.array([forests[k].predict_proba(read[i : i + 1])[0] for i, k in enumerate(fold.tolist())])
+    own = read[:, values.shape[1] :].astype(float)
+    own /= own.sum(axis=1, keepdims=True)
+    first = model.passes[-2]
+    shares = count_shares(by_hand(own, grown, first.before, list(first.labeled), first.trusted))
+    some = np.arange(0, len(passes.samples), 5)
+    rows = passes.samples.row[some]
+    assert np.allclose(context[some], reference(xyz, shares, rows, model.passes[-1].context), atol=2e-5)
+
+
+@pytest.mark.pdal
+def test_many_labels_ask_for_another_pass(tmp_path, write_las, monkeypatch, capsys):
+    from pdal_stages.cli import main
+    from pdal_stages.stages import classifiermodel
+
+    town = ps.make_town(40.0, 4.0, seed=5)
+    points = dict(zip("XYZ", town.xyz.T, strict=True)) | {"Classification": town.classification}
+    source = write_las(tmp_path / "in.las", points, point_format=3)
+    monkeypatch.setattr(classifiermodel, "MANY", 50)
+    words = [
+        "train",
+        str(source),
+        "--base",
+        "standard",
+        "--classes",
+        "2,5,6",
+        "--trees",
+        "3",
+        "--count",
+        "100",
+    ]
+    for more, said in (([], True), (["--passes", "2"], False)):
+        assert main([*words, *more, "--model", str(tmp_path / "m.model"), "--no-progress"]) == 0
+        out = "".join(capsys.readouterr())
+        assert ("--passes 2" in out) is said, out
 
 
 @pytest.mark.pdal
@@ -254,14 +364,15 @@ def test_a_shipped_model_can_be_a_base():
     """With its own passes and the one on top, a model file must still be valid."""
     schema = json.loads(resources.files("pdal_stages.classifier").joinpath("model.json").read_text())
     properties = schema["properties"]
-    assert properties["passes"]["maxItems"] == MOST_BELOW + 1
+    most = MOST_BELOW + MOST_PASSES
+    assert properties["passes"]["maxItems"] == most
     named = re.compile(properties["arrays"]["propertyNames"]["pattern"])
-    assert all(named.search(f"{number + 1}.tree_sizes") for number in range(MOST_BELOW + 1))
+    assert all(named.search(f"{number + 1}.tree_sizes") for number in range(most))
     for path in shipped().values():
         passes = ps.load_model(path).passes
         assert len(passes) <= MOST_BELOW
         held = sum(len(one) for one in _arrays_by_pass(path))
-        assert held / len(passes) * (MOST_BELOW + 1) <= properties["arrays"]["maxProperties"]
+        assert held / len(passes) * most <= properties["arrays"]["maxProperties"]
 
 
 def _arrays_by_pass(path):

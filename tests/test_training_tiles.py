@@ -50,6 +50,14 @@ def both(town, tmp_path, capsys, *more, files=("",)):
     return models, said
 
 
+@pytest.mark.parametrize("passes", [1, 2])
+def test_on_top_of_a_model(town, tmp_path, capsys, passes):
+    words = ["--base", "standard", "--passes", str(passes)]
+    (whole, tiles), (one, other) = both(town, tmp_path, capsys, *words)
+    assert whole == tiles and one.out == other.out
+    assert len(ps.load_model(tmp_path / "tiles.model").passes) == 3 + passes
+
+
 def test_the_model_is_the_same_to_the_byte(town, tmp_path, capsys):
     (whole, tiles), (one, other) = both(town, tmp_path, capsys)
     assert whole == tiles and one.out == other.out

@@ -62,7 +62,7 @@ class PointClassifier(ClassifierMixin, BaseEstimator):
         trees: Any = TrainingOptions.trees,
         min_samples_leaf: Any = TrainingOptions.min_samples_leaf,
         prior_weight: float = TrainingOptions.prior_weight,
-        passes: int = TrainingOptions.passes,
+        passes: int | None = TrainingOptions.passes,
         thin: Any = TrainingOptions.thin,
         seed: int = TrainingOptions.seed,
         threads: int | None = TrainingOptions.threads,

@@ -7,7 +7,7 @@ the next pass is trained on comes from forests that have not seen it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -106,6 +106,8 @@ class FoldForests:
     context: Context | None
     forests: Sequence[Forest]
     fold: npt.NDArray[np.int16]  #: (n,) of every point of the cloud: the forest that judges it
+    #: of a pass on top of others: what it makes of all that it reads and of what its forests say
+    blend: Callable[[npt.NDArray[np.float32], npt.NDArray[np.float64]], npt.NDArray[np.float64]] | None = None
 
     def probabilities(
         self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64]
@@ -117,7 +119,7 @@ class FoldForests:
             mine = fold == number
             whole = mine.all()
             out[mine] = self.forests[number].predict_proba(values if whole else values[mine])
-        return out
+        return out if self.blend is None else self.blend(values, out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,15 +137,21 @@ class ContextOnly:
 
 
 def sample_context(
-    request: PredictRequest, passes: Sequence[FoldForests], context: Context, classes: int
+    request: PredictRequest,
+    passes: Sequence[Any],
+    context: Context,
+    classes: Sequence[int],
+    factors: Sequence[npt.NDArray[np.float64] | None] = (),
 ) -> tuple[npt.NDArray[np.float32], bool]:
     """(m, columns): the context of the m points asked for, as passes say, one after the other, that have not seen them.
 
-    And whether any of those that were looked at had neighbors beyond the features' halo.
+    `classes` and `factors` of each pass: see :class:`Passes`. And whether any of those that were looked at had neighbors
+    beyond the features' halo.
     """
     asked: Any = request.rows
-    out = np.empty((len(asked), len(context.tokens) * classes), np.float32)
-    run = PassRun([*passes, ContextOnly(context)], [classes] * (len(passes) + 1), request)
+    out = np.empty((len(asked), len(context.tokens) * classes[-1]), np.float32)
+    padded = (*factors, *[None] * (len(passes) - len(factors) + 1))
+    run = PassRun([*passes, ContextOnly(context)], [*classes, classes[-1]], request, padded)
     return context_of(run, asked, out), bool(run.report.beyond_halo)
 
 

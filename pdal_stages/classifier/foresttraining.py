@@ -29,12 +29,12 @@ from .forest import Forest
 from .growing import TreeOptions, grow
 from .model import Model
 from .passes import weighed
-from .refinement import blended
-from .refining import Below, held_by_base, on_top, trust
+from .refinement import Blend, blended
+from .refining import Below, held_by_base, on_top
 from .samplefeatures import SHORT, fitted, must_fit, percentiles, sample_features
 from .sampling import Samples, draw_samples
 from .sureness import Sureness, counted
-from .surroundings import Looks, Seen, work_on
+from .surroundings import Looks, Seen, wider, work_on
 from .thinning import density_range
 from .trainoptions import PER_TREE, TrainingOptions
 from .trees import GrownTree, Ranked
@@ -82,7 +82,8 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     with Progress(total, "drawing samples", enabled=progress) as bar:
         samples = draw_samples(labeled, len(classes.codes), options.count, options.seed, shares, progress=bar)
     base = options.base
-    read = 0 if options.passes == 1 and base is None else len(classes.codes if base is None else base.classes)
+    known = set() if base is None else set(base.codes.tolist())
+    read = 0 if options.passes == 1 and base is None else len(known | set(classes.codes))
     of_context = len(options.context) * read
     must_fit(len(plan.names) + of_context, len(samples))
     features = Features(plan, *fitted(clouds, samples, plan, options), options.seed)
@@ -93,7 +94,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     xy = samples.take(lambda number: clouds[number].xyz[:, :2])
     priors = _priors(samples, len(classes.codes), options.prior_weight)
     heard = _Heard(samples, classes.codes, priors, below, options)
-    ranked = Ranked.of(values, options.threads)
+    ranked = alone = Ranked.of(values, options.threads)
     del values  # as large again
     if below is not None:
         ranked = ranked.beside(Ranked.of(below.columns, options.threads))
@@ -109,7 +110,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
         heard,
     )
     started = time.perf_counter()
-    passes = _Passes(labeled, samples, ranked, features, chosen, options, progress, below)
+    passes = _Passes(labeled, samples, (alone, ranked), features, chosen, options, progress, below)
     passes.grow(*limits)
     left_out = passes.without_each_survey() if options.leave_one_survey_out else None
     timed["trees"] = time.perf_counter() - started
@@ -139,7 +140,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
         "created_by": _versions(),
     }
     made = Model(tuple(passes.made), list(zip(classes.codes, classes.names, strict=True)), info, timed)
-    return made if base is None else on_top(base, made, trust(int(np.bincount(samples.label).min())))
+    return made if below is None else on_top(below.base, made, below.trusted)
 
 
 def _with_short(counted: Mapping[str, Any], more: int) -> dict[str, Any]:
@@ -314,8 +315,7 @@ class _Heard:
             p = weighed(p, self._factors)
         else:
             before = self._below.base.codes.tolist()
-            trusted = trust(int(np.bincount(self.samples.label).min()))
-            p = blended(self._below.own[rows], p, before, codes, trusted)
+            p = blended(self._below.own[rows], p, before, codes, self._below.trusted)
             codes = sorted({*before, *codes})
         true = np.asarray(self.codes)[self.samples.label[rows]]
         counted(p, codes, true, self._weight[rows], self.tables.setdefault((candidate, trees), Sureness()))
@@ -329,7 +329,7 @@ class _Heard:
         rows = validation["tried"]
         place = rows.index(validation["chosen"])
         found = list(self.tables.values())[place]
-        passes = "" if below is not None or self._options.passes == 1 else ", of the first pass"
+        passes = "" if self._options.passes == 1 else ", of the first pass"
         found.about = f"{validation['by']} held out, forests of {validation['chosen']['trees']} trees{passes}"
         return {"sureness": found.to_dict()}
 
@@ -341,7 +341,7 @@ class _Passes:
         self,
         labeled: Labeled,
         samples: Samples,
-        ranked: Ranked,
+        ranked: tuple[Ranked, Ranked],
         features: Features,
         chosen: Mapping[str, Any],
         options: TrainingOptions,
@@ -350,7 +350,8 @@ class _Passes:
     ) -> None:
         self.below = below
         self.clouds, self.codes = labeled.clouds, labeled.classes.codes
-        self.samples, self.ranked, self.features = samples, ranked, features
+        self.samples, self.features = samples, features
+        self.alone, self.ranked = ranked  # the features, and all that the first pass reads
         self.chosen, self.options, self.progress = chosen, options, progress
         self.context = Context(tuple(options.context))
         drawn = _share_drawn(options, samples, len(self.codes))
@@ -360,7 +361,7 @@ class _Passes:
         self.notes: dict[str, Any] = {}
         self.short = 0  #: samples whose neighbors lie farther away than the memory allowed to look
         self.flights = [cloud.flight for cloud in self.clouds]
-        if options.passes > 1 and below is None:
+        if options.passes > 1:
             self.folds = Folds.of(labeled, self.flights, options.pass_folds)
             self.notes["pass_folds"] = self.folds.count
 
@@ -368,8 +369,7 @@ class _Passes:
         """Fill `made` and `scores`; `low` and `high` are the percentiles of the features."""
         for number, ranked in enumerate(self._ranked(self.samples.weight)):
             forest, importances, bag = self._forest(ranked, number)
-            reads = number or self.below is not None
-            self.made.append(FeatureForest(self.features, forest, self.context if reads else None))
+            self.made.append(FeatureForest(self.features, forest, self._context_of(number)))
             least, largest = ranked.limits(len(low))
             percentiles = {
                 "low": [*low, *least],
@@ -405,12 +405,16 @@ class _Passes:
         held_out: list[list[Forest]] = []
         ranked = self.ranked
         yield ranked
-        if self.below is not None:
-            return
         for number in range(1, self.options.passes):
             held_out.append(self._hold_out(ranked, weight, number))
-            ranked = self.ranked.beside(Ranked.of(self._context(held_out), self.options.threads))
+            ranked = self.alone.beside(Ranked.of(self._context(held_out), self.options.threads))
             yield ranked
+
+    def _context_of(self, number: int) -> Context | None:
+        """What a pass reads of the one before."""
+        if number:
+            return self.context
+        return None if self.below is None else self.below.context
 
     def _hold_out(self, ranked: Ranked, weight: npt.NDArray[np.int64], number: int) -> list[Forest]:
         """The pass `number` once more, a forest without each fold.
@@ -438,10 +442,17 @@ class _Passes:
 
     def _context(self, held_out: Sequence[Sequence[Forest]]) -> npt.NDArray[np.float32]:
         """The samples' context, (samples, columns), by passes that have not seen them."""
-        classes, o = len(self.codes), self.options
-        out = np.empty((len(self.samples), len(self.context.tokens) * classes), np.float32)
-        what = f"context for pass {len(held_out) + 1}"
-        looks = Looks(self.features.plan, [self.context] * len(held_out))
+        o, below, count = self.options, self.below, len(held_out)
+        reads = [self._context_of(number) for number in range(count)]
+        first: Any = () if below is None else below.passes
+        factors = () if below is None else below.factors
+        blends: Sequence[Blend | None] = [None] * count if below is None else self._blends(reads)
+        classes = [] if below is None else list(below.classes)
+        classes += [len(self.codes) if one is None else len(one.codes) for one in blends]
+        plan = self.features.plan if below is None else wider(below.base.plan, self.features.plan)
+        looks = Looks(plan, [self.context] * count)
+        out = np.empty((len(self.samples), len(self.context.tokens) * classes[-1]), np.float32)
+        what = f"context for pass {count + 1}"
         with Progress(len(self.samples), what, enabled=self.progress) as bar:
             for number, cloud in enumerate(self.clouds):
                 at, rows = self.samples.of_cloud(number)
@@ -458,18 +469,30 @@ class _Passes:
                 ) -> bool:
                     fold = self.folds.points(seen.xyz, flight)
                     passes = [
-                        FoldForests(self.features, self.context if k else None, forests, fold)
-                        for k, forests in enumerate(held_out)
+                        FoldForests(self.features, context, forests, fold, blend)
+                        for context, forests, blend in zip(reads, held_out, blends, strict=True)
                     ]
                     shown = None if again else bar
                     request = PredictRequest(
                         seen.xyz, seen.dimensions, seen.rows, o.threads, o.memory_mb, shown
                     )
-                    out[at[places]], beyond = sample_context(request, passes, self.context, classes)
+                    out[at[places]], beyond = sample_context(
+                        request, [*first, *passes], self.context, classes, factors
+                    )
                     return beyond
 
                 self.short += work_on(cloud, rows, looks, compute, o.threads)
         return out
+
+    def _blends(self, reads: Sequence[Context | None]) -> list[Blend]:
+        """What each pass on top of the base makes of the one before."""
+        assert self.below is not None
+        blends, before = [], self.below.base.codes.tolist()
+        for context in reads:
+            assert context is not None
+            blends.append(self.below.blend(before, self.codes, len(self.features.plan.names), context))
+            before = blends[-1].codes
+        return blends
 
     def _grown(
         self,
@@ -490,8 +513,7 @@ class _Passes:
         total = np.zeros((len(self.samples), len(self.codes)))
         trees = []
         importance = np.zeros(ranked.columns)
-        several = self.options.passes > 1 and self.below is None
-        what = f"growing pass {number + 1}" if several else "growing"
+        what = f"growing pass {number + 1}" if self.options.passes > 1 else "growing"
         count, weight = self.chosen["trees"], self.samples.weight
         # Trees that draw few of the samples leave nearly all out of their bags: a share of these is judged.
         every = max(1, round(1.0 / self.setting.max_samples))

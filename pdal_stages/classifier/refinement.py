@@ -1,6 +1,6 @@
-"""A few labels on top of a trained model: a last pass that reads what the base says and changes what the labels teach.
+"""Labels on top of a trained model: passes that read what the base says and change what the labels teach.
 
-The base's passes stay as they are. The forest on top knows the classes of the labels; what the base says of classes that
+The base's passes stay as they are. The forests on top know the classes of the labels; what the base says of classes that
 the labels lack is left alone, and of the others it is believed the more the fewer labels there are.
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,13 +18,63 @@ from ..base.errors import ModelError, OptionError
 from .context import OWN, Context
 from .featureforest import FeatureForest, Features, check_names
 from .forest import Forest
+from .passes import weighed
 
 #: As many labeled points of its rarest class count as much as the base.
 EVEN = 30
+#: From so many on, several passes on top are better than one.
+MANY = 5000
 #: Probabilities that cannot be divided by.
 NOTHING = 1e-300
 #: Most passes of a base.
 MOST_BELOW = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Blend:
+    """How what is said before and what a forest on top says become one; see :func:`blended`.
+
+    Attributes
+    ----------
+    before : tuple of int
+        Classes of the pass before.
+    labeled : tuple of int
+        Those the forest was trained on, in the order of its columns.
+    trusted : float
+        See :func:`trust`.
+    target : int or None
+        With the binary strategy, the class that alone is changed.
+    first : int
+        Column, among all that the forest reads, where the point's own probabilities of before begin.
+    factors : tuple of float or None
+        What the forest's classes are multiplied by for being frequent.
+    """
+
+    before: tuple[int, ...]
+    labeled: tuple[int, ...]
+    trusted: float
+    target: int | None
+    first: int
+    factors: tuple[float, ...] | None = None
+
+    @property
+    def codes(self) -> list[int]:
+        """The classes that come out."""
+        return sorted({*self.before, *(self.labeled if self.target is None else (self.target,))})
+
+    def __call__(
+        self, values: npt.NDArray[np.float32], grown: npt.NDArray[np.float64]
+    ) -> npt.NDArray[np.float64]:
+        """Probabilities (b, classes) of points, by all that the forest reads and what it says."""
+        said = values[:, self.first : self.first + len(self.before)].astype(np.float64)
+        said /= np.maximum(said.sum(axis=1, keepdims=True), 1e-9)
+        grown = weighed(grown, None if self.factors is None else np.array(self.factors))
+        return blended(said, grown, self.before, self.labeled, self.trusted, self.target)
+
+
+def own_column(features: int, context: Context, before: int) -> int:
+    """Where a point's own probabilities stand after `features` columns; `before`: classes that are spoken of."""
+    return features + context.tokens.index(OWN) * before
 
 
 def trust(labels: int) -> float:
@@ -38,27 +89,36 @@ class RefinedForest(FeatureForest):
     Attributes
     ----------
     before : tuple of int
-        The base's classes.
+        Classes of the pass before it: the base's, or those of another on top of it.
     labeled : tuple of int
         Those the forest was trained on, in the order of its columns.
     trusted : float
         See :func:`trust`.
     target : int or None
         With the binary strategy, the class that alone is changed.
+    factors : tuple of float or None
+        What its classes are multiplied by for being frequent.
     """
 
     before: tuple[int, ...] = ()
     labeled: tuple[int, ...] = ()
     trusted: float = 1.0
     target: int | None = None
+    factors: tuple[float, ...] | None = None
 
     name: ClassVar[str] = "refined_forest"
+
+    @cached_property
+    def blend(self) -> Blend:
+        """What it does to the pass before."""
+        assert self.context is not None
+        first = own_column(len(self.plan.names), self.context, len(self.before))
+        return Blend(self.before, self.labeled, self.trusted, self.target, first, self.factors)
 
     @property
     def codes(self) -> list[int]:
         """The classes that come out."""
-        new = self.labeled if self.target is None else (self.target,)
-        return sorted({*self.before, *new})
+        return self.blend.codes
 
     @classmethod
     def from_file(
@@ -67,7 +127,7 @@ class RefinedForest(FeatureForest):
         """Made from what a model file says of a pass, everything checked."""
         said = entry["parameters"]
         before, labeled = _codes(said.get("before")), _codes(said.get("labeled"))
-        trusted, target = said.get("trusted"), said.get("target")
+        trusted, target, factors = said.get("trusted"), said.get("target"), said.get("factors")
         if type(trusted) is not float or not 0.0 <= trusted <= 1.0:
             raise ModelError(
                 "'trusted' of a refined forest must be a number from 0 to 1", found=str(trusted)[:20]
@@ -76,10 +136,18 @@ class RefinedForest(FeatureForest):
             raise ModelError(
                 "'target' of a refined forest must be one of its two classes", found=str(target)[:20]
             )
+        if factors is not None and not _good_factors(factors, len(labeled)):
+            raise ModelError(
+                "'factors' of a refined forest must be positive numbers, one of each class",
+                found=str(factors)[:60],
+            )
         features, context = Features.from_dict(entry), Context(tuple(entry["context"]))
+        if OWN not in context.tokens:
+            raise ModelError(f"a refined forest must read '{OWN}'", found=entry["context"][:10])
         check_names(features.plan, context.names(before), entry)
         forest = Forest.from_arrays(arrays, len(entry["feature_names"]), len(labeled))
-        made = cls(features, forest, context, before, labeled, trusted, target)
+        weights = None if factors is None else tuple(map(float, factors))
+        made = cls(features, forest, context, before, labeled, trusted, target, weights)
         if made.codes != list(codes):
             raise ModelError(
                 "the classes of a refined forest do not add up to the model's", found=made.codes[:10]
@@ -90,23 +158,19 @@ class RefinedForest(FeatureForest):
         """What a model file says of it beside its arrays."""
         entry = super().to_file(codes)
         own = {"before": list(self.before), "labeled": list(self.labeled), "trusted": self.trusted}
+        if self.factors is not None:
+            own["factors"] = list(self.factors)
         return {**entry, "parameters": {**entry["parameters"], **own, "target": self.target}}
 
     def classes_before(self, codes: Sequence[int]) -> list[int]:
-        """The base's."""
+        """Those of the pass before."""
         return list(self.before)
 
     def probabilities(
         self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64] | None = None
     ) -> npt.NDArray[np.float64]:
-        """Probabilities (b, classes): what the base says, changed as far as the labels are to be believed."""
-        assert self.context is not None
-        first = len(self.plan.names) + self.context.tokens.index(OWN) * len(self.before)
-        said = values[:, first : first + len(self.before)].astype(np.float64)
-        said /= np.maximum(said.sum(axis=1, keepdims=True), 1e-9)
-        return blended(
-            said, self.forest.predict_proba(values), self.before, self.labeled, self.trusted, self.target
-        )
+        """Probabilities (b, classes): what is said before, changed as far as the labels are to be believed."""
+        return self.blend(values, self.forest.predict_proba(values))
 
 
 def blended(
@@ -173,6 +237,14 @@ def check_base(base: Any) -> None:
             found=len(passes),
             cure="Start from the model that it was built on, with all labels together",
         )
+
+
+def _good_factors(given: Any, classes: int) -> bool:
+    return (
+        isinstance(given, list)
+        and len(given) == classes
+        and all(type(one) in (int, float) and 0.0 < one < float("inf") for one in given)
+    )
 
 
 def _codes(given: Any) -> tuple[int, ...]:

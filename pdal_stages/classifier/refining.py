@@ -14,19 +14,24 @@ from ..base.progress import Progress
 from .algorithms import PredictRequest
 from .clouds import TrainingCloud
 from .context import OWN, Context
-from .folds import ContextOnly, context_of
+from .folds import sample_context
 from .model import Model
-from .passes import PassRun
-from .refinement import RefinedForest, trust
+from .refinement import Blend, RefinedForest, own_column, trust
 from .sampling import Samples
 from .surroundings import Looks, Seen, work_on
 from .trainoptions import TrainingOptions
 
-__all__ = ["Below", "held_by_base", "on_top", "trust"]
-
 
 class Below:
-    """A base at work on the training clouds. It has not seen their labels, so no ground need be held out."""
+    """A base at work on the training clouds. It has not seen their labels, so no ground need be held out.
+
+    Attributes
+    ----------
+    context : Context
+        What the first pass on top reads of it: of several, the point's own probabilities alone.
+    passes, classes, factors
+        As :class:`PassRun` takes them.
+    """
 
     def __init__(
         self,
@@ -38,17 +43,18 @@ class Below:
     ) -> None:
         self.base, self._clouds, self.samples = base, clouds, samples
         self.options, self._progress = options, progress
+        self.context = Context((OWN,) if options.passes > 1 else tuple(options.context))
+        self.passes, self.classes = base.passes, tuple(map(len, base.codes_of))
+        self.factors = (*(_array(one.get("factors")) for one in base.info["passes"][:-1]), base.factors)
+        self.trusted = trust(int(np.bincount(samples.label).min()))
         self.short = 0  #: samples whose neighbors lie farther away than the memory allowed to look
 
     @cached_property
     def columns(self) -> npt.NDArray[np.float32]:
         """What it says around the samples, (samples, columns)."""
-        context, o, samples = Context(tuple(self.options.context)), self.options, self.samples
-        classes = [*map(len, self.base.codes_of), len(self.base.classes)]
-        out = np.empty((len(samples), len(context.tokens) * len(self.base.classes)), np.float32)
-        factors = [*(_array(one.get("factors")) for one in self.base.info["passes"]), None]
-        factors[len(self.base.passes) - 1] = self.base.factors
-        looks = Looks(self.base.plan, (context,))
+        o, samples = self.options, self.samples
+        out = np.empty((len(samples), len(self.context.tokens) * len(self.base.classes)), np.float32)
+        looks = Looks(self.base.plan, (self.context,))
         with Progress(len(samples), "what the base says", enabled=self._progress) as bar:
             for number, cloud in enumerate(self._clouds):
                 at, rows = samples.of_cloud(number)
@@ -61,34 +67,49 @@ class Below:
                     again: bool,
                     at: npt.NDArray[np.int64] = at,
                 ) -> bool:
-                    shown = None if again else bar
                     request = PredictRequest(
-                        seen.xyz, seen.dimensions, seen.rows, o.threads, o.memory_mb, shown
+                        seen.xyz, seen.dimensions, seen.rows, o.threads, o.memory_mb, None if again else bar
                     )
-                    run = PassRun([*self.base.passes, ContextOnly(context)], classes, request, factors)
-                    mine = np.empty((len(seen.rows), out.shape[1]), np.float32)
-                    out[at[places]] = context_of(run, seen.rows, mine)
-                    return bool(run.report.beyond_halo)
+                    out[at[places]], beyond = sample_context(
+                        request, self.passes, self.context, self.classes, self.factors
+                    )
+                    return beyond
 
                 self.short += work_on(cloud, rows, looks, compute, o.threads)
         return out
+
+    def blend(self, before: Sequence[int], labeled: Sequence[int], features: int, context: Context) -> Blend:
+        """What a pass on top makes of the one before, whose classes are `before`; `features` it computes itself."""
+        o = self.options
+        first = own_column(features, context, len(before))
+        target = o.target if o.strategy == "binary" else None
+        return Blend(tuple(before), tuple(labeled), self.trusted, target, first)
 
     @property
     def own(self) -> npt.NDArray[np.float64]:
         """(samples, classes) the base's probabilities of the samples themselves."""
         n = len(self.base.classes)
-        first = Context(tuple(self.options.context)).tokens.index(OWN) * n
+        first = own_column(0, self.context, n)
         said = self.columns[:, first : first + n].astype(np.float64)
         return said / np.maximum(said.sum(axis=1, keepdims=True), 1e-9)
 
 
 def on_top(base: Model, made: Model, trusted: float) -> Model:
-    """The model of the base's passes and the one pass of `made`, with the classes of both."""
-    (forest,) = made.passes
-    target = made.info["target"]
-    shared = {field.name: getattr(forest, field.name) for field in fields(forest)}
-    before, labeled = tuple(base.codes.tolist()), tuple(made.codes.tolist())
-    refined = RefinedForest(**shared, before=before, labeled=labeled, trusted=trusted, target=target)
+    """The model of the base's passes and those of `made`, with the classes of both."""
+    target, priors, labeled = made.info["target"], made.info["priors"], tuple(made.codes.tolist())
+    last, added = len(made.passes) - 1, []
+    before = tuple(base.codes.tolist())
+    for number, forest in enumerate(made.passes):
+        shared = {field.name: getattr(forest, field.name) for field in fields(forest)}
+        weighs = (
+            last and number == last and priors is not None
+        )  # a few labels say nothing of how frequent a class is
+        factors = tuple(priors["factors"]) if weighs else None
+        refined = RefinedForest(
+            **shared, before=before, labeled=labeled, trusted=trusted, target=target, factors=factors
+        )
+        added.append(refined)
+        before = tuple(refined.codes)
     names, entries = dict(base.classes), {one["code"]: one for one in made.info["classes"]}
     names.update((code, name) for code, name in made.classes if code in refined.codes and code not in names)
     unseen = {"available": 0, "samples": 0, "duplicates": 0}
@@ -112,7 +133,7 @@ def on_top(base: Model, made: Model, trusted: float) -> Model:
         "preparation": base.info.get("preparation") or [],
         "passes": [*scores, *made.info["passes"]],
     }
-    return Model((*base.passes, refined), [(code, names[code]) for code in refined.codes], info, made.seconds)
+    return Model((*base.passes, *added), [(code, names[code]) for code in refined.codes], info, made.seconds)
 
 
 def held_by_base(below: Below, codes: Sequence[int]) -> dict[str, list[int]]:

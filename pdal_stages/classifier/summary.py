@@ -78,6 +78,10 @@ def text(info: Mapping[str, Any]) -> str:
         lines.append(f"voxel          {info['voxel']:g} m, which one point stands for")
     for cloud in training["clouds"]:
         lines.append(f"trained on     {cloud['name']}, {cloud['points']:,} points")
+    if teacher := info.get("teacher"):
+        lines.append(
+            f"labels         what {teacher['name']} is sure of ({teacher['sure']:g} and more); no person's"
+        )
     if gone := training.get("contradicted"):
         lines.append(f"left out       labels that their height contradicts: {_counts(gone)}")
     lines += ["", f"{'class':<34}{'available':>12}{'samples':>10}{'duplicates':>12}{'F1 out of bag':>15}"]

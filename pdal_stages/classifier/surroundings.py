@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..features import FeatureEngine, FeaturePlan
+from .algorithms import InputPlan
 from .context import Context, around
 
 #: Density counts as float32: distances that follow from it are taken so much longer.
@@ -47,6 +48,17 @@ class Looking(Protocol):
     def most_neighbors(self) -> int: ...
     @property
     def second_neighbors(self) -> int: ...
+
+
+def wider(one: Looking, other: Looking) -> Looking:
+    """As far as either looks."""
+    return InputPlan(
+        (),
+        (),
+        max(one.halo_m, other.halo_m),
+        max(one.most_neighbors, other.most_neighbors),
+        max(one.second_neighbors, other.second_neighbors),
+    )
 
 
 @dataclass(frozen=True)

@@ -206,11 +206,13 @@ class TrainingOptions:
         "boolean",
         "Score each survey with forests grown without it; takes a training per survey",
     )
-    passes: int = setting(
-        2,
+    passes: Any = setting(
+        None,
         "integer",
-        "Forests one after the other, each reading what the one before says of a point's surroundings",
-        "Each is trained on what the one before says of ground it has not seen.",
+        "Forests one after the other, each reading what the one before says of a point's surroundings; default 2, on top of "
+        "a base 1, for few labels: a labeled survey gains by 2",
+        "Each is trained on what the one before says of ground it has not seen. Of several on top of a base the first reads "
+        "what the base says of the point itself.",
         low=1,
         high=MOST_PASSES,
     )
@@ -218,7 +220,7 @@ class TrainingOptions:
         None,
         "list",
         "What passes after the first read: own, or box, boxvotes, column, columnvotes and a cell's side (box0.5); default: "
-        f"{','.join(DEFAULT_CONTEXT)}, with a base {','.join(CONTEXT_OF_BASE)}",
+        f"{','.join(DEFAULT_CONTEXT)}, of one pass on top of a base {','.join(CONTEXT_OF_BASE)}, of several own besides",
         "See :class:`pdal_stages.classifier.context.Context`. The default leaves the point's own probabilities out: the "
         "next pass sees the same features and does better by what is said around it.",
     )
@@ -284,8 +286,10 @@ class TrainingOptions:
         if self.folds == 1:
             raise OptionError("'folds' must be 0 or at least 2", found=1)
         self._check_algorithm()
+        if self.passes is None:
+            object.__setattr__(self, "passes", 2 if self.base is None else 1)
         if self.context is None:
-            object.__setattr__(self, "context", DEFAULT_CONTEXT if self.base is None else CONTEXT_OF_BASE)
+            object.__setattr__(self, "context", self._default_context())
         self._check_base()
         put("context", lambda _, tokens: Context.parse(tokens).tokens)
         if self.passes > 1 and not self.context:
@@ -329,6 +333,11 @@ class TrainingOptions:
         if own is not None:
             object.__setattr__(self, self.algorithm, own)
 
+    def _default_context(self) -> tuple[str, ...]:
+        if self.base is None:
+            return DEFAULT_CONTEXT
+        return CONTEXT_OF_BASE if self.passes == 1 else (OWN, *DEFAULT_CONTEXT)
+
     def _check_base(self) -> None:
         if self.base is None:
             return
@@ -341,7 +350,8 @@ class TrainingOptions:
             raise OptionError(
                 "'leave_one_survey_out' is not for a model with a 'base'", cure="Leave one of them out"
             )
-        object.__setattr__(self, "voxel", self.base.voxel)
+        if self.passes == 1:
+            object.__setattr__(self, "voxel", self.base.voxel)
 
     @property
     def inputs(self) -> tuple[str, ...]:

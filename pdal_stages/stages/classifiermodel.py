@@ -21,6 +21,7 @@ from ..classifier import Model, TrainingCloud, TrainingOptions, summary, train
 from ..classifier.algorithms import ALGORITHMS, Trainer, trainer
 from ..classifier.classes import ClassMap
 from ..classifier.dimensions import ALWAYS, CHECKED, required, welcome
+from ..classifier.refinement import MANY
 from ..classifier.samplefeatures import SHORT
 from ..classifier.sureness import of_the_base
 from ..models import find
@@ -122,7 +123,7 @@ class ClassifierModel(Stage):
         may_be_empty=True,
     )
     leave_one_survey_out: bool = trained("leave_one_survey_out")
-    passes: int = trained("passes")
+    passes: int | None = trained("passes")
     context: list | None = trained("context")
     pass_folds: int = trained("pass_folds")
     files: list = option("list", (), "Files that the model names; default: those of the readers")
@@ -137,7 +138,9 @@ fewer points has them several times, and the counts are in the file. Lists in `t
 sides. Where there is nothing to search, a quarter of the trees is cross-validated all the same, for the score alone
 (`folds` 0: not). With `groups`, points of one tile or flight are held out together instead of blocks; `pdal-stages
 train` holds out each of several files. With `passes` 2, a second forest also reads the first one's [probabilities all
-around a point](../model-file.md#context), and is trained on what they are on ground the first has not seen. With
+around a point](../model-file.md#context), and is trained on what they are on ground the first has not seen. On top of
+a `base` one pass is for few labels, in the base's voxels; two are for a labeled survey, in voxels of its own: the first
+reads what the base says of a point, the second what the first says all around it. With
 `"algorithm": "alsnet"` a network is trained instead, from `dimensions`, `classes`, `strategy`, `seed` and the options
 in `alsnet` ([alsNet](../alsnet.md)). Points of several readers are merged first. `label` names the dimension that
 holds the classes.
@@ -307,6 +310,12 @@ holds the classes.
             report.warnings.append(
                 f"{held:,} of {all_:,} samples of class {code} are, to the base, of a class that no label has, and stay it: "
                 "label some of that class too, or find this one alone (strategy binary, target)"
+            )
+        least = min(one["available"] for one in model.info["classes"] if one["samples"])
+        if self.base is not None and self.training.passes == 1 and least >= MANY:
+            report.notes.append(
+                f"there are {least:,} labels of the rarest class: so many are worth more with passes=2 (pdal-stages train "
+                "--passes 2)"
             )
         if short := model.info["training"].get(SHORT):
             report.warnings.append(
