@@ -12,7 +12,7 @@ OVERRIDES = (
 )
 INPUTS = "Files that PDAL reads, folders, patterns, tile indexes, EPT sources"
 #: Commands that work long enough for a log and progress.
-_LOGGED = ("pipeline", "classify", "objects", "review", "train", "accuracy", "demo")
+_LOGGED = ("pipeline", "classify", "objects", "review", "train", "adapt", "accuracy", "demo")
 
 
 class Adder:

@@ -16,7 +16,7 @@ from .running import run
 
 
 def add_commands(add: Adder) -> None:
-    """``models``, ``train``, ``accuracy`` and ``model``."""
+    """``models``, ``train``, ``adapt``, ``accuracy`` and ``model``."""
     add("models", _models, "List the models that come with the package")
 
     takes = add("train", _train, "Train a model on labeled clouds", overrides=True)
@@ -24,6 +24,11 @@ def add_commands(add: Adder) -> None:
     takes("--model", required=True, help="The model file to write")
     takes(
         "--base", metavar="MODEL", help="A model to build on: standard, or a file; then few labels are enough"
+    )
+    takes(
+        "--passes",
+        type=int,
+        help="Forests one after the other (default: 2; on top of --base 1, for few labels: take 2 for a labeled survey)",
     )
     takes(
         "--classes",
@@ -55,6 +60,19 @@ def add_commands(add: Adder) -> None:
         "flight line (any dimension with a number for each group), and --writers.classifiermodel.survey=UserData says that "
         "points of another number there are of another survey. " + OVERRIDES
     )
+
+    takes = add("adapt", _adapt, "Make a model for a survey without labels, of what another is sure of there")
+    takes("inputs", nargs="+", metavar="input", help=f"One survey's: {INPUTS[0].lower()}{INPUTS[1:]}")
+    takes("--model", required=True, help="The model file to write, for classify --model")
+    takes("--teacher", default="standard", metavar="MODEL", help="The model that is asked; default standard")
+    takes(
+        "--sure",
+        type=float,
+        default=0.7,
+        metavar="SHARE",
+        help="How sure it must be of a point (Reliability) to be believed; default 0.7",
+    )
+    add_tile_arguments(add.choices["adapt"])
 
     takes = add("accuracy", _accuracy, "Compare two class dimensions, or two files", overrides=True)
     takes("inputs", nargs="+", metavar="input", help=f"Classified: {INPUTS[0].lower()}{INPUTS[1:]}")
@@ -104,7 +122,7 @@ def _train(options: argparse.Namespace) -> None:
     from ..tiling.command import options_of, run_training
     from ..tiling.training import TrainTask
 
-    named = ("classes", "neighborhoods", "feature_set", "count", "trees", "base")
+    named = ("classes", "neighborhoods", "feature_set", "count", "trees", "base", "passes")
     extra = {name: value for name in named if (value := getattr(options, name)) is not None}
     files, surveys = input_files(options.inputs), {}
     print_messages(*overlooked(options.inputs))
@@ -120,6 +138,20 @@ def _train(options: argparse.Namespace) -> None:
         stages = train_pipeline(files, options.model, options.overrides, **extra)
         run(options, Pipeline(stages, options.overrides))
     if Path(options.model).is_file():  # not written into a pipe or device
+        print(load_model(options.model))
+
+
+def _adapt(options: argparse.Namespace) -> None:
+    from ..pipeline.ends import overlooked
+    from ..stages.loading import load_model
+    from ..tiling.adapting import AdaptTask
+    from ..tiling.command import interruptible, options_of
+
+    print_messages(*overlooked(options.inputs))
+    task = AdaptTask(options.inputs, options.model, options.teacher, options.sure, options_of(options))
+    with interruptible():
+        print_messages(*task.run())
+    if Path(options.model).is_file():
         print(load_model(options.model))
 
 

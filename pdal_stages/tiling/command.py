@@ -124,7 +124,7 @@ def wants_tiles(options: argparse.Namespace) -> bool:
 
 def run_training(task: TrainTask) -> list[str]:
     """Train in tiles; what is to be told."""
-    with _terminated_as_interrupted():
+    with interruptible():
         return task.run()
 
 
@@ -138,7 +138,7 @@ def run_command(options: argparse.Namespace, source: Path | PipelineSource) -> i
         print(pipeline.validate())
         return 0
     interrupted = False
-    with _terminated_as_interrupted():
+    with interruptible():
         try:
             run = run_tiled(pipeline, chosen, dry_run=options.dry_run, brief=_brief(options))
         except InterruptedRun as stopped:
@@ -218,7 +218,7 @@ def classify(
         print(f"{written.path}: {_counted(written.points, 'point')}{_shares(written, names)}", flush=True)
 
     interrupted = False
-    with _terminated_as_interrupted():
+    with interruptible():
         try:
             run = task.run_tiles(dry_run=options.dry_run, finished=finished, brief=_brief(options))
         except InterruptedRun as stopped:
@@ -356,7 +356,7 @@ def _print_classes(
 
 
 @contextmanager
-def _terminated_as_interrupted():
+def interruptible():
     """A run stopped by a service manager or batch system cleans up like one stopped by Ctrl-C."""
     try:
         before = signal.signal(signal.SIGTERM, signal.default_int_handler)

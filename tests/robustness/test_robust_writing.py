@@ -67,6 +67,7 @@ SITES = {
     "synthetic/demo:_work": _WHOLE,
     "synthetic/demo:run_demo": _WHOLE,
     "synthetic/townfile:write_town": "town",
+    "tiling/adapting:AdaptTask.run": "adapted model",
     "tiling/alike:_tried": _SCRATCH,
     "tiling/alike:write_alike": "tiles: output of a file, as small ones have it; test_tiling_alike fills its disk",
     "tiling/byplace:CopyByPlace.__enter__": "a copy that a run goes on without; test_tiling_copies fills its disk",

@@ -127,6 +127,9 @@ CASES = {
     "writers.ogr shapefile": pdal("o.shp", {"type": "writers.ogr"}),
     "writers.gdal": pdal("o.tif", {"type": "writers.gdal", "resolution": 1, "output_type": "mean"}),
     "model": ours("o.model", {"type": "writers.classifiermodel", **FOREST}, "filename", exact=False),
+    "adapted model": plain(
+        "o.model", "adapt", "{inputs}/in.las", "--model", "{target}", "--teacher", "{inputs}/in.model", "--sure", "0", exact=False
+    ),
     "thresholds": ours("bins.json", {"type": "filters.multiscalefeatures", "neighborhoods": "c1", "feature_set": "D1"}, "bins"),
     "accuracy json": ours("o.json", {"type": "filters.accuracy", "reference": "Classification", "ignore": []}, "json"),
     "accuracy html": ours("o.html", {"type": "filters.accuracy", "reference": "Classification", "ignore": []}, "html", exact=False),

@@ -1,0 +1,164 @@
+"""A model for a survey without labels: trained on what another model is sure of there, and so on that survey's own ways.
+
+Self-training: what a model that has never seen a survey says of it is right, nearly always, where it is sure; these points
+show how roofs, crowns and ground look in this sensor's points, at this density, in this land. A model of them alone knows
+nothing else, and is better there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from ..base import checks, kinds, las
+from ..base.errors import StageError
+from ..base.outputs import Output, check_outputs
+from ..pipeline.classifying import ClassifyRequest
+from ..pipeline.ends import input_files, is_las, outputs_of
+from ..pipeline.run import Pipeline
+from ..pipeline.trainjob import train_pipeline
+from ..stages.loading import digest_of, load_model
+from .classify import ClassifyTask
+from .settings import TilingOptions
+from .training import TrainTask
+
+#: Reliability from which on a model is believed. Of eleven surveys none is worse by more than 0.01 with 0.7.
+SURE = 0.7
+#: Samples of a class: enough for one survey, and quickly trained.
+COUNT = 10_000
+#: A class of which the teacher is sure of fewer points is left out: these may well be its errors.
+FEWEST = 200
+#: Points to look at: of a larger survey some of its files, spread over it.
+MOST = 20_000_000
+
+
+@dataclass(frozen=True)
+class AdaptTask:
+    """What a model is made for.
+
+    Attributes
+    ----------
+    inputs : sequence of str
+        Files, folders, patterns, tile indexes of one survey; of the classes they have noise and overlap alone count.
+    model : str
+        The file to write.
+    teacher : str
+        The model that says what it sees.
+    sure : float
+        Its least ``Reliability`` that counts.
+    options : TilingOptions
+    """
+
+    inputs: Sequence[str]
+    model: str
+    teacher: str = "standard"
+    sure: float = SURE
+    options: TilingOptions = field(default_factory=TilingOptions)
+
+    def run(self) -> list[str]:
+        """Write the model; what is to be told.
+
+        Raises
+        ------
+        StageError
+            Where an input cannot be read, or the teacher is sure of fewer than two classes.
+        """
+        sure = checks.number("'sure'", self.sure, 0.0, 1.0)
+        teacher, files = load_model(self.teacher), input_files(self.inputs)
+        check_outputs([Output(self.model, "model", kinds.MODEL)], files)
+        chosen, told = spread(files)
+        place = Path(self.model).absolute().parent
+        with TemporaryDirectory(prefix=".pdal-stages-adapt-", dir=place) as folder:
+            classified = self._classified(chosen, Path(folder))
+            found = sure_points(classified, sure, teacher.codes.tolist())
+            codes = [code for code, count in found.items() if count >= FEWEST]
+            if len(codes) < 2:
+                counts = ", ".join(f"{count:,} of class {code}" for code, count in found.items())
+                raise StageError(
+                    f"'{self.teacher}' is sure of {FEWEST:,} points or more of fewer than two of its classes",
+                    found=counts,
+                    cure="Adapt to more of the survey, or use that model itself",
+                )
+            given: dict[str, Any] = {
+                "classes": ",".join(map(str, codes)),
+                "where": f"Reliability >= {sure:g}",
+                "voxel": teacher.voxel,
+                "count": COUNT,
+                "folds": 0,  # a score by the teacher's own answers would be none
+            }
+            made = str(Path(folder) / "adapted.model")
+            task = TrainTask(classified, made, (), given, self.options)
+            if task.in_one_piece():
+                Pipeline(train_pipeline(classified, made, **given)).execute(arrays=False)
+            else:
+                told += task.run()
+            model = load_model(made)
+            name = Path(self.teacher).stem
+            info = {**model.info, "teacher": {"name": name, "sha256": digest_of(self.teacher), "sure": sure}}
+            replace(model, info=info).save(self.model)
+        missing = [f"{found[code]:,} points of class {code}" for code in found if code not in codes]
+        if missing:
+            told.append(
+                f"'{self.teacher}' is sure of too few points of a class ({', '.join(missing)}): the model does not know it"
+            )
+        return told
+
+    def _classified(self, files: Sequence[str], folder: Path) -> list[str]:
+        """The inputs as the teacher classifies them."""
+        request = ClassifyRequest(self.teacher, dimensions=("Reliability",))
+        task = ClassifyTask(tuple(files), f"{folder}/classified/", request, self.options)
+        if task.in_one_piece():
+            return [task.run_whole().path]
+        if task.can_be_cut:
+            run = task.run_tiles(brief=True)
+            if run.failures:
+                raise StageError(
+                    f"{len(run.failures):,} parts of the survey cannot be classified",
+                    found="; ".join(str(one) for one in run.failures[:3]),
+                    cure="Mend or leave out what is named",
+                )
+            return sorted(str(one) for one in (folder / "classified").rglob("*.la[sz]"))
+        for source, answer in task.run_each():
+            if isinstance(answer, str):
+                raise StageError(f"{source} cannot be classified", found=answer)
+        return outputs_of(list(files), task.output)
+
+
+def spread(files: Sequence[str], most: int = MOST) -> tuple[list[str], list[str]]:
+    """Every so many-th file, so that they have about `most` points; and what is to be told."""
+    if not all(map(is_las, files)):
+        return list(files), []
+    points = 0
+    for name in files:
+        try:
+            header = las.read_header(name)
+        except OSError:
+            header = None
+        if header is None:
+            return list(files), []  # what is wrong is said when it is read
+        points += header.count
+    step = min(max(1, round(points / most)), len(files))
+    if step == 1:
+        return list(files), []
+    chosen = list(files[step // 2 :: step])
+    return chosen, [
+        f"{len(chosen):,} of {len(files):,} files are looked at, every {step}th: so many points are enough"
+    ]
+
+
+def sure_points(files: Sequence[str], sure: float, codes: Sequence[int]) -> dict[int, int]:
+    """Of each class, the points of classified files whose ``Reliability`` is at least `sure`."""
+    import laspy
+
+    total = np.zeros(256, np.int64)
+    for name in files:
+        with laspy.open(name) as file:
+            for points in file.chunk_iterator(1_000_000):
+                good = np.asarray(points["Reliability"]) >= sure
+                total += np.bincount(np.asarray(points.classification)[good], minlength=256)
+    return {code: int(total[code]) for code in codes}

@@ -1,0 +1,137 @@
+"""`adapt`: a model for a survey without labels, of what another is sure of there."""
+
+from __future__ import annotations
+
+import laspy
+import numpy as np
+import pytest
+
+import pdal_stages as ps
+from pdal_stages.cli import main
+from pdal_stages.tiling import adapting
+from pdal_stages.tiling.adapting import spread, sure_points
+
+pytestmark = pytest.mark.pdal
+
+TOWN = ps.make_town(80.0, 4.0, seed=5)
+
+
+def run(capsys, *words):
+    """Exit code, and all that was said."""
+    code = main([*map(str, words), "--no-progress"])
+    return code, "".join(capsys.readouterr())
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory, write_las):
+    """A town in two files with classes of its own, and the same without any."""
+    folder = tmp_path_factory.mktemp("town")
+    random = np.random.default_rng(0)
+    east = TOWN.xyz[:, 0] > 500_043.0
+    for name, codes in (
+        ("labeled", random.choice([0, 1, 2, 5, 6], len(east))),
+        ("bare", np.zeros(len(east))),
+    ):
+        (folder / name).mkdir()
+        for number, mine in enumerate((east, ~east)):
+            points = dict(zip("XYZ", TOWN.xyz[mine].T, strict=True))
+            points["Classification"] = codes[mine].astype(np.uint8)
+            write_las(folder / name / f"t{number}.laz", points, point_format=6)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def model(town):
+    """Adapted to the town."""
+    path = town / "town.model"
+    assert main(["adapt", str(town / "bare"), "--model", str(path), "--no-progress"]) == 0
+    return path
+
+
+def test_is_a_model_that_says_what_it_is_of(model, town, tmp_path, capsys):
+    made = ps.load_model(model)
+    assert made.codes.tolist() == [2, 5, 6] and len(made.passes) == 2
+    standard = ps.load_model("standard")
+    assert made.voxel == standard.voxel and made.info["preparation"] == standard.info["preparation"]
+    assert made.info["teacher"]["name"] == "standard" and made.info["teacher"]["sure"] == adapting.SURE
+    assert "what standard is sure of (0.7 and more)" in str(made)
+    source, target = town / "bare" / "t0.laz", tmp_path / "o.laz"
+    code, said = run(capsys, "classify", source, target, "--model", model, "--keep-sure", "0.9")
+    assert (
+        code == 1 and "it was never scored" in said
+    )  # by answers of a teacher nothing is known of how right it is
+    assert run(capsys, "classify", source, target, "--model", model)[0] == 0
+    truth = TOWN.classification[TOWN.xyz[:, 0] > 500_043.0]
+    found = np.asarray(laspy.read(target).classification)
+    known = np.isin(truth, (2, 5, 6))
+    assert (found == truth)[known].mean() > 0.9
+
+
+@pytest.mark.parametrize("more", [("--tile", "40", "--workers", "0"), ("--tile", "61", "--workers", "1")])
+def test_tiles_and_classes_that_are_there_change_nothing(model, town, tmp_path, capsys, more):
+    other = tmp_path / "o.model"
+    assert run(capsys, "adapt", town / "labeled", "--model", other, *more)[0] == 0
+    assert other.read_bytes() == model.read_bytes()
+    assert [one.name for one in tmp_path.iterdir()] == ["o.model"]
+
+
+def test_only_what_is_sure_is_learned(model, town, tmp_path, capsys):
+    other = tmp_path / "o.model"
+    assert run(capsys, "adapt", town / "bare", "--model", other, "--sure", "0.95")[0] == 0
+    few, many = (
+        sum(one["available"] for one in ps.load_model(path).info["classes"]) for path in (other, model)
+    )
+    assert few < many
+    assert run(capsys, "classify", town / "bare", tmp_path / "out", "--dimensions", "Reliability")[0] == 0
+    files = [tmp_path / "out" / f"t{number}.laz" for number in range(2)]
+    counts = dict.fromkeys((2, 5, 6), 0)
+    for file in map(laspy.read, files):
+        good = np.asarray(file["Reliability"]) >= 0.95
+        for one in counts:
+            counts[one] += int((good & (np.asarray(file.classification) == one)).sum())
+    assert sure_points([str(one) for one in files], 0.95, (2, 5, 6)) == counts
+
+
+def test_a_class_that_is_not_there(town, tmp_path, write_las, capsys):
+    wood = (TOWN.classification != 6) & (TOWN.classification != 1)
+    write_las(tmp_path / "wood.laz", dict(zip("XYZ", TOWN.xyz[wood].T, strict=True)), point_format=6)
+    code, said = run(capsys, "adapt", tmp_path / "wood.laz", "--model", tmp_path / "o.model")
+    assert code == 0 and "too few points of a class" in said and "class 6" in said
+    assert ps.load_model(tmp_path / "o.model").codes.tolist() == [2, 5]
+    flat = np.random.default_rng(0).uniform(0, 60, (3, 9000)) * [[1], [1], [0.001]]
+    write_las(tmp_path / "flat.laz", dict(zip("XYZ", flat, strict=True)), point_format=6)
+    code, said = run(capsys, "adapt", tmp_path / "flat.laz", "--model", tmp_path / "p.model")
+    assert code == 1 and "fewer than two of its classes" in said and "of class 2" in said
+    assert {one.name for one in tmp_path.iterdir()} == {"wood.laz", "flat.laz", "o.model"}
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (("nix.laz", "--model", "o.model"), "there is no such file"),
+        (("{town}/bare", "--model", "nix/o.model"), "does not exist"),
+        (("{town}/bare", "--model", "o.model", "--sure", "1.5"), "from 0 to 1"),
+        (("{town}/bare", "--model", "o.model", "--teacher", "standart"), "standart"),
+        (("{town}/bare/t0.laz", "--model", "{town}/bare/t0.laz"), "t0.laz"),
+        (("cut.laz", "--model", "o.model"), "cut.laz"),
+    ],
+)
+def test_what_is_wrong_is_said_and_nothing_is_left(town, tmp_path, capsys, monkeypatch, words, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cut.laz").write_bytes((town / "bare" / "t0.laz").read_bytes()[:9000])
+    before = (town / "bare" / "t0.laz").read_bytes()
+    code, told = run(capsys, "adapt", *(word.format(town=town) for word in words))
+    assert code != 0 and said in told
+    assert (town / "bare" / "t0.laz").read_bytes() == before
+    assert [one.name for one in tmp_path.iterdir()] == ["cut.laz"]
+
+
+def test_of_many_files_some_are_looked_at(town):
+    files = [str(town / "bare" / f"t{number % 2}.laz") for number in range(9)]
+    assert spread(files) == (files, [])
+    points = sum(len(laspy.read(file)) for file in files)
+    chosen, told = spread(files, points // 3)
+    assert chosen == files[1::3] and "3 of 9 files" in told[0]
+    chosen, _ = spread(files[:2], 10)
+    assert len(chosen) == 1
+    assert spread(["a.ply"], 10) == (["a.ply"], [])
