@@ -72,7 +72,8 @@ class AdaptTask:
         teacher, files = load_model(self.teacher), input_files(self.inputs)
         check_outputs([Output(self.model, "model", kinds.MODEL)], files)
         chosen, told = spread(files)
-        place = Path(self.model).absolute().parent
+        model = Path(self.model).absolute()
+        place = model.parent if model.is_file() or not model.exists() else None  # not beside a device
         with TemporaryDirectory(prefix=".pdal-stages-adapt-", dir=place) as folder:
             classified = self._classified(chosen, Path(folder))
             found = sure_points(classified, sure, teacher.codes.tolist())
@@ -97,10 +98,9 @@ class AdaptTask:
                 Pipeline(train_pipeline(classified, made, **given)).execute(arrays=False)
             else:
                 told += task.run()
-            model = load_model(made)
-            name = Path(self.teacher).stem
-            info = {**model.info, "teacher": {"name": name, "sha256": digest_of(self.teacher), "sure": sure}}
-            replace(model, info=info).save(self.model)
+            new, name = load_model(made), Path(self.teacher).stem
+            of = {"name": name, "sha256": digest_of(self.teacher), "sure": sure}
+            replace(new, info={**new.info, "teacher": of}).save(self.model)
         missing = [f"{found[code]:,} points of class {code}" for code in found if code not in codes]
         if missing:
             told.append(
