@@ -114,7 +114,7 @@ def test_a_file_holds_the_base(base, tmp_path, more):
     model = on_top(base, passes=more, prior_weight=0.3)
     assert [one.name for one in model.passes] == ["random_forest"] * 2 + ["refined_forest"] * more
     assert model.voxel == (base.voxel if more == 1 else FEW["voxel"]) and model.halo_m > base.halo_m
-    assert [one.factors is not None for one in model.passes[2:]] == [False] * (more - 1) + [more > 1]
+    assert [one.blend.factors is not None for one in model.passes[2:]] == [False] * (more - 1) + [more > 1]
     assert model.passes[2].context.tokens == (("own",) if more > 1 else model.passes[-1].context.tokens)
     model.save(tmp_path / "m.model")
     again = load_model(tmp_path / "m.model")
@@ -261,19 +261,21 @@ def test_two_passes_equal_the_passes_by_hand(base):
     model = on_top(base, keep=base.codes.tolist()[:-1], passes=2, voxel=0, n=200, prior_weight=0.5)
     xyz, _, dimensions = scene(seed=7, n=4000)
     first, second = model.passes[-2:]
-    values, labeled = computed(first.features, xyz, dimensions), list(first.labeled)
+    values, labeled = computed(first.features, xyz, dimensions), list(first.blend.labeled)
     said = of_the_base(base, xyz, dimensions)
     read = np.hstack([values, (said / WHOLE).astype(np.float32)])
     own = read[:, values.shape[1] :].astype(float)
     own /= own.sum(axis=1, keepdims=True)
     grown = first.forest.predict_proba(read)
-    shares = count_shares(by_hand(own, grown, first.before, labeled, first.trusted))
+    shares = count_shares(by_hand(own, grown, first.blend.before, labeled, first.blend.trusted))
     rows = np.arange(0, len(xyz), 9)
     columns = reference(xyz, shares, rows, second.context)
-    grown = weighed(second.forest.predict_proba(np.hstack([values[rows], columns])), np.array(second.factors))
+    grown = weighed(
+        second.forest.predict_proba(np.hstack([values[rows], columns])), np.array(second.blend.factors)
+    )
     own = columns[:, : len(model.codes)].astype(float)
     own /= own.sum(axis=1, keepdims=True)
-    p = by_hand(own, grown, second.before, labeled, second.trusted)
+    p = by_hand(own, grown, second.blend.before, labeled, second.blend.trusted)
     got = model.predict(xyz, dimensions, probabilities=True).probabilities[rows]
     assert np.allclose(got, p, atol=1e-6)
 
@@ -298,7 +300,9 @@ def test_the_second_is_trained_on_ground_that_the_first_has_not_seen(base, monke
     own = read[:, values.shape[1] :].astype(float)
     own /= own.sum(axis=1, keepdims=True)
     first = model.passes[-2]
-    shares = count_shares(by_hand(own, grown, first.before, list(first.labeled), first.trusted))
+    shares = count_shares(
+        by_hand(own, grown, first.blend.before, list(first.blend.labeled), first.blend.trusted)
+    )
     some = np.arange(0, len(passes.samples), 5)
     rows = passes.samples.row[some]
     assert np.allclose(context[some], reference(xyz, shares, rows, model.passes[-1].context), atol=2e-5)

@@ -140,7 +140,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
         "created_by": _versions(),
     }
     made = Model(tuple(passes.made), list(zip(classes.codes, classes.names, strict=True)), info, timed)
-    return made if below is None else on_top(below.base, made, below.trusted)
+    return made if below is None else on_top(below, made)
 
 
 def _with_short(counted: Mapping[str, Any], more: int) -> dict[str, Any]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -50,11 +49,11 @@ class Blend:
         What the forest's classes are multiplied by for being frequent.
     """
 
-    before: tuple[int, ...]
-    labeled: tuple[int, ...]
-    trusted: float
-    target: int | None
-    first: int
+    before: tuple[int, ...] = ()
+    labeled: tuple[int, ...] = ()
+    trusted: float = 1.0
+    target: int | None = None
+    first: int = 0
     factors: tuple[float, ...] | None = None
 
     @property
@@ -84,41 +83,11 @@ def trust(labels: int) -> float:
 
 @dataclass(frozen=True, eq=False)
 class RefinedForest(FeatureForest):
-    """The forest on top.
+    """The forest on top; `blend` is how it changes what is said before."""
 
-    Attributes
-    ----------
-    before : tuple of int
-        Classes of the pass before it: the base's, or those of another on top of it.
-    labeled : tuple of int
-        Those the forest was trained on, in the order of its columns.
-    trusted : float
-        See :func:`trust`.
-    target : int or None
-        With the binary strategy, the class that alone is changed.
-    factors : tuple of float or None
-        What its classes are multiplied by for being frequent.
-    """
-
-    before: tuple[int, ...] = ()
-    labeled: tuple[int, ...] = ()
-    trusted: float = 1.0
-    target: int | None = None
-    factors: tuple[float, ...] | None = None
+    blend: Blend = Blend()
 
     name: ClassVar[str] = "refined_forest"
-
-    @cached_property
-    def blend(self) -> Blend:
-        """What it does to the pass before."""
-        assert self.context is not None
-        first = own_column(len(self.plan.names), self.context, len(self.before))
-        return Blend(self.before, self.labeled, self.trusted, self.target, first, self.factors)
-
-    @property
-    def codes(self) -> list[int]:
-        """The classes that come out."""
-        return self.blend.codes
 
     @classmethod
     def from_file(
@@ -147,24 +116,25 @@ class RefinedForest(FeatureForest):
         check_names(features.plan, context.names(before), entry)
         forest = Forest.from_arrays(arrays, len(entry["feature_names"]), len(labeled))
         weights = None if factors is None else tuple(map(float, factors))
-        made = cls(features, forest, context, before, labeled, trusted, target, weights)
-        if made.codes != list(codes):
+        first = own_column(len(features.plan.names), context, len(before))
+        blend = Blend(before, labeled, trusted, target, first, weights)
+        if blend.codes != list(codes):
             raise ModelError(
-                "the classes of a refined forest do not add up to the model's", found=made.codes[:10]
+                "the classes of a refined forest do not add up to the model's", found=blend.codes[:10]
             )
-        return made
+        return cls(features, forest, context, blend)
 
     def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
         """What a model file says of it beside its arrays."""
-        entry = super().to_file(codes)
-        own = {"before": list(self.before), "labeled": list(self.labeled), "trusted": self.trusted}
-        if self.factors is not None:
-            own["factors"] = list(self.factors)
-        return {**entry, "parameters": {**entry["parameters"], **own, "target": self.target}}
+        entry, blend = super().to_file(codes), self.blend
+        own = {"before": list(blend.before), "labeled": list(blend.labeled), "trusted": blend.trusted}
+        if blend.factors is not None:
+            own["factors"] = list(blend.factors)
+        return {**entry, "parameters": {**entry["parameters"], **own, "target": blend.target}}
 
     def classes_before(self, codes: Sequence[int]) -> list[int]:
         """Those of the pass before."""
-        return list(self.before)
+        return list(self.blend.before)
 
     def probabilities(
         self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64] | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -94,24 +94,19 @@ class Below:
         return said / np.maximum(said.sum(axis=1, keepdims=True), 1e-9)
 
 
-def on_top(base: Model, made: Model, trusted: float) -> Model:
+def on_top(below: Below, made: Model) -> Model:
     """The model of the base's passes and those of `made`, with the classes of both."""
-    target, priors, labeled = made.info["target"], made.info["priors"], tuple(made.codes.tolist())
-    last, added = len(made.passes) - 1, []
-    before = tuple(base.codes.tolist())
-    for number, forest in enumerate(made.passes):
+    base, priors, added = below.base, made.info["priors"], []
+    before = base.codes.tolist()
+    for forest in made.passes:
         shared = {field.name: getattr(forest, field.name) for field in fields(forest)}
-        weighs = (
-            last and number == last and priors is not None
-        )  # a few labels say nothing of how frequent a class is
-        factors = tuple(priors["factors"]) if weighs else None
-        refined = RefinedForest(
-            **shared, before=before, labeled=labeled, trusted=trusted, target=target, factors=factors
-        )
-        added.append(refined)
-        before = tuple(refined.codes)
+        blend = below.blend(before, made.codes.tolist(), len(forest.plan.names), forest.context)
+        added.append(RefinedForest(**shared, blend=blend))
+        before = blend.codes
+    if len(added) > 1 and priors is not None:  # a few labels say nothing of how frequent a class is
+        added[-1] = replace(added[-1], blend=replace(blend, factors=tuple(priors["factors"])))
     names, entries = dict(base.classes), {one["code"]: one for one in made.info["classes"]}
-    names.update((code, name) for code, name in made.classes if code in refined.codes and code not in names)
+    names.update((code, name) for code, name in made.classes if code in before and code not in names)
     unseen = {"available": 0, "samples": 0, "duplicates": 0}
     inherited = {one["code"]: {"labels": one["labels"]} for one in base.info["classes"]}
     scores = []
@@ -126,14 +121,14 @@ def on_top(base: Model, made: Model, trusted: float) -> Model:
         "background": None,
         "classes": [
             {**unseen, **inherited.get(code, {}), **entries.get(code, {}), "code": code, "name": names[code]}
-            for code in refined.codes
+            for code in before
         ],
         "priors": None,
         "densities": _spanned(base.info.get("densities"), made.info["densities"]),
         "preparation": base.info.get("preparation") or [],
         "passes": [*scores, *made.info["passes"]],
     }
-    return Model((*base.passes, *added), [(code, names[code]) for code in refined.codes], info, made.seconds)
+    return Model((*base.passes, *added), [(code, names[code]) for code in before], info, made.seconds)
 
 
 def held_by_base(below: Below, codes: Sequence[int]) -> dict[str, list[int]]:
