@@ -85,7 +85,7 @@ def text(info: Mapping[str, Any]) -> str:
     if gone := training.get("contradicted"):
         lines.append(f"left out       labels that their height contradicts: {_counts(gone)}")
     lines += ["", f"{'class':<34}{'available':>12}{'samples':>10}{'duplicates':>12}{'F1 out of bag':>15}"]
-    bag = info["passes"][-1]["out_of_bag"] or {}
+    bag = out_of_bag(info)
     for entry in info["classes"]:
         f1 = (bag.get("f1") or {}).get(str(entry["code"]))
         lines.append(
@@ -100,6 +100,11 @@ def text(info: Mapping[str, Any]) -> str:
             top = list(one["importances"][by].items())[:10]
             lines.append(f"importance by {by:<13}" + ", ".join(f"{k} {100 * v:.1f} %" for k, v in top))
     return "\n".join(lines)
+
+
+def out_of_bag(info: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The last pass's score; none where its labels were another model's answers."""
+    return {} if info.get("teacher") else info["passes"][-1]["out_of_bag"] or {}
 
 
 def _short(name: str) -> str:
@@ -118,6 +123,11 @@ def _in_one_line(value: Any) -> Any:
 
 def scores(info: Mapping[str, Any], held_out: dict[str, Any] | None = None) -> list[str]:
     """Lines of scores, the most honest first; `held_out`: a network's own, over points as they lie."""
+    if teacher := info.get("teacher"):
+        return [
+            f"not scored     {teacher['name']}'s answers are its labels; how right it is only your own tell",
+            "",
+        ]
     names = ("overall_accuracy", "kappa", "mean_f1")
     if isinstance(held_out, dict) and all(isinstance(held_out.get(n), float | None) for n in names):
         return [

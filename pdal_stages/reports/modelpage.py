@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from ..accuracy.text import percent
 from ..base import checks
 from ..base.files import write_whole
-from ..classifier.summary import held_out_by
+from ..classifier.summary import held_out_by, out_of_bag
 from .charts import Chart
 from .page import render
 
@@ -52,7 +52,7 @@ def model_page(model: Model, name: str = "") -> str:
         subtitle=f"{last['algorithm'].replace('_', ' ')}, {len(last['feature_names']):,} features of a point",
         model=described,
         scores=_scores(described),
-        out_of_bag=(last["out_of_bag"] or {}).get("f1") or {},
+        out_of_bag=out_of_bag(described).get("f1") or {},
         prior_factors=priors,
         curves=_curves(described["training"].get("curve")),
         crossed=described["accuracy"]["cross_validation"],
@@ -69,8 +69,8 @@ def _scores(d: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
         row, detail = held, "on ground held out, which chose the epoch"
     elif crossed:
         row, detail = crossed["chosen"], f"{held_out_by(crossed)}; classes weigh the same"
-    elif d["passes"][-1]["out_of_bag"]:
-        row, detail = d["passes"][-1]["out_of_bag"], "out of bag, flattered by neighboring samples"
+    elif bag := out_of_bag(d):
+        row, detail = dict(bag), "out of bag, flattered by neighboring samples"
     else:
         return []
     titles = {"overall_accuracy": "Overall accuracy", "kappa": "Kappa", "mean_f1": "Mean F1"}
@@ -115,7 +115,7 @@ def _curve(points: list[tuple[float, float]], title: str, is_share: bool) -> Cha
 
 
 def _settings(d: Mapping[str, Any]) -> dict[str, Any]:
-    keep = ("required_dimensions", "halo_m", "strategy", "target", "created_by")
+    keep = ("teacher", "required_dimensions", "halo_m", "strategy", "target", "created_by")
     out = {key: d[key] for key in keep if d.get(key) is not None}
     for number, one in enumerate(d["passes"], 1):
         what = {key: one[key] for key in ("algorithm", "parameters", "features", "context") if one[key]}
