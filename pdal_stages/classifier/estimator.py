@@ -14,7 +14,7 @@ from sklearn.utils.validation import check_is_fitted
 from ..base.errors import OptionError
 from .model import Model
 from .training import train
-from .trainoptions import TrainingOptions
+from .trainoptions import DEFAULT_PASSES, TrainingOptions
 
 
 class PointClassifier(ClassifierMixin, BaseEstimator):
@@ -62,7 +62,7 @@ class PointClassifier(ClassifierMixin, BaseEstimator):
         trees: Any = TrainingOptions.trees,
         min_samples_leaf: Any = TrainingOptions.min_samples_leaf,
         prior_weight: float = TrainingOptions.prior_weight,
-        passes: int | None = TrainingOptions.passes,
+        passes: int = DEFAULT_PASSES,
         thin: Any = TrainingOptions.thin,
         seed: int = TrainingOptions.seed,
         threads: int | None = TrainingOptions.threads,

@@ -24,6 +24,8 @@ from .refinement import check_base
 MOST_PASSES = 3
 #: Samples of a class that a tree draws on average, at most, where `max_samples` is not given.
 PER_TREE = 10_000
+#: How many it has by default, and on top of a base, where labels are few.
+DEFAULT_PASSES, PASSES_ON_BASE = 2, 1
 #: What passes after the first read of the surroundings.
 DEFAULT_CONTEXT = ("box1", "box4", "columnvotes1", "columnvotes4", "columnvotes8")
 #: The same of a forest on top of a base.
@@ -287,7 +289,7 @@ class TrainingOptions:
             raise OptionError("'folds' must be 0 or at least 2", found=1)
         self._check_algorithm()
         if self.passes is None:
-            object.__setattr__(self, "passes", 2 if self.base is None else 1)
+            object.__setattr__(self, "passes", DEFAULT_PASSES if self.base is None else PASSES_ON_BASE)
         if self.context is None:
             object.__setattr__(self, "context", self._default_context())
         self._check_base()
