@@ -12,7 +12,7 @@ extremes, so that no order of points and no tile matters:
    unless ground as deep is near: then it is a courtyard or a well of light (:mod:`.envelope`).
 4. Echoes from just below the ground are joined to it. Columns whose lowest point lies below the plane, as in 3, show
    them, where few columns do so side by side.
-5. Where so much is low that it is no noise, it is the ground, of which a canopy lets single points through.
+5. Some of that is the ground, of which a canopy lets single points through (:mod:`.sheets`).
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from .columns import columns
 from .envelope import ENOUGH, FAR, NEAR, WIDER, envelope, has_company, supported_columns
 from .minima import cell_numbers
 from .patches import patches
+from .sheets import take_back
 
 LOW, HIGH = NOISE
 #: The gap in meters grows by this with each point of a cluster, and with the spacing of points beyond DENSE meters.
@@ -44,8 +45,6 @@ IN_LINE, WIRES, HANGING = 14, 4, 5.0
 STRUNG, STRUNG_SHARE = 4, 0.3
 #: How far below the plane a suspect lies at least, in units of the scatter.
 SCATTERS = 4.0
-#: More than such a share of the points around, and of the columns that hold any, so many at least, is no noise.
-TOO_MANY, COLUMNS = 0.025, 6
 #: The same of echoes from just below, the share of `depth` that is enough there, and the most such columns in 5 x 5.
 JUST_SCATTERS, JUST, TOGETHER = 5.0, 0.8, 4
 #: Heights beyond this, in meters, are noise whatever else there is.
@@ -141,7 +140,7 @@ def _judge(x, y, z, column, row, cluster, gap, depth):
     _just_below(base, supported, JUST * depth, below)
     marks = verdict[voxel]
     _mark_below(z, column, row, left, bottom, below, marks)
-    _take_back(column, row, left, bottom, np.zeros((2, h, w), np.int32), marks)
+    take_back(z, column, row, left, bottom, base, supported, SIDE, LOW, marks)
     return marks
 
 
@@ -283,21 +282,6 @@ def _low(keys, suspect, extremes, base, supported, depth, verdict):
             verdict[k] = LOW
 
 
-@device
-def _too_many(points, low, j, i):
-    """Whether more around a column is low than noise is."""
-    h, w = points.shape
-    every = deep = full = held = 0
-    for b in range(max(j - FAR, 0), min(j + FAR + 1, h)):
-        for a in range(max(i - FAR, 0), min(i + FAR + 1, w)):
-            if (b - j) ** 2 + (a - i) ** 2 <= FAR * FAR:
-                every += points[b, a]
-                deep += low[b, a]
-                full += points[b, a] > 0
-                held += low[b, a] > 0
-    return held >= COLUMNS and held > TOO_MANY * full and deep > TOO_MANY * every
-
-
 @njit
 def _just_below(base, supported, least, below):
     """Fill `below` with the level that points of a column must not lie under; NaN where there is none."""
@@ -333,16 +317,3 @@ def _mark_below(z, column, row, left, bottom, below, marks):
     for p in range(len(z)):
         if marks[p] == 0 and z[p] < below[row[p] - bottom, column[p] - left]:
             marks[p] = LOW
-
-
-@njit
-def _take_back(column, row, left, bottom, number, marks):
-    """Take low noise back where it is too many; `number` (2, h, w), all 0, is for the points of columns and the low ones."""
-    points, low = number
-    for p in range(len(marks)):
-        points[row[p] - bottom, column[p] - left] += 1
-        low[row[p] - bottom, column[p] - left] += marks[p] == LOW
-    for p in range(len(marks)):
-        j, i = row[p] - bottom, column[p] - left
-        if marks[p] == LOW and _too_many(points, low, j, i):
-            marks[p] = 0
