@@ -61,9 +61,7 @@ def test_is_a_model_that_says_what_it_is_of(model, town, tmp_path, capsys):
     assert "Overall accuracy" not in page.read_text() and "teacher" in page.read_text()
     source, target = town / "bare" / "t0.laz", tmp_path / "o.laz"
     code, said = run(capsys, "classify", source, target, "--model", model, "--keep-sure", "0.9")
-    assert (
-        code == 1 and "it was never scored" in said
-    )  # by answers of a teacher nothing is known of how right it is
+    assert code == 1 and "it was never scored" in said and "Its labels are another model's answers" in said
     assert run(capsys, "classify", source, target, "--model", model)[0] == 0
     truth = TOWN.classification[TOWN.xyz[:, 0] > 500_043.0]
     found = np.asarray(laspy.read(target).classification)
@@ -114,7 +112,7 @@ def test_a_class_that_is_not_there(town, tmp_path, write_las, capsys):
     [
         (("nix.laz", "--model", "o.model"), "there is no such file"),
         (("{town}/bare", "--model", "nix/o.model"), "does not exist"),
-        (("{town}/bare", "--model", "o.model", "--sure", "1.5"), "from 0 to 1"),
+        (("{town}/bare", "--model", "o.model", "--sure", "1.5"), "'--sure' must be a number from 0 to 1"),
         (("{town}/bare", "--model", "o.model", "--teacher", "standart"), "standart"),
         (("{town}/bare/t0.laz", "--model", "{town}/bare/t0.laz"), "t0.laz"),
         (("cut.laz", "--model", "o.model"), "cut.laz"),

@@ -289,7 +289,7 @@ def test_without_the_extra(monkeypatch):
         raise ImportError(f"No module named '{name}'")
 
     monkeypatch.setattr(outlines.importlib, "import_module", missing)
-    with pytest.raises(StageError, match=r"pip install 'pdal-stages\[vector\]'"):
+    with pytest.raises(StageError, match=r"outlines need shapely .* Install the extra: .*vector"):
         outlines.vector("shapely")
 
 

@@ -204,6 +204,9 @@ def test_slow_rates_are_no_zero(monkeypatch):
         bar.started -= 20
         bar.update(1)
     assert "0.05 trees/s" in out.getvalue()
+    with Progress(0, "compiling", "kernels") as bar:
+        bar.update(1)
+    assert "compiling: 1 kernel," in out.getvalue()
 
 
 # ---- objects that behave like python-pdal's ----------------------------------------------------------------

@@ -31,8 +31,8 @@ def again(tmp_path, write_las, monkeypatch):
             {"type": "filters.hag_minima", "cell": cell},
             {"type": "writers.las", "filename": str(tmp_path / "out" / "c_#.las"), "extra_dims": "all"},
         ]
-        options = {"resume": True, "brief": True, **options}
-        done = run_tiled(stages, tile, workers=0, progress=False, **options)
+        options = {"resume": True, "brief": True, "progress": False, **options}
+        done = run_tiled(stages, tile, workers=0, **options)
         assert not done.failures
         return done, bool(looked)
 
@@ -81,3 +81,11 @@ def test_another_run_between_is_not_forgotten(again):
 def test_another_side_is_not_the_same_run(again):
     assert again(tile=15.0)[1]
     assert not again(tile=15.0)[1]
+
+
+def test_a_first_run_says_that_it_compiles(again, monkeypatch, capsys):
+    """Workers do not: they show no progress of their own."""
+    for count, asked, said in ((0, None, True), (0, False, False), (1, None, False)):
+        monkeypatch.setattr(tiledrun, "kept_kernels", lambda count=count: count)
+        again(resume=False, progress=asked)
+        assert ("compiling for this processor first" in capsys.readouterr().err) == said

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import sys
 from collections.abc import Iterable
 from functools import partial
+from pathlib import Path
 
 
 class StageError(Exception):
@@ -92,6 +94,14 @@ def suggest(word: str, known: Iterable[str]) -> str:
     return f"Did you mean '{near[0]}'? " if near else ""
 
 
+def how_to_add(extra: str) -> str:
+    """The command that brings an extra of ours."""
+    root = Path(__file__).resolve().parents[2]
+    if Path(sys.prefix) == root / ".venv" and (root / "scripts" / "setup").is_file():
+        return f"{root}/scripts/setup {extra}"
+    return f"pip install 'pdal-stages[{extra}]' (from a clone: pip install '.[{extra}]')"
+
+
 def optional_import(module: str, extra: str, purpose: str):
     """Import a heavy optional package, or say which extra of ours brings it."""
     import importlib
@@ -102,5 +112,5 @@ def optional_import(module: str, extra: str, purpose: str):
         raise DependencyError(
             f"{purpose} needs the Python package '{module}'",
             found=str(error),
-            cure=f"Install it with: pip install 'pdal-stages[{extra}]'",
+            cure=f"Install it with: {how_to_add(extra)}",
         ) from error

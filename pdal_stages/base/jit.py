@@ -271,6 +271,15 @@ def _not_kept(names: Iterable[str]) -> list[Kernel]:
     return found
 
 
+def kept_kernels() -> int:
+    """How many kernels there is compiled code of, of whatever version, without asking numba."""
+    named = os.environ.get("NUMBA_CACHE_DIR")
+    folders = (
+        [Path(named)] if named else [Path(__file__).resolve().parents[1], Path.home() / ".cache" / "numba"]
+    )
+    return sum(1 for folder in folders for _ in folder.rglob("*.nbi"))
+
+
 @contextlib.contextmanager
 def compiled_elsewhere(names: Iterable[str]) -> Iterator[None]:
     """Say on stderr how many of these kernels have come into the cache, whoever compiles them, until the block ends."""

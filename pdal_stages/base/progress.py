@@ -72,7 +72,7 @@ class Progress(AbstractContextManager):
         if self.total:
             text += f" of {self.total:,} {self.unit} ({100.0 * self.count / self.total:.0f} %)"
         else:
-            text += f" {self.unit}"
+            text += f" {self.unit if self.count != 1 else self.unit.removesuffix('s')}"
         text += f", {rate:,.0f} {self.unit}/s" if rate >= 10 else f", {rate:.2g} {self.unit}/s"
         if end:
             text += f", {seconds:.1f} s"

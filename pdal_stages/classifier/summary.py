@@ -76,6 +76,8 @@ def text(info: Mapping[str, Any]) -> str:
         lines.append(f"densities      {densities['low']:.3g} to {densities['high']:.3g} points/m2")
     if info.get("voxel"):
         lines.append(f"voxel          {info['voxel']:g} m, which one point stands for")
+    if base := info.get("base"):
+        lines.append(f"on top of      {base['name']} (SHA-256 {base['sha256']})")
     for cloud in training["clouds"]:
         lines.append(f"trained on     {cloud['name']}, {cloud['points']:,} points")
     if teacher := info.get("teacher"):

@@ -132,11 +132,13 @@ def sureness_of(info: Mapping[str, Any], path: str) -> Sureness:
     beside = Path(path).with_suffix(SUFFIX)
     if beside.is_file():
         return Sureness.from_dict(json.loads(beside.read_text(encoding="utf-8")))
+    cure = "Train it with folds (the default), on labels that lie in more than one place"
+    if info.get("teacher"):
+        cure = "Its labels are another model's answers; take a model that was scored on a person's labels"
     raise OptionError(
         "it is not known how sure this model must be to be right: it was never scored on ground it had not seen",
         found=path,
-        cure="Train it with folds (the default), on labels that lie in more than one place; or set a limit by hand: "
-        "--filters.modelclassifier.reject_below=0.8",
+        cure=f"{cure}; or set a limit by hand: --filters.modelclassifier.reject_below=0.8",
     )
 
 

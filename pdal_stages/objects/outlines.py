@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.apart import apart
-from ..base.errors import DependencyError, StageError
+from ..base.errors import DependencyError, StageError, how_to_add
 from ..base.lean import imported
 from .boundaries import polygon
 from .found import Table
@@ -49,7 +49,7 @@ def vector(name: str) -> Any:
         raise DependencyError(
             f"outlines need {name}",
             found=str(error),
-            cure="Install the extra: pip install 'pdal-stages[vector]'",
+            cure=f"Install the extra: {how_to_add('vector')}",
         ) from None
 
 
@@ -369,13 +369,13 @@ def _parallel(a: _Wall, b: _Wall) -> bool:
     return abs(float(a.way @ b.way)) > 0.995
 
 
-def _meeting(a: _Wall, b: _Wall, near: float = 4.0) -> list[NDArray]:
+def _meeting(a: _Wall, b: _Wall) -> list[NDArray]:
     """Where two walls meet; where that is far from where the first ends on the boundary, the places on both beside it."""
     cross = float(a.way[0] * b.way[1] - a.way[1] * b.way[0])
     away = b.place - a.place
     if abs(cross) > 0.05:
         corner = a.place + a.way * float((away[0] * b.way[1] - away[1] * b.way[0]) / cross)
-        if a.end is None or b.end is None or math.hypot(*(corner - a.end)) <= near:
+        if a.end is None or b.end is None or math.hypot(*(corner - a.end)) <= 4.0:
             return [corner]
     end = a.end if a.end is not None else 0.5 * (a.place + b.place)
     return [wall.place + wall.way * float((end - wall.place) @ wall.way) for wall in (a, b)]
@@ -399,18 +399,18 @@ def _straight_wall(corners: NDArray, angle: float) -> NDArray[np.float64]:
     return _turned(xy[at], -angle)
 
 
-def _attached(xy: NDArray, corners: NDArray, near: float = 2.5, by: float = 4.0) -> NDArray[np.float64]:
+def _attached(xy: NDArray, corners: NDArray) -> NDArray[np.float64]:
     """A line whose ends lie at corners near them, or else go on."""
     out = np.array(xy, np.float64)
     for end, before in ((0, 1), (-1, -2)):
         away = np.hypot(*(corners - out[end]).T)
-        if away.min() <= near:
+        if away.min() <= 2.5:
             out[end] = corners[int(np.argmin(away))]
             continue
         way = out[end] - out[before]
         length = math.hypot(*way)
         if length > 0:
-            out[end] = out[end] + way * (by / length)
+            out[end] = out[end] + way * (4.0 / length)
     return out
 
 

@@ -68,7 +68,7 @@ class Overlay:
             If there is no such file, or no such layer of polygons in it.
         """
         if "://" not in self.file and not Path(self.file).exists():
-            raise StageError("the file of polygons does not exist", where=self.file)
+            raise StageError("the file of polygons does not exist", where=self.file, cure="Check the path")
         try:
             layers = [
                 str(name)

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
-from ..base.errors import PipelineError, StageError
+from ..base.errors import PipelineError, StageError, how_to_add
+from ..base.jit import kept_kernels
 from ..base.memory import free_memory
 from ..base.threads import available_threads
 from ..base.version import __version__
@@ -157,11 +158,7 @@ def _machine() -> Iterator[Finding]:
 
 
 def _kernels() -> Iterator[Finding]:
-    named = os.environ.get("NUMBA_CACHE_DIR")
-    folders = (
-        [Path(named)] if named else [Path(__file__).resolve().parents[1], Path.home() / ".cache" / "numba"]
-    )
-    count = sum(1 for folder in folders for _ in folder.rglob("*.nbi"))
+    count = kept_kernels()
     cure = "" if count else "pdal-stages warmup, once; otherwise the first job waits for the compiler"
     yield Finding("compiled kernels", str(count) if count else "none yet", cure, needed=False)
 
@@ -171,5 +168,5 @@ def _extras() -> Iterator[Finding]:
         try:
             yield Finding(f"extra {extra}", f"{package} {metadata.version(package)}")
         except metadata.PackageNotFoundError:
-            cure = f"pip install 'pdal-stages[{extra}]', for {purpose}"
+            cure = f"{how_to_add(extra)}, for {purpose}"
             yield Finding(f"extra {extra}", f"no {package}", cure, needed=False)

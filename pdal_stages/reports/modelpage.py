@@ -115,7 +115,7 @@ def _curve(points: list[tuple[float, float]], title: str, is_share: bool) -> Cha
 
 
 def _settings(d: Mapping[str, Any]) -> dict[str, Any]:
-    keep = ("teacher", "required_dimensions", "halo_m", "strategy", "target", "created_by")
+    keep = ("base", "teacher", "required_dimensions", "halo_m", "strategy", "target", "created_by")
     out = {key: d[key] for key in keep if d.get(key) is not None}
     for number, one in enumerate(d["passes"], 1):
         what = {key: one[key] for key in ("algorithm", "parameters", "features", "context") if one[key]}

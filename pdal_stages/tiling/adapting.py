@@ -68,7 +68,7 @@ class AdaptTask:
         StageError
             Where an input cannot be read, or the teacher is sure of fewer than two classes.
         """
-        sure = checks.number("'sure'", self.sure, 0.0, 1.0)
+        sure = checks.number("'--sure'", self.sure, 0.0, 1.0)
         teacher, files = load_model(self.teacher), input_files(self.inputs)
         check_outputs([Output(self.model, "model", kinds.MODEL)], files)
         chosen, told = spread(files)
@@ -147,7 +147,7 @@ def spread(files: Sequence[str], most: int = MOST) -> tuple[list[str], list[str]
         return list(files), []
     chosen = list(files[step // 2 :: step])
     return chosen, [
-        f"{len(chosen):,} of {len(files):,} files are looked at, every {step}th: so many points are enough"
+        f"{len(chosen):,} of {len(files):,} files are looked at, one in {step}: so many points are enough"
     ]
 
 

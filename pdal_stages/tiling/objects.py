@@ -125,7 +125,8 @@ def _write(
         shutil.rmtree(_kept(stage.filename), ignore_errors=True)
     summary = found.summary()
     for kind, one in summary.items():
-        print(f"{one['objects']:,} {kind}, {one['to_be_checked']:,} to be checked")
+        word = kind if one["objects"] != 1 else kind.removesuffix("s")
+        print(f"{one['objects']:,} {word}, {one['to_be_checked']:,} to be checked")
         for reason, count in one["reasons"].items():
             print(f"  {reason:28s} {count:>10,}")
     if stage.refuse:

@@ -12,6 +12,8 @@ from typing import Any
 
 from ..base.errors import StageError
 from ..base.files import sweep
+from ..base.jit import kept_kernels
+from ..base.plain import print_messages
 from ..pipeline import classflags
 from ..pipeline.overrides import Override
 from ..pipeline.read import PipelineSource
@@ -132,6 +134,8 @@ def run_plan(
         return estimate(plan, survey)
     if not folder.is_dir():
         raise StageError("the folder of the output does not exist", found=str(folder), cure="Create it first")
+    if plan.makes and progress is not False and not chosen.scheduler and not kept_kernels():
+        print_messages("compiling for this processor first, once: it takes a minute or two")
     folders = {folder}
     if survey.per == "file":  # refused now, not after reading all inputs
         named = outputs_for(plan, survey.names, survey.paths)
