@@ -17,7 +17,7 @@ from pdal_stages.base.asprs import class_color, class_name
 from pdal_stages.base.errors import StageError
 from pdal_stages.reports import views
 from pdal_stages.reports.panels import legend, triptych
-from pdal_stages.reports.pictures import LARGE, fit_text, plain, png, text_width, write_png
+from pdal_stages.reports.pictures import fit_text, plain, png, text_width, write_png
 from pdal_stages.reports.raster import BACKGROUND, blur, shading
 from pdal_stages.reports.views import (
     RIGHT,
@@ -236,7 +236,7 @@ def test_text_is_shortened():
     short = fit_text("a rather long caption", 60)
     assert short.endswith("..") and text_width(short) <= 60
     assert fit_text("abc", 200) == "abc" and fit_text("abc", 1) == ""
-    assert text_width("") == 0 and text_width("abc", LARGE) > text_width("abc") > text_width("ab")
+    assert text_width("") == 0 and text_width("abc") > text_width("ab")
 
 
 def test_triptych():

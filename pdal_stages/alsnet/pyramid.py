@@ -36,12 +36,12 @@ class Pyramid:
     steps: tuple[Step, ...]  #: from fine to coarse
 
 
-def scramble(xyz: npt.NDArray[np.float64], seed: int = 0) -> npt.NDArray[np.int64]:
+def scramble(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
     """An order that looks random and follows from the coordinates, whatever order the points come in.
 
     A ball takes its first points by index: in this order that is a fair sample of it.
     """
-    mixed = coordinate_hash(xyz, seed)
+    mixed = coordinate_hash(xyz, 0)
     return np.lexsort((xyz[:, 2], xyz[:, 1], xyz[:, 0], mixed))
 
 

@@ -21,7 +21,7 @@ _LEAVES = 64
 _OF_COORDINATES = ("HeightAbove", "Ground", "Slope")
 
 
-def telltale(values: Iterable[Labels], seed: int = 0) -> dict[str, float]:
+def telltale(values: Iterable[Labels]) -> dict[str, float]:
     """Dimensions that tell the classes almost alone, and which share of points they tell.
 
     A small decision tree on each dimension by itself is grown on half of a sample and tried on the other half. Heights
@@ -44,7 +44,7 @@ def telltale(values: Iterable[Labels], seed: int = 0) -> dict[str, float]:
         names = set(there) if names is None else names & set(there)  # in every cloud
         for place in np.unique(part.position[part.position >= 0]).tolist():
             rows = np.flatnonzero(part.position == place)
-            some.setdefault((part.whole, place), _Chosen()).add(part.xyz, there, rows, seed)
+            some.setdefault((part.whole, place), _Chosen()).add(part.xyz, there, rows)
     if not names or not some:
         return {}
     known = np.repeat([place for _, place in some], [len(one) for one in some.values()])
@@ -83,10 +83,9 @@ class _Chosen:
         xyz: npt.NDArray[np.float64],
         columns: Mapping[str, npt.NDArray[Any]],
         rows: npt.NDArray[np.int64],
-        seed: int,
     ) -> None:
         """More points."""
-        hashes = coordinate_hash(xyz[rows], seed)
+        hashes = coordinate_hash(xyz[rows], 0)
         if len(hashes) > _LOOKED_AT:
             least = np.argpartition(hashes, _LOOKED_AT)[:_LOOKED_AT]
             hashes, rows = hashes[least], rows[least]

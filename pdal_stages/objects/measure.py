@@ -246,15 +246,15 @@ def _chord(path: NDArray) -> NDArray:
     return path[0, 2] + share * (path[-1, 2] - path[0, 2])
 
 
-def path_of(body: Body, size: float, every: float = 2.0) -> NDArray[np.float64]:
-    """A line along wires (n, 3), meters: the middle of each piece of `every` meters along their main direction."""
+def path_of(body: Body, size: float) -> NDArray[np.float64]:
+    """A line along wires (n, 3), meters: the middle of each piece of 2 m along their main direction."""
     x, y = (body.column + 0.5) * size, (body.row + 0.5) * size
     origin = np.array([x.min(), y.min()])
     u, v = x - origin[0], y - origin[1]
     du, dv = u - u.mean(), v - v.mean()
     angle = 0.5 * math.atan2(2.0 * float(du @ dv), float(du @ du - dv @ dv))
     along = u * math.cos(angle) + v * math.sin(angle)
-    piece = np.floor((along - along.min()) / every).astype(np.int64)
+    piece = np.floor((along - along.min()) / 2.0).astype(np.int64)
     _, piece = np.unique(piece, return_inverse=True)
     many = np.bincount(piece)
     aside = v * math.cos(angle) - u * math.sin(angle)

@@ -23,12 +23,12 @@ class Window:
     rows: int
     columns: int
 
-    def dense(self, cells: Cells, name: str, empty: float, dtype=np.float64) -> NDArray:
+    def dense(self, cells: Cells, name: str, empty: float) -> NDArray:
         """A column of cells, all of one kind, as an array (rows, columns) with `empty` where there is no cell."""
         _, row, column = unpack(cells.key)
         row, column = row - self.row, column - self.column
         keep = (row >= 0) & (row < self.rows) & (column >= 0) & (column < self.columns)
-        out = np.full((self.rows, self.columns), empty, dtype)
+        out = np.full((self.rows, self.columns), empty, np.float64)
         out[row[keep], column[keep]] = cells.columns[name][keep]
         return out
 

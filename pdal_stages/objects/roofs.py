@@ -19,6 +19,8 @@ SURFACE = 0.5
 INSIDE = 2
 #: Within how many meters the rim of a roof without points is at one height.
 LEVEL = 1.0
+#: The share of the border of two roofs along which their heights meet where they are of one building.
+_SHARE = 0.34
 
 
 def roof_cells(
@@ -277,20 +279,18 @@ def borders(part: NDArray, z: NDArray, step: float) -> NDArray:
     return out
 
 
-def building_parts(
-    mask: NDArray[np.bool_], z: NDArray, *, step: float, smallest: int, fine: float = 1.0, share: float = 0.34
-) -> NDArray[np.int64]:
+def building_parts(mask: NDArray[np.bool_], z: NDArray, *, step: float, smallest: int) -> NDArray[np.int64]:
     """Number of each cell's building, from 0 in the order of their first cells; -1 outside.
 
-    Connected cells whose heights differ by at most `fine` are a roof. Roofs of fewer than `smallest` cells (dormers,
+    Connected cells whose heights differ by at most 1 m are a roof. Roofs of fewer than `smallest` cells (dormers,
     chimneys) go with the neighbor that they share the longest border with, the smallest first. Then two roofs are of
-    one building where their heights (measured beyond rims and walls) differ by at most `step` along at least the `share`
-    of their border, the most equal first. A `step` of 0 parts nothing.
+    one building where their heights (measured beyond rims and walls) differ by at most `step` along at least a
+    third of their border, the most equal first. A `step` of 0 parts nothing.
     """
     if step <= 0:
         return numbered(connected(mask, z, np.inf))
-    number = absorbed(numbered(connected(mask, z, min(fine, step))), z, smallest)
-    return joined(number, z, step, share)
+    number = absorbed(numbered(connected(mask, z, min(1.0, step))), z, smallest)
+    return joined(number, z, step)
 
 
 def numbered(first: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -322,7 +322,7 @@ def absorbed(number: NDArray[np.int64], z: NDArray, smallest: int) -> NDArray[np
     return _renamed(number, into)
 
 
-def joined(number: NDArray[np.int64], z: NDArray, step: float, share: float) -> NDArray[np.int64]:
+def joined(number: NDArray[np.int64], z: NDArray, step: float) -> NDArray[np.int64]:
     """Parts with those put together whose heights meet along enough of their border."""
     size, shared = np.bincount(number[number >= 0]).tolist(), _shared(number, z, step)
     into = list(range(len(size)))
@@ -335,7 +335,7 @@ def joined(number: NDArray[np.int64], z: NDArray, step: float, share: float) -> 
     heapq.heapify(waiting)
     while waiting:
         near, a, b, *state = heapq.heappop(waiting)
-        if into[a] != a or into[b] != b or shared[a].get(b) != tuple(state) or -near < share:
+        if into[a] != a or into[b] != b or shared[a].get(b) != tuple(state) or -near < _SHARE:
             continue
         keep = _merge(a, b, into, size, shared)
         for other in shared[keep]:

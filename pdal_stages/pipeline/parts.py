@@ -86,23 +86,22 @@ def reference_and_wkt(path: str, horizontal: str = "") -> tuple[Reference, str]:
     return reference_of({**reader, "type": name}, horizontal), wkt
 
 
-def parts_of(path: str, wkt: str, more: Sequence[str] = ()) -> Iterator[Part]:
-    """The points of a file, in its order; `more`: dimensions beside :data:`WANTED` that are wanted where they are there.
+def parts_of(path: str, wkt: str) -> Iterator[Part]:
+    """The points of a file, in its order, with those of the dimensions :data:`WANTED` that it has.
 
     Raises
     ------
     StageError
         If it cannot be read to its end.
     """
-    wanted = (*WANTED, *more)
     if not reads_in_parts(path):
         ran = pdal_env.execute([reader_of(path, "input")])
         for array in ran.arrays:
             flags = pdal_env.flags_inside_classification(array.dtype.names, ran.metadata)
             names = [
-                n for n in ("X", "Y", "Z", "Classification", "Withheld", *wanted) if n in array.dtype.names
+                n for n in ("X", "Y", "Z", "Classification", "Withheld", *WANTED) if n in array.dtype.names
             ]
-            yield _part(Points({n: np.asarray(array[n]) for n in names}, wkt=wkt, legacy_flags=flags), wanted)
+            yield _part(Points({n: np.asarray(array[n]) for n in names}, wkt=wkt, legacy_flags=flags))
         return
     for chunk in las_chunks(path):
         arrays = {
@@ -113,10 +112,10 @@ def parts_of(path: str, wkt: str, more: Sequence[str] = ()) -> Iterator[Part]:
             "Withheld": np.asarray(chunk.withheld),
         }
         there = set(chunk.point_format.dimension_names)
-        for name in wanted:
+        for name in WANTED:
             if (known := _LASPY.get(name, name)) in there:
                 arrays[name] = np.asarray(chunk[known])
-        yield _part(Points(arrays, wkt=wkt), wanted)
+        yield _part(Points(arrays, wkt=wkt))
 
 
 def las_chunks(path: str) -> Iterator[Any]:
@@ -139,8 +138,8 @@ def las_chunks(path: str) -> Iterator[Any]:
         raise StageError("the input is cut short", where=path, found=f"{count:,} of {total:,} points")
 
 
-def _part(points: Points, wanted: Sequence[str]) -> Part:
+def _part(points: Points) -> Part:
     codes = points.class_codes
     kept = ~np.isin(codes, NOISE) & ~points.flag("Withheld").astype(bool)
-    arrays = {name: np.asarray(points.dimension(name))[kept] for name in wanted if name in points.arrays}
+    arrays = {name: np.asarray(points.dimension(name))[kept] for name in WANTED if name in points.arrays}
     return Part(points.xyz[kept], codes[kept], arrays)

@@ -261,14 +261,14 @@ def _extent(files: Sequence[str], references: dict[str, Any]) -> tuple[int, floa
     return (points, area) if area > 0 else (1, 1e-9)
 
 
-def complete_parts(path: str, wkt: str, model: str = STANDARD, say: bool = True) -> Any:
+def complete_parts(path: str, wkt: str, model: str) -> Any:
     """The points of a file with reliabilities and heights: as they are there, or made now, which is said."""
     missing: list[str] | None = None
     whole: list[Part] = []
     for part in parts_of(path, wkt):
         if missing is None:
             missing = [n for n in ("Reliability", "HeightAboveGround") if n not in part.arrays]
-            if missing and say:
+            if missing:
                 print_messages(
                     f"{path} has no {' and no '.join(missing)}: made now"
                     + (

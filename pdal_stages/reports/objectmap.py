@@ -25,14 +25,16 @@ _INKS: dict[str, tuple[_Color, _Color]] = {
 _CHECK: tuple[_Color, _Color] = ((250, 205, 90), (170, 110, 0))
 
 
-def object_map(layers: Mapping[str, Layer], width: int = 900) -> npt.NDArray[np.uint8]:
+#: Pixels across the map.
+_WIDTH = 900
+
+
+def object_map(layers: Mapping[str, Layer]) -> npt.NDArray[np.uint8]:
     """A map of layers, by :func:`~pdal_stages.reports.objectlayers.object_layers`; north is up.
 
     Parameters
     ----------
     layers : mapping of str to Layer
-    width : int
-        Pixels.
 
     Returns
     -------
@@ -41,12 +43,12 @@ def object_map(layers: Mapping[str, Layer], width: int = 900) -> npt.NDArray[np.
     shapely = vector("shapely")
     shapes = [shape for layer in layers.values() for shape in layer.shapes]
     if not shapes:
-        return np.full((width, width, 3), 255, np.uint8)
+        return np.full((_WIDTH, _WIDTH, 3), 255, np.uint8)
     bounds = shapely.bounds(shapes)
     low, high = bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)
     extent = np.maximum(high - low, 1e-9)
-    fine = 2 * width / extent[0]  # drawn twice as large: no jagged edges
-    size = 2 * width, max(2, 2 * min(round(fine * extent[1] / 2), 4 * width))
+    fine = 2 * _WIDTH / extent[0]  # drawn twice as large: no jagged edges
+    size = 2 * _WIDTH, max(2, 2 * min(round(fine * extent[1] / 2), 4 * _WIDTH))
     image = Image.new("RGB", size, (255, 255, 255))
     draw = ImageDraw.Draw(image)
 

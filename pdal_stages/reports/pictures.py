@@ -15,7 +15,8 @@ from PIL import Image, ImageFont
 from ..base.errors import StageError
 from ..base.files import write_whole
 
-SMALL, LARGE = 16, 24
+#: Pixels of letters.
+_SIZE = 16
 #: What the built-in font has beyond ASCII, and spellings of common characters it lacks.
 _LETTERS = "°±·"
 _SPELLINGS = str.maketrans({"ß": "ss", "æ": "ae", "ø": "o", "×": "x", "–": "-", "—": "-", "µ": "u"})
@@ -60,7 +61,7 @@ def write_png(path: str | os.PathLike[str], rgb: npt.NDArray[np.uint8], palette:
 
 
 @lru_cache
-def font(size: int = SMALL) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+def font(size: int = _SIZE) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     """Pillow's own font: pictures look alike on every machine."""
     return ImageFont.load_default(size)
 
@@ -75,16 +76,16 @@ def plain(text: str) -> str:
     )
 
 
-def text_width(text: str, size: int = SMALL) -> int:
+def text_width(text: str) -> int:
     """Pixels that a line of text is wide."""
-    return round(font(size).getlength(plain(text)))
+    return round(font().getlength(plain(text)))
 
 
-def fit_text(text: str, width: int, size: int = SMALL) -> str:
+def fit_text(text: str, width: int) -> str:
     """The text in letters of the font, shortened with '..' where it is wider than `width` pixels."""
     text = plain(text)
-    if text_width(text, size) <= width:
+    if text_width(text) <= width:
         return text
-    while text and text_width(text + "..", size) > width:
+    while text and text_width(text + "..") > width:
         text = text[:-1]
     return text + ".." if text else ""

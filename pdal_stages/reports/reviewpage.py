@@ -22,6 +22,8 @@ _TOP, _SECTION = 420, 760
 _DEPTH = 2.0
 #: Tiles in the table.
 _TILES = 200
+#: Tiles and patches that are named in text.
+_WORST = 10
 
 
 @dataclass(frozen=True)
@@ -145,7 +147,7 @@ def review_page(
     )
 
 
-def lines(found: Mapping[str, Any], most: int = 10) -> list[str]:
+def lines(found: Mapping[str, Any]) -> list[str]:
     """The same in a few lines of text: the worst tiles and the worst patches."""
     points, expected = found["points"], found["expected"]
     out = [
@@ -154,15 +156,15 @@ def lines(found: Mapping[str, Any], most: int = 10) -> list[str]:
         "",
         f"{'tile':<40}{'points':>14}{'expected wrong':>16}{'%':>8}{'patches':>9}{'minutes':>9}",
     ]
-    for row in found["tiles"][:most]:
+    for row in found["tiles"][:_WORST]:
         out.append(
             f"{one_line(row['tile'])[-40:]:<40}{row['points']:>14,}{row['expected']:>16,.0f}{100 * row['share']:>8.2f}"
             f"{row['patches']:>9,}{row['minutes']:>9.1f}"
         )
-    if len(found["tiles"]) > most:
-        out.append(f"... and {len(found['tiles']) - most:,} more")
+    if len(found["tiles"]) > _WORST:
+        out.append(f"... and {len(found['tiles']) - _WORST:,} more")
     out += ["", f"{'patch':>5}{'expected':>10}{'m2':>8}  why, where"]
-    for row in found["worst"][:most]:
+    for row in found["worst"][:_WORST]:
         x, y = (0.5 * (row["box"][k] + row["box"][k + 2]) for k in (0, 1))
         out.append(
             f"{row['rank']:>5}{row['expected']:>10,.0f}{row['area']:>8,.0f}  {row['reason']}; "
