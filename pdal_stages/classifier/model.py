@@ -25,7 +25,7 @@ from .dimensions import known, required, welcome
 from .passes import Passes, weighed
 from .preparing import preparing
 from .smoothing import count_shares, smooth
-from .thinning import density, out_of_range
+from .thinning import density, out_of_range, range_text
 
 #: Points decided on at a time after smoothing.
 _DECIDED = 500_000
@@ -321,7 +321,6 @@ class Model:
             return
         report.figures["density"] = round(found, 3)
         if out_of_range(found, trained):
-            low, high = f"{trained['low']:.3g}", f"{trained['high']:.3g}"
             lonely_in = report.figures.get("fewer_than_three", {})
             token = max(lonely_in, key=lambda one: lonely_in[one], default="")
             lonely = (
@@ -331,7 +330,7 @@ class Model:
             )
             report.warnings.append(
                 f"the cloud has {found:.3g} points/m2, the model was trained on "
-                f"{low if low == high else f'{low} to {high}'}{lonely}. Expect lower accuracy, or train with 'thin'"
+                f"{range_text(trained)}{lonely}. Expect lower accuracy, or train with 'thin'"
             )
 
 

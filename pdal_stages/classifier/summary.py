@@ -8,6 +8,7 @@ from typing import Any
 from ..base.errors import ModelError, OptionError
 from ..base.plain import one_line
 from .algorithms import Column
+from .thinning import range_text
 
 #: The dimension in which the command `train` numbers its files.
 FILE_NUMBER = "FileNumber"
@@ -73,7 +74,7 @@ def text(info: Mapping[str, Any]) -> str:
     if info["strategy"] == "binary":
         lines.append(f"strategy       binary, target {info['target']}, background {info['background']}")
     if densities := info.get("densities"):
-        lines.append(f"densities      {densities['low']:.3g} to {densities['high']:.3g} points/m2")
+        lines.append(f"densities      {range_text(densities)} points/m2")
     if info.get("voxel"):
         lines.append(f"voxel          {info['voxel']:g} m, which one point stands for")
     if base := info.get("base"):

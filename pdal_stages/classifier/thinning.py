@@ -75,6 +75,12 @@ def out_of_range(found: float, trained: Mapping[str, float]) -> bool:
     return not trained["low"] / TOLERANCE <= found <= trained["high"] * TOLERANCE
 
 
+def range_text(trained: Mapping[str, float]) -> str:
+    """``0.3 to 46``, or one number where both are alike."""
+    low, high = f"{trained['low']:.3g}", f"{trained['high']:.3g}"
+    return low if low == high else f"{low} to {high}"
+
+
 def density_range(densities: Iterable[float]) -> dict[str, float]:
     """Smallest and largest density of some clouds, as a manifest has it; empty ones do not count."""
     found = [one for one in densities if one]

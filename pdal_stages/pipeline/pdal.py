@@ -208,8 +208,7 @@ def log_lines(log: str) -> list[str]:
     return list(dict.fromkeys(line for line in lines if line))
 
 
-#: How PDAL begins a line of its log.
-#: Some stages say their name once more.
+#: How PDAL begins a line of its log; some stages say their name once more.
 _BY_PROGRAM = re.compile(r"^\((?:pypipeline|pdal pipeline)\s+(\S+?)\s+\w+\)\s*(?:\1:\s*)?", re.IGNORECASE)
 
 

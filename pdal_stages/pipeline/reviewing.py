@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -226,7 +226,7 @@ def review_files(request: ReviewRequest) -> Review:
             found=", ".join(request.files[:3]),
             cure="Classify the files first: pdal-stages classify raw.laz classified.laz",
         )
-    settings = Settings(**{**asdict(request.settings), "cell": side})
+    settings = replace(request.settings, cell=side)
     seen = outlook(joined, standard_calibration())
     patches = find_patches(seen, settings)
     held = np.cumsum(patches.errors)
