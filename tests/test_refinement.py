@@ -361,7 +361,8 @@ def test_through_pdal(tmp_path, write_las):
     made = ps.load_model(model)
     assert made.codes.tolist() == [2, 5, 6, 11]
     assert made.info["base"]["name"] == "standard" and len(made.info["base"]["sha256"]) == 64
-    assert f"on top of      standard (SHA-256 {made.info['base']['sha256']})" in str(made)
+    assert f"on top of      standard, the passes before (SHA-256 {made.info['base']['sha256']})" in str(made)
+    assert "pass 4" in str(made) and "pass 3" not in str(made) and "out of bag 1" not in str(made)
     assert made.info["preparation"] == ps.load_model("standard").info["preparation"]
 
 

@@ -33,9 +33,7 @@ from .text import CONFUSIONS, table
 
 FORMAT = "pdal-stages accuracy"
 VERSION = 1
-
-
-#: Standard deviations that hold 95 % of a normal distribution.
+#: Standard deviations within which 95 % of a normal distribution lie.
 _Z = 1.959964
 
 
@@ -230,6 +228,41 @@ class Accuracy:
         codes = tuple(sorted(rows)) + tuple(sorted(more))
         return cls(codes[: len(rows)], codes[len(rows) :], whole, class_names((*codes, *left), names), left)
 
+    def merge(self, mapping: Mapping[Any, Any], names: Mapping[int, str] | None = None) -> Accuracy:
+        """The accuracy with some classes taken as one: ``{5: [3, 4]}`` or ``{3: 5, 4: 5}``.
+
+        Confusions inside a merged class become right, so the gradings of reliability and margin, which
+        do not know them, are dropped; use `merge` of :meth:`from_labels` to keep them.
+        """
+        merged = Merge.parse(mapping)
+        of_rows, of_columns = merged.target_of[list(self.classes)], merged.target_of[list(self.columns)]
+        rows = tuple(np.unique(of_rows).tolist())
+        columns, matrix = regroup(rows, (self.matrix, of_rows, of_columns))
+        self._refuse_clash(
+            [int(merged.target_of[c]) for c in self.left_out],
+            rows,
+            "merging joins a compared class with one that was left out",
+            "Compare the labels again with this merge",
+        )
+        known = {c: n for c, n in self.names.items() if int(merged.target_of[c]) == c}
+        return Accuracy(
+            rows,
+            columns[len(rows) :],
+            matrix,
+            class_names((*columns, *self.left_out), {**known, **merged.names, **(names or {})}),
+            self.left_out,
+            merged={**{c: int(merged.target_of[t]) for c, t in self.merged.items()}, **merged.changed},
+        )
+
+    def _refuse_clash(self, left: Iterable[int], rows: Iterable[int], what: str, cure: str) -> None:
+        """Refuse classes that are compared in one part and left out in another.
+
+        A code that others were merged into may be both: its own points left out, theirs compared.
+        """
+        clash = sorted(set(left) & set(rows) - set(self.merged.values()))
+        if clash:
+            raise StageError(what, found=f"class {clash[0]}", cure=cure)
+
     def __add__(self, other: Accuracy) -> Accuracy:
         if not isinstance(other, Accuracy):
             return NotImplemented
@@ -240,14 +273,12 @@ class Accuracy:
             c: self.left_out.get(c, 0) + other.left_out.get(c, 0)
             for c in sorted(set(self.left_out) | set(other.left_out))
         }
-        # A code that others were merged into may be both: its own points left out, theirs compared.
-        clash = sorted(set(left) & set(rows) - set(self.merged.values()))
-        if clash:
-            raise StageError(
-                "two accuracies do not add: one compares a class that the other leaves out",
-                found=f"class {clash[0]}",
-                cure="Compare both with the same 'classes' and 'ignore'",
-            )
+        self._refuse_clash(
+            left,
+            rows,
+            "two accuracies do not add: one compares a class that the other leaves out",
+            "Compare both with the same 'classes' and 'ignore'",
+        )
         if self.merged != other.merged and self.points and other.points:
             raise StageError(
                 "two accuracies do not add: they merge different classes",

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..base.errors import ModelError, OptionError
 from ..base.plain import one_line
-from .algorithms import Column
+from .algorithms import ON_TOP, Column
 from .thinning import range_text
 
 #: The dimension in which the command `train` numbers its files.
@@ -55,7 +55,7 @@ def text(info: Mapping[str, Any]) -> str:
     info = _in_one_line(info)
     training, several = info["training"], len(info["passes"]) > 1
     lines = scores(info, training.get("held_out"))
-    for number, one in enumerate(info["passes"], 1):
+    for number, one in _own_passes(info):
         if several:
             lines.append(f"pass {number}")
         numbers = [f"{v:,} {k}" for k, v in one["parameters"].items() if isinstance(v, int)]
@@ -78,7 +78,7 @@ def text(info: Mapping[str, Any]) -> str:
     if info.get("voxel"):
         lines.append(f"voxel          {info['voxel']:g} m, which one point stands for")
     if base := info.get("base"):
-        lines.append(f"on top of      {base['name']} (SHA-256 {base['sha256']})")
+        lines.append(f"on top of      {base['name']}, the passes before (SHA-256 {base['sha256']})")
     for cloud in training["clouds"]:
         lines.append(f"trained on     {cloud['name']}, {cloud['points']:,} points")
     if teacher := info.get("teacher"):
@@ -96,13 +96,19 @@ def text(info: Mapping[str, Any]) -> str:
             f"{entry['duplicates']:>12,}{_percent(f1):>15}"
         )
     lines.append("")
-    for number, one in enumerate(info["passes"], 1):
+    for number, one in _own_passes(info):
         if "importances" in one and several:
             lines.append(f"pass {number}")
         for by in ("neighborhood", "group", "feature") if "importances" in one else ():
             top = list(one["importances"][by].items())[:10]
             lines.append(f"importance by {by:<13}" + ", ".join(f"{k} {100 * v:.1f} %" for k, v in top))
     return "\n".join(lines)
+
+
+def _own_passes(info: Mapping[str, Any]) -> list[tuple[int, Mapping[str, Any]]]:
+    """A model's passes with their numbers; of one on top of a base not those of the base, which its own file describes."""
+    passes = list(enumerate(info["passes"], 1))
+    return [(number, one) for number, one in passes if one.get("algorithm") in ON_TOP] or passes
 
 
 def out_of_bag(info: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -149,7 +155,7 @@ def scores(info: Mapping[str, Any], held_out: dict[str, Any] | None = None) -> l
         )
     crossed = info["accuracy"]["cross_validation"]
     rows = [(held_out_by(crossed), crossed and crossed["chosen"])]
-    for number, one in enumerate(info["passes"], 1):
+    for number, one in _own_passes(info):
         rows.append((f"out of bag{f' {number}' if len(info['passes']) > 1 else ''}", one["out_of_bag"]))
     lines += [_scored(label, row) for label, row in rows if row]
     if unscored := info["training"].get("unscored"):

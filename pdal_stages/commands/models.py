@@ -12,7 +12,7 @@ from ..base.outputs import Output, check_outputs
 from ..base.plain import print_messages
 from ..tiling.command import add_tile_arguments
 from .adder import INPUTS, OVERRIDES, Adder
-from .running import run
+from .running import ran, run
 
 
 def add_commands(add: Adder) -> None:
@@ -131,14 +131,18 @@ def _train(options: argparse.Namespace) -> None:
         extra |= {"leave_one_survey_out": True} if options.leave_one_survey_out else {}
     task = TrainTask(files, options.model, options.overrides, extra, options_of(options), surveys)
     if not task.in_one_piece():
-        print_messages(*run_training(task))
+        said = run_training(task)
     elif surveys:
-        print_messages(*train_surveys(surveys, options.model, options.overrides, **extra))
+        said = train_surveys(surveys, options.model, options.overrides, **extra)
     else:
         stages = train_pipeline(files, options.model, options.overrides, **extra)
-        run(options, Pipeline(stages, options.overrides))
-    if Path(options.model).is_file():  # not written into a pipe or device
-        print(load_model(options.model))
+        _, said = ran(options, Pipeline(stages, options.overrides))
+    # Nothing is said of one written into a pipe or device
+    text = str(load_model(options.model)) if Path(options.model).is_file() else ""
+    score = text.partition("\n")[0]
+    print_messages(*(line for line in said if not score or not line.endswith(score)))
+    if text:
+        print(text)
 
 
 def _adapt(options: argparse.Namespace) -> None:

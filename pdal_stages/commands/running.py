@@ -17,12 +17,12 @@ _LEVELS = {0: logging.ERROR, 1: logging.WARNING, 2: logging.INFO}
 
 def run(options: argparse.Namespace, pipeline) -> int:
     """Run a pipeline and print its messages; the number of points."""
-    count, messages = _ran(options, pipeline)
+    count, messages = ran(options, pipeline)
     print_messages(*messages)
     return count
 
 
-def _ran(options: argparse.Namespace, pipeline) -> tuple[int, list[str]]:
+def ran(options: argparse.Namespace, pipeline) -> tuple[int, list[str]]:
     """Run a pipeline: the number of points, and messages."""
     from ..base.files import write_whole
     from ..tiling.command import end_at_once
