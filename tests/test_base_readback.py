@@ -9,9 +9,11 @@ import subprocess
 import numpy as np
 import pytest
 
+from pdal_stages.base.chunks import laz_chunks
 from pdal_stages.base.complete import check_complete
 from pdal_stages.base.errors import StageError
-from pdal_stages.base.las import check_readable, laz_chunks, read_header
+from pdal_stages.base.las import read_header
+from pdal_stages.base.lascheck import check_readable
 from pdal_stages.base.readback import chunks_are_whole
 
 COUNT = 120_000

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.base import chunks
-from pdal_stages.base.las import check_readable
+from pdal_stages.base.lascheck import check_readable
 
 lazrs = pytest.importorskip("lazrs")
 NUMBERS = st.integers(0, 2**31 - 1) | st.integers(0, 300) | st.sampled_from([50_000, 2**16, 2**24 - 1])

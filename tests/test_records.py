@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from robustness.writing_faults import WKT
 
-from pdal_stages.base.las import check_readable
+from pdal_stages.base.lascheck import check_readable
 from pdal_stages.base.projection import projection_of, put_back
 from pdal_stages.pipeline.run import Pipeline
 from pdal_stages.tiling import run_tiled

@@ -1,4 +1,4 @@
-"""The table of chunks at the end of a LAZ file, decoded and held against the file.
+"""The chunks of a LAZ file, and the table of them at its end: found, decoded and held against the file.
 
 PDAL from 2.7 on waits forever for a point that no chunk of the table holds, and ends the process where the
 table leads it astray. Layout: "LAZ specification 1.4", chunk table.
@@ -7,7 +7,11 @@ table leads it astray. Layout: "LAZ specification 1.4", chunk table.
 from __future__ import annotations
 
 import io
+import os
 import struct
+from typing import BinaryIO, NamedTuple
+
+from .las import LARGEST_RECORD, LasHeader, records
 
 #: More chunks than this (ten billion points in chunks of the usual size) are not decoded one by one.
 MOST_DECODED = 200_000
@@ -77,3 +81,63 @@ def decode(table: bytes, *, variable: bool) -> tuple[list[int], list[int]]:
         raise EOFError from None
     counts = [points % _TOP for points, _ in entries] if variable else []
     return [size % _TOP for _, size in entries], counts
+
+
+def table_place(path: str | os.PathLike, size: int, header: LasHeader) -> int:
+    """Where a LAZ file's table of chunks is, which is written last; -1 where that is not in the file."""
+    with open(path, "rb") as file:
+        file.seek(header.offset)
+        place = file.read(8)
+        if len(place) == 8 and place == b"\xff" * 8:  # a stream that could not be rewound has it at its end
+            file.seek(size - 8)
+            place = file.read(8)
+    return struct.unpack("<q", place)[0] if len(place) == 8 else -1
+
+
+def coding_of(file: BinaryIO, header: LasHeader) -> bytes | None:
+    """The record of how a LAZ file is compressed, None where it lacks one."""
+    for record in records(file, header):
+        if (record.user, record.number) == (b"laszip encoded", 22204):
+            file.seek(record.data)
+            data = file.read(min(record.length, LARGEST_RECORD))
+            return data if len(data) >= 16 else None
+    return None
+
+
+def points_of_chunk(coding: bytes) -> int | None:
+    """Points of every chunk but the last; None where the table tells for each."""
+    (points,) = struct.unpack_from("<I", coding, 12)
+    return None if points in (0, 2**32 - 1) else points
+
+
+def table_at(file: BinaryIO, place: int) -> tuple[int, bytes]:
+    """Number of chunks, and the file from their table on: as much as the table of so many can take."""
+    file.seek(place)
+    begin = file.read(8)
+    number = struct.unpack("<4xI", begin)[0] if len(begin) == 8 else 0
+    # A number takes less than eight bytes, and a chunk has two at most.
+    return number, begin + file.read(56 + 16 * min(MOST_DECODED, number))
+
+
+class LazChunks(NamedTuple):
+    """The chunks of a LAZ file: the record of their coding, where the first begins, bytes and points of each."""
+
+    record: bytes
+    begin: int
+    sizes: list[int]
+    points: list[int]
+
+
+def laz_chunks(path: str | os.PathLike, header: LasHeader) -> LazChunks | None:
+    """The chunks of a LAZ file that `check_readable` takes; None where they are too many to be listed."""
+    table = table_place(path, os.stat(path).st_size, header)
+    with open(path, "rb") as file:
+        coding = coding_of(file, header)
+        number, data = table_at(file, table)
+    if coding is None or number > MOST_DECODED:
+        return None
+    of_chunk = points_of_chunk(coding)
+    sizes, points = decode(data, variable=of_chunk is None)
+    if of_chunk is not None:
+        points = [max(0, min(of_chunk, header.count - done * of_chunk)) for done in range(number)]
+    return LazChunks(coding, header.offset + 8, sizes, points)

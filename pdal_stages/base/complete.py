@@ -14,7 +14,8 @@ from typing import Any, BinaryIO
 
 from .errors import StageError
 from .files import disk_is_full
-from .las import check_readable, read_header
+from .las import read_header
+from .lascheck import check_readable
 from .readback import chunks_are_whole
 
 _CURE = "Make room on the disk (or raise the limit on file sizes)"

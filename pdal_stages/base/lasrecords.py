@@ -12,9 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .chunks import laz_chunks
 from .errors import StageError
 from .extrabytes import number_type, plain_dimensions
-from .las import DAMAGED, POINT_BYTES, LasHeader, laz_chunks
+from .las import POINT_BYTES, LasHeader
+from .lascheck import DAMAGED
 
 _OLD = [
     *(("X", "<i4"), ("Y", "<i4"), ("Z", "<i4"), ("intensity", "<u2"), ("bit_fields", "u1")),

@@ -17,7 +17,8 @@ import struct
 
 import numpy as np
 
-from .las import POINT_BYTES, LasHeader, laz_chunks
+from .chunks import laz_chunks
+from .las import POINT_BYTES, LasHeader
 
 #: Layers of a chunk, without those of extra bytes ("LAZ specification 1.4", point data of formats 6 to 8).
 _LAYERS = {6: 9, 7: 10, 8: 11}

@@ -16,8 +16,9 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.chunks import laz_chunks
 from ..base.extrabytes import number_type, plain_dimensions
-from ..base.las import POINT_BYTES, LasHeader, laz_chunks, read_header
+from ..base.las import POINT_BYTES, LasHeader, read_header
 from . import packing
 
 

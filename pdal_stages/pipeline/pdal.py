@@ -18,7 +18,7 @@ from typing import Any
 
 from ..base.errors import DependencyError, PipelineError, StageError
 from ..base.extrabytes import extra_dimensions
-from ..base.las import check_readable
+from ..base.lascheck import check_readable
 from ..base.lasrecords import damaged
 from ..base.shortage import is_short, shortage
 from .filenames import readers_files

@@ -17,7 +17,8 @@ from ..base.complete import check_complete
 from ..base.errors import InterruptedStage, PipelineError, StageError
 from ..base.files import whole_files
 from ..base.jit import Compiling
-from ..base.las import beyond_box, check_readable, odd_text, read_header, supersede_copc
+from ..base.las import odd_text, read_header, supersede_copc
+from ..base.lascheck import beyond_box, check_readable
 from ..base.outputs import Output, check_outputs
 from ..base.report import Report
 from ..base.shortage import check_limit

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import PipelineError, StageError
-from ..base.las import read_header
+from ..base.las import holds_flags
 from ..pipeline.callbacks import Callbacks
 from ..pipeline.references import NO_REFERENCE
 from ..pipeline.run import Pipeline
@@ -343,8 +343,7 @@ class _Mark:
         self.away = piece.away
         if context.unit != 1.0:
             self.away = np.where(piece.away < 0, -1.0, piece.away * context.unit)
-        header = read_header(piece.path)
-        self.old_format = header is not None and header.point_format <= 5  # one of LAS 1.0 to 1.3
+        self.old_format = holds_flags(piece.path)
         self.mixed = False  # whether there are others beside it
         self.holds_flags = False  # whether class codes of the results hold flags
         self.original: dict[str, NDArray] = {}  # dimensions of the tile's own points

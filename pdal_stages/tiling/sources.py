@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..base import las, strictjson
+from ..base import las, lascheck, strictjson
 from ..base.errors import PipelineError, StageError
 from ..pipeline.tindex import locations
 from .grid import Box
@@ -151,7 +151,7 @@ def check_source(source: InputSource) -> str | None:
     """
     if any("\ud800" <= character <= "\udfff" for character in source.path):
         raise StageError("the name of the file is not UTF-8", where=source.path, cure="Rename the file")
-    return las.check_readable(source.path) if source.kind == "las" else None
+    return lascheck.check_readable(source.path) if source.kind == "las" else None
 
 
 def las_extent(path: str) -> Extent:

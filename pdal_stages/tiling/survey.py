@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base import las
+from ..base import las, lascheck
 from ..base.errors import OptionError, PipelineError, StageError
 from ..base.progress import Progress
 from ..base.stamps import stamp
@@ -252,7 +252,9 @@ class Survey:
                     self.unreadable[reading.path] = answer.reason
                     continue
                 self.indexes[reading.path] = answer.result
-                if answer.result.count and (odd := las.beyond_box(reading.path, union(answer.result.boxes))):
+                if answer.result.count and (
+                    odd := lascheck.beyond_box(reading.path, union(answer.result.boxes))
+                ):
                     self.messages.append(odd)
                 store.keep_index(reading.mark, answer.result)
                 progress.update(answer.result.count)

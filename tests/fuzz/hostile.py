@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from pdal_stages.base import las
+from pdal_stages.base import las, lascheck
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.strictjson import loads
 from pdal_stages.pipeline import tindex
@@ -106,7 +106,7 @@ def cloud(data: bytes) -> str:
     """A LAS or LAZ file: what passes the look at its header is read, whole or with an error."""
     path = put("cloud.laz", data)
     try:
-        las.check_readable(path)
+        lascheck.check_readable(path)
         las.projection(path)
         las.odd_text(path)
         found = sources.las_extent(str(path))
