@@ -25,6 +25,7 @@ from typing import Any
 
 import laspy
 import numpy as np
+from calibrating import learned_factors, learned_rates
 from clouds import SURVEYS, slug, true_classes
 from folds import TREES, LeaveOneOut
 
@@ -33,7 +34,7 @@ from pdal_stages import cli
 from pdal_stages.classifier.sureness import Sureness
 from pdal_stages.review import Calibration, Outlook, Records, Settings, find_patches, side_for
 from pdal_stages.review.cells import BINS, GROUP_OF, PARTS, bins_of, cell_keys
-from pdal_stages.review.expected import binned, kinds_of, learned_factors, learned_rates, outlook
+from pdal_stages.review.expected import binned, kinds_of, outlook
 from pdal_stages.review.signals import JUDGED, signals
 
 #: The part of the area that is looked at first.
