@@ -42,7 +42,7 @@ SITES = {
     "classifier/modelfile:write": "model",
     "classifier/parts:CloudParts._write": "train in tiles",
     "commands/pipelines:_expand": "expanded pipeline",
-    "commands/running:_ran": "metadata",
+    "commands/running:ran": "metadata",
     "base/projection:_rewrite": "records kept",
     "pipeline/packing:_pack": "writers.las .laz 1.4",
     "commands/models:_compare_objects": _WHOLE,
