@@ -22,8 +22,19 @@ import pdal_stages.synthetic
 from pdal_stages.cli import main
 from pdal_stages.stages.bridges import Bridges
 from pdal_stages.stages.hag_morphological import HagMorphological
-from pdal_stages.terrain import decks, walkable
-from pdal_stages.terrain.deckrims import ISLET, LINK, WITHIN, is_land, islets, may_be_land, opposite_ends
+from pdal_stages.terrain import deckrims, decks, walkable
+from pdal_stages.terrain.deckrims import (
+    ASLANT,
+    INWARD,
+    ISLET,
+    LINK,
+    LOFTY,
+    WITHIN,
+    is_land,
+    islets,
+    may_be_land,
+    opposite_ends,
+)
 from pdal_stages.terrain.decks import PARTS, SURFACE, find_decks, level_points
 from pdal_stages.terrain.deckwalls import around
 from pdal_stages.terrain.levels import GAP, levels
@@ -319,6 +330,73 @@ def test_a_deck_that_the_rim_of_the_cloud_cuts():
     assert f1(deck, codes[cut] == DECK, codes[cut] != OTHER) > 0.9
 
 
+@functools.cache
+def clipped(side):
+    xyz, codes = scan(LONG_SCENES["deep valley"](), 8.0)
+    middle = np.abs(xyz[:, :2] - xyz[codes == DECK, :2].mean(axis=0)).max(axis=1) < side / 2
+    return xyz[middle], codes[middle]
+
+
+@pytest.mark.parametrize("side", [60.0, 120.0])
+def test_a_deck_that_the_rim_of_the_cloud_cuts_at_both_ends(side):
+    xyz, codes = clipped(side)
+    deck = found(xyz)
+    assert f1(deck > 0, codes == DECK, codes != OTHER) > 0.95
+    order = np.random.default_rng(0).permutation(len(xyz))
+    assert np.array_equal(found(xyz[order]), deck[order])
+
+
+def test_roofs_and_banks_between_walls_that_the_rim_cuts_at_both_ends_are_no_decks():
+    slabs = []
+    for right, wide, tall in ((-45, 12, 9.0), (-20, 9, 15.0), (12, 7, 3.2), (30, 20, 7.5)):
+        slabs.append(Slab(-90, 90, right, right + wide, lambda s, h=tall: h + 0 * s, 0.4, 6))
+        for down in np.arange(0.4, tall, 0.4):  # walls below eaves of 0.6 m
+            slabs.append(
+                Slab(
+                    -90, 90, right + 0.6, right + wide - 0.6, lambda s, h=tall - down: h + 0 * s, 0.4, GROUND
+                )
+            )
+    flat = lambda s, t: (0.02 * np.sin(s / 9) + 0 * t, np.full(len(s), GROUND))  # noqa: E731
+    xyz, _ = scan(Scene(flat, slabs, [], 0.3, 150.0, 120.0), 8.0)
+    assert not found(xyz).any()
+
+
+def test_glass_roofs_that_the_rim_cuts_at_both_ends_are_no_decks():
+    rng = np.random.default_rng(0)
+    place = np.column_stack([rng.uniform(0, (100, 120), (100_000, 2)), rng.normal(0, 0.02, 100_000)])
+    hall = (np.abs(place[:, 1] - 60) < 25) & (rng.random(len(place)) < 0.6)
+    for tall in (6.0, 16.0):
+        assert not found(place + np.outer(hall, (0, 0, tall))).any()
+
+
+def test_what_lies_below_a_side_is_seen_as_a_slow_reference_sees_it():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        h, w = rng.integers(1, 40, 2)
+        start = np.concatenate([[0], np.cumsum(rng.integers(0, 4, h * w))])
+        cell = np.repeat(np.arange(h * w), np.diff(start))
+        z = rng.choice([0.0, 1.0, 11.0, 12.0], len(cell))
+        z = z[np.lexsort((z, cell))]
+        end = rng.integers(0, 5, (len(z), 8)).astype(np.int8)
+        number = rng.choice([-1, 0, 1, 2], len(z), p=[0.1, 0.7, 0.1, 0.1])
+
+        def low(n, d, cells, cell=cell, z=z, number=number, h=h, w=w):
+            b, a = np.array(divmod(cell[n], w)) + cells * np.array([walkable.UP[d], walkable.RIGHT[d]])
+            there = np.flatnonzero(cell == b * w + a) if 0 <= b < h and 0 <= a < w else []
+            own = [m for m in there if number[m] == number[n]]
+            return z[own[0]] - min(z[there]) if own else -1.0
+
+        slow = np.zeros((3, 3), int)
+        for n in np.flatnonzero(number >= 0):
+            deep = z[n] - min(z[cell == cell[n]])
+            amid = all(low(n, d, INWARD + int(deep * ASLANT)) >= 0 for d in range(0, 8, 2))
+            slow[number[n], 2] += deep > LOFTY and amid
+            for d in range(0, 8, 2):
+                if end[n, d] in (DOWN, ACROSS):
+                    slow[number[n], :2] += (1, low(n, d, -INWARD) > LOFTY)
+        assert np.array_equal(deckrims._below(z, start, h, w, end, number, 3), slow)
+
+
 @pytest.mark.parametrize(("name", "behind"), [("footbridge", 12.0), ("river", 8.0)])
 def test_a_deck_behind_one_end_of_which_the_cloud_soon_ends(name, behind):
     xyz, codes = seen(name)
@@ -370,6 +448,15 @@ def test_squares_of_a_large_cloud_give_what_the_whole_gives(monkeypatch):
     xyz = np.vstack([seen("viaduct of two decks", 4.0)[0], seen("river", 4.0)[0] + (700, 300, 0)])
     whole = found(xyz)
     assert (whole > 0).sum() > 10_000
+    monkeypatch.setattr("pdal_stages.terrain.patches.LARGEST", 100)
+    monkeypatch.setattr("pdal_stages.terrain.patches.SIDE", 128)
+    assert np.array_equal(found(xyz), whole)
+
+
+def test_squares_of_a_deck_cut_at_both_ends_give_what_the_whole_gives(monkeypatch):
+    xyz = np.vstack([clipped(120.0)[0] + step * np.array([900.0, 300.0, 0.0]) for step in range(2)])
+    whole = found(xyz)
+    assert (whole > 0).sum() > 5_000
     monkeypatch.setattr("pdal_stages.terrain.patches.LARGEST", 100)
     monkeypatch.setattr("pdal_stages.terrain.patches.SIDE", 128)
     assert np.array_equal(found(xyz), whole)

@@ -13,6 +13,9 @@ from .walkable import ACROSS, DOWN, DROP, NOTHING, ON, RIGHT, SOLID, UP, WALLED,
 LINK, LINK_THROUGH, JOIN = 2, 5, 4
 #: Of such a deck, so many cells show what lies below.
 THROUGH = 0.5
+#: What lies so many meters lower, as it does below few roofs, is seen so many cells from a drop at a deck's side, beside
+#: such a share of these drops; beams come in so far per meter, and farther in it is seen in such a share of them at most.
+LOFTY, INWARD, OPEN, ASLANT, GLASS = 10.0, 3, 0.45, 0.7, 0.1
 #: The smallest deck and the smallest land at its ends, in cells, and how far land is looked for.
 SMALLEST, LAND, AWAY = 20, 100, 40
 #: Of land that the rim of the cloud cuts so many of the ways end at nothing; what is clear of drops may have so few cells.
@@ -71,6 +74,49 @@ def through(z, start, end, number, count) -> NDArray[np.bool_]:
     cells = np.bincount(number[within], minlength=count)
     shown = np.bincount(number[within & (lowest < z - DROP)], minlength=count)
     return (cells >= SMALLEST) & (shown >= THROUGH * cells)
+
+
+@device
+def _shown(z, start, h, w, number, j, i, part):
+    """How much lower than a part something lies in one of its cells, -1 where there is none of it."""
+    if 0 <= j < h and 0 <= i < w:
+        for m in range(start[j * w + i], start[j * w + i + 1]):
+            if number[m] == part:
+                return z[m] - z[start[j * w + i]]
+    return -1.0
+
+
+@njit
+def _below(z, start, h, w, end, number, count):
+    """Of each part: drops straight ahead (count, 0); those beside which one sees what lies far below; cells in which one
+    does, though the part goes on farther to all sides than a beam comes in.
+    """
+    out = np.zeros((count, 3), np.int64)
+    for j in range(h):
+        for i in range(w):
+            for n in range(start[j * w + i], start[j * w + i + 1]):
+                k = number[n]
+                if k < 0:
+                    continue
+                low = z[n] - z[start[j * w + i]]
+                far, amid = INWARD + int(low * ASLANT), low > LOFTY
+                for d in range(0, DIRECTIONS, 2):
+                    b, a = UP[d], RIGHT[d]
+                    amid = amid and _shown(z, start, h, w, number, j + far * b, i + far * a, k) >= 0.0
+                    if end[n, d] == DOWN or end[n, d] == ACROSS:
+                        seen = _shown(z, start, h, w, number, j - INWARD * b, i - INWARD * a, k)
+                        out[k, 0] += 1
+                        out[k, 1] += seen > LOFTY
+                out[k, 2] += amid
+    return out
+
+
+def is_open(z, start, h, w, end, number, count) -> NDArray[np.bool_]:
+    """Of each part, whether beams that come aslant pass below its sides, as they do not below walls, and none through it,
+    as through glass.
+    """
+    drops, seen, glass = _below(z, start, h, w, end, number, count).T
+    return (seen > OPEN * drops) & (glass <= GLASS * seen)
 
 
 @njit

@@ -36,6 +36,7 @@ from .deckrims import (
     WITHIN,
     first_land,
     is_land,
+    is_open,
     islets,
     may_be_land,
     no_ends,
@@ -78,6 +79,9 @@ BROAD = 18
 _FILLS = 2
 #: A deck that the rim of the cloud cuts is so large and has for each cell that leads on so many at a drop.
 CUT, CUT_RIM = 60, 3
+#: Where it cuts both ends, or land at one is too little to tell, a deck of so many cells that goes on in so many ways at
+#: each end is one if what lies below is seen from its sides.
+CROSSING, CUT_END = 250, 8
 #: How far from the deck's surface its points lie, meters: on it, and in cells beside it, where leaves are; parapets and cars
 #: above; its flank below.
 ON_DECK, ON_RIM, PARAPET, FLANK = 0.4, 0.25, 1.6, 2.0
@@ -332,6 +336,7 @@ def whole_decks(raster, number, sums, box) -> NDArray[np.bool_]:
     """Levels (n,) of the parts that are decks, but for those that are too long to be judged as a whole."""
     z, start, h, w, kind, end = raster
     opposite, long, link = {}, np.zeros(len(sums), bool), np.full(len(sums), LINK)
+    crossing: list[int] = []
     judged = (sums[:, 0] >= SMALLEST) & (extent(box) <= LONGEST)
     clear = through(z, start, end, number, len(sums))
     for across in (LINK, LINK_THROUGH):
@@ -345,14 +350,18 @@ def whole_decks(raster, number, sums, box) -> NDArray[np.bool_]:
             if found:
                 opposite[k], link[k] = found, across
                 long[k] = _is_long(int(sums[k, 0]), outward[k], drops[k])
+            elif across == LINK and _crosses(int(sums[k, 0]), outward[k], cut[k], drops[k], ends[k]):
+                crossing.append(k)
         judged &= clear & (link == LINK)
         judged[list(opposite)] = False
+    good = np.zeros(len(sums) + 1, bool)
+    if crossing:
+        good[crossing] = is_open(z, start, h, w, end, number, len(sums))[crossing]
     # The deck beside one, as of a motorway, is no land that it leads on to.
-    likely = np.zeros(len(sums) + 1, bool)
+    likely = good.copy()
     likely[list(opposite)] = True
     other = np.where(likely[number], number, -1)
     land, seen = np.empty((len(z), 3), np.int32), np.full(len(z), -1, np.int32)
-    good = np.zeros(len(sums) + 1, bool)
     stamp = 0
     for part, found in opposite.items():
         there, maybe = 0, 0
@@ -366,13 +375,26 @@ def whole_decks(raster, number, sums, box) -> NDArray[np.bool_]:
             land_here = is_land(cells, over, bool(clear[part]))
             there += land_here
             maybe += not land_here and may_be_land(cells, over)
-        good[part] = there == len(found) or (maybe == 1 and there == 1 and long[part])
+        good[part] |= there == len(found) or (maybe == 1 and there == 1 and long[part])
     return good[number]
 
 
 def _is_long(size: int, outward: NDArray[np.int64], drops: NDArray[np.int64]) -> bool:
     """Whether a deck shows enough of its rim to do with land at one end."""
     return bool(size >= CUT and outward.sum() * CUT_RIM <= drops.sum())
+
+
+def _crosses(size: int, outward, cut, drops, ends) -> bool:
+    """Whether a part that the rim of the cloud cuts goes on at two opposite ends, and its sides are drops."""
+    down, leads = ends[DOWN] + ends[ACROSS], outward + cut
+    if size < CROSSING or ends[WALLED] > WALLS * down or outward.sum() > OUTWARD * drops.sum():
+        return False
+    found = opposite_ends(leads, leads)
+    if found is None or not _is_free(found[0], leads, drops):
+        return False
+    return bool(
+        min(leads[found[0]].sum(), leads[found[1]].sum()) >= CUT_END and cut[found[0] | found[1]].any()
+    )
 
 
 def _ends(size: int, outward, cut, drops, ends) -> list[NDArray[np.bool_]]:
