@@ -254,17 +254,19 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
         share = min(held / filled, low[near].sum() / points[near].sum())
         closed = supported[near].sum() <= sheets.CLOSED * np.isfinite(base[near]).sum()
         many = held >= sheets.COLUMNS and share > sheets.TOO_MANY
-        if many or (closed and slow_sheet(deepest, near, c)):
+        if many or (closed and slow_sheet(deepest, c)):
             out[(at[:, 0] == c[0]) & (at[:, 1] == c[1]) & (out == 7)] = 0
     return out
 
 
-def slow_sheet(deepest, near, c):
+def slow_sheet(deepest, c, side=SIDE):
     """Whether one plane holds enough of the low places round a column: all planes through it and two others."""
-    b, a = np.nonzero(near & np.isfinite(deepest))
+    b, a = np.nonzero(np.isfinite(deepest))
+    near = np.hypot(b - c[0], a - c[1]) <= sheets.reach(side)
+    b, a = b[near], a[near]
     places = [c]
     for k in np.lexsort((a, b, (b - c[0]) ** 2 + (a - c[1]) ** 2)):
-        if all(max(abs(b[k] - d[0]), abs(a[k] - d[1])) >= sheets.APART for d in places):
+        if all(max(abs(b[k] - d[0]), abs(a[k] - d[1])) >= np.ceil(sheets.APART / side) for d in places):
             places.append((b[k], a[k]))
     places = places[: sheets.MOST + 1]
     at = np.array([(e[1] - c[1], e[0] - c[0], deepest[e] - deepest[c]) for e in places])
@@ -274,8 +276,8 @@ def slow_sheet(deepest, near, c):
         if abs(turn) >= 0.25 * far[p] * far[q]:
             grade = np.linalg.solve(at[[p, q], :2], at[[p, q], 2])
             off = np.abs(at[:, 2] - at[:, :2] @ grade)
-            on = (off <= sheets.NEAR_PLANE + sheets.BEND * far).sum()
-            if (grade**2).sum() <= (sheets.STEEPEST * SIDE) ** 2 and on >= max(
+            on = (off <= sheets.NEAR_PLANE + sheets.BEND * side * far).sum()
+            if (grade**2).sum() <= (sheets.STEEPEST * side) ** 2 and on >= max(
                 sheets.PLACES, sheets.SHARE * len(at)
             ):
                 return True

@@ -103,7 +103,7 @@ minus the surface through the ground points. `Classification` is read for `ignor
 are not looked at.
 
 The options mean what they mean in PDAL's `filters.smrf`. Unlike it, every step reaches a bounded way and the grid is
-anchored to absolute coordinates: a tile with its halo (about 630 m, less with a smaller `window`) gets the heights of
+anchored to absolute coordinates: a tile with its halo (about 680 m, less with a smaller `window`) gets the heights of
 the whole cloud, bit for bit. Large buildings are removed up to 200 m; what lies far from all ground, such as
 the middle of a large hall, is measured from the openings' level. A point with no usable point near has height 0;
 metadata counts these as `without_terrain`.

@@ -31,6 +31,7 @@ from .columns import columns
 from .envelope import ENOUGH, FAR, NEAR, WIDER, envelope, has_company, supported_columns
 from .minima import cell_numbers
 from .patches import patches
+from .sheets import reach as sheets_reach
 from .sheets import take_back
 
 LOW, HIGH = NOISE
@@ -113,7 +114,7 @@ def detached_noise(
 
 
 #: How far away, in meters, points can change what a point is: the halo a tile needs.
-REACH = (2 * FAR + 4) * SIDE + CLUSTER_REACH
+REACH = (FAR + sheets_reach(SIDE) + 4) * SIDE + CLUSTER_REACH
 
 
 def _judge(x, y, z, column, row, cluster, gap, depth):

@@ -29,6 +29,7 @@ from .plateaus import reach as plateau_reach
 from .plateaus import remove_plateaus
 from .profile import opening_radius
 from .progressive import objects_of
+from .sheets import reach as sheets_reach
 
 #: Blocks, in meters, from which the surface is made: that for telling ground, and that of the heights.
 NEAR, FAR = 8.0, 32.0
@@ -87,7 +88,7 @@ class FilterOptions:
         fitted through ground between.
         """
         surfaces = ROUNDS * planes_reach(self.levels(NEAR))
-        outliers = COMPANY + SURROUNDINGS + ISLANDS_REACH
+        outliers = COMPANY + SURROUNDINGS + ISLANDS_REACH + sheets_reach(self.cell)
         found = outliers + 2 * self.largest_radius + plateau_reach(self.cell) + surfaces + 2
         return max(found, self.reach_of_decks) if self.decks else found
 

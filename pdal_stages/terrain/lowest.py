@@ -2,7 +2,8 @@
 
 A pit is a low outlier: an echo from below the ground (multiple reflections, noise) that would pull the
 terrain down. Ground seen through a canopy lies as deep below its surroundings, but not alone, and what it
-lies below is rough. Clusters of such echoes keep each other company: see :mod:`.islands`.
+lies below is rough; where it is rare, it lies on one plane with half of what is as low (:mod:`.sheets`).
+Clusters of such echoes keep each other company: see :mod:`.islands`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import numpy as np
 from ..base.jit import device, njit
 from .islands import mark_islands
 from .openings import HOLE, by_distance
+from .sheets import seen_through_canopy
 
 #: Cells within which a lone low cell looks for company, and within which smooth surroundings are judged.
 COMPANY, SURROUNDINGS = 20, 4
@@ -175,4 +177,6 @@ def pits(raster: np.ndarray, cell: float) -> np.ndarray:
     wide[COMPANY:-COMPANY, COMPANY:-COMPANY][out != 0] = HOLE
     _below_smooth(wide, out)
     mark_islands(raster, cell, 3, out)
-    return out > 0
+    low = out > 0
+    low &= ~seen_through_canopy(np.where(low, raster, HOLE), np.where(low, HOLE, raster), None, cell)
+    return low
