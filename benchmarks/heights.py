@@ -7,7 +7,7 @@
 
 Heights above filtered ground with two openings, as the model that comes with the package prepares them. A run is a process
 of its own that does the work twice and counts the second time, when kernels are loaded; reading is left out. The block has
-1,024 cells a side; a town of 512 m at 5 points/m2 is repeated in it and all around it.
+1,024 cells a side, decks are looked for; a town of 512 m at 5 points/m2 is repeated in it and all around it.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ if sys.argv[2] == "block":
     axes = axes[:, (axes[:2] < 512).all(axis=0)]
     low = lowest_of_cells(*axes, np.ones(axes.shape[1], bool), 1.0)
     around, inside = np.ascontiguousarray(repeated(axes[:, low], 0.0, 6).T), repeated(axes, 1024.0, 2)
-    options = groundcells.FilterOptions(openings=(5, 17))
+    options = groundcells.FilterOptions(openings=(5, 17), decks=True)
     work = lambda: groundblocks.cells_of_block(*around, (1, 1), options, [inside])
 else:
     work = lambda: filtered_ground(*axes, openings=(5, 17), threads=1)

@@ -9,7 +9,7 @@ from test_terrain_morphological import town
 
 import pdal_stages as ps
 from pdal_stages.stages.hag_morphological import HagMorphological
-from pdal_stages.terrain import filtered_ground
+from pdal_stages.terrain import filtered_ground, groundblocks
 from pdal_stages.terrain.decks import level_points
 from pdal_stages.terrain.groundblocks import by_block, cells_of_block, reach_of_block
 from pdal_stages.terrain.groundcells import BLOCK_SIDE, FilterOptions, GroundCells
@@ -331,6 +331,24 @@ def test_points_by_block_are_by_the_cells_of_blocks(cell):
         tuple((np.floor(xyz[0, :2] / cell) // BLOCK_SIDE).astype(int))
     }
     assert by_block(*np.empty((3, 0)), use[:0], cell) == {}
+
+
+@pytest.mark.parametrize("side", [1024, 4096])
+def test_decks_of_a_block_are_looked_for_in_one_piece(side, monkeypatch):
+    """In squares each would be looked at with as much around as the whole, four times the work."""
+    found = []
+
+    def levels(x, y, z, use, largest):
+        found.append((np.ptp(x) + 1, np.ptp(y) + 1, largest))
+        return np.empty((0, 5)), np.empty(0, np.int64)
+
+    monkeypatch.setattr(groundblocks, "levels_near_decks", levels)
+    options = FilterOptions(decks=True)
+    away = reach_of_block(options) + 40
+    axes = np.meshgrid(*[np.arange(-away, side + away, 8) + 0.5] * 2)
+    cells_of_block(*(axis.ravel() for axis in axes), np.zeros(axes[0].size), (0, 0), options, side=side)
+    ((across, along, largest),) = found
+    assert side < across * along <= largest
 
 
 def test_a_block_without_points_has_no_cells():

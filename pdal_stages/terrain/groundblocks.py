@@ -24,7 +24,7 @@ from .groundcells import (
 from .groundmeans import add_ground, around, heights_above, means_of
 from .lowpoints import HIGHEST
 from .minima import cell_numbers
-from .patches import LARGEST, connected
+from .patches import connected
 from .planes import reach as planes_reach
 from .planes import surface
 
@@ -103,9 +103,9 @@ def cells_of_block(
         far = options.reach_of_decks + margin
         seen = within(column, row, far) if beyond(far + _FEW) else slice(None)
         use = np.ones(len(x[seen]), bool)
-        levels, lowest = levels_near_decks(
-            x[seen], y[seen], z[seen], use, LARGEST * max(1, side // BLOCK_SIDE) ** 2
-        )
+        # In one piece: squares of it would each be looked at with as much around as the block has.
+        largest = (side + 2 * (far + _FEW)) ** 2
+        levels, lowest = levels_near_decks(x[seen], y[seen], z[seen], use, largest)
         deck[seen] = decks_of_levels(x[seen], y[seen], z[seen], use, levels)
         own_levels = levels[within(column[seen][lowest], row[seen][lowest], 0)]
     ground = _GroundPoints(west, south, side, levels, options)
