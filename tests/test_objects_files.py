@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
+import sys
 
 import laspy
 import numpy as np
@@ -289,7 +290,10 @@ def test_without_the_extra(monkeypatch):
         raise ImportError(f"No module named '{name}'")
 
     monkeypatch.setattr(outlines.importlib, "import_module", missing)
-    with pytest.raises(StageError, match=r"outlines need shapely .* Install the extra: .*vector"):
+    monkeypatch.setattr(sys, "prefix", "/usr")  # not the environment that scripts/setup made
+    with pytest.raises(
+        StageError, match=r"outlines need shapely .* Install the extra: pip install 'pdal-stages\[vector\]'"
+    ):
         outlines.vector("shapely")
 
 

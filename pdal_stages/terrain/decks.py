@@ -153,7 +153,7 @@ def levels_near_decks(
     y: NDArray[np.float64],
     z: NDArray[np.float64],
     use: NDArray[np.bool_],
-    largest: int | None = None,
+    largest: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """All that :func:`decks_of_levels` needs, of the points :func:`level_points` at least, and what these are numbers of.
 
