@@ -19,7 +19,6 @@ from tempfile import TemporaryDirectory
 import pdal_stages as ps
 from pdal_stages.base import jit
 from pdal_stages.classifier.warmup import features_part, other_part, warmup
-from pdal_stages.objects.warmup import objects_part
 from pdal_stages.stages import registry
 from pdal_stages.synthetic import TownOptions, write_town
 from pdal_stages.synthetic.demo import compile_kernels
@@ -57,7 +56,7 @@ def called(folder: Path) -> dict[str, list[str]]:
     for row in _rows(town, folder):
         ps.Pipeline(row).execute()
     running.append("warmup")
-    for part in (features_part, other_part, objects_part, compile_kernels, warmup):
+    for part in (features_part, other_part, compile_kernels, warmup):
         part()
     return {kind: sorted(names) for kind, names in sorted(found.items())}
 

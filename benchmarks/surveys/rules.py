@@ -45,7 +45,6 @@ def count(data: Path, survey: str, model: Model) -> dict[str, Any]:
         codes,
         height=made["HeightAboveGround"],
         ground=made["Ground"],
-        reliability=said.reliability,
         mask=seen,
         figures=changed,
     )

@@ -37,12 +37,11 @@ def _warmup(options: argparse.Namespace) -> None:
     from ..base.jit import compiled_elsewhere
     from ..base.threads import available_threads
     from ..classifier.warmup import compile_part, features_part, other_part, warmup
-    from ..objects.warmup import objects_part
     from ..pipeline.processes import each_file
     from ..stages import registry
     from ..synthetic.demo import compile_kernels
 
-    parts = [(part,) for part in (features_part, other_part, objects_part, compile_kernels)]
+    parts = [(part,) for part in (features_part, other_part, compile_kernels)]
     with compiled_elsewhere(registry.kernels(["warmup"])):
         for _, answer in each_file(compile_part, parts, min(2, available_threads()), apart=True):
             if answer.reason:

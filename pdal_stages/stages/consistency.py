@@ -24,12 +24,6 @@ class Consistency(Stage):
         True,
         "A building that a ground filter calls ground, below 0.3 m and 2 m from all that stands, is ground",
     )
-    doubtful: bool = option(
-        "boolean",
-        False,
-        "A detached piece of building of 3 m² to 8 x 8 m whose mean Reliability is below 0.62 is vegetation, as clipped "
-        "hedges and dense bushes are; sheds of which the model is unsure become so too",
-    )
     islands: bool = option(
         "boolean",
         True,
@@ -48,12 +42,11 @@ class Consistency(Stage):
     keep: Selection = keep_option()
     details = """
 The last step after a classification. Only ground (2), vegetation (3, 4, 5) and buildings (6) are changed, and only into one
-another; `ground` and `islands` need `HeightAboveGround` and `Ground`, `doubtful` needs `Reliability`; without them they do
-nothing, which the metadata says.
+another; `ground` and `islands` need `HeightAboveGround` and `Ground`; without them they do nothing, which the metadata says.
 Each rule has an option of its name, and its number of changed points in the metadata.
 
-Neighbors are those in 3 x 3 x 3 voxels of 1 m on an absolute grid (5 high for walls), and a piece is what touches in such
-voxels, so a tile with its halo gets the classes of the whole cloud. Planes are fitted to the buildings among neighbors,
+Neighbors are those in 3 x 3 x 3 voxels of 1 m on an absolute grid (5 high for walls), so a tile with its halo gets the
+classes of the whole cloud. Planes are fitted to the buildings among neighbors,
 where nine in ten of what is no ground are. The feet of walls stay what they are: surveys label them building as often as
 ground.
 """
@@ -90,26 +83,22 @@ ground.
             for word, name in (
                 ("height", "HeightAboveGround"),
                 ("ground", "Ground"),
-                ("reliability", "Reliability"),
             )
         }
         if (known["height"] is None or known["ground"] is None) and (self.ground or self.islands):
             points.report.warnings.append(
                 "there is no HeightAboveGround or no Ground: the rules ground and islands did nothing"
             )
-        if known["reliability"] is None and self.doubtful:
-            points.report.warnings.append("there is no Reliability: the rule doubtful did nothing")
         before = points.class_codes
         limits = bands(self.vegetation_heights)
         if limits:
             points.dimension("HeightAboveGround")  # refused where there is none
-        points.keep_only(["Classification", "HeightAboveGround", "Ground", "Reliability"])
+        points.keep_only(["Classification", "HeightAboveGround", "Ground"])
         codes = consistent(
             points.take_xyz(),
             before,
             height=known["height"],  # by name: unpacked, they would keep the coordinates alive
             ground=known["ground"],
-            reliability=known["reliability"],
             mask=~ignored,
             change=change,
             rules=self._rules,
