@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import DimensionError
-from ..base.lazycolumns import as_column
 from ..features import returns
 
 #: What every point has: the feature engine takes these from the coordinates.
@@ -115,7 +114,7 @@ def gather(
         if name not in dimensions:
             cure = _MAKERS.get(name, f"Put the stage that creates {name} before this one")
             raise DimensionError(f"the dimension {name} is missing", where=where, cure=cure)
-        values = as_column(dimensions[name])
+        values = np.asarray(dimensions[name])
         if values.shape != (n,):
             raise DimensionError(
                 f"the dimension {name} must have one value per point",
@@ -141,7 +140,7 @@ def gather(
         if name in COORDINATES:
             continue
         if returns.parse(name) is not None:  # made by with_returns
-            values = as_column(dimensions[name])
+            values: Any = dimensions[name]
             out[name] = values if rows is None else values[rows]
         elif name != RETURN_RATIO:
             out[name] = picked(name)

@@ -167,7 +167,9 @@ class FeatureForest:
     ) -> PredictResult:
         """Classify; see ``Algorithm.predict``. Not for one that reads context, which :class:`Passes` gives it."""
         features_here = CloudFeatures(self.features, request)
-        blocks = features_here.blocks(request.rows, lambda values, rows: finish(self.probabilities(values)))
+        blocks = features_here.blocks(
+            request.rows, lambda values, rows: finish(self.probabilities(values)), progress=request.progress
+        )
         return PredictResult((Block(rows, result) for rows, result in blocks), features_here.report)
 
 
@@ -189,12 +191,11 @@ class CloudFeatures:
         apply: Callable[[npt.NDArray[np.float32], npt.NDArray[np.int64]], Any],
         memory_share: float = 1.0,
         counted: bool = True,
-        shown: bool = True,
+        progress: Any = None,
     ) -> Iterator[tuple[npt.NDArray[np.int64], Any]]:
-        """Yield (rows, ``apply(values, rows)``) for all rows (None: all points).
+        """Yield (rows, ``apply(values, rows)``) for some rows (None: all points); `apply` runs in workers' threads.
 
-        `apply` runs in workers' threads. Where not `counted`, the report does not change; the progress does where
-        `counted` and `shown`.
+        Where not `counted`, the report does not change.
         """
         asked = self._request
         if not (len(asked.xyz) if rows is None else len(rows)):
@@ -209,7 +210,7 @@ class CloudFeatures:
             dimensions=lambda some: gather(names, known, n, some)[0],
             threads=asked.threads,
             memory_mb=max(asked.memory_mb * memory_share, 16.0),
-            progress=asked.progress if counted and shown else None,
+            progress=progress,
             apply=apply,
         )
         if not counted:

@@ -14,15 +14,18 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError
+from ..base.jit import njit
 from .arrays import ArrayRule
 from .trees import GrownTree
-from .walkable import SPAN, walkable
 
 #: Levels below the root a tree may have.
 MAX_DEPTH = 10_000
-#: Bytes of feature values that pass over a tree before the next one's turn: they are read again for every tree, and stay
-#: in a core's own cache; of rows wider than so many bytes only a little is read.
-_GROUP_BYTES, _NARROW, _WIDE_GROUP_BYTES = 1 << 18, 512, 1 << 20
+#: Rows that walk a tree together: many nodes are loaded at a time.
+LANES = 8
+#: Rows that walk one tree before the next one's turn: their values stay in a core's cache.
+GROUP = 2048
+#: A node as it is walked. A leaf is its own left child under a threshold that is not a number, which nothing exceeds.
+_NODE = np.dtype([("threshold", np.float32), ("feature", np.uint32), ("left", np.uint32), ("leaf", np.uint32)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,10 +80,15 @@ class Forest:
         totals = self.leaf_counts.sum(axis=1, dtype=np.uint64)
         if not totals.all():
             raise ModelError("a leaf holds no samples", found=f"leaf {int(np.argmin(totals))}")
-        leaf_value = self.leaf_counts / totals[:, None].astype(np.float64)
+        leaf = self.feature < 0
+        nodes = np.zeros(len(leaf), _NODE)
+        nodes["threshold"] = np.where(leaf, np.nan, self.threshold)
+        nodes["feature"] = np.where(leaf, 0, self.feature)
+        nodes["left"] = left
+        nodes["leaf"][leaf] = np.arange(leaves)
         object.__setattr__(self, "depths", depths)
-        walked = walkable(sizes, self.feature, self.threshold, left, leaf_value, self.n_features)
-        object.__setattr__(self, "_walked", walked)
+        object.__setattr__(self, "_nodes", nodes)
+        object.__setattr__(self, "_shares", self.leaf_counts / totals[:, None].astype(np.float64))
 
     def _shapes(self) -> str:
         names = ("tree_sizes", "feature", "threshold", "leaf_counts")
@@ -175,20 +183,37 @@ class Forest:
             raise ModelError(
                 f"the model takes {self.n_features} features per point", found=f"shape {values.shape}"
             )
-        from . import walk as kernels
+        out = np.zeros((len(values), self.n_classes))
+        walk(values, self.tree_sizes, self._nodes, self._shares, out)  # type: ignore[attr-defined]
+        return out / self.n_trees
 
-        *trees, table = self._walked  # type: ignore[attr-defined]
-        out = np.zeros((len(values), -(-self.n_classes // SPAN) * SPAN))
-        width = 4 * self.n_features
-        rows = (_GROUP_BYTES if width <= _NARROW else _WIDE_GROUP_BYTES) // width
-        rows = max(rows // kernels.WIDE, 1) * kernels.WIDE
-        sizes, nodes, limits, *parts = trees
-        # Places in a group are counted in 32 bits.
-        if nodes.dtype == np.uint32 and kernels.WIDE * self.n_features < 2**31 and kernels.gathers():
-            kernels.walk_wide(values.reshape(-1), sizes, nodes, *parts, table, rows, out)
-        else:
-            kernels.walk(values.reshape(-1), sizes, nodes, limits, *parts, table, rows, out)
-        return out[:, : self.n_classes] / self.n_trees
+
+@njit
+def walk(values, sizes, nodes, shares, out):
+    """Add each tree's class frequencies to `out`, (n, classes), for rows of `values`, (n, features)."""
+    at = np.zeros(LANES, np.uint32)
+    for first in range(0, len(values), GROUP):
+        last = min(len(values), first + GROUP)
+        start = 0
+        for t in range(len(sizes)):
+            tree = nodes[start : start + sizes[t]]
+            start += sizes[t]
+            for row in range(first, last, LANES):
+                at[:] = 0
+                moving = True
+                while moving:
+                    changed = np.uint32(0)
+                    for lane in range(LANES):
+                        node = tree[at[lane]]
+                        value = values[min(row + lane, last - 1), node.feature]
+                        to = np.uint32(node.left + np.uint32(value > node.threshold))
+                        changed |= to ^ at[lane]
+                        at[lane] = to
+                    moving = changed != 0
+                for lane in range(min(LANES, last - row)):
+                    leaf = tree[at[lane]].leaf
+                    for c in range(out.shape[1]):
+                        out[row + lane, c] += shares[leaf, c]
 
 
 def _laid_out(

@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import DimensionError, ModelError, OptionError
-from ..base.lazycolumns import Taken
 from ..base.report import Report
 from ..features import FeaturePlan
 from ..features.index import CellGrid, build_grid, check_xyz
@@ -245,7 +244,8 @@ class Model:
             rows = None if rows is None else _places(order, rows)
             taken = order if taken is None else taken[order]
         if taken is not None:
-            given = {name: Taken(np.asarray(values), taken) for name, values in given.items()}
+            needed = (*self.required_dimensions, *self.welcome_dimensions)
+            given = {name: np.asarray(given[name])[taken] for name in needed if name in given}
         report = self._predict(xyz, given, rows, grid, order, representatives, outcome, how, progress)
         if len(xyz) < n - ignored:
             report.figures["representatives"] = len(xyz)

@@ -16,7 +16,7 @@ from ..classifier import Model, Prediction
 from ..classifier.deciding import UNCLASSIFIED
 from ..classifier.smoothing import FARTHEST
 from ..classifier.sureness import Limit, Sureness, said, sureness_of
-from ..classifier.sweep import TOGETHER
+from ..classifier.passes import BAND
 from ..models import find
 from .base import Stage
 from .dimensions import meaning, parts_of
@@ -197,9 +197,9 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         )
 
     def memory_in_tiles(self) -> int | None:
-        # Half of it is for features that wait for the next pass: where they all fit, more is of no use.
+        # Half of it is for features that wait for the next pass: where they fit, more is of no use.
         columns = len(self.model.plan.names) + len(self.model.plan.dimensions)
-        return 256 if 4 * TOGETHER * columns <= 128 << 20 else None
+        return 256 if 4 * BAND * columns * len(self.model.passes) <= 128 << 20 else None
 
     def most_neighbors(self) -> int:
         return self.model.plan.most_neighbors
