@@ -6,9 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.base.errors import OptionError
+from pdal_stages.classifier import passes
+from pdal_stages.classifier.algorithms import Block, PredictRequest, PredictResult
 from pdal_stages.classifier.context import CELLS, OWN, Context, around
+from pdal_stages.classifier.passes import PassRun, Strips
 from pdal_stages.classifier.smoothing import WHOLE, count_shares
-from pdal_stages.classifier.sweep import Passed, Sweep
 
 TOKENS = ("own", "box0.5", "box1", "column2", "columnvotes4", "boxvotes1", "column0.125")
 
@@ -60,43 +62,51 @@ def test_equals_the_reference(seed, n, kind):
     assert np.array_equal(out, reference(xyz, shares, rows, context))
 
 
+class Said:
+    """A first pass that hands over probabilities in blocks in any order; or a last one that reads context alone."""
+
+    features = None
+
+    def __init__(self, context=None, blocks=()):
+        self.context, self.blocks = context, blocks
+
+    def predict(self, request, finish):
+        return PredictResult(Block(rows, finish(p)) for rows, p in self.blocks)
+
+
 @settings(max_examples=40, deadline=None)
-@given(
-    st.integers(0, 10**6),
-    st.sampled_from(["even", "copies", "far"]),
-    st.booleans(),
-    st.sampled_from([0.0, 3000.0, 1e9]),
-    st.integers(1, 60),
-)
-def test_strip_by_strip_is_the_same(seed, kind, asc, room, size):
-    """Whatever blocks come in whatever order, however much is kept: every wanted point once, same bits."""
+@given(st.integers(0, 10**6), st.sampled_from(["even", "corners", "far"]), st.integers(1, 300))
+def test_band_by_band_is_the_same(seed, kind, size):
     xyz, shares = cloud(seed, 300, kind)
     random = np.random.default_rng(seed)
     context = Context(("own", "box0.5", "columnvotes2", "column4"))
     wanted = None if seed % 3 == 0 else np.flatnonzero(random.random(300) < 0.3)
     coming = around(xyz, wanted, context)
-    all_coming = np.arange(300) if coming is None else coming
-    features = random.random((300, 4)).astype(np.float32)
-    order = all_coming[np.argsort(xyz[all_coming, 1])] if asc else random.permutation(all_coming)
-    blocks = [
-        Passed(part, shares[part], features[part])
-        for part in (order[k : k + size] for k in range(0, len(order), size))
-    ]
-
-    def again(rows, apply):
-        assert (np.diff(rows) > 0).all()
-        for part in np.array_split(rows, 3):
-            yield part, apply(features[part], part)
-
-    sweep = Sweep(xyz, coming, wanted, context, 3, threads=2, keep_bytes=room, again=again)
-    got = np.full((300, 16), np.nan, np.float32)
-    seen = np.zeros(300, int)
-    for rows, (values, columns) in sweep.run(blocks, lambda values, rows, columns: (values, columns)):
-        seen[rows] += 1
-        got[rows] = np.hstack([values, columns])
+    order = random.permutation(300 if coming is None else coming)
+    blocks = [(part, shares[part] / WHOLE) for part in np.array_split(order, 5)]
+    request = PredictRequest(xyz, {}, wanted, 2)
+    got, seen = np.full((300, 12), np.nan, np.float32), np.zeros(300, int)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(passes, "BAND", size)
+        for rows, columns in PassRun([Said(blocks=blocks), Said(context)], (3, 3), request).blocks(
+            lambda values, rows, columns: columns
+        ):
+            seen[rows] += 1
+            got[rows] = columns
     rows = np.arange(300) if wanted is None else wanted
     assert (seen[rows] == 1).all() and seen.sum() == len(rows)
-    assert np.array_equal(got[rows], np.hstack([features[rows], reference(xyz, shares, rows, context)]))
+    assert np.array_equal(got[rows], reference(xyz, shares, rows, context))
+
+
+@given(st.integers(0, 10**6), st.integers(1, 60))
+def test_bands_are_all_strips_once(seed, size):
+    y = np.random.default_rng(seed).uniform(0, 50, 200)
+    strips = Strips(np.column_stack([y, y, y]), None, 2.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(passes, "BAND", size)
+        bands = strips.bands()
+    assert sorted(np.concatenate([strips.rows(band) for band in bands])) == list(range(200))
+    assert all(strips.count(band) <= size or band[1] - band[0] == 1 for band in bands)
 
 
 @settings(max_examples=30, deadline=None)

@@ -14,6 +14,7 @@ from pdal_stages.classifier import (
     foresttraining,
     load_model,
     modelfile,
+    passes,
     train,
 )
 from pdal_stages.classifier.folds import Folds
@@ -29,9 +30,9 @@ FEW = {
 }
 
 
-def learned(passes=2, **more):
+def learned(number=2, **more):
     xyz, label, dimensions = scene()
-    options = TrainingOptions(**{**FEW, **more}, passes=passes)
+    options = TrainingOptions(**{**FEW, **more}, passes=number)
     return train([TrainingCloud(xyz, label, dimensions, "a.laz")], options, progress=False)
 
 
@@ -48,6 +49,12 @@ def three():
 @pytest.fixture(scope="module")
 def other():
     return scene(seed=7, n=5000)
+
+
+@pytest.fixture(autouse=True)
+def small_bands(monkeypatch):
+    """Scenes of a few thousand points have several bands."""
+    monkeypatch.setattr(passes, "BAND", 500)
 
 
 def same(a, b, rows=slice(None), other=slice(None)):
@@ -118,11 +125,9 @@ def test_where_and_tiles_change_nothing(name, other, request):
 
 
 def test_features_that_are_not_kept_are_computed_again(two, other, monkeypatch):
-    from pdal_stages.classifier import passes
-
     xyz, _, dimensions = other
     kept = everything(two, xyz, dimensions)
-    monkeypatch.setattr(passes, "_KEPT", 0.0)
+    monkeypatch.setattr(passes, "_HELD", 0.0)
     again = everything(two, xyz, dimensions)
     same(kept, again)
     assert kept.report == again.report

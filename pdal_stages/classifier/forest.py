@@ -25,7 +25,9 @@ LANES = 8
 #: Rows that walk one tree before the next one's turn: their values stay in a core's cache.
 GROUP = 2048
 #: A node as it is walked. A leaf is its own left child under a threshold that is not a number, which nothing exceeds.
-_NODE = np.dtype([("threshold", np.float32), ("feature", np.uint32), ("left", np.uint32), ("leaf", np.uint32)])
+_NODE = np.dtype(
+    [("threshold", np.float32), ("feature", np.uint32), ("left", np.uint32), ("leaf", np.uint32)]
+)
 
 
 @dataclass(frozen=True, eq=False)

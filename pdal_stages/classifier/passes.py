@@ -23,7 +23,7 @@ from .context import Context, around
 from .featureforest import CloudFeatures, Features
 from .smoothing import count_shares
 
-#: Points of a band, where strips hold fewer.
+#: Points of a band at most, but for a band of one strip.
 BAND = 150_000
 #: Features of a band are held for the next pass where they take no more than this share of the memory; else they are
 #: computed once more.
@@ -286,8 +286,8 @@ class Strips:
         points = self._start[1:]
         out, first = [], 0
         while first < len(points):
-            end = int(np.searchsorted(points, self._start[first] + BAND)) + 1
-            out.append((first, min(end, len(points))))
+            end = int(np.searchsorted(points, self._start[first] + BAND, side="right"))
+            out.append((first, max(end, first + 1)))
             first = out[-1][1]
         return out
 
@@ -305,9 +305,7 @@ class Strips:
 
     def window(self, band: Band) -> slice:
         """Places of the points of a band and of the strips beside it."""
-        return slice(
-            self._start[max(band[0] - 1, 0)], self._start[min(band[1] + 1, len(self._start) - 1)]
-        )
+        return slice(self._start[max(band[0] - 1, 0)], self._start[min(band[1] + 1, len(self._start) - 1)])
 
     def places(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """Where points lie in this order."""
