@@ -24,11 +24,11 @@ import numpy as np
 from pdal_stages import __version__
 from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.pipeline import pdal as pdal_env
-from pdal_stages.pipeline.classifying import ClassifyRequest
-from pdal_stages.pipeline.ends import input_files
+from pdal_stages.pipeline.classify_request import ClassifyRequest
+from pdal_stages.pipeline.inputs_outputs import input_files
 from pdal_stages.pipeline.overrides import parse_overrides
 from pdal_stages.pipeline.run import Pipeline
-from pdal_stages.pipeline.trainjob import train_pipeline
+from pdal_stages.pipeline.training import train_pipeline
 from pdal_stages.reports.panels import triptych
 from pdal_stages.reports.pictures import write_png
 

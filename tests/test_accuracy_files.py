@@ -10,7 +10,7 @@ from test_training_scores import QUICK_WORDS, scene
 
 from pdal_stages.base.errors import StageError
 from pdal_stages.cli import main
-from pdal_stages.pipeline.comparing import paired
+from pdal_stages.pipeline.accuracy_files import paired
 from pdal_stages.reports.accuracypage import Place, places
 
 

@@ -12,8 +12,8 @@ import pdal_stages as ps
 from pdal_stages.base.errors import StageError
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 from pdal_stages.cli import main
-from pdal_stages.pipeline.comparing import paired
-from pdal_stages.pipeline.ends import input_files
+from pdal_stages.pipeline.accuracy_files import paired
+from pdal_stages.pipeline.inputs_outputs import input_files
 
 pytestmark = pytest.mark.pdal
 WKT = 'PROJCS["RGF93 / Lambert-93",GEOGCS["RGF93",DATUM["x",SPHEROID["GRS 1980",6378137,298.257222101]],'

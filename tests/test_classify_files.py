@@ -15,8 +15,8 @@ import pytest
 
 from pdal_stages.cli import main
 from pdal_stages.pipeline import pdal as pdal_env
-from pdal_stages.pipeline.classifying import ClassifyRequest
-from pdal_stages.pipeline.ends import overlooked
+from pdal_stages.pipeline.classify_request import ClassifyRequest
+from pdal_stages.pipeline.inputs_outputs import overlooked
 from pdal_stages.tiling import TilingOptions, sizing
 from pdal_stages.tiling.classify import ClassifyTask
 

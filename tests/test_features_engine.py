@@ -439,7 +439,7 @@ def run_python(code, **environment):
 def test_importing_and_loading_a_model_are_light():
     out = run_python(
         """
-        import sys, pdal_stages.features, pdal_stages.pipeline.classifying
+        import sys, pdal_stages.features, pdal_stages.pipeline.classify_request
         from pdal_stages.classifier import load_model
         from pdal_stages.models import find
         load_model(find("standard"))

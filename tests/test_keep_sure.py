@@ -16,7 +16,7 @@ from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 from pdal_stages.classifier.sureness import BINS, Sureness, of_the_base, said, sureness_of
 from pdal_stages.cli import main
 from pdal_stages.models import find
-from pdal_stages.pipeline.classifying import ClassifyRequest
+from pdal_stages.pipeline.classify_request import ClassifyRequest
 from pdal_stages.synthetic import write_town
 
 

@@ -21,9 +21,7 @@ import pytest
 import pdal_stages as ps
 from pdal_stages.base.version import __version__
 from pdal_stages.pipeline import pdal as pdal_env
-from pdal_stages.pipeline.lowering import lower
 from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
-from pdal_stages.pipeline.read import read_pipeline
 from pdal_stages.plugin import arrival, building, declarations, places
 from pdal_stages.stages import registry
 from pdal_stages.synthetic import TownOptions, write_town
@@ -73,28 +71,10 @@ def pipeline(stock, tmp_path_factory):
 
     def run(stages, *words, **how):
         path = folder / f"{next(count)}.json"
-        path.write_text(json.dumps(mended(pdal_env.adapted(stages))))
+        path.write_text(json.dumps(pdal_env.adapted(stages)))
         return stock("pipeline", path, *words, **how)
 
     return run
-
-
-def mended(stages):
-    """The stages with the extra dimensions that our command names where PDAL 2.2 takes flags for one of them."""
-    if pdal_env.knows_class_flags():
-        return stages
-    try:
-        lowered = lower(read_pipeline(stages)).stages
-    except ps.StageError:
-        return stages
-    named = {str(s["filename"]): s.get("extra_dims") for s in lowered if "filename" in s}
-    out = [dict(s) if isinstance(s, dict) else s for s in stages]
-    for stage in out:
-        if isinstance(stage, dict) and "extra_dims" in stage:
-            stage["extra_dims"] = named[str(stage["filename"])]
-            if stage["extra_dims"] is None:
-                del stage["extra_dims"]
-    return out
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pdal_stages as ps
 from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier.unscored import why_unscored
 from pdal_stages.cli import main
-from pdal_stages.pipeline.surveyjob import surveys_of
+from pdal_stages.pipeline.training import surveys_of
 
 
 def test_surveys_are_files_or_groups_of_them():

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import sqlite3
 
 import pytest
 
-from pdal_stages.base.errors import PipelineError
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.run import Pipeline
 
@@ -20,8 +18,6 @@ def test_it_gets_a_measure_where_nobody_names_one(monkeypatch):
     monkeypatch.setattr(pdal_env, "version", lambda: (2, 2, 0))
     for writer in ({"type": "writers.ogr", "filename": "a.gml"}, {"filename": "a.shp"}):
         assert pdal_env.adapted([FAUX, writer])[-1]["measure_dim"] == "Z"
-        expanded = json.loads(Pipeline([FAUX, {"type": "filters.hag_minima"}, writer]).json)["pipeline"]
-        assert expanded[-1]["measure_dim"] == "Z"
     own = {"type": "writers.ogr", "filename": "a.shp", "measure_dim": "Intensity"}
     assert pdal_env.adapted([FAUX, own])[-1] == own
     assert "measure_dim" not in pdal_env.adapted([FAUX, {"filename": "a.las"}])[-1]
@@ -44,18 +40,3 @@ def test_points_reach_the_file(tmp_path, name, multicount):
         found = json.loads(out.read_text())["features"]
         assert len(found) == -(-POINTS // multicount)
         assert found[0]["geometry"]["type"] == ("Point" if multicount == 1 else "MultiPoint")
-
-
-def test_formats_that_number_features(tmp_path):
-    out = tmp_path / "o.gpkg"
-    stages = [FAUX, {"type": "writers.ogr", "filename": str(out), "ogrdriver": "GPKG"}]
-    if pdal_env.writes_numbered_features():
-        Pipeline(stages).execute()
-        assert sqlite3.connect(out).execute("SELECT COUNT(*) FROM points").fetchone() == (POINTS,)
-        return
-    with pytest.raises(PipelineError, match=r"cannot write points as GPKG.*ogr2ogr") as caught:
-        Pipeline(stages)
-    assert "Did you mean" not in str(caught.value)
-    del stages[1]["ogrdriver"]  # which would be a folder of Shapefiles
-    with pytest.raises(PipelineError, match=r"cannot write points as gpkg.*ogr2ogr"):
-        Pipeline(stages)

@@ -11,8 +11,8 @@ import pytest
 
 from pdal_stages.base.errors import PipelineError
 from pdal_stages.cli import main
+from pdal_stages.pipeline.lowering import run_by_pdal
 from pdal_stages.pipeline.run import Pipeline
-from pdal_stages.pipeline.wiring import run_by_pdal
 
 FAUX = {"type": "readers.faux", "count": 300, "mode": "ramp", "bounds": "([0,60],[0,60],[0,9])"}
 HAG = {"type": "filters.hag_minima"}

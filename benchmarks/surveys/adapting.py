@@ -20,7 +20,7 @@ import laspy
 import numpy as np
 from clouds import SURVEYS, slug, true_classes
 
-from pdal_stages.pipeline.classifying import ClassifyRequest
+from pdal_stages.pipeline.classify_request import ClassifyRequest
 from pdal_stages.tiling.adapting import SURE, AdaptTask
 from pdal_stages.tiling.classify import classify_file
 

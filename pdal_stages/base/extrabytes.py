@@ -6,7 +6,7 @@ PDAL writes its own words for dimensions that it knows and none for others, what
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -57,14 +57,6 @@ def extra_dimensions(path: str | os.PathLike) -> dict[str, str]:
         return {}
 
 
-def passed_over(path: str | os.PathLike) -> list[str]:
-    """Names of extra dimensions that a LAS file describes in records after the first, which PDAL passes over."""
-    try:
-        return [entry.name for entry in _entries(path, later=True) if entry.name]
-    except (OSError, ValueError):
-        return []
-
-
 def plain_dimensions(path: str | os.PathLike) -> list[tuple[str, str]] | None:
     """Names and types of the extra dimensions in their order; None where one is scaled, not a number or has no name."""
     found = list(_entries(path))
@@ -76,32 +68,3 @@ def plain_dimensions(path: str | os.PathLike) -> list[tuple[str, str]] | None:
 def number_type(kind: str) -> np.dtype:
     """The NumPy type of one that PDAL writes so: ``double``, ``float``, ``uint8`` or ``uint8_t``."""
     return np.dtype({"float": "f4", "double": "f8"}.get(kind, kind.removesuffix("_t")))
-
-
-def descriptions(path: str | os.PathLike) -> dict[str, bytes]:
-    """What a LAS file says of its extra dimensions, by name; those of which it says nothing are left out."""
-    try:
-        return {entry.name: entry.description for entry in _entries(path) if entry.description}
-    except (OSError, ValueError):
-        return {}
-
-
-def describe(path: str | os.PathLike, texts: Mapping[str, bytes]) -> None:
-    """Put descriptions of extra dimensions, by name, into a LAS file; what it says of others stays.
-
-    Raises
-    ------
-    ValueError
-        For a text of more than 32 bytes.
-    OSError
-        If the file cannot be written.
-    """
-    if long := [text for text in texts.values() if len(text) > 32]:
-        raise ValueError(f"longer than 32 bytes: {long[0]!r}")
-    new = [(one.place, texts[one.name]) for one in _entries(path) if one.name in texts]
-    if not new:
-        return
-    with open(path, "r+b") as file:
-        for place, text in new:
-            file.seek(place + _DESCRIPTION.start)
-            file.write(text.ljust(32, b"\0"))

@@ -103,8 +103,8 @@ def add_commands(add: Adder) -> None:
 
 
 def _classify(options: argparse.Namespace) -> int:
-    from ..pipeline.classifying import WRITTEN, ClassifyRequest
-    from ..pipeline.ends import overlooked
+    from ..pipeline.classify_request import WRITTEN, ClassifyRequest
+    from ..pipeline.inputs_outputs import overlooked
     from ..tiling.classify import ClassifyTask
     from ..tiling.command import classify, options_of
 

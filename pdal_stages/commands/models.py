@@ -114,10 +114,9 @@ def _models(options: argparse.Namespace) -> None:
 
 
 def _train(options: argparse.Namespace) -> None:
-    from ..pipeline.ends import input_files, overlooked
+    from ..pipeline.inputs_outputs import input_files, overlooked
     from ..pipeline.run import Pipeline
-    from ..pipeline.surveyjob import surveys_of, train_surveys
-    from ..pipeline.trainjob import train_pipeline
+    from ..pipeline.training import surveys_of, train_pipeline, train_surveys
     from ..stages.loading import load_model
     from ..tiling.command import options_of, run_training
     from ..tiling.training import TrainTask
@@ -146,7 +145,7 @@ def _train(options: argparse.Namespace) -> None:
 
 
 def _adapt(options: argparse.Namespace) -> None:
-    from ..pipeline.ends import overlooked
+    from ..pipeline.inputs_outputs import overlooked
     from ..stages.loading import load_model
     from ..tiling.adapting import AdaptTask
     from ..tiling.command import interruptible, options_of
@@ -160,8 +159,8 @@ def _adapt(options: argparse.Namespace) -> None:
 
 
 def _accuracy(options: argparse.Namespace) -> None:
-    from ..pipeline.comparing import WHAT_IS_TRUE, accuracy_pipeline, compare_files
-    from ..pipeline.ends import input_files, overlooked
+    from ..pipeline.accuracy_files import WHAT_IS_TRUE, accuracy_pipeline, compare_files
+    from ..pipeline.inputs_outputs import input_files, overlooked
     from ..pipeline.run import Pipeline
 
     reference_dimension = options.reference_dimension or (

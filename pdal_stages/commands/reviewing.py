@@ -81,7 +81,7 @@ def add_commands(add: Adder) -> None:
 
 
 def _review(options: argparse.Namespace) -> None:
-    from ..pipeline.ends import overlooked
+    from ..pipeline.inputs_outputs import overlooked
     from ..pipeline.reviewing import request_of, write_review
     from ..reports.reviewpage import lines
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from ..base import kinds
@@ -77,6 +77,12 @@ def stage_files(stage: Stage) -> list[str]:
     given = [(o.kind, stage.options[o.name]) for o in stage.all_options() if o.kind in ("filename", "model")]
     found = [find(name) if kind == "model" else name for kind, name in given if name]
     return [name for name in [*found, *stage.inputs()] if name not in written]
+
+
+def is_reader(stages: Sequence[dict[str, Any]], number: int) -> bool:
+    """Whether a stage is a reader: without a type, one that is not the last of several."""
+    kind = stages[number].get("type", "")
+    return kind.startswith("readers.") or (not kind and (number == 0 or number < len(stages) - 1))
 
 
 def is_writer(stage: dict[str, Any], stages: list[dict[str, Any]]) -> bool:

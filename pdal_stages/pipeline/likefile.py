@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.chunks import laz_chunks
+from ..base.errors import StageError
 from ..base.extrabytes import number_type, plain_dimensions
 from ..base.las import POINT_BYTES, LasHeader, read_header
-from . import packing
+from .las_output import UNCOMPRESSED
 
 
 class Extra(NamedTuple):
@@ -83,10 +84,9 @@ class LikeFile:
         with open(path, "rb") as file:
             head = file.read(header.offset)
         coding = b""
-        if path.endswith(packing.UNPACKED):
-            head, made = packing.packed_head(head, header)
-            coding = bytes(made.record_data())
-        elif header.compressed:
+        if path.endswith(UNCOMPRESSED):
+            return None
+        if header.compressed:
             chunks = laz_chunks(path, header)
             if chunks is None:
                 return None
@@ -117,7 +117,15 @@ class LikeFile:
         if self.coding:
             import lazrs
 
-            packing.compress(file, lazrs.LazVlr(self.coding), (block.view(np.uint8) for block in blocks))
+            try:
+                packer = lazrs.ParLasZipCompressor(file, lazrs.LazVlr(self.coding))
+                for block in blocks:
+                    packer.compress_many(block.view(np.uint8))
+                packer.done()
+            except (ValueError, RuntimeError, lazrs.LazrsError) as error:
+                raise StageError(
+                    "the output file could not be compressed", found=f"{getattr(file, 'name', '')}: {error}"
+                ) from error
         else:
             for block in blocks:
                 file.write(block.view(np.uint8).data)

@@ -9,19 +9,25 @@ from __future__ import annotations
 import copy
 import difflib
 import itertools
+import json
+import shlex
 import uuid
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..base.errors import PipelineError, StageError, suggest
+from ..base.errors import DimensionError, OptionError, PipelineError, StageError, suggest
+from ..base.extrabytes import extra_dimensions
+from ..base.las import read_header
 from ..stages import preparation, registry
 from ..stages.base import Stage
-from . import classflags, extradims, wiring
-from .optionfile import settled
+from ..stages.points import MAKERS
+from . import pdal as pdal_env
+from .filenames import is_reader, reader_files
+from .las_output import check_copc, check_writers, files_with_flags_to_split, flag_splitter
 from .read import PipelineSource
 from .runtime import TRAMPOLINE, made, place, python_filter
-from .writerlimits import check_copc, check_vectors, check_writers
 
 #: Options of every PDAL stage that a lowered stage hands on.
 PDAL_OWN = ("tag", "inputs", "user_data", "log")
@@ -50,11 +56,6 @@ class Lowered:
     ours: list[LoweredStage] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
-    @property
-    def meanings(self) -> dict[str, str]:
-        """What LAS files say of the dimensions that stages of ours make; of what several change, the last one's word."""
-        return {name: text for ours in self.ours for name, text in ours.stage.meanings().items()}
-
 
 def lower(source: PipelineSource, whole: bool = True) -> Lowered:
     """Lower a pipeline; not `whole`: to be cut into tiles, whose outputs part flags from classes themselves.
@@ -71,20 +72,37 @@ def lower(source: PipelineSource, whole: bool = True) -> Lowered:
         _refuse_near_miss(stages[-1], source.where(place_of))
     views = _Views()
     out = Lowered([])
-    run = wiring.run_by_pdal(stages)
+    if stages and not is_reader(stages, 0):
+        raise PipelineError(
+            "the pipeline does not start with a reader",
+            found=stages[0].get("type", ""),
+            cure="Put the file that is to be read first",
+        )
+    run = run_by_pdal(stages)
     if len(run) < len(stages):
         places = [source.where(number) for number in range(len(stages))]
-        out.warnings.append(wiring.warning_of_ends(stages, run, places))
+        out.warnings.append(_warning_of_ends(stages, run, places))
         stages = [stages[number] for number in run]
     check_copc(stages)
-    check_vectors(stages)
+    out.warnings += unread_extra_dimensions(stages)
+    has_ours = any(stage.get("type") in registry.stages() for stage in stages)
+    flags = files_with_flags_to_split(stages, has_ours) if whole else []
+    readers = [number for number in range(len(stages)) if is_reader(stages, number)]
+    if flags and (readers[-1] >= len(readers) or any("inputs" in stage for stage in stages)):
+        raise PipelineError(
+            "this PDAL brings the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 into other files only where all "
+            "readers stand first and no stage has 'inputs'",
+            found=f"PDAL {pdal_env.dotted_version()}",
+            cure="Leave 'inputs' out, write one file at a time, or use PDAL 2.6",
+        )
     tags = {str(s["tag"]) for s in stages if "tag" in s}
-    numbered: Iterable[tuple[dict[str, Any], int | None]] = zip(stages, itertools.count(), strict=False)
-    for stage, index in classflags.wired(stages) if whole else numbered:
+    for index, stage in enumerate(stages):
         type_name = stage.get("type", "")
-        if index is None or type_name not in registry.stages():
-            views.add(stage, last=index is not None and 0 < index == len(stages) - 1)
+        if type_name not in registry.stages():
+            views.add(stage, last=0 < index == len(stages) - 1)
             out.stages.append(stage)
+            if flags and index == readers[-1]:
+                out.stages.append(flag_splitter(flags))
             continue
         where = source.where(run[index])
         try:
@@ -105,10 +123,59 @@ def lower(source: PipelineSource, whole: bool = True) -> Lowered:
         views.add(stage)
         out.ours.append(lowered)
         out.stages.append(lowered.plain)
-    out.stages = extradims.settle(out.stages)
     _follow_preparations(out)
     check_writers(out.stages, [(ours.stage, ours.place, ours.index) for ours in out.ours])
     return out
+
+
+# ---- which stages PDAL runs ----------------------------------------------------------------------
+
+
+def run_by_pdal(stages: Sequence[dict[str, Any]]) -> list[int]:
+    """The numbers of the stages that lead to the first end of a pipeline; PDAL runs no others."""
+    tagged: dict[str, int] = {}
+    waiting: list[int] = []
+    inputs: list[list[int]] = []
+    for number, stage in enumerate(stages):
+        named = stage.get("inputs") or []
+        chosen = [named] if isinstance(named, str) else named
+        if any(str(tag) not in tagged for tag in chosen):
+            return list(range(len(stages)))  # for PDAL to refuse
+        if is_reader(stages, number):
+            inputs.append([])
+            waiting = [*waiting, number]
+        else:
+            inputs.append([tagged[str(tag)] for tag in chosen] or waiting)
+            waiting = [number]
+        if "tag" in stage:
+            tagged[str(stage["tag"])] = number
+    taken = {one for several in inputs for one in several}
+    found: set[int] = set()
+    left = [next(number for number in range(len(stages)) if number not in taken)]
+    while left:
+        number = left.pop()
+        found.add(number)
+        left += [one for one in inputs[number] if one not in found]
+    return sorted(found)
+
+
+def _warning_of_ends(stages: Sequence[dict[str, Any]], run: Sequence[int], where: Sequence[str]) -> str:
+    """The warning about stages that PDAL leaves out; an error if no writer would run at all."""
+    left = [number for number in range(len(stages)) if number not in run]
+    names = [" ".join(str(stages[n][key]) for key in ("type", "filename") if key in stages[n]) for n in left]
+    named = ", ".join(f"{name} ({where[n]})" for n, name in list(zip(left, names, strict=True))[:5])
+    what = "a pipeline with several ends: PDAL runs only what leads to the first of them"
+    cure = (
+        "Write one file after the other (a writer hands on what it gets, so leave its 'inputs' out), or put a last "
+        'stage there that has all ends as inputs, e.g. {"type": "filters.merge", "inputs": [...]}'
+    )
+    writing = {n for n, stage in enumerate(stages) if str(stage.get("type", "")).startswith("writers.")}
+    if writing and not writing & set(run):
+        raise PipelineError(what, where=where[run[-1]], found=f"not run: {named}", cure=cure)
+    return f"{what}. Not run: {named}. {cure}"
+
+
+# ---- what stages read, and whether it will be there ----------------------------------------------
 
 
 class Upstream(NamedTuple):
@@ -155,6 +222,66 @@ def _follow_preparations(lowered: Lowered) -> None:
         before.append(({"type": ours.stage.type, **ours.given}, ours.stage.creates()))
 
 
+#: How dimensions begin that no reader has of itself, but a stage or a file's extra bytes.
+_MADE = ("HeightAbove", "Ground", "Slope", "Reference")
+#: Stages of PDAL that make dimensions of any name, or name them in files.
+_MAKES_ANY = {f"filters.{name}" for name in ("python", "matlab", "colorization", "overlay", "hag_dem")}
+
+
+def check_dimensions(lowered: Lowered) -> None:
+    """Refuse a stage that reads heights or labels that no stage makes and no input has.
+
+    Raises
+    ------
+    DimensionError
+    """
+    of_ours = {ours.index: ours.stage.creates() for ours in lowered.ours}
+    for ours in lowered.ours:
+        before = list(enumerate(lowered.stages[: ours.index]))
+        for name in ours.stage.reads():
+            if name.startswith(_MADE) and not any(
+                name in of_ours[index] if index in of_ours else _may_make(name, stage)
+                for index, stage in before
+            ):
+                raise DimensionError(
+                    f"the dimension '{name}' is missing: no stage before makes it, and no input has it",
+                    where=ours.place,
+                    cure=getattr(ours.stage, "hint", None) or MAKERS.get(name),
+                )
+
+
+def _may_make(name: str, stage: Mapping[str, Any]) -> bool:
+    """Whether a stage of PDAL may make a dimension: readers of other formats than LAS may make any."""
+    kind = str(stage.get("type") or "readers.")
+    if kind.startswith("readers."):
+        files = reader_files(dict(stage), las=True)
+        named = name in str(stage.get("extra_dims", ""))
+        return not files or named or any(name in extra_dimensions(path) for path in files)
+    if kind in _MAKES_ANY or name in heights_of(stage):
+        return True
+    return any(name in str(value) for key, value in stage.items() if key not in ("type", "tag"))
+
+
+def unread_extra_dimensions(stages: Sequence[dict[str, Any]]) -> list[str]:
+    """A warning for each file of LAS 1.0-1.3 with extra dimensions, which PDAL reads only when told."""
+    warnings = []
+    for stage in stages:
+        if str(stage.get("use_eb_vlr", "")).lower() == "true" or "extra_dims" in stage:
+            continue
+        for path in reader_files(stage, las=True):
+            header, names = read_header(path), list(extra_dimensions(path))
+            if header is not None and header.minor < 4 and names:
+                listed = ", ".join(names[:5]) + ", ..." * (len(names) > 5)
+                warnings.append(
+                    f"{path}: its extra dimensions are not read: {listed}. Of LAS 1.{header.minor} PDAL reads them "
+                    'where the reader has "use_eb_vlr": true'
+                )
+    return warnings
+
+
+# ---- one stage -----------------------------------------------------------------------------------
+
+
 def _refuse_near_miss(stage: dict[str, Any], where: str) -> None:
     """A mistyped type of ours would reach PDAL, whose message cannot name our stages."""
     type_name = stage.get("type", "")
@@ -187,6 +314,58 @@ def lower_stage(given: dict[str, Any], number: int = 0, index: int = 0) -> Lower
     plain.update({key: given[key] for key in PDAL_OWN if key in given})
     made[label] = stage
     return LoweredStage(stage, named, label, number, index, given, plain)
+
+
+def settled(stage: Mapping[str, Any]) -> dict[str, Any]:
+    """A stage of ours with `option_file` and `where_merge` answered, which every PDAL stage has.
+
+    Options of the pipeline go before those of the file.
+
+    Raises
+    ------
+    OptionError
+        If the file cannot be read, or `where_merge` asks for what cannot be.
+    """
+    options = dict(stage)
+    if "option_file" in options:
+        options = {**_option_file(options.pop("option_file")), **options}
+    if "where_merge" in options:
+        word = str(options.pop("where_merge")).strip().lower()
+        if word not in ("auto", "true"):
+            raise OptionError(
+                "option 'where_merge' must be 'auto' or 'true': points outside 'where' stay beside the others, as "
+                "neighbors",
+                found=repr(word),
+                cure='Leave it out, and tell the points apart afterwards, e.g. with {"type": "filters.expression"}',
+            )
+    return options
+
+
+def _option_file(path: Any) -> dict[str, Any]:
+    """An option file as PDAL has them: a JSON object, or words ``--name=value``."""
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig").strip()
+        found = json.loads(text) if text.startswith("{") else _words(shlex.split(text))
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        raise OptionError("the option file cannot be read", found=f"{str(path)[:200]!r}: {error}") from None
+    if wired := {"type", "tag", "inputs"} & set(found):
+        raise OptionError(
+            "an option file sets options, not how stages are joined",
+            found=f"{path}: {', '.join(sorted(wired))}",
+        )
+    return found
+
+
+def _words(words: list[str]) -> dict[str, str]:
+    found, waiting = {}, iter(words)
+    for word in waiting:
+        name, equals, value = word.partition("=")
+        if not name.startswith("--"):
+            raise ValueError(f"'{word}' does not begin with --name")
+        if not (value := value if equals else next(waiting, "")):
+            raise ValueError(f"'{word}' has no value")
+        found[name[2:]] = value
+    return found
 
 
 class _Views:

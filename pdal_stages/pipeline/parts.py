@@ -15,7 +15,7 @@ from ..base.errors import StageError
 from ..base.las import read_header
 from ..stages.points import Points
 from . import pdal as pdal_env
-from .ends import reader_of
+from .inputs_outputs import reader_of
 from .references import Reference, reference_of
 
 #: Points read at a time.

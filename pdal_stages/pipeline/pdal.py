@@ -16,13 +16,10 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
-from ..base.errors import DependencyError, PipelineError, StageError
-from ..base.extrabytes import extra_dimensions
-from ..base.lascheck import check_readable
-from ..base.lasrecords import damaged
-from ..base.shortage import is_short, shortage
+from ..base.errors import DependencyError, PipelineError
+from ..base.lascheck import DAMAGED, check_readable
 from .filenames import readers_files
-from .interrupts import fragile
+from .interrupts import calls_pdal
 
 INSTALL = (
     "Install PDAL with its Python bindings: conda install -c conda-forge python-pdal pdal-plugins; on Debian or "
@@ -49,8 +46,6 @@ def bindings():
     try:
         import pdal
     except ImportError as error:
-        if is_short(error):
-            raise shortage(f"python-pdal: {error}") from error
         raise DependencyError(
             "python-pdal cannot be imported", found=f"{sys.executable}: {error}", cure=INSTALL
         ) from error
@@ -124,7 +119,7 @@ def execute(
 _one_run = threading.RLock()
 
 
-@fragile
+@calls_pdal
 def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execution:
     pdal = bindings()
     stdout = sys.stdout
@@ -138,11 +133,15 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
         count = pipeline.execute()
     except (RuntimeError, ValueError, IndexError, OverflowError) as error:  # C++'s errors, as Python has them
         keep(stdout)
-        raise (
-            _of_damaged(stages, str(error))
-            or _of_names(stages, str(error))
-            or translate(str(error), log_lines(_log(pipeline))[-3:])
-        ) from None
+        failure = translate(str(error), log_lines(_log(pipeline))[-3:])
+        if _CUT_POINTS.search(str(error)) and (read := readers_files(stages, las=True)):
+            failure = PipelineError(
+                "the LAS file is damaged: its points cannot be decoded",
+                where=read[0] if len(read) == 1 else "one of " + ", ".join(read),
+                found=str(error).strip(),
+                cure=DAMAGED,
+            )
+        raise failure from None
     except MemoryError:
         raise PipelineError(
             "memory ran out", cure="Work in tiles (--tile), or read less, e.g. with filters.crop"
@@ -162,32 +161,6 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
 
 
 _CUT_POINTS = re.compile(r"readers\.las: .*(reading point \d+ of \d+|[Cc]ouldn't read .*point)")
-
-
-def _of_damaged(stages: list[dict[str, Any]], message: str) -> StageError | None:
-    """What PDAL says of points that cannot be decoded, with the file; None where it speaks of something else."""
-    read = readers_files(stages, las=True)
-    if not read or not _CUT_POINTS.search(message):
-        return None
-    return damaged(read[0] if len(read) == 1 else "one of " + ", ".join(read), message.strip())
-
-
-_NO_NAME = re.compile(r"Can't create dimension with invalid name '(.*)'")
-
-
-def _of_names(stages: list[dict[str, Any]], message: str) -> PipelineError | None:
-    """What older PDAL says of an extra dimension such as ``Pulse width``, with its file; None of anything else."""
-    name = found[1] if (found := _NO_NAME.search(message)) else None
-    for path in readers_files(stages, las=True) if name else ():
-        if name in extra_dimensions(path):
-            return PipelineError(
-                "this PDAL does not read an extra dimension of that name",
-                where=path,
-                found=name,
-                cure="Newer ones do, such as 2.9; or write the file without it: "
-                f"las = laspy.read(IN); las.remove_extra_dim({name!r}); las.write(OUT)",
-            )
-    return None
 
 
 _kept: list[Any] = []
@@ -361,12 +334,12 @@ def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
         return stages
     out = []
     for stage in stages:
-        last = stage is stages[-1] and len(stages) > 1
-        if isinstance(stage, dict) and stage.get("type") == "writers.las" and "forward" not in stage:
+        kind = stage.get("type") if isinstance(stage, dict) else None
+        if kind == "writers.las" and "forward" not in stage:
             stage = {"filesource_id": 0, **stage}
-        elif isinstance(stage, dict) and _writes_ogr(stage, last):
+        elif kind == "writers.ogr" or (not kind and len(out) and _is_vector(stage)):
             stage = {"measure_dim": "Z", **stage}
-        elif isinstance(stage, dict) and stage.get("type") == "readers.copc":
+        elif kind == "readers.copc":
             beyond = [name for name in stage if name in _COPC_OPTIONS]
             if beyond:
                 raise PipelineError(
@@ -380,17 +353,8 @@ def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return out
 
 
-def with_measures(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Stages whose ``writers.ogr`` is told the dimension of its measure, which PDAL before 2.4 takes from anywhere."""
-    if version() >= (2, 4, 0):
-        return stages
-    many = len(stages) > 1
-    return [{"measure_dim": "Z", **s} if _writes_ogr(s, many and s is stages[-1]) else s for s in stages]
-
-
-def _writes_ogr(stage: dict[str, Any], last: bool) -> bool:
-    by_name = last and str(stage.get("filename", "")).lower().endswith((".shp", ".geojson"))
-    return stage.get("type") == "writers.ogr" or (by_name and not stage.get("type"))
+def _is_vector(stage: Any) -> bool:
+    return isinstance(stage, dict) and str(stage.get("filename", "")).lower().endswith((".shp", ".geojson"))
 
 
 #: Options of readers.copc that choose points, and those that only make it faster.
@@ -417,19 +381,9 @@ def writes_copc() -> bool:
     return version() >= (2, 4, 0)
 
 
-def writes_numbered_features() -> bool:
-    """Whether writers.ogr makes a new feature of each point, as formats need that number their features."""
-    return version() >= (2, 5, 0)
-
-
 def crashes_without_ground() -> bool:
     """Whether filters.hag_nn and filters.hag_delaunay end the process where no point is ground (PDAL 2.2 does)."""
     return version() < (2, 9, 0)
-
-
-def knows_class_flags() -> bool:
-    """Whether writers know that `ClassFlags` is no extra dimension of LAS 1.4 (PDAL 2.2 does not)."""
-    return version() >= (2, 3, 0)
 
 
 #: Dimensions of newer PDAL for the flags of a point.

@@ -39,7 +39,7 @@ from ..review import (
 from ..review.patches import REASONS
 from ..stages.heights import PREPARATION, made_of_coordinates
 from ..stages.loading import loaded_model
-from .ends import input_files
+from .inputs_outputs import input_files
 from .parts import Part, parts_of, reads_in_parts, reference_and_wkt
 from .processes import each_file
 from .references import check_one_reference, without_reference

@@ -7,7 +7,6 @@ import logging
 import os
 import re
 import signal
-import threading
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,29 +16,19 @@ from ..base.complete import check_complete
 from ..base.errors import InterruptedStage, PipelineError, StageError
 from ..base.files import whole_files
 from ..base.jit import Compiling
-from ..base.las import odd_text, read_header, supersede_copc
-from ..base.lascheck import beyond_box, check_readable
+from ..base.las import odd_text, supersede_copc
+from ..base.lascheck import check_readable
 from ..base.outputs import Output, check_outputs
 from ..base.report import Report
-from ..base.shortage import check_limit
 from ..stages import registry
-from . import direct, packing, runtime, straight
+from . import describe, interrupts, las_output, runtime, straight
 from . import pdal as pdal_env
 from .callbacks import Callbacks, Function
 from .filenames import is_writer, named_files, readers_files, stage_files, with_outputs, writers_outputs
-from .foreseen import check_dimensions, unread_extra_dimensions
-from .groundcheck import GroundChecks
-from .interrupts import gentle
-from .lowering import Lowered, lower
+from .lowering import Lowered, check_dimensions, lower
 from .overrides import Override, apply_overrides
 from .read import PipelineSource, read_pipeline
-from .records import keep_records
 from .references import check_readers
-from .together import joined
-from .wiring import check_start
-
-#: Held while a pipeline is marked as running.
-_marking = threading.Lock()
 
 
 class Pipeline:
@@ -84,7 +73,6 @@ class Pipeline:
         self.warnings: list[str] = []
         #: Called with the points that go to the last writer; see :class:`.callbacks.Callbacks`.
         self.look: Function | None = None
-        self._running = False
 
     @property
     def messages(self) -> list[str]:
@@ -101,7 +89,7 @@ class Pipeline:
     @property
     def json(self) -> str:
         """The lowered pipeline, which stock ``pdal pipeline`` runs."""
-        return json.dumps({"pipeline": pdal_env.with_measures(self.lowered.stages)}, indent=2)
+        return json.dumps({"pipeline": self.lowered.stages}, indent=2)
 
     def validate(self) -> str:
         """Check outputs and let PDAL check its own stages' options, without reading points; PDAL's answer, as JSON."""
@@ -172,58 +160,40 @@ class Pipeline:
         StageError
             What went wrong, where, and the cure.
         """
-        with _marking:
-            if self._running:
-                raise PipelineError(
-                    "this pipeline is running already, in another thread",
-                    where=self.source.name or None,
-                    cure="Make one Pipeline for each thread",
-                )
-            self._running = True
-        try:
-            return self._execute(arrays, loglevel, read)
-        finally:
-            self._running = False
-
-    def _execute(self, arrays: bool, loglevel: int, read: Mapping[str, straight.View] | None) -> int:
         self._check_inputs()
         self.check_outputs()
         stages = self.lowered.stages
         outputs = [output.path for output in writers_outputs(stages)]
-        sources = readers_files(stages, las=True)
         writers = [stage for stage in stages if is_writer(stage, stages)]
         alone = len(writers) == 1 and writers[0] is stages[-1] and "where" not in writers[0]
 
         def finish(made: Path, final: Path, number: int) -> None:
             count = result.count if alone and "#" not in outputs[0] else None
             check_complete(made, final, writers[number], count)
-            if alone and len(sources) == 1 and len(stages) == 2 + len(self.lowered.ours):  # none moves points
-                written = read_header(made)
-                if written is not None and written.count:
-                    self.warnings += filter(None, [beyond_box(sources[0], written.box)])
             supersede_copc(made)
-            if self.lowered.ours:  # else the file is as PDAL writes it, to the byte
-                keep_records(made, writers[number], stages, self.lowered.meanings)
 
         if self.lowered.ours:
-            check_limit()
-            types = [ours.stage.type for ours in self.lowered.ours]
-            Compiling.expect(lambda: registry.kernels(types))
+            Compiling.expect(lambda: registry.kernels([ours.stage.type for ours in self.lowered.ours]))
         runtime.remember_stdout()
         failure: StageError | None = None
         try:
-            with GroundChecks() as ground, whole_files(*outputs, check=finish) as partials:
+            with Callbacks() as callbacks, whole_files(*outputs, check=finish) as partials:
+                run = with_outputs(stages, list(partials))
+                for number, stage in enumerate(run):
+                    if is_writer(stage, run):
+                        run[number] = las_output.uncompressed_writer(stage, run[:number])
+                if self.look is not None and alone:
+                    run.insert(len(run) - 1, callbacks.filter(self.look))
                 try:
-                    with gentle(signal.SIGINT) as interrupts, Callbacks() as callbacks:
-                        run = ground.put_before(packing.unpacked(stages, partials))
-                        if self.look is not None and alone:
-                            run.insert(len(run) - 1, callbacks.filter(self.look))
-                        if read is None:
-                            result = self._run(run, arrays, loglevel)
+                    with interrupts.gentle(signal.SIGINT):
+                        if read is not None:
+                            result = straight.execute(callbacks.check_ground(run), read)
                         else:
-                            result = straight.execute(run, read)
+                            result = pdal_env.execute(
+                                callbacks.check_ground(run), arrays=arrays, loglevel=loglevel
+                            )
                         interrupts.check()
-                    packed = packing.pack(partials)
+                    compressed = las_output.compress(partials)
                 finally:
                     self.reports = []
                     for ours in self.lowered.ours:
@@ -236,32 +206,12 @@ class Pipeline:
         except StageError as error:
             if isinstance(failure, InterruptedStage):
                 raise KeyboardInterrupt from None
-            raise failure or ground.failure or self._located(error) from None
+            raise failure or callbacks.failure or self._located(error) from None
         names = {str(made): final for made, final in zip(partials, outputs, strict=True)}
-        names |= {made: names.get(target, target) for made, target in packed.items()}
-        self.metadata = packing.renamed(_named_metadata(result.metadata, self.reports), names)
+        names |= {made: names.get(target, target) for made, target in compressed.items()}
+        self.metadata = _renamed(_named_metadata(result.metadata, self.reports), names)
         self.arrays, self.log_lines = result.arrays, pdal_env.log_lines(result.log)
         return result.count
-
-    def _run(self, run: list[dict[str, Any]], arrays: bool, loglevel: int) -> pdal_env.Execution:
-        """Run what is lowered: without PDAL's table of all points where that gives the same, which takes half the memory."""
-        writes = any(ours.stage.outputs() for ours in self.lowered.ours)  # not to be written twice
-        if not arrays and loglevel == logging.WARNING and not writes and direct.may_run(run):
-            try:
-                return direct.execute(run)
-            except straight.NeedsPdal:
-                for ours in self.lowered.ours:
-                    runtime.collect(ours.label)
-        return pdal_env.execute(joined(run), arrays=arrays, loglevel=loglevel)
-
-    def goes_past_pdal(self) -> bool:
-        """Whether all points go past PDAL's table of them, as far as the first ones tell; nothing is written."""
-        stages = self.lowered.stages
-        outputs = [Path(output.path) for output in writers_outputs(stages)]
-        if any(ours.stage.outputs() for ours in self.lowered.ours):
-            return False
-        run = packing.unpacked(stages, outputs)
-        return direct.may_run(run) and direct.goes(run)
 
     def _check_inputs(self) -> None:
         """Open what is read, and look at the headers of LAS files: PDAL takes damaged ones for whole, or crashes."""
@@ -271,12 +221,9 @@ class Pipeline:
                     pass
             except OSError as error:
                 raise PipelineError("the file cannot be read", where=path, found=error) from None
-        check_start(self.lowered.stages, {ours.index: ours.stage.type for ours in self.lowered.ours})
         check_dimensions(self.lowered)
-        self.warnings = [*self.lowered.warnings, *unread_extra_dimensions(self.lowered.stages)]
-        self.warnings += [
-            r for path in readers_files(self.lowered.stages, las=True) if (r := check_readable(path))
-        ]
+        odd = (check_readable(path) for path in readers_files(self.lowered.stages, las=True))
+        self.warnings = [*self.lowered.warnings, *filter(None, odd)]
         units = [ours.stage.horizontal_unit for ours in self.lowered.ours]
         if units:
             self.warnings += check_readers(self.lowered.stages, next(filter(None, units), ""))
@@ -301,12 +248,8 @@ class Pipeline:
         if given.count(named.group()) == 1 and self.source.lines[given.index(named.group())]:
             error.where = self.source.where(given.index(named.group()))
         if error.cure is None and (option := _NO_OPTION.search(str(error.found))):
-            from . import describe
-
             error.cure = describe.nearest_option(named.group(), option.group(1))
         if error.cure is None and _NO_STAGE.search(str(error.found)):
-            from . import describe
-
             error.found = str(error.found).splitlines()[0]
             error.cure = describe.nearest_stage(named.group())
         return error
@@ -320,14 +263,8 @@ def run_pipeline(source: str | Path | list | dict, overrides: Iterable[Override]
 
 
 _STAGE_TYPE = re.compile(r"\b(?:readers|filters|writers)\.\w+")
-
-
 _NO_OPTION = re.compile(r"Unexpected argument '([^']*)'")
-
-
 _NO_STAGE = re.compile(r"Couldn't create (?:reader|filter|writer) stage")
-
-
 _NOT_UTF8 = re.compile(r"returned a result with an exception set|UnicodeDecodeError|codec can't decode")
 
 
@@ -346,3 +283,12 @@ def _named_metadata(metadata: dict[str, Any], reports: list[tuple[str, list[Repo
 
 def _several(node: Any) -> list[Any]:
     return node if isinstance(node, list) else [node]
+
+
+def _renamed(node: Any, names: Mapping[str, str]) -> Any:
+    """Metadata with the names that files have in the end."""
+    if isinstance(node, dict):
+        return {key: _renamed(value, names) for key, value in node.items()}
+    if isinstance(node, list):
+        return [_renamed(value, names) for value in node]
+    return names.get(node, node) if isinstance(node, str) else node

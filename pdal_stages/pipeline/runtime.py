@@ -19,9 +19,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from ..base.errors import InterruptedStage, StageError
-from ..base.memory import give_back
 from ..base.report import Report
-from ..base.shortage import is_short, shortage
 from ..stages import registry
 from ..stages.base import Stage
 from ..stages.points import Points
@@ -71,7 +69,7 @@ def python_filter(
 
 
 def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
-    """Run one lowered stage, or several that follow each other, on one point view; True, also where one failed (see above).
+    """Run one lowered stage on one point view; True, also where it failed (see above).
 
     Parameters
     ----------
@@ -81,36 +79,20 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
     ins, outs : dict
         PDAL's dimensions, and the ones to write back.
     """
-    together = module["pdalargs"]
+    arguments = module["pdalargs"]
+    label = str(arguments.get("label", ""))
     # PDAL's module object stays alive; the register need not grow.
-    sys.modules.pop(str(together.get("label", "")), None)
-    several = together.get("together", [together])
-    at_hand = ins
-    for arguments in several:
-        label = str(arguments.get("label", ""))
-        try:
-            stage = made.get(label) or _made_again(arguments)
-            new: dict[str, Any] = {}
-            report = run_on_view(stage, module, at_hand, new, last=arguments is several[-1], lent=ins)
-            module["out_metadata"] = node(arguments["stage"], leaves(report))
-        except BaseException as error:
-            failure = as_stage_error(error, place(arguments["stage"], arguments.get("tag")))
-            _failures[label] = failure
-            hand_over(failure, outs)
-            break
+    sys.modules.pop(label, None)
+    try:
+        stage = made.get(label) or _made_again(arguments)
+        report = run_on_view(stage, module, ins, outs)
+        module["out_metadata"] = node(arguments["stage"], leaves(report))
         _reports.setdefault(label, []).append(report)
-        outs.update(new)
-        if arguments is not several[-1]:
-            at_hand = {**at_hand, **new}
-            _let_go_of_former(new, ins)
+    except BaseException as error:
+        failure = as_stage_error(error, place(arguments["stage"], arguments.get("tag")))
+        _failures[label] = failure
+        hand_over(failure, outs)
     return True
-
-
-def _let_go_of_former(new: Mapping[str, Any], ins: Mapping[str, Any]) -> None:
-    """Give the memory of PDAL's arrays back whose values were made anew, for the stages that follow."""
-    for former in (ins[name] for name in new):
-        if not any(np.may_share_memory(former, array) for array in new.values()):
-            give_back(former)
 
 
 def hand_over(failure: StageError, outs: dict[str, Any]) -> None:
@@ -140,27 +122,14 @@ def _made_again(arguments: Mapping[str, Any]) -> Stage:
 
 @interrupts.catches
 def run_on_view(
-    stage: Stage,
-    module: Mapping[str, Any],
-    ins: Mapping[str, Any],
-    outs: dict[str, Any],
-    *,
-    last: bool = True,
-    lent: Mapping[str, Any] | None = None,
+    stage: Stage, module: Mapping[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]
 ) -> Report:
-    """Run a stage on one view; its report. What it raises may be anything, Ctrl-C too.
-
-    With others in one filter, it may let go of what it is not the `last` to read, if that is PDAL's: `lent` and not made by
-    those before it.
-    """
+    """Run a stage on one view; its report. What it raises may be anything, Ctrl-C too."""
     interrupts.check()
     points = points_of(stage, module, ins)
     for name in stage.reads():
         if name not in ins:
             stage.take(points, name)  # raises, naming the stage that makes it
-    if last and isinstance(ins, dict):  # PDAL makes these arrays for this one call, and frees them after it
-        theirs = {id(array) for array in (lent or ins).values()}
-        points.let_go_of = lambda array: give_back(array) if id(array) in theirs else None
     for name, values in stage.run(points).items():
         target = ins[name].dtype
         # PDAL copies raw memory: exactly this type, contiguous, one value per point.
@@ -192,8 +161,6 @@ def as_stage_error(error: BaseException, where: str) -> StageError:
             where=where,
             cure="Lower 'memory', work in tiles (--tile), or take fewer features",
         )
-    if isinstance(error, ImportError | OSError) and is_short(error):
-        return shortage(f"{type(error).__name__}: {error}", where)
     if isinstance(error, KeyboardInterrupt):
         return InterruptedStage("interrupted", where=where)
     failure = StageError(

@@ -17,7 +17,6 @@ from typing import Any
 from ..base.errors import StageError
 from ..base.version import __version__
 from ..pipeline import lowering, runtime
-from ..pipeline.optionfile import settled
 from ..stages import registry
 from ..stages.base import Stage
 from ..stages.options import Option, split_list
@@ -85,7 +84,7 @@ def _made(question: Mapping[str, Any]) -> tuple[Stage, str | None]:
     for name, value in question["options"]:
         texts.setdefault(name, []).append(value)
     before = [_typed(stage) for stage in _stages(question["pipeline"])][:-1]
-    given = settled({**kind.from_pipeline(texts, before), **_parsed(kind, texts)})
+    given = lowering.settled({**kind.from_pipeline(texts, before), **_parsed(kind, texts)})
     where = runtime.place(kind.type, question.get("tag"))
     stage = kind({name: value for name, value in given.items() if name not in lowering.PDAL_OWN}, where)
     warning = lowering.settle_upstream(stage, [(one, _creates(one)) for one in before]).warning
@@ -116,7 +115,7 @@ def _typed(stage: Mapping[str, Any]) -> dict[str, Any]:
     if stage.get("type") in registry.stages():
         kind = registry.get(stage["type"])
         own = {name: _texts(value) for name, value in stage.items() if name not in ("type", "inputs")}
-        return {"type": kind.type, **settled(_parsed(kind, own))}
+        return {"type": kind.type, **lowering.settled(_parsed(kind, own))}
     return {name: _number(value) if isinstance(value, str) else value for name, value in stage.items()}
 
 

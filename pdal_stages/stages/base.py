@@ -13,7 +13,6 @@ from ..base.errors import StageError
 from ..base.outputs import Output
 from ..base.units import named_unit
 from .carried import Rule
-from .dimensions import meaning
 from .options import Option, option, parse_options
 from .points import Points
 from .where import Expression
@@ -104,8 +103,6 @@ class Stage(ABC):
     in_models: ClassVar[Mapping[str, Rule] | None] = None
     #: Whether points beyond the halo may matter; tiles then ask :meth:`reach_of`, and are read wider.
     open_ended: ClassVar[bool] = False
-    #: Whether it lets go, while it works, of points' arrays that it does not read itself.
-    lets_go: ClassVar[bool] = False
 
     where: str | None = option(
         "expression",
@@ -173,10 +170,6 @@ class Stage(ABC):
     def creates(self) -> dict[str, str]:
         """Dimensions made or overwritten: name -> PDAL type (``double``, ``float``, ``uint8_t``)."""
         return {}
-
-    def meanings(self) -> dict[str, str]:
-        """What LAS files say of dimensions that the stage makes or changes: name -> at most 31 bytes."""
-        return {name: text for name in self.creates() if (text := meaning(name))}
 
     def halo_m(self) -> float:
         """How far beyond a tile, in meters, points can change the tile's results."""

@@ -17,7 +17,6 @@ class Consistency(Stage):
     type = "filters.consistency"
     summary = "Mend classes that contradict their surroundings, by named rules that count what they change"
     where_chooses = True
-    lets_go = True
     where_help = "Points outside keep their class but still serve as neighbors."
     ground: bool = option(
         "boolean",

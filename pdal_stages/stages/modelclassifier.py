@@ -19,7 +19,7 @@ from ..classifier.sureness import Limit, Sureness, said, sureness_of
 from ..classifier.passes import BAND
 from ..models import find
 from .base import Stage
-from .dimensions import meaning, parts_of
+from .dimensions import parts_of
 from .loading import loaded_model
 from .options import ignore_option, keep_option, option, vegetation_heights_option
 from .points import Points, class_counts
@@ -34,7 +34,6 @@ class ModelClassifier(Stage):
     summary = "Apply a model file: compute what the model needs block by block, and write classes"
     source = "[B16] section 3.4, [W18] section 3.3, [WM19] for networks"
     where_chooses = True
-    lets_go = True
     where_help = "Points outside keep their class but still serve as neighbors."
     model_file: str = option(
         "model",
@@ -219,11 +218,6 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         if self.probabilities:
             out.update({f"Probability_{code}": "float" for code, _ in self.model.classes})
         return out
-
-    def meanings(self) -> dict[str, str]:
-        rounded = [HEIGHT] if self.compact else []
-        texts = {name: meaning(name, self.compact) for name in [*self.creates(), *rounded]}
-        return {name: text for name, text in texts.items() if text}
 
     def halo_m(self) -> float:
         return self.model.halo_m + self.inner_halo_m()

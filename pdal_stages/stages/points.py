@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import ChainMap
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from typing import cast
 
@@ -57,14 +57,7 @@ class Points:
         True where the three flag bits of LAS 1.0-1.3 sit inside `Classification`.
     own : (n,) ndarray, optional
         Below zero for the points whose results are used: :meth:`counted` counts those alone.
-
-    Attributes
-    ----------
-    let_go_of : function, optional
-        Called by :meth:`keep_only` with the arrays that are not kept, by whom they are lent to the stage.
     """
-
-    let_go_of: Callable[[NDArray], None] | None = None
 
     def __init__(
         self,
@@ -162,9 +155,6 @@ class Points:
         if isinstance(lent, dict):
             kept |= {name for name, array in lent.items() if array is self._own}
         self.arrays = {name: lent[name] for name in lent if name in kept}
-        if self.let_go_of is not None:
-            for name in lent.keys() - kept:
-                self.let_go_of(lent[name])
         if hasattr(lent, "forget"):  # dimensions that are made as they are asked for
             lent.forget()
 

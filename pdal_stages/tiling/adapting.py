@@ -18,10 +18,10 @@ import numpy as np
 from ..base import checks, kinds, las
 from ..base.errors import StageError
 from ..base.outputs import Output, check_outputs
-from ..pipeline.classifying import ClassifyRequest
-from ..pipeline.ends import input_files, is_las, outputs_of
+from ..pipeline.classify_request import ClassifyRequest
+from ..pipeline.inputs_outputs import input_files, is_las, outputs_of
 from ..pipeline.run import Pipeline
-from ..pipeline.trainjob import train_pipeline
+from ..pipeline.training import train_pipeline
 from ..stages.loading import digest_of, load_model
 from .classify import ClassifyTask
 from .settings import TilingOptions

@@ -14,14 +14,14 @@ from ..base import kinds, las
 from ..base.errors import OptionError, StageError
 from ..base.files import write_whole
 from ..base.outputs import Output, check_outputs
-from ..pipeline.classifying import ClassifyRequest
-from ..pipeline.ends import input_files, is_ept, is_folder, is_las, outputs_of
+from ..pipeline.classify_request import ClassifyRequest
+from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of
 from ..pipeline.processes import each_file
 from ..pipeline.run import Pipeline
 from .oneformat import one_format
 from .outcome import FileJob, TiledRun, TileJob, left_alone
 from .settings import TilingOptions
-from .sizing import DIRECT_POINT, fits_whole
+from .sizing import fits_whole
 from .tiledrun import run_plan
 from .tileplan import TilePlan, make_plan
 
@@ -88,17 +88,7 @@ class ClassifyTask:
             header = las.read_header(self.files[0])
         except OSError:
             header = None  # said when it is read
-        if header is None or fits_whole(header.count, self.options.memory):
-            return True
-        return fits_whole(header.count, self.options.memory, DIRECT_POINT) and self._past_pdal()
-
-    def _past_pdal(self) -> bool:
-        """Whether the only input takes less memory, since PDAL's table is left out."""
-        try:
-            target = self._target().replace("#", "x.laz" if self._in_folder else "x")
-            return self.request.pipeline(self.files[0], target).goes_past_pdal()
-        except StageError:
-            return False  # said when it is run
+        return header is None or fits_whole(header.count, self.options.memory)
 
     # ---- in one piece ------------------------------------------------------------------------------------
 

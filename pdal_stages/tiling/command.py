@@ -19,7 +19,7 @@ from ..base.errors import OptionError, StageError
 from ..base.files import check_writable, write_whole
 from ..base.memory import parse_size
 from ..base.plain import one_line, print_messages
-from ..pipeline.ends import is_ept, is_folder, is_las
+from ..pipeline.inputs_outputs import is_ept, is_folder, is_las
 from ..pipeline.read import PipelineSource
 from ..pipeline.run import Pipeline
 from .classify import ClassifyTask, Written

@@ -16,8 +16,8 @@ from ..base import las
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import PipelineError
 from ..base.extrabytes import number_type
-from ..pipeline.beside import extra_dims_option
 from ..pipeline.filenames import LAS_WRITERS
+from ..pipeline.las_output import extra_dims_option
 from . import alike, sizing
 from .extract import unpacked
 from .grid import Box
@@ -43,7 +43,6 @@ class FileTask:
     beside: dict[str, str] | None  #: see TilePlan
     outputs: list[str]  #: what each of the writers writes
     scratch: str  #: folder for temporary files
-    meanings: dict[str, str]  #: see TilePlan
     cells: OutputCells | None = None  #: see TilePlan
     copy: str = ""  #: of the input by place, see :mod:`.byplace`; empty where there is none
     makes: Mapping[str, str] = field(default_factory=dict)  #: see TilePlan
@@ -88,7 +87,6 @@ class FileTask:
                     tail,
                     self.outputs,
                     self.scratch,
-                    self.meanings,
                     seen,
                 )
             except HeadersDifferError:  # such as automatic offsets: written at once
@@ -100,7 +98,7 @@ class FileTask:
         new = new_values(0, self.count)
         kind = None
         if seen is None and len(self.outputs) == 1:
-            kind = alike.kind_of(self.source, tail, new.values, self.outputs[0], self.meanings)
+            kind = alike.kind_of(self.source, tail, new.values, self.outputs[0])
         here = self.source, self.copy, new, self.outputs[0], self.scratch
         record = alike.write_alike(kind, *here)
         if record is None:
@@ -111,14 +109,12 @@ class FileTask:
     def _try_with_pdal(self, path: str, new: NewValues, output: str) -> None:
         """Write other points than the input's as its own are written."""
         tail = with_beside(self.tail, self.beside, [path])
-        run_tail(
-            [{**self.source.reader, "filename": path}], [new], tail, [output], self.meanings, self.scratch
-        )
+        run_tail([{**self.source.reader, "filename": path}], [new], tail, [output], self.scratch)
 
     def _write_with_pdal(
         self, reader: dict[str, Any], new: NewValues, tail: list[dict[str, Any]], seen: CellsSeen | None
     ) -> dict[str, Any]:
-        rest = [new], tail, self.outputs, self.meanings, self.scratch, seen
+        rest = [new], tail, self.outputs, self.scratch, seen
         if not self.copy:
             return run_tail([reader], *rest)
         with TemporaryDirectory(prefix="file-", dir=self.scratch, ignore_cleanup_errors=True) as folder:
@@ -148,9 +144,7 @@ def write_tile(
         return plan.takes(mine, outputs, scratch)
     readers = [{**result.piece.reader, "filename": result.piece.core} for result in mine]
     tail = on_one_grid(tail, box, half_open=True)
-    return run_tail(
-        readers, [of_own_points(result) for result in mine], tail, outputs, plan.meanings, scratch
-    )
+    return run_tail(readers, [of_own_points(result) for result in mine], tail, outputs, scratch)
 
 
 def with_beside(

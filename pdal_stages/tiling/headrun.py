@@ -16,11 +16,11 @@ from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import PipelineError, StageError
 from ..base.las import holds_flags
 from ..pipeline.callbacks import Callbacks
+from ..pipeline.las_output import check_writers
 from ..pipeline.references import NO_REFERENCE
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import points_of
 from ..pipeline.straight import NeedsPdal, Reading, View, may_run, reading_of
-from ..pipeline.writerlimits import check_writers
 from ..stages import registry
 from ..stages.base import Left, Stage
 from ..stages.points import HOLDS_NOWHERE

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -33,7 +33,6 @@ def write_in_parts(
     tail: list[dict[str, Any]],
     outputs: list[str],
     scratch: str,
-    meanings: Mapping[str, str],
     seen: CellsSeen | None = None,
 ) -> dict[str, Any]:
     """Write the outputs of a file with `count` points, `most` points at a time.
@@ -61,7 +60,7 @@ def write_in_parts(
             _copy(source.path, start, end, piece)
             parts = [os.path.join(folder, f"out{n}.las") for n in range(len(outputs))]
             reader = {**source.reader, "filename": piece}
-            run_tail([reader], [new_values(start, end)], _uncompressed(tail), parts, meanings, scratch, seen)
+            run_tail([reader], [new_values(start, end)], _uncompressed(tail), parts, scratch, seen)
             for one, part in zip(joined, parts, strict=True):
                 one.add(part)
     return written(outputs, joined[0].count if joined else 0)

@@ -29,7 +29,7 @@ from ..base.version import __version__
 from ..objects import Cells, Objects, ObjectSettings, find_objects
 from ..objects.cells import refuse_unclassified
 from ..pipeline import pdal as pdal_env
-from ..pipeline.ends import input_files, outputs_of, overlooked
+from ..pipeline.inputs_outputs import input_files, outputs_of, overlooked
 from ..pipeline.overrides import Override
 from ..pipeline.parts import reads_in_parts, reference_and_wkt
 from ..pipeline.processes import each_file

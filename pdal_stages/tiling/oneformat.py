@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from ..base import las
 from ..base.errors import StageError
-from ..pipeline.ends import is_ept, is_las
+from ..pipeline.inputs_outputs import is_ept, is_las
 from .ept import format_of
 from .grid import Box
 from .sources import read_ept

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from typing import Any
 
-from ..pipeline.interrupts import gentle
+from ..pipeline.interrupts import check, gentle
 from ..pipeline.processes import Processes
 from ..pipeline.work import Task, TaskResult, perform
 from .scheduler import OnDask
@@ -24,11 +24,11 @@ class Here(AbstractContextManager):
 
     def run(self, waiting: deque, task_of: Callable[[Any], Task]) -> Iterator[tuple[Any, TaskResult]]:
         """Yield (item, answer) for every item; see :meth:`pdal_stages.pipeline.processes.Processes.run`."""
-        with gentle() as interrupts:
+        with gentle():
             while waiting:
                 item = waiting.popleft()
                 answer = perform(task_of(item))
-                interrupts.check()
+                check()
                 yield item, answer
 
 

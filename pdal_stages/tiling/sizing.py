@@ -15,9 +15,8 @@ from .sources import Extent
 #: Memory of a worker: programs and model, a point of a tile with its halo, a point of an output file that is put
 #: together, and the `memory` option of our stages. See docs/large-areas.md.
 BASE, TILE_POINT, FILE_POINT, BLOCKS = 350 << 20, 285, 250, 512 << 20
-#: Of a point of a file that is classified in one piece past PDAL's table of points (:mod:`..pipeline.direct`), and of one
-#: that is trained on in one piece, voxels and samples' surroundings included.
-DIRECT_POINT, TRAIN_POINT = 190, 400
+#: Of a point of a file that is trained on in one piece, voxels and samples' surroundings included.
+TRAIN_POINT = 400
 #: Of a cell of the raster of which a block is made before the tiles.
 _CELL = 200
 #: Blocks are at most so many times as wide as they would be by themselves: what is beyond gains little, and one takes long.

@@ -16,8 +16,8 @@ from ..base.errors import OptionError, PipelineError, StageError
 from ..base.progress import Progress
 from ..base.stamps import stamp
 from ..base.units import Units
-from ..pipeline.ends import in_folders
 from ..pipeline.filenames import named_files
+from ..pipeline.inputs_outputs import in_folders
 from ..pipeline.references import Reference, check_one_reference, reference_of, without_reference
 from ..pipeline.work import Call
 from .byplace import copy_bytes

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,10 +13,9 @@ from ..base.complete import check_complete
 from ..base.errors import StageError
 from ..base.files import whole_files
 from ..base.las import supersede_copc
-from ..pipeline import classflags, extradims, packing
+from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
 from ..pipeline.callbacks import Callbacks
-from ..pipeline.records import keep_records
 from .results import NewValues
 from .store import check_run
 
@@ -32,7 +31,6 @@ def run_tail(
     new: list[NewValues],
     tail: list[dict[str, Any]],
     outputs: Sequence[str],
-    meanings: Mapping[str, str],
     scratch: str,
     seen: CellsSeen | None = None,
 ) -> dict[str, Any]:
@@ -41,7 +39,7 @@ def run_tail(
     `seen` looks at the points with their new values.
 
     The files, `outputs`, appear under their names when all are whole, and the run goes on whose folder for temporary files
-    is `scratch`; `meanings` is what they say of dimensions.
+    is `scratch`.
     """
     writers = [stage for stage in tail if stage["type"].startswith("writers.")]
 
@@ -49,22 +47,19 @@ def run_tail(
         check_run(scratch)
         check_complete(made, final, writers[number], None if "where" in writers[number] else run.count)
         supersede_copc(made)
-        keep_records(made, writers[number], [*readers, *tail], meanings)
 
-    flags = classflags.parting([*readers, *tail], with_ours=True)
+    flags = las_output.files_with_flags_to_split([*readers, *tail])
     with Callbacks() as callbacks:
         stages = merged(callbacks, readers, new, flags, seen)
         tail = [{k: v for k, v in stage.items() if k != "inputs"} for stage in tail]
-        if flags.way == "around":
-            tail = [stage for stage, _ in classflags.around(tail)]
         with whole_files(*outputs, check=finish) as partials:
             waiting = iter(partials)
             for stage in tail:
                 if stage["type"].startswith("writers."):
-                    stage = packing.unpacked_writer({**stage, "filename": str(next(waiting))}, readers)
+                    stage = las_output.uncompressed_writer({**stage, "filename": str(next(waiting))}, readers)
                 stages.append(stage)
-            run = pdal_env.execute(extradims.settle(stages), arrays=False)
-            packing.pack(partials)
+            run = pdal_env.execute(stages, arrays=False)
+            las_output.compress(partials)
     return written(outputs, run.count)
 
 
@@ -72,7 +67,7 @@ def merged(
     callbacks: Callbacks,
     readers: list[dict[str, Any]],
     new: list[NewValues],
-    flags: classflags.Parting,
+    flags: Sequence[bool],
     seen: CellsSeen | None = None,
 ) -> list[dict[str, Any]]:
     """Stages that read points, give them their new values, and merge them; `seen` looks at them then."""
@@ -82,8 +77,8 @@ def merged(
         stages.append({**reader, "tag": f"in{number}"})
         stages += _put(callbacks, values, f"in{number}", f"put{number}", seen)
         inputs.append(f"put{number}")
-        if flags.way == "split" and flags.old[number]:
-            stages.append(classflags.splitter(inputs=[f"put{number}"], tag=f"split{number}"))
+        if flags and flags[number]:
+            stages.append(las_output.flag_splitter([True], inputs=[f"put{number}"], tag=f"split{number}"))
             inputs[-1] = f"split{number}"
     return [*stages, {"type": "filters.merge", "inputs": inputs}]
 

@@ -14,7 +14,7 @@ from ..base.errors import StageError
 from ..base.files import sweep
 from ..base.jit import kept_kernels
 from ..base.plain import print_messages
-from ..pipeline import classflags
+from ..pipeline.las_output import files_with_flags_to_split
 from ..pipeline.overrides import Override
 from ..pipeline.read import PipelineSource
 from ..pipeline.run import Pipeline
@@ -125,7 +125,7 @@ def run_plan(
     plan, chosen = survey.plan, survey.options
     if survey.per == "tile":  # whose outputs have points of all readers
         plan = replace(plan, tail=following(plan.tail, survey.paths))
-        classflags.parting([*plan.readers, *plan.tail], with_ours=True)
+        files_with_flags_to_split([*plan.readers, *plan.tail])
     survey.messages += remarks(plan.tail, chosen.tile if survey.per == "tile" else None)
     if source is not None:
         readable = [each for each in survey.sources if each.path not in survey.unreadable]

@@ -78,7 +78,6 @@ class TilePlan:
     beside: dict[str, str] | None = None
     first: FirstRound | None = None  #: what is made of the points before any tile
     #: What LAS files say of dimensions that stages make.
-    meanings: dict[str, str] = field(default_factory=dict)
     #: What takes each tile's own points in place of the tail: called with their results, the outputs and the folder for
     #: temporary files, it gives the record of what it wrote.
     takes: Callable[[list[Any], list[str], str], dict[str, Any]] | None = None
@@ -179,7 +178,6 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
         makes=makes,
         unit=next(filter(None, (stage.horizontal_unit for stage in stages)), ""),
         messages=messages,
-        meanings=pipeline.lowered.meanings,
         name=source.name,
     )
 

@@ -23,14 +23,13 @@ from ..classifier.dimensions import CHECKED
 from ..classifier.parts import CloudParts
 from ..classifier.summary import FILE_NUMBER
 from ..classifier.training import train_parts
-from ..pipeline import classflags, extradims
+from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
 from ..pipeline.callbacks import Callbacks
-from ..pipeline.ends import is_ept, is_las, overridden
+from ..pipeline.inputs_outputs import is_ept, is_las, overridden
 from ..pipeline.overrides import Override
 from ..pipeline.run import Pipeline
-from ..pipeline.surveyjob import check_surveys, points_in
-from ..pipeline.trainjob import heights_for, lowered_writer, numbered
+from ..pipeline.training import check_surveys, heights_for, lowered_writer, numbered, points_in
 from ..stages import registry
 from ..stages.checked import CheckedChoice, Looked
 from ..stages.classifiermodel import ClassifierModel
@@ -300,9 +299,9 @@ class Taking:
         readers = [{**result.piece.reader, "filename": result.piece.core} for result in results]
         new = [self._new_values(result) for result in results]
         with Callbacks() as callbacks:
-            flags = classflags.parting(readers, with_ours=True)
+            flags = las_output.files_with_flags_to_split(readers)
             stages = merged(callbacks, readers, new, flags)
-            run = pdal_env.execute(extradims.settle(stages))
+            run = pdal_env.execute(stages)
         if not run.count:
             return {"outputs": []}
         points = points_in(stage, run.arrays, run.metadata)

@@ -171,7 +171,6 @@ class Worklist:
                     plan.beside,
                     item.outputs,
                     scratch,
-                    plan.meanings,
                     plan.cells,
                     survey.indexes[item.source.path].copy,
                     plan.makes,

@@ -22,7 +22,7 @@ import targets
 
 from pdal_stages.base.errors import StageError
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, modelfile, train
-from pdal_stages.pipeline.classifying import ClassifyRequest
+from pdal_stages.pipeline.classify_request import ClassifyRequest
 from pdal_stages.pipeline.run import Pipeline
 from pdal_stages.stages import carried, registry
 from pdal_stages.stages.loading import load_model

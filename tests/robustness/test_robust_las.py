@@ -407,8 +407,8 @@ def test_damaged_in_tiles(cell, tmp_path, good, case, edit, says):
 @pytest.mark.pdal
 def test_cut_short_whoever_reads_it(tmp_path, write_las):
     """Newer PDAL crashes of such a file, so it is asked for nothing of it: not for a reference, nor for dimensions."""
+
     from pdal_stages.base.errors import StageError
-    from pdal_stages.pipeline.beside import dimensions_of
     from pdal_stages.pipeline.parts import reference_and_wkt
     from pdal_stages.pipeline.references import reference_of
 
@@ -418,7 +418,6 @@ def test_cut_short_whoever_reads_it(tmp_path, write_las):
     cut.write_bytes(whole.read_bytes()[:-100])
     reader = {"type": "readers.las", "filename": str(cut)}
     for read in (
-        lambda: dimensions_of(reader),
         lambda: reference_of({**reader, "count": 1}),
         lambda: reference_and_wkt(str(cut)),
     ):

@@ -17,8 +17,8 @@ from ..base.report import Report
 from ..stages.accuracy import AccuracyStage
 from ..stages.points import Points
 from . import pdal as pdal_env
-from .ends import in_folders, input_files, reader_of
 from .filenames import stage_files
+from .inputs_outputs import in_folders, input_files, reader_of
 from .lowering import lower_stage
 from .overrides import Override, apply_overrides
 from .run import Pipeline
@@ -120,7 +120,7 @@ def _classified(
     source: str, model: str, truth: str, overrides: Sequence[Override]
 ) -> tuple[Any, str, NDArray]:
     """A file's points as a model classifies them, its true classes in another dimension; reference, withheld flags."""
-    from .classifying import ClassifyRequest
+    from .classify_request import ClassifyRequest
 
     request = ClassifyRequest(model, tuple(overrides))
     ferry = {"type": "filters.ferry", "dimensions": f"{truth}=>{_TRUTH}"}

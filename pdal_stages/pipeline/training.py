@@ -1,12 +1,15 @@
-"""Training on several surveys that do not see each other: each read by itself, in its own reference system."""
+"""The pipeline behind ``train``, and training on several surveys.
+
+Surveys do not see each other: each is read by itself, in its own reference system.
+"""
 
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,16 +19,60 @@ from ..base.jit import Compiling
 from ..base.progress import Progress
 from ..base.report import Report
 from ..classifier import TrainingCloud, train
+from ..classifier.summary import FILE_NUMBER
 from ..stages import registry
 from ..stages.classifiermodel import ClassifierModel
+from ..stages.heights import preparation_of
 from ..stages.points import Points
 from . import pdal as pdal_env
-from .ends import overridden, reader_of
+from .inputs_outputs import overridden, reader_of
+from .lowering import lower_stage
 from .overrides import Override
 from .references import check_readers
 from .run import Pipeline
-from .runtime import wkt_of
-from .trainjob import heights_for, lowered_writer
+from .runtime import python_filter, wkt_of
+
+#: PDAL calls this for the points of one reader after the other.
+_NUMBER = f"""\
+import numpy as np
+number = 0
+def stage(ins, outs):
+    global number
+    number += 1
+    outs["{FILE_NUMBER}"] = np.full(len(ins["X"]), number, np.uint32)
+    return True
+"""
+
+
+def train_pipeline(
+    sources: Iterable[str], model: str, overrides: Iterable[Override] = (), **options: Any
+) -> list[dict[str, Any]]:
+    """Read labeled files, give heights if wanted, train, write the model; of several files the score is by file."""
+    writer = {"type": "writers.classifiermodel", "filename": model, **options}
+    stage = lowered_writer(overridden(writer, overrides))
+    heights = heights_for(stage)
+    readers = [reader_of(name, f"input{i}") for i, name in enumerate(sources, 1)]
+    if not numbered(stage, len(readers)):
+        return [*readers, *heights, writer]
+    number = python_filter("pdal_stages_file_number", _NUMBER, {}, {FILE_NUMBER: "uint32_t"})
+    return [*readers, number, *heights, {**writer, "groups": FILE_NUMBER}]
+
+
+def lowered_writer(given: Mapping[str, Any]) -> ClassifierModel:
+    """The stage that trains."""
+    return cast(ClassifierModel, lower_stage(dict(given)).stage)
+
+
+def heights_for(stage: ClassifierModel) -> list[dict[str, Any]]:
+    """The stages that make what it reads: those of the model it builds on, or heights."""
+    base = stage.training.base
+    return preparation_of(stage.wished) if base is None else base.info.get("preparation") or []
+
+
+def numbered(stage: ClassifierModel, files: int) -> bool:
+    """Whether the score is by file, so that points need their file's number."""
+    by_itself = stage.groups or stage.survey or stage.algorithm != "random_forest"
+    return files > 1 and not by_itself
 
 
 def surveys_of(files: Sequence[str], grouped: Sequence[str] = ()) -> dict[str, list[str]]:

@@ -12,9 +12,10 @@ from ..models import STANDARD
 from ..stages import preparation, registry
 from ..stages.heights import preparation_of
 from ..stages.loading import loaded_model
-from .beside import dimensions_of, extra_dims_option, only
-from .ends import overridden, reader_of, writer_of
+from . import pdal as pdal_env
 from .filenames import LAS_WRITERS
+from .inputs_outputs import overridden, reader_of, writer_of
+from .las_output import extra_dims_option
 from .lowering import lower_stage
 from .overrides import Override
 from .run import Pipeline
@@ -173,8 +174,8 @@ class ClassifyRequest:
         return stages
 
     @cached_property
-    def beside(self) -> dict[str, str] | None:
-        """What is written beside the input's own dimensions: name -> PDAL type; None for all there is.
+    def beside(self) -> dict[str, str]:
+        """What is written beside the input's own dimensions: name -> PDAL type.
 
         Raises
         ------
@@ -196,24 +197,41 @@ class ClassifyRequest:
                     cure=f"{suggest(name, list(made))}There are {', '.join(made)}; or all, or none",
                 )
         if "all" in self.dimensions:
-            return None
+            return made
         return {name: kind for name, kind in made.items() if name in self.dimensions}
 
     def writer(self, target: str) -> dict[str, Any]:
         """The writer of an output, before it is told which extra dimensions to write."""
-        writer = writer_of(target)
-        return {**writer, "extra_dims": "all"} if self.beside is None and _is_las(writer) else writer
+        return writer_of(target)
 
     def pipeline(self, source: str, target: str) -> Pipeline:
         """Read a file, make heights where the model wants them, classify, write with everything else kept."""
         writer = self.writer(target)
-        if self.beside is not None and _is_las(writer):
+        if writer.get("type") in LAS_WRITERS:
             listed = extra_dims_option([source], self.beside)
             writer |= {"extra_dims": listed} if listed else {}
-        elif self.beside is not None and self.dimensions != WRITTEN:
-            writer = only(writer, [*dimensions_of(reader_of(source, "input")), *self.beside])
+        elif self.dimensions != WRITTEN and "all" not in self.dimensions:
+            writer = self._writer_of_some(writer, source)
         return Pipeline([reader_of(source, "input"), *self.stages, writer], self.overrides)
 
-
-def _is_las(writer: dict[str, Any]) -> bool:
-    return writer.get("type") in LAS_WRITERS
+    def _writer_of_some(self, writer: dict[str, Any], source: str) -> dict[str, Any]:
+        """A writer of text or PLY that writes the input's own dimensions and :attr:`beside` alone."""
+        kind = writer.get("type") or pdal_env.writer_type(str(writer["filename"]))
+        options = {"writers.text": {"keep_unspecified": False}, "writers.ply": {}}
+        if kind in ("writers.gdal", "writers.ogr"):
+            return writer
+        if kind not in options:
+            raise OptionError(
+                f"--dimensions is for LAS, LAZ, text and PLY; {kind or 'this format'} takes all there are",
+                found=str(writer["filename"]),
+                cure="Leave it out, or write a pipeline",
+            )
+        arrays = pdal_env.execute([{**reader_of(source, "input"), "count": 1}]).arrays
+        own = list(arrays[0].dtype.names or ()) if arrays else []
+        listed = ",".join(dict.fromkeys([*own, *self.beside]))
+        return {
+            **writer,
+            "type": kind,
+            "order" if kind == "writers.text" else "dims": listed,
+            **options[kind],
+        }

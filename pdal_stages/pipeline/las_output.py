@@ -1,0 +1,257 @@
+"""What LAS writers can hold, and where old PDAL writes LAS files wrongly.
+
+PDAL before 2.3 cannot compress LAS 1.4 with class codes above 31. PDAL before 2.6 reads the flags of LAS 1.0-1.3
+(synthetic, key-point, withheld) as the upper bits of the class: written as LAS 1.4, a withheld point of class 2 would
+become one of class 130.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ..base.asprs import LEGACY_LIMIT
+from ..base.errors import DimensionError, OptionError, PipelineError, StageError
+from ..base.extrabytes import extra_dimensions
+from ..base.las import LasHeader, read_header
+from ..stages import registry
+from ..stages.base import CodeLimit, Stage
+from . import pdal as pdal_env
+from .filenames import is_reader, is_writer, reader_files, writes_las
+from .runtime import python_filter
+
+#: A variable-length record of LAS holds 65,535 bytes; the description of an extra dimension takes 192.
+_MOST_EXTRA = 65_535 // 192
+
+
+# ---- what a writer will write --------------------------------------------------------------------
+
+
+def las_version(writer: Mapping[str, Any], before: Iterable[Mapping[str, Any]]) -> tuple[int, int]:
+    """(minor_version, dataformat_id) the writer will use: its options, the forwarded header, PDAL's defaults."""
+    minor, format_id = _whole(writer.get("minor_version")), _whole(writer.get("dataformat_id"))
+    forward = str(writer.get("forward", ""))
+    headers = las_headers(before)
+    if headers and ("all" in forward or "header" in forward or "minor_version" in forward):
+        if minor is None and len({h.minor for h in headers}) == 1:
+            minor = headers[0].minor
+        if format_id is None and len({h.point_format for h in headers}) == 1:
+            format_id = headers[0].point_format
+    if minor is None or format_id is None:  # PDAL is asked only then: it is another process
+        defaults = pdal_env.las_writer_defaults()
+        minor = defaults[0] if minor is None else minor
+        format_id = defaults[1] if format_id is None else format_id
+    return minor, format_id
+
+
+def _whole(value: Any) -> int | None:
+    """An option as a whole number; anything else is left for PDAL to refuse."""
+    try:
+        return None if value is None else int(value)
+    except (TypeError, ValueError, OverflowError):
+        return None
+
+
+def las_headers(readers: Iterable[Mapping[str, Any]]) -> list[LasHeader]:
+    """Headers of the LAS files that stages read, as far as they can be read here."""
+    found = []
+    for path in [name for stage in readers for name in reader_files(dict(stage), las=True)]:
+        with contextlib.suppress(OSError, ValueError):
+            found.append(read_header(path))
+    return [header for header in found if header is not None]
+
+
+def extra_dims_option(sources: Sequence[str], made: Mapping[str, str]) -> str:
+    """The inputs' own extra dimensions and those `made` (name -> PDAL type); ``all`` where the own are not known."""
+    own: dict[str, str] = {}
+    for source in sources:
+        if Path(source).suffix.lower() not in (".las", ".laz"):
+            return "all"
+        own |= extra_dimensions(source)
+    if not all(re.fullmatch(r"[A-Za-z_]\w*", name) for name in own):
+        return "all"
+    return ",".join(f"{name}={kind}" for name, kind in {**own, **made}.items())
+
+
+# ---- limits, checked before any work -------------------------------------------------------------
+
+
+def check_writers(stages: list[dict[str, Any]], ours: list[tuple[Stage, str, int]]) -> None:
+    """Class codes must fit the LAS files written later, and extra dimensions must fit one LAS record.
+
+    `ours` are our stages in the lowered pipeline: the stage, its name in messages, its place.
+
+    Raises
+    ------
+    OptionError, DimensionError
+        Naming the stage.
+    """
+    for stage, place, index in ours:
+        largest, extra = stage.largest_class(), len(stage.creates())
+        for writer in stages[index + 1 :]:
+            if not writes_las(writer):
+                continue
+            if (limit := _code_limit(writer, stages[:index])) is not None:
+                stage.code_limit = limit
+                if largest > limit.largest:
+                    raise OptionError(limit.what, where=place, found=f"code {largest}", cure=limit.cure)
+            if extra > _MOST_EXTRA and str(writer.get("extra_dims", "")).strip() == "all":
+                raise DimensionError(
+                    f"LAS cannot hold so many extra dimensions: one record describes {_MOST_EXTRA} of them",
+                    where=place,
+                    found=f"{extra} features",
+                    cure="Take fewer neighborhoods or features, write to a format without the limit (writers.text, "
+                    "writers.tiledb), or use writers.classifiermodel and filters.modelclassifier, which need no "
+                    "dimensions",
+                )
+
+
+def _code_limit(writer: dict[str, Any], before: list[dict[str, Any]]) -> CodeLimit | None:
+    """The largest class code that a LAS writer can hold; None for point formats that hold all codes."""
+    if writer.get("type") == "writers.copc":
+        return None
+    minor, format_id = las_version(writer, before)
+    if format_id > 5:
+        return None
+    return CodeLimit(
+        LEGACY_LIMIT,
+        f"class codes above {LEGACY_LIMIT} do not fit the LAS file that writers.las would write "
+        f"(LAS 1.{minor}, dataformat_id {format_id})",
+        'Give writers.las "minor_version": 4 and "dataformat_id": 6 (7 with colors, 8 with near infrared)',
+    )
+
+
+def check_copc(stages: list[dict[str, Any]]) -> None:
+    """Refuse a plain LAZ file under the name of a COPC file."""
+    for stage in stages:
+        name, kind = str(stage.get("filename", "")), stage.get("type", "")
+        last = stage is stages[-1] and len(stages) > 1
+        if not name.lower().endswith(".copc.laz") or not (kind == "writers.las" or (last and not kind)):
+            continue
+        if not pdal_env.writes_copc():
+            raise PipelineError(
+                f"PDAL {pdal_env.dotted_version()} cannot write COPC",
+                found=name,
+                cure="Name the output .laz, or use PDAL 2.4 or later",
+            )
+        if kind:
+            raise PipelineError(
+                "writers.las writes plain LAZ, not COPC", found=name, cure='Use "type": "writers.copc"'
+            )
+
+
+# ---- flags of LAS 1.0-1.3, before PDAL 2.6 -------------------------------------------------------
+
+# PDAL calls this for the points of one file after the other.
+_SPLIT = f"""\
+files = iter(())
+def stage(ins, outs):
+    global files
+    old = next(files, None)
+    if old is None:
+        files = iter(pdalargs["old"])
+        old = next(files)
+    both = ins["Classification"]
+    if old:
+        outs["Classification"] = both & {LEGACY_LIMIT}
+        outs["ClassFlags"] = both >> {LEGACY_LIMIT.bit_length()}
+    return True
+"""
+_LABEL = "pdal_stages_class_flags"
+
+
+def files_with_flags_to_split(stages: Sequence[dict[str, Any]], with_ours: bool = True) -> list[bool]:
+    """Of each file that is read, whether flags must be split from the class; empty where nothing is to be done.
+
+    A writer of LAS 1.0-1.3 writes both into one byte, as they were read. `with_ours`: stages of ours are among them, or
+    work on the points besides; without, text and rasters come out as PDAL makes them.
+
+    Raises
+    ------
+    PipelineError
+        Where one writer needs them together and another one apart.
+    """
+    if pdal_env.splits_class_flags():
+        return []
+    readers = [stage for number, stage in enumerate(stages) if is_reader(stages, number)]
+    old: list[bool] = []
+    for reader in readers:
+        headers = las_headers([reader])
+        old += [header.point_format <= 5 for header in headers] if headers else [False]
+    if True not in old:
+        return []
+    writers = [stage for stage in stages if is_writer(stage, list(stages))]
+    writers = [stage for stage in writers if stage.get("type") not in registry.stages()]
+    formats = [las_version(one, stages)[1] if writes_las(one) else None for one in writers]
+    together = [one for one in formats if one is not None and one <= 5]
+    apart = [one for one in formats if one is not None and one > 5]
+    if together and (apart or not all(old)):
+        raise PipelineError(
+            "this PDAL cannot bring the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 into a pipeline with LAS 1.4",
+            found=f"PDAL {pdal_env.dotted_version()}",
+            cure='Give all LAS writers "minor_version": 4 and "dataformat_id": 6 (7 with colors), or use PDAL 2.6',
+        )
+    needed = apart or (with_ours and (writers or not all(old)))
+    return old if needed and not together else []
+
+
+def flag_splitter(old: Sequence[bool], **wiring: Any) -> dict[str, Any]:
+    """A filter that gives flags the dimension that they have in LAS 1.4; `old`: see :func:`files_with_flags_to_split`."""
+    return {**python_filter(_LABEL, _SPLIT, {"old": list(old)}, {"ClassFlags": "uint8_t"}), **wiring}
+
+
+# ---- LAZ with class codes above 31, before PDAL 2.3 ----------------------------------------------
+
+UNCOMPRESSED = ".uncompressed.las"
+_BLOCK = 1_000_000
+
+
+def uncompressed_writer(writer: dict[str, Any], before: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    """The writer, or one that leaves compressing to :func:`compress` where PDAL would fail to."""
+    named = str(writer.get("filename", "")).lower().endswith(".laz")
+    compresses = named or str(writer.get("compression", "")).lower() not in ("", "none", "false")
+    if (
+        pdal_env.writes_extended_classes_to_laz()
+        or writer.get("type") not in ("writers.las", None)
+        or not compresses
+        or las_version(writer, before)[1] <= 5
+    ):
+        return writer
+    plain = {key: value for key, value in writer.items() if key != "compression"}
+    return {**plain, "filename": f"{writer['filename']}{UNCOMPRESSED}"}
+
+
+def compress(partials: Iterable[Path]) -> dict[str, str]:
+    """Compress what was left uncompressed; the names that files had -> those that they have now.
+
+    Raises
+    ------
+    StageError
+        If a file cannot be written.
+    """
+    names: dict[str, str] = {}
+    for folder in {partial.parent for partial in partials}:
+        for made in sorted(folder.glob(f"*{UNCOMPRESSED}")):
+            target = made.with_name(made.name.removesuffix(UNCOMPRESSED))
+            _compress(made, target)
+            names[str(made)] = str(target)
+    return names
+
+
+def _compress(made: Path, target: Path) -> None:
+    import laspy
+
+    try:
+        with laspy.open(made) as source:
+            header = source.header
+            with laspy.open(target, "w", header=header, do_compress=True) as out:
+                for points in source.chunk_iterator(_BLOCK):
+                    out.write_points(points)
+                if header.evlrs:
+                    out.write_evlrs(header.evlrs)
+    except Exception as error:  # laspy and lazrs raise many types
+        raise StageError("the output file could not be compressed", found=f"{target}: {error}") from error
+    made.unlink()
