@@ -14,7 +14,6 @@ import pytest
 
 from pdal_stages.classifier import modelfile
 from pdal_stages.classifier.featureforest import shared_features
-from pdal_stages.classifier.warmup import _bridge
 from pdal_stages.cli import main
 from pdal_stages.features import FeaturePlan
 from pdal_stages.pipeline import Pipeline
@@ -298,31 +297,6 @@ def test_what_is_asked_of_one_command_ends_with_it(cloud, tmp_path, capsys, monk
     (tmp_path / "job.json").write_text(json.dumps([str(cloud)]))
     assert run(capsys, "pipeline", tmp_path / "job.json", "--no-progress")[0] == 0
     assert "PDAL_STAGES_PROGRESS" not in os.environ
-
-
-@pytest.mark.slow
-def test_after_warmup_the_demo_and_the_defaults_compile_nothing(tmp_path, write_las):
-    """The demo makes a town, trains, classifies with its model and the shipped one, compares, and draws."""
-    cache = tmp_path / "cache"
-
-    def compiled(*words: object) -> list[str]:
-        code = "import sys; from pdal_stages.cli import main; sys.exit(main(sys.argv[1:]))"
-        done = subprocess.run(
-            [sys.executable, "-c", code, *map(str, words)],
-            capture_output=True,
-            text=True,
-            env={**os.environ, "NUMBA_CACHE_DIR": str(cache)},
-        )
-        assert done.returncode == 0, done.stderr
-        return sorted(path.name for path in cache.rglob("*.nbc"))
-
-    there = compiled("warmup")
-    assert len(there) > 20
-    assert compiled("demo", tmp_path / "demo", "--size", 60, "--density", 4) == there
-    xyz = dict(zip("XYZ", _bridge().T, strict=True))
-    bridge = write_las(tmp_path / "bridge.las", {**xyz, "NumberOfReturns": np.ones(len(xyz["X"]), np.uint8)})
-    assert compiled("classify", bridge, tmp_path / "out.las") == there
-    assert np.count_nonzero(laspy.read(tmp_path / "out.las").classification == 17) > 500
 
 
 @pytest.mark.parametrize(

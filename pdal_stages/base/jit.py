@@ -18,14 +18,12 @@ cache ahead of time, e.g. at installation.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import importlib
 import os
 import stat
 import tempfile
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from functools import lru_cache, update_wrapper
 from pathlib import Path
 from typing import Any
@@ -73,13 +71,6 @@ class Kernel:
                 load_lightly(made)
                 self._dispatcher = made
             return self._dispatcher
-
-    @property
-    def kept(self) -> bool:
-        """Whether compiled code of it is in the cache; False where this numba does not tell."""
-        file = getattr(getattr(self.dispatcher, "_cache", None), "_cache_file", None)
-        read = getattr(file, "_load_index", None)
-        return bool(read and read())
 
     @property
     def _numba_type_(self) -> Any:
@@ -208,17 +199,11 @@ def _sources(kernel: Any) -> set[str]:
 
 
 class Compiling:
-    r"""Says on stderr how many kernels were compiled so far, where that takes longer than two seconds.
-
-    numba compiles a kernel when a job first calls it, so these are the job's own. It tells the beginning and the end
-    of each, with those of the functions that it calls in between. How many there will be is known where the job told
-    which ones it :meth:`expect`\ s to call.
-    """
+    """Says on stderr how many kernels were compiled so far, where that takes longer than two seconds."""
 
     #: Whether this process says it, whatever PDAL_STAGES_PROGRESS is.
     enabled: bool | None = None
     _bar: Progress | None = None
-    _expected: Callable[[], Iterable[str]] | None = None
     _inside = threading.local()
 
     @classmethod
@@ -228,47 +213,16 @@ class Compiling:
             listener = type("Listener", (event.Listener,), {"on_start": cls._start, "on_end": cls._end})
             event.register("numba:compile", listener())
             cls._bar = Progress(0, "compiling for this processor, once", "kernels", enabled=cls.enabled)
-            if cls.enabled:
-                cls._bar.enabled = cls._bar.stream is not None
-
-    @classmethod
-    def expect(cls, names: Callable[[], Iterable[str]]) -> None:
-        """Be told which kernels will be called, as ``terrain.minima.lowest``; asked when the first one is compiled."""
-        cls._expected = names
-
-    @classmethod
-    def _count(cls) -> None:
-        """The total: what was compiled already, and what is expected and not in the cache."""
-        names, cls._expected = cls._expected, None
-        if cls._bar is None or names is None:
-            return
-        cls._bar.total = cls._bar.count + len(_not_kept(names()))
 
     @staticmethod
     def _start(_: Any, event: Any) -> None:
         Compiling._inside.depth = getattr(Compiling._inside, "depth", 0) + 1
-        if Compiling._inside.depth == 1:
-            with _lock:
-                Compiling._count()
 
     @staticmethod
-    def _end(_: Any, event: Any) -> None:
+    def _end(_: Any, event: Any) -> None:  # of the kernel itself, not of the functions it calls
         Compiling._inside.depth = getattr(Compiling._inside, "depth", 1) - 1
-        if Compiling._inside.depth == 0 and (bar := Compiling._bar) is not None:
-            if bar.total:  # more than was foreseen
-                bar.total = max(bar.total, bar.count + 1)
-            bar.update()
-
-
-def _not_kept(names: Iterable[str]) -> list[Kernel]:
-    """Kernels, named as ``terrain.minima.lowest``, of which no compiled code is in the cache."""
-    found = []
-    for name in names:
-        module, _, function = f"{__package__.rpartition('.')[0]}.{name}".rpartition(".")
-        kernel = getattr(importlib.import_module(module), function, None)
-        if isinstance(kernel, Kernel) and not kernel.kept:
-            found.append(kernel)
-    return found
+        if Compiling._inside.depth == 0 and Compiling._bar is not None:
+            Compiling._bar.update()
 
 
 def kept_kernels() -> int:
@@ -278,37 +232,6 @@ def kept_kernels() -> int:
         [Path(named)] if named else [Path(__file__).resolve().parents[1], Path.home() / ".cache" / "numba"]
     )
     return sum(1 for folder in folders for _ in folder.rglob("*.nbi"))
-
-
-@contextlib.contextmanager
-def compiled_elsewhere(names: Iterable[str]) -> Iterator[None]:
-    """Say on stderr how many of these kernels have come into the cache, whoever compiles them, until the block ends."""
-    missing = _not_kept(names)
-    before, Compiling.enabled = Compiling.enabled, False
-    if Compiling._bar is not None:
-        Compiling._bar.enabled = False
-    ended = threading.Event()
-
-    def watch(bar: Progress) -> None:
-        while not ended.wait(1.0):
-            there = [kernel for kernel in missing if kernel.kept]
-            for kernel in there:
-                missing.remove(kernel)
-            bar.update(len(there))
-
-    shown = None if missing else False
-    with Progress(len(missing), "compiling for this processor, once", "kernels", enabled=shown) as bar:
-        watcher = threading.Thread(target=watch, args=(bar,), daemon=True)
-        watcher.start()
-        try:
-            yield
-            ended.set()
-            watcher.join()
-            bar.update(len(missing))  # those of which the cache does not tell
-        finally:
-            ended.set()
-            watcher.join()
-            Compiling.enabled = before
 
 
 @device

@@ -5,12 +5,8 @@
 
 from __future__ import annotations
 
-import gc
-from collections.abc import Callable
-
 import numpy as np
 
-from ..base.jit import Compiling
 from ..features import compute_features
 from ..features.voxels import represent
 from ..terrain import detached_noise, filtered_ground, hag_minima
@@ -35,13 +31,6 @@ def warmup() -> None:
     options = TrainingOptions(dimensions=read, trees=1, count=50, threads=1)
     model = train(TrainingCloud(xyz, np.where(xyz[:, 2] > 6.0, 6, 2), dimensions), options, progress=False)
     model.predict(xyz, dimensions, threads=1)
-
-
-def compile_part(part: Callable[[], None]) -> None:
-    """Call one of the parts in a process that does nothing else."""
-    gc.disable()  # a seventh of the time would go into looking for garbage
-    Compiling.enabled = False  # the process that has this one do it says how far all are
-    part()
 
 
 def features_part() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 
-from ..base.errors import OptionError, StageError
+from ..base.errors import OptionError
 from .adder import Adder
 
 
@@ -34,19 +34,18 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def _warmup(options: argparse.Namespace) -> None:
-    from ..base.jit import compiled_elsewhere
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
     from ..base.threads import available_threads
-    from ..classifier.warmup import compile_part, features_part, other_part, warmup
-    from ..pipeline.processes import each_file
-    from ..stages import registry
+    from ..classifier.warmup import features_part, other_part, warmup
     from ..synthetic.demo import compile_kernels
 
-    parts = [(part,) for part in (features_part, other_part, compile_kernels)]
-    with compiled_elsewhere(registry.kernels(["warmup"])):
-        for _, answer in each_file(compile_part, parts, min(2, available_threads()), apart=True):
-            if answer.reason:
-                raise StageError("the kernels cannot be compiled", found=answer.reason)
-        warmup()  # shows that all are there and work together
+    workers = min(2, available_threads())
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        for done in [pool.submit(part) for part in (features_part, other_part, compile_kernels)]:
+            done.result()
+    warmup()  # shows that all are there and work together
     if options.all:
         from ..features import warmup as every_neighborhood
 

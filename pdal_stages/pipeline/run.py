@@ -15,7 +15,6 @@ from typing import Any
 from ..base.complete import check_complete
 from ..base.errors import InterruptedStage, PipelineError, StageError
 from ..base.files import whole_files
-from ..base.jit import Compiling
 from ..base.las import odd_text, supersede_copc
 from ..base.lascheck import check_readable
 from ..base.outputs import Output, check_outputs
@@ -172,8 +171,6 @@ class Pipeline:
             check_complete(made, final, writers[number], count)
             supersede_copc(made)
 
-        if self.lowered.ours:
-            Compiling.expect(lambda: registry.kernels([ours.stage.type for ours in self.lowered.ours]))
         runtime.remember_stdout()
         failure: StageError | None = None
         try:

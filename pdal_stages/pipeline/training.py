@@ -15,12 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import OptionError, StageError
-from ..base.jit import Compiling
 from ..base.progress import Progress
 from ..base.report import Report
 from ..classifier import TrainingCloud, train
 from ..classifier.summary import FILE_NUMBER
-from ..stages import registry
 from ..stages.classifiermodel import ClassifierModel
 from ..stages.heights import preparation_of
 from ..stages.points import Points
@@ -174,7 +172,6 @@ def train_surveys(
         (first, group), *others = surveys.items()
         start = reading(first, group, bar)()  # what all are trained on follows from its dimensions
         clouds = (one for one in [lambda: start, *(reading(name, group, bar) for name, group in others)])
-        Compiling.expect(lambda: registry.kernels([stage.type]))
         made = train(clouds, training)
     stage.finish(made, report)
     return [*told, *report.messages]

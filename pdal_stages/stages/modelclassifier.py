@@ -14,9 +14,9 @@ from ..base.vegetation import HIGH as HIGH_VEGETATION
 from ..base.vegetation import LOW, MEDIUM, bands, by_height
 from ..classifier import Model, Prediction
 from ..classifier.deciding import UNCLASSIFIED
+from ..classifier.passes import BAND
 from ..classifier.smoothing import FARTHEST
 from ..classifier.sureness import Limit, Sureness, said, sureness_of
-from ..classifier.passes import BAND
 from ..models import find
 from .base import Stage
 from .dimensions import parts_of

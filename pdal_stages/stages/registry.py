@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import importlib
-import json
 import pkgutil
-from collections.abc import Iterable
 from functools import cache
-from pathlib import Path
 
 from ..base.errors import PipelineError, suggest
 from .base import Stage
@@ -36,9 +33,3 @@ def get(type_name: str) -> type[Stage]:
             f"there is no stage '{type_name}' in pdal_stages",
             cure=f"{suggest(type_name, stages())}Stages: {', '.join(stages())}",
         ) from None
-
-
-def kernels(types: Iterable[str]) -> set[str]:
-    """Kernels that stages of these types call with their defaults, as ``benchmarks/kernels.py`` found."""
-    of_stage = json.loads(Path(__file__).with_name("kernels.json").read_text())
-    return {name for kind in types for name in of_stage.get(kind, ())}

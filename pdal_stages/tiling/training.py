@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from ..base.errors import StageError
 from ..base.extrabytes import extra_dimensions
-from ..base.jit import Compiling
 from ..base.memory import free_memory
 from ..base.report import Report
 from ..classifier import TrainingCloud
@@ -30,7 +29,6 @@ from ..pipeline.inputs_outputs import is_ept, is_las, overridden
 from ..pipeline.overrides import Override
 from ..pipeline.run import Pipeline
 from ..pipeline.training import check_surveys, heights_for, lowered_writer, numbered, points_in
-from ..stages import registry
 from ..stages.checked import CheckedChoice, Looked
 from ..stages.classifiermodel import ClassifierModel
 from ..stages.points import HOLDS_NOWHERE
@@ -147,8 +145,6 @@ class TrainTask:
         told = [said] if (said := stage.follows(heights)) is not None else []
         pdal_env.bindings()  # says what is wrong with PDAL before any work
         stage.check()
-        types = [one["type"] for one in [*heights, self._writer]]
-        Compiling.expect(lambda: registry.kernels(types))
         model = Path(self.model).absolute()
         place = model.parent if model.is_file() or not model.exists() else None  # not beside a device
         clouds: list[CloudParts] = []
