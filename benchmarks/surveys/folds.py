@@ -23,11 +23,10 @@ from pdal_stages.classifier.clouds import label_classes
 from pdal_stages.classifier.context import Context
 from pdal_stages.classifier.featureforest import CloudFeatures, Features
 from pdal_stages.classifier.foresttraining import FOLD_TREES, feature_plan
-from pdal_stages.classifier.growing import TreeOptions, grow
 from pdal_stages.classifier.passes import joined
 from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.classifier.smoothing import count_shares
-from pdal_stages.classifier.trees import Ranked
+from pdal_stages.classifier.trees import Ranked, TreeOptions, grow
 from pdal_stages.stages.loading import load_model
 
 #: Of a forest of a model that misses a survey, by default: what the card's and the review's figures are of.
@@ -70,7 +69,7 @@ class LeaveOneOut:
         self._pair = cache(self._grown_without)
 
     def _grow(self, ranked: Ranked, kept: npt.NDArray[np.bool_], trees: int) -> Forest:
-        setting = TreeOptions(None, OPTIONS.min_samples_leaf, OPTIONS.max_samples, OPTIONS.max_features)
+        setting = TreeOptions(OPTIONS.min_samples_leaf, OPTIONS.max_samples, OPTIONS.max_features)
         weight = self.samples.weight * kept
         grown = grow(ranked, self.samples.label, weight, trees, setting, OPTIONS.seed)
         return Forest.from_trees([tree for tree, _, _ in grown], ranked.columns)

@@ -16,10 +16,8 @@ from ..base.errors import OptionError, StageError
 from ..base.progress import Progress
 from ..features.voxels import Representatives, represent
 from .classes import MAX_LABEL, ClassMap, as_labels
-from .dimensions import known, required, welcome
-from .surroundings import Seen
-from .telltale import Labels, telltale
-from .thinning import density, thinned
+from .dimensions import known
+from .thinning import density, density_range, thinned
 from .trainoptions import TrainingOptions
 
 
@@ -42,6 +40,8 @@ class TrainingCloud:
         The flight it belongs to; by default it is one of its own.
     copy : str
         Which of the survey's copies it is, where there are several.
+    own : (n,) bool, optional
+        Of a tile its own points; the others are only neighbors.
     """
 
     xyz: npt.NDArray[np.float64]
@@ -51,6 +51,7 @@ class TrainingCloud:
     mask: npt.ArrayLike | None = None
     survey: str | None = None
     copy: str = ""
+    own: npt.ArrayLike | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "xyz", np.asarray(self.xyz, dtype=np.float64))
@@ -64,26 +65,15 @@ class TrainingCloud:
         return self.survey or self.name
 
     @property
-    def whole(self) -> object:
-        """The same for the parts of one cloud (:mod:`.parts`), and for no others."""
-        return id(self)
+    def points(self) -> int:
+        """How many points are its own."""
+        return len(self) if self.own is None else int(np.count_nonzero(self.own))
 
     @property
-    def density(self) -> float:
-        """Points per square meter; see :func:`.thinning.density`."""
-        return density(self.xyz)
-
-    def seen(self, rows: npt.NDArray[np.int64], reach: float) -> Seen:
-        """What features of some of its points depend on that look so many meters around them."""
-        return Seen(self.xyz, self.dimensions, rows)
-
-    def can_be_seen(self, rows: npt.NDArray[np.int64], reach: float) -> bool:
-        """Whether the memory suffices to see that."""
-        return True
-
-    def holds_numbers(self, count: int) -> bool:
-        """Whether the memory suffices for numbers of so many points, a few of each."""
-        return True
+    def usable(self) -> npt.NDArray[np.bool_]:
+        """(n,) points that samples may be drawn from."""
+        good = np.ones(len(self), np.bool_) if self.mask is None else np.array(self.mask)
+        return good if self.own is None else good & np.asarray(self.own)
 
     def part(self, rows: npt.NDArray[np.int64], copy: str = "") -> TrainingCloud:
         """Some of its points, as a cloud of the same survey."""
@@ -95,6 +85,7 @@ class TrainingCloud:
             None if self.mask is None else np.asarray(self.mask)[rows],
             self.flight,
             copy or self.copy,
+            None if self.own is None else np.asarray(self.own)[rows],
         )
 
 
@@ -130,14 +121,27 @@ def cleaned(cloud: TrainingCloud, options: TrainingOptions) -> TrainingCloud:
     return _told(cloud, representatives, named) if few else cloud.part(representatives.rows)
 
 
-def thinned_copy(
-    cloud: TrainingCloud, wanted: float, seed: int, there: float | None = None
-) -> TrainingCloud | None:
-    """A copy with `wanted` points per square meter; None where there are hardly more. `there`: see :func:`thinned`."""
-    rows = thinned(cloud.xyz, wanted, seed, there)
+def thinned_copy(cloud: TrainingCloud, wanted: float, seed: int) -> TrainingCloud | None:
+    """A copy with `wanted` points per square meter; None where there are hardly more."""
+    rows = thinned(cloud.xyz, wanted, seed)
     if rows is None or not len(rows):
         return None
     return cloud.part(rows, f"thinned to {wanted:g} per m2")
+
+
+def joined(parts: Sequence[TrainingCloud]) -> TrainingCloud:
+    """Clouds of the same dimensions as one, named as the first."""
+    first = parts[0]
+    return replace(
+        first,
+        xyz=np.concatenate([one.xyz for one in parts]),
+        labels=np.concatenate([np.asarray(one.labels) for one in parts]),
+        dimensions={
+            name: np.concatenate([np.asarray(one.dimensions[name]) for one in parts])
+            for name in first.dimensions
+        },
+        mask=None if first.mask is None else np.concatenate([np.asarray(one.mask) for one in parts]),
+    )
 
 
 def _told(cloud: TrainingCloud, representatives: Representatives, named: set[int]) -> TrainingCloud:
@@ -185,6 +189,7 @@ def _mapped(cloud: TrainingCloud, folder: Path, number: int) -> TrainingCloud:
         kept("mask", cloud.mask),
         cloud.survey,
         cloud.copy,
+        kept("own", cloud.own),
     )
 
 
@@ -203,8 +208,7 @@ class Labeled:
     def __getitem__(self, number: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int16]]:
         cloud = self.clouds[number]
         position = self.classes.index(as_labels(cloud.labels, cloud.name))
-        if cloud.mask is not None:
-            position[~np.asarray(cloud.mask)] = -1
+        position[~cloud.usable] = -1
         gone = contradicted(cloud, self.contradicted_below)
         if gone is not None:
             position[gone] = -1
@@ -212,21 +216,6 @@ class Labeled:
 
     def __iter__(self) -> Iterator[tuple[npt.NDArray[np.float64], npt.NDArray[np.int16]]]:
         return (self[number] for number in range(len(self)))
-
-    def training_notes(self, options: TrainingOptions) -> dict[str, Any]:
-        """What was counted, for a manifest."""
-        notes: dict[str, Any] = {"contradicted": dict(self.left_out)} if self.left_out else {}
-        read = {*required(options.inputs), *welcome(options.inputs)}
-        telling = telltale(
-            Labels(
-                cloud.whole,
-                cloud.xyz,
-                {name: cloud.dimensions[name] for name in cloud.dimensions if name in read},
-                self[number][1],
-            )
-            for number, cloud in enumerate(self.clouds)
-        )
-        return notes | ({"telltale": telling} if telling else {})
 
     def described(self, options: TrainingOptions, counts: Iterable[Mapping[str, int]]) -> dict[str, Any]:
         """What a manifest says of the task and of each class, whose samples `counts` tells."""
@@ -265,7 +254,7 @@ def label_classes(
     number, left_out = np.zeros((2, MAX_LABEL + 1), np.int64)
     for cloud in watched(clouds, "counting labels", progress):
         labels = as_labels(cloud.labels, cloud.name)
-        used = np.ones(len(labels), np.bool_) if cloud.mask is None else np.asarray(cloud.mask)
+        used = cloud.usable
         gone = contradicted(cloud, options.contradicted_below)
         if gone is not None:
             left_out += np.bincount(labels[used & gone], minlength=len(number))
@@ -302,12 +291,29 @@ def watched(clouds: Sequence[TrainingCloud], what: str, progress: bool) -> Itera
 
 
 def listed(clouds: Iterable[TrainingCloud]) -> list[dict[str, Any]]:
-    """Names and numbers of points of clouds, those in parts as one, for a manifest."""
-    rows: dict[object, dict[str, Any]] = {}
+    """Names and numbers of points of clouds, the tiles of one as one, for a manifest."""
+    rows: list[dict[str, Any]] = []
     for cloud in clouds:
-        row = rows.setdefault(cloud.whole, {"name": os.path.basename(cloud.name), "points": 0})
-        row["points"] += len(cloud)
-    return list(rows.values())
+        name, points = os.path.basename(cloud.name), cloud.points
+        before = next((row for row in rows if cloud.own is not None and row["name"] == name), None)
+        if before is None:
+            rows.append({"name": name, "points": points})
+        else:
+            before["points"] += points
+    return rows
+
+
+def densities(clouds: Iterable[TrainingCloud]) -> dict[str, float]:
+    """Smallest and largest density of some clouds, as a manifest has it; of tiles the median by their points."""
+    found: dict[object, list[tuple[float, int]]] = {}
+    for number, cloud in enumerate(clouds):
+        key = number if cloud.own is None else (cloud.name, cloud.flight, cloud.copy)
+        found.setdefault(key, []).append((density(cloud.xyz), cloud.points))
+    medians = []
+    for tiles in found.values():
+        value, points = (np.array(column) for column in zip(*sorted(tiles), strict=True))
+        medians.append(float(value[np.searchsorted(np.cumsum(points), points.sum() / 2)]))
+    return density_range(medians)
 
 
 def _checked_labels(cloud: TrainingCloud) -> npt.NDArray[Any]:

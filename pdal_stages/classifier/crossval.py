@@ -7,7 +7,7 @@ random for validation are therefore half known already, and the score says littl
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,11 +16,8 @@ import numpy.typing as npt
 from ..accuracy.measures import Accuracy
 from ..base.errors import OptionError
 from ..base.progress import Progress
-from .growing import TreeOptions, grow
-from .trees import Ranked
+from .trees import Ranked, TreeOptions, grow
 
-#: A smaller forest is preferred if its mean F1 is within this of the best.
-TOLERANCE = 0.002
 #: Rows handed to scikit-learn to deal out blocks.
 _DEALT = 50_000
 
@@ -54,8 +51,8 @@ def block_folds(
     if len(blocks) < folds:
         raise OptionError(
             f"the samples cover {len(blocks)} block(s) of {block_size:g} m, fewer than the {folds} folds",
-            found=f"block_size {block_size:g}, folds {folds}",
-            cure="Make block_size or folds smaller, or give more training data",
+            found=f"folds {folds}",
+            cure="Make folds smaller, or give more training data",
         )
     from sklearn.model_selection import StratifiedGroupKFold
 
@@ -88,45 +85,35 @@ def split(
     return train, np.flatnonzero(held)
 
 
-def search(
+def score(
     ranked: Ranked,
     label: npt.NDArray[Any],
     weight: npt.NDArray[np.int64],
     xy: npt.NDArray[np.float64],
     codes: Sequence[int],
-    candidates: Sequence[TreeOptions],
-    tree_counts: Sequence[int],
+    setting: TreeOptions,
+    trees: int,
+    fold: npt.NDArray[np.int16],
     *,
-    folds: int,
-    block_size: float,
     gap: float,
     seed: int,
-    fold: npt.NDArray[np.int16] | None = None,
     threads: int | None = None,
     progress: bool = True,
-    heard: Callable[[int, int, npt.NDArray[np.int64], npt.NDArray[np.float64]], None] | None = None,
-) -> list[dict[str, Any]]:
-    """Score every candidate by spatial cross-validation.
+    heard: Callable[[npt.NDArray[np.int64], npt.NDArray[np.float64]], None] | None = None,
+) -> dict[str, Any]:
+    """Score a forest by cross-validation: one of so many `trees` for each `fold` of the samples, grown without it.
 
-    `fold` is of each sample, where these are not blocks of ground. One forest of the largest size is grown per fold and
-    candidate; smaller ones are its first trees. `heard` is called with the place of a candidate, a number of trees, the rows
-    that were held out and their probabilities.
+    `heard` is called with the rows that were held out and their probabilities.
 
     Returns
     -------
-    list of dict
-        Per combination: trees, max_depth, min_samples_leaf, overall_accuracy, kappa, mean_f1, f1 by code, and
-        mean_f1_by_fold. Samples count as often as they were drawn, so classes weigh the same.
+    dict
+        trees, min_samples_leaf, overall_accuracy, kappa, mean_f1, f1 by code, and mean_f1_by_fold. Samples count as often
+        as they were drawn, so classes weigh the same.
     """
-    if fold is None:
-        fold = block_folds(xy, label, weight, folds, block_size)
-    sums = {
-        (c, t): np.zeros((folds, len(codes), len(codes)), np.int64)
-        for c in range(len(candidates))
-        for t in tree_counts
-    }
-    total = folds * len(candidates) * tree_counts[-1]
-    with Progress(total, "cross-validation", "trees", enabled=progress) as bar:
+    folds = int(fold.max()) + 1
+    matrices = np.zeros((folds, len(codes), len(codes)), np.int64)
+    with Progress(folds * trees, "cross-validation", "trees", enabled=progress) as bar:
         for number in range(folds):
             train, rows = split(xy, fold, number, gap)
             missing = [codes[k] for k in range(len(codes)) if not (weight * train)[label == k].any()]
@@ -134,47 +121,25 @@ def search(
                 raise OptionError(
                     f"without fold {number + 1} and its gap of {gap:g} m a class has no samples left",
                     found=f"class {missing[0]}",
-                    cure="Make block_size or gap smaller, or give more training data",
+                    cure="Give more training data",
                 )
-            for c, candidate in enumerate(candidates):
-                trees = grow(
-                    ranked,
-                    label,
-                    weight * train,
-                    tree_counts[-1],
-                    candidate,
-                    seed,
-                    score=rows,
-                    threads=threads,
-                    progress=bar,
-                )
-                for t, shares in _votes(trees, tree_counts, len(rows), len(codes)):
-                    np.add.at(sums[c, t][number], (label[rows], shares.argmax(axis=1)), weight[rows])
-                    if heard is not None:
-                        heard(c, t, rows, shares / np.maximum(shares.sum(axis=1, keepdims=True), 1e-300))
-    return [_row(candidates[c], t, matrices, codes) for (c, t), matrices in sums.items()]
-
-
-def _votes(
-    trees, counts: Sequence[int], n: int, classes: int
-) -> Iterator[tuple[int, npt.NDArray[np.float64]]]:
-    total = np.zeros((n, classes))
-    for number, (_, _, shares) in enumerate(trees, 1):
-        total += shares
-        if number in counts:
-            yield number, total
-
-
-def _row(
-    candidate: TreeOptions, trees: int, matrices: npt.NDArray[np.int64], codes: Sequence[int]
-) -> dict[str, Any]:
-    by_fold = [Accuracy.from_confusion(m, codes).mean_f1 if m.any() else None for m in matrices]
+            total = np.zeros((len(rows), len(codes)))
+            grown = grow(
+                ranked, label, weight * train, trees, setting, seed, score=rows, threads=threads, progress=bar
+            )
+            for _, _, shares in grown:
+                total += shares
+            np.add.at(matrices[number], (label[rows], total.argmax(axis=1)), weight[rows])
+            if heard is not None:
+                heard(rows, total / np.maximum(total.sum(axis=1, keepdims=True), 1e-300))
     return {
         "trees": trees,
-        "max_depth": candidate.max_depth,
-        "min_samples_leaf": candidate.min_samples_leaf,
+        "max_depth": None,
+        "min_samples_leaf": setting.min_samples_leaf,
         **figures(matrices.sum(axis=0), codes),
-        "mean_f1_by_fold": by_fold,
+        "mean_f1_by_fold": [
+            Accuracy.from_confusion(m, codes).mean_f1 if m.any() else None for m in matrices
+        ],
     }
 
 
@@ -187,13 +152,3 @@ def figures(matrix: npt.NDArray[np.int64], codes: Sequence[int]) -> dict[str, An
         "mean_f1": accuracy.mean_f1,
         "f1": {str(one.code): one.f1 if one.support else None for one in accuracy.per_class},
     }
-
-
-def choose(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The cheapest combination whose mean F1 is within :data:`TOLERANCE` of the best."""
-    best = max(row["mean_f1"] for row in rows)
-    good = [row for row in rows if row["mean_f1"] >= best - TOLERANCE]
-    return min(
-        good,
-        key=lambda row: (row["trees"], row["max_depth"] or 10**9, -row["min_samples_leaf"], -row["mean_f1"]),
-    )

@@ -142,23 +142,15 @@ def sample_context(
     context: Context,
     classes: Sequence[int],
     factors: Sequence[npt.NDArray[np.float64] | None] = (),
-) -> tuple[npt.NDArray[np.float32], bool]:
-    """(m, columns): the context of the m points asked for, as passes say, one after the other, that have not seen them.
+) -> npt.NDArray[np.float32]:
+    """(m, columns): the context of the m points asked for, ascending, as passes say that have not seen them.
 
-    `classes` and `factors` of each pass: see :class:`Passes`. And whether any of those that were looked at had neighbors
-    beyond the features' halo.
+    `classes` and `factors` of each pass: see :class:`Passes`.
     """
     asked: Any = request.rows
     out = np.empty((len(asked), len(context.tokens) * classes[-1]), np.float32)
     padded = (*factors, *[None] * (len(passes) - len(factors) + 1))
     run = PassRun([*passes, ContextOnly(context)], [*classes, classes[-1]], request, padded)
-    return context_of(run, asked, out), bool(run.report.beyond_halo)
-
-
-def context_of(
-    run: PassRun, rows: npt.NDArray[np.int64], out: npt.NDArray[np.float32]
-) -> npt.NDArray[np.float32]:
-    """Fill `out` with the context of `rows`, ascending, that a run ends with."""
-    for part, columns in run.blocks(lambda _, rows, columns: columns):
-        out[np.searchsorted(rows, part)] = columns
+    for rows, columns in run.blocks(lambda values, rows, columns: columns):
+        out[np.searchsorted(asked, rows)] = columns
     return out

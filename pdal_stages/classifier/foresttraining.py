@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import platform
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,28 +19,26 @@ from ..features import FeaturePlan
 from ..features.returns import SOURCES
 from . import crossval
 from .algorithms import PredictRequest
-from .clouds import Labeled, TrainingCloud, label_classes, listed
+from .clouds import Labeled, TrainingCloud, densities, label_classes, listed
 from .context import Context
 from .dimensions import WHERE_THERE, gather, required
 from .featureforest import FeatureForest, Features
 from .folds import FoldForests, Folds, sample_context
 from .forest import Forest
-from .growing import TreeOptions, grow
 from .model import Model
 from .passes import weighed
-from .refinement import Blend, blended
-from .refining import Below, held_by_base, on_top
-from .samplefeatures import SHORT, fitted, must_fit, percentiles, sample_features
+from .refinement import Below, Blend, blended, held_by_base, on_top
+from .samplefeatures import fitted, must_fit, percentiles, sample_features
 from .sampling import Samples, draw_samples
 from .sureness import Sureness, counted
-from .surroundings import Looks, Seen, wider, work_on
-from .thinning import density_range
-from .trainoptions import PER_TREE, TrainingOptions
-from .trees import GrownTree, Ranked
+from .trainoptions import PER_TREE, TrainingOptions, feature_plan
+from .trees import GrownTree, Ranked, TreeOptions, grow
 from .unscored import why_unscored
 
 #: Trees of a forest that judges a fold, as a share of the final one's.
 FOLD_TREES = 0.25
+#: Side in meters of blocks of ground that are held out.
+BLOCK = 25.0
 
 
 optional_inputs = {**{name: (name,) for name in WHERE_THERE}, "returns": SOURCES}
@@ -63,13 +60,6 @@ def inputs(options: TrainingOptions) -> tuple[str, ...]:
     return own if options.base is None else tuple(dict.fromkeys([*own, *options.base.plan.dimensions]))
 
 
-def feature_plan(options: TrainingOptions) -> FeaturePlan:
-    """The features that options ask for."""
-    return FeaturePlan.parse(
-        options.neighborhoods, feature_set=options.feature_set, dimensions=options.dimensions
-    )
-
-
 def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model:
     """See :func:`pdal_stages.classifier.train`."""
     started = time.perf_counter()
@@ -77,15 +67,14 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     _check_groups(clouds, options)  # before any work: a dimension may be missing
     labeled = label_classes(clouds, options, progress)
     classes = labeled.classes
-    shares = [f"{cloud.flight} {cloud.copy}" for cloud in clouds] if options.balance else None
+    shares = [f"{cloud.flight} {cloud.copy}" for cloud in clouds]
     total = sum(map(len, clouds)) * (1 + len(classes.codes))  # which are read for each class
     with Progress(total, "drawing samples", enabled=progress) as bar:
         samples = draw_samples(labeled, len(classes.codes), options.count, options.seed, shares, progress=bar)
     base = options.base
     known = set() if base is None else set(base.codes.tolist())
     read = 0 if options.passes == 1 and base is None else len(known | set(classes.codes))
-    of_context = len(options.context) * read
-    must_fit(len(plan.names) + of_context, len(samples))
+    must_fit(len(plan.names) + len(options.context) * read, len(samples))
     features = Features(plan, *fitted(clouds, samples, plan, options), options.seed)
     values, counted = sample_features(clouds, samples, features, options, progress)
     timed = {"features": time.perf_counter() - started}
@@ -93,26 +82,19 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     below = None if base is None else Below(base, clouds, samples, options, progress)
     xy = samples.take(lambda number: clouds[number].xyz[:, :2])
     priors = _priors(samples, len(classes.codes), options.prior_weight)
-    heard = _Heard(samples, classes.codes, priors, below, options)
     ranked = alone = Ranked.of(values, options.threads)
     del values  # as large again
     if below is not None:
         ranked = ranked.beside(Ranked.of(below.columns, options.threads))
-    chosen, validation = _validate(
-        ranked,
-        samples,
-        xy,
-        samples.take(lambda number: _groups(clouds[number], options)),
-        classes.codes,
-        plan,
-        options,
-        progress,
-        heard,
+    heard = _Heard(samples, classes.codes, priors, below, options)
+    group = samples.take(lambda number: _groups(clouds[number], options))
+    setting = TreeOptions(
+        options.min_samples_leaf, _share_drawn(options, samples, len(classes.codes)), options.max_features
     )
+    validation = _validate(ranked, samples, xy, group, classes.codes, plan, setting, options, progress, heard)
     started = time.perf_counter()
-    passes = _Passes(labeled, samples, (alone, ranked), features, chosen, options, progress, below)
+    passes = _Passes(labeled, samples, (alone, ranked), features, setting, options, progress, below)
     passes.grow(*limits)
-    left_out = passes.without_each_survey() if options.leave_one_survey_out else None
     timed["trees"] = time.perf_counter() - started
     info = {
         **labeled.described(options, map(samples.counts, range(len(classes.codes)))),
@@ -121,32 +103,25 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
             "count": options.count,
             "seed": options.seed,
             "samples": len(samples),
-            **labeled.training_notes(options),
-            "max_samples": _share_drawn(options, samples, len(classes.codes)),
+            **({"contradicted": dict(labeled.left_out)} if labeled.left_out else {}),
+            "max_samples": setting.max_samples,
             "max_features": options.max_features,
-            "min_samples_leaf": chosen["min_samples_leaf"],
-            "max_depth": chosen["max_depth"],
+            "min_samples_leaf": options.min_samples_leaf,
             **passes.notes,
-            **_unscored(heard, validation, xy, samples, labeled, options, _gap(plan, options)),
+            **_unscored(heard, validation, xy, samples, labeled, options, _gap(plan)),
             **({} if below is None or options.target is not None else _held(below, classes.codes)),
-            **_with_short(counted, passes.short + (0 if below is None else below.short)),
+            **counted,
         },
         "priors": priors,
-        **heard.of(chosen, validation, below),
-        "densities": density_range(cloud.density for cloud in clouds),
+        **heard.of(validation),
+        "densities": densities(clouds),
         "voxel": options.voxel,
-        "accuracy": {"cross_validation": validation, "leave_one_survey_out": left_out},
+        "accuracy": {"cross_validation": validation},
         "passes": passes.scores,
         "created_by": _versions(),
     }
     made = Model(tuple(passes.made), list(zip(classes.codes, classes.names, strict=True)), info, timed)
     return made if below is None else on_top(below, made)
-
-
-def _with_short(counted: Mapping[str, Any], more: int) -> dict[str, Any]:
-    """What was counted of the samples' features, with those of contexts whose neighbors lie too far away."""
-    short = counted.get(SHORT, 0) + more
-    return {**counted, **({SHORT: short} if short else {})}
 
 
 def _unscored(
@@ -161,7 +136,7 @@ def _unscored(
     if validation is not None or options.folds == 0:
         return {}
     named = list(zip(labeled.classes.codes, labeled.classes.names, strict=True))
-    return {"unscored": why_unscored(heard.errors, xy, samples.label, named, options.block_size, gap)}
+    return {"unscored": why_unscored(heard.errors, xy, samples.label, named, BLOCK, gap)}
 
 
 def _held(below: Below, codes: Sequence[int]) -> dict[str, Any]:
@@ -181,12 +156,6 @@ def _priors(samples: Samples, n_classes: int, weight: float) -> dict[str, Any] |
 # ---- trees -------------------------------------------------------------------------------------------------
 
 
-def _tree_options(
-    options: TrainingOptions, drawn: float, max_depth: int | None, min_samples_leaf: int
-) -> TreeOptions:
-    return TreeOptions(max_depth, min_samples_leaf, drawn, options.max_features)
-
-
 def _share_drawn(options: TrainingOptions, samples: Samples, classes: int) -> float:
     """The share of the samples that each tree draws."""
     if options.max_samples is not None:
@@ -194,10 +163,8 @@ def _share_drawn(options: TrainingOptions, samples: Samples, classes: int) -> fl
     return min(1.0, PER_TREE * classes / int(samples.weight.sum()))
 
 
-def _gap(plan: FeaturePlan, options: TrainingOptions) -> float:
+def _gap(plan: FeaturePlan) -> float:
     """Meters between samples trained on and ground held out."""
-    if options.gap is not None:
-        return options.gap
     return max((one.reach or 0.0 for one in plan.neighborhoods), default=0.0)
 
 
@@ -227,63 +194,49 @@ def _validate(
     group: npt.NDArray[Any],
     codes: Sequence[int],
     plan: FeaturePlan,
+    setting: TreeOptions,
     options: TrainingOptions,
     progress: bool,
     heard: _Heard,
-) -> tuple[dict[str, Any], dict[str, Any] | None]:
-    """(chosen trees, depth, leaf size; the cross-validation for the manifest or None)."""
-    counts, candidates = options.tree_counts(), options.candidates()
-    as_given = {"trees": counts[-1], **candidates[0]}
-    if options.folds == 0 and not options.searches:
-        return as_given, None
-    quick = options.folds is None and not options.searches
-    if quick:
-        counts = [max(1, math.ceil(counts[-1] * FOLD_TREES))]
+) -> dict[str, Any] | None:
+    """The cross-validation for the manifest, over groups where there are several, else over blocks; None without."""
+    if options.folds == 0:
+        return None
+    trees = max(1, math.ceil(options.trees * FOLD_TREES))
     ways: list[tuple[str, int, npt.NDArray[np.int16] | None]] = [("blocks", options.folds or 5, None)]
     names, index = np.unique(group, return_inverse=True)
-    if len(names) > 1 and (quick or options.groups):
+    if len(names) > 1:
         folds = min(options.folds or 5, len(names))
         ways.insert(0, ("groups" if options.groups else "surveys", folds, (index % folds).astype(np.int16)))
     asked = {"groups": options.groups} if options.groups else {}
-    drawn = _share_drawn(options, samples, len(codes))
     for by, folds, fold in ways:
-        heard.tables.clear()
+        heard.said = Sureness()
         try:
-            rows = crossval.search(
+            if fold is None:
+                fold = crossval.block_folds(xy, samples.label, samples.weight, folds, BLOCK)
+            row = crossval.score(
                 ranked,
                 samples.label,
                 samples.weight,
                 xy,
                 codes,
-                [_tree_options(options, drawn, **candidate) for candidate in candidates],
-                counts,
-                folds=folds,
-                block_size=options.block_size,
-                gap=_gap(plan, options),
+                setting,
+                trees,
+                fold,
+                gap=_gap(plan),
                 seed=options.seed,
-                fold=fold,
                 threads=options.threads,
                 progress=progress,
                 heard=heard,
             )
         except OptionError as error:  # too little ground, or a class in one place
             heard.errors.append(error)
-            if not quick and by == "blocks":
-                raise
-            if options.groups and by == "groups":
+            if by == "groups":
                 asked["instead"] = f"{error.what}: {error.found}"
             continue
-        chosen = crossval.choose(rows)
-        return as_given if quick else chosen, {
-            "by": by,
-            **asked,
-            "folds": folds,
-            "block_size": options.block_size,
-            "gap": _gap(plan, options),
-            "tried": rows,
-            "chosen": chosen,
-        }
-    return as_given, None
+        more = {"folds": folds, "block_size": BLOCK, "gap": _gap(plan), "tried": [row], "chosen": row}
+        return {"by": by, **asked, **more}
+    return None
 
 
 class _Heard:
@@ -301,37 +254,31 @@ class _Heard:
         self._factors = None if priors is None else np.array(priors["factors"])
         drawn = np.bincount(samples.label, samples.weight, len(codes))
         self._weight = samples.weight * (np.array(samples.available) / np.maximum(drawn, 1))[samples.label]
-        self.tables: dict[tuple[int, int], Sureness] = {}
+        self.said = Sureness()
         self.errors: list[OptionError] = []
 
-    def __call__(
-        self, candidate: int, trees: int, rows: npt.NDArray[np.int64], p: npt.NDArray[np.float64]
-    ) -> None:
+    def __call__(self, rows: npt.NDArray[np.int64], p: npt.NDArray[np.float64]) -> None:
         """Rows of the samples, and their probabilities (rows, classes)."""
-        codes, o = self.codes, self._options
-        if self._below is not None and o.target is not None:
-            return  # what the others truly are is not known
+        codes = self.codes
         if self._below is None:
             p = weighed(p, self._factors)
         else:
+            if self._options.target is not None:
+                return  # what the others truly are is not known
             before = self._below.base.codes.tolist()
             p = blended(self._below.own[rows], p, before, codes, self._below.trusted)
             codes = sorted({*before, *codes})
         true = np.asarray(self.codes)[self.samples.label[rows]]
-        counted(p, codes, true, self._weight[rows], self.tables.setdefault((candidate, trees), Sureness()))
+        counted(p, codes, true, self._weight[rows], self.said)
 
-    def of(
-        self, chosen: Mapping[str, Any], validation: Mapping[str, Any] | None, below: Below | None
-    ) -> dict[str, Any]:
+    def of(self, validation: Mapping[str, Any] | None) -> dict[str, Any]:
         """What a manifest says, where anything was heard."""
-        if validation is None or not self.tables:
+        if validation is None or not self.said.right:
             return {}
-        rows = validation["tried"]
-        place = rows.index(validation["chosen"])
-        found = list(self.tables.values())[place]
         passes = "" if self._options.passes == 1 else ", of the first pass"
-        found.about = f"{validation['by']} held out, forests of {validation['chosen']['trees']} trees{passes}"
-        return {"sureness": found.to_dict()}
+        trees = validation["chosen"]["trees"]
+        self.said.about = f"{validation['by']} held out, forests of {trees} trees{passes}"
+        return {"sureness": self.said.to_dict()}
 
 
 class _Passes:
@@ -343,7 +290,7 @@ class _Passes:
         samples: Samples,
         ranked: tuple[Ranked, Ranked],
         features: Features,
-        chosen: Mapping[str, Any],
+        setting: TreeOptions,
         options: TrainingOptions,
         progress: bool,
         below: Below | None = None,
@@ -352,14 +299,11 @@ class _Passes:
         self.clouds, self.codes = labeled.clouds, labeled.classes.codes
         self.samples, self.features = samples, features
         self.alone, self.ranked = ranked  # the features, and all that the first pass reads
-        self.chosen, self.options, self.progress = chosen, options, progress
+        self.setting, self.options, self.progress = setting, options, progress
         self.context = Context(tuple(options.context))
-        drawn = _share_drawn(options, samples, len(self.codes))
-        self.setting = _tree_options(options, drawn, chosen["max_depth"], chosen["min_samples_leaf"])
         self.made: list[FeatureForest] = []
         self.scores: list[dict[str, Any]] = []
         self.notes: dict[str, Any] = {}
-        self.short = 0  #: samples whose neighbors lie farther away than the memory allowed to look
         self.flights = [cloud.flight for cloud in self.clouds]
         if options.passes > 1:
             self.folds = Folds.of(labeled, self.flights, options.pass_folds)
@@ -377,28 +321,6 @@ class _Passes:
                 "limited": self.options.scale,
             }
             self.scores.append({"percentiles": percentiles, "importances": importances, "out_of_bag": bag})
-
-    def without_each_survey(self) -> dict[str, Any]:
-        """Scores of each survey's samples by passes grown without that survey; OptionError where there is only one."""
-        names = sorted(set(self.flights))
-        if len(names) < 2:
-            raise OptionError(
-                "'leave_one_survey_out' needs clouds of at least two surveys", found=", ".join(names)
-            )
-        flight = np.array(self.flights)[self.samples.cloud]
-        weight, trees, rows = self.samples.weight, self.chosen["trees"], []
-        for name in names:
-            mine = flight == name
-            *_, ranked = self._ranked(weight * ~mine)
-            total = np.zeros((np.count_nonzero(mine), len(self.codes)))
-            with Progress(trees, f"growing without {name}", "trees", enabled=self.progress) as bar:
-                judged = np.flatnonzero(mine)
-                for _, _, shares in self._grown(ranked, weight * ~mine, trees, bar, score=judged):
-                    total += shares
-            best = total.argmax(axis=1)
-            rows.append({"name": os.path.basename(name), **self._figures(mine, best)})
-        means = {key: float(np.mean([row[key] for row in rows])) for key in ("overall_accuracy", "mean_f1")}
-        return {"surveys": rows, **means}
 
     def _ranked(self, weight: npt.NDArray[np.int64]) -> Iterator[Ranked]:
         """What each pass reads of the samples; those of weight 0 teach none of them anything."""
@@ -422,7 +344,7 @@ class _Passes:
         Ground beside a fold is not left out as in cross-validation: the forests miss the fold's samples already, and the
         next pass should see probabilities as good as those it will see when the model is used.
         """
-        trees = max(1, math.ceil(self.chosen["trees"] * FOLD_TREES))
+        trees = max(1, math.ceil(self.options.trees * FOLD_TREES))
         fold = np.empty(len(self.samples), np.int16)
         for k, cloud in enumerate(self.clouds):
             mine = self.samples.cloud == k
@@ -449,39 +371,19 @@ class _Passes:
         blends: Sequence[Blend | None] = [None] * count if below is None else self._blends(reads)
         classes = [] if below is None else list(below.classes)
         classes += [len(self.codes) if one is None else len(one.codes) for one in blends]
-        plan = self.features.plan if below is None else wider(below.base.plan, self.features.plan)
-        looks = Looks(plan, [self.context] * count)
         out = np.empty((len(self.samples), len(self.context.tokens) * classes[-1]), np.float32)
-        what = f"context for pass {count + 1}"
-        with Progress(len(self.samples), what, enabled=self.progress) as bar:
+        with Progress(len(self.samples), f"context for pass {count + 1}", enabled=self.progress) as bar:
             for number, cloud in enumerate(self.clouds):
                 at, rows = self.samples.of_cloud(number)
                 if not len(at):
                     continue
-                flight = self.flights[number]
-
-                def compute(
-                    places: npt.NDArray[np.int64],
-                    seen: Seen,
-                    again: bool,
-                    at: npt.NDArray[np.int64] = at,
-                    flight: str = flight,
-                ) -> bool:
-                    fold = self.folds.points(seen.xyz, flight)
-                    passes = [
-                        FoldForests(self.features, context, forests, fold, blend)
-                        for context, forests, blend in zip(reads, held_out, blends, strict=True)
-                    ]
-                    shown = None if again else bar
-                    request = PredictRequest(
-                        seen.xyz, seen.dimensions, seen.rows, o.threads, o.memory_mb, shown
-                    )
-                    out[at[places]], beyond = sample_context(
-                        request, [*first, *passes], self.context, classes, factors
-                    )
-                    return beyond
-
-                self.short += work_on(cloud, rows, looks, compute, o.threads)
+                fold = self.folds.points(cloud.xyz, self.flights[number])
+                passes = [
+                    FoldForests(self.features, context, forests, fold, blend)
+                    for context, forests, blend in zip(reads, held_out, blends, strict=True)
+                ]
+                request = PredictRequest(cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb, bar)
+                out[at] = sample_context(request, [*first, *passes], self.context, classes, factors)
         return out
 
     def _blends(self, reads: Sequence[Context | None]) -> list[Blend]:
@@ -514,7 +416,7 @@ class _Passes:
         trees = []
         importance = np.zeros(ranked.columns)
         what = f"growing pass {number + 1}" if self.options.passes > 1 else "growing"
-        count, weight = self.chosen["trees"], self.samples.weight
+        count, weight = self.options.trees, self.samples.weight
         # Trees that draw few of the samples leave nearly all out of their bags: a share of these is judged.
         every = max(1, round(1.0 / self.setting.max_samples))
         with Progress(count, what, "trees", enabled=self.progress) as bar:

@@ -7,17 +7,27 @@ the labels lack is left alone, and of the others it is believed the more the few
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from ..base.errors import ModelError, OptionError
+from ..base.errors import ModelError
+from ..base.progress import Progress
+from .algorithms import PredictRequest
 from .context import OWN, Context
 from .featureforest import FeatureForest, Features, check_names
+from .folds import sample_context
 from .forest import Forest
+from .model import Model
 from .passes import weighed
+
+if TYPE_CHECKING:
+    from .clouds import TrainingCloud
+    from .sampling import Samples
+    from .trainoptions import TrainingOptions
 
 #: As many labeled points of its rarest class count as much as the base.
 EVEN = 30
@@ -25,8 +35,6 @@ EVEN = 30
 MANY = 5000
 #: Probabilities that cannot be divided by.
 NOTHING = 1e-300
-#: Most passes of a base.
-MOST_BELOW = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,19 +204,6 @@ def blended(
     return out
 
 
-def check_base(base: Any) -> None:
-    """Refuse what cannot be built on."""
-    passes = getattr(base, "passes", None)
-    if passes is None:
-        raise OptionError("'base' must be a model", found=type(base).__name__, cure="Load it with load_model")
-    if len(passes) > MOST_BELOW:
-        raise OptionError(
-            f"a base may have {MOST_BELOW} passes",
-            found=len(passes),
-            cure="Start from the model that it was built on, with all labels together",
-        )
-
-
 def _good_factors(given: Any, classes: int) -> bool:
     return (
         isinstance(given, list)
@@ -224,3 +219,128 @@ def _codes(given: Any) -> tuple[int, ...]:
             "a refined forest's classes must be codes, ascending, each once", found=str(given)[:60]
         )
     return tuple(given)
+
+
+# ---- training on top of a model ----------------------------------------------------------------------
+
+
+class Below:
+    """A base at work on the training clouds. It has not seen their labels, so no ground need be held out.
+
+    Attributes
+    ----------
+    context : Context
+        What the first pass on top reads of it: of several, the point's own probabilities alone.
+    passes, classes, factors
+        As :class:`PassRun` takes them.
+    """
+
+    def __init__(
+        self,
+        base: Model,
+        clouds: Sequence[TrainingCloud],
+        samples: Samples,
+        options: TrainingOptions,
+        progress: bool,
+    ) -> None:
+        self.base, self._clouds, self.samples = base, clouds, samples
+        self.options, self._progress = options, progress
+        self.context = Context((OWN,) if options.passes > 1 else tuple(options.context))
+        self.passes, self.classes = base.passes, tuple(map(len, base.codes_of))
+        self.factors = (*(_array(one.get("factors")) for one in base.info["passes"][:-1]), base.factors)
+        self.trusted = trust(int(np.bincount(samples.label).min()))
+
+    @cached_property
+    def columns(self) -> npt.NDArray[np.float32]:
+        """What it says around the samples, (samples, columns)."""
+        o, samples = self.options, self.samples
+        out = np.empty((len(samples), len(self.context.tokens) * len(self.base.classes)), np.float32)
+        with Progress(len(samples), "what the base says", enabled=self._progress) as bar:
+            for number, cloud in enumerate(self._clouds):
+                at, rows = samples.of_cloud(number)
+                if not len(at):
+                    continue
+                request = PredictRequest(cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb, bar)
+                out[at] = sample_context(request, self.passes, self.context, self.classes, self.factors)
+        return out
+
+    def blend(self, before: Sequence[int], labeled: Sequence[int], features: int, context: Context) -> Blend:
+        """What a pass on top makes of the one before, whose classes are `before`; `features` it computes itself."""
+        o = self.options
+        first = own_column(features, context, len(before))
+        target = o.target if o.strategy == "binary" else None
+        return Blend(tuple(before), tuple(labeled), self.trusted, target, first)
+
+    @property
+    def own(self) -> npt.NDArray[np.float64]:
+        """(samples, classes) the base's probabilities of the samples themselves."""
+        n = len(self.base.classes)
+        first = own_column(0, self.context, n)
+        said = self.columns[:, first : first + n].astype(np.float64)
+        return said / np.maximum(said.sum(axis=1, keepdims=True), 1e-9)
+
+
+def on_top(below: Below, made: Model) -> Model:
+    """The model of the base's passes and those of `made`, with the classes of both."""
+    base, priors, added = below.base, made.info["priors"], []
+    before = base.codes.tolist()
+    for forest in made.passes:
+        shared = {field.name: getattr(forest, field.name) for field in fields(forest)}
+        blend = below.blend(before, made.codes.tolist(), len(forest.plan.names), forest.context)
+        added.append(RefinedForest(**shared, blend=blend))
+        before = blend.codes
+    if len(added) > 1 and priors is not None:  # a few labels say nothing of how frequent a class is
+        added[-1] = replace(added[-1], blend=replace(blend, factors=tuple(priors["factors"])))
+    names, entries = dict(base.classes), {one["code"]: one for one in made.info["classes"]}
+    names.update((code, name) for code, name in made.classes if code in before and code not in names)
+    unseen = {"available": 0, "samples": 0, "duplicates": 0}
+    inherited = {one["code"]: {"labels": one["labels"]} for one in base.info["classes"]}
+    scores = []
+    for codes, one in zip(base.codes_of, base.info["passes"], strict=True):
+        scores.append({**one, "codes": codes})
+    if base.factors is not None:
+        scores[-1]["factors"] = base.factors.tolist()
+    info = {
+        **made.info,
+        "strategy": "multiclass",
+        "target": None,
+        "background": None,
+        "classes": [
+            {**unseen, **inherited.get(code, {}), **entries.get(code, {}), "code": code, "name": names[code]}
+            for code in before
+        ],
+        "priors": None,
+        "densities": _spanned(base.info.get("densities"), made.info["densities"]),
+        "preparation": base.info.get("preparation") or [],
+        "passes": [*scores, *made.info["passes"]],
+    }
+    return Model((*base.passes, *added), [(code, names[code]) for code in before], info, made.seconds)
+
+
+def held_by_base(below: Below, codes: Sequence[int]) -> dict[str, list[int]]:
+    """Labeled classes new to the base: [different samples, of these what it calls a class that the labels lack].
+
+    Such points stay what the base calls them.
+    """
+    base, samples = below.base, below.samples
+    before = base.codes.tolist()
+    said = np.array(before)[below.own.argmax(axis=1)]
+    out = {}
+    for place, code in enumerate(codes):
+        mine = samples.label == place
+        held = int(np.count_nonzero(~np.isin(said[mine], codes)))
+        if code not in before and held:
+            out[str(code)] = [int(np.count_nonzero(mine)), held]
+    return out
+
+
+def _array(given: Any) -> npt.NDArray[np.float64] | None:
+    """Numbers of a manifest, or None."""
+    return None if given is None else np.array(given)
+
+
+def _spanned(one: Any, other: Any) -> Any:
+    """Densities that either was trained for."""
+    if one is None or other is None:
+        return other
+    return {**other, "low": min(one["low"], other["low"]), "high": max(one["high"], other["high"])}

@@ -12,20 +12,18 @@ import numpy.typing as npt
 from ..base.errors import DimensionError, OptionError
 from ..base.progress import Progress
 from ..base.threads import map_blocks
-from ..features import FeatureEngine, FeaturePlan, ShapeBins
+from ..features import FeaturePlan, ShapeBins
 from ..features.fitting import fit_clouds
 from ..features.names import SHAPES
-from ..features.samples import SAMPLES, smallest_hashes
 from .clouds import TrainingCloud
 from .dimensions import gather, with_returns
 from .featureforest import Features
 from .sampling import Samples
-from .surroundings import Looks, Seen, work_on
 from .trainoptions import TrainingOptions
 
 #: Dimensions that the papers count among the geometric features.
 CUT = ("HeightAboveGround", "Z")
-#: In the counts: samples whose neighbors lie farther away than the memory allowed to look.
+#: In the counts: samples of tiles whose nearest neighbors lie beyond the halo of their features.
 SHORT = "short_of_neighbors"
 _HISTOGRAMS = tuple(f"{metric}_" for metric in SHAPES)
 
@@ -49,59 +47,8 @@ def fitted(
     clouds: Sequence[TrainingCloud], samples: Samples, plan: FeaturePlan, options: TrainingOptions
 ) -> tuple[ShapeBins | None, float | None]:
     """Shape thresholds and the threshold of copt, fitted to the clouds that have samples; see :func:`fit_clouds`."""
-    if not (plan.shapes or plan.copt):
-        return None, None
-    used = {clouds[number].whole for number in np.unique(samples.cloud).tolist()}
-    views = [cloud for cloud in clouds if cloud.whole in used]
-    if len(views) == len(used):
-        return fit_clouds([one.xyz for one in views], plan, seed=options.seed, threads=options.threads)
-    threshold = _threshold_of_parts(views, plan, options.threads) if plan.copt else None
-    if not plan.shapes:
-        return None, threshold
-    each = [smallest_hashes(one.xyz, options.seed) for one in views]
-    of_whole: dict[object, list[npt.NDArray[np.uint64]]] = {}
-    for one, (hashes, _) in zip(views, each, strict=True):
-        of_whole.setdefault(one.whole, []).append(hashes)
-    least = np.sort(np.concatenate([np.sort(np.concatenate(h))[:SAMPLES] for h in of_whole.values()]))
-    last = least[min(SAMPLES, len(least)) - 1]
-    values: dict[str, list[npt.NDArray[Any]]] = {}
-
-    def compute(_: Any, seen: Seen, again: bool) -> bool:
-        narrow = np.zeros(len(seen.rows), bool)
-        if plan.unbounded and not seen.whole:
-            narrow, _ = Looks(plan).too_narrow(seen, options.threads)
-        if not narrow.all():
-            engine = FeatureEngine(
-                seen.xyz, plan, copt_threshold=threshold, seed=options.seed, threads=options.threads
-            )
-            for token, some in engine.shape_values(seen.rows[~narrow]).items():
-                values.setdefault(token, []).append(some)
-        return bool(narrow.any())  # which come again
-
-    for one, (hashes, rows) in zip(views, each, strict=True):
-        rows = np.sort(rows[hashes <= last])
-        if len(rows):
-            work_on(one, rows, Looks(plan), compute, options.threads)
-    return ShapeBins.fit({token: np.concatenate(parts) for token, parts in values.items()}), threshold
-
-
-def _threshold_of_parts(parts: Sequence[TrainingCloud], plan: FeaturePlan, threads: int | None) -> float:
-    """The threshold of copt, of the curvatures of all points of clouds in parts, which are held at once."""
-    from ..features.ropt import curvature_threshold  # numba is loaded here, not when the package is
-
-    count = sum(map(len, parts))
-    if not all(one.holds_numbers(count) for one in parts):
-        raise OptionError(
-            "the threshold of copt is fitted to the curvatures of all points at once [H17], and these do not fit in the "
-            "memory that was given",
-            found=f"{count:,} points",
-            cure="Give more memory, or choose other neighborhoods",
-        )
-    each = []
-    for one in parts:
-        seen = one.seen(np.arange(len(one)), plan.halo_m)
-        each.append(FeatureEngine(seen.xyz, plan, threads=threads).curvatures(seen.rows))
-    return curvature_threshold(np.concatenate(each))
+    used = [clouds[number].xyz for number in np.unique(samples.cloud).tolist()]
+    return fit_clouds(used, plan, seed=options.seed, threads=options.threads)
 
 
 def sample_features(
@@ -121,32 +68,21 @@ def sample_features(
             if not len(at):
                 continue
 
-            def compute(
-                places: npt.NDArray[np.int64],
-                seen: Seen,
-                again: bool,
-                at: npt.NDArray[np.int64] = at,
-                name: str = cloud.name,
-            ) -> bool:
-                engine = features.engine(seen.xyz, options.threads)
-                there = with_returns(own, seen.xyz, seen.dimensions, options.threads)
-                fed, counted = gather(own, there, len(seen.xyz), seen.rows, name)
-                for key, n in counted.items():
-                    counts[key] = counts.get(key, 0) + (0 if again else n)
-                for part, block in engine.blocks(
-                    queries=seen.rows,
-                    dimensions=fed,
-                    threads=options.threads,
-                    memory_mb=options.memory_mb,
-                    progress=None if again else bar,
-                ):
-                    values[at[places[np.searchsorted(seen.rows, part)]]] = (
-                        block  # `part` are rows of the cloud
-                    )
-                return bool(engine.report.beyond_halo)
-
-            if short := work_on(cloud, rows, Looks(features.plan), compute, options.threads):
-                counts[SHORT] = counts.get(SHORT, 0) + short
+            engine = features.engine(cloud.xyz, options.threads)
+            there = with_returns(own, cloud.xyz, cloud.dimensions, options.threads)
+            fed, counted = gather(own, there, len(cloud), rows, cloud.name)
+            for key, n in counted.items():
+                counts[key] = counts.get(key, 0) + n
+            for part, block in engine.blocks(
+                queries=rows,
+                dimensions=fed,
+                threads=options.threads,
+                memory_mb=options.memory_mb,
+                progress=bar,
+            ):
+                values[at[np.searchsorted(rows, part)]] = block
+            if cloud.own is not None and engine.report.beyond_halo:
+                counts[SHORT] = counts.get(SHORT, 0) + max(engine.report.beyond_halo.values())
     if not np.isfinite(values).all():
         column = int(np.argmin(np.isfinite(values).all(axis=0)))
         raise DimensionError(f"the feature {names[column]} is not finite for some samples")

@@ -14,11 +14,12 @@ import numpy.typing as npt
 from ..base.errors import OptionError
 from .algorithms import trainer
 from .clouds import CloudSource, TrainingCloud, prepared, spooled
+from .context import Context
 from .dimensions import ALWAYS, WHERE_THERE, required
 from .model import Model
-from .parts import CloudParts, prepared_parts
 from .preparing import preparing
-from .trainoptions import TrainingOptions
+from .tiledcloud import TiledCloud
+from .trainoptions import TrainingOptions, feature_plan
 
 
 def train(
@@ -72,21 +73,33 @@ def train(
     return model
 
 
-def train_parts(
-    clouds: Sequence[CloudParts], options: TrainingOptions, folder: Path, progress: bool = True
+def train_tiles(
+    clouds: Sequence[TiledCloud], options: TrainingOptions, folder: Path, progress: bool = True
 ) -> Model:
-    """Train a forest on clouds in parts, one of which is in memory at a time; the model is that of the whole clouds.
+    """Train a forest on clouds in tiles, one of which is in memory at a time.
 
-    Files are written into `folder`, and those of `clouds` removed.
+    Files are written into `folder`, and those of `clouds` removed. The model is that of the whole clouds, but for points
+    whose nearest neighbors lie farther away than the halo of :func:`reach`, and for thinned copies, which follow the
+    density of each tile.
 
     Raises
     ------
     OptionError, DimensionError
     """
-    made = [part for one in clouds for part in prepared_parts(one, options, folder, progress)]
+    tiles = (tile for cloud in clouds for tile in cloud.clouds(reach(options)))
+    made = [one for one in spooled(prepared(tiles, options), folder) if one.points]
     if not made:
         raise OptionError("no training cloud was given")
     return trainer(options.algorithm).train(made, options, progress)
+
+
+def reach(options: TrainingOptions) -> float:
+    """Meters around a tile whose points training on it depends on."""
+    halo, context = feature_plan(options).halo_m, Context(tuple(options.context)).reach
+    passes = options.passes - 1
+    if options.base is not None:
+        halo, passes = max(halo, options.base.plan.halo_m), options.passes
+    return halo + passes * context + 2.0 * options.voxel
 
 
 def _prepared(

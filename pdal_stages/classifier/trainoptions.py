@@ -14,11 +14,11 @@ from ..base import checks
 from ..base.asprs import NOISE
 from ..base.errors import OptionError, suggest
 from ..base.threads import resolve_threads
+from ..features import FeaturePlan
 from ..features.voxels import LARGEST, check_side
 from .algorithms import ALGORITHMS, trainer
 from .classes import MAX_LABEL
 from .context import OWN, Context
-from .refinement import check_base
 
 #: Most passes a model can have.
 MOST_PASSES = 3
@@ -112,15 +112,8 @@ class TrainingOptions:
         low=0,
         high=2**31 - 1,
     )
-    trees: int | Sequence[int] = setting(
-        50, "list", "Number of trees; of several values the best is found by cross-validation"
-    )
-    max_depth: int | Sequence[int | None] | None = setting(
-        None, "list", "Maximum depth of the trees, 0 for no limit; of several values the best is found"
-    )
-    min_samples_leaf: int | Sequence[int] = setting(
-        3, "list", "Minimum number of samples in a leaf; of several values the best is found"
-    )
+    trees: int = setting(50, "integer", "Number of trees", low=1, high=10_000)
+    min_samples_leaf: int = setting(3, "integer", "Minimum number of samples in a leaf", low=1, high=10**6)
     max_samples: float | None = setting(
         None,
         "number",
@@ -145,11 +138,6 @@ class TrainingOptions:
         "and held-out blocks amid the training points (0 to 0.1).",
         low=0,
         high=1,
-    )
-    balance: bool = setting(
-        True,
-        "boolean",
-        "Take as many samples of a class from each survey and each thinned copy; false: as many as their share",
     )
     thin: Sequence[float] = setting(
         (),
@@ -178,8 +166,7 @@ class TrainingOptions:
         None,
         "integer",
         "Folds of cross-validation over groups or spatial blocks; 0 for none; default: 5, with a quarter of the trees",
-        "The default is by survey where there are several, so that every model has an honest score; it chooses nothing "
-        "then. Where there is a grid to search, there are always some.",
+        "The default is by survey where there are several, so that every model has an honest score.",
         low=0,
         high=1000,
     )
@@ -188,25 +175,7 @@ class TrainingOptions:
         "string",
         "Dimension whose points of one value are held out together, such as the number of a tile or flight, so that the "
         "score is of tiles or flights that the model has not seen",
-        "Where that takes all samples of a class away, blocks of ground are held out instead. It changes the score alone, "
-        "unless there is a grid to search.",
-    )
-    block_size: float = setting(
-        25.0, "number", "Side of these blocks", low=0, high=10**6, above=True, unit="m"
-    )
-    gap: float | None = setting(
-        None,
-        "number",
-        "Training samples nearer than this, in plan, to a validation sample are left out of that fold; by default the "
-        "largest radius of the neighborhoods",
-        low=0,
-        high=10**6,
-        unit="m",
-    )
-    leave_one_survey_out: bool = setting(
-        False,
-        "boolean",
-        "Score each survey with forests grown without it; takes a training per survey",
+        "Where that takes all samples of a class away, blocks of ground are held out instead. It changes the score alone.",
     )
     passes: Any = setting(
         None,
@@ -269,7 +238,6 @@ class TrainingOptions:
         def put(name: str, check: Any, *bounds: float, **more: Any) -> None:
             object.__setattr__(self, name, check(f"'{name}'", getattr(self, name), *bounds, **more))
 
-        self.searches  # noqa: B018  wrong values to search are refused here
         for one in fields(self):
             rule = dict(one.metadata)
             words = [rule.pop(key) for key in ("what", "more", "kind")]
@@ -348,10 +316,6 @@ class TrainingOptions:
             raise OptionError(
                 "only a forest is built on a 'base'", found=self.algorithm, cure="Leave 'algorithm' out"
             )
-        if self.leave_one_survey_out:
-            raise OptionError(
-                "'leave_one_survey_out' is not for a model with a 'base'", cure="Leave one of them out"
-            )
         if self.passes == 1:
             object.__setattr__(self, "voxel", self.base.voxel)
 
@@ -369,30 +333,25 @@ class TrainingOptions:
                 raise OptionError(f"unknown training option '{name}'", cure=suggest(name, known))
         return cls(**values)
 
-    def candidates(self) -> list[dict[str, Any]]:
-        """Every combination of `max_depth` and `min_samples_leaf` to search."""
-        return [
-            {"max_depth": depth, "min_samples_leaf": leaf}
-            for depth in _values("max_depth", self.max_depth, 1, 10_000, none=True)
-            for leaf in _values("min_samples_leaf", self.min_samples_leaf, 1, 10**6)
-        ]
 
-    def tree_counts(self) -> list[int]:
-        """Numbers of trees to search, ascending."""
-        return sorted(set(_values("trees", self.trees, 1, 10_000)))
-
-    @property
-    def searches(self) -> bool:
-        """Whether there is more than one combination to try."""
-        return len(self.candidates()) * len(self.tree_counts()) > 1
+def check_base(base: Any) -> None:
+    """Refuse what cannot be built on."""
+    passes = getattr(base, "passes", None)
+    if passes is None:
+        raise OptionError("'base' must be a model", found=type(base).__name__, cure="Load it with load_model")
+    if len(passes) > MOST_PASSES:
+        raise OptionError(
+            f"a base may have {MOST_PASSES} passes",
+            found=len(passes),
+            cure="Start from the model that it was built on, with all labels together",
+        )
 
 
-def _values(name: str, value: Any, low: int, high: int, none: bool = False) -> list[Any]:
-    """One value or a list of them, each a whole number (or unlimited: None or 0)."""
-    many = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]
-    if not many:
-        raise OptionError(f"'{name}' is an empty list", cure="Give a number")
-    return [None if none and (v is None or v == 0) else checks.whole(f"'{name}'", v, low, high) for v in many]
+def feature_plan(options: TrainingOptions) -> FeaturePlan:
+    """The features that options ask for."""
+    return FeaturePlan.parse(
+        options.neighborhoods, feature_set=options.feature_set, dimensions=options.dimensions
+    )
 
 
 def _documented() -> str:

@@ -12,13 +12,17 @@ candidates, the same sums and the same order of nodes. What takes less time:
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OptionError
 from ..base.jit import device, njit
+from ..base.progress import Progress
 from ..base.threads import map_blocks
 
 #: Values of a feature that are no further apart are taken as equal, and nodes that are no less pure are not split, as by
@@ -31,8 +35,6 @@ FEW = 32
 DIGIT = 8
 #: Weight of all samples whose squares are whole numbers of 64 bits. Up to 94 million scikit-learn's sums are exact as well.
 MOST = 2**31
-#: Where there is no limit of depth.
-NO_LIMIT = np.iinfo(np.int32).max
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +138,6 @@ def grow_tree(
     tried: int,
     seed: int,
     *,
-    max_depth: int | None = None,
     min_samples_leaf: int = 1,
 ) -> GrownTree:
     """The tree that scikit-learn's ``DecisionTreeClassifier`` grows.
@@ -168,13 +169,101 @@ def grow_tree(
     state = np.random.RandomState(seed).randint(0, 2**31 - 1)  # as scikit-learn seeds its own generator
     made = _grow(
         ranked.place, ranked.different, ranked.start, rows, marks, class_bits, mark_bits, tried,
-        NO_LIMIT if max_depth is None else max_depth, min_samples_leaf, np.uint32(state),
+        min_samples_leaf, np.uint32(state),
         left, right, feature, threshold, last, counts, impurity,
     )  # fmt: skip
     return GrownTree(
         left[:made].copy(), right[:made].copy(), feature[:made].copy(), threshold[:made].copy(),
         last[:made].copy(), counts[:made].copy(), impurity[:made].copy(),
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TreeOptions:
+    """How each tree is grown; see ``TrainingOptions``."""
+
+    min_samples_leaf: int = 1
+    max_samples: float = 1.0
+    max_features: str | int | float = "auto"
+
+    def tried(self, features: int) -> int:
+        """How many features are tried at a split; by default a tenth of them, but at least their root."""
+        asked = self.max_features
+        if asked == "auto":
+            return max(1, math.isqrt(features), features // 10)
+        if asked == "sqrt":
+            return max(1, math.isqrt(features))
+        if asked == "log2":
+            return max(1, features.bit_length() - 1)
+        return (
+            max(1, int(asked * features))
+            if isinstance(asked, float | np.floating)
+            else min(int(asked), features)
+        )
+
+
+def grow(
+    ranked: Ranked,
+    label: npt.NDArray[Any],
+    weight: npt.NDArray[np.int64],
+    n_trees: int,
+    options: TreeOptions,
+    seed: int,
+    *,
+    score: npt.NDArray[np.int64] | str | None = None,
+    every: int = 1,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Iterator[tuple[GrownTree, npt.NDArray[np.int64], npt.NDArray[np.float64]]]:
+    """Grow trees, one after the other, and apply each to the rows it should be judged by.
+
+    Parameters
+    ----------
+    ranked : Ranked
+        Of n samples.
+    label : (n,) int
+        Class positions; every class occurs, if only with weight 0.
+    weight : (n,) int
+        Times a row counts; rows of weight 0 take no part.
+    score : array of rows, or "out of bag", or None
+        Rows to apply each tree to. Out of bag: those of positive weight not in its bootstrap sample.
+    every : int
+        Out of bag: of every so many rows, one is judged by all trees that have not drawn it, the others by none.
+
+    Yields
+    ------
+    tree : GrownTree
+    rows : (m,) int64
+    shares : (m, classes) float64
+        The tree's class frequencies for those rows.
+    """
+    ends = np.cumsum(weight)
+    draws = max(1, round(options.max_samples * int(ends[-1])))
+    labels = np.asarray(label, dtype=np.int64)
+
+    def one(number: int):
+        random = np.random.default_rng([seed, number])
+        drawn = np.searchsorted(ends, random.integers(0, ends[-1], draws), side="right")
+        bag = np.bincount(drawn, minlength=len(weight))
+        tree = grow_tree(
+            ranked,
+            labels,
+            bag,
+            options.tried(ranked.columns),
+            int(random.integers(0, 2**31 - 1)),
+            min_samples_leaf=options.min_samples_leaf,
+        )
+        rows = np.zeros(0, np.int64)
+        if isinstance(score, str):
+            rows = np.flatnonzero((bag[::every] == 0) & (weight[::every] > 0)) * every
+        elif score is not None:
+            rows = score
+        return tree, rows, tree.shares(ranked, rows)
+
+    for tree in map_blocks(one, range(n_trees), threads):
+        if progress is not None:
+            progress.update(1)
+        yield tree
 
 
 @njit
@@ -203,7 +292,7 @@ def _next(state):
 
 @njit
 def _grow(
-    place, different, first, rows, marks, class_bits, mark_bits, tried, max_depth, leaf, state,
+    place, different, first, rows, marks, class_bits, mark_bits, tried, leaf, state,
     left, right, feature, threshold, last, counts, impurity,
 ):  # fmt: skip
     """Fill the arrays of a tree; how many nodes it has. `rows` and `marks` (weight << class_bits | class) are reordered."""
@@ -215,16 +304,14 @@ def _grow(
     digits = np.empty(1 << DIGIT, np.int64)
     below, total = np.empty(counts.shape[1], np.int64), np.empty(counts.shape[1], np.int64)
     order, constant = np.arange(number), np.empty(number, np.int64)
-    stack = np.empty((n + 1, 5), np.int64)  # start, end, depth, parent and side, constant features
+    stack = np.empty((n + 1, 4), np.int64)  # start, end, parent and side, constant features
     known_impurity = np.empty(n + 1)
-    stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3], stack[0, 4] = 0, n, 0, -1, 0
+    stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = 0, n, -1, 0
     top, made = 1, 0
     whole = 0.0
     while top > 0:
         top -= 1
-        start, end, depth, parent, constants = (
-            stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3], stack[top, 4],
-        )  # fmt: skip
+        start, end, parent, constants = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
         total[:] = 0
         for i in range(start, end):
             total[np.int64(marks[i] & of_class)] += np.int64(marks[i] >> class_bits)
@@ -239,7 +326,7 @@ def _grow(
             here = known_impurity[top]
         best_feature, best_place, next_place, best = -1, np.uint64(0), np.uint64(0), -np.inf
         split = -1
-        if depth < max_depth and end - start >= max(2, 2 * leaf) and here > PURE:
+        if end - start >= max(2, 2 * leaf) and here > PURE:
             # Drawing without replacement: order holds the drawn constant features, the other ones known to be constant,
             # those found to be, those not drawn yet, and the drawn ones.
             undrawn, visited, found, drawn = number, 0, 0, 0
@@ -333,7 +420,7 @@ def _grow(
         feature[node], threshold[node], last[node] = best_feature, limit, np.uint32(at)
         for side in range(1, -1, -1):  # the left one on top
             stack[top, 0], stack[top, 1] = (split, end) if side else (start, split)
-            stack[top, 2], stack[top, 3], stack[top, 4] = depth + 1, 2 * node + side, constants
+            stack[top, 2], stack[top, 3] = 2 * node + side, constants
             known_impurity[top] = pure_right if side else pure_left
             top += 1
     return made

@@ -39,13 +39,7 @@ def add_commands(add: Adder) -> None:
     takes("--neighborhoods", help="Preset or tokens, e.g. s5,k10,k50")
     takes("--feature-set", help="Groups or single features, e.g. covariance,geometric")
     takes("--count", type=int, help="Samples of each class")
-    takes("--trees", help="Number of trees; of several the best is found")
-
-    takes(
-        "--leave-one-survey-out",
-        action="store_true",
-        help="Score each survey by a model trained without it; each file is a survey, unless --surveys groups them",
-    )
+    takes("--trees", type=int, help="Number of trees")
     takes(
         "--surveys",
         nargs="+",
@@ -125,9 +119,8 @@ def _train(options: argparse.Namespace) -> None:
     extra = {name: value for name in named if (value := getattr(options, name)) is not None}
     files, surveys = input_files(options.inputs), {}
     print_messages(*overlooked(options.inputs))
-    if options.leave_one_survey_out or options.surveys:
-        surveys = surveys_of(files, options.surveys or ())
-        extra |= {"leave_one_survey_out": True} if options.leave_one_survey_out else {}
+    if options.surveys:
+        surveys = surveys_of(files, options.surveys)
     task = TrainTask(files, options.model, options.overrides, extra, options_of(options), surveys)
     if not task.in_one_piece():
         said = run_training(task)

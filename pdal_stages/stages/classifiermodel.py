@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
@@ -92,15 +91,13 @@ class ClassifierModel(Stage):
     count: int = trained("count")
     contradicted_below: float = trained("contradicted_below")
     seed: int = trained("seed")
-    trees: list = trained("trees")
-    max_depth: list = trained("max_depth", default=(0,))
-    min_samples_leaf: list = trained("min_samples_leaf")
+    trees: int = trained("trees")
+    min_samples_leaf: int = trained("min_samples_leaf")
     max_samples: float | None = trained("max_samples")
     max_features: str = trained("max_features")
     prior_weight: float = trained("prior_weight")
     folds: int | None = trained("folds")
     groups: str = trained("groups")
-    block_size: float = trained("block_size")
     survey: str = option(
         "string",
         "",
@@ -112,7 +109,6 @@ class ClassifierModel(Stage):
         f"Where points have the dimension {CHECKED} (of the command corrections), and it is not 0 everywhere, draw samples "
         "only from those where it is 1",
     )
-    balance: bool = trained("balance")
     thin: list = trained("thin", may_be_empty=True)
     voxel: float = trained("voxel")
     ignore: Selection = option(
@@ -122,7 +118,6 @@ class ClassifierModel(Stage):
         "ReturnNumber[0:0], or the word withheld",
         may_be_empty=True,
     )
-    leave_one_survey_out: bool = trained("leave_one_survey_out")
     passes: int | None = trained("passes")
     context: list | None = trained("context")
     pass_folds: int = trained("pass_folds")
@@ -133,10 +128,8 @@ class ClassifierModel(Stage):
     details = """
 Samples `count` points of each class, spread over space; computes features for the samples only; fits the
 percentiles and histogram thresholds; grows a Random Forest; writes [one model file](../model-file.md). A class with
-fewer points has them several times, and the counts are in the file. Lists in `trees`, `max_depth` and
-`min_samples_leaf` are searched by cross-validation over spatial blocks, so that neighbors never stand on both
-sides. Where there is nothing to search, a quarter of the trees is cross-validated all the same, for the score alone
-(`folds` 0: not). With `groups`, points of one tile or flight are held out together instead of blocks; `pdal-stages
+fewer points has them several times, and the counts are in the file. For its score a forest of a quarter of the trees is
+cross-validated over spatial blocks, so that neighbors never stand on both sides (`folds` 0: not). With `groups`, points of one tile or flight are held out together instead of blocks; `pdal-stages
 train` holds out each of several files. With `passes` 2, a second forest also reads the first one's [probabilities all
 around a point](../model-file.md#context), and is trained on what they are on ground the first has not seen. On top of
 a `base` one pass is for few labels, in the base's voxels; two are for a labeled survey, in voxels of its own: the first
@@ -190,9 +183,6 @@ holds the classes.
     def training(self) -> TrainingOptions:
         """The trainer's options."""
         values = {name: value for name, value in self.options.items() if name in _TRAINING}
-        for name in ("trees", "max_depth", "min_samples_leaf"):
-            numbers = [int(v) if re.fullmatch(r"\s*-?[0-9]+\s*", str(v)) else v for v in values[name]]
-            values[name] = numbers[0] if len(numbers) == 1 else numbers
         values["max_features"] = _number(values["max_features"])
         if self.automatic:
             values["dimensions"] = ALWAYS
@@ -300,12 +290,6 @@ holds the classes.
         report.figures |= {"model": self.filename, **shown, "seconds": model.seconds}
         if gone := model.info["training"].get("contradicted"):
             report.figures["contradicted"] = gone
-        if telling := model.info["training"].get("telltale"):
-            listed = ", ".join(f"{name} ({100 * share:.3g} %)" for name, share in telling.items())
-            report.warnings.append(
-                f"the classes follow from one dimension almost alone: {listed}. If it was made of the labels, or of what "
-                "unlabeled points do not have, leave it out of 'dimensions': the score is worth nothing"
-            )
         for code, (all_, held) in model.info["training"].get("held_by_base", {}).items():
             report.warnings.append(
                 f"{held:,} of {all_:,} samples of class {code} are, to the base, of a class that no label has, and stay it: "
@@ -319,8 +303,8 @@ holds the classes.
             )
         if short := model.info["training"].get(SHORT):
             report.warnings.append(
-                f"{short:,} samples have neighbors farther away than the memory allowed to look, and may differ from those "
-                "of a run in one piece: give more --memory"
+                f"{short:,} samples have neighbors farther away than their tile shows, and may differ from those of a run in one "
+                "piece: give more --memory"
             )
         if unscored := model.info["training"].get("unscored"):
             report.warnings.append(unscored)

@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 
 from ..base.errors import StageError
 from ..base.extrabytes import extra_dimensions
-from ..base.memory import free_memory
 from ..base.report import Report
 from ..classifier import TrainingCloud
 from ..classifier.dimensions import CHECKED
-from ..classifier.parts import CloudParts
 from ..classifier.summary import FILE_NUMBER
-from ..classifier.training import train_parts
+from ..classifier.tiledcloud import TiledCloud
+from ..classifier.training import train_tiles
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
 from ..pipeline.callbacks import Callbacks
@@ -36,7 +35,7 @@ from .kept import load_arrays, save_arrays
 from .outcome import TiledRun, TileJob
 from .results import NewValues, PieceResults, of_own_points
 from .settings import TilingOptions
-from .sizing import BASE, BLOCKS, TILE_POINT, TRAIN_POINT, fits_whole
+from .sizing import TRAIN_POINT, fits_whole
 from .sources import find_sources, read_extent
 from .tail import merged, written
 from .tiledrun import run_plan
@@ -147,7 +146,7 @@ class TrainTask:
         stage.check()
         model = Path(self.model).absolute()
         place = model.parent if model.is_file() or not model.exists() else None  # not beside a device
-        clouds: list[CloudParts] = []
+        clouds: list[TiledCloud] = []
         report, dimensions = Report(), None
         with TemporaryDirectory(prefix=".pdal-stages-train-", dir=place) as folder:
             self._check_room(Path(folder))
@@ -163,7 +162,7 @@ class TrainTask:
             training = self.stage.training
             if self.stage.automatic:
                 training = replace(training, dimensions=tuple(dimensions or ()))
-            trained = train_parts(clouds, training, Path(folder))
+            trained = train_tiles(clouds, training, Path(folder))
         stage.finish(trained, report)
         return [*told, *report.messages]
 
@@ -172,7 +171,7 @@ class TrainTask:
         free = shutil.disk_usage(folder).free
         if free < points * _DISK:
             raise StageError(
-                f"the disk has no room for {points:,} points in parts, which are kept while training lasts",
+                f"the disk has no room for {points:,} points in tiles, which are kept while training lasts",
                 found=f"{folder.parent}: {free / 1e9:.1f} GB free, up to {points * _DISK / 1e9:.1f} GB needed",
                 cure="Write the model to a disk with more room, or give more --memory",
             )
@@ -215,7 +214,7 @@ class TrainTask:
 
     def _in_tiles(
         self, folder: Path, heights: Sequence[Mapping[str, Any]]
-    ) -> tuple[Report, list[CloudParts], list[str]]:
+    ) -> tuple[Report, list[TiledCloud], list[str]]:
         """What is to be known of the points; these, with heights, as clouds in parts; and the dimensions to train on."""
         tiles = folder / "tiles"
         tiles.mkdir()
@@ -226,10 +225,8 @@ class TrainTask:
             raise StageError("not all points could be read, so nothing was trained", found=named + more)
         report = Report({"points": run.summary["points"]}, list(run.messages))
         _say(report, run)
-        memory = self.options.memory or free_memory() // 2
-        most = max(memory - BASE - BLOCKS, 0) / TILE_POINT
         side = run.summary["tile"] * run.summary["meters_per_unit"]
-        clouds: dict[float, CloudParts] = {}
+        clouds: dict[float, TiledCloud] = {}
         dimensions: list[str] | None = None
         choice = self._choice(run.tiles, report)
         for job in run.tiles:
@@ -238,7 +235,7 @@ class TrainTask:
                     raise _not_the_same(cloud["dimensions"], dimensions)
                 dimensions = cloud["dimensions"]
                 if cloud["value"] not in clouds:
-                    clouds[cloud["value"]] = CloudParts(folder / f"cloud{len(clouds)}", side, most)
+                    clouds[cloud["value"]] = TiledCloud(folder / f"cloud{len(clouds)}", side)
                 assert job.outputs is not None
                 points = _read_back(job.outputs[0], number, self.survey or cloud["name"], self.survey, choice)
                 clouds[cloud["value"]].put(job.tile, points)

@@ -17,7 +17,6 @@ sys.path.insert(0, str(HERE))
 
 # Modules with compiled kernels are left out: numba cannot compile what atheris has instrumented.
 _KERNELS = [
-    "pdal_stages.classifier.walk",
     "pdal_stages.classifier.trees",
     "pdal_stages.features",
     "pdal_stages.alsnet",
