@@ -29,9 +29,8 @@ from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 from pdal_stages.classifier.crossval import block_folds, split
 from pdal_stages.classifier.forest import Forest
-from pdal_stages.classifier.growing import TreeOptions, grow
 from pdal_stages.classifier.sampling import draw_samples
-from pdal_stages.classifier.trees import Ranked
+from pdal_stages.classifier.trees import Ranked, TreeOptions, grow
 from pdal_stages.features import FeatureEngine, FeaturePlan
 from pdal_stages.terrain.minima import hag_minima
 

@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier.crossval import block_folds, choose, search, split
-from pdal_stages.classifier.growing import TreeOptions
-from pdal_stages.classifier.trees import Ranked
+from pdal_stages.classifier.crossval import block_folds, score, split
+from pdal_stages.classifier.trees import Ranked, TreeOptions
 
 
 @settings(max_examples=30, deadline=None)
@@ -56,7 +55,7 @@ def test_order_of_samples_does_not_matter():
 
 
 def test_too_few_blocks_is_an_error():
-    with pytest.raises(OptionError, match="block_size"):
+    with pytest.raises(OptionError, match="fewer than the 3 folds"):
         block_folds(np.random.default_rng(0).random((50, 2)), np.zeros(50, int), np.ones(50, int), 3, 10.0)
 
 
@@ -68,34 +67,16 @@ def test_a_memorised_place_scores_no_better_than_chance():
     label = random.integers(0, 2, (20, 20))[cell[:, 0], cell[:, 1]]
     values = Ranked.of(xy.astype(np.float32))
     weight = np.ones(1500, np.int64)
-    rows = search(
-        values, label, weight, xy, (2, 6), [TreeOptions(min_samples_leaf=1, max_samples=1.0)], [5, 20],
-        folds=4, block_size=25.0, gap=5.0, seed=0, progress=False,
-    )  # fmt: skip
-    assert [row["trees"] for row in rows] == [5, 20]
-    assert all(row["overall_accuracy"] < 0.62 for row in rows)
-    assert all(len(row["mean_f1_by_fold"]) == 4 for row in rows)
+    fold = block_folds(xy, label, weight, 4, 25.0)
+    row = score(values, label, weight, xy, (2, 6), TreeOptions(1), 20, fold, gap=5.0, seed=0, progress=False)
+    assert row["overall_accuracy"] < 0.62 and len(row["mean_f1_by_fold"]) == 4
 
 
 def test_a_class_only_in_one_block_is_an_error():
     xy = np.random.default_rng(0).random((300, 2)) * 100
     label = (np.hypot(*(xy - 10).T) < 5).astype(int)
+    weight = np.ones(300, np.int64)
+    fold = block_folds(xy, label, weight, 3, 25.0)
+    values = Ranked.of(xy.astype(np.float32))
     with pytest.raises(OptionError, match="no samples left"):
-        search(
-            Ranked.of(xy.astype(np.float32)), label, np.ones(300, np.int64), xy, (2, 6), [TreeOptions()], [3],
-            folds=3, block_size=25.0, gap=0.0, seed=0, progress=False,
-        )  # fmt: skip
-
-
-def test_the_cheapest_of_equals_is_chosen():
-    def row(trees, depth, leaf, f1):
-        return {"trees": trees, "max_depth": depth, "min_samples_leaf": leaf, "mean_f1": f1}
-
-    rows = [
-        row(50, None, 1, 0.80),
-        row(100, None, 1, 0.8505),
-        row(200, None, 1, 0.851),
-        row(100, 10, 1, 0.8495),
-    ]
-    assert choose(rows)["trees"] == 100 and choose(rows)["max_depth"] == 10
-    assert choose([*rows, row(400, None, 5, 0.90)])["trees"] == 400
+        score(values, label, weight, xy, (2, 6), TreeOptions(), 3, fold, gap=0.0, seed=0, progress=False)

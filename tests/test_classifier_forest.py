@@ -9,8 +9,7 @@ from sklearn.tree import DecisionTreeClassifier
 
 from pdal_stages.base.errors import ModelError
 from pdal_stages.classifier.forest import MAX_DEPTH, Forest, float32_at_most
-from pdal_stages.classifier.growing import TreeOptions, grow
-from pdal_stages.classifier.trees import Ranked
+from pdal_stages.classifier.trees import Ranked, TreeOptions, grow
 
 
 def data(n=600, features=17, classes=4, seed=0):

@@ -14,9 +14,9 @@ from pdal_stages.classifier import (
     Prediction,
     TrainingCloud,
     TrainingOptions,
-    growing,
     load_model,
     train,
+    trees,
 )
 from pdal_stages.classifier.samplefeatures import percentiles
 from pdal_stages.features import FeatureEngine, FeaturePlan
@@ -99,20 +99,18 @@ def test_equals_sklearn_on_the_same_features(other, monkeypatch):
     """The same features into scikit-learn's own trees: identical labels, identical probabilities."""
     xyz, label, dimensions = scene()
     kept = []
-    original = growing.grow_tree
+    original = trees.grow_tree
 
-    def beside(ranked, label, weight, tried, seed, *, max_depth, min_samples_leaf):
+    def beside(ranked, label, weight, tried, seed, *, min_samples_leaf):
         columns = zip(ranked.start[:-1], ranked.start[1:], ranked.place, strict=True)
         values = np.stack([ranked.different[a:b][place] for a, b, place in columns], axis=1)
         theirs = DecisionTreeClassifier(
-            max_features=tried, random_state=seed, max_depth=max_depth, min_samples_leaf=min_samples_leaf
+            max_features=tried, random_state=seed, min_samples_leaf=min_samples_leaf
         )
         kept.append(theirs.fit(values, label, sample_weight=weight.astype(float)).tree_)
-        return original(
-            ranked, label, weight, tried, seed, max_depth=max_depth, min_samples_leaf=min_samples_leaf
-        )
+        return original(ranked, label, weight, tried, seed, min_samples_leaf=min_samples_leaf)
 
-    monkeypatch.setattr(growing, "grow_tree", beside)
+    monkeypatch.setattr(trees, "grow_tree", beside)
     model = train(
         [TrainingCloud(xyz, label, dimensions)],
         TrainingOptions(**SMALL, prior_weight=0, folds=0, threads=1),
@@ -386,18 +384,6 @@ def test_merged_and_named_classes(tmp_path):
     assert model.classes == [(2, "Ground"), (64, "Things")]
     model.save(tmp_path / "m")
     assert load_model(tmp_path / "m").classes == model.classes
-
-
-def test_grid_search_with_blocks_held_out(tmp_path):
-    xyz, label, dimensions = scene()
-    options = TrainingOptions(**{**SMALL, "trees": [3, 9]}, max_depth=[2, None], folds=3, block_size=15.0)
-    model = train([TrainingCloud(xyz, label, dimensions)], options, progress=False)
-    found = model.info["accuracy"]["cross_validation"]
-    assert found["folds"] == 3 and found["gap"] == 2.0 and len(found["tried"]) == 4
-    assert found["chosen"] in found["tried"]
-    assert model.algorithm.forest.n_trees == found["chosen"]["trees"]
-    model.save(tmp_path / "m")
-    assert load_model(tmp_path / "m").info["accuracy"]["cross_validation"]["chosen"] == found["chosen"]
 
 
 def test_limits_to_percentiles_are_in_the_thresholds(trained):

@@ -1,7 +1,5 @@
 """Training that generalizes: copies, surveys that weigh alike, surveys left out, noise, clouds one at a time, densities."""
 
-import json
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -130,10 +128,6 @@ def test_surveys_weigh_alike():
     one = draw_samples(inputs, 3, 60, 0, ["a", "a"])  # tiles of one survey are one
     for name in ("cloud", "row", "label", "weight"):
         assert np.array_equal(getattr(one, name), getattr(alike, name))
-    proportional = learned(pair, balance=False)
-    assert not np.array_equal(
-        proportional.passes[0].forest.threshold, learned(pair).passes[0].forest.threshold
-    )
     swapped = learned(pair[::-1])
     assert np.array_equal(swapped.passes[0].forest.threshold, learned(pair).passes[0].forest.threshold)
 
@@ -154,41 +148,6 @@ def test_more_points_than_are_put_in_order_at_a_time(monkeypatch):
     parts = (xyz[p][:2000], xyz[p][2000:])
     rows = np.array([parts[c][r] for c, r in zip(other.cloud, other.row, strict=True)])
     assert np.array_equal(rows, chosen[0])
-
-
-@pytest.mark.parametrize("passes", [1, 2])
-def test_each_survey_left_out(passes, tmp_path):
-    three = clouds(3)
-    odd = three[2]
-    wrong = {2: 5, 5: 6, 6: 2}
-    three[2] = TrainingCloud(
-        odd.xyz, np.vectorize(wrong.get)(odd.labels), odd.dimensions, name="odd.laz", survey="the odd one"
-    )
-    model = learned(three, leave_one_survey_out=True, passes=passes, context=["own", "box1"])
-    found = model.info["accuracy"]["leave_one_survey_out"]
-    by_name = {row["name"]: row["overall_accuracy"] for row in found["surveys"]}
-    assert set(by_name) == {"flight 0", "flight 1", "the odd one"}
-    assert by_name["the odd one"] < 0.1  # nobody else calls things as it does
-    assert found["overall_accuracy"] == pytest.approx(np.mean(list(by_name.values())))
-    lines = str(model).splitlines()
-    scores = [line for line in lines if line.startswith(("survey left out", "out of bag"))]
-    assert scores[0].startswith("survey left out") and "the odd one" in scores[0]
-    model.save(tmp_path / "m")
-    assert load_model(tmp_path / "m").info["accuracy"]["leave_one_survey_out"] == json.loads(
-        json.dumps(found)
-    )
-    plain = learned(three, passes=passes, context=["own", "box1"])
-    assert np.array_equal(plain.passes[-1].forest.threshold, model.passes[-1].forest.threshold)
-
-
-def test_a_survey_left_out_equals_a_model_without_it():
-    """One pass: the forest grown with the others' samples alone."""
-    three = clouds(3)
-    model = learned(three, leave_one_survey_out=True, scale=False)
-    row = model.info["accuracy"]["leave_one_survey_out"]["surveys"][0]
-    assert 0.7 < row["overall_accuracy"] < 1.0 and set(row["f1"]) == {"2", "5", "6"}
-    with pytest.raises(OptionError, match="at least two surveys"):
-        learned(three[:1], leave_one_survey_out=True)
 
 
 # ---- noise, one at a time ------------------------------------------------------------------------------
@@ -267,8 +226,6 @@ def test_options():
         {"thin": [0]},
         {"thin": "x"},
         {"ignore": [-1]},
-        {"balance": 1},
-        {"leave_one_survey_out": "yes"},
     ):
         with pytest.raises(OptionError):
             TrainingOptions(**bad)

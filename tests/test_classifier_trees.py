@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from sklearn.tree import DecisionTreeClassifier
 
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier.growing import TreeOptions
-from pdal_stages.classifier.trees import Ranked, grow_tree
+from pdal_stages.classifier.trees import Ranked, TreeOptions, grow_tree
 
 
 def assert_is_sklearns(values, label, weight, tried, seed, **options):
@@ -31,7 +30,7 @@ def assert_is_sklearns(values, label, weight, tried, seed, **options):
     return tree
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(
     st.integers(0, 10**6),
     st.integers(1, 300),
@@ -40,9 +39,8 @@ def assert_is_sklearns(values, label, weight, tried, seed, **options):
     st.sampled_from(["normal", "few values", "nearly equal", "constant columns", "signed zeros", "huge"]),
     st.sampled_from([1, 1_000, 100_000]),
     st.integers(1, 4),
-    st.sampled_from([None, 1, 4]),
 )
-def test_a_tree_is_scikit_learns(seed, rows, features, classes, kind, most, leaf, depth):
+def test_a_tree_is_scikit_learns(seed, rows, features, classes, kind, most, leaf):
     random = np.random.default_rng(seed)
     values = random.normal(size=(rows, features)).astype(np.float32)
     if kind == "few values":
@@ -59,19 +57,19 @@ def test_a_tree_is_scikit_learns(seed, rows, features, classes, kind, most, leaf
     weight = random.integers(0, 4, rows) * random.integers(1, most, rows, endpoint=True)
     weight[random.integers(rows)] += 1
     tried = int(random.integers(1, features, endpoint=True))
-    assert_is_sklearns(values, label, weight, tried, seed, min_samples_leaf=leaf, max_depth=depth)
+    assert_is_sklearns(values, label, weight, tried, seed, min_samples_leaf=leaf)
 
 
-@pytest.mark.parametrize("tried", [1, 5, 30])
+@pytest.mark.parametrize("tried", [1, 12])
 def test_large_nodes_are_sorted_digit_by_digit(tried):
     random = np.random.default_rng(tried)
-    values = random.normal(size=(70_000, 30)).astype(np.float32)  # places of more than two digits
+    values = random.normal(size=(30_000, 12)).astype(np.float32)  # places of more than two digits
     values[:, ::3] = np.round(values[:, ::3], 1)
     label = (values[:, 0] + values[:, 4] > random.normal(size=len(values))).astype(np.int64)
     label[values[:, 7] > 1.5] = 2
     weight = random.integers(0, 3, len(values))
-    tree = assert_is_sklearns(values, label, weight, tried, 5, min_samples_leaf=3, max_depth=12)
-    assert len(tree.left) > 300
+    tree = assert_is_sklearns(values, label, weight, tried, 5, min_samples_leaf=30)
+    assert len(tree.left) > 100
 
 
 def test_ranks_of_two_matrices_side_by_side():
@@ -93,7 +91,7 @@ def test_counts_whose_squares_have_no_room_are_refused():
         grow_tree(ranked, np.array([0, 1, 1]), np.array([1, 1, 2**31]), 1, 0)
 
 
-@pytest.mark.parametrize("features", [1, 2, 3, 7, 8, 60, 64, 569])
+@pytest.mark.parametrize("features", [1, 7, 64, 569])
 @pytest.mark.parametrize("asked", ["sqrt", "log2", 1, 5, 700, 0.01, 0.1, 1.0, np.float32(0.3)])
 def test_features_tried_are_as_many_as_scikit_learn_tries(asked, features):
     x = np.random.default_rng(0).normal(size=(4, features)).astype(np.float32)

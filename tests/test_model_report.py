@@ -41,7 +41,7 @@ def read(page):
 @pytest.fixture(scope="module")
 def searched():
     xyz, label, dimensions = scene(n=4000)
-    options = TrainingOptions(**{**SMALL, "trees": (5, 10)}, folds=3, block_size=10, prior_weight=0.5)
+    options = TrainingOptions(**{**SMALL, "trees": 10}, folds=2, prior_weight=0.5)
     return train([TrainingCloud(xyz, label, dimensions, "a<b>.laz")], options, progress=False)
 
 
@@ -50,7 +50,7 @@ def test_a_forest(searched, tmp_path, capsys):
     assert main(["model", str(tmp_path / "town.model"), "--html", str(tmp_path / "m.html")]) == 0
     said = capsys.readouterr().out
     words = read((tmp_path / "m.html").read_text())
-    assert "Model town.model" in words and "3 folds of blocks of 10 m" in words and "a<b>.laz" in words
+    assert "Model town.model" in words and "2 folds of blocks of 25 m" in words and "a<b>.laz" in words
     for row in searched.info["accuracy"]["cross_validation"]["tried"]:
         assert f"{100 * row['overall_accuracy']:.2f}" in words
     assert "Prior factor" in words and not re.search(r"\d\.\d{7,}", words)
@@ -85,8 +85,8 @@ def _with(model, curve):
 
 def test_what_was_held_out(searched):
     for held, words in (
-        ({"by": "surveys"}, "3 folds of whole surveys with"),
-        ({"by": "groups", "groups": "FileNumber"}, "3 folds of whole files with"),
+        ({"by": "surveys"}, "2 folds of whole surveys with"),
+        ({"by": "groups", "groups": "FileNumber"}, "2 folds of whole files with"),
     ):
         other = _with(searched, None)
         other.info["accuracy"]["cross_validation"] |= held

@@ -18,7 +18,7 @@ from pdal_stages.base.errors import ModelError, OptionError
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, foresttraining, load_model, train
 from pdal_stages.classifier.algorithms import PredictRequest
 from pdal_stages.classifier.passes import weighed
-from pdal_stages.classifier.refinement import EVEN, MOST_BELOW, blended, trust
+from pdal_stages.classifier.refinement import EVEN, blended, trust
 from pdal_stages.classifier.smoothing import count_shares
 from pdal_stages.classifier.trainoptions import MOST_PASSES
 from pdal_stages.features import FeatureEngine
@@ -370,13 +370,13 @@ def test_a_shipped_model_can_be_a_base():
     """With its own passes and the one on top, a model file must still be valid."""
     schema = json.loads(resources.files("pdal_stages.classifier").joinpath("model.json").read_text())
     properties = schema["properties"]
-    most = MOST_BELOW + MOST_PASSES
+    most = MOST_PASSES + MOST_PASSES
     assert properties["passes"]["maxItems"] == most
     named = re.compile(properties["arrays"]["propertyNames"]["pattern"])
     assert all(named.search(f"{number + 1}.tree_sizes") for number in range(most))
     for path in shipped().values():
         passes = ps.load_model(path).passes
-        assert len(passes) <= MOST_BELOW
+        assert len(passes) <= MOST_PASSES
         held = sum(len(one) for one in _arrays_by_pass(path))
         assert held / len(passes) * most <= properties["arrays"]["maxProperties"]
 

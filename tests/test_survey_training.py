@@ -36,17 +36,17 @@ def test_surveys_of_two_reference_systems_are_left_out_in_turn(tmp_path, write_l
         )
     words = ["train", *(str(tmp_path / f"t{k}.laz") for k in range(3)), "--model", str(tmp_path / "m.model")]
     telling = ["--feature-set", "HeightAboveLowest", "--neighborhoods", "s12"]
-    assert main([*words, *QUICK_WORDS, *telling, "--leave-one-survey-out"]) == 0
+    assert main([*words, *QUICK_WORDS, *telling, "--surveys"]) == 0
     out = capsys.readouterr().out
-    assert "survey left out" in out.splitlines()[0]
+    assert "surveys held out" in out.splitlines()[0]
     info = ps.load_model(tmp_path / "m.model").info
-    found = info["accuracy"]["leave_one_survey_out"]
-    assert [one["name"] for one in found["surveys"]] == ["t0", "t1", "t2"]
-    assert found["overall_accuracy"] > 0.9
+    found = info["accuracy"]["cross_validation"]
+    assert (found["by"], found["folds"]) == ("surveys", 3)
+    assert found["chosen"]["overall_accuracy"] > 0.9
     assert [one["name"] for one in info["training"]["clouds"]] == ["t0", "t1", "t2"]
 
     wide = ["--filters.hag_morphological.window=20", "--writers.classifiermodel.dimensions=Ground"]
-    assert main([*words, *QUICK_WORDS, *telling, "--leave-one-survey-out", *wide]) == 0
+    assert main([*words, *QUICK_WORDS, *telling, *wide, "--surveys"]) == 0
     capsys.readouterr()
     (heights,) = ps.load_model(tmp_path / "m.model").info["preparation"]  # as they were made
     assert heights["window"] == 20
@@ -54,14 +54,11 @@ def test_surveys_of_two_reference_systems_are_left_out_in_turn(tmp_path, write_l
     grouped = [
         *words,
         *QUICK_WORDS,
-        "--leave-one-survey-out",
         "--surveys",
         f"one={tmp_path}/t0.laz,{tmp_path}/t1.laz",
     ]
     assert main(grouped) == 1  # of one survey must be of one reference system
     assert "reference systems" in capsys.readouterr().err
-    assert main([*words[:2], *words[-2:], *QUICK_WORDS, "--leave-one-survey-out"]) == 1
-    assert "at least two surveys" in capsys.readouterr().err
 
 
 @pytest.mark.pdal

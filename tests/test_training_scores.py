@@ -74,13 +74,13 @@ def test_each_file_is_held_out_whole(tmp_path, write_las, monkeypatch):
     from pdal_stages.classifier import crossval
 
     seen = []
-    search = crossval.search
+    score = crossval.score
 
-    def spy(values, label, weight, xy, *rest, fold, **named):
+    def spy(values, label, weight, xy, codes, setting, trees, fold, **named):
         seen.append((xy.copy(), fold))
-        return search(values, label, weight, xy, *rest, fold=fold, **named)
+        return score(values, label, weight, xy, codes, setting, trees, fold, **named)
 
-    monkeypatch.setattr(crossval, "search", spy)
+    monkeypatch.setattr(crossval, "score", spy)
     files = [write_las(tmp_path / f"t{n}.laz", scene(n, 70.0 * n), point_format=1) for n in range(7)]
     assert main(words(tmp_path, *files)) == 0
     ((xy, fold),) = seen

@@ -137,9 +137,7 @@ def score(
         "max_depth": None,
         "min_samples_leaf": setting.min_samples_leaf,
         **figures(matrices.sum(axis=0), codes),
-        "mean_f1_by_fold": [
-            Accuracy.from_confusion(m, codes).mean_f1 if m.any() else None for m in matrices
-        ],
+        "mean_f1_by_fold": [Accuracy.from_confusion(m, codes).mean_f1 if m.any() else None for m in matrices],
     }
 
 

@@ -211,6 +211,9 @@ def _validate(
     asked = {"groups": options.groups} if options.groups else {}
     for by, folds, fold in ways:
         heard.said = Sureness()
+        gap = (
+            0.0 if by == "surveys" else _gap(plan)
+        )  # which do not see each other, whatever their coordinates
         try:
             if fold is None:
                 fold = crossval.block_folds(xy, samples.label, samples.weight, folds, BLOCK)
@@ -223,7 +226,7 @@ def _validate(
                 setting,
                 trees,
                 fold,
-                gap=_gap(plan),
+                gap=gap,
                 seed=options.seed,
                 threads=options.threads,
                 progress=progress,
@@ -234,7 +237,7 @@ def _validate(
             if by == "groups":
                 asked["instead"] = f"{error.what}: {error.found}"
             continue
-        more = {"folds": folds, "block_size": BLOCK, "gap": _gap(plan), "tried": [row], "chosen": row}
+        more = {"folds": folds, "block_size": BLOCK, "gap": gap, "tried": [row], "chosen": row}
         return {"by": by, **asked, **more}
     return None
 

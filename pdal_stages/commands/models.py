@@ -42,10 +42,10 @@ def add_commands(add: Adder) -> None:
     takes("--trees", type=int, help="Number of trees")
     takes(
         "--surveys",
-        nargs="+",
+        nargs="*",
         metavar="NAME=PATTERN",
-        help="Files of one survey, e.g. north=north/*.laz; surveys do not see each other, weigh alike, and may have "
-        "different reference systems",
+        help="Files of one survey, e.g. north=north/*.laz; each other file is a survey of its own. Surveys do not see each other, "
+        "weigh alike, and may have different reference systems",
     )
 
     add_tile_arguments(add.choices["train"])
@@ -119,7 +119,7 @@ def _train(options: argparse.Namespace) -> None:
     extra = {name: value for name in named if (value := getattr(options, name)) is not None}
     files, surveys = input_files(options.inputs), {}
     print_messages(*overlooked(options.inputs))
-    if options.surveys:
+    if options.surveys is not None:
         surveys = surveys_of(files, options.surveys)
     task = TrainTask(files, options.model, options.overrides, extra, options_of(options), surveys)
     if not task.in_one_piece():

@@ -126,17 +126,18 @@ class ClassifierModel(Stage):
         "memory_mb", kind="integer", default=512, name="memory", minimum=16, exclusive=False, maximum=None
     )
     details = """
-Samples `count` points of each class, spread over space; computes features for the samples only; fits the
-percentiles and histogram thresholds; grows a Random Forest; writes [one model file](../model-file.md). A class with
-fewer points has them several times, and the counts are in the file. For its score a forest of a quarter of the trees is
-cross-validated over spatial blocks, so that neighbors never stand on both sides (`folds` 0: not). With `groups`, points of one tile or flight are held out together instead of blocks; `pdal-stages
-train` holds out each of several files. With `passes` 2, a second forest also reads the first one's [probabilities all
-around a point](../model-file.md#context), and is trained on what they are on ground the first has not seen. On top of
-a `base` one pass is for few labels, in the base's voxels; two are for a labeled survey, in voxels of its own: the first
-reads what the base says of a point, the second what the first says all around it. With
-`"algorithm": "alsnet"` a network is trained instead, from `dimensions`, `classes`, `strategy`, `seed` and the options
-in `alsnet` ([alsNet](../alsnet.md)). Points of several readers are merged first. `label` names the dimension that
-holds the classes.
+Samples `count` points of each class, spread over space; computes features for the samples only; fits the percentiles
+and histogram thresholds; grows a Random Forest; writes [one model file](../model-file.md). A class with fewer points
+has them several times, and the counts are in the file. For its score a forest of a quarter of the trees is
+cross-validated over spatial blocks, so that neighbors never stand on both sides (`folds` 0: not). With `groups`,
+points of one tile or flight are held out together instead of blocks; `pdal-stages train` holds out each of several
+files. With `passes` 2, a second forest also reads the first one's [probabilities all around a
+point](../model-file.md#context), and is trained on what they are on ground the first has not seen. On top of a `base`
+one pass is for few labels, in the base's voxels; two are for a labeled survey, in voxels of its own: the first reads
+what the base says of a point, the second what the first says all around it. With `"algorithm": "alsnet"` a network is
+trained instead, from `dimensions`, `classes`, `strategy`, `seed` and the options in `alsnet`
+([alsNet](../alsnet.md)). Points of several readers are merged first. `label` names the dimension that holds the
+classes.
 """
     before = ({"type": "filters.hag_minima"},)
     after = ()
@@ -303,8 +304,8 @@ holds the classes.
             )
         if short := model.info["training"].get(SHORT):
             report.warnings.append(
-                f"{short:,} samples have neighbors farther away than their tile shows, and may differ from those of a run in one "
-                "piece: give more --memory"
+                f"{short:,} samples have neighbors farther away than their tile shows, and may differ from those of a run "
+                "in one piece: give more --memory"
             )
         if unscored := model.info["training"].get("unscored"):
             report.warnings.append(unscored)

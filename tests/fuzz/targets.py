@@ -184,6 +184,6 @@ def seeds(name: str) -> list[bytes]:
         b'"minor_version":4,"dataformat_id":6,"forward":"all"}]}',
         b'[{"type":"filters.accuracy","dimension":"Classification","classes":[2,5],"merge":{"5":[3,4]}}]',
         b'[{"type":"writers.classifiermodel","filename":"m.model","classes":{"2":"Ground","3,4,5":"5 Vegetation",'
-        b'"6":6},"strategy":"binary","target":2,"trees":[10,20],"max_depth":[5],"dimensions":["Intensity"]}]',
+        b'"6":6},"strategy":"binary","target":2,"trees":10,"dimensions":["Intensity"]}]',
         b'[{"type":"filters.modelclassifier","model":"m.model","reject_below":0.5}]',
     ]

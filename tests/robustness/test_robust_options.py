@@ -98,7 +98,7 @@ WRONG = [
     ("no trees", TRAIN, {"filename": "m", "trees": 0}, ["'trees'", "0"]),
     ("half a tree", TRAIN, {"filename": "m", "trees": 1.5}, ["'trees'", "1.5"]),
     ("trees less than none twice", TRAIN, {"filename": "m", "trees": "--5"}, ["'trees'", "--5"]),
-    ("depth in superscript", TRAIN, {"filename": "m", "max_depth": "\u00b2"}, ["'max_depth'"]),
+    ("trees in superscript", TRAIN, {"filename": "m", "trees": "\u00b2"}, ["'trees'"]),
     (
         "no samples",
         TRAIN,

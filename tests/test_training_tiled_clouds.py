@@ -1,0 +1,116 @@
+"""Clouds in tiles: the forests trained on them are those of the whole."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
+from pdal_stages.classifier.samplefeatures import SHORT
+from pdal_stages.classifier.tiledcloud import TiledCloud
+from pdal_stages.classifier.training import train_tiles
+
+QUICK = {
+    "count": 120,
+    "trees": 4,
+    "threads": 1,
+    "voxel": 0.25,
+    "dimensions": ("Intensity",),
+}
+
+
+def scene(n=6000, size=60.0, seed=0, **more):
+    """Ground and boxes on it, noise above, strays; some of the labels are not to be used."""
+    random = np.random.default_rng(seed)
+    xy = random.random((n, 2)) * size + (1000.0, -20.0)
+    roof = ((xy // 7).sum(axis=1) % 3) == 0
+    z = np.where(roof, 5.0, 0.0) + random.normal(0, 0.05, n)
+    labels = np.where(roof, 6, 2)
+    bush = random.random(n) < 0.15
+    z, labels = z + bush * random.random(n) * 3, np.where(bush, 5, labels)
+    noise = random.random(n) < 0.01
+    z, labels = np.where(noise, 60.0, z), np.where(noise, 7, labels)
+    labels = np.where(random.random(n) < 0.05, 1, labels)
+    xyz = np.column_stack([xy, z])
+    dimensions = {
+        "Intensity": random.integers(0, 99, n).astype(np.uint16),
+        "Flight": (xy[:, 0] // 20).astype(int),
+    }
+    return TrainingCloud(xyz, labels, dimensions, "scene", **more)
+
+
+def cut(cloud, side, folder, seed=1):
+    """The cloud in squares, the points of each in any order."""
+    tiles = TiledCloud(folder, side)
+    place = np.floor(cloud.xyz[:, :2] / side).astype(int)
+    random = np.random.default_rng(seed)
+    for tile in np.unique(place, axis=0):
+        rows = random.permutation(np.flatnonzero((place == tile).all(axis=1)))
+        tiles.put(tuple(tile.tolist()), replace(cloud.part(rows), survey=None))
+    return tiles
+
+
+def same_forests(cloud, options, side, folder):
+    """Trains on the whole and on tiles."""
+    whole = train([cloud], options, progress=False)
+    (folder / "work").mkdir()
+    tiles = train_tiles([cut(cloud, side, folder / "raw")], options, folder / "work", progress=False)
+    assert not (folder / "raw").exists()
+    assert tiles.info["classes"] == whole.info["classes"]
+    assert tiles.info["training"]["clouds"] == whole.info["training"]["clouds"]
+    for one, other in zip(tiles.passes, whole.passes, strict=True):
+        for name, array in one.arrays().items():
+            assert np.array_equal(array, other.arrays()[name]), name
+    assert tiles.info["densities"]["low"] == pytest.approx(whole.info["densities"]["low"], rel=0.3)
+
+
+@pytest.mark.parametrize("side", [25.0, 1000.0])
+def test_defaults(tmp_path, side):
+    same_forests(scene(), TrainingOptions(**QUICK), side, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"voxel": 0.0, "passes": 1, "groups": "Flight", "prior_weight": 0.5},
+        {"passes": 3, "context": ("own", "box2"), "voxel": 0.9},
+        {"strategy": "binary", "target": 6, "classes": {"2": 2, "5": 5, "6": 6}},
+        {"dimensions": ("returns",)},
+    ],
+    ids=["groups", "three", "binary", "returns"],
+)
+def test_other_options(tmp_path, more):
+    cloud = scene()
+    random = np.random.default_rng(5)
+    number = random.integers(1, 4, len(cloud)).astype(np.uint8)
+    returns = {"ReturnNumber": number, "NumberOfReturns": np.maximum(number, 2)}
+    cloud = replace(cloud, dimensions={**cloud.dimensions, **returns}, mask=random.random(6000) < 0.8)
+    same_forests(cloud, TrainingOptions(**{**QUICK, **more}), 17.0, tmp_path)
+
+
+def test_on_top_of_a_model(tmp_path):
+    base = train([scene(seed=8)], TrainingOptions(**QUICK), progress=False)
+    options = TrainingOptions(**{**QUICK, "base": base, "classes": {"2": 2, "6": 6}})
+    same_forests(scene(), options, 17.0, tmp_path)
+
+
+def test_neighbors_beyond_the_halo_are_counted(tmp_path):
+    """At one point on 40 m2 the fifty nearest lie 25 m around."""
+    (tmp_path / "work").mkdir()
+    options = TrainingOptions(**{**QUICK, "neighborhoods": "k50", "thin": 0.01})
+    model = train_tiles([cut(scene(900, 190.0), 21.0, tmp_path / "raw")], options, tmp_path / "work", False)
+    assert model.info["training"][SHORT] > 0
+
+
+def test_tiles_hold_each_point_once_and_what_lies_around(tmp_path):
+    cloud = scene()
+    tiles = list(cut(cloud, 8.1, tmp_path / "raw").clouds(10.0))
+    assert sum(tile.points for tile in tiles) == len(cloud)
+    for tile in tiles:
+        own = tile.xyz[tile.own]
+        low, high = np.floor(own[0, :2] / 8.1) * 8.1, np.floor(own[0, :2] / 8.1) * 8.1 + 8.1
+        near = ((cloud.xyz[:, :2] >= low - 10) & (cloud.xyz[:, :2] <= high + 10)).all(axis=1)
+        assert np.count_nonzero(near) == len(tile)
+        assert len(tile) == len(np.unique(tile.xyz, axis=0)) and len(tile.dimensions["Flight"]) == len(tile)
