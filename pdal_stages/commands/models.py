@@ -44,8 +44,8 @@ def add_commands(add: Adder) -> None:
         "--surveys",
         nargs="*",
         metavar="NAME=PATTERN",
-        help="Files of one survey, e.g. north=north/*.laz; each other file is a survey of its own. Surveys do not see each other, "
-        "weigh alike, and may have different reference systems",
+        help="Files of one survey, e.g. north=north/*.laz; each other file is a survey of its own. Surveys do not see each "
+        "other, weigh alike, and may have different reference systems",
     )
 
     add_tile_arguments(add.choices["train"])
