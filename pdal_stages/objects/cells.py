@@ -9,14 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import NOISE
 from ..base.errors import StageError
-from ..base.jit import njit
 
 
 class Kind(IntEnum):
@@ -57,8 +55,6 @@ _COLUMNS: dict[str, tuple[type, np.ufunc]] = {
     "sure": (np.int64, np.add),  # of their reliabilities, thousandths
     "told": (np.int32, np.add),  # points that have one
 }
-_HOW: dict[Any, int] = {np.add: 0, np.minimum: 1, np.maximum: 2}
-_KINDS = len(Kind)
 
 
 def cell_keys(kind: int, row: NDArray, column: NDArray) -> NDArray[np.int64]:
@@ -154,20 +150,25 @@ class Cells:
         used = key >= 0
         if not used.any():
             return cls(size)
-        if not used.all():
-            key, height = key[used], height[used]
+        key, height = key[used], height[used]
         if max(-height.min(), height.max()) > 2**31 - 2:
             raise StageError(
                 "heights lie beyond 2,000 km", found=f"{height.min() / MM:g} to {height.max() / MM:g} m"
             )
-        if reliability is None:
-            sure = np.empty(0, np.int64)
-        else:
-            given = np.asarray(reliability)
-            sure = np.rint(np.clip(given if used.all() else given[used], 0.0, 1.0) * MM).astype(np.int64)
-        place, keys = _places(key)
-        columns = _sums(place, len(keys), height.astype(np.int32), sure)
-        return cls(size, keys, dict(zip(_COLUMNS, columns, strict=True)))
+        z = height.astype(np.int32)
+        told = np.full(len(z), reliability is not None, np.int32)
+        sure = np.zeros(len(z), np.int64)
+        if reliability is not None:
+            sure = np.rint(np.clip(np.asarray(reliability)[used], 0.0, 1.0) * MM).astype(np.int64)
+        columns = {
+            "count": np.ones(len(z), np.int32),
+            "low": z,
+            "high": z,
+            "sum": z,
+            "sure": sure,
+            "told": told,
+        }
+        return cls(size, key, columns)._joined()
 
     def doubled(self) -> Cells:
         """Records of the same points in cells twice as wide."""
@@ -178,12 +179,16 @@ class Cells:
 
     def _joined(self) -> Cells:
         """Sorted, with one record for each cell."""
-        place, keys = _places(self.key)
-        columns: dict[str, NDArray] = {}
-        for name, values in self.columns.items():
-            kind, join = _COLUMNS[name]
-            columns[name] = _combined(place, len(keys), values.astype(kind, copy=False), _HOW[join])
-        return Cells(self.size, keys, columns)
+        if not len(self.key):
+            return self
+        order = np.argsort(self.key, kind="stable")
+        key = self.key[order]
+        first = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
+        columns = {
+            name: join.reduceat(self.columns[name][order], first, dtype=kind)
+            for name, (kind, join) in _COLUMNS.items()
+        }
+        return Cells(self.size, key[first], columns)
 
     @staticmethod
     def join(parts: Sequence[Cells]) -> Cells:
@@ -229,122 +234,17 @@ class Cells:
 
 def point_keys(x: NDArray, y: NDArray, kinds: NDArray, size: float) -> NDArray[np.int64]:
     """Keys of the cells that points fall in; -1 for those of no kind (below 0)."""
-    key, far = _point_keys(x, y, kinds, size, size * GROUND_CELLS)
-    if far:
+    side = np.where(kinds == Kind.GROUND, size * GROUND_CELLS, size)
+    row, column = np.floor(y / side), np.floor(x / side)
+    used = kinds >= 0
+    if not (np.maximum(np.abs(row), np.abs(column))[used] < _HALF).all():
         raise StageError(
             "coordinates lie too far out for the grid of cells",
             found=f"x {x.min():g} to {x.max():g}, y {y.min():g} to {y.max():g} m",
             cure="Drop stray points first, or give a larger 'cell'",
         )
-    return key
-
-
-@njit
-def _point_keys(x: NDArray, y: NDArray, kinds: NDArray, size: float, wide: float) -> tuple[NDArray, bool]:
-    """Keys of points, and whether any lies beyond the grid."""
     out = np.full(len(x), -1, np.int64)
-    far = False
-    for n in range(len(x)):
-        if kinds[n] < 0:
-            continue
-        side = wide if kinds[n] == 0 else size
-        column, row = np.floor(x[n] / side), np.floor(y[n] / side)
-        if not (abs(column) < _HALF and abs(row) < _HALF):
-            far = True
-            continue
-        out[n] = (
-            (np.int64(kinds[n]) << _KIND) | ((np.int64(row) + _HALF) << _ROW) | (np.int64(column) + _HALF)
-        )
-    return out, far
-
-
-def _places(key: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """The place of each key among the different ones, sorted; and those."""
-    if key.size == 0:
-        return np.empty(0, np.int32), key
-    low, high = _extents(key)
-    sides = np.maximum(high - low + 1, 0)
-    many = int(sum(int(rows) * int(columns) for rows, columns in sides))
-    if many > min(8 * key.size + (1 << 16), 2**31 - 1):  # strays, or few points in a wide area
-        keys, place = np.unique(key, return_inverse=True)
-        return place.astype(np.int32), keys
-    return _counted_places(key, low, sides, many)
-
-
-@njit
-def _extents(key: NDArray) -> tuple[NDArray, NDArray]:
-    """Lowest and highest row and column of each kind's keys."""
-    low, high = np.full((_KINDS, 2), 4 * _HALF, np.int64), np.full((_KINDS, 2), -1, np.int64)
-    one = (np.int64(1) << _ROW) - 1
-    for k in key:
-        kind, row, column = k >> _KIND, (k >> _ROW) & one, k & one
-        low[kind, 0], high[kind, 0] = min(low[kind, 0], row), max(high[kind, 0], row)
-        low[kind, 1], high[kind, 1] = min(low[kind, 1], column), max(high[kind, 1], column)
-    return low, high
-
-
-@njit
-def _counted_places(key: NDArray, low: NDArray, sides: NDArray, many: int) -> tuple[NDArray, NDArray]:
-    """The same where cells fill much of the area: by a table of it, without sorting."""
-    one = (np.int64(1) << _ROW) - 1
-    begin = np.zeros(_KINDS, np.int64)
-    for kind in range(1, _KINDS):
-        begin[kind] = begin[kind - 1] + sides[kind - 1, 0] * sides[kind - 1, 1]
-    number = np.zeros(many, np.int32)
-    place = np.empty(len(key), np.int32)
-    for n in range(len(key)):
-        k = key[n]
-        kind = k >> _KIND
-        at = ((k >> _ROW) & one) - low[kind, 0]
-        at = begin[kind] + at * sides[kind, 1] + (k & one) - low[kind, 1]
-        number[at] = 1
-        place[n] = at
-    count = 0
-    for at in range(many):
-        if number[at]:
-            number[at] = count
-            count += 1
-    keys = np.empty(count, np.int64)
-    for n in range(len(key)):
-        place[n] = number[place[n]]
-        keys[place[n]] = key[n]
-    return place, keys
-
-
-@njit
-def _sums(
-    place: NDArray, many: int, height: NDArray, sure: NDArray
-) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray, NDArray]:
-    """The columns of records of points, in the order of `_COLUMNS`; `sure` may be empty."""
-    count, told = np.zeros(many, np.int32), np.zeros(many, np.int32)
-    low, high = np.full(many, 2**31 - 1, np.int32), np.full(many, -(2**31), np.int32)
-    total, reliability = np.zeros(many, np.int64), np.zeros(many, np.int64)
-    for n in range(len(place)):
-        p, z = place[n], height[n]
-        count[p] += 1
-        low[p], high[p] = min(low[p], z), max(high[p], z)
-        total[p] += z
-    for n in range(len(sure)):
-        reliability[place[n]] += sure[n]
-        told[place[n]] += 1
-    return count, low, high, total, reliability, told
-
-
-@njit
-def _combined(place: NDArray, many: int, values: NDArray, how: int) -> NDArray:
-    """Values of the same place together: 0 added, 1 the least, 2 the greatest."""
-    out = np.zeros(many, values.dtype)
-    first = np.ones(many, np.bool_)
-    for n in range(len(place)):
-        p = place[n]
-        if first[p]:
-            out[p], first[p] = values[n], False
-        elif how == 0:
-            out[p] += values[n]
-        elif how == 1:
-            out[p] = min(out[p], values[n])
-        else:
-            out[p] = max(out[p], values[n])
+    out[used] = cell_keys(0, row[used], column[used]) | (kinds[used].astype(np.int64) << _KIND)
     return out
 
 

@@ -12,15 +12,15 @@ from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from ..base.jit import device, njit
 from ..base.progress import Progress
 from . import crowns, lines, measure, roofs
 from .cells import Cells, Kind, cell_keys, object_id, unpack
 from .found import Found, Objects, ObjectSettings
 from .measure import Body
 from .rasters import Window
-from .view import MARGIN, CellView, extent_of, whole, widened
+from .view import AROUND, MARGIN, CellView, extent_of, whole, widened
 
 #: Meters more that are looked at first: most buildings that reach into a block end there, so few blocks are looked at twice.
 AHEAD = 64.0
@@ -133,18 +133,14 @@ def _spans(near: CellView, core: Window, found: Found) -> None:
 
     def masked(view: CellView) -> NDArray[np.bool_]:
         tower = view.column(Kind.TOWER, "count", 0.0) > 0
-        for _ in range(round(1.5 / chosen.cell)):
-            tower = roofs.dilated(tower)
-        mask = ~np.isnan(view.high(Kind.SPAN))
-        for _ in range(round(chosen.span_gap / chosen.cell / 2)):
-            mask = roofs.dilated(mask)
+        tower = _dilated(tower, round(1.5 / chosen.cell))
+        mask = _dilated(~np.isnan(view.high(Kind.SPAN)), round(chosen.span_gap / chosen.cell / 2))
         return mask & ~tower
 
     view, mask, sure = whole(near, core, masked, beside=False)
     high = view.high(Kind.SPAN)
-    joined = roofs.connected(mask, np.zeros(mask.shape), np.inf)
-    number = roofs.numbered(np.where(np.isnan(high), -1, joined))
-    number = _without_small(number, 4)
+    joined, _ = ndimage.label(mask)
+    number = _without_small(np.where(np.isnan(high), -1, joined - 1), 4)
     number = _parted(number, chosen)
 
     def measured(body: Body, size: float) -> dict[str, object]:
@@ -161,7 +157,7 @@ def _parted(number: NDArray[np.int64], chosen: ObjectSettings) -> NDArray[np.int
         line = lines.parted(r, c, chosen.cell, chosen.span_gap)
         where, first = np.unique(line, return_index=True)
         out[r, c] = (r * number.shape[1] + c)[first[np.searchsorted(where, line)]]
-    return roofs.numbered(out)
+    return out
 
 
 def _trees(near: CellView, core: Window, found: Found) -> None:
@@ -238,23 +234,12 @@ def _without_small(number: NDArray[np.int64], smallest: float) -> NDArray[np.int
     return np.where(inside & (size[np.where(inside, number, 0)] >= smallest), number, -1)
 
 
-@njit
-def _beside(number: NDArray) -> NDArray:
-    """The lowest number among the eight neighbors of each cell, -1 where none has one."""
-    rows, columns = number.shape
-    out = np.full(number.shape, -1, np.int64)
-    for r in range(rows):
-        for c in range(columns):
-            out[r, c] = _lowest(number, r, c)
-    return out
+def _beside(number: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The lowest number among each cell and its eight neighbors, -1 where none has one."""
+    none = np.iinfo(np.int64).max
+    lowest = ndimage.minimum_filter(np.where(number < 0, none, number), 3, mode="constant", cval=none)
+    return np.where(lowest == none, -1, lowest)
 
 
-@device
-def _lowest(number, r, c):
-    best = -1
-    for i in range(max(r - 1, 0), min(r + 2, number.shape[0])):
-        for j in range(max(c - 1, 0), min(c + 2, number.shape[1])):
-            n = number[i, j]
-            if n >= 0 and (best < 0 or n < best):
-                best = n
-    return best
+def _dilated(mask: NDArray[np.bool_], cells: int) -> NDArray[np.bool_]:
+    return ndimage.binary_dilation(mask, AROUND, iterations=cells) if cells else mask

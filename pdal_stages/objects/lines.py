@@ -1,22 +1,19 @@
 """Straight lines that cells of wires which touch lie along: two lines of wires that cross are two spans, and so are both
 sides of a bend.
 
-Lines are taken out one after the other, each the longest run of cells in a strip of any direction (a Hough transform, on
-whole cells), and those that run side by side are put together again: conductors of one span.
+Lines are taken out one after the other, each the strip of any direction that holds most cells (a Hough transform, on whole
+cells), and those that run side by side are put together again: conductors of one span.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from ..base.jit import njit
-
-#: Half the width of a strip, meters.
-STRIP = 0.8
-#: Gaps in a run along a strip, meters: where another line crosses, or a wire was not seen.
-GAP = 3.0
-#: The least that a line adds to those before it, meters.
+#: Width of a strip, meters.
+STRIP = 1.6
+#: The least length of a line, meters.
 LEAST = 8.0
 #: Lines that run side by side are at most so far from parallel, degrees.
 PARALLEL = 9
@@ -24,8 +21,6 @@ PARALLEL = 9
 WIDTH = 2.5
 #: What reaches farther is left in one piece, meters: a line for which towers are no class of their own.
 FARTHEST = 1000.0
-#: Steps of direction in half a turn.
-_WAYS = 180
 
 
 def parted(row: NDArray[np.int64], column: NDArray[np.int64], size: float, gap: float) -> NDArray[np.int64]:
@@ -41,131 +36,57 @@ def parted(row: NDArray[np.int64], column: NDArray[np.int64], size: float, gap: 
         Lines side by side are apart by more, or one, meters.
     """
     one = np.zeros(len(row), np.int64)
-    extent = np.hypot(float(np.ptp(row)), float(np.ptp(column))) * size
-    if not LEAST <= extent <= FARTHEST:
+    if not LEAST <= np.hypot(float(np.ptp(row)), float(np.ptp(column))) * size <= FARTHEST:
         return one
-    turns = np.arange(_WAYS) * (np.pi / _WAYS)
-    strip, away = max(1.0, STRIP / size), max(1.0, GAP / size)
-    owner, ways = _lines(
-        row - row.min(), column - column.min(), np.cos(turns), np.sin(turns), strip, away, LEAST / size
-    )
-    if len(ways) < 2:
-        return one
-    owner = _together(row, column, owner, ways, gap / size + 1.5)
-    length = 0.0
-    for line in np.unique(owner):
-        mine, turn = owner == line, turns[ways[line]]
-        length += float(np.ptp(column[mine] * np.cos(turn) + row[mine] * np.sin(turn))) + 1.0
-    if len(row) * size > max(WIDTH, 2 * size) * length:
-        return one
-    first = np.full(len(ways), len(row))
-    np.minimum.at(first, owner, np.arange(len(row)))
-    order = np.argsort(first, kind="stable")
-    rank = np.empty(len(ways), np.int64)
-    rank[order] = np.arange(len(ways))
-    return rank[owner]
-
-
-@njit
-def _lines(
-    row: NDArray, column: NDArray, c: NDArray, s: NDArray, strip: float, gap: float, least: float
-) -> tuple[NDArray, NDArray]:
-    """Of each cell its line; of each line the way it goes, a step of direction."""
-    many = len(row)
-    x, y = column.astype(np.float64), row.astype(np.float64)
-    owner = np.full(many, -1, np.int64)
-    ways = np.empty(many, np.int64)
-    middles, begins, ends = np.empty(many), np.empty(many), np.empty(many)
-    size = int(np.hypot(x.max(), y.max())) + 3
-    seen = np.zeros((2 * size, 2 * size), np.int8)  # by strip, then along: 1 a line's, 2 of none yet
-    count = 0
-    fresh = np.zeros(2 * size, np.int64)
-    along, aside = np.empty(many, np.int64), np.empty(many, np.int64)
-    while count < many:
-        best, best_way, best_strip, best_from, best_to = 0.0, -1, 0, 0, 0
-        for way in range(len(c)):
-            for n in range(many):
-                along[n] = int(np.floor(x[n] * c[way] + y[n] * s[way])) + size
-                aside[n] = int(np.floor((y[n] * c[way] - x[n] * s[way]) / strip)) + size
-                new = owner[n] < 0
-                for k in (aside[n], aside[n] - 1):  # strips overlap by half
-                    seen[k, along[n]] = max(seen[k, along[n]], np.int8(2 if new else 1))
-                    fresh[k] += new
-            for m in range(many):
-                for k in (aside[m], aside[m] - 1):
-                    if 2 * fresh[k] <= best:
-                        continue
-                    start, last, run = -1, -1, 0.0
-                    for at in range(2 * size):
-                        if seen[k, at] == 0:
-                            continue
-                        if last < 0 or at - last > gap:
-                            start, run = at, 0.0
-                        elif seen[k, at] == 2:
-                            run += min(at - last, 2.0)
-                        last = at
-                        if run > best:
-                            best, best_way, best_strip, best_from, best_to = run, way, k, start, at
-                    fresh[k] = 0  # looked at
-            for n in range(many):
-                for k in (aside[n], aside[n] - 1):
-                    seen[k, along[n]] = 0
-                    fresh[k] = 0
-        if best < least:
+    xy = np.column_stack([column - column.min(), row - row.min()]).astype(np.float64) * size
+    turns = np.radians(np.arange(180.0))
+    ways = np.column_stack([np.cos(turns), np.sin(turns)])
+    owner, found = one - 1, []
+    while (left := np.flatnonzero(owner < 0)).size:
+        line = _longest(xy[left], ways, max(STRIP, 2 * size))
+        if line is None:
             break
-        middles[count] = (best_strip - size + 1) * strip
-        ways[count] = best_way
-        begins[count], ends[count] = best_from - size, best_to - size + 1
-        for n in range(many):
-            if (
-                owner[n] < 0
-                and _off(x[n], y[n], c, s, best_way, middles[count], begins[count], ends[count]) <= strip
-            ):
-                owner[n] = count
-        count += 1
-    for n in range(many):  # what lies along none goes to the nearest
-        nearest = np.inf
-        if owner[n] >= 0:
-            continue
-        for line in range(count):
-            off = _off(x[n], y[n], c, s, ways[line], middles[line], begins[line], ends[line])
-            if off < nearest:
-                nearest, owner[n] = off, line
-    return owner, ways[:count].copy()
+        way, inside = line
+        owner[left[inside]] = len(found)
+        found.append(way)
+    if len(found) < 2:
+        return one
+    known = owner >= 0
+    owner[~known] = owner[known][cKDTree(xy[known]).query(xy[~known])[1]]
+    owner = _side_by_side(xy, owner, found, gap + 1.5 * size)
+    length = sum(np.ptp(xy[owner == n] @ ways[found[n]]) + size for n in np.unique(owner).tolist())
+    if len(row) * size**2 > max(WIDTH, 2 * size) * length:
+        return one
+    _, first, at = np.unique(owner, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[at]
 
 
-@njit
-def _off(x, y, c, s, way, middle, begin, end):
-    """How far a place lies from a line."""
-    along, aside = x * c[way] + y * s[way], y * c[way] - x * s[way]
-    beyond = max(0.0, begin - along, along - end)
-    return np.hypot(beyond, aside - middle)
+def _longest(xy: NDArray, ways: NDArray, width: float) -> tuple[int, NDArray[np.bool_]] | None:
+    """The direction of the strip with most cells, and which cells lie in it; None where it is too short."""
+    best, line = 0, None
+    for number, (c, s) in enumerate(ways):
+        aside = xy[:, 1] * c - xy[:, 0] * s
+        for shift in (0.0, 0.5):  # strips overlap by half
+            strip = np.floor(aside / width + shift).astype(np.int64)
+            count = np.bincount(strip - strip.min())
+            most = int(count.argmax())
+            if count[most] > best:
+                best, line = int(count[most]), (number, strip == most + strip.min())
+    if line is None or np.ptp(xy[line[1]] @ ways[line[0]]) < LEAST:
+        return None
+    return line
 
 
-@njit
-def _together(row: NDArray, column: NDArray, owner: NDArray, ways: NDArray, near: float) -> NDArray:
-    """Lines with those put together that run side by side: of each cell the first of them."""
-    first = np.arange(len(ways))
-    reach = int(near)
-    low_row, low_column = row.min() - reach, column.min() - reach
-    image = np.full((row.max() - low_row + reach + 1, column.max() - low_column + reach + 1), -1, np.int64)
-    for n in range(len(row)):
-        image[row[n] - low_row, column[n] - low_column] = owner[n]
-    for n in range(len(row)):
-        r, c = row[n] - low_row, column[n] - low_column
-        for i in range(-reach, reach + 1):
-            for j in range(-reach, reach + 1):
-                other = image[r + i, c + j]
-                if other < 0 or first[other] == first[owner[n]] or i * i + j * j > near * near:
-                    continue
-                turn = abs(ways[owner[n]] - ways[other])
-                if min(turn, _WAYS - turn) > PARALLEL:
-                    continue
-                low, high = min(first[owner[n]], first[other]), max(first[owner[n]], first[other])
-                for line in range(len(ways)):
-                    if first[line] == high:
-                        first[line] = low
-    out = np.empty(len(row), np.int64)
-    for n in range(len(row)):
-        out[n] = first[owner[n]]
+def _side_by_side(xy: NDArray, owner: NDArray, ways: list[int], near: float) -> NDArray[np.int64]:
+    """Owners with nearly parallel lines that lie near each other put together: the first of them."""
+    out = owner.copy()
+    for n in range(len(ways)):
+        for m in range(n):
+            turn = abs(ways[n] - ways[m])
+            if min(turn, 180 - turn) > PARALLEL:
+                continue
+            away, _ = cKDTree(xy[owner == m]).query(xy[owner == n], distance_upper_bound=near)
+            if np.isfinite(away).any():
+                a, b = out[owner == n][0], out[owner == m][0]
+                out[out == max(a, b)] = min(a, b)
     return out

@@ -56,18 +56,9 @@ def _gradients(z: NDArray, size: float) -> tuple[NDArray, NDArray, NDArray]:
         for c in range(columns):
             if np.isnan(z[r, c]):
                 continue
-            n, a, b, base, _ = plane_around(z, r, c, size, z[r, c], 1.5, 0.0)
-            if np.isnan(a):
-                continue
-            worst = 0.0
-            for i in range(max(r - 2, 0), min(r + 3, rows)):
-                for j in range(max(c - 2, 0), min(c + 3, columns)):
-                    d = z[i, j] - z[r, c]
-                    if np.isnan(d) or abs(d) > 1.5:
-                        continue
-                    miss = d - base - a * (j - c) * size - b * (i - r) * size
-                    worst += miss * miss
-            east[r, c], north[r, c], off[r, c] = a, b, np.sqrt(worst / n)
+            _, a, b, _, scatter = plane_around(z, r, c, size, z[r, c], 1.5, 0.0)
+            if not np.isnan(a):
+                east[r, c], north[r, c], off[r, c] = a, b, np.sqrt(max(scatter, 0.0))
     return east, north, off
 
 

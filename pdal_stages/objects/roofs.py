@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import heapq
-
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from ..base.jit import device, njit
-from ..base.unionfind import root as root_of
 from .planes import plane_around
 
 #: Scatter of a roof's plane that is gone on from, and how near to it vegetation is of the roof, meters.
@@ -17,8 +17,8 @@ PLANE, NEAR = 0.12, 0.2
 SURFACE = 0.5
 #: So many cells inside its border a roof's height is measured where two roofs are compared.
 INSIDE = 2
-#: Within how many meters the rim of a roof without points is at one height.
-LEVEL = 1.0
+#: Within how many meters the rim of a hole in a roof is at one height, and how much of the rim.
+LEVEL, RIM = 1.0, 0.65
 #: The share of the border of two roofs along which their heights meet where they are of one building.
 _SHARE = 0.34
 
@@ -95,12 +95,11 @@ def continued(high: NDArray, leaves: NDArray, thick: NDArray, size: float, reach
     return out
 
 
-@njit
 def covered(high: NDArray, seen: NDArray, reach: int) -> NDArray:
-    """Heights of roofs with the cells filled from which nothing came back, neither roof nor ground: dark or wet ones.
+    """Heights of roofs with the holes filled from which nothing came back, neither roof nor ground: dark or wet ones.
 
-    A cell is filled where, going out in eight directions, the first cell in which anything was seen is of the roof in at
-    least seven of them, at nearly one height.
+    A hole is filled where nearly all around it is roof, at nearly one height, and no cell of it lies more than `reach`
+    cells from the rim.
 
     Parameters
     ----------
@@ -109,126 +108,77 @@ def covered(high: NDArray, seen: NDArray, reach: int) -> NDArray:
     seen : (r, c) bool
         Whether points of the ground or of vegetation lie in the cell.
     reach : int
-        How many cells away at most.
     """
-    rows, columns = high.shape
-    out = high.copy()
-    found = np.empty(8)
-    for r in range(rows):
-        for c in range(columns):
-            if seen[r, c] or not np.isnan(high[r, c]):
-                continue
-            n = 0
-            for way in range(8):
-                if n < way - 1:
-                    break
-                dr, dc = (0, 0, 1, -1, 1, -1, 1, -1)[way], (1, -1, 0, 0, 1, -1, -1, 1)[way]
-                level = _first_roof(high, seen, r, c, dr, dc, reach)
-                if not np.isnan(level):
-                    found[n] = level
-                    n += 1
-            if n < 7:
-                continue
-            level = np.median(found[:n])
-            if np.sum(np.abs(found[:n] - level) <= LEVEL) >= 7:
-                out[r, c] = level
+    roof = ~np.isnan(high)
+    holes, _ = ndimage.label(~roof & ~seen)
+    out, rows, columns = high.copy(), *high.shape
+    boxes, beside = ndimage.find_objects(holes), np.unique(holes[ndimage.binary_dilation(roof)])
+    for number in beside[beside > 0].tolist():
+        box = boxes[number - 1]
+        (top, bottom), (left, right) = ((part.start - 1, part.stop + 1) for part in box)
+        if (
+            top < 0
+            or left < 0
+            or bottom > rows
+            or right > columns
+            or max(bottom - top, right - left) > 12 * reach
+        ):
+            continue
+        part = slice(top, bottom), slice(left, right)
+        hole = holes[part] == number
+        rim = ndimage.binary_dilation(hole) & ~hole
+        levels = high[part][rim & roof[part]]
+        if len(levels) < RIM * np.count_nonzero(rim):
+            continue
+        level = np.median(levels)
+        if (
+            np.mean(np.abs(levels - level) <= LEVEL) < RIM
+            or ndimage.distance_transform_cdt(hole).max() > reach
+        ):
+            continue
+        out[part][hole] = level
     return out
 
 
-@device
-def _first_roof(high, seen, r, c, dr, dc, reach):
-    """Height of the first roof from a cell in a direction, NaN where something else comes before.
-
-    The ground is known by cells twice as wide, so what is seen in the two cells before a roof may lie outside it.
-    """
-    left = reach
-    for k in range(1, reach + 1):
-        i, j = r + k * dr, c + k * dc
-        if i < 0 or j < 0 or i >= high.shape[0] or j >= high.shape[1]:
-            break
-        if not np.isnan(high[i, j]):
-            return high[i, j]
-        if dr != 0 and dc != 0 and not np.isnan(high[i - dr, j]) and not np.isnan(high[i, j - dc]):
-            return high[i - dr, j]  # through a corner
-        left = min(left - 1, 1 if seen[i, j] else left)
-        if left < 0:
-            break
-    return np.nan
-
-
-@njit
 def _closed(high: NDArray) -> NDArray:
     """Heights with those of empty cells that have at least seven neighbors: the mean of them."""
-    rows, columns = high.shape
-    out = high.copy()
-    for r in range(rows):
-        for c in range(columns):
-            if not np.isnan(high[r, c]):
-                continue
-            total, count, missing = 0.0, 0, 0
-            for i in range(r - 1, r + 2):
-                for j in range(c - 1, c + 2):
-                    if i < 0 or j < 0 or i >= rows or j >= columns or np.isnan(high[i, j]):
-                        missing += 1  # the cell itself is one
-                    else:
-                        total += high[i, j]
-                        count += 1
-                if missing > 2:
-                    break
-            if count >= 7:
-                out[r, c] = total / count
-    return out
-
-
-def dilated(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Cells in or beside (eight neighbors) the mask."""
-    wide = np.pad(mask, 1)
-    rows = wide[:-2] | wide[1:-1] | wide[2:]
-    return rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]
+    known = ~np.isnan(high)
+    around = np.ones((3, 3))
+    count = ndimage.correlate(known.astype(np.float64), around, mode="constant")
+    total = ndimage.correlate(np.where(known, high, 0.0), around, mode="constant")
+    return np.where(~known & (count >= 7), total / np.maximum(count, 1), high)
 
 
 def opened(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Cells of the mask that lie in a square of two by two of it."""
-    square = mask[:-1, :-1] & mask[1:, :-1] & mask[:-1, 1:] & mask[1:, 1:]
-    out = np.zeros_like(mask)
-    for r in (0, 1):
-        for c in (0, 1):
-            out[r : mask.shape[0] - 1 + r, c : mask.shape[1] - 1 + c] |= square
-    return out
+    return ndimage.binary_opening(mask, np.ones((2, 2), bool))
 
 
-@device
-def _unite(parent, a, b):
-    a, b = root_of(parent, a), root_of(parent, b)
-    if a < b:
-        parent[b] = a
-    elif b < a:
-        parent[a] = b
-
-
-@njit
-def connected(mask: NDArray, z: NDArray, step: float) -> NDArray:
-    """The first cell (row by row) of each cell's part, -1 outside the mask.
+def connected(mask: NDArray, z: NDArray, step: float) -> NDArray[np.int64]:
+    """Number of each cell's part, from 0 in the order of their first cells; -1 outside the mask.
 
     Two cells side by side are of one part where their heights differ by at most `step`.
     """
-    rows, columns = mask.shape
-    parent = np.arange(rows * columns)
-    for r in range(rows):
-        for c in range(columns):
-            if not mask[r, c]:
-                continue
-            n = r * columns + c
-            if c + 1 < columns and mask[r, c + 1] and not abs(z[r, c] - z[r, c + 1]) > step:
-                _unite(parent, n, n + 1)
-            if r + 1 < rows and mask[r + 1, c] and not abs(z[r, c] - z[r + 1, c]) > step:
-                _unite(parent, n, n + columns)
-    out = np.full((rows, columns), -1, np.int64)
-    for r in range(rows):
-        for c in range(columns):
-            if mask[r, c]:
-                out[r, c] = root_of(parent, r * columns + c)
-    return out
+    number = np.full(mask.shape, -1, np.int64)
+    count = int(np.count_nonzero(mask))
+    number[mask] = np.arange(count)
+    pairs = []
+    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        with np.errstate(invalid="ignore"):
+            joined = mask[a] & mask[b] & ~(np.abs(z[a] - z[b]) > step)
+        pairs.append((number[a][joined], number[b][joined]))
+    number[mask] = _sets(np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs]), count)
+    return number
+
+
+def _sets(a: NDArray, b: NDArray, count: int) -> NDArray[np.int64]:
+    """Of each of `count` members the number of its set, in the order of their first members; a and b are joined."""
+    pairs = coo_matrix((np.ones(len(a), np.bool_), (a, b)), (count, count))
+    _, of = connected_components(pairs, directed=False)
+    _, first, at = np.unique(of, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return rank[at]
 
 
 @device
@@ -283,94 +233,51 @@ def building_parts(mask: NDArray[np.bool_], z: NDArray, *, step: float, smallest
     """Number of each cell's building, from 0 in the order of their first cells; -1 outside.
 
     Connected cells whose heights differ by at most 1 m are a roof. Roofs of fewer than `smallest` cells (dormers,
-    chimneys) go with the neighbor that they share the longest border with, the smallest first. Then two roofs are of
-    one building where their heights (measured beyond rims and walls) differ by at most `step` along at least a
-    third of their border, the most equal first. A `step` of 0 parts nothing.
+    chimneys) go with the neighbor that they share the longest border with. Then two roofs are of one building where their
+    heights (measured beyond rims and walls) differ by at most `step` along at least a third of their border. A `step`
+    of 0 parts nothing.
     """
     if step <= 0:
-        return numbered(connected(mask, z, np.inf))
-    number = absorbed(numbered(connected(mask, z, min(1.0, step))), z, smallest)
+        return connected(mask, z, np.inf)
+    number = absorbed(connected(mask, z, min(1.0, step)), z, smallest)
     return joined(number, z, step)
-
-
-def numbered(first: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Parts numbered from 0 in the order of what they are called; below 0 is nothing."""
-    inside = first >= 0
-    if not inside.any():
-        return np.full(first.shape, -1, np.int64)
-    known = np.zeros(int(first.max()) + 1, bool)
-    known[first[inside]] = True
-    place = np.cumsum(known, dtype=np.int32) - 1
-    return np.where(inside, place[first], np.int64(-1))
 
 
 def absorbed(number: NDArray[np.int64], z: NDArray, smallest: int) -> NDArray[np.int64]:
     """Parts without the small ones that have a neighbor."""
-    size, shared = np.bincount(number[number >= 0]).tolist(), _shared(number, z, np.inf)
-    into = list(range(len(size)))
-    waiting = [(n, part) for part, n in enumerate(size) if n < smallest]
-    heapq.heapify(waiting)
-    while waiting:
-        n, part = heapq.heappop(waiting)
-        if into[part] != part or n != size[part] or not shared[part]:
-            continue
-        # The longest border; of equal ones the part that begins first.
-        other = min(shared[part], key=lambda p: (-shared[part][p][0], p))
-        keep = _merge(part, other, into, size, shared)
-        if size[keep] < smallest:
-            heapq.heappush(waiting, (size[keep], keep))
-    return _renamed(number, into)
+    while True:
+        a, b, length, _ = _shared(number, z, np.inf)
+        size = np.bincount(number[number >= 0])
+        a, b, length = np.r_[a, b], np.r_[b, a], np.r_[length, length]
+        order = np.lexsort((b, -length, a))  # the longest border; of equal ones the part that begins first
+        order = order[size[a[order]] < smallest]
+        small, first = np.unique(a[order], return_index=True)
+        if not len(small):
+            return number
+        number = _renamed(number, _sets(small, b[order][first], len(size)))
 
 
 def joined(number: NDArray[np.int64], z: NDArray, step: float) -> NDArray[np.int64]:
     """Parts with those put together whose heights meet along enough of their border."""
-    size, shared = np.bincount(number[number >= 0]).tolist(), _shared(number, z, step)
-    into = list(range(len(size)))
-
-    def entry(a: int, b: int) -> tuple[float, int, int, int, int]:
-        length, near = shared[a][b]
-        return -near / length, min(a, b), max(a, b), length, near
-
-    waiting = [entry(a, b) for a in range(len(size)) for b in shared[a] if a < b]
-    heapq.heapify(waiting)
-    while waiting:
-        near, a, b, *state = heapq.heappop(waiting)
-        if into[a] != a or into[b] != b or shared[a].get(b) != tuple(state) or -near < _SHARE:
-            continue
-        keep = _merge(a, b, into, size, shared)
-        for other in shared[keep]:
-            heapq.heappush(waiting, entry(keep, other))
-    return _renamed(number, into)
+    while True:
+        a, b, length, near = _shared(number, z, step)
+        meets = near >= _SHARE * length
+        if not meets.any():
+            return number
+        number = _renamed(number, _sets(a[meets], b[meets], int(number.max()) + 1))
 
 
-def _shared(number: NDArray[np.int64], z: NDArray, step: float) -> list[dict[int, tuple[int, int]]]:
-    """Of each part its neighbors: how long the border is, in cells, and along how much of it heights are within step."""
-    shared: list[dict[int, tuple[int, int]]] = [{} for _ in range(int(number.max(initial=-1)) + 1)]
+def _shared(number: NDArray[np.int64], z: NDArray, step: float) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Neighboring parts, the lower number first; how long their border is, in cells, and how much of it is within step."""
     pairs = borders(number, z, step)
-    if len(pairs):
-        pair = pairs[:, 0] * len(shared) + pairs[:, 1]
-        ends, which, length = np.unique(pair, return_inverse=True, return_counts=True)
-        near = np.bincount(which, weights=pairs[:, 2]).astype(np.int64)
-        for both, n, m in zip(ends.tolist(), length.tolist(), near.tolist(), strict=True):
-            a, b = divmod(both, len(shared))
-            shared[a][b] = shared[b][a] = (n, m)
-    return shared
+    both, which, length = np.unique(pairs[:, :2], axis=0, return_inverse=True, return_counts=True)
+    return (
+        both[:, 0],
+        both[:, 1],
+        length,
+        np.bincount(which.ravel(), weights=pairs[:, 2], minlength=len(both)),
+    )
 
 
-def _merge(a: int, b: int, into: list[int], size: list[int], shared: list[dict[int, tuple[int, int]]]) -> int:
-    """Put two parts together; the one that begins first stays."""
-    keep, gone = min(a, b), max(a, b)
-    into[gone] = keep
-    size[keep] += size[gone]
-    for p, (n, m) in shared[gone].items():
-        del shared[p][gone]
-        if p != keep:
-            before = shared[keep].get(p, (0, 0))
-            shared[keep][p] = shared[p][keep] = before[0] + n, before[1] + m
-    return keep
-
-
-def _renamed(number: NDArray[np.int64], into: list[int]) -> NDArray[np.int64]:
-    for part in range(len(into)):  # a part goes into one that begins before it
-        into[part] = into[into[part]]
-    return numbered(np.where(number >= 0, np.array([*into, -1], np.int64)[number], -1))
+def _renamed(number: NDArray[np.int64], name: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.where(number >= 0, name[number], -1)

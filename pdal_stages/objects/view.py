@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from . import crowns, roofs
 from .cells import GROUND_CELLS, MM, Cells, Kind, unpack
@@ -20,6 +21,8 @@ MARGIN = GROUND_REACH + 2 * crowns.REACH
 GROWTH = 3.0
 #: How far the cells of a roof from which nothing came back lie from its rim at most, meters.
 DARK = 6.0
+#: A cell and its eight neighbors.
+AROUND = np.ones((3, 3), bool)
 #: Cells of a window beyond which no more is looked at around a block: objects that reach farther are cut, and say so.
 MOST_CELLS = 64_000_000
 
@@ -145,8 +148,8 @@ def whole(
     view, around = near, near.seen.rows - core.rows >> 1
     while True:
         mask = masked(view)
-        wide = roofs.dilated(mask) if beside else mask
-        first = roofs.connected(wide, np.zeros(mask.shape), np.inf)
+        first, _ = ndimage.label(ndimage.binary_dilation(mask, AROUND) if beside else mask)
+        first -= 1
         sure = widened(view.seen, -margin)
         reached = np.zeros(mask.size + 1, bool)  # the last: no part
         reached[first[_part(view.window, core)]] = True

@@ -46,7 +46,6 @@ SITES = {
     "base/projection:_rewrite": "records kept",
     "pipeline/las_output:_compress": "writers.las .laz 1.4",
     "commands/models:_compare_objects": _WHOLE,
-    "base/apart:answer": "opens a pipe",
     "pipeline/correcting:_write": _WHOLE,
     "pipeline/reviewing:write_review": _WHOLE,
     "pipeline/run:Pipeline._execute": "writers.las .las",
