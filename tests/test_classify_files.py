@@ -15,10 +15,7 @@ import pytest
 
 from pdal_stages.cli import main
 from pdal_stages.pipeline import pdal as pdal_env
-from pdal_stages.pipeline.classify_request import ClassifyRequest
 from pdal_stages.pipeline.inputs_outputs import overlooked
-from pdal_stages.tiling import TilingOptions, sizing
-from pdal_stages.tiling.classify import ClassifyTask
 
 pytestmark = pytest.mark.pdal
 
@@ -283,28 +280,6 @@ def test_dimensions_are_chosen(folder, classify, tmp_path, words, made):
     assert sorted(d.name for d in extra) == made and all(d.dtype == np.float32 for d in extra)
 
 
-def test_a_second_record_of_extra_dimensions_is_named_and_left_out(classify, tmp_path, write_las):
-    # As files have that two programs gave dimensions: PDAL reads the first record.
-    rng = np.random.default_rng(0)
-    arrays = {**dict(zip("XY", rng.uniform(0, 30, (2, 500)), strict=True)), "Z": rng.normal(0, 0.02, 500)}
-    for name in ("Amplitude", "Width"):
-        arrays[name] = rng.random(500).astype("f4")
-    write_las(tmp_path / "a.las", arrays, point_format=6)
-    data = (tmp_path / "a.las").read_bytes()
-    at = data.index(b"Amplitude") - 4 - 54  # one record of two entries becomes two of one
-    head, entries, rest = data[at : at + 54], data[at + 54 : at + 54 + 384], data[at + 54 + 384 :]
-    one = head[:20] + (192).to_bytes(2, "little") + head[22:]
-    start = bytearray(data[:at])
-    start[96:100] = (int.from_bytes(data[96:100], "little") + 54).to_bytes(4, "little")
-    start[100:104] = (int.from_bytes(data[100:104], "little") + 1).to_bytes(4, "little")
-    (tmp_path / "b.las").write_bytes(start + one + entries[:192] + one + entries[192:] + rest)
-    code, _, err = classify(tmp_path / "b.las", tmp_path / "o.las")
-    assert code == 0 and "second record" in err and "Width" in err, err
-    made = laspy.read(tmp_path / "o.las")
-    assert set(made.point_format.extra_dimension_names) == {"Amplitude", "HeightAboveGround", "Reliability"}
-    assert np.array_equal(made["Amplitude"], arrays["Amplitude"])
-
-
 @pytest.mark.parametrize("suffix", ["txt", "ply"])
 @pytest.mark.parametrize(("words", "made"), [("none", []), ("Margin", ["margin"]), (None, ["reliability"])])
 def test_dimensions_are_chosen_for_text_and_ply(folder, classify, tmp_path, suffix, words, made):
@@ -340,25 +315,6 @@ def test_copc_or_a_refusal(folder, classify, tmp_path, capsys):
     (tmp_path / "job.json").write_text(plain)
     assert main(["pipeline", str(tmp_path / "job.json")]) == 1
     assert "writers.copc" in capsys.readouterr().err
-
-
-def test_what_goes_past_pdal_fits_where_other_files_do_not(folder, tmp_path, write_las):
-    """190 bytes a point, or 285: the file is worked on in one piece where PDAL shows on its first points that it can be."""
-    rng = np.random.default_rng(0)
-    arrays = {axis: rng.uniform(0, 30, 500) for axis in "XYZ"} | {"Classification": np.ones(500, np.uint8)}
-    source = write_las(tmp_path / "one.laz", arrays, point_format=6)
-
-    def in_one_piece(a_point, target):
-        memory = TilingOptions(memory=sizing.BASE + sizing.BLOCKS + 500 * a_point)
-        request = ClassifyRequest(str(folder / "m.model"))
-        return ClassifyTask((str(source),), str(tmp_path / target), request, memory).in_one_piece()
-
-    assert sizing.DIRECT_POINT < 200 < sizing.TILE_POINT
-    assert in_one_piece(200, "out.laz") and in_one_piece(200, "out/")
-    assert not in_one_piece(180, "out.laz")
-    assert not in_one_piece(200, "out.ply")  # which PDAL writes
-    assert in_one_piece(300, "out.ply")
-    assert [path.name for path in tmp_path.iterdir()] == ["one.laz"]
 
 
 def test_files_in_folders_below_are_said(tmp_path):

@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 
 import pdal_stages as ps
-from pdal_stages.base.version import __version__
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
 from pdal_stages.plugin import arrival, building, declarations, places
@@ -197,8 +196,10 @@ def test_no_stage_is_forgotten():
     assert set(registry.stages()) <= tested
 
 
-@pytest.mark.parametrize("name", STAGES)
-@pytest.mark.parametrize("where", [None, "X > 500030 && Classification != 6"])
+@pytest.mark.parametrize(
+    ("name", "where"),
+    [*((name, None) for name in STAGES), ("hag_morphological", "X > 500030 && Classification != 6")],
+)
 def test_a_stage_gives_the_same_bytes(pipeline, town, tmp_path, name, where):
     stage = {**STAGES[name], **({"where": where} if where else {})}
     heights = [
@@ -233,32 +234,6 @@ def test_objects_are_written(pipeline, python, town, tmp_path, door):
         stock, ours = (json.loads((tmp_path / f"{name}{layer}").read_text()) for name in ("stock", "ours"))
         assert stock["features"] == ours["features"]
         assert stock["features"] or layer != "_buildings.geojson"
-
-
-def test_polygons_in_the_program(pipeline, town, tmp_path):
-    """The same bytes, and the same errors before any point is read."""
-    pytest.importorskip("pyogrio")
-    x, y = (np.asarray(laspy.read(town)[name]) for name in "xy")
-    ring = [
-        [x.min(), y.min()],
-        [x.mean(), y.min()],
-        [x.mean(), y.max()],
-        [x.min(), y.max()],
-        [x.min(), y.min()],
-    ]
-    lakes = tmp_path / "lakes.geojson"
-    shape = {"type": "Feature", "properties": {}, "geometry": {"type": "Polygon", "coordinates": [ring]}}
-    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}
-    lakes.write_text(json.dumps({"type": "FeatureCollection", "crs": crs, "features": [shape]}))
-    stages = [str(town), {"type": "filters.polygons", "polygons": [f"{lakes}=9"]}]
-    pipeline(las(stages, tmp_path / "stock.laz"))
-    ps.Pipeline(las(stages, tmp_path / "ours.laz")).execute()
-    assert_same(tmp_path / "stock.laz", tmp_path / "ours.laz")
-    assert np.count_nonzero(laspy.read(tmp_path / "ours.laz").classification == 9) > 100
-    wrong = [str(town), {"type": "filters.polygons", "polygons": [f"{tmp_path / 'gone.gpkg'}=9"]}]
-    said = pipeline(las(wrong, tmp_path / "o.laz"), code=1).stderr
-    assert "filters.polygons: " in said and "the file of polygons does not exist" in said
-    assert not (tmp_path / "o.laz").exists()
 
 
 def _words(name, town, halves, models, folder):
@@ -327,24 +302,6 @@ def test_translate(stock, town, tmp_path):
     assert_same(tmp_path / "t.laz", tmp_path / "o.laz")
 
 
-def test_between_stages_of_pdal(pipeline, town, tmp_path):
-    """Filters and writers of PDAL before and after, one of our stages in the middle."""
-    pipeline(
-        [
-            str(town),
-            {"type": "filters.outlier"},
-            {"type": "filters.hag_minima", "cell": 10},
-            {"type": "filters.range", "limits": "HeightAboveGround[2:]"},
-            {"type": "filters.sort", "dimension": "X"},
-            {"type": "writers.text", "filename": str(tmp_path / "o.csv"), "order": "X,HeightAboveGround"},
-        ]
-    )
-    table = np.loadtxt(tmp_path / "o.csv", delimiter=",", skiprows=1)
-    assert 1000 < len(table) < 18000
-    assert (table[:, 1] >= 2).all()
-    assert (np.diff(table[:, 0]) >= 0).all()
-
-
 # ---- views -------------------------------------------------------------------------------------------------
 
 
@@ -361,22 +318,6 @@ def test_points_of_several_readers_see_each_other(pipeline, halves, tmp_path):
         pipeline(las(stages, tmp_path / "stock.laz"))
         ps.Pipeline(las(stages, tmp_path / "ours.laz")).execute()
         assert_same(tmp_path / "stock.laz", tmp_path / "ours.laz")
-
-
-def test_pieces_stay_pieces(pipeline, town, tmp_path):
-    stages = [
-        str(town),
-        {"type": "filters.splitter", "length": 30, "origin_x": 500000, "origin_y": 5400000},
-        {"type": "filters.hag_minima", "cell": 7},
-    ]
-    for door in ("stock", "ours"):
-        (tmp_path / door).mkdir()
-        whole = las(stages, tmp_path / door / "o_#.laz")
-        pipeline(whole) if door == "stock" else ps.Pipeline(whole).execute()
-    names = sorted(path.name for path in (tmp_path / "ours").iterdir())
-    assert len(names) >= 4
-    for name in names:
-        assert_same(tmp_path / "stock" / name, tmp_path / "ours" / name)
 
 
 def test_points_outside_where_are_neighbors(pipeline, town, tmp_path):
@@ -502,12 +443,6 @@ def test_errors_of_the_work(pipeline, town, models, tmp_path):
     assert "not finite" in finite and "1 of 2 points" in finite
     assert "numpy" not in missing + required + finite and "of a stage that failed" not in finite
     assert not out.exists()
-
-
-def test_a_check_alone_finds_them_too(pipeline, town, tmp_path):
-    stages = las([str(town), {"type": "filters.hag_minima", "cell": -1}], tmp_path / "o.laz")
-    said = json.loads(pipeline(stages, "--validate").stdout)
-    assert said["valid"] is False and "option 'cell'" in said["error_detail"]
 
 
 def test_a_package_that_is_missing(pipeline, environment, town, tmp_path):
@@ -644,33 +579,6 @@ def test_runs_again_and_in_threads(python, town):
     )
 
 
-def test_in_two_processes_at_once(environment, pdal_program, town, tmp_path):
-    running = []
-    for n in range(2):
-        path = tmp_path / f"{n}.json"
-        path.write_text(json.dumps(las([str(town), {"type": "filters.hag_minima"}], tmp_path / f"{n}.laz")))
-        running.append(subprocess.Popen([pdal_program, "pipeline", str(path)], env=environment))
-    assert [one.wait(timeout=120) for one in running] == [0, 0]
-    assert_same(tmp_path / "0.laz", tmp_path / "1.laz")
-
-
-def test_stages_that_never_run_are_forgotten(python, town):
-    python(
-        "import json, pdal\n"
-        "from pdal_stages.plugin import arrival\n"
-        f"stages = [{str(town)!r}, dict(type='filters.hag_minima')]\n"
-        "for n in range(40):\n"
-        "    try:\n"
-        "        pdal.Pipeline(json.dumps([*stages, dict(type='filters.hag_minima', cell=-1)])).execute()\n"
-        "    except RuntimeError:\n"
-        "        pass\n"
-        "assert len(arrival._prepared) <= arrival._KEPT\n"
-        "arrival._prepared.clear()\n"
-        "pdal.Pipeline(json.dumps(stages)).execute()\n"
-        "assert not arrival._prepared\n"
-    )
-
-
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_ctrl_c_ends_pdal_at_once(environment, pdal_program, town, models, tmp_path):
     out = tmp_path / "o.laz"
@@ -727,15 +635,6 @@ def test_install_check_uninstall(tmp_path, plugin, monkeypatch, capsys):
     assert [path.name for path in folder.iterdir()] == ["libpdal_plugin_filter_other.so"]
     assert building.uninstall(folder) == []
     assert (tmp_path / "outside.so").exists()
-
-
-def test_a_plugin_that_pip_installed(tmp_path, monkeypatch):
-    monkeypatch.setattr(building, "_by_pip", lambda: __version__)
-    assert any("pdal-stages-plugin" in line for line in building.check(tmp_path)[0])
-    monkeypatch.setattr(building, "_by_pip", lambda: "0.0.1")
-    assert "of another version" in building.check(tmp_path)[1][-1]
-    with pytest.raises(ps.StageError, match="pip uninstall pdal-stages-plugin"):
-        building.uninstall(tmp_path)
 
 
 def test_what_is_missing_is_told(tmp_path, monkeypatch):

