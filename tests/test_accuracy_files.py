@@ -59,25 +59,6 @@ def test_each_file_has_its_line_and_each_place_its_map(tmp_path, write_las, capf
 
 
 @pytest.mark.pdal
-@pytest.mark.parametrize("several", [False, True])
-def test_vegetation_is_one_class_where_one_was_predicted(tmp_path, write_las, capsys, several):
-    points = scene(3)
-    points["Reference"] = np.where(
-        points["Classification"] == 6, np.arange(len(points["X"])) % 3 + 3, 2
-    ).astype("u1")
-    points["Classification"] = np.where(points["Classification"] == 6, 5, 2).astype("u1")
-    write_las(tmp_path / "a.laz", points, point_format=6)
-    write_las(tmp_path / "b.laz", {**points, "X": points["X"] + 100}, point_format=6)
-    files = [str(tmp_path / f"{name}.laz") for name in ("a", "b")[: 1 + several]]
-    assert main(["accuracy", *files, "--json", str(tmp_path / "a.json")]) == 0
-    assert "of the reference 3 and 4 count as 5" in capsys.readouterr().err
-    said = json.loads((tmp_path / "a.json").read_text())
-    assert said["overall_accuracy"] == 1.0 and said["merged"] == {"3": 5, "4": 5}
-    assert main(["accuracy", *files, "--filters.accuracy.merge={}"]) == 0
-    assert "count as 5" not in capsys.readouterr().err
-
-
-@pytest.mark.pdal
 def test_a_model_is_scored_by_one_option(tmp_path, write_las, capsys):
     for number in range(2):
         write_las(tmp_path / f"t{number}.laz", scene(number, 100.0 * number), point_format=6)

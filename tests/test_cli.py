@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
-from collections import Counter
 
 import laspy
 import numpy as np
 import pytest
 
-from pdal_stages.classifier import modelfile
-from pdal_stages.classifier.featureforest import shared_features
 from pdal_stages.cli import main
-from pdal_stages.features import FeaturePlan
-from pdal_stages.pipeline import Pipeline
 from pdal_stages.stages import registry
-from pdal_stages.stages.modelclassifier import ModelClassifier
 
 pytestmark = pytest.mark.pdal
 
@@ -194,32 +187,6 @@ def test_train_model_classify_accuracy(cloud, tmp_path, capsys):
     assert (tmp_path / "a.html").stat().st_size > 10_000
 
 
-def test_classifying_does_each_thing_once(cloud, tmp_path, capsys, monkeypatch):
-    """The model is read once and its plan is made once; the stage is made to say what it writes, and to run."""
-    model = tmp_path / "m.model"
-    words = ["--neighborhoods", "c1", "--count", 50, "--writers.classifiermodel.trees=2"]
-    assert run(capsys, "train", cloud, "--model", model, *words)[0] == 0
-    counts: Counter[str] = Counter()
-    shared_features.cache_clear()
-
-    def count(owner, name):
-        original = getattr(owner, name)
-
-        def counted(*given, **more):
-            counts[f"{owner.__name__}.{name}"] += 1
-            return original(*given, **more)
-
-        monkeypatch.setattr(owner, name, counted)
-
-    count(modelfile, "read")
-    count(FeaturePlan, "__post_init__")
-    count(ModelClassifier, "__init__")
-    count(Pipeline, "__init__")
-    assert run(capsys, "classify", cloud, tmp_path / "out.laz", "--model", model)[0] == 0
-    assert counts.pop("ModelClassifier.__init__") == 2
-    assert set(counts.values()) == {1} and len(counts) == 3, counts
-
-
 def test_flags_of_old_files_are_no_classes(tmp_path, capsys, write_las, random_cloud):
     """PDAL 2.2 reads the key-point flag of LAS 1.2 into the class: 5 becomes 69."""
     xyz = random_cloud(60)
@@ -242,13 +209,6 @@ def test_flags_of_old_files_are_no_classes(tmp_path, capsys, write_las, random_c
         assert code == 0, err
         figures = json.loads((tmp_path / "a.json").read_text())
         assert figures["overall_accuracy"] == 1 and figures["predicted_outside_reference"]["points"] == 0
-
-
-def test_other_points_cannot_be_compared(cloud, tmp_path, capsys, write_las):
-    other = write_las(tmp_path / "o.las", {"X": [1.0, 2.0], "Y": [1.0, 2.0], "Z": [0.0, 0.0]}, point_format=3)
-    code, _, err = run(capsys, "accuracy", other, "--reference", cloud)
-    assert code == 1
-    assert "do not hold the same points" in err
 
 
 def test_wrong_usage(capsys, tmp_path):
@@ -279,24 +239,6 @@ def test_importing_the_package_is_light():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-
-
-def test_a_command_starts_without_what_only_some_need():
-    code = (
-        "import sys; from pdal_stages.cli import main\n"
-        "try:\n    main(['classify', '--help'])\nexcept SystemExit:\n    pass\n"
-        "heavy = {'numba', 'sklearn', 'pdal', 'scipy', 'torch', 'PIL', 'jinja2'} & set(sys.modules)\n"
-        "sys.exit(f'{heavy}' if heavy else 0)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
-def test_what_is_asked_of_one_command_ends_with_it(cloud, tmp_path, capsys, monkeypatch):
-    monkeypatch.delenv("PDAL_STAGES_PROGRESS", raising=False)
-    (tmp_path / "job.json").write_text(json.dumps([str(cloud)]))
-    assert run(capsys, "pipeline", tmp_path / "job.json", "--no-progress")[0] == 0
-    assert "PDAL_STAGES_PROGRESS" not in os.environ
 
 
 @pytest.mark.parametrize(

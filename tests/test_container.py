@@ -76,11 +76,6 @@ def test_compose_has_one_image_one_folder_and_no_open_port():
     assert len(lines) == 3 and all(line in page for line in lines)
 
 
-def test_no_host_or_mirror_is_named():
-    for path in FILES:
-        assert not re.search(r"https?://|ftp://|\b[\w-]+\.(org|com|net|io)\b", path.read_text()), path.name
-
-
 # ---- starting ----------------------------------------------------------------------------------------------------
 
 
@@ -122,39 +117,3 @@ def test_without_a_volume_the_kernels_of_any_processor_are_there(image, tmp_path
     assert Path(folder).parent == tmp_path / "tmp" and Path(folder).stat().st_mode & 0o077 == 0
     _, ((_, _, again),) = image("classify", "a.laz")
     assert again == folder and len(os.listdir(tmp_path / "tmp")) == 1
-
-
-def test_a_volume_gets_the_kernels_of_this_processor_once(image, tmp_path):
-    volume = tmp_path / "volume"
-    volume.mkdir()
-    kept = {"PDAL_STAGES_KERNELS": str(volume)}
-    ended, calls = image("doctor", **kept)
-    assert [name for name, *_ in calls] == ["doctor"], "short answers wait for nothing"
-    assert calls[0][1] != "host" and not ended.stderr
-    _, calls = image("classify", "--help", **kept)
-    assert [name for name, *_ in calls] == ["classify"]
-    ended, calls = image("classify", "a.laz", **kept)
-    assert calls == [["warmup", "host", str(volume)], ["classify", "host", str(volume)]]
-    assert "once" in ended.stderr and not ended.stdout
-    for command in ("classify", "doctor"):
-        ended, calls = image(command, **kept)
-        assert calls == [[command, "host", str(volume)]] and not ended.stderr
-
-
-def test_where_compiling_fails_the_job_runs_all_the_same(image, tmp_path):
-    volume = tmp_path / "volume"
-    volume.mkdir()
-    ended, ((command, processor, _),) = image("classify", FAIL="1", PDAL_STAGES_KERNELS=str(volume))
-    assert ended.returncode == 0 and command == "classify" and processor != "host"
-    assert "any processor" in ended.stderr
-    assert not list(volume.glob("ready-*"))
-
-
-def test_another_users_folder_is_not_believed(image, tmp_path):
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    (tmp_path / f"tmp/pdal-stages-kernels-{os.getuid()}-0123").symlink_to(elsewhere)
-    _, ((command, *rest),) = image("classify")
-    assert (
-        command == "classify" and str(elsewhere) not in rest and not any("kernels" in word for word in rest)
-    )

@@ -5,12 +5,10 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from pdal_stages import cli
-from pdal_stages.base import errors
 from pdal_stages.plugin import doctor
 
 pytestmark = pytest.mark.pdal
@@ -63,23 +61,8 @@ def test_another_python_is_told(tmp_path, monkeypatch):
     assert "did not run" in doctor._python_of("filters.python", lambda stages: None).found
 
 
-def test_how_extras_come(monkeypatch):
-    """Into the environment that scripts/setup made by that, into another one by pip."""
-    root = Path(errors.__file__).parents[2]
-    monkeypatch.setattr(sys, "prefix", str(root / ".venv"))
-    assert errors.how_to_add("vector") == f"{root}/scripts/setup vector"
-    monkeypatch.setattr(sys, "prefix", "/usr")
-    assert errors.how_to_add("vector").startswith("pip install 'pdal-stages[vector]' (from a clone: ")
-
-
 def test_extras_are_named(monkeypatch):
     monkeypatch.setattr(doctor, "_EXTRAS", {"none": ("no-such-package", "nothing")})
     monkeypatch.setattr(sys, "prefix", "/usr")  # not the environment that scripts/setup made
     (finding,) = doctor._extras()
     assert "pdal-stages[none]" in finding.cure and not finding.needed
-
-
-def test_little_memory_is_told(monkeypatch):
-    monkeypatch.setattr(doctor, "free_memory", lambda: 10**8)
-    findings = {one.what: one for one in doctor._machine()}
-    assert "--tile" in findings["free memory"].cure

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 from stage_message import message_of
 
 import pdal_stages as ps
 from pdal_stages.pipeline import runtime
-from pdal_stages.pipeline.runtime import TRAMPOLINE, run_stage
 
 pytestmark = pytest.mark.pdal
 
@@ -94,21 +91,6 @@ def test_fifty_failing_pipelines(tmp_path, body):
     assert done.stdout == "survived\n"
 
 
-def test_bytes_of_file_names_in_a_message(monkeypatch):
-    """Names with bytes that are not UTF-8, and a zero: PDAL's C++ would take neither."""
-    from pdal_stages.stages.hag_minima import HagMinima
-
-    def fails(points, options):
-        raise ps.StageError("no file '\udcff\0'")
-
-    monkeypatch.setattr(HagMinima, "run", fails)
-    outs = {"HeightAboveGround": np.zeros(1)}
-    points = {name: np.zeros(1) for name in ("X", "Y", "Z", "HeightAboveGround")}
-    assert run_stage({"pdalargs": {"stage": "filters.hag_minima"}}, points, outs) is True
-    (name,) = outs
-    assert message_of(name) == "filters.hag_minima: no file '??'."
-
-
 def test_stock_pdal_says_it_and_fails(tmp_path, pdal_program):
     text = tmp_path / "nan.txt"
     text.write_text("X,Y,Z\n1,1,1\nnan,2,2\n")
@@ -127,28 +109,6 @@ def test_stock_pdal_says_it_and_fails(tmp_path, pdal_program):
     )
     assert done.returncode == 1, (done.returncode, done.stderr)
     assert message_of(done.stderr).startswith("filters.hag_minima (tag 'h'): coordinates are not finite")
-
-
-def test_a_python_without_the_package(tmp_path, pdal_program):
-    """The trampoline itself raises nothing, so that PDAL's message says what is missing."""
-    (tmp_path / "plain.json").write_text(
-        json.dumps(
-            [
-                {"type": "readers.faux", "count": 5, "mode": "ramp", "bounds": "([0,1],[0,1],[0,1])"},
-                {
-                    "type": "filters.python",
-                    "module": "any_name",
-                    "function": "stage",
-                    "source": TRAMPOLINE.replace("pdal_stages", "pdal_stages_elsewhere"),
-                },
-            ]
-        )
-    )
-    done = subprocess.run(
-        [pdal_program, "pipeline", tmp_path / "plain.json"], capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 1, (done.returncode, done.stderr)
-    assert "ModuleNotFoundError: No module named 'pdal_stages_elsewhere'" in done.stderr
 
 
 INTERRUPTED = """

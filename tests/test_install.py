@@ -42,21 +42,6 @@ def test_shell_scripts_parse_and_are_executable(name):
     assert name.endswith(".sh") or os.access(script, os.X_OK)
 
 
-def test_ci_runs_the_readme_command_strictly():
-    text = (ROOT / ".ci/run").read_text()
-    assert "PDAL_STAGES_REQUIRE=pdal" in text
-    assert re.search(r"^exec \./scripts/test$", text, re.MULTILINE)
-    assert re.search(r"^  exec \./scripts/test --deep$", text, re.MULTILINE)
-
-
-def test_pytorch_of_the_tests_is_one_version_without_cuda():
-    said = subprocess.run(
-        [ROOT / "scripts/setup", "--torch"], capture_output=True, text=True, check=True
-    ).stdout
-    assert re.fullmatch(r"torch==\d+\.\d+\.\d+(\+cpu)?\n", said)
-    assert ("+cpu" in said) == (sys.platform != "darwin")
-
-
 @pytest.mark.parametrize(
     ("output", "message"),
     [
@@ -80,40 +65,6 @@ def test_failed_step_says_why(tmp_path, output, message):
     assert message in done.stderr and output in done.stderr and "never" not in done.stderr
 
 
-def test_step_that_works_is_timed_and_logged(tmp_path):
-    done = bash('step "The step" echo hidden', tmp_path)
-    assert done.returncode == 0 and re.fullmatch(r"  The step +\d+ s\n", done.stdout)
-    assert "hidden" in (tmp_path / "log").read_text()
-
-
-def test_packages_without_root_prints_the_command(tmp_path):
-    stubs = "installed() { false; }; may_install() { false; }; packages Compiling g++ patchelf"
-    done = bash(stubs, tmp_path)
-    assert done.returncode == 1 and "apt-get install -y --no-install-recommends g++ patchelf " in done.stderr
-    assert done.stderr.count("patchelf") == 1 and "python3-dev" in done.stderr
-
-
-@pytest.mark.parametrize("name", ["plain", "a b", "it's", "é$HOME"])
-def test_wrapper_survives_any_path(tmp_path, name):
-    venv, program = tmp_path / name / "venv", tmp_path / name / "pdal"
-    (venv / "bin").mkdir(parents=True)
-    program.write_text('#!/bin/sh\nprintf "%s\\n" "${PATH%%:*}" "$PDAL_DRIVER_PATH" "$@"\n')
-    program.chmod(0o755)
-    made = bash('write_wrapper "$V" "$P" "$V/plugins"', tmp_path, V=str(venv), P=str(program))
-    assert made.returncode == 0, made.stderr
-    environment = {k: v for k, v in os.environ.items() if k != "PDAL_DRIVER_PATH"}
-    command = [venv / "bin/pdal", "info", "x y"]
-    said = subprocess.run(
-        command, env=environment, capture_output=True, text=True, check=True
-    ).stdout.splitlines()
-    assert said == [str(venv / "bin"), str(venv / "plugins"), "info", "x y"]
-    environment["PDAL_DRIVER_PATH"] = "/elsewhere"
-    said = subprocess.run(
-        command, env=environment, capture_output=True, text=True, check=True
-    ).stdout.splitlines()
-    assert said[1] == "/elsewhere"
-
-
 # ---- PDAL's check and patches ----------------------------------------------------------------------------
 
 
@@ -130,16 +81,6 @@ def test_check_pdal_names_what_is_missing():
     command = [sys.executable, "-I", "-S", ROOT / "scripts/check_pdal.py"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 1 and "import pdal" in done.stderr
-
-
-@pytest.mark.pdal
-def test_check_pdal_refuses_another_interpreters_program(tmp_path):
-    fake = tmp_path / "pdal"
-    fake.write_text("#!/bin/sh\necho wrong interpreter >&2\nexit 1\n")
-    fake.chmod(0o755)
-    command = [sys.executable, ROOT / "scripts/check_pdal.py", "--program", fake]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 1 and "wrong interpreter" in done.stderr
 
 
 def test_patch_refuses_unexpected_sources(tmp_path):
@@ -166,19 +107,6 @@ def repository_files():
             path = Path(folder, name)
             if path.suffix in {".py", ".md", ".sh", ".toml", ".yml", ".yaml", ".json", ".cfg", ".txt", ""}:
                 yield path
-
-
-def test_no_registry_or_mirror_is_named():
-    host = re.compile(
-        r"https?://[\w.-]*(pypi|pythonhosted|debian|ubuntu|anaconda|conda-forge)[\w.-]*", re.IGNORECASE
-    )
-    found = [
-        f"{path.relative_to(ROOT)}: {match.group()}"
-        for path in repository_files()
-        if path.name != Path(__file__).name
-        for match in host.finditer(path.read_text(encoding="utf-8", errors="replace"))
-    ]
-    assert not found
 
 
 def project():

@@ -203,42 +203,6 @@ def test_what_cannot_stream_says_so(cloud, pdal_module):
     assert pipeline.execute() == 2000
 
 
-def test_data_frames(cloud, pdal_module):
-    needs_bindings(3, 2)
-    pandas = pytest.importorskip("pandas")
-    pipeline = pdal_module.Reader.las(str(cloud)) | ps.Filter.hag_minima()
-    pipeline.execute()
-    frame = pipeline.get_dataframe(0)
-    assert isinstance(frame, pandas.DataFrame) and frame["HeightAboveGround"].max() > 3
-    again = pdal_module.Pipeline(ps.Filter.hag_minima(cell=10).stages, dataframes=[frame[["X", "Y", "Z"]]])
-    assert again.execute() == 2000
-    assert np.allclose(
-        again.arrays[0]["HeightAboveGround"], hag_minima(*(frame[n].to_numpy() for n in "XYZ"), cell=10)
-    )
-
-
-def test_stream_handlers(pdal_module):
-    """Points that come in pieces reach our stage as one cloud."""
-    needs_bindings(3, 5)
-    rng = np.random.default_rng(2)
-    whole = np.zeros(900, [("X", "f8"), ("Y", "f8"), ("Z", "f8")])
-    for name in "XYZ":
-        whole[name] = rng.uniform(0, 40, 900)
-    buffer, sent = np.zeros(300, whole.dtype), iter((0, 300, 600))
-
-    def more() -> int:
-        start = next(sent, None)
-        if start is None:
-            return 0
-        buffer[:] = whole[start : start + 300]
-        return 300
-
-    pipeline = pdal_module.Pipeline(ps.Filter.hag_minima().stages, arrays=[buffer], stream_handlers=[more])
-    assert pipeline.execute() == 900
-    assert np.array_equal(pipeline.arrays[0]["X"], whole["X"])
-    assert np.allclose(pipeline.arrays[0]["HeightAboveGround"], hag_minima(*(whole[n] for n in "XYZ")))
-
-
 def test_every_join_that_python_pdal_lets_us_have(cloud, pdal_module):
     """With | between its objects and ours, on either side; only its own object before a ps.Pipeline raises there."""
     hag, head = {"type": "filters.hag_minima"}, pdal_module.Filter.head(count=5)

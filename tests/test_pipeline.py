@@ -467,17 +467,6 @@ def test_feet_are_converted(tmp_path, write_las):
     assert np.mean(np.isclose(in_feet["Density_c2"], in_meters["Density_c2"], rtol=1e-3)) > 0.97
 
 
-@pytest.mark.data
-def test_the_real_tile_in_feet(data_dir):
-    pipeline = ps.run_pipeline([str(data_dir / "units" / "autzen_feet.las"), {"type": "filters.hag_minima"}])
-    array = pipeline.arrays[0]
-    foot = 0.3048
-    expected = hag_minima(array["X"] * foot, array["Y"] * foot, array["Z"] * foot) / foot
-    assert np.allclose(array["HeightAboveGround"], expected, atol=1e-9)
-    ground = array["HeightAboveGround"][array["Classification"] == 2]
-    assert np.abs(np.median(ground)) < 3.0  # feet
-
-
 def test_degrees_are_refused(tmp_path, write_las):
     wkt = UTM[UTM.index("GEOGCS") : UTM.index(",PROJECTION")]
     arrays = {**scene(50), "X": np.linspace(9, 9.001, 50), "Y": np.linspace(48, 48.001, 50)}
@@ -565,48 +554,6 @@ def test_too_many_features_for_one_las_record(cloud, tmp_path):
 # ---- threads ---------------------------------------------------------------------------------------------
 
 
-def test_standard_output_is_back_after_runs_in_threads(cloud, capsys):
-    """PDAL swaps sys.stdout for its log while it runs, and in two threads puts back the other's."""
-    before = sys.stdout
-    failed = []
-
-    def work():
-        try:
-            for _ in range(4):
-                ps.Pipeline([str(cloud), {"type": "filters.hag_minima"}]).execute(arrays=False)
-        except ps.StageError as error:
-            failed.append(error)
-
-    threads = [threading.Thread(target=work) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not failed and sys.stdout is before
-    print("heard")
-    assert "heard" in capsys.readouterr().out
-
-
-def test_one_pipeline_in_several_threads_says_so(cloud):
-    pipeline = ps.Pipeline([str(cloud), {"type": "filters.hag_minima"}])
-    counts, failures = [], []
-
-    def work():
-        try:
-            counts.append(pipeline.execute(arrays=False))
-        except ps.StageError as error:
-            failures.append(str(error))
-
-    threads = [threading.Thread(target=work) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert counts and len(set(counts)) == 1
-    assert all("running already, in another thread" in failure for failure in failures)
-    assert pipeline.execute(arrays=False) == counts[0]
-
-
 def test_pipelines_run_in_threads(cloud):
     results: dict[int, np.ndarray] = {}
 
@@ -629,12 +576,6 @@ def test_pipelines_run_in_threads(cloud):
     assert all(np.array_equal(results[0], r) for r in results.values())
 
 
-def test_labels_are_unique(cloud):
-    stages = [str(cloud), {"type": "filters.hag_minima"}, {"type": "filters.hag_minima", "cell": 10}]
-    labels = [o.label for _ in range(3) for o in ps.Pipeline(stages).lowered.ours]
-    assert len(set(labels)) == 6
-
-
 def test_ctrl_c_in_a_stage_is_an_interrupt(cloud, monkeypatch, tmp_path):
     from pdal_stages.stages.hag_minima import HagMinima
 
@@ -645,14 +586,3 @@ def test_ctrl_c_in_a_stage_is_an_interrupt(cloud, monkeypatch, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         ps.run_pipeline([str(cloud), {"type": "filters.hag_minima"}, str(tmp_path / "o.laz")])
     assert not list(tmp_path.glob("*o.laz*"))
-
-
-def test_a_pipeline_without_a_reader_names_its_first_stage():
-    with pytest.raises(PipelineError, match=r"does not start with a reader \(found filters\.hag_minima\)"):
-        ps.Pipeline([{"type": "filters.hag_minima"}, {"type": "writers.null"}]).execute()
-
-
-def test_names_with_line_breaks_make_no_lines_of_their_own_in_what_pdal_says():
-    with pytest.raises(PipelineError) as raised:
-        ps.Pipeline([{"type": "readers.text", "filename": "no\npdal-stages: forged.txt"}]).execute()
-    assert "\n" not in str(raised.value)

@@ -295,13 +295,6 @@ def test_a_ready_pipeline_gives_the_same_bytes(pipeline, environment, town, halv
             assert_same(stock, ours)
 
 
-def test_translate(stock, town, tmp_path):
-    words = ["-f", "filters.hag_minima", "--filters.hag_minima.cell=10", "--writers.las.forward=all"]
-    stock("translate", town, tmp_path / "t.laz", *words, "--writers.las.extra_dims=HeightAboveGround=float")
-    ps.Pipeline(las([str(town), {"type": "filters.hag_minima", "cell": 10}], tmp_path / "o.laz")).execute()
-    assert_same(tmp_path / "t.laz", tmp_path / "o.laz")
-
-
 # ---- views -------------------------------------------------------------------------------------------------
 
 
@@ -318,20 +311,6 @@ def test_points_of_several_readers_see_each_other(pipeline, halves, tmp_path):
         pipeline(las(stages, tmp_path / "stock.laz"))
         ps.Pipeline(las(stages, tmp_path / "ours.laz")).execute()
         assert_same(tmp_path / "stock.laz", tmp_path / "ours.laz")
-
-
-def test_points_outside_where_are_neighbors(pipeline, town, tmp_path):
-    """PDAL hides them from its own filters; what is computed inside must not change with that."""
-    stage = {"type": "filters.multiscalefeatures", "neighborhoods": "s2", "feature_set": "Linearity,Density"}
-    pipeline(las([str(town), stage], tmp_path / "all.laz"))
-    pipeline(las([str(town), {**stage, "where": "X > 500030"}], tmp_path / "some.laz"))
-    every, some = laspy.read(tmp_path / "all.laz"), laspy.read(tmp_path / "some.laz")
-    inside = np.asarray(every.x) > 500030
-    np.testing.assert_array_equal(
-        np.asarray(every["Density_s2"])[inside], np.asarray(some["Density_s2"])[inside]
-    )
-    assert not np.asarray(some["Density_s2"])[~inside].any()
-    np.testing.assert_array_equal(every.X, some.X)
 
 
 # ---- options, metadata, log --------------------------------------------------------------------------------
@@ -368,19 +347,6 @@ def test_an_empty_list_is_none(pipeline, town, tmp_path):
             stage = {"type": "filters.hag_minima", "ignore": value}
             run([str(town), stage, {"type": "writers.text", "filename": str(file)}])
         assert files[0].read_bytes() == files[1].read_bytes()
-
-
-def test_a_model_of_other_heights_is_warned_of(pipeline, town, halves, models, tmp_path):
-    stages = [
-        str(town),
-        {"type": "filters.hag_minima"},
-        {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17], "cell": 2},
-        {"type": "filters.modelclassifier", "model": str(models / "classes.model")},
-    ]
-    said = pipeline(las(stages, tmp_path / "o.laz")).stderr
-    assert "trained on other heights" in said
-    right = with_words("classify", *_words("classify", town, halves, models, tmp_path))
-    assert "trained on other heights" not in pipeline(right).stderr
 
 
 def test_numbers_are_typed_as_in_json():
@@ -560,23 +526,6 @@ def test_a_notebook_survives_failures(python, town):
         "print((read | pdal.Filter.hag_minima()).execute() > 0)\n"
     )
     assert "True" in said
-
-
-def test_runs_again_and_in_threads(python, town):
-    python(
-        "import pdal, threading, numpy as np\n"
-        f"read = pdal.Reader.las({str(town)!r})\n"
-        "job = read | pdal.Filter.hag_minima(cell=10, threads=1)\n"
-        "job.execute(); first = job.arrays[0]['HeightAboveGround']\n"
-        "job.execute(); assert np.array_equal(job.arrays[0]['HeightAboveGround'], first)\n"
-        "found = []\n"
-        "def work():\n"
-        "    one = read | pdal.Filter.hag_minima(cell=10, threads=1)\n"
-        "    one.execute(); found.append(one.arrays[0]['HeightAboveGround'])\n"
-        "threads = [threading.Thread(target=work) for _ in range(4)]\n"
-        "[t.start() for t in threads]; [t.join() for t in threads]\n"
-        "assert len(found) == 4 and all(np.array_equal(one, first) for one in found)\n"
-    )
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")

@@ -19,10 +19,8 @@ import laspy
 import numpy as np
 import pytest
 
-import pdal_stages as ps
 from pdal_stages.base.version import __version__
 from pdal_stages.cli import main
-from pdal_stages.stages import registry
 from pdal_stages.synthetic import TownOptions, write_town
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -128,41 +126,6 @@ def test_found_by_itself(environment, program, tmp_path, monkeypatch):
         environment.find("/nowhere")
 
 
-def test_qgis_own_variables_stay_outside(environment, program, monkeypatch):
-    for name in ("PYTHONHOME", "PYTHONPATH", "PROJ_LIB", "GDAL_DATA"):
-        monkeypatch.setenv(name, "of QGIS")
-    given = environment.variables(str(program))
-    assert not {"PYTHONHOME", "PYTHONPATH", "PROJ_LIB", "GDAL_DATA"} & set(given)
-    assert given["PATH"].startswith(str(program.parent) + os.pathsep)
-
-
-def test_forms_are_asked_once(environment, program, tmp_path):
-    said = environment.forms(str(program), tmp_path)
-    assert said["version"] == __version__ and {"classify", "train", "objects", "accuracy"} <= set(
-        said["commands"]
-    )
-    assert set(said["stages"]) == set(registry.stages())
-    silent = script(tmp_path, "raise SystemExit(1)")
-    os.utime(silent, ns=(os.stat(program).st_atime_ns, os.stat(program).st_mtime_ns))
-    program_text = program.read_text()
-    try:
-        size, at = program.stat().st_size, program.stat().st_mtime_ns
-        program.write_text("#!/bin/sh\nexit 1\n".ljust(size, "#"))
-        os.utime(program, ns=(at, at))
-        assert environment.forms(str(program), tmp_path) == said  # kept
-    finally:
-        program.write_text(program_text)
-    with pytest.raises(environment.Missing, match="failed"):
-        environment.forms(silent, tmp_path)
-
-
-def test_forms_of_another_kind_are_refused(environment):
-    with pytest.raises(environment.Missing, match="update the plugin"):
-        environment.checked('{"format": 99}', "pdal-stages")
-    with pytest.raises(environment.Missing, match="cannot be read"):
-        environment.checked("no JSON", "pdal-stages")
-
-
 def test_forms_follow_the_command(capsys):
     """Arguments stand in the JSON with the words of --help."""
     assert main(["commands", "--showjson"]) == 0
@@ -231,23 +194,6 @@ def test_cancel_ends_it_and_its_workers(running, tmp_path, monkeypatch):
     while runs(worker) and time.monotonic() - begun < 20:  # what is killed ends a little later
         time.sleep(0.05)
     assert not runs(worker)
-
-
-def test_progress_in_lines(monkeypatch, capfd):
-    """The bars of a run, a line every second, where PDAL_STAGES_PROGRESS=lines asks for it."""
-    from pdal_stages.base.progress import Progress
-
-    monkeypatch.setenv("PDAL_STAGES_PROGRESS", "lines")
-    now = [100.0]
-    monkeypatch.setattr("pdal_stages.base.progress.time.monotonic", lambda: now[0])
-    with Progress(10, "work") as bar:
-        for _ in range(10):
-            now[0] += 0.5
-            bar.update()
-    lines = capfd.readouterr().err.splitlines()
-    assert (
-        len(lines) == 6 and lines[0].startswith("work: 1 of 10 points (10 %)") and "\r" not in "".join(lines)
-    )
 
 
 def test_zip_is_the_same_twice_and_complete(zipped):
@@ -364,15 +310,6 @@ def test_check_tells_what_is_there_and_what_is_missing(qgis):
 
 
 @needs_qgis
-def test_without_the_program_dialogs_are_there_and_runs_refused(session, tmp_path):
-    found = session(
-        "parameters", "classify", PDAL_STAGES_PROGRAM="/nowhere", QGIS_CUSTOM_CONFIG_PATH=str(tmp_path)
-    )
-    assert found["can"][0] is False and "Install pdal-stages" in found["can"][1]
-    assert "DIMENSIONS" in found["parameters"]
-
-
-@needs_qgis
 def test_parameters_are_the_commands_own(session, capsys):
     assert main(["commands", "--showjson"]) == 0
     forms = json.loads(capsys.readouterr().out)
@@ -466,50 +403,6 @@ def test_the_way_of_a_tile(qgis, session, town, tmp_path):
 
 
 @pytest.mark.pdal
-def test_flags_of_old_files_are_no_classes_of_a_map(package, tmp_path):
-    """A key point of the ground is ground, flagged noise is noise."""
-    jobs = importlib.import_module("qgis_plugin.jobs")
-    old = laspy.create(file_version="1.2", point_format=1)
-    old.x, old.y, old.z = np.arange(12.0).reshape(3, 4)
-    old.classification, old.key_point = [2, 6, 18, 2], [1, 1, 1, 0]
-    old.write(tmp_path / "old.las")
-    job = jobs.class_map(str(tmp_path / "old.las"), str(tmp_path / "map.tif"), 1.0)[:-1]
-    pipeline = ps.Pipeline(job)
-    assert pipeline.execute() == 3
-    assert pipeline.arrays[0]["Classification"].tolist() == [2, 6, 2]
-    new = laspy.convert(old, file_version="1.4", point_format_id=6)
-    new.classification[:] = [2, 64, 18, 2]
-    new.write(tmp_path / "new.las")
-    assert jobs.plain_classes(str(tmp_path / "new.las")) == jobs.plain_classes("no.ply") == []
-
-
-@pytest.mark.pdal
-@needs_qgis
-def test_rasters_of_terrain_and_surface(qgis, town, tmp_path):
-    """The terrain lies on the true ground, the surface on or above the terrain."""
-    rasters = {name: tmp_path / f"{name}.tif" for name in ("terrain", "surface")}
-    qgis(
-        "run", "pdalstages:terrainmodels", "--", f"INPUT={town}", f"TERRAIN={rasters['terrain']}",
-        f"SURFACE={rasters['surface']}", "RESOLUTION=2",
-    )  # fmt: skip
-    points = laspy.read(town)
-    ground = np.asarray(points.classification) == 2
-    info = subprocess.run(
-        ["gdalinfo", "-stats", "-json", rasters["terrain"]], capture_output=True, text=True, check=False
-    )
-    if info.returncode:
-        pytest.skip("no gdalinfo")
-    band = json.loads(info.stdout)["bands"][0]
-    z = np.asarray(points.z)[ground]
-    assert z.min() - 0.5 < band["minimum"] and band["maximum"] < z.max() + 0.5
-    assert abs(band["mean"] - z.mean()) < 0.5
-    info = subprocess.run(
-        ["gdalinfo", "-stats", "-json", rasters["surface"]], capture_output=True, text=True, check=True
-    )
-    assert json.loads(info.stdout)["bands"][0]["maximum"] == pytest.approx(points.z.max(), abs=1.0)
-
-
-@pytest.mark.pdal
 @needs_qgis
 def test_many_files_and_training(qgis, town, tmp_path):
     second = tmp_path / "in" / "b.laz"
@@ -536,53 +429,3 @@ def test_many_files_and_training(qgis, town, tmp_path):
         f"OUTPUT={tmp_path / 'm.laz'}",
     )
     assert (tmp_path / "m.laz").is_file()
-
-
-@pytest.mark.pdal
-@needs_qgis
-def test_errors_are_the_commands_own(qgis, tmp_path):
-    said = qgis(
-        "run",
-        "pdalstages:classify",
-        "--",
-        f"INPUT={tmp_path / 'gone.laz'}",
-        f"OUTPUT={tmp_path / 'c.laz'}",
-        code=1,
-    )
-    assert "gone.laz" in said and not (tmp_path / "c.laz").exists()
-    said = qgis("run", "pdalstages:objects", "--", f"OUTPUT={tmp_path / 'o.gpkg'}", code=1)
-    assert "No point cloud was given" in said
-
-
-@pytest.mark.pdal
-@needs_qgis
-def test_cancel_leaves_nothing(session, program, town, tmp_path):
-    large = tmp_path / "large.laz"
-    write_town(TownOptions(size=250.0, density=8.0, seed=3), large)
-    done = session("cancel", large, tmp_path / "out.laz")
-    assert not done["good"] and done["seconds"] < 40
-    assert any("Canceled" in line for line in done["lines"])
-    left = [path.name for path in tmp_path.iterdir() if not path.name.startswith(".pdal-stages-partial-")]
-    assert left == ["large.laz"]
-    # What a run has left that was ended in PDAL's midst goes with the next one there
-    subprocess.run([program, "classify", town, tmp_path / "out.laz"], check=True)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["large.laz", "out.laz"]
-
-
-@pytest.mark.pdal
-@pytest.mark.data
-@needs_qgis
-def test_a_real_tile(qgis, data_dir, tmp_path):
-    source = data_dir / "montpellier" / "train_77055_627760.laz"
-    said = qgis("run", "pdalstages:classify", "--", f"INPUT={source}", f"OUTPUT={tmp_path / 'c.laz'}")
-    assert "points written" in said
-    said = qgis(
-        "run",
-        "pdalstages:accuracy",
-        "--",
-        f"INPUT={tmp_path / 'c.laz'}",
-        f"REFERENCE={source}",
-        f"PAGE={tmp_path / 'a.html'}",
-    )
-    overall = next(line for line in said.splitlines() if line.startswith("Overall accuracy"))
-    assert float(overall.split()[2]) > 80

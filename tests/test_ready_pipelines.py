@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from pathlib import Path
 
 import laspy
 import numpy as np
 import pytest
 
-from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
 from pdal_stages.pipeline.run import Pipeline
 from pdal_stages.synthetic import TownOptions, write_town
@@ -63,25 +61,6 @@ def test_names_say_what_they_are(path):
     stages = json.loads(path.read_text())
     assert isinstance(stages, list)
     assert all("tag" in s for s in stages)
-
-
-def test_noise(town, tmp_path):
-    source, out = laspy.read(town), tmp_path / "o.laz"
-    source.z[:3] += np.array([200, -12, 50]) / source.header.scales[2]
-    source.write(str(tmp_path / "in.laz"))
-    run("noise", f"--stage.input.filename={tmp_path / 'in.laz'}", f"--stage.output.filename={out}")
-    codes = np.asarray(laspy.read(out).classification)
-    assert codes[:3].tolist() == [18, 7, 18] and np.array_equal(
-        codes[3:], np.asarray(source.classification)[3:]
-    )
-
-
-def test_normalize(town, tmp_path):
-    out = tmp_path / "o.laz"
-    run("normalize", f"--stage.input.filename={town}", f"--stage.output.filename={out}")
-    las = laspy.read(out)
-    ground = np.asarray(las["HeightAboveGround"])[np.asarray(las.classification) == 2]
-    assert np.median(np.abs(ground)) < 1.0
 
 
 @pytest.mark.parametrize(
@@ -162,61 +141,6 @@ def test_tiles_to_tiles(town, models, tmp_path):
         assert all(len(found) == 1 for found in cells.values()), cells
         corners.add(tuple(found.pop() for found in cells.values()))
     assert len(corners) == 4
-
-
-def test_copc_to_tiles(models, tmp_path):
-    """Whole, and in tiles; the octree's records do not stay in files that are no COPC."""
-    source = Path(__file__).parent / "data" / "town.copc.laz"
-    words = [f"--stage.input.filename={source}", f"--stage.classifier.model={models / 'classes.model'}"]
-    run("copc-to-tiles", *words, f"--stage.output.filename={tmp_path}/whole.laz")
-    whole, before = laspy.read(tmp_path / "whole.laz"), laspy.read(source)
-    assert len(whole) == len(before)
-    assert next(v.user_id for v in before.header.vlrs) == "copc"
-    assert not any(v.user_id == "copc" for v in [*whole.header.vlrs, *(whole.evlrs or [])])
-    tiled = run_tiled(
-        _with("copc-to-tiles", *words, f"--stage.output.filename={tmp_path}/t_#.laz"),
-        15,
-        per="tile",
-        workers=0,
-    )
-    assert not tiled.failures
-    _same_points([whole], [laspy.read(p) for p in sorted(tmp_path.glob("t_*.laz"))])
-    tiled = run_tiled(
-        _with("copc-to-tiles", *words, f"--stage.output.filename={tmp_path}/f_#.laz"), 15, workers=0
-    )
-    (one,) = [laspy.read(p) for p in tmp_path.glob("f_*.laz")]
-    assert not tiled.failures and not any(v.user_id == "copc" for v in [*one.header.vlrs, *(one.evlrs or [])])
-    _same_points([whole], [one])
-    if pdal_env.version() < (2, 4, 0):  # later ones read COPC in an order of their own
-        np.testing.assert_array_equal(one.points.array, whole.points.array)
-
-
-def test_tile_index_to_tiles(town, models, tmp_path):
-    Pipeline(
-        [
-            str(town),
-            {"type": "filters.splitter", "length": 40, "origin_x": 500000, "origin_y": 5400000},
-            {"type": "writers.las", "filename": str(tmp_path / "in_#.laz"), "forward": "all"},
-        ]
-    ).execute()
-    index = tmp_path / "survey.gpkg"
-    files = sorted(str(p) for p in tmp_path.glob("in_*.laz"))
-    subprocess.run(
-        [pdal_env.program(), "tindex", "create", str(index), "--stdin", "-f", "GPKG", "--lyr_name", "pdal"],
-        input="\n".join(files), text=True, check=True, capture_output=True,
-    )  # fmt: skip
-    words = [f"--stage.input.filename={index}", f"--stage.classifier.model={models / 'classes.model'}"]
-    run("tile-index-to-tiles", *words, f"--stage.output.filename={tmp_path}/whole.laz")
-    tiled = run_tiled(
-        _with("tile-index-to-tiles", *words, f"--stage.output.filename={tmp_path}/t_#.laz"),
-        25,
-        per="tile",
-        workers=0,
-    )
-    assert not tiled.failures and tiled.summary["inputs"] == len(files) > 2
-    _same_points(
-        [laspy.read(tmp_path / "whole.laz")], [laspy.read(p) for p in sorted(tmp_path.glob("t_*.laz"))]
-    )
 
 
 def _with(name, *words):

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import inspect
-import io
 import json
-import sys
 
 import laspy
 import numpy as np
 import pytest
 
 import pdal_stages as ps
-from pdal_stages.base.progress import Progress
 from pdal_stages.cli import main
 
 pytestmark = pytest.mark.pdal
@@ -50,18 +47,6 @@ def test_warnings_of_pdal_are_shown_once(cloud, tmp_path, run, tiles):
     assert err.count("no spatial reference") == 1
 
 
-def test_levels_as_pdal_takes_them(cloud, tmp_path, run):
-    stages = [
-        cloud,
-        {"type": "filters.hag_minima"},
-        {"type": "writers.las", "filename": str(tmp_path / "o.las")},
-    ]
-    for words in (("-v", 4), ("-v",), ("--verbose", "3"), ("--verbose=0",)):
-        assert run(stages, *words)[0] == 0, words
-    path = str(tmp_path / "job.json")
-    assert main(["pipeline", "-v", "4", path]) == 0 and main(["pipeline", "-v", path]) == 0
-
-
 def test_a_log_file(cloud, tmp_path, run):
     log = tmp_path / "run.log"
     assert run([cloud, {"type": "filters.hag_minima"}, tmp_path / "o.las"], "--log", log)[0] == 0
@@ -86,31 +71,6 @@ def test_the_log_hears_the_workers_of_tiles_and_the_summary(cloud, tmp_path, run
     assert any(line.endswith("said by a worker") for line in lines)
     assert any(" tiles done; " in line or " tile done; " in line for line in lines)
     assert all(line[:2] == "20" and line[10] == " " for line in lines) and "exit code 0" in lines[-1]
-
-
-def test_a_log_keeps_lines_of_threads_apart(tmp_path):
-    from io import StringIO
-    from threading import Thread
-
-    from pdal_stages.base.runlog import LoggedStream, RunLog
-
-    shown = StringIO()
-    log = RunLog(str(tmp_path / "l.log"), ["x"], shown)
-    stream = LoggedStream(shown, log)
-
-    def say(word):
-        for _ in range(200):
-            stream.write(word)
-            stream.write(f" {word}\n")
-
-    threads = [Thread(target=say, args=(word,)) for word in ("one", "two", "three")]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    log.end(0)
-    said = [line.split(" ", 2)[2] for line in (tmp_path / "l.log").read_text().splitlines()[1:-1]]
-    assert sorted(said) == sorted(200 * ["one one", "two two", "three three"])
 
 
 def test_metadata_names_the_output(cloud, tmp_path, run):
@@ -174,19 +134,6 @@ def test_errors_of_others_are_told_as_such(cloud, tmp_path, run):
     code, _, err = run([cloud, theirs, {"type": "filters.hag_minima"}, tmp_path / "o.las"])
     assert code == 1 and "ValueError: my own problem" in err and "line 2" in err
     assert "Traceback" not in err and "internal error" not in err
-
-
-def test_slow_rates_are_no_zero(monkeypatch):
-    out = io.StringIO()
-    monkeypatch.setattr(sys, "__stderr__", out)
-    monkeypatch.setattr(Progress, "delay", 0.0)
-    with Progress(10, "growing", "trees") as bar:
-        bar.started -= 20
-        bar.update(1)
-    assert "0.05 trees/s" in out.getvalue()
-    with Progress(0, "compiling", "kernels") as bar:
-        bar.update(1)
-    assert "compiling: 1 kernel," in out.getvalue()
 
 
 # ---- objects that behave like python-pdal's ----------------------------------------------------------------

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import shutil
 import signal
@@ -13,7 +12,6 @@ import tempfile
 import time
 from pathlib import Path
 
-import laspy
 import numpy as np
 import pytest
 from conftest import scene
@@ -129,28 +127,6 @@ def test_driver_path(cell, tmp_path, cloud, kind):
     it.refused(done, "filters.python", "pdal-plugins", "PDAL_DRIVER_PATH")
 
 
-def test_another_numpy(cell, tmp_path, cloud):
-    fake = tmp_path / "packages" / "numpy"
-    fake.mkdir(parents=True)
-    (fake / "__init__.py").write_text("raise ImportError('numpy.core.multiarray failed to import')\n")
-    it = cell("Environment", "packages built for another NumPy")
-    done = it.process(
-        "pipeline",
-        simple(tmp_path, cloud),
-        env={"PYTHONPATH": str(fake.parent), "PYTHONDONTWRITEBYTECODE": "1"},
-    )
-    it.refused(done, "cannot be imported", "numpy.core.multiarray failed to import", "one environment")
-
-
-def test_an_optional_package_is_missing(cell, tmp_path, cloud):
-    path = simple(tmp_path, cloud)
-    it = cell("Environment", "a package of an extra is not installed")
-    stage = {"type": "writers.classifiermodel", "filename": str(tmp_path / "m")}
-    path = job(tmp_path, str(cloud), HAG, stage)
-    it.refused(it.process("pipeline", path, command=prepared("import sys", "sys.modules['sklearn'] = sys.modules['sklearn.ensemble'] = None")),
-               "sklearn")  # fmt: skip
-
-
 # ---- rights and room -------------------------------------------------------------------------------------------
 
 
@@ -204,47 +180,6 @@ def test_no_rights(cell, open_folder, write_las):
     it.refused(it.process("pipeline", plain, **words), "p.json", "Permission denied")
 
 
-@pytest.mark.slow
-def test_read_only_home(cell, open_folder, write_las):
-    """No folder for compiled code but the temporary one, and then none at all."""
-    nobody = without_rights()
-    source = write_las(open_folder / "in.las", scene(), point_format=3)
-    package = Path(shutil.copytree(Path(__file__).resolve().parents[2] / "pdal_stages", open_folder / "lib" / "pdal_stages",
-                                   ignore=shutil.ignore_patterns("__pycache__", "synthetic", "picture")))  # fmt: skip
-    for folder in (package, *package.rglob("*")):
-        folder.chmod(0o555 if folder.is_dir() else 0o444)
-    stage = {"type": "filters.multiscalefeatures", "neighborhoods": "c1", "feature_set": "Linearity"}
-    path = job(
-        open_folder,
-        str(source),
-        stage,
-        {"type": "writers.las", "filename": str(open_folder / "out.las"), "extra_dims": "all"},
-    )
-    for case, temporary in (
-        ("read-only HOME and installation", open_folder),
-        ("nowhere to keep compiled code", "/proc"),
-    ):
-        it = cell("Environment", case)
-        environment = {
-            "HOME": "/proc",
-            "XDG_CACHE_HOME": "/proc/cache",
-            "PYTHONPATH": str(open_folder / "lib"),
-            "NUMBA_CACHE_DIR": None,
-        }
-        command = prepared("import tempfile", f"tempfile.tempdir = {str(temporary)!r}")
-        done = it.process("pipeline", path, env=environment, cwd=open_folder, command=command, **nobody)
-        it.runs(
-            done,
-            "kernels are compiled for this run"
-            if "nowhere" in case
-            else "compiled code is kept in the temporary folder",
-        )
-        assert len(laspy.read(open_folder / "out.las")) == 600
-        (open_folder / "out.las").unlink()
-        assert bool(list(open_folder.glob("pdal-stages-cache-*/**/*.nbc"))) == ("HOME" in case)
-        shutil.rmtree(open_folder / f"pdal-stages-cache-{os.getuid()}", ignore_errors=True)
-
-
 def big(tmp_path, write_las, n=60_000):
     rng = np.random.default_rng(0)
     x, y, z = rng.uniform(0, 300, (3, n)).round(2)
@@ -260,48 +195,6 @@ def test_disk_full(cell, tmp_path, write_las, suffix):
             ["pipeline", path], f"out.{suffix}", "ake room"
         )
         assert not list(small.iterdir())
-
-
-def test_disk_full_of_other_files(cell, tmp_path, cloud):
-    with mounted(tmp_path / "small", "size=20k") as small:
-        (small / "filler").write_bytes(bytes(20 << 10))
-        path = job(tmp_path, str(cloud), HAG)
-        cell("Environment", "disk full while writing metadata").refused(
-            ["pipeline", path, "--metadata", small / "m.json"], "m.json", "No space left"
-        )
-        train = job(tmp_path, str(cloud), HAG, {"type": "writers.classifiermodel", "filename": str(small / "m"), "count": 50, "trees": 3,
-                                                "neighborhoods": "c1", "feature_set": "covariance"})  # fmt: skip
-        cell("Environment", "disk full while writing a model").refused(["pipeline", train], "No space left")
-        assert [p.name for p in small.iterdir()] == ["filler"]
-
-
-def test_limit_on_file_size(cell, tmp_path, write_las):
-    import resource
-
-    source = big(tmp_path, write_las)
-    path = job(tmp_path, str(source), HAG, str(tmp_path / "out.las"))
-    it = cell("Environment", "limit on the size of files")
-
-    def limit():
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
-
-    it.refused(it.process("pipeline", path, preexec_fn=limit), "could not be written completely")
-
-
-def test_standard_output_is_full(cell, tmp_path, cloud):
-    if not os.path.exists("/dev/full"):
-        pytest.skip("no /dev/full here")
-    it = cell("Environment", "standard output on a full disk")
-    it.before = it.files() | {simple(tmp_path, cloud)}
-    with open("/dev/full", "w") as full:
-        done = subprocess.run(
-            [sys.executable, "-m", "pdal_stages.cli", "drivers", "--ours"],
-            stdout=full,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-    assert done.returncode == 1 and "No space left" in done.stderr and "Traceback" not in done.stderr
 
 
 # ---- locale, names, cores ----------------------------------------------------------------------------------------
@@ -339,42 +232,6 @@ def test_file_name_that_is_not_utf8(cell, tmp_path, cloud, model):
         "not valid UTF-8",
         "rename the file",
     )
-
-
-def test_one_core(cell, tmp_path, cloud):
-    if not hasattr(os, "sched_setaffinity"):
-        pytest.skip("no affinity here")
-    path = job(tmp_path, str(cloud), {"type": "filters.multiscalefeatures", "neighborhoods": "c1", "feature_set": "Linearity"},
-               {"type": "writers.las", "filename": str(tmp_path / "one.las"), "extra_dims": "all"})  # fmt: skip
-    it = cell("Environment", "one core allowed")
-    core = sorted(os.sched_getaffinity(0))[0]
-    it.runs(
-        it.process("pipeline", path, preexec_fn=lambda: os.sched_setaffinity(0, {core})),
-        "the same values as with all",
-    )
-    (tmp_path / "job.json").write_text((tmp_path / "job.json").read_text().replace("one.las", "all.las"))
-    assert it.command("pipeline", path).code == 0
-    assert np.array_equal(
-        laspy.read(tmp_path / "one.las")["Linearity_c1"], laspy.read(tmp_path / "all.las")["Linearity_c1"]
-    )
-
-
-def test_settings_of_numba(cell, tmp_path, cloud):
-    it = cell("Environment", "NUMBA_NUM_THREADS=0")
-    done = it.process("pipeline", job(tmp_path, str(cloud), {"type": "filters.multiscalefeatures", "neighborhoods": "c1"}),
-                      env={"NUMBA_NUM_THREADS": "0"})  # fmt: skip
-    it.refused(done, "numba cannot be started", "must be > 0", "begin with NUMBA_")
-
-
-def test_no_threads_to_be_had(cell, tmp_path, cloud):
-    import resource
-
-    if os.geteuid() == 0:
-        pytest.skip("the limit on processes does not hold for a superuser")
-    it = cell("Environment", "no threads to be had")
-    path = simple(tmp_path, cloud)
-    done = it.process("pipeline", path, preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_NPROC, (1, 1)))
-    it.refused(done) if done.code else it.runs(done, "works in one thread")
 
 
 # ---- signals -------------------------------------------------------------------------------------------------------
@@ -437,18 +294,3 @@ def test_a_closed_pipe(cell, tmp_path):
     done = it.process(command=["sh", "-c", f"{sys.executable} -m pdal_stages.cli drivers | head -1"])
     it.runs(done, "ends quietly")
     assert "BrokenPipe" not in done.err
-
-
-def test_json_of_metadata_is_whole(cell, tmp_path, cloud):
-    meta = tmp_path / "meta.json"
-    meta.write_text("older")
-    path = job(tmp_path, str(cloud), {**HAG, "ignore": list(range(256))}, str(tmp_path / "o.las"))
-    cell("Environment", "older output and metadata when a run fails").refused(
-        ["pipeline", path, "--metadata", meta], "no terrain"
-    )
-    assert meta.read_text() == "older"
-    path = job(tmp_path, str(cloud), HAG)
-    cell("Environment", "older output and metadata when a run fails").command(
-        "pipeline", path, "--metadata", meta
-    )
-    assert "filters.hag_minima" in json.loads(meta.read_text())["metadata"]

@@ -19,28 +19,19 @@ STAGE = b'{"type": "filters.hag_minima"}'
 #: case, bytes of the file, what the message must hold
 REFUSED = [
     ("empty file", b"", ["the pipeline is empty"]),
-    ("only spaces", b" \r\n\t ", ["the pipeline is empty"]),
-    ("only a comment", b"// nothing here\n", ["the pipeline is empty"]),
     ("null", b"null", ["must be a list or an object", "NoneType"]),
-    ("a number", b"42", ["must be a list or an object"]),
     ("a text", b'"in.las"', ["must be a list or an object"]),
     ("empty list", b"[]", ["the pipeline has no stages"]),
     ("object without 'pipeline'", b'{"stages": []}', ["no list named 'pipeline'", "'stages'", 'Write {"pipeline"']),
-    ("'pipeline' that is an object", b'{"pipeline": {}}', ["no list named 'pipeline'"]),
     ("trailing comma in the list", b"[\n" + STAGE + b",\n]", ["job.json, line", "Remove the comma"]),
     ("trailing comma in a stage", b'[\n{"type": "filters.hag_minima",\n}]', ["job.json, line", "Remove the comma"]),
     ("missing comma", b'[\n"a.las"\n"b.las"]', ["job.json, line 3", "Expecting ',' delimiter"]),
-    ("two commas", b'["a.las",,"b.las"]', ["job.json, line 1"]),
     ("several roots", b'["a.las"]\n["b.las"]', ["line 2", "Extra data", "one list or object"]),
     ("cut in the middle", b'["a.las", {"type": "filt', ["job.json, line 1"]),
-    ("single quotes", b"['a.las']", ["job.json, line 1, column 2"]),
-    ("name without quotes", b'[{type: "filters.hag_minima"}]', ["job.json, line 1"]),
     ("Windows path without doubled backslashes", b'["C:\\data\\in.las"]', ["line 1", "escape"]),
     ("NaN", b'[{"type": "filters.hag_minima", "cell": NaN}]', ["NaN is not a JSON number"]),
-    ("Infinity", b'[{"type": "filters.hag_minima", "cell": -Infinity}]', ["-Infinity is not a JSON number"]),
     ("number too large for a double in JSON", b'["a.las",\n{"type": "filters.range", "limits": 1e999}]', ["line 2", "float"]),
     ("whole number of 5,000 digits", b'[{"type": "filters.hag_minima", "cell": ' + b"9" * 5000 + b"}]", ["not valid JSON"]),
-    ("whole number of 400 digits", b'[{"type": "filters.hag_minima", "cell": ' + b"9" * 400 + b"}]", ["option 'cell' must be a number"]),
     ("comment that does not end", b'["a.las", /* b\n"c.las"]', ["line 1", "does not end"]),
     ("half a surrogate pair", b'["a.las",\n"\\ud800.las"]', ["line 2", "not valid UTF-8"]),
     ("NUL in a name", b'["a\\u0000.las", "b.las"]', ["line 1", "NUL"]),
@@ -48,9 +39,7 @@ REFUSED = [
     ("UTF-16", '["a.las"]'.encode("utf-16"), ["not UTF-8", "UTF-16", "Save it as UTF-8"]),
     ("a LAS file as the pipeline", b"LASF\x00\x00\xff\xfe" + b"\x00" * 300, ["not"]),
     ("nested 100,000 deep", b"[" * 100_000, ["not valid JSON"]),
-    ("10 MB without an end", b'["' + b"x" * 10_000_000, ["job.json, line 1"]),
     ("a million opened comments", b"[" + b"/*" * 1_000_001, ["does not end"]),
-    ("10 MB of quotes and backslashes", b'["' + b'\\"' * 5_000_000, ["line 1"]),
 ]  # fmt: skip
 
 
@@ -68,13 +57,9 @@ GOOD = [
     ("CRLF line ends", b'[\r\n"a.las",\r\n' + STAGE + b"\r\n]\r\n"),
     ("comments of both kinds", b'// a\n[ /* b */ "a.las", // "c"\n' + STAGE + b"/* d\n */]"),
     ("comment marks inside texts", b'["http://a/b.las", {"type": "filters.range", "limits": "/* Z */"}, ' + STAGE + b"]"),
-    ("tabs and empty lines", b'\n\n\t[\t"a.las"\t,\n\n' + STAGE + b"\t]\n\n"),
     ("non-ASCII names", '["Stra\u00dfe/\u6e2c\u91cf.las", '.encode() + STAGE + b"]"),
-    ("names with emoji as escapes", b'["\\ud83d\\ude00.las", ' + STAGE + b"]"),
     ("object with other keys", b'{"name": "x", "pipeline": ["a.las", ' + STAGE + b'], "more": [1]}'),
     ("key 'pipeline' twice: the last counts", b'{"pipeline": 3, "pipeline": ["a.las", ' + STAGE + b"]}"),
-    ("3,000 stages", b'["a.las",' + b",".join([b'{"type": "filters.range", "limits": "Z[0:1]"}'] * 3_000) + b"," + STAGE + b"]"),
-    ("10 MB of JSON", b'["a.las", {"type": "filters.range", "limits": "' + b"x" * 10_000_000 + b'"}, ' + STAGE + b"]"),
 ]  # fmt: skip
 
 
