@@ -7,12 +7,12 @@ import json
 from pathlib import Path
 
 from ..base import kinds
-from ..base.errors import DimensionError, StageError
+from ..base.errors import StageError
 from ..base.outputs import Output, check_outputs
 from ..base.plain import print_messages
 from ..tiling.command import add_tile_arguments
 from .adder import INPUTS, OVERRIDES, Adder
-from .running import ran, run
+from .running import ran
 
 
 def add_commands(add: Adder) -> None:
@@ -152,45 +152,30 @@ def _adapt(options: argparse.Namespace) -> None:
 
 
 def _accuracy(options: argparse.Namespace) -> None:
-    from ..pipeline.accuracy_files import WHAT_IS_TRUE, accuracy_pipeline, compare_files
-    from ..pipeline.inputs_outputs import input_files, overlooked
-    from ..pipeline.run import Pipeline
+    from ..pipeline.accuracy_files import compare_files
+    from ..pipeline.inputs_outputs import overlooked
 
-    reference_dimension = options.reference_dimension or (
-        "Classification" if options.reference else "Reference"
-    )
-    outputs = {k: v for k in ("json", "html") if (v := getattr(options, k))}
     if options.objects:
         _compare_objects(options)
         return
     if options.area:
         raise StageError("--area needs --objects", found=options.area)
-    several = len(input_files(options.inputs)) > 1
+    if options.reference and options.model:
+        raise StageError("--reference and --model exclude each other", found=options.model)
+    other = "Classification" if options.reference or options.model else "Reference"
+    outputs = {k: v for k in ("json", "html") if (v := getattr(options, k))}
     print_messages(*overlooked(options.inputs))
-    if options.reference or options.model or several:
-        if options.reference and options.model:
-            raise StageError("--reference and --model exclude each other", found=options.model)
-        if options.model:
-            reference_dimension = options.reference_dimension or "Classification"
-        print_messages(
-            *compare_files(
-                options.inputs,
-                options.reference or (),
-                options.dimension,
-                reference_dimension,
-                options.overrides,
-                options.model or "",
-                **outputs,
-            )
+    print_messages(
+        *compare_files(
+            options.inputs,
+            options.reference or (),
+            options.dimension,
+            options.reference_dimension or other,
+            options.overrides,
+            options.model or "",
+            **outputs,
         )
-        return
-    stages = accuracy_pipeline(options.inputs, options.dimension, reference_dimension, **outputs)
-    try:
-        run(options, Pipeline(stages, options.overrides))
-    except DimensionError as error:
-        if f"'{reference_dimension}'" in error.what:
-            error.cure = WHAT_IS_TRUE
-        raise
+    )
 
 
 def _compare_objects(options: argparse.Namespace) -> None:

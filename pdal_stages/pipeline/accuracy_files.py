@@ -31,18 +31,6 @@ WHAT_IS_TRUE = (
 )
 
 
-def accuracy_pipeline(
-    sources: Sequence[str], dimension: str, reference: str, **outputs: str
-) -> list[dict[str, Any]]:
-    """Read files, folders or patterns, compare two dimensions."""
-    files = input_files(sources)
-    tags = ["input"] if len(files) == 1 else [f"input{i}" for i in range(1, len(files) + 1)]
-    return [
-        *map(reader_of, files, tags),
-        {"type": "filters.accuracy", "dimension": dimension, "reference": reference, **outputs},
-    ]
-
-
 def compare_files(
     sources: Sequence[str],
     references: Sequence[str],

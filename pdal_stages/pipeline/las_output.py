@@ -16,7 +16,7 @@ from typing import Any
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import DimensionError, OptionError, PipelineError, StageError
 from ..base.extrabytes import extra_dimensions
-from ..base.las import LasHeader, read_header
+from ..base.las import LasHeader, read_header, supersede_copc
 from ..stages import registry
 from ..stages.base import CodeLimit, Stage
 from . import pdal as pdal_env
@@ -178,23 +178,25 @@ def files_with_flags_to_split(stages: Sequence[dict[str, Any]], with_ours: bool 
         return []
     readers = [stage for number, stage in enumerate(stages) if is_reader(stages, number)]
     old: list[bool] = []
+    mixed = False
     for reader in readers:
-        headers = las_headers([reader])
-        old += [header.point_format <= 5 for header in headers] if headers else [False]
+        formats = [header.point_format for header in las_headers([reader])]
+        old += [one <= 5 for one in formats] or [False]
+        mixed |= any(one > 5 for one in formats)
     if True not in old:
         return []
     writers = [stage for stage in stages if is_writer(stage, list(stages))]
     writers = [stage for stage in writers if stage.get("type") not in registry.stages()]
-    formats = [las_version(one, stages)[1] if writes_las(one) else None for one in writers]
-    together = [one for one in formats if one is not None and one <= 5]
-    apart = [one for one in formats if one is not None and one > 5]
-    if together and (apart or not all(old)):
+    written = [las_version(one, stages)[1] for one in writers if writes_las(one)]
+    together = any(one <= 5 for one in written)
+    apart = any(one > 5 for one in written)
+    if together and (apart or mixed):
         raise PipelineError(
             "this PDAL cannot bring the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 into a pipeline with LAS 1.4",
             found=f"PDAL {pdal_env.dotted_version()}",
             cure='Give all LAS writers "minor_version": 4 and "dataformat_id": 6 (7 with colors), or use PDAL 2.6',
         )
-    needed = apart or (with_ours and (writers or not all(old)))
+    needed = apart or (with_ours and (writers or mixed))
     return old if needed and not together else []
 
 
@@ -244,6 +246,7 @@ def compress(partials: Iterable[Path]) -> dict[str, str]:
 def _compress(made: Path, target: Path) -> None:
     import laspy
 
+    supersede_copc(made)  # of a COPC file that was read, whose record laspy does not write
     try:
         with laspy.open(made) as source:
             header = source.header

@@ -128,54 +128,53 @@ def check(folder: Path | None = None) -> tuple[list[str], list[str]]:
     """What is there, and what is missing or wrong, each with its cure."""
     good: list[str] = []
     bad: list[str] = []
-    no_compiler: list[str] = []  # which is no fault where all is built
+    no_compiler: list[str] = []  # no fault where all is built
     pdal_version = ""
-    for what in ("compiler", "pdal", "plugin_folder"):
-        try:
-            found = getattr(places, what)()
-        except DependencyError as error:
-            (no_compiler if what == "compiler" else bad).append(str(error))
-            continue
-        if isinstance(found, places.Pdal):
-            pdal_version = found.version
-            good.append(f"PDAL {found.version}: {found.library}, headers {found.headers / 'pdal'}")
-        elif isinstance(found, list):
-            good.append(f"compiler: {shutil.which(found[0])}")
-        else:
-            good.append(f"filters.python: {found}")
-            folder = folder or usual_folder()
+    try:
+        good.append(f"compiler: {shutil.which(places.compiler()[0])}")
+    except DependencyError as error:
+        no_compiler.append(str(error))
+    try:
+        found = places.pdal()
+        pdal_version = found.version
+        good.append(f"PDAL {found.version}: {found.library}, headers {found.headers / 'pdal'}")
+    except DependencyError as error:
+        bad.append(str(error))
+    try:
+        good.append(f"filters.python: {places.plugin_folder()}")
+        folder = folder or usual_folder()
+    except DependencyError as error:
+        bad.append(str(error))
     if folder is None:
         return good, no_compiler + bad
-    kept = record(folder)
     cure = "pdal-stages plugin --install"
-    if kept is None and (version := _by_pip()) is not None:
+    if (kept := record(folder)) is None:
+        version = _by_pip()
         if version == __version__:
-            good.append(f"plugin: the package {_PACKAGE} {version}")
-        else:
+            return [*good, f"plugin: the package {_PACKAGE} {version}"], bad
+        if version is not None:
             bad.append(
                 f"{_PACKAGE} is of another version (found {version}, pdal-stages {__version__}). Upgrade both"
             )
-        return good, bad
-    if kept is None:
-        bad.append(f"the plugin is not in {folder}. {cure}")
-        return good, no_compiler + bad
-    missing = [
-        library_name(name) for name in registry.stages() if not (folder / library_name(name)).is_file()
-    ]
-    if missing:
-        bad.append(f"libraries are missing in {folder} (found {', '.join(missing)}). {cure}")
-    if kept.get("pdal_stages") != __version__:
-        bad.append(
-            f"the plugin in {folder} is of another version (found {kept.get('pdal_stages')}, package {__version__}). {cure}"
-        )
-    elif kept.get("digest") != declarations.digest():
-        bad.append(f"the plugin in {folder} is out of date: options of stages have changed since. {cure}")
-    if pdal_version and kept.get("pdal") != pdal_version:
-        bad.append(f"the plugin in {folder} was built for another PDAL (found {kept.get('pdal')}). {cure}")
+            return good, bad
+        return good, [*no_compiler, *bad, f"the plugin is not in {folder}. {cure}"]
+    missing = [name for kind in registry.stages() if not (folder / (name := library_name(kind))).is_file()]
+    wrong = {
+        f"libraries are missing in {folder} (found {', '.join(missing)})": bool(missing),
+        f"the plugin in {folder} is of another version (found {kept.get('pdal_stages')}, package {__version__})": (
+            kept.get("pdal_stages") != __version__
+        ),
+        f"the plugin in {folder} is out of date: options of stages have changed since": (
+            kept.get("digest") != declarations.digest()
+        ),
+        f"the plugin in {folder} was built for another PDAL (found {kept.get('pdal')})": (
+            bool(pdal_version) and kept.get("pdal") != pdal_version
+        ),
+    }
+    bad += [f"{text}. {cure}" for text, is_so in wrong.items() if is_so]
     if bad:
         return good, no_compiler + bad
-    good.append(f"plugin: {len(kept['files'])} stages in {folder}")
-    return good, []
+    return [*good, f"plugin: {len(kept['files'])} stages in {folder}"], []
 
 
 def _by_pip() -> str | None:
