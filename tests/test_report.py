@@ -18,8 +18,6 @@ from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.accuracy.text import percent
 from pdal_stages.base.errors import StageError
 from pdal_stages.reports.accuracypage import write_accuracy_report
-from pdal_stages.reports.charts import percent_axis
-from pdal_stages.reports.maps import MapScene, densest_line, heights_to_draw
 from pdal_stages.reports.runpage import run_page
 
 VOID = {"meta", "img", "br"}
@@ -138,11 +136,8 @@ def test_accessible(full):
     page = Page(full)
     assert page.all("html")[0]["lang"] == "en"
     images = page.all("img")
-    assert len(images) == 5  # three maps, two sections
+    assert len(images) == 3
     assert all(len(i["alt"]) > 20 and int(i["width"]) > 0 for i in images)
-    charts = [s for s in page.all("svg") if s.get("role") == "img"]
-    assert len(charts) == 2
-    assert all("%" in s["aria-label"] for s in charts)
     assert all(h.get("scope") in ("row", "col", "colgroup") for h in page.all("th"))
     assert len(page.all("caption")) == len(page.all("table"))
     assert next(t for t, _ in page.tags if t in ("h1", "h2")) == "h1"
@@ -271,16 +266,6 @@ def test_error_map_shows_the_errors(full):
     assert red[differs].mean() > 0.5
 
 
-def test_section_lies_where_the_errors_are(scene, accuracy):
-    xyz, reference, predicted, _ = scene
-    line = densest_line(MapScene.of(accuracy, xyz, reference, predicted), depth=2.77)
-    (x0, y0), (x1, y1) = np.subtract(line, (770_600, 6_277_500))
-    assert abs(y0 - 12.5) < 1.5
-    assert y0 == y1
-    assert x0 < 14
-    assert x1 > 26
-
-
 def test_maps_follow_the_merge():
     xyz = np.random.default_rng(0).random((500, 3)) * (10, 10, 2)
     reference = np.repeat([3, 4, 6, 2, 2], 100)
@@ -325,30 +310,6 @@ def test_degenerate_clouds(xyz, maps):
     assert ("No map: " in page.text) == (maps == 0)
 
 
-def test_stray_heights_do_not_flatten_the_section(scene, accuracy):
-    xyz, reference, predicted, _ = scene
-    strayed = xyz.copy()
-    wrong = np.flatnonzero((reference == 6) & (predicted == 5))
-    strayed[wrong[0], 2] += 5000
-    text = accuracy_page(accuracy, xyz=strayed, reference=reference, predicted=predicted)
-    assert "Not drawn: 1 point far above or below the others." in Page(text).text
-    assert embedded(text)[3].shape[0] < 800
-
-
-def test_a_section_of_ones_own(scene, accuracy):
-    xyz, reference, predicted, _ = scene
-    given = ((770_610.0, 6_277_520.0), (770_650.0, 6_277_525.0))
-    text = accuracy_page(accuracy, xyz=xyz, reference=reference, predicted=predicted, section=given)
-    assert "from 770610, 6277520 to 770650, 6277525" in Page(text).text
-    assert "errors are densest" not in text
-    for bad, message in (
-        (((0.0, 0.0), (1.0, 1.0)), "holds no points"),
-        (((770_610.0, 6_277_520.0),) * 2, "two different ends"),
-    ):
-        with pytest.raises(StageError, match=message):
-            accuracy_page(accuracy, xyz=xyz, reference=reference, predicted=predicted, section=bad)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -389,14 +350,6 @@ def test_or_not_at_all(tmp_path, accuracy):
 
 
 # ---- pieces ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("most", [0.0, 0.0001, 0.004, 0.05, 0.31, 0.5, 1.0])
-def test_axis_holds_its_values(most):
-    top, ticks = percent_axis(most)
-    assert top >= most
-    assert 2 <= len(ticks) <= 6
-    assert ticks[-1][0] == pytest.approx(top)
 
 
 # ---- the page of a tiled run -----------------------------------------------------------------------------
@@ -467,28 +420,3 @@ def test_nothing_of_a_run_becomes_markup():
 def test_a_run_of_nothing_makes_a_page():
     empty = tiled(tiles=[], outputs=[], failures=[], notes=[], classes={}, states={"waiting": 0}, bounds=None)
     assert "Map of the tiles" not in Page(run_page(empty)).text
-
-
-# ---- what a section shows --------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("share", [0.0, 0.001, 0.01, 0.05, 0.3])
-def test_noise_does_not_empty_a_section(share):
-    rng = np.random.default_rng(3)
-    town = np.concatenate([rng.normal(50, 0.1, 8000), rng.uniform(50, 62, 2000)])
-    noise = rng.uniform(-2000, 4000, int(share * len(town)))
-    low, high = heights_to_draw(np.concatenate([town, noise]), 80.0)
-    assert low <= 49.8
-    assert high >= 61.9
-    assert high - low < 200
-
-
-def test_labeled_noise_does_not_empty_a_section(scene, accuracy):
-    xyz, reference, predicted, _ = scene
-    rng = np.random.default_rng(0)
-    noise = rng.random(len(xyz)) < 0.2
-    xyz, predicted = xyz.copy(), np.where(noise, 7, predicted)
-    xyz[noise, 2] += rng.uniform(-900, 900, noise.sum())
-    text = accuracy_page(accuracy, xyz=xyz, reference=reference, predicted=predicted)
-    assert "far above or below the others" in Page(text).text
-    assert embedded(text)[3].shape[0] < 800

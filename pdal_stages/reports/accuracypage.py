@@ -11,18 +11,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..accuracy.confidence import Grading
 from ..accuracy.measures import Accuracy
 from ..accuracy.text import percent
 from ..base.files import write_whole
-from .charts import Chart, percent_axis
-from .maps import DrawnScene, Line, MapScene, draw_scene
+from .maps import DrawnScene, MapScene, draw_scene
 from .page import render
 
 #: Files within so many meters share a map, and places that are drawn at most.
 TOGETHER, DRAWN = 1000.0, 12
-#: A chart, the titles of the table of its figures, and the rows.
-Charted = tuple[Chart, list[str], list[list[str]]]
 
 
 @dataclass(frozen=True)
@@ -80,7 +76,6 @@ def write_accuracy_report(
     importances: Mapping[str, float] | None = None,
     settings: Mapping[str, Any] | None = None,
     unit: str = "m",
-    section: Line | None = None,
     date: str | None = None,
 ) -> Path:
     """Write an accuracy report, whole or not at all.
@@ -92,7 +87,7 @@ def write_accuracy_report(
     accuracy : Accuracy
         The figures.
     xyz : (n, 3) array, optional
-        Coordinates, for maps from above and a vertical section. They become images of bounded size, so
+        Coordinates, for maps from above. They become images of bounded size, so
         millions of points do not make the page large.
     reference, predicted : (n,) arrays, optional
         Class codes of those points, as they were before any merge; needed with `xyz`.
@@ -106,8 +101,6 @@ def write_accuracy_report(
         What was compared and how (files, reference system, model, options); mappings may be nested.
     unit : str
         Unit of the coordinates, for scales and axes.
-    section : ((x, y), (x, y)), optional
-        Ends of the vertical section; by default it lies where the errors are densest.
     date : str, optional
         The date to print; by default today, or ``SOURCE_DATE_EPOCH`` where the environment sets it.
 
@@ -124,10 +117,10 @@ def write_accuracy_report(
     scenes: list[tuple[str, DrawnScene]] = []
     if xyz is not None or reference is not None or predicted is not None:
         scene = MapScene.of(accuracy, xyz, reference, predicted)
-        scenes = [("", draw_scene(accuracy, scene, unit, section))]
+        scenes = [("", draw_scene(accuracy, scene, unit))]
     for one in places[:DRAWN]:
         scene = MapScene.of(accuracy, one.xyz, one.reference, one.predicted)
-        scenes.append((one.name if len(places) > 1 else "", draw_scene(accuracy, scene, unit, section)))
+        scenes.append((one.name if len(places) > 1 else "", draw_scene(accuracy, scene, unit)))
     ordered = sorted((importances or {}).items(), key=lambda item: (-item[1], item[0]))
     page = render(
         "accuracy.html",
@@ -152,86 +145,35 @@ def _matrix_width(a: Accuracy) -> int:
     return 120 + 7 * max(len(f"{c} {a.name(c)}") for c in a.classes) + columns
 
 
-def _confidence(a: Accuracy) -> list[Charted]:
-    drawn = (_reliability, a.reliability), (_margin, a.margin)
-    return [draw(grading) for draw, grading in drawn if grading is not None and grading.points]
-
-
-def _reliability(g: Grading) -> Charted:
-    curve = [b for b in g.curve() if b["points"]]
-    tenths = [(i / 10, f"{10 * i}") for i in range(0, 11, 2)]
-    words = [
-        f"Reliability {100 * b['lower']:.0f}-{100 * b['upper']:.0f} %: {b['points']:,} points, "
-        f"{percent(b['share_right'], 1)} % right"
-        for b in curve
-    ]
-    chart = Chart(
-        heading="Reliability",
-        caption="Line: share of right points; dashed: where it would equal the reliability; bars: share of all "
-        f"points. Mean reliability {percent(g.mean, 1)} %, expected calibration error "
-        f"{percent(g.expected_calibration_error(), 1)} %.",
-        alt="Reliability curve. " + "; ".join(words),
-        x_label="Reliability (winning probability), %",
-        y_label="Points, %",
-        x_ticks=tenths,
-        y_ticks=tenths,
-        bars=[
-            (b["lower"], b["upper"], b["points"] / g.points, "faint", w)
-            for b, w in zip(curve, words, strict=True)
-        ],
-        lines=[([(0, 0), (1, 1)], "ideal"), ([(b["mean"], b["share_right"]) for b in curve], "line")],
-        dots=[(b["mean"], b["share_right"], w) for b, w in zip(curve, words, strict=True)],
-    )
-    rows = [
-        [
-            f"{100 * b['lower']:.0f} to {100 * b['upper']:.0f}",
-            f"{b['points']:,}",
-            percent(b["mean"], 1),
-            percent(b["share_right"], 1),
+def _confidence(a: Accuracy) -> list[dict[str, Any]]:
+    """Tables of how well reliability and margin tell where the classifier is wrong: a share of each group as a bar."""
+    out = []
+    if (g := a.reliability) is not None and g.points:
+        rows = [
+            (f"{100 * b['lower']:.0f} to {100 * b['upper']:.0f}", b["points"], b["share_right"])
+            for b in g.curve()
+            if b["points"]
         ]
-        for b in curve
-    ]
-    return chart, ["Reliability %", "Points", "Mean %", "Right %"], rows
-
-
-def _margin(g: Grading) -> Charted:
-    groups = g.quantiles()
-    n = len(groups)
-    top, ticks = percent_axis(1.07 * max(d["share_wrong"] for d in groups))  # room above the longest bar
-    words = [
-        f"Margin {100 * d['lower']:.1f}-{100 * d['upper']:.1f} %: {d['points']:,} points, "
-        f"{percent(d['share_wrong'], 1)} % wrong"
-        for d in groups
-    ]
-    caption = "Margin: the winning probability minus the second."
-    wrong = sum(d["points"] - d["right"] for d in groups)
-    if wrong:
-        caught = groups[0]["points"] - groups[0]["right"]
-        caption += (
-            f" The {percent(groups[0]['points'] / g.points, 0)} % of points with the least margin hold "
-            f"{percent(caught / wrong, 0)} % of the errors."
+        caption = (
+            f"Share of right points by the winning probability. Mean reliability {percent(g.mean, 1)} %, expected "
+            f"calibration error {percent(g.expected_calibration_error(), 1)} %."
         )
-    chart = Chart(
-        heading="Errors against margin",
-        caption=caption,
-        alt="Errors against margin. " + "; ".join(words),
-        x_label=f"{'Tenths' if n == 10 else 'Groups'} of the points, least certain first",
-        y_label="Wrong, %",
-        x=(0, n),
-        y=(0, top),
-        x_ticks=[(i + 0.5, str(i + 1)) for i in range(n)],
-        y_ticks=ticks,
-        bars=[
-            (i, i + 1, d["share_wrong"], "bad", w) for i, (d, w) in enumerate(zip(groups, words, strict=True))
-        ],
-        values=[(i + 0.5, d["share_wrong"], percent(d["share_wrong"], 1)) for i, d in enumerate(groups)],
-    )
-    rows = [
-        [
-            f"{100 * d['lower']:.1f} to {100 * d['upper']:.1f}",
-            f"{d['points']:,}",
-            percent(d["share_wrong"], 1),
+        titles = ["Reliability %", "Points", "Right %"]
+        out.append({"heading": "Reliability", "caption": caption, "titles": titles, "rows": rows})
+    if (g := a.margin) is not None and g.points:
+        groups = g.quantiles()
+        caption = "Share of wrong points by the winning probability minus the second."
+        wrong = sum(d["points"] - d["right"] for d in groups)
+        if wrong:
+            caught = groups[0]["points"] - groups[0]["right"]
+            caption += (
+                f" The {percent(groups[0]['points'] / g.points, 0)} % of points with the least margin hold "
+                f"{percent(caught / wrong, 0)} % of the errors."
+            )
+        rows = [
+            (f"{100 * d['lower']:.1f} to {100 * d['upper']:.1f}", d["points"], d["share_wrong"])
+            for d in groups
         ]
-        for d in groups
-    ]
-    return chart, ["Margin %", "Points", "Wrong %"], rows
+        titles = ["Margin %", "Points", "Wrong %"]
+        out.append({"heading": "Errors against margin", "caption": caption, "titles": titles, "rows": rows})
+    return out

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +11,6 @@ from ..accuracy.text import percent
 from ..base import checks
 from ..base.files import write_whole
 from ..classifier.summary import held_out_by, out_of_bag
-from .charts import Chart
 from .page import render
 
 #: A curve with more is nonsense: the manifest's free parts may hold anything.
@@ -80,38 +78,25 @@ def _scores(d: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     ]
 
 
-def _curves(rows: Any) -> list[Chart]:
-    """Loss, and the mean F1 on the ground held out, epoch by epoch."""
+def _curves(rows: Any) -> list[dict[str, Any]]:
+    """Loss, and the mean F1 on the ground held out, epoch by epoch: the best value, and of at most 30 epochs a bar each."""
     rows = [r for r in rows if isinstance(r, dict)] if isinstance(rows, list) else []
-    charts = []
+    curves = []
     for key, title in (("loss", "Loss"), ("mean_f1", "Mean F1 on the ground held out")):
         pairs = [(checks.finite(r.get("epoch")), checks.finite(r.get(key))) for r in rows]
         points = sorted((a, b) for a, b in pairs if a is not None and b is not None and 0 < a <= _MOST_EPOCHS)
-        if len(points) > 1:
-            charts.append(_curve(points, title, is_share=key == "mean_f1"))
-    return charts
+        if len(points) < 2:
+            continue
+        most = max(b for _, b in points)
+        epoch, best = (max if key == "mean_f1" else min)(points, key=lambda p: p[1])
 
+        def said(value: float, share: bool = key == "mean_f1") -> str:
+            return f"{100 * value:.1f} %" if share else f"{value:.4g}"
 
-def _curve(points: list[tuple[float, float]], title: str, is_share: bool) -> Chart:
-    last = points[-1][0]
-    most = max(b for _, b in points)
-    most = most if most > 0 and not is_share else 1.0
-    best = (max if is_share else min)(points, key=lambda p: p[1])
-    step = max(1, math.ceil(last / 6))
-    said = f"{100 * best[1]:.1f} %" if is_share else f"{best[1]:.4g}"
-    return Chart(
-        heading=title,
-        caption=f"Best: {said} in epoch {best[0]:g}.",
-        alt=f"{title} over {len(points)} epochs; best {said} in epoch {best[0]:g}",
-        x_label="Epoch",
-        y_label=f"{title}, %" if is_share else title,
-        x=(0.0, last),
-        y=(0.0, most),
-        x_ticks=[(float(e), str(e)) for e in range(0, int(last) + 1, step)],
-        y_ticks=[(most * i / 5, f"{20 * i}" if is_share else f"{most * i / 5:.2g}") for i in range(6)],
-        lines=[(points, "line")],
-        dots=[(*best, f"epoch {best[0]:g}: {said}")],
-    )
+        shown = points[:: max(1, -(-len(points) // 30))]
+        bars = [(f"Epoch {a:g}", max(b / most, 0.0) if most > 0 else 0.0, said(b)) for a, b in shown]
+        curves.append({"heading": title, "caption": f"Best: {said(best)} in epoch {epoch:g}.", "bars": bars})
+    return curves
 
 
 def _settings(d: Mapping[str, Any]) -> dict[str, Any]:
