@@ -3,7 +3,6 @@
     python benchmarks/classification.py --data DIR                    # both scenes, defaults
     python benchmarks/classification.py --data DIR --count 1000 10000 100000 --json out.json
     python benchmarks/classification.py --data DIR --scene montpellier --target 6    # Building, the rest
-    python benchmarks/classification.py --data DIR --tune             # defaults, from the training parts
 
 DIR (or the environment variable PDAL_STAGES_DATA) holds montpellier/train_*.laz, montpellier/test_*.laz,
 delft/train.laz and delft/test.laz. Scores are over the test points of the classes trained; all others
@@ -27,11 +26,6 @@ import numpy as np
 
 from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
-from pdal_stages.classifier.crossval import block_folds, split
-from pdal_stages.classifier.forest import Forest
-from pdal_stages.classifier.sampling import draw_samples
-from pdal_stages.classifier.trees import Ranked, TreeOptions, grow
-from pdal_stages.features import FeatureEngine, FeaturePlan
 from pdal_stages.terrain.minima import hag_minima
 
 SCENES = {"montpellier": (2, 3, 4, 5, 6), "delft": (1, 2, 6)}
@@ -178,87 +172,6 @@ def warm(options: TrainingOptions) -> None:
     model.predict(xyz, tiny)
 
 
-# ---- tuning, on the training parts alone -------------------------------------------------------------------
-
-
-def tune(
-    data: Path, scene: str, options: TrainingOptions, folds: int, block: float, quick: int
-) -> list[dict]:
-    """How trees are grown and classes weighed, judged on blocks held out of the training part.
-
-    Unlike the scores kept in a model file these count points as they lie (not classes alike), as the test does.
-    """
-    xyz, labels, dimensions = read(data, scene, "train")
-    dimensions = with_height(xyz, dimensions)
-    plan = FeaturePlan.parse(
-        options.neighborhoods, feature_set=options.feature_set, dimensions=options.dimensions
-    )
-    codes = np.array(SCENES[scene])
-    position = np.full(len(xyz), -1, np.int16)
-    for k, code in enumerate(codes):
-        position[labels == code] = k
-    use = np.flatnonzero(position >= 0)
-    fold = block_folds(xyz[use, :2], position[use], np.ones(len(use)), folds, block)
-    print(f"{scene}: features of {len(use):,} points", flush=True)
-    engine = FeatureEngine(xyz, plan, seed=options.seed, threads=options.threads)
-    values = np.empty((len(xyz), len(plan.names)), np.float32)
-    fed = {name: np.asarray(dimensions[name])[use] for name in plan.dimensions}
-    for rows, part in engine.blocks(queries=use, dimensions=fed, threads=options.threads):
-        values[rows] = part
-    base = {"count": options.count, "trees": 50, "leaf": 1, "bag": 1.0, "tried": "auto", "limit": True}
-    trials = [dict(base)]
-    for key, choices in {
-        "tried": ("sqrt", 0.2),
-        "bag": (0.5,),
-        "leaf": (3, 5),
-        "limit": (False,),
-        "trees": (25, 100),
-        "count": (1000, 30_000),
-    }.items():
-        trials += [{**base, key: choice} for choice in choices]
-    out = []
-    for trial in trials[: quick or None]:
-        sums = dict.fromkeys((0.0, 0.05, 0.1, 0.2, 0.3), 0)
-        cpu = 0.0
-        nodes = 0
-        for number in range(folds):
-            train_mask, held = split(xyz[use, :2], fold, number, 5.0)
-            masked = np.full(len(xyz), -1, np.int16)
-            masked[use[train_mask]] = position[use[train_mask]]
-            samples = draw_samples([(xyz, masked)], len(codes), trial["count"], options.seed)
-            x = values[samples.row]
-            if trial["limit"]:
-                for j in range(x.shape[1] - len(plan.dimensions)):
-                    np.clip(x[:, j], *np.percentile(x[:, j], [1, 99]).astype(np.float32), out=x[:, j])
-            start = time.process_time()
-            setting = TreeOptions(None, trial["leaf"], trial["bag"], trial["tried"])
-            grown = grow(Ranked.of(x), samples.label, samples.weight, trial["trees"], setting, options.seed)
-            forest = Forest.from_trees([tree for tree, _, _ in grown], x.shape[1])
-            cpu += time.process_time() - start
-            nodes += len(forest.feature)
-            rows = use[np.random.default_rng(0).permutation(held)[:30_000]]
-            shares = forest.predict_proba(values[rows])
-            drawn = np.bincount(samples.label, samples.weight)
-            for weight in sums:
-                best = (shares * (np.array(samples.available) / drawn) ** weight).argmax(axis=1)
-                matrix = np.zeros((len(codes), len(codes)), np.int64)
-                np.add.at(matrix, (position[rows], best), 1)
-                sums[weight] = sums[weight] + matrix
-        row = {"scene": scene, **trial, "grow_cpu": round(cpu / folds, 1), "nodes": nodes // folds}
-        print(json.dumps(row))
-        for weight, matrix in sums.items():
-            result = Accuracy.from_confusion(matrix, codes)
-            row[f"prior_{weight:g}"] = figures(result)
-            merged = result.merge(MERGED[scene]).overall_accuracy if MERGED[scene] else None
-            print(
-                f"  prior_weight {weight:<5g} OA {100 * result.overall_accuracy:.2f}  "
-                f"F1 {100 * result.mean_f1:.2f}" + (f"  merged OA {100 * merged:.2f}" if merged else ""),
-                flush=True,
-            )
-        out.append(row)
-    return out
-
-
 # ---- command -----------------------------------------------------------------------------------------------
 
 
@@ -288,10 +201,6 @@ def main() -> None:
     parser.add_argument("--target", type=int, help="binary: this class against the rest")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int)
-    parser.add_argument("--tune", action="store_true")
-    parser.add_argument("--folds", type=int, default=3)
-    parser.add_argument("--block", type=float, default=25.0, help="meters, for --tune")
-    parser.add_argument("--quick", type=int, default=0, help="only the first so many trials of --tune")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--progress", action="store_true")
     args = parser.parse_args()
@@ -316,10 +225,7 @@ def main() -> None:
                 seed=args.seed,
                 threads=args.threads,
             )
-            if args.tune:
-                results += tune(Path(args.data), scene, options, args.folds, args.block, args.quick)
-            else:
-                results.append(score(Path(args.data), scene, options, args.smooth, args.progress))
+            results.append(score(Path(args.data), scene, options, args.smooth, args.progress))
     if args.json:
         import numba
         import sklearn

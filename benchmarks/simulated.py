@@ -25,7 +25,7 @@ from classification import read
 
 from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
-from pdal_stages.classifier.preparing import preparing
+from pdal_stages.classifier.dimensions import preparing
 from pdal_stages.synthetic import make_town
 
 CLASSES = (1, 2, 6)

@@ -18,8 +18,7 @@ from ..base import checks
 from ..base.errors import ModelError, OptionError, StageError
 from ..base.report import Report
 from ..base.threads import map_blocks, resolve_threads
-from ..classifier.algorithms import Block, Column, InputPlan, PredictRequest, PredictResult
-from ..classifier.arrays import ArrayRule
+from ..classifier.algorithms import ArrayRule, Block, Column, InputPlan, PredictRequest, PredictResult
 from ..classifier.dimensions import gather, with_returns
 from ..features.index import check_xyz
 from . import circles as circles_

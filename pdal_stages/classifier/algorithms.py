@@ -15,7 +15,6 @@ from ..base.outputs import Output
 from ..base.report import Report
 from ..features import FeaturePlan
 from ..features.index import CellGrid
-from .arrays import ArrayRule
 
 #: Each kind by its word in manifests and options: its Algorithm and its Trainer, imported when asked for.
 ALGORITHMS = {
@@ -29,6 +28,14 @@ ALGORITHMS = {
 
 #: Passes that training makes by itself, on top of others.
 ON_TOP = {"refined_forest": "pdal_stages.classifier.refinement:RefinedForest"}
+
+
+@dataclass(frozen=True)
+class ArrayRule:
+    """What an algorithm expects of one of its arrays."""
+
+    dtypes: tuple[str, ...]  #: allowed types, as NumPy writes them: ``<f4``
+    ndim: int  #: number of axes
 
 
 @dataclass(frozen=True)

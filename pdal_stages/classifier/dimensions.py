@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pkgutil
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -156,3 +157,8 @@ def gather(
             counts["points_without_return_numbers"] = int(np.count_nonzero(~there))
             out[name] = np.where(there, number / np.maximum(total, 1), 1.0)
     return out, counts
+
+
+def preparing() -> Any:
+    """The module that knows the stages which make dimensions; it stands above this room, and is imported when asked for."""
+    return pkgutil.resolve_name("pdal_stages.stages.heights")

@@ -17,8 +17,7 @@ from ..base.report import Report
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.index import CellGrid
 from ..features.names import GROUPS, RELATIVE
-from .algorithms import Block, Column, PredictRequest, PredictResult
-from .arrays import ArrayRule
+from .algorithms import ArrayRule, Block, Column, PredictRequest, PredictResult
 from .context import Context
 from .dimensions import gather, with_returns
 from .forest import Forest

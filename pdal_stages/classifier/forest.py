@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError
 from ..base.jit import njit
-from .arrays import ArrayRule
+from .algorithms import ArrayRule
 from .trees import GrownTree
 
 #: Levels below the root a tree may have.

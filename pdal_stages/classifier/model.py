@@ -20,9 +20,8 @@ from ..features.voxels import Representatives, check_side, represent
 from . import modelfile, summary
 from .algorithms import InputPlan, PredictRequest, algorithm
 from .deciding import Outcome, Prediction, PredictionOptions, decide
-from .dimensions import known, required, welcome
+from .dimensions import known, preparing, required, welcome
 from .passes import Passes, weighed
-from .preparing import preparing
 from .smoothing import count_shares, smooth
 from .thinning import density, out_of_range, range_text
 

@@ -7,7 +7,9 @@ before anything is allocated, so a hostile one costs bounded time and memory. Se
 from __future__ import annotations
 
 import hashlib
+import io
 import json
+import math
 import os
 import struct
 import zipfile
@@ -19,13 +21,14 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
 from ..base import strictjson
 from ..base.errors import ModelError, StageError
 from ..base.files import whole_files
 from ..models import shipped
-from .arrays import ArrayRule, from_bytes, to_bytes
+from .algorithms import ArrayRule
 
 #: Arrays of each pass by their names.
 Arrays = list[dict[str, npt.NDArray[Any]]]
@@ -224,6 +227,48 @@ def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
         if len(data) != info.file_size or stream.read(1):
             raise ModelError("a member has another size than declared", found=repr(info.filename))
     return data
+
+
+# ---- arrays ------------------------------------------------------------------------------------------------
+
+#: Of ``.npy`` files, version 1.0.
+_MAGIC = b"\x93NUMPY\x01\x00"
+
+
+def to_bytes(array: npt.NDArray[Any]) -> bytes:
+    """The array as ``.npy`` bytes (version 1.0, little-endian, C order)."""
+    array = np.asarray(array)
+    little = array.astype(array.dtype.newbyteorder("<"), order="C", copy=False)
+    out = io.BytesIO()
+    np.lib.format.write_array(out, little, version=(1, 0), allow_pickle=False)
+    return out.getvalue()
+
+
+def from_bytes(data: bytes, rule: ArrayRule, name: str) -> npt.NDArray[Any]:
+    """The array in ``.npy`` bytes, if it is what `rule` says; a view of `data`, read-only.
+
+    ``np.load`` is not used because it allocates what a header says: here an array's size must be that of the bytes.
+    """
+    if data[:8] != _MAGIC:
+        raise ModelError("an array is not in the .npy format, version 1.0", found=name)
+    stream = io.BytesIO(data)
+    stream.seek(len(_MAGIC))
+    try:
+        shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+    except (ValueError, RecursionError, MemoryError) as error:
+        raise ModelError(f"the header of the array '{name}' cannot be read", found=str(error)[:80]) from None
+    if fortran or dtype.str not in rule.dtypes or len(shape) != rule.ndim:
+        raise ModelError(
+            f"the array '{name}' must be {' or '.join(rule.dtypes)} with {rule.ndim} axes, in C order",
+            found=f"{dtype.str} {shape}",
+        )
+    start = stream.tell()
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(data) - start:
+        raise ModelError(
+            f"the array '{name}' has another size than its header says",
+            found=f"shape {shape}, {len(data) - start:,} bytes",
+        )
+    return np.frombuffer(data, dtype, offset=start).reshape(shape).astype(dtype.newbyteorder("="), copy=False)
 
 
 # ---- the manifest ----------------------------------------------------------------------------------------

@@ -145,14 +145,6 @@ def scores(info: Mapping[str, Any], held_out: dict[str, Any] | None = None) -> l
             "",
         ]
     lines = []
-    left_out = info["accuracy"].get("leave_one_survey_out")
-    if left_out:
-        worst = min(left_out["surveys"], key=lambda row: row["overall_accuracy"])
-        lines.append(
-            f"{'survey left out':<17}overall accuracy {_percent(left_out['overall_accuracy'])} on average, "
-            f"{_percent(worst['overall_accuracy'])} at worst ({worst['name']}), "
-            f"mean F1 {_percent(left_out['mean_f1'])}"
-        )
     crossed = info["accuracy"]["cross_validation"]
     rows = [(held_out_by(crossed), crossed and crossed["chosen"])]
     for number, one in _own_passes(info):

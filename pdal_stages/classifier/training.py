@@ -15,9 +15,8 @@ from ..base.errors import OptionError
 from .algorithms import trainer
 from .clouds import CloudSource, TrainingCloud, prepared, spooled
 from .context import Context
-from .dimensions import ALWAYS, WHERE_THERE, required
+from .dimensions import ALWAYS, WHERE_THERE, preparing, required
 from .model import Model
-from .preparing import preparing
 from .tiledcloud import TiledCloud
 from .trainoptions import TrainingOptions, feature_plan
 

@@ -57,7 +57,7 @@ def wild_feature(head, members):
 
 
 def bomb(head, members):
-    from pdal_stages.classifier.arrays import to_bytes
+    from pdal_stages.classifier.modelfile import to_bytes
 
     members[head["arrays"]["1.threshold"]["file"]] = to_bytes(np.zeros(30_000_000, np.float32))
     head["arrays"]["1.threshold"]["shape"] = [30_000_000]
@@ -280,7 +280,6 @@ def test_figures_of_any_size(cell, tmp_path, model):
 
 def test_the_label_as_a_dimension(cell, tmp_path, write_las):
     data = scene(2000)
-    data["Copy"] = data["Classification"].astype("f4")
     source = write_las(tmp_path / "in.las", data, point_format=6)
     words = [
         "train",
@@ -298,11 +297,6 @@ def test_the_label_as_a_dimension(cell, tmp_path, write_las):
     it.refused(
         [*words, "--writers.classifiermodel.dimensions=Classification"], "the label itself", "Leave it out"
     )
-    it = cell("Models", "training on a dimension that is a copy of the label")
-    done = it.runs(
-        [*words, "--writers.classifiermodel.dimensions=Copy"], "trained, with a warning that names it"
-    )
-    assert "almost alone: Copy (100 %)" in done.err
 
 
 def test_more_samples_than_points(cell, tmp_path, cloud):

@@ -40,7 +40,7 @@ SITES = {
     "classifier/clouds:_mapped.kept": _SCRATCH,
     "classifier/estimator:PointClassifier.save": "through classifier/modelfile:write",
     "classifier/modelfile:write": "model",
-    "classifier/parts:CloudParts._write": "train in tiles",
+    "classifier/tiledcloud:TiledCloud.put": "train in tiles",
     "commands/pipelines:_expand": "expanded pipeline",
     "commands/running:ran": "metadata",
     "base/projection:_rewrite": "records kept",
