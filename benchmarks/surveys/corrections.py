@@ -27,7 +27,6 @@ from pdal_stages.objects.overlay import points_inside
 from pdal_stages.pipeline.parts import reference_and_wkt
 from pdal_stages.pipeline.reviewing import ReviewRequest, review_files, review_layers
 from pdal_stages.reports.objectlayers import Layer, write_layers
-from pdal_stages.review.patches import REASONS
 
 ROUNDS, PATCHES = 3, 5
 
@@ -75,7 +74,7 @@ def rounds(data: Path, name: str, model: Path, folder: Path) -> dict[str, Any]:
         fresh = [k for k, shape in enumerate(shapes) if shape.difference(seen).area > 0.5 * shape.area]
         chosen = fresh[:PATCHES]
         done += [shapes[k] for k in chosen]
-        told.append([", ".join(REASONS[word] for word in found.patches.reasons[k]) for k in chosen])
+        told.append([found.patches.reason[k] for k in chosen])
         mine = points_inside(x, y, [shapes[k] for k in chosen])
         touched |= mine
         corrected(checked_file, folder / "after.laz", truth, mine)

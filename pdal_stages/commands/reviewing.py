@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from ..base.plain import print_messages
 from .adder import Adder
@@ -13,11 +14,8 @@ def add_commands(add: Adder) -> None:
     takes = add("review", _review, "List where a person should look in classified files, worst first")
     takes("inputs", nargs="+", metavar="input", help="Classified files PDAL can read, folders, patterns")
     takes("output", help="Vector file to write: .gpkg, .geojson, .fgb or .shp")
-    takes(
-        "--html", metavar="FILE", help="A page with pictures; default: beside the vector file, under its name"
-    )
+    takes("--html", metavar="FILE", help="A page; default: beside the vector file, under its name")
     takes("--json", metavar="FILE", help="Write figures to a JSON file")
-    takes("--pictures", type=int, default=40, metavar="N", help="Patches that the page shows (40)")
     takes(
         "--share",
         type=float,
@@ -28,6 +26,7 @@ def add_commands(add: Adder) -> None:
     takes(
         "--cell",
         type=float,
+        default=0.0,
         metavar="METERS",
         help="Side of the cells that are judged; default: by the density, 1 m at least",
     )
@@ -44,12 +43,7 @@ def add_commands(add: Adder) -> None:
         "Mark what a person has corrected, or looked at and found right, for train",
     )
     takes("before", help="The file as it was classified (LAS or LAZ)")
-    takes(
-        "after",
-        nargs="?",
-        help="The same points, in any order, as the person left them; or points with true classes: a CSV file or a vector "
-        "layer with x, y, z and class",
-    )
+    takes("after", nargs="?", help="The same points, in any order, as the person left them")
     takes(
         "--out",
         required=True,
@@ -71,30 +65,23 @@ def add_commands(add: Adder) -> None:
         metavar="METERS",
         help="So far around a changed point all was looked at (1)",
     )
-    takes(
-        "--within",
-        type=float,
-        default=0.5,
-        metavar="METERS",
-        help="A point of a table is about the nearest one of the file within this distance (0.5)",
-    )
 
 
 def _review(options: argparse.Namespace) -> None:
     from ..pipeline.inputs_outputs import overlooked
-    from ..pipeline.reviewing import request_of, write_review
+    from ..pipeline.reviewing import ReviewRequest, write_review
     from ..reports.reviewpage import lines
 
-    request = request_of(
-        options.inputs,
+    html = str(Path(options.output).with_suffix(".html")) if options.html is None else options.html
+    request = ReviewRequest(
+        tuple(options.inputs),
         options.output,
-        html=options.html,
-        json=options.json or "",
-        share=options.share,
-        pictures=options.pictures,
-        model=options.model,
-        cell=options.cell,
-        workers=options.workers,
+        html,
+        options.json or "",
+        options.share,
+        options.cell,
+        options.model,
+        options.workers,
     )
     print_messages(*overlooked(options.inputs))
     print("\n".join(lines(write_review(request).to_dict())))
@@ -102,10 +89,9 @@ def _review(options: argparse.Namespace) -> None:
 
 
 def _corrections(options: argparse.Namespace) -> None:
-    from ..pipeline.correcting import request_of, write_corrections
+    from ..pipeline.correcting import CorrectionRequest, write_corrections
 
-    request = request_of(
-        options.before, options.after, options.out, options.area, options.around, options.within
-    )
+    areas = tuple(options.area)
+    request = CorrectionRequest(options.before, options.out, options.after or "", areas, options.around)
     print("\n".join(write_corrections(request).lines()))
     print(f"written to {request.output}; next: pdal-stages train --base MODEL {request.output} --model NEW")

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base import checks, kinds
 from ..base.errors import StageError
@@ -25,18 +24,8 @@ from ..models import STANDARD
 from ..objects.outlines import vector
 from ..reports.objectlayers import Layer, check_target, write_layers
 from ..reports.reviewlayers import patch_style, tile_style
-from ..reports.reviewpage import PatchView, draw_patch, review_page
-from ..review import (
-    Outlook,
-    Patches,
-    Records,
-    Settings,
-    find_patches,
-    outlook,
-    side_for,
-    standard_calibration,
-)
-from ..review.patches import REASONS
+from ..reports.reviewpage import review_page
+from ..review import Cells, Patches, find_patches, side_for
 from ..stages.heights import PREPARATION, made_of_coordinates
 from ..stages.loading import loaded_model
 from .inputs_outputs import input_files
@@ -48,8 +37,6 @@ from .references import check_one_reference, without_reference
 _SAME = {3: 5, 4: 5}
 #: What is written, in this order.
 LAYERS = ("patches", "tiles")
-#: Meters of surroundings in a picture.
-_MARGIN = 6.0
 
 
 @dataclass(frozen=True)
@@ -63,17 +50,20 @@ class ReviewRequest:
     output : str
         Vector file.
     html, json : str
-        A page with pictures, and figures; empty for none.
+        A page, and figures; empty for none.
     share : float
         Patches are written until they hold this share of the expected errors.
-    pictures : int
-        Patches that the page shows.
+    cell : float
+        Side of a cell, meters; 0: chosen by the density.
     model : str
         What gives reliabilities where the files have none.
-    settings : Settings
-        Its cell is chosen by the density where it is 0.
     workers : int
         Files read at the same time.
+
+    Raises
+    ------
+    OptionError
+        If a number is out of bounds.
     """
 
     inputs: tuple[str, ...]
@@ -81,39 +71,20 @@ class ReviewRequest:
     html: str = ""
     json: str = ""
     share: float = 0.95
-    pictures: int = 40
+    cell: float = 0.0
     model: str = STANDARD
-    settings: Settings = field(default_factory=lambda: Settings(cell=0.0))
     workers: int = 1
+
+    def __post_init__(self) -> None:
+        if self.cell:
+            checks.number("'--cell'", self.cell, 0.5, 100, unit="m")
+        checks.number("'--share'", self.share, 0, 1, above=True)
+        checks.whole("'--workers'", self.workers, 1, 1024)
 
     @cached_property
     def files(self) -> list[str]:
         """All inputs."""
         return input_files(self.inputs)
-
-
-def request_of(
-    inputs: Sequence[str],
-    output: str,
-    *,
-    html: str | None = None,
-    cell: float | None = None,
-    **more: Any,
-) -> ReviewRequest:
-    """What a command asks for; the page lies beside the vector file where `html` is None.
-
-    Raises
-    ------
-    OptionError
-        If a number is out of bounds.
-    """
-    page = str(Path(output).with_suffix(".html")) if html is None else html
-    if cell is not None:
-        cell = checks.number("'--cell'", cell, 0.5, 100, unit="m")
-    checks.number("'--share'", more.get("share", 1.0), 0, 1, above=True)
-    checks.whole("'--pictures'", more.get("pictures", 0), 0, 10_000)
-    checks.whole("'--workers'", more.get("workers", 1), 1, 1024)
-    return ReviewRequest(tuple(inputs), output, page, settings=Settings(cell=cell or 0.0), **more)
 
 
 @dataclass
@@ -122,35 +93,26 @@ class Review:
 
     Attributes
     ----------
-    seen : Outlook
+    cells : Cells
     patches : Patches
     listed : int
         Patches that are written: those that come first.
     files : list of str
-    settings : Settings
     """
 
-    seen: Outlook
+    cells: Cells
     patches: Patches
     listed: int
     files: list[str]
-    settings: Settings
-
-    @property
-    def points(self) -> int:
-        """All that were judged."""
-        return int(self.seen.records.points[:, :3].sum())
 
     @cached_property
     def tiles(self) -> list[dict[str, Any]]:
         """A row for each file: points, points expected wrong, patches listed, minutes to look at these; worst first."""
-        records, patches = self.seen.records, self.patches
-        n = len(self.files)
-        points = np.bincount(records.tile, records.points[:, :3].sum(axis=1), n)
-        errors = np.bincount(records.tile, self.seen.total, n)
-        mine = patches.tile[: self.listed]
-        number = np.bincount(mine, minlength=n)
-        minutes = np.bincount(mine, patches.minutes[: self.listed], n)
+        n, listed = len(self.files), self.patches.file[: self.listed]
+        points = np.bincount(self.cells.place[:, 0], self.cells.points.sum(axis=1), n)
+        errors = np.bincount(self.cells.place[:, 0], self.cells.errors.sum(axis=1), n)
+        number = np.bincount(listed, minlength=n)
+        minutes = np.bincount(listed, self.patches.minutes[: self.listed], n)
         rows = [
             {
                 "tile": Path(name).name,
@@ -166,14 +128,13 @@ class Review:
 
     def to_dict(self) -> dict[str, Any]:
         """Figures, for JSON."""
-        patches = self.patches
         return {
             "version": __version__,
-            "points": self.points,
-            "expected": float(patches.errors.sum()),
-            "patches": len(patches),
+            "points": int(self.cells.points.sum()),
+            "expected": float(self.patches.errors.sum()),
+            "patches": len(self.patches),
             "listed": self.listed,
-            "settings": asdict(self.settings),
+            "cell": self.cells.side,
             "tiles": self.tiles,
             "worst": [self.row(number) for number in range(min(self.listed, 1000))],
         }
@@ -183,12 +144,12 @@ class Review:
         p = self.patches
         return {
             "rank": number + 1,
-            "tile": Path(self.files[p.tile[number]]).name,
+            "tile": Path(self.files[p.file[number]]).name,
             "expected": round(float(p.errors[number]), 1),
             "points": int(p.points[number]),
             "area": float(p.area[number]),
             "seconds": round(60.0 * float(p.minutes[number]), 1),
-            "reason": ", ".join(REASONS[word] for word in p.reasons[number]),
+            "reason": p.reason[number],
             "box": [round(float(v), 3) for v in p.box[number]],
         }
 
@@ -204,49 +165,38 @@ def review_files(request: ReviewRequest) -> Review:
     references = {path: reference_and_wkt(path) for path in request.files}
     without = check_one_reference({path: one for path, (one, _) in references.items()})
     print_messages(*without_reference(without))
-    side = request.settings.cell or side_for(*_extent(request.files, references))
-    records: list[Records] = []
+    side = request.cell or side_for(*_extent(request.files, references))
+    found: list[Cells] = []
     work = [
         (path, references[path][1], request.model, side, number) for number, path in enumerate(request.files)
     ]
     with Progress(len(work), "reading", "files") as line:
-        for _, answer in each_file(records_of, work, request.workers):
+        for _, answer in each_file(cells_of, work, request.workers):
             if answer.reason:
                 raise StageError(answer.reason)
-            records += answer.result
-            if len(records) >= 8:
-                records = [Records.join(records)]
+            found += answer.result
             line.update(1)
-    if not records:
-        raise StageError("there are no points to review", found=", ".join(request.files[:3]))
-    joined = Records.join(records)
-    if not joined.points[:, :3].any():
+    cells = Cells.join(found) if found else None
+    if cells is None or not len(cells):
         raise StageError(
             "no point is ground, vegetation or a building",
             found=", ".join(request.files[:3]),
             cure="Classify the files first: pdal-stages classify raw.laz classified.laz",
         )
-    settings = replace(request.settings, cell=side)
-    seen = outlook(joined, standard_calibration())
-    patches = find_patches(seen, settings)
+    patches = find_patches(cells)
     held = np.cumsum(patches.errors)
     listed = int(np.searchsorted(held, request.share * held[-1])) + 1 if held[-1] > 0 else 0
-    return Review(seen, patches, min(listed, len(patches)), request.files, settings)
+    return Review(cells, patches, min(listed, len(patches)), request.files)
 
 
-def records_of(path: str, wkt: str, model: str, side: float, number: int) -> list[Records]:
-    """What the cells of a file say, in one record at most; `number` is the file's."""
-    rates = standard_calibration().rates
-    out: list[Records] = []
-    for part in complete_parts(path, wkt, model):
-        if len(part):
-            reliability, height = (part.arrays[name] for name in ("Reliability", "HeightAboveGround"))
-            strip = part.arrays.get("PointSourceId")
-            made = Records.of(
-                part.xyz, part.codes, reliability, height, side, rates, tile=number, strip=strip
-            )
-            out = [Records.join([*out, made])]
-    return out
+def cells_of(path: str, wkt: str, model: str, side: float, number: int) -> list[Cells]:
+    """The cells of a file; `number` is the file's."""
+    found = [
+        Cells.of(part.xyz, part.codes, part.arrays["Reliability"], side, number)
+        for part in complete_parts(path, wkt, model)
+        if len(part)
+    ]
+    return [Cells.join(found)] if found else []
 
 
 def _extent(files: Sequence[str], references: dict[str, Any]) -> tuple[int, float]:
@@ -262,49 +212,40 @@ def _extent(files: Sequence[str], references: dict[str, Any]) -> tuple[int, floa
 
 
 def complete_parts(path: str, wkt: str, model: str) -> Any:
-    """The points of a file with reliabilities and heights: as they are there, or made now, which is said."""
-    missing: list[str] | None = None
+    """The points of a file with reliabilities: as they are there, or made now, which is said."""
     whole: list[Part] = []
     for part in parts_of(path, wkt):
-        if missing is None:
-            missing = [n for n in ("Reliability", "HeightAboveGround") if n not in part.arrays]
-            if missing:
-                print_messages(
-                    f"{path} has no {' and no '.join(missing)}: made now"
-                    + (
-                        f" by the model {model}, which takes as long as classifying"
-                        * ("Reliability" in missing)
-                    )
-                )
-        if missing:
-            whole.append(part)
-        else:
+        if "Reliability" in part.arrays:
             yield part
+        else:
+            whole.append(part)
     if whole:
+        print_messages(
+            f"{path} has no Reliability: made now by the model {model}, which takes as long as classifying"
+        )
         yield completed(Part.join(whole), model)
 
 
 def completed(points: Part, model: str) -> Part:
-    """The points with heights above ground, and with the probability that the model gives to the class each has."""
-    arrays = dict(points.arrays)
-    made = dict(made_of_coordinates(PREPARATION, points.xyz))
-    arrays.setdefault("HeightAboveGround", made["HeightAboveGround"])
-    if "Reliability" not in arrays:
-        loaded = loaded_model(model)
-        if list(loaded.info.get("preparation") or []) != list(PREPARATION):
-            made = {}  # the model says what it needs, or how it is made
-        given = {name: arrays[name] for name in loaded.welcome_dimensions if name in arrays}
-        found = loaded.predict(points.xyz, {**made, **given}, probabilities=True)
-        place = np.full(256, -1)
-        place[loaded.codes] = np.arange(len(loaded.codes))
-        for code, known in _SAME.items():
-            if place[code] < 0:
-                place[code] = place[known]
-        mine = place[points.codes]
-        probability: Any = found.probabilities
-        own = np.take_along_axis(probability, np.maximum(mine, 0)[:, None], axis=1)[:, 0]
-        arrays["Reliability"] = np.where(mine >= 0, own, 1.0).astype(np.float32)
-    return Part(points.xyz, points.codes, arrays)
+    """The points with the probability that the model gives to the class each has."""
+    loaded = loaded_model(model)
+    made = {}
+    if list(loaded.info.get("preparation") or []) == list(
+        PREPARATION
+    ):  # else it says what it needs, or how it is made
+        made = dict(made_of_coordinates(PREPARATION, points.xyz))
+    given = {name: points.arrays[name] for name in loaded.welcome_dimensions if name in points.arrays}
+    found = loaded.predict(points.xyz, {**made, **given}, probabilities=True)
+    place = np.full(256, -1)
+    place[loaded.codes] = np.arange(len(loaded.codes))
+    for code, known in _SAME.items():
+        if place[code] < 0:
+            place[code] = place[known]
+    mine = place[points.codes]
+    probability: Any = found.probabilities
+    own = np.take_along_axis(probability, np.maximum(mine, 0)[:, None], axis=1)[:, 0]
+    reliability = np.where(mine >= 0, own, 1.0).astype(np.float32)
+    return Part(points.xyz, points.codes, {**points.arrays, "Reliability": reliability})
 
 
 # ---- writing -----------------------------------------------------------------------------------------------
@@ -326,9 +267,7 @@ def write_review(request: ReviewRequest) -> Review:
     if request.json:
         write_whole(request.json, (json.dumps(found.to_dict(), indent=1) + "\n").encode())
     if request.html:
-        views = draw_worst(found, request.pictures)
-        page = review_page(found.to_dict(), views, minutes=_minutes(found))
-        write_whole(request.html, page.encode())
+        write_whole(request.html, review_page(found.to_dict(), _minutes(found)).encode())
     return found
 
 
@@ -337,18 +276,16 @@ def _minutes(found: Review) -> list[tuple[float, float]]:
     held, spent = np.cumsum(found.patches.errors), np.cumsum(found.patches.minutes)
     if not len(held) or held[-1] <= 0:
         return []
-    places = [int(np.searchsorted(held, share * held[-1])) for share in (0.25, 0.5, 0.75, 0.9)]
-    return [
-        (share, float(spent[min(place, len(spent) - 1)]))
-        for share, place in zip((0.25, 0.5, 0.75, 0.9), places, strict=True)
-    ]
+    shares = (0.25, 0.5, 0.75, 0.9)
+    places = [min(int(np.searchsorted(held, share * held[-1])), len(spent) - 1) for share in shares]
+    return [(share, float(spent[place])) for share, place in zip(shares, places, strict=True)]
 
 
 def review_layers(found: Review, across: float = 1.0) -> dict[str, Layer]:
     """Layers ``patches``, best first, and ``tiles``; coordinates in units of `across` meters."""
     shapely = vector("shapely")
     patches, n = found.patches, found.listed
-    corners = cell_corners(found) / across
+    corners = found.cells.corners / across
     boxes = shapely.box(*corners.T)
     mine = np.flatnonzero(patches.of_cell < n)
     order = mine[np.argsort(patches.of_cell[mine], kind="stable")]
@@ -370,7 +307,7 @@ def review_layers(found: Review, across: float = 1.0) -> dict[str, Layer]:
     outlines, kept = [], []
     for row in found.tiles:
         number = next(k for k, name in enumerate(found.files) if Path(name).name == row["tile"])
-        at = found.seen.records.tile == number
+        at = found.cells.place[:, 0] == number
         if at.any():
             low, high = corners[at, :2].min(axis=0), corners[at, 2:].max(axis=0)
             outlines.append(_many(shapely.box(*low, *high)))
@@ -386,53 +323,5 @@ def review_layers(found: Review, across: float = 1.0) -> dict[str, Layer]:
     return {"patches": whole, "tiles": Layer(outlines, "MultiPolygon", tiles)}
 
 
-def cell_corners(found: Review) -> NDArray[np.float64]:
-    """(cells, 4) west, south, east, north, meters."""
-    from ..review.cells import rows_and_columns
-
-    records = found.seen.records
-    row, column = rows_and_columns(records.key)
-    return np.stack([column, row, column + 1, row + 1], axis=1) * records.side
-
-
 def _many(shape: Any) -> Any:
     return shape if shape.geom_type == "MultiPolygon" else vector("shapely").MultiPolygon([shape])
-
-
-def draw_worst(found: Review, most: int) -> list[PatchView]:
-    """Pictures of the first patches, in their order."""
-    n = min(most, found.listed)
-    patches, corners = found.patches, cell_corners(found)
-    wide = patches.box[:n] + np.array([-_MARGIN, -_MARGIN, _MARGIN, _MARGIN])
-    held: list[list[NDArray]] = [[] for _ in range(n)]
-    with Progress(len(found.files), "drawing", "files") as line:
-        for path in found.files:
-            reference, wkt = reference_and_wkt(path)
-            if _may_hold(path, wide / reference.units.horizontal):
-                for part in parts_of(path, wkt):
-                    x, y = part.xyz[:, 0], part.xyz[:, 1]
-                    for number, (west, south, east, north) in enumerate(wide):
-                        at = np.flatnonzero((x >= west) & (x <= east) & (y >= south) & (y <= north))
-                        if len(at):
-                            held[number].append(np.column_stack([part.xyz[at], part.codes[at]]))
-            line.update(1)
-    views = []
-    for number in range(n):
-        if held[number]:
-            cells = corners[patches.of_cell == number]
-            hottest = found.seen.total[patches.of_cell == number]
-            views.append(draw_patch(found.row(number), np.concatenate(held[number]), cells, hottest))
-    return views
-
-
-def _may_hold(path: str, boxes: NDArray[np.float64]) -> bool:
-    """Whether the header of a file says that points may lie in one of the boxes."""
-    header = read_header(path) if reads_in_parts(path) else None
-    if header is None:
-        return True
-    west, south, east, north = header.box
-    return bool(
-        (
-            (boxes[:, 0] <= east) & (boxes[:, 2] >= west) & (boxes[:, 1] <= north) & (boxes[:, 3] >= south)
-        ).any()
-    )

@@ -2,18 +2,7 @@
 
 from __future__ import annotations
 
-from .cells import Records, Settings, side_for
-from .expected import Calibration, Outlook, outlook, standard_calibration
+from .cells import Cells, side_for
 from .patches import Patches, find_patches
 
-__all__ = [
-    "Calibration",
-    "Outlook",
-    "Patches",
-    "Records",
-    "Settings",
-    "find_patches",
-    "outlook",
-    "side_for",
-    "standard_calibration",
-]
+__all__ = ["Cells", "Patches", "find_patches", "side_for"]

@@ -74,14 +74,6 @@ def _nearest_left(
     out[mine[chosen]] = theirs[near[chosen]]
 
 
-def nearest_points(xyz: NDArray[np.float64], places: NDArray[np.float64], within: float) -> NDArray[np.int64]:
-    """(m,) the point nearest to each place, -1 where none is `within` so many meters."""
-    from scipy.spatial import cKDTree
-
-    far, near = cKDTree(xyz).query(places, distance_upper_bound=within)
-    return np.where(np.isfinite(far), near, -1).astype(np.int64)
-
-
 def near_any(xyz: NDArray[np.float64], chosen: NDArray[np.bool_], within: float) -> NDArray[np.bool_]:
     """(n,) points that lie `within` so many meters of a chosen one."""
     from scipy.spatial import cKDTree

@@ -393,7 +393,7 @@ class Review(_Showing):
     key, title, command = "review", "Where to look: likely errors of a classified point cloud", "review"
     about = (
         "Lists where a person should look in classified point clouds, worst first, as patches with the number of errors "
-        "expected in each, and as a page with pictures. What is right or was corrected can be learned from: see Corrections."
+        "expected in each, and as a page. What is right or was corrected can be learned from: see Corrections."
     )
     listed = ("share",)
     own = ("html", "json")
@@ -402,9 +402,7 @@ class Review(_Showing):
         self.add_inputs(self.help_of("inputs"))
         self.add_declared()
         self.add_destination("OUTPUT", "Patches", self.help_of("output"), _VECTORS)
-        self.add_destination(
-            "PAGE", "Page", "The patches with pictures; under Processing > Results Viewer", _PAGES
-        )
+        self.add_destination("PAGE", "Page", "The worst patches; under Processing > Results Viewer", _PAGES)
         self.addOutput(QgsProcessingOutputHtml("HTML", "Page"))
         self.add_show()
 
@@ -426,7 +424,7 @@ class Corrections(_Showing):
         "Marks the points whose classes a person has corrected, or looked at and found right, in the dimension Checked: "
         "training then learns from these points alone."
     )
-    listed = ("around", "within")
+    listed = ("around",)
     own = ("before", "after", "out", "area")
 
     def initAlgorithm(self, configuration=None):
