@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import mmap
-import sys
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,7 +9,6 @@ from hypothesis import strategies as st
 
 from pdal_stages.base import checks, threads
 from pdal_stages.base.errors import OptionError
-from pdal_stages.base.memory import give_back
 
 
 @given(st.integers() | st.floats() | st.booleans() | st.none() | st.text())
@@ -81,23 +77,6 @@ def test_words():
 
 
 # ---- memory ----------------------------------------------------------------------------------------------
-
-
-def test_only_whole_pages_inside_an_array_are_given_back():
-    page = mmap.PAGESIZE
-    room = np.ones(16 * page, np.uint8)
-    give_back(room[100:200])  # within a page, or two
-    assert room.all()
-    part = room[page + 8 : 9 * page + 8]
-    give_back(part.view(np.float64))
-    gone = np.flatnonzero(room == 0)
-    assert room[: page + 8].all() and room[9 * page + 8 :].all()
-    if sys.platform == "linux":
-        assert 7 * page <= len(gone) < 8 * page and np.array_equal(np.unique(np.diff(gone)), [1])
-    part[:] = 3  # it is still there
-    assert (part == 3).all()
-    give_back(room[::2])
-    assert room[:page].all()
 
 
 def test_cores_are_bounded_by_affinity_quota_and_what_a_worker_is_told(tmp_path, monkeypatch):

@@ -43,7 +43,6 @@ SITES = {
     "classifier/tiledcloud:TiledCloud.put": "train in tiles",
     "commands/pipelines:_expand": "expanded pipeline",
     "commands/running:ran": "metadata",
-    "base/projection:_rewrite": "records kept",
     "pipeline/las_output:_compress": "writers.las .laz 1.4",
     "commands/models:_compare_objects": _WHOLE,
     "pipeline/correcting:_write": _WHOLE,
