@@ -263,32 +263,10 @@ def _check_whole(path: Path, layers: dict[str, Layer], driver: str) -> None:
             found = pyogrio.read_info(path, force_feature_count=True, **which)["features"]
             if found != len(layer.shapes):
                 lost = f"{found:,} of {len(layer.shapes):,} {name}"
-        if driver == "GPKG":
-            lost = lost or _damage(path, layers)
     except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
         lost = str(error)
     if lost:
         raise StageError("objects could not be written completely", found=lost, cure="Make room on the disk")
-
-
-def _damage(path: Path, layers: dict[str, Layer]) -> str:
-    """What a GeoPackage lacks, or nothing."""
-    import sqlite3
-
-    base = sqlite3.connect(path)
-    try:
-        state = base.execute("PRAGMA quick_check").fetchone()[0]
-        if state != "ok":
-            return state
-        rows = base.execute(
-            "SELECT table_name FROM gpkg_extensions WHERE extension_name = 'gpkg_rtree_index'"
-        )
-        indexed = {name for (name,) in rows}
-    except sqlite3.Error as error:
-        return str(error)
-    finally:
-        base.close()
-    return ", ".join(f"no index of {name}" for name in layers if name not in indexed)
 
 
 #: Class whose color a layer's sure objects have, with its opacity; those to be checked are yellow on every layer.
