@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import pdal_stages as ps
 from pdal_stages import cli
-from pdal_stages.review import Cells, find_patches, side_for
+from pdal_stages.review import ReviewCells, find_patches, side_for
 from pdal_stages.review.patches import BLOCK
 from pdal_stages.synthetic import write_town
 
@@ -29,20 +29,20 @@ def cloud(seed, n=3000, wide=60.0):
 def test_order_and_cuts_change_nothing(seed, n, parts):
     points, random = cloud(seed, n, 20.0), np.random.default_rng(seed)
     order, of = random.permutation(n), random.integers(0, parts, n)
-    whole = Cells.of(*points, 2.0)
+    whole = ReviewCells.of(*points, 2.0)
     several = [
-        Cells.of(*(values[order[of[order] == k]] for values in points), 2.0)
+        ReviewCells.of(*(values[order[of[order] == k]] for values in points), 2.0)
         for k in range(parts)
         if (of == k).any()
     ]
-    joined = Cells.join(several)
+    joined = ReviewCells.join(several)
     for name in ("place", "points", "parts"):
         assert np.array_equal(getattr(whole, name), getattr(joined, name)), name
 
 
 def test_cells_are_what_they_say():
     xyz, codes, reliability = cloud(3)
-    made = Cells.of(xyz, codes, reliability, 2.0, file=4)
+    made = ReviewCells.of(xyz, codes, reliability, 2.0, file=4)
     place = np.floor(xyz[:, :2] / 2.0)
     groups = [codes == 2, np.isin(codes, (3, 4, 5)), codes == 6]
     assert made.points.sum() == sum(group.sum() for group in groups)
@@ -55,7 +55,7 @@ def test_cells_are_what_they_say():
 
 
 def test_patches_hold_each_cell_once_and_come_best_first():
-    cells = Cells.of(*cloud(9, 6000, 150.0), 2.0)
+    cells = ReviewCells.of(*cloud(9, 6000, 150.0), 2.0)
     found = find_patches(cells)
     assert np.array_equal(np.unique(found.of_cell), np.arange(len(found)))
     assert np.isclose(found.errors.sum(), cells.errors.sum()) and found.points.sum() == cells.points.sum()

@@ -26,7 +26,7 @@ from folds import TREES, LeaveOneOut
 import pdal_stages
 from pdal_stages import cli
 from pdal_stages.classifier.sureness import Sureness
-from pdal_stages.review import Cells, find_patches, side_for
+from pdal_stages.review import ReviewCells, find_patches, side_for
 
 #: The part of the area that is looked at first.
 FIRST = 0.1
@@ -120,7 +120,10 @@ def judged(one: Classified) -> tuple[int, int, float, float, float]:
     codes, wrong = one.codes[known], one.codes[known] != one.truth[known]
     xyz, reliability = one.xyz[known], one.reliability[known]
     side = side_for(len(xyz), 16.0 * len(np.unique(np.floor(xyz[:, :2] / 4.0), axis=0)))
-    cells, truth = Cells.of(xyz, codes, reliability, side), Cells.of(xyz, codes, 1.0 - wrong, side)
+    cells, truth = (
+        ReviewCells.of(xyz, codes, reliability, side),
+        ReviewCells.of(xyz, codes, 1.0 - wrong, side),
+    )
     true = truth.errors.sum(axis=1)
     found = [_first(each, true) for each in (cells, truth)]
     return len(codes), int(wrong.sum()), float(cells.errors.sum()), *found

@@ -25,7 +25,7 @@ from ..objects.outlines import vector
 from ..reports.objectlayers import Layer, check_target, write_layers
 from ..reports.reviewlayers import patch_style, tile_style
 from ..reports.reviewpage import review_page
-from ..review import Cells, Patches, find_patches, side_for
+from ..review import Patches, ReviewCells, find_patches, side_for
 from ..stages.heights import PREPARATION, made_of_coordinates
 from ..stages.loading import loaded_model
 from .inputs_outputs import input_files
@@ -93,14 +93,14 @@ class Review:
 
     Attributes
     ----------
-    cells : Cells
+    cells : ReviewCells
     patches : Patches
     listed : int
         Patches that are written: those that come first.
     files : list of str
     """
 
-    cells: Cells
+    cells: ReviewCells
     patches: Patches
     listed: int
     files: list[str]
@@ -166,7 +166,7 @@ def review_files(request: ReviewRequest) -> Review:
     without = check_one_reference({path: one for path, (one, _) in references.items()})
     print_messages(*without_reference(without))
     side = request.cell or side_for(*_extent(request.files, references))
-    found: list[Cells] = []
+    found: list[ReviewCells] = []
     work = [
         (path, references[path][1], request.model, side, number) for number, path in enumerate(request.files)
     ]
@@ -176,7 +176,7 @@ def review_files(request: ReviewRequest) -> Review:
                 raise StageError(answer.reason)
             found += answer.result
             line.update(1)
-    cells = Cells.join(found) if found else None
+    cells = ReviewCells.join(found) if found else None
     if cells is None or not len(cells):
         raise StageError(
             "no point is ground, vegetation or a building",
@@ -189,14 +189,14 @@ def review_files(request: ReviewRequest) -> Review:
     return Review(cells, patches, min(listed, len(patches)), request.files)
 
 
-def cells_of(path: str, wkt: str, model: str, side: float, number: int) -> list[Cells]:
+def cells_of(path: str, wkt: str, model: str, side: float, number: int) -> list[ReviewCells]:
     """The cells of a file; `number` is the file's."""
     found = [
-        Cells.of(part.xyz, part.codes, part.arrays["Reliability"], side, number)
+        ReviewCells.of(part.xyz, part.codes, part.arrays["Reliability"], side, number)
         for part in complete_parts(path, wkt, model)
         if len(part)
     ]
-    return [Cells.join(found)] if found else []
+    return [ReviewCells.join(found)] if found else []
 
 
 def _extent(files: Sequence[str], references: dict[str, Any]) -> tuple[int, float]:

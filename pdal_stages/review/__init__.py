@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .cells import Cells, side_for
+from .cells import ReviewCells, side_for
 from .patches import Patches, find_patches
 
-__all__ = ["Cells", "Patches", "find_patches", "side_for"]
+__all__ = ["Patches", "ReviewCells", "find_patches", "side_for"]

@@ -31,7 +31,7 @@ def side_for(points: int, area: float) -> float:
 
 
 @dataclass(frozen=True)
-class Cells:
+class ReviewCells:
     """Cells that hold judged points, each once for each file.
 
     Attributes
@@ -73,7 +73,7 @@ class Cells:
         reliability: ArrayLike,
         side: float,
         file: int = 0,
-    ) -> Cells:
+    ) -> ReviewCells:
         """Cells of points.
 
         Parameters
@@ -97,12 +97,12 @@ class Cells:
         return cls(side, place, one, one * np.rint(wrong * _PARTS).astype(np.int64)[:, None])._added()
 
     @classmethod
-    def join(cls, several: Sequence[Cells]) -> Cells:
+    def join(cls, several: Sequence[ReviewCells]) -> ReviewCells:
         """Cells of several parts as one."""
         arrays = (np.concatenate([getattr(c, n) for c in several]) for n in ("place", "points", "parts"))
         return cls(several[0].side, *arrays)._added()
 
-    def _added(self) -> Cells:
+    def _added(self) -> ReviewCells:
         place, at = np.unique(self.place, axis=0, return_inverse=True)
 
         def added(values: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -110,4 +110,4 @@ class Cells:
             np.add.at(out, at.reshape(-1), values)
             return out
 
-        return Cells(self.side, place, added(self.points), added(self.parts))
+        return ReviewCells(self.side, place, added(self.points), added(self.parts))

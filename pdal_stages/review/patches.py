@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .cells import GROUPS, Cells
+from .cells import GROUPS, ReviewCells
 
 #: Share of the cells, those with most errors expected, that make patches of their own.
 HOT = 0.1
@@ -47,7 +47,7 @@ class Patches:
         return len(self.errors)
 
 
-def find_patches(cells: Cells) -> Patches:
+def find_patches(cells: ReviewCells) -> Patches:
     """The patches of all cells. What is hot in a block is seen at a glance, so it is one patch, and the rest another."""
     total = cells.errors.sum(axis=1)
     hot = (total > 0) & (total >= np.quantile(total, 1.0 - HOT)) if len(total) else np.zeros(0, bool)
