@@ -18,7 +18,6 @@ from pdal_stages.stages.base import Blocks
 from pdal_stages.synthetic.townfile import wkt
 from pdal_stages.tiling import TilingOptions
 from pdal_stages.tiling.classify import ClassifyTask
-from pdal_stages.tiling.pace import Pace
 from pdal_stages.tiling.sizing import (
     BASE,
     PARENT,

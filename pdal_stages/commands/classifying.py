@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 
 from ..base.plain import print_messages
 from ..tiling.command import add_arguments
@@ -141,11 +140,10 @@ def _classify(options: argparse.Namespace) -> int:
     )
     if not options.objects:
         return classify(task, options)
-    from ..tiling.objects import cells_of_outputs, objects_of_outputs, refuse_tiles, writer
+    from ..tiling.objects import objects_of_outputs, refuse_tiles, writer
 
     stage = writer(options.objects, own)
     refuse_tiles(task, options.objects)
-    task = replace(task, cells=cells_of_outputs(stage))
     return classify(task, options, lambda: objects_of_outputs(task, stage))
 
 

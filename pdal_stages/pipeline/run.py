@@ -22,7 +22,7 @@ from ..base.report import Report
 from ..stages import registry
 from . import describe, interrupts, las_output, runtime, straight
 from . import pdal as pdal_env
-from .callbacks import Callbacks, Function
+from .callbacks import Callbacks
 from .filenames import (
     is_reader,
     is_writer,
@@ -78,8 +78,6 @@ class Pipeline:
         self.log_lines: list[str] = []
         self.reports: list[tuple[str, list[Report]]] = []
         self.warnings: list[str] = []
-        #: Called with the points that go to the last writer; see :class:`.callbacks.Callbacks`.
-        self.look: Function | None = None
 
     @property
     def messages(self) -> list[str]:
@@ -187,8 +185,6 @@ class Pipeline:
                 for number, stage in enumerate(run):
                     if is_writer(stage, run):
                         run[number] = las_output.uncompressed_writer(stage, run[:number])
-                if self.look is not None and alone:
-                    run.insert(len(run) - 1, callbacks.filter(self.look))
                 try:
                     with interrupts.gentle(signal.SIGINT):
                         if read is not None:

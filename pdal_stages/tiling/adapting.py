@@ -115,7 +115,7 @@ class AdaptTask:
         if task.in_one_piece():
             return [task.run_whole().path]
         if task.can_be_cut:
-            run = task.run_tiles(brief=True)
+            run = task.run_tiles()
             if run.failures:
                 raise StageError(
                     f"{len(run.failures):,} parts of the survey cannot be classified",

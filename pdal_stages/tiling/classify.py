@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..base import kinds, las
 from ..base.errors import OptionError, StageError
@@ -24,9 +24,6 @@ from .settings import TilingOptions
 from .sizing import fits_whole
 from .tiledrun import run_plan
 from .tileplan import TilePlan, make_plan
-
-if TYPE_CHECKING:
-    from .outputcells import OutputCells
 
 
 @dataclass
@@ -55,8 +52,6 @@ class ClassifyTask:
     options : TilingOptions
     metadata, log : str
         Files that are written beside, empty for none.
-    cells : OutputCells, optional
-        What takes the cells of points while outputs are written.
     """
 
     inputs: tuple[str, ...]
@@ -65,7 +60,6 @@ class ClassifyTask:
     options: TilingOptions = field(default_factory=TilingOptions)
     metadata: str = ""
     log: str = ""
-    cells: OutputCells | None = None
 
     @cached_property
     def files(self) -> list[str]:
@@ -120,7 +114,7 @@ class ClassifyTask:
     def run_whole(self) -> Written:
         """Classify the only input in one piece."""
         (source,), (target,) = self.files, self.outputs()
-        return classify_file(replace(self.request), source, target, self.metadata, self.log, self.cells)
+        return classify_file(replace(self.request), source, target, self.metadata, self.log)
 
     def run_each(self, apart: bool = False) -> Iterator[tuple[str, Written | str]]:
         """Classify inputs each by itself: yields an input, and what was written or why it failed, as they finish.
@@ -182,7 +176,6 @@ class ClassifyTask:
             creates=["Classification", *(beside or {})] if tail_only and plan.creates else plan.creates,
             makes=plan.makes if beside is None else beside,
             beside=beside,
-            cells=self.cells,
             whole_names=self._in_folder and self.options.per != "tile",
             name=self.request.model,
         )
@@ -203,9 +196,8 @@ class ClassifyTask:
         *,
         dry_run: bool = False,
         finished: Callable[[Written], None] | None = None,
-        brief: bool = False,
     ) -> TiledRun:
-        """Classify all inputs in tiles; `finished` hears of every output that was written; `brief`: see :func:`run_plan`."""
+        """Classify all inputs in tiles; `finished` hears of every output that was written."""
         outputs: list[str] = []
         if self.options.per != "tile" and not any(map(is_ept, self.files)):
             outputs = outputs_of(self.files, self.output)  # which says what is wrong with names
@@ -226,7 +218,6 @@ class ClassifyTask:
             self.options,
             dry_run=dry_run,
             finished=finished_one,
-            brief=brief,
             source=self._pipeline.source,
         )
 
@@ -237,18 +228,12 @@ def classify_file(
     target: str,
     metadata: str = "",
     log: str = "",
-    cells: OutputCells | None = None,
 ) -> Written:
-    """Classify a file in one piece; `metadata` and `log` are files that are written beside, `cells` takes its points'."""
+    """Classify a file in one piece; `metadata` and `log` are files that are written beside."""
     pipeline = request.pipeline(source, target)
-    seen = cells.begin(source) if cells is not None else None
-    if seen is not None:
-        pipeline.look = seen.look
     more = [("log", log, ""), ("metadata", metadata, kinds.JSON)]
     pipeline.check_outputs(*(Output(name, what, kind) for what, name, kind in more if name))
     count = pipeline.execute(arrays=False, loglevel=logging.WARNING)
-    if seen is not None:
-        seen.keep(target)
     if metadata:
         write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
     reports = [each[-1].figures for _, each in pipeline.reports if each]

@@ -140,16 +140,11 @@ def run_command(options: argparse.Namespace, source: Path | PipelineSource) -> i
     interrupted = False
     with interruptible():
         try:
-            run = run_tiled(pipeline, chosen, dry_run=options.dry_run, brief=_brief(options))
+            run = run_tiled(pipeline, chosen, dry_run=options.dry_run)
         except InterruptedRun as stopped:
             run, interrupted = stopped.run, True
     _print_dry(run) if options.dry_run else _print(run)
     return _end(options, run, "run it again with --resume" if interrupted else "")
-
-
-def _brief(options: argparse.Namespace) -> bool:
-    """Whether nobody asks for the tiles of a run of which nothing is left to be done."""
-    return not options.report and not options.metadata
 
 
 def _check_reports(options: argparse.Namespace) -> None:
@@ -220,7 +215,7 @@ def classify(
     interrupted = False
     with interruptible():
         try:
-            run = task.run_tiles(dry_run=options.dry_run, finished=finished, brief=_brief(options))
+            run = task.run_tiles(dry_run=options.dry_run, finished=finished)
         except InterruptedRun as stopped:
             run, interrupted = stopped.run, True
     if options.dry_run:
@@ -403,18 +398,13 @@ def _print_dry(run: TiledRun) -> None:
     print(
         f"about {s['points_read_by_a_tile']:,} points read for a tile, {s['points_of_largest_tile']:,} its own at most"
     )
-    memory, rate, known = s["memory_mb_of_a_worker"], s["points_per_core_second"], s["measured"]
+    memory = s["memory_mb_of_a_worker"]
     workers = {0: "this process", 1: "the worker"}.get(s["workers"], f"each of {s['workers']} workers")
     print(f"up to {memory:,.0f} MB for {workers} with {_counted(s['threads_per_worker'], 'thread')}")
     hours = f"roughly {s['core_hours']:.2f}" if s["core_hours"] >= 0.01 else "less than 0.01"
-    told = "no run was measured here yet; the model decides"
-    if known:
-        told = f"as in a run of {known['points']:,} points here on {known['day']}"
-    print(f"{hours} core hours at {rate:,.0f} points/s and core, {told}")
+    print(f"{hours} core hours, at {s['points_per_core_second']:,.0f} points/s and core; the model decides")
     if s["disk_gb"] >= 0.01:
-        copies = s["disk_gb_of_copies"]
-        some = f", {copies:,.2f} of it for copies of the inputs by place" if copies >= 0.01 else ""
-        print(f"{s['disk_gb']:,.2f} GB of disk beside the outputs, until these are written{some}")
+        print(f"{s['disk_gb']:,.2f} GB of disk beside the outputs, until these are written")
     for job in run.tiles[:50]:
         print(f"  {job.name:24s} {job.points:>14,} points  {_counted(len(job.sources), 'input')}")
     if len(run.tiles) > 50:

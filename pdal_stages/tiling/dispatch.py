@@ -16,7 +16,6 @@ from ..pipeline.work import Task, TaskResult
 from .firstround import BlockTask, FirstRoundTask, block_grid, blocks_around, blocks_of, tiles_around
 from .grid import Box
 from .outcome import Costs, FileJob, TileJob
-from .pace import Pace
 from .pool import Pool, last_tries
 from .store import Store, block_file, fingerprint, left_file
 from .worklist import Worklist
@@ -53,9 +52,6 @@ def run_all(
             users.setdefault(job.tile, []).append(out)
         _make_ready(out, waiting)
     total = sum(item.points for item in waiting if isinstance(item, TileJob))
-    pace = Pace(
-        total, sum(out.points for out in work.outputs if out.state in ("waiting", "ready")), pool.slots
-    )
     failed = 0
     costs = work.survey.costs
 
@@ -73,9 +69,6 @@ def run_all(
             if finished is not None and item.state == "done" and item.outputs:
                 progress.clear()
                 finished(item)
-            kind = "tile" if isinstance(item, TileJob) else "output"
-            pace.finished(kind, item.points, answer.cost.get("seconds", 0.0))
-            progress.seconds_left = pace.seconds_left()
             if isinstance(item, FileJob):
                 progress.update(0)
                 continue

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..pipeline import pdal as pdal_env
-from .cloudindex import CloudIndex, index_las
-from .grid import TileGrid
+from .grid import Box
 from .sources import InputSource, las_extent, read_ept
 
 
@@ -17,10 +16,8 @@ def format_of(described: Mapping[str, Any]) -> int:
     return 8 if "Infrared" in names else 7 if "Red" in names else 6
 
 
-def fetch(
-    source: InputSource, grid: TileGrid, tile: tuple[int, int], halo_units: float, target: str
-) -> CloudIndex | None:
-    """Read a tile and its halo into a LAS file; its index, None where it is empty.
+def fetch(source: InputSource, box: Box, target: str) -> bool:
+    """Read the points in a box into a LAS file; whether there are any.
 
     Scales and offsets are the source's, so coordinates stay what they are; other
     dimensions become extra dimensions.
@@ -38,5 +35,5 @@ def fetch(
             axis = dimension["name"].lower()
             writer[f"scale_{axis}"] = dimension.get("scale", 0.001)
             writer[f"offset_{axis}"] = dimension.get("offset", 0.0)
-    run = pdal_env.execute([source.within(grid.box(tile, halo_units)), writer], arrays=False)
-    return index_las(target, grid) if run.count and las_extent(target).count else None
+    run = pdal_env.execute([source.within(box), writer], arrays=False)
+    return bool(run.count and las_extent(target).count)

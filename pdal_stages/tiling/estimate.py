@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from .measured import pace_before
 from .outcome import TiledRun, TileJob
 from .sizing import Density, worker_bytes
-from .store import has_room
 from .survey import Survey
 from .tileplan import TilePlan, outputs_for
 
+#: CPU seconds of a core for a point of a tile, for one that is only read around a tile, and for one in all other steps.
+_OWN, _AROUND, _OTHER = 8.0e-6, 1.3e-6, 5.0e-6
 #: Bytes that a run keeps of a point until its output is written.
 _KEPT = 20
 #: Bytes that the rounds before the tiles keep of a point, and of a cell of a raster of 1,024 x 1,024, until all tiles are
@@ -41,12 +39,8 @@ def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
     density = Density.of(survey.extents.values())
     read = density.read_by(grid.size, survey.halo_units)
     held = worker_bytes(read, density.largest if survey.per == "file" else 0, survey.block_bytes)
-    pace = pace_before(plan.head)
-    seconds = pace.core_seconds(count, _beside(listed, read))
+    seconds = count * (_OWN + _OTHER) + sum(max(0, read - tile.points) for tile in listed) * _AROUND
     kept = count * _KEPT * (survey.per == "file") + _kept_before(plan, count, density.area * survey.unit**2)
-    copies = survey.copy_bytes()
-    if not has_room(Path(plan.writers[0]["filename"]).absolute().parent, copies):
-        copies = 0
     summary = survey.figures(plan) | {
         "workers": options.local_workers,
         "threads_per_worker": options.threads,
@@ -55,10 +49,8 @@ def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
         "points_read_by_a_tile": read,
         "memory_mb_of_a_worker": held / 2**20,
         "points_per_core_second": count / seconds if seconds else 0.0,
-        "measured": {"points": pace.points, "day": pace.day} if pace.points else None,
         "core_hours": seconds / 3600,
-        "disk_gb": (kept + copies) / 1e9,
-        "disk_gb_of_copies": copies / 1e9,
+        "disk_gb": kept / 1e9,
         "states": {"waiting": len(listed)},
     }
     return TiledRun(listed, [], survey.unreadable, [], survey.messages, summary)
@@ -69,8 +61,3 @@ def _kept_before(plan: TilePlan, count: int, area: float) -> float:
     if plan.first is None:
         return 0.0
     return count * _KEPT_BEFORE + area / plan.first.blocks.cell**2 * _KEPT_OF_CELL
-
-
-def _beside(tiles: list[TileJob], read: int) -> int:
-    """Points that are read as surroundings, all tiles together."""
-    return sum(max(0, read - tile.points) for tile in tiles)

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..base import las
 from ..base.asprs import LEGACY_LIMIT
-from ..base.errors import PipelineError
 from ..base.extrabytes import number_type
 from ..pipeline.filenames import LAS_WRITERS
 from ..pipeline.las_output import extra_dims_option
-from . import alike, sizing
-from .extract import unpacked
+from . import sizing
 from .grid import Box
 from .inparts import HeadersDifferError, write_in_parts
 from .rasters import on_one_grid
@@ -27,9 +22,6 @@ from .results import NewValues, PieceResults, of_own_points, read_range
 from .sources import InputSource
 from .tail import run_tail
 from .tileplan import TilePlan
-
-if TYPE_CHECKING:
-    from .outputcells import CellsSeen, OutputCells
 
 
 @dataclass(frozen=True)
@@ -43,15 +35,12 @@ class FileTask:
     beside: dict[str, str] | None  #: see TilePlan
     outputs: list[str]  #: what each of the writers writes
     scratch: str  #: folder for temporary files
-    cells: OutputCells | None = None  #: see TilePlan
-    copy: str = ""  #: of the input by place, see :mod:`.byplace`; empty where there is none
     makes: Mapping[str, str] = field(default_factory=dict)  #: see TilePlan
 
     def run(self) -> dict[str, Any]:
         """Write the outputs; see :func:`~pdal_stages.tiling.tail.run_tail`. The record counts classes, too."""
         classes = np.zeros(256, np.int64)
         holds_flags = las.holds_flags(self.source.path)
-        seen = self.cells.begin(self.source.path) if self.cells is not None else None
 
         def new_values(start: int, end: int) -> NewValues:
             values = read_range(self.results, self.source, self.count, start, end)
@@ -60,20 +49,16 @@ class FileTask:
                 values = NewValues(values.kept, {name: (None, column) for name, column in nothing.items()})
             if start == 0:  # begun, or begun anew
                 classes[:] = 0
-                if seen is not None:
-                    seen.begin()
             if "Classification" in values.values:
                 codes = np.asarray(values.values["Classification"][1], np.uint8)
                 codes = codes & np.uint8(LEGACY_LIMIT if holds_flags else 255)
                 np.add(classes, np.bincount(codes, minlength=256), out=classes)
             return values
 
-        record = self._write(new_values, seen)
-        if seen is not None:
-            seen.keep(self.outputs[0])
+        record = self._write(new_values)
         return record | {"classes": {str(code): int(classes[code]) for code in np.flatnonzero(classes)}}
 
-    def _write(self, new_values: Callable[[int, int], NewValues], seen: CellsSeen | None) -> dict[str, Any]:
+    def _write(self, new_values: Callable[[int, int], NewValues]) -> dict[str, Any]:
         tail = with_beside(self.tail, self.beside, [self.source.path])
         writers = [stage["type"] for stage in self.tail if stage["type"].startswith("writers.")]
         kinds = {(kind, Path(path).suffix.lower()) for kind, path in zip(writers, self.outputs, strict=True)}
@@ -87,7 +72,6 @@ class FileTask:
                     tail,
                     self.outputs,
                     self.scratch,
-                    seen,
                 )
             except HeadersDifferError:  # such as automatic offsets: written at once
                 pass
@@ -95,36 +79,7 @@ class FileTask:
         header = las.read_header(self.source.path)
         if header is not None and header.count:
             tail = on_one_grid(tail, header.box, half_open=False)
-        new = new_values(0, self.count)
-        kind = None
-        if seen is None and len(self.outputs) == 1:
-            kind = alike.kind_of(self.source, tail, new.values, self.outputs[0])
-        here = self.source, self.copy, new, self.outputs[0], self.scratch
-        record = alike.write_alike(kind, *here)
-        if record is None:
-            record = self._write_with_pdal(reader, new, tail, seen)
-            alike.learn(kind, *here, self._try_with_pdal)
-        return record
-
-    def _try_with_pdal(self, path: str, new: NewValues, output: str) -> None:
-        """Write other points than the input's as its own are written."""
-        tail = with_beside(self.tail, self.beside, [path])
-        run_tail([{**self.source.reader, "filename": path}], [new], tail, [output], self.scratch)
-
-    def _write_with_pdal(
-        self, reader: dict[str, Any], new: NewValues, tail: list[dict[str, Any]], seen: CellsSeen | None
-    ) -> dict[str, Any]:
-        rest = [new], tail, self.outputs, self.scratch, seen
-        if not self.copy:
-            return run_tail([reader], *rest)
-        with TemporaryDirectory(prefix="file-", dir=self.scratch, ignore_cleanup_errors=True) as folder:
-            plain = os.path.join(folder, f"{Path(self.source.path).stem}.las")
-            if unpacked(self.source.path, self.copy, self.count, plain):
-                with contextlib.suppress(PipelineError):  # whose message would name this file
-                    return run_tail([{**reader, "filename": plain}], *rest)
-                if seen is not None:
-                    seen.begin()
-        return run_tail([reader], *rest)
+        return run_tail([reader], [new_values(0, self.count)], tail, self.outputs, self.scratch)
 
 
 def write_tile(
@@ -135,9 +90,7 @@ def write_tile(
     `box`: where it lies; `scratch`: the run's folder for temporary files.
     """
     mine = [result for result in results if result.piece.own.size]
-    tail = with_beside(
-        plan.tail, plan.beside, [source.path for result in mine for source, *_ in result.piece.spans]
-    )
+    tail = with_beside(plan.tail, plan.beside, [result.piece.source.path for result in mine])
     if not mine:
         return {"outputs": []}
     if plan.takes is not None:

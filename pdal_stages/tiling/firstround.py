@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from ..stages import registry
 from ..stages.base import Stage
-from .cloudindex import CloudIndex
-from .extract import Piece, cut_all
+from .cut import Piece, cut_all
 from .grid import Box, TileGrid
 from .headrun import FirstResults, RunContext, run_first
+from .index import CloudIndex
 from .kept import load_arrays, save_arrays
 from .sources import InputSource
 from .store import block_file, left_file
@@ -46,7 +46,7 @@ class FirstRoundTask:
         context = self.context
         with TemporaryDirectory(prefix="first-", dir=context.scratch, ignore_cleanup_errors=True) as folder:
             cuts = cut_all(
-                context.grid, self.tile, self.sources, self.first.halo_m / context.unit, folder, False, True
+                context.grid, self.tile, self.sources, self.first.halo_m / context.unit, folder, False
             )
             found = run_first(context, cuts, self.first) if cuts else FirstResults([], {}, [])
         arrays = {"around": np.concatenate([np.empty((0, 3)), *(one.around for one in found.left)])}
@@ -148,17 +148,16 @@ class Before:
         }
         for tile in sorted(piece.tiles):
             path = os.path.join(self.folder, left_file(self.context.grid.name(tile)))
-            names = [f"{source.key}/{name}" for source, *_ in piece.spans for name in ("index", *found)]
-            kept = load_arrays(path, names)
-            for source, first, end in piece.spans:
-                index = kept.get(f"{source.key}/index")
-                if index is None:
-                    continue
-                rows = np.searchsorted(piece.index[first:end], index)
-                rows[rows == end - first] = 0
-                there = piece.index[first:end][rows] == index
-                for name, parts in found.items():
-                    parts.append((rows[there] + first, kept[f"{source.key}/{name}"][there]))
+            key = piece.source.key
+            kept = load_arrays(path, [f"{key}/{name}" for name in ("index", *found)])
+            index = kept.get(f"{key}/index")
+            if index is None:
+                continue
+            rows = np.searchsorted(piece.index, index)
+            rows[rows == len(piece.index)] = 0
+            there = piece.index[rows] == index
+            for name, parts in found.items():
+                parts.append((rows[there], kept[f"{key}/{name}"][there]))
         return {
             name: tuple(np.concatenate(part) for part in zip(*parts, strict=True))  # type: ignore[misc]
             for name, parts in found.items()

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import re
-from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -20,12 +18,11 @@ from ..pipeline.las_output import check_writers
 from ..pipeline.references import NO_REFERENCE
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import points_of
-from ..pipeline.straight import NeedsPdal, Reading, View, may_run, reading_of
 from ..stages import registry
 from ..stages.base import Left, Stage
 from ..stages.points import HOLDS_NOWHERE
 from ..stages.polygons import THE_PLACES, TOUCH_NONE
-from .extract import Piece, sampled
+from .cut import Piece
 from .grid import Box, TileGrid
 from .outcome import left_alone
 from .results import PieceResults
@@ -35,8 +32,6 @@ from .tileplan import INPUT, OUTSIDE, ROW, FirstRound, TilePlan
 _NARROW = 0.5
 #: Points whose neighbors are looked at in one go where they lie far apart.
 _AT_ONCE = 100_000
-#: Kinds of files of which it is remembered how PDAL reads them.
-_MOST_READINGS = 16
 _MARK_TYPES = {ROW: "uint32_t", INPUT: "uint32_t", OUTSIDE: "double"}
 
 
@@ -128,12 +123,7 @@ def run_head(
             if ours.number in reaches:
                 reaches[ours.number].stage = ours.stage
         found.with_places = any(ours.stage.most_neighbors() for ours in pipeline.lowered.ours)
-        read = _read(pipeline, cuts)
-        try:
-            pipeline.execute(arrays=False, read=read)
-        except NeedsPdal:
-            _write(cuts)
-            return run_head(context, tile, cuts, everything, before, narrowing)
+        pipeline.execute(arrays=False)
     results = _collect(found.views, cuts, plan.creates, marks)
     need = max((reach.need for reach in reaches.values()), default=0.0)
     far = any(report.beyond_halo for _, reports in pipeline.reports for report in reports)
@@ -190,11 +180,7 @@ def run_first(context: RunContext, cuts: list[Piece], first: FirstRound) -> Firs
         left = _Left(wanting, marks)
         run = callbacks.filter(left, **(_after(marks) if first.at == 0 else {}))
         pipeline = Pipeline([*stages, *head[:-1], run], whole=False)
-        try:
-            pipeline.execute(arrays=False, read=_read(pipeline, cuts))
-        except NeedsPdal:
-            _write(cuts)
-            return run_first(context, cuts, first)
+        pipeline.execute(arrays=False)
     messages = _messages(pipeline, context.scratch)
     return FirstResults(left.found, _changes(left.values, marks), messages)
 
@@ -217,46 +203,10 @@ def _changes(
         new = np.zeros(len(rows), bool)
         for name, column in values.items():
             new |= column != mark.original[name][at]
-        for source, first, end in mark.piece.spans:
-            these = new & (rows >= first) & (rows < end)
-            if these.any():
-                chosen = {name: column[these] for name, column in values.items()}
-                out[source.key] = (mark.piece.index[rows[these]], chosen)
+        if new.any():
+            chosen = {name: column[new] for name, column in values.items()}
+            out[mark.piece.source.key] = (mark.piece.index[rows[new]], chosen)
     return out
-
-
-def _read(pipeline: Pipeline, cuts: list[Piece]) -> dict[str, View] | None:
-    """The points of pieces that are held in memory, for a pipeline that runs without PDAL; None where it runs with it."""
-    views = {}
-    try:
-        if not may_run(pipeline.lowered.stages):
-            raise NeedsPdal("a stage")
-        for number, piece in enumerate(cuts):
-            if piece.records is None:
-                raise NeedsPdal("points in a file")
-            views[f"in{number}"] = View.of_file(_reading(piece, piece.records), piece.records)
-    except NeedsPdal:
-        _write(cuts)
-        return None
-    return views
-
-
-def _write(cuts: list[Piece]) -> None:
-    for piece in cuts:
-        piece.write()
-
-
-#: How PDAL reads files that are alike, by what is the same in them and their reader.
-_readings: OrderedDict[tuple[bytes, str], Reading] = OrderedDict()
-
-
-def _reading(piece: Piece, records: NDArray) -> Reading:
-    key = (piece.like, json.dumps(piece.reader, sort_keys=True))
-    if key not in _readings:
-        _readings[key] = reading_of({**piece.reader, "filename": piece.path}, sampled(records))
-        while len(_readings) > _MOST_READINGS:
-            _readings.popitem(last=False)
-    return _readings[key]
 
 
 def _marks(cuts: list[Piece], context: RunContext, keep: Collection[str] = ()) -> list[_Mark]:

@@ -7,18 +7,15 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..base.complete import check_complete
 from ..base.files import whole_files
-from .lasfiles import BLOCK, finish, open_las, plain_header, read_block
+from .lasfiles import BLOCK, header_of, open_las, read_block, record_blocks, write_records
 from .results import NewValues
 from .sources import InputSource
 from .store import check_run
 from .tail import run_tail, written
-
-if TYPE_CHECKING:
-    from .outputcells import CellsSeen
 
 
 class HeadersDifferError(Exception):
@@ -33,7 +30,6 @@ def write_in_parts(
     tail: list[dict[str, Any]],
     outputs: list[str],
     scratch: str,
-    seen: CellsSeen | None = None,
 ) -> dict[str, Any]:
     """Write the outputs of a file with `count` points, `most` points at a time.
 
@@ -57,10 +53,10 @@ def write_in_parts(
         for start in range(0, count, most):
             end = min(count, start + most)
             piece = os.path.join(folder, "part.las")
-            _copy(source.path, start, end, piece)
+            write_records(piece, header_of(source.path), record_blocks(source.path, start, end))
             parts = [os.path.join(folder, f"out{n}.las") for n in range(len(outputs))]
             reader = {**source.reader, "filename": piece}
-            run_tail([reader], [new_values(start, end)], _uncompressed(tail), parts, scratch, seen)
+            run_tail([reader], [new_values(start, end)], _uncompressed(tail), parts, scratch)
             for one, part in zip(joined, parts, strict=True):
                 one.add(part)
     return written(outputs, joined[0].count if joined else 0)
@@ -70,16 +66,6 @@ def _uncompressed(tail: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [
         {k: v for k, v in s.items() if k != "compression"} if s["type"] == "writers.las" else s for s in tail
     ]
-
-
-def _copy(path: str, start: int, end: int, target: str) -> None:
-    """Points `start` to `end` as an uncompressed file with the file's own header."""
-    head, tail = plain_header(path)
-    with open_las(path) as reader, open(target, "wb") as out:
-        out.write(head)
-        for first in range(start, end, BLOCK):
-            out.write(read_block(reader, path, first, end).array.tobytes())
-        finish(out, head, tail, end - start)
 
 
 class _Joined:

@@ -24,6 +24,7 @@ from ..base.files import write_whole
 from ..base.outputs import Output, check_outputs
 from ..base.plain import print_messages
 from ..base.progress import Progress
+from ..base.stamps import stamp
 from ..base.units import Units
 from ..base.version import __version__
 from ..objects import Cells, Objects, ObjectSettings, find_objects
@@ -38,8 +39,7 @@ from ..reports.objectlayers import check_target, object_layers, target_files, wr
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter
 from .lasfiles import BLOCK, open_las, read_block
 from .outcome import FoundObjects
-from .outputcells import OutputCells, keep_cells, kept_name
-from .store import take_lock
+from .store import fingerprint, take_lock
 
 if TYPE_CHECKING:
     from .classify import ClassifyTask
@@ -96,13 +96,8 @@ def refuse_tiles(task: ClassifyTask, output: str) -> None:
     check_outputs([Output(output, "objects")], task.files)
 
 
-def cells_of_outputs(stage: ObjectsWriter) -> OutputCells:
-    """What takes the cells of outputs while ``classify --objects`` writes them."""
-    return OutputCells(stage, str(_kept(stage.filename)))
-
-
 def objects_of_outputs(task: ClassifyTask, stage: ObjectsWriter) -> FoundObjects:
-    """What ``classify --objects`` does when all is classified; outputs whose cells were kept are not read."""
+    """What ``classify --objects`` does when all is classified."""
     workers = max(1, task.options.local_workers)
     return _write(outputs_of(task.files, task.output), stage, workers, resume=True, draw=True)
 
@@ -223,6 +218,19 @@ def _all_cells(inputs: Sequence[str], stage: ObjectsWriter, wkt: str, workers: i
             Path(kept).unlink(missing_ok=True)
         raise
     return cells
+
+
+def kept_name(folder: Path, path: str, stage: ObjectsWriter) -> Path:
+    """The file that keeps a file's cells: another one when the file, the options or the version are others."""
+    mark = fingerprint(__version__, stage.options, str(Path(path).resolve()), stamp(path))
+    return folder / f"{mark}.npz"
+
+
+def keep_cells(target: Path, cells: Cells, seen: NDArray) -> None:
+    """Keep cells, and which class codes were seen ((256,), above 0), in a file."""
+    partial = target.with_name(f"partial-{target.name}")
+    np.savez(partial, key=cells.key, seen=(seen > 0).astype(np.int64), **cells.columns)  # type: ignore[arg-type]
+    partial.replace(target)
 
 
 def read_cells(path: str, stage: ObjectsWriter, wkt: str, kept: str) -> list[int]:

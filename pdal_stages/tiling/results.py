@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import StageError
-from .extract import Piece
+from .cut import Piece
 from .kept import members, save_arrays
 from .sources import InputSource
 
@@ -63,14 +63,12 @@ def save(path: str | Path, results: Iterable[PieceResults], scratch: str) -> Non
     content: dict[str, NDArray] = {}
     for result in results:
         piece = result.piece
-        for source, first, end in piece.spans:
-            own = np.searchsorted(piece.own, (first, end))
-            if own[0] == own[1]:
-                continue
-            mine = slice(*np.searchsorted(result.rows, (first, end)))
-            content[f"{source.key}/index"] = piece.index[result.rows[mine]]
-            content[f"{source.key}/core"] = np.array(own[1] - own[0])
-            content |= {f"{source.key}/dim/{name}": values[mine] for name, values in result.values.items()}
+        if not len(piece.own):
+            continue
+        key = piece.source.key
+        content[f"{key}/index"] = piece.index[result.rows]
+        content[f"{key}/core"] = np.array(len(piece.own))
+        content |= {f"{key}/dim/{name}": values for name, values in result.values.items()}
     save_arrays(path, content, scratch)
 
 

@@ -21,13 +21,11 @@ import numpy as np
 from ..base import strictjson
 from ..base.errors import StageError
 from ..base.files import try_lock
-from .cloudindex import CloudIndex
+from .index import CloudIndex
 
 #: The folder beside the outputs.
 FOLDER = ".pdal-stages"
 _SCRATCH = "scratch"
-#: What can be done without is kept where so many times its size is free.
-_ROOM = 4
 
 
 def fingerprint(*parts: Any) -> str:
@@ -138,19 +136,6 @@ class Store:
             _remove(path)
         _keep(path, {"tile": tile, "block": block}, "result")
 
-    def keep_complete(self, run: dict[str, Any]) -> None:
-        """Remember a run of which all is done."""
-        with contextlib.suppress(StageError, OSError):  # no room: the next run looks into everything
-            _keep(self.folder / "complete.json", run, "result")
-
-    def complete(self) -> dict[str, Any] | None:
-        """What was remembered of a run of which all was done."""
-        return _read(self.folder / "complete.json")
-
-    def forget_complete(self) -> None:
-        """Something is to be done, or may be."""
-        _forget(self.folder / "complete.json")
-
     def side(self, what: str = "tile") -> float | None:
         """The side of the last run's tiles, or its ``block``, where it is known."""
         return (_read(self.folder / "run.json") or {}).get(what)
@@ -230,40 +215,27 @@ class Store:
         known = _read(self.indexes / f"{mark}.json")
         if known is None:
             return None
-        boxes = np.array(known["boxes"], np.float64).reshape(-1, 4)
-        copy = self.copy(mark)
+        cells = np.array(known["cells"], np.int64).reshape(-1, 4)
         tiles = [(i, j, n) for i, j, n in known["tiles"]]
-        return CloudIndex(int(known["count"]), boxes, tiles, str(copy) if copy.exists() else "")
+        return CloudIndex(int(known["count"]), tuple(known["box"]), tiles, cells, str(self.copy(mark)))
 
     def copy(self, mark: str) -> Path:
-        """The file of an input's copy by place."""
+        """The file of an input's points, sorted by place."""
         return self.indexes / f"{mark}.points"
 
     def forget_copies(self, but: Collection[str] = ()) -> None:
-        """Remove copies of inputs, but those of these marks."""
+        """Remove the copies of inputs, but those of these marks."""
         kept = {self.copy(mark).name for mark in but}
-        # Also what is left of one that was not finished.
         for path in self.indexes.glob("*.points*"):
             if path.name not in kept:
                 path.unlink(missing_ok=True)
 
-    def room_for(self, size: int) -> bool:
-        """Whether so many bytes are a small part of what is free on the disk."""
-        return has_room(self.folder, size)
-
     def keep_index(self, mark: str, index: CloudIndex) -> None:
         """Keep the index of an input, where there is room."""
         with contextlib.suppress(StageError, OSError):
-            known = {"count": index.count, "boxes": index.boxes.tolist(), "tiles": index.tiles}
+            known = {"count": index.count, "box": index.box, "tiles": index.tiles}
+            known |= {"cells": index.cells.tolist()}
             _keep(self.indexes / f"{mark}.json", known, "index")
-
-
-def has_room(folder: Path, size: int) -> bool:
-    """Whether so many bytes are a small part of what is free where a folder is, or will be made."""
-    with contextlib.suppress(OSError):
-        there = next(path for path in (folder, *folder.parents) if path.is_dir())
-        return size * _ROOM <= shutil.disk_usage(there).free
-    return False
 
 
 # ---- files that nobody else put there ----------------------------------------------------------------------

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,9 +21,8 @@ from ..pipeline.filenames import named_files
 from ..pipeline.inputs_outputs import in_folders
 from ..pipeline.references import Reference, check_one_reference, reference_of, without_reference
 from ..pipeline.work import Call
-from .byplace import copy_bytes
-from .cloudindex import SMALL, CloudIndex, index_las
 from .grid import Box, TileGrid, check_number, touching, union
+from .index import CloudIndex, sort_points
 from .outcome import Costs
 from .pool import Pool, last_tries
 from .settings import TilingOptions
@@ -165,7 +165,7 @@ class Survey:
         boxes = []
         for source in self.placed:
             index = self.indexes.get(source.path)
-            boxes.append(union(index.boxes) if index else self.extents[source.path].box)
+            boxes.append(index.box if index and index.count else self.extents[source.path].box)
         self._boxes = np.array(boxes, np.float64)
         self.bounds: Box = union(boxes)
 
@@ -220,28 +220,31 @@ class Survey:
             "bounds": list(self.bounds) if math.isfinite(self.bounds[0]) else None,
         }
 
-    def read_indexes(self, store: Store, pool: Pool, retries: int, show: bool | None) -> None:
-        """Read every LAS and LAZ file once, but those whose index an earlier run kept."""
+    def mark_of(self, path: str) -> str:
+        """A name for what is kept of an input, another one when the file changes."""
+        return fingerprint(path, self.stamps[path], self.grid.size)
+
+    def read_inputs(
+        self, store: Store, pool: Pool, retries: int, show: bool | None, needed: Collection[str] | None = None
+    ) -> None:
+        """Read LAS and LAZ files once, sort their points by place, and note where they lie.
+
+        Those that an earlier run read are only read again where their points are `needed` (paths) and not there any more.
+        """
         waiting: deque[_Reading] = deque()
-        marks = []
         for source in self.sources:
             if source.kind != "las" or source.path in self.unreadable:
                 continue
-            mark = fingerprint(source.path, self.stamps[source.path], self.grid.size)
-            marks.append(mark)
-            if (known := store.index(mark)) is not None:
+            mark = self.mark_of(source.path)
+            known = self.indexes.get(source.path) or store.index(mark)
+            there = known is not None and (needed is None or source.path not in needed)
+            if there or (known is not None and os.path.exists(known.copy)):
                 self.indexes[source.path] = known
             else:
                 waiting.append(_Reading(source.path, mark))
-        store.forget_copies(but=marks)
-        copied = set(self._worth(reading.path for reading in waiting))
-        sizes = (copy_bytes(self.extents[path].count, self.extents[path].point_bytes) for path in copied)
-        if not store.room_for(sum(sizes)):
-            copied = set()
 
         def task_of(reading: _Reading) -> Call:
-            copy = str(store.copy(reading.mark)) if reading.path in copied else ""
-            return Call(index_las, (reading.path, self.grid, copy))
+            return Call(sort_points, (reading.path, self.grid, str(store.copy(reading.mark))))
 
         total = sum(self.extents[reading.path].count for reading in waiting)
         with Progress(total, "reading the inputs", enabled=show) as progress:
@@ -251,27 +254,12 @@ class Survey:
                 if answer.reason:
                     self.unreadable[reading.path] = answer.reason
                     continue
-                self.indexes[reading.path] = answer.result
-                if answer.result.count and (
-                    odd := lascheck.beyond_box(reading.path, union(answer.result.boxes))
-                ):
+                index = self.indexes[reading.path] = answer.result
+                if index.count and (odd := lascheck.beyond_box(reading.path, index.box)):
                     self.messages.append(odd)
-                store.keep_index(reading.mark, answer.result)
-                progress.update(answer.result.count)
+                store.keep_index(reading.mark, index)
+                progress.update(index.count)
         self._place()
-
-    def copy_bytes(self) -> int:
-        """How much disk copies of all inputs by place take, as far as they are worth it."""
-        return sum(
-            copy_bytes(self.extents[path].count, self.extents[path].point_bytes)
-            for path in self._worth(self.extents)
-        )
-
-    def _worth(self, paths: Iterable[str]) -> list[str]:
-        """Inputs of which copies by place are worth it: tiles read more than their own of them."""
-        if self.options.scheduler or not self.halo_units or len(self.tiles()) == 1:
-            return []  # a network carries them less often compressed
-        return [path for path in paths if self.extents[path].count > SMALL]
 
 
 @dataclass

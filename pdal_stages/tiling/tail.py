@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +19,6 @@ from ..pipeline.callbacks import Callbacks
 from .results import NewValues
 from .store import check_run
 
-if TYPE_CHECKING:
-    from .outputcells import CellsSeen
-
 #: PDAL's names of types that are not NumPy's with ``_t``.
 _FLOATS = {"float64": "double", "float32": "float"}
 
@@ -32,11 +29,8 @@ def run_tail(
     tail: list[dict[str, Any]],
     outputs: Sequence[str],
     scratch: str,
-    seen: CellsSeen | None = None,
 ) -> dict[str, Any]:
     """Run readers, the new values of each, and the tail with its writers; what they have :func:`written`.
-
-    `seen` looks at the points with their new values.
 
     The files, `outputs`, appear under their names when all are whole, and the run goes on whose folder for temporary files
     is `scratch`.
@@ -50,7 +44,7 @@ def run_tail(
 
     flags = las_output.files_with_flags_to_split([*readers, *tail])
     with Callbacks() as callbacks:
-        stages = merged(callbacks, readers, new, flags, seen)
+        stages = merged(callbacks, readers, new, flags)
         tail = [{k: v for k, v in stage.items() if k != "inputs"} for stage in tail]
         with whole_files(*outputs, check=finish) as partials:
             waiting = iter(partials)
@@ -68,14 +62,13 @@ def merged(
     readers: list[dict[str, Any]],
     new: list[NewValues],
     flags: Sequence[bool],
-    seen: CellsSeen | None = None,
 ) -> list[dict[str, Any]]:
-    """Stages that read points, give them their new values, and merge them; `seen` looks at them then."""
+    """Stages that read points, give them their new values, and merge them."""
     stages: list[dict[str, Any]] = []
     inputs = []
     for number, (reader, values) in enumerate(zip(readers, new, strict=True)):
         stages.append({**reader, "tag": f"in{number}"})
-        stages += _put(callbacks, values, f"in{number}", f"put{number}", seen)
+        stages += _put(callbacks, values, f"in{number}", f"put{number}")
         inputs.append(f"put{number}")
         if flags and flags[number]:
             stages.append(las_output.flag_splitter([True], inputs=[f"put{number}"], tag=f"split{number}"))
@@ -83,9 +76,7 @@ def merged(
     return [*stages, {"type": "filters.merge", "inputs": inputs}]
 
 
-def _put(
-    callbacks: Callbacks, new: NewValues, after: str, tag: str, seen: CellsSeen | None
-) -> list[dict[str, Any]]:
+def _put(callbacks: Callbacks, new: NewValues, after: str, tag: str) -> list[dict[str, Any]]:
     """Filters that give a reader's points their new values, and drop some; PDAL wants the two apart."""
 
     def put(module, ins, outs) -> None:
@@ -97,8 +88,6 @@ def _put(
             else:
                 outs[name] = np.array(ins[name])
                 outs[name][rows] = values
-        if seen is not None:
-            seen.look(module, ins, outs, new.kept)
 
     def drop(module, ins, outs) -> None:
         outs["Mask"] = np.ascontiguousarray(new.kept, bool)

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import NoTerrainError
-from .cloudindex import CloudIndex
-from .extract import Piece, cut_all
+from .cut import Piece, cut_all
 from .file_task import write_tile
 from .firstround import Before
 from .grid import inside
 from .headrun import FromBefore, HeadRun, RunContext, run_head
+from .index import CloudIndex
 from .results import PieceResults, class_counts, save
 from .sources import InputSource
 
@@ -72,7 +72,6 @@ def _settle(task: TileTask, folder: str) -> tuple[list[PieceResults], dict[str, 
             halo_m / context.unit,
             folder,
             task.outputs is not None,
-            context.plan.all_ours,
         )
         read = sum(len(piece.index) for piece in cuts)
         own = sum(len(piece.own) for piece in cuts)

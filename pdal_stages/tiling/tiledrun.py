@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import StageError
+from ..base.errors import DependencyError, StageError
 from ..base.files import sweep
 from ..base.jit import kept_kernels
 from ..base.plain import print_messages
@@ -20,17 +20,14 @@ from ..pipeline.read import PipelineSource
 from ..pipeline.run import Pipeline
 from ..stages.points import HOLDS_NOWHERE
 from ..stages.polygons import TOUCH_NONE
-from . import measured
-from .complete import remember, told_again
 from .dispatch import run_all, run_first_round
 from .estimate import estimate
 from .oneformat import following
 from .outcome import FileJob, InterruptedRun, TiledRun, TileJob, summarize
 from .pool import open_pool
 from .rasters import remarks
-from .rehearsal import rehearse
 from .settings import TilingOptions
-from .store import FOLDER as STORE
+from .sources import InputSource
 from .store import Store
 from .survey import Survey
 from .tileplan import TilePlan, make_plan, outputs_for
@@ -44,7 +41,6 @@ def run_tiled(
     *,
     dry_run: bool = False,
     progress: bool | None = None,
-    brief: bool = False,
     **options: Any,
 ) -> TiledRun:
     """Run a pipeline in tiles.
@@ -60,8 +56,6 @@ def run_tiled(
         Only find the tiles; nothing is read but headers, nothing written.
     progress : bool, optional
         Whether to show progress on stderr.
-    brief : bool
-        With `resume`, where nothing is left to be done: say that, quickly, without the tiles.
     **options
         The other fields of :class:`TilingOptions`.
 
@@ -91,7 +85,6 @@ def run_tiled(
         chosen,
         dry_run=dry_run,
         progress=progress,
-        brief=brief,
         source=pipeline.source,
     )
 
@@ -103,24 +96,16 @@ def run_plan(
     dry_run: bool = False,
     progress: bool | None = None,
     finished: Callable[[TileJob | FileJob], None] | None = None,
-    brief: bool = False,
     source: PipelineSource | None = None,
 ) -> TiledRun:
     """Run what was planned; see :func:`run_tiled`. `finished` hears of every output that was written.
 
-    `source`: the pipeline as the user gave it, which is tried on an input first. `brief`: where an earlier run did
-    everything and nothing has changed since, it is enough to say so, without its tiles.
+    `source`: the pipeline as the user gave it, which is tried on an input first.
     """
     started = time.monotonic()
     folder = Path(plan.writers[0]["filename"]).absolute().parent
-    if brief and chosen.resume and not dry_run and (folder / STORE).is_dir():
-        with Store(folder) as store:
-            told = told_again(store, plan, chosen)
-        if told is not None:
-            return told
     if chosen.resume and chosen.tile is None:  # the free memory may be another today
         chosen = replace(chosen, tile=Store(folder).side())
-    asked = chosen
     survey = Survey(plan, chosen, Store(folder).side("block") if chosen.resume else None)
     plan, chosen = survey.plan, survey.options
     if survey.per == "tile":  # whose outputs have points of all readers
@@ -129,7 +114,7 @@ def run_plan(
     survey.messages += remarks(plan.tail, chosen.tile if survey.per == "tile" else None)
     if source is not None:
         readable = [each for each in survey.sources if each.path not in survey.unreadable]
-        rehearse(source, readable, len(plan.readers))
+        _try_on_an_input(source, readable, len(plan.readers))
     if dry_run:
         return estimate(plan, survey)
     if not folder.is_dir():
@@ -143,21 +128,22 @@ def run_plan(
     with Store(folder) as store:
         if not chosen.resume:
             store.clear()
-        store.forget_complete()
         store.keep_sides(survey.grid.size, None if plan.first is None else plan.first.blocks.side)
         try:
             with open_pool(chosen, str(store.folder)) as pool:
-                survey.read_indexes(store, pool, chosen.retries, progress)
+                store.forget_copies(map(survey.mark_of, survey.paths))
+                survey.read_inputs(store, pool, chosen.retries, progress)
                 work = Worklist(plan, survey)
                 if chosen.resume:
                     work.take_over(store)
+                    survey.read_inputs(store, pool, chosen.retries, progress, work.inputs())
                 with contextlib.suppress(KeyboardInterrupt):
                     interrupted = True
                     run_first_round(work, store, pool, chosen.retries, progress)
                     run_all(work, store, pool, chosen.retries, progress, finished)
                     interrupted = False
                     work.forget_results(store)
-            changed = remember(store, replace(plan, tail=survey.plan.tail), asked, work)
+                    store.forget_copies()
         finally:
             for each in folders:
                 sweep(each)  # what workers left that were killed
@@ -171,9 +157,7 @@ def run_plan(
             f"than could be read within {chosen.most_points:,} points; they may differ from an untiled run: "
             + ", ".join(short[:5])
         )
-    run = TiledRun(work.jobs, work.outputs, survey.unreadable, changed, survey.messages, summary)
-    if not chosen.scheduler:
-        measured.remember(run, plan.head)
+    run = TiledRun(work.jobs, work.outputs, survey.unreadable, survey.changed(), survey.messages, summary)
     if interrupted:
         raise InterruptedRun(run)
     return run
@@ -201,3 +185,15 @@ def _messages_of_tiles(work: Worklist) -> list[str]:
     return messages + (
         [f"and {len(found) - _MOST_MESSAGES} more; see --report"] if len(found) > _MOST_MESSAGES else []
     )
+
+
+def _try_on_an_input(source: PipelineSource, inputs: list[InputSource], readers: int) -> None:
+    """Let PDAL prepare the pipeline on one input: stages that lack dimensions and unknown options fail before any tile."""
+    first = next((one for one in inputs if one.kind == "las"), None)
+    if first is None:
+        return
+    reader: dict[str, Any] = {**first.reader, "type": "readers.las", "filename": first.path}
+    tags = [stage.get("tag") if isinstance(stage, dict) else None for stage in source.stages[:readers]]
+    stages = [{**reader, "tag": tag} if tag else dict(reader) for tag in tags]
+    with contextlib.suppress(DependencyError):  # the program pdal is not there to ask
+        Pipeline(replace(source, stages=[*stages, *source.stages[readers:]]), whole=False).prepare()

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..base import kinds
 from ..base.errors import PipelineError, StageError
@@ -15,9 +15,6 @@ from ..models import shipped
 from ..pipeline.filenames import writes_las
 from ..pipeline.run import Pipeline
 from ..stages.base import Blocks, Stage
-
-if TYPE_CHECKING:
-    from .outputcells import OutputCells
 
 #: Dimensions that follow a point through a tile's pipeline.
 ROW, INPUT, OUTSIDE = "PdalStagesRow", "PdalStagesInput", "PdalStagesOutside"
@@ -81,7 +78,6 @@ class TilePlan:
     #: What takes each tile's own points in place of the tail: called with their results, the outputs and the folder for
     #: temporary files, it gives the record of what it wrote.
     takes: Callable[[list[Any], list[str], str], dict[str, Any]] | None = None
-    cells: OutputCells | None = None  #: what takes the cells of points while outputs are written
     #: Dimensions that our stages make and outputs hold, with PDAL's types: what a file without points gets, too.
     makes: dict[str, str] = field(default_factory=dict)
     whole_names: bool = False  #: '#' in an output's name is the whole name of the input file, with its suffix

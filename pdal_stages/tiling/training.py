@@ -328,7 +328,5 @@ class Taking:
         found = of_own_points(result)
         if not self.numbers:
             return found
-        number = np.empty(len(result.piece.own), np.uint32)
-        for source, first, end in result.piece.spans:
-            number[slice(*np.searchsorted(result.piece.own, (first, end)))] = self.numbers[source.path]
+        number = np.full(len(result.piece.own), self.numbers[result.piece.source.path], np.uint32)
         return NewValues(found.kept, {**found.values, FILE_NUMBER: (None, number)})

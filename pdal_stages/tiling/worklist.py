@@ -8,9 +8,9 @@ from dataclasses import replace
 from typing import Any
 
 from ..base.version import build
-from .cloudindex import CloudIndex
 from .file_task import FileTask
 from .headrun import RunContext
+from .index import CloudIndex
 from .outcome import FileJob, TileJob
 from .sources import InputSource
 from .store import Store, fingerprint
@@ -171,8 +171,6 @@ class Worklist:
                     plan.beside,
                     item.outputs,
                     scratch,
-                    plan.cells,
-                    survey.indexes[item.source.path].copy,
                     plan.makes,
                 )
             sources = survey.near(item.tile, far)
@@ -192,3 +190,14 @@ class Worklist:
         """A source and its index, of which the blocks are all that a worker needs."""
         index = self.survey.indexes.get(source.path)
         return source, index and replace(index, tiles=[])
+
+    def inputs(self) -> set[str]:
+        """Inputs whose points tiles read that are to be run."""
+        far = self.farthest
+        if self.plan.first is not None:
+            far += (
+                self.plan.first.far_m + self.plan.first.blocks.side + self.plan.first.blocks.reach
+            ) / self.survey.unit
+            far += self.survey.grid.size
+        waiting = [job for job in self.jobs if job.state == "waiting"]
+        return {source.path for job in waiting for source in self.survey.near(job.tile, far)}
