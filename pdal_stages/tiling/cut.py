@@ -67,20 +67,18 @@ def cut_all(
             numbers, records = points_near(path, index, grid, box)
         else:
             continue
+        if not len(records):
+            continue
         header = header_of(path)
         x, y = coordinates(records, header)
-        near = (x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])
-        if not near.any():
-            continue
-        records = records[near]
-        away, tiles = outside(x[near], y[near], grid, tile)
+        away, tiles = outside(x, y, grid, tile)
         target = os.path.join(folder, f"piece{number}.las")
         write_records(target, header, [records])
         core = ""
         if cores:
             core = os.path.join(folder, f"core{number}.las")
             write_records(core, header, [records[away < 0]])
-        pieces.append(Piece(source, target, core, numbers[near], away, tiles))
+        pieces.append(Piece(source, target, core, numbers, away, tiles))
     return pieces
 
 
@@ -92,5 +90,8 @@ def outside(
     away = np.maximum(np.maximum(x0 - x, x - x1), np.maximum(y0 - y, y - y1))
     column, row = grid.index(x), grid.index(y)
     mine = (column == tile[0]) & (row == tile[1])
-    tiles = set(map(tuple, np.unique(np.column_stack([column, row]), axis=0).tolist()))
+    left, bottom = int(column.min()), int(row.min())
+    across = int(column.max()) - left + 1
+    there = np.flatnonzero(np.bincount((row - bottom) * across + (column - left)))  # few: all lie in one box
+    tiles = {(left + int(n) % across, bottom + int(n) // across) for n in there}
     return np.where(mine, -1.0, np.maximum(away, 0.0)), tiles

@@ -36,9 +36,9 @@ class CloudIndex:
     copy: str  #: the file with the points
 
 
-def copy_type(path: str) -> np.dtype:
+def copy_type(header) -> np.dtype:
     """How the copy of a file holds a point: its number in the file, and its record."""
-    return np.dtype([("number", "<i8"), ("record", header_of(path).point_format.dtype())])
+    return np.dtype([("number", "<i8"), ("record", header.point_format.dtype())])
 
 
 def sort_points(path: str, grid: TileGrid, copy: str) -> CloudIndex:
@@ -50,7 +50,7 @@ def sort_points(path: str, grid: TileGrid, copy: str) -> CloudIndex:
         If any of it cannot be read, or the copy cannot be written.
     """
     header = header_of(path)
-    dtype, cells = copy_type(path), TileGrid(grid.size * _SHARE)
+    dtype, cells = copy_type(header), TileGrid(grid.size * _SHARE)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     tiles: Counter[tuple[int, int]] = Counter()
     found = [np.empty((0, 4), np.int64)]
@@ -103,18 +103,20 @@ def _groups(column: NDArray[np.int64], row: NDArray[np.int64]) -> tuple[NDArray[
 
 
 def points_near(path: str, index: CloudIndex, grid: TileGrid, box: Box) -> tuple[NDArray[np.int64], NDArray]:
-    """Numbers, ascending, and records of the points of a file that lie in cells which a box touches."""
-    cells = TileGrid(grid.size * _SHARE)
+    """Numbers, ascending, and records of the points of a file that lie in a box, edges included."""
+    cells, header = TileGrid(grid.size * _SHARE), header_of(path)
     (i0, j0), (i1, j1) = (cells.index(np.array(corner)).tolist() for corner in (box[:2], box[2:]))
     i, j = index.cells[:, 0], index.cells[:, 1]
     near = index.cells[(i >= i0) & (i <= i1) & (j >= j0) & (j <= j1)]
-    dtype = copy_type(path)
+    dtype = copy_type(header)
     try:
         rows = np.concatenate([np.empty(0, dtype), *_read(index.copy, near, dtype)])
     except OSError as error:
         raise StageError("the copy of an input cannot be read", where=path, found=error) from error
+    x, y = coordinates(rows["record"], header)
+    rows = rows[(x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])]
     rows = rows[np.argsort(rows["number"])]
-    return rows["number"], rows["record"]
+    return np.ascontiguousarray(rows["number"]), np.ascontiguousarray(rows["record"])
 
 
 def _read(copy: str, cells: NDArray[np.int64], dtype: np.dtype) -> Iterator[NDArray]:

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pdal_stages.tiling.cloudindex import index_las
 
 from pdal_stages.base import las, lascheck
 from pdal_stages.base.errors import StageError
@@ -29,7 +30,6 @@ from pdal_stages.pipeline import tindex
 from pdal_stages.pipeline.pdal import version
 from pdal_stages.stages.where import Expression
 from pdal_stages.tiling import results, sources
-from pdal_stages.tiling.cloudindex import index_las
 from pdal_stages.tiling.grid import TileGrid
 from pdal_stages.tiling.store import Store
 
