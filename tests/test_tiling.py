@@ -705,7 +705,7 @@ def test_outputs_of_tiles_hold_all_that_inputs_of_several_kinds_hold(tmp_path, w
         writer = {"type": "writers.las", "filename": f"{tmp_path}/own_#.las", "forward": forward, **options}
         stages = [{"type": "readers.las", "filename": f"{folder}/*.laz"}, {"type": "filters.hag_minima"}]
         for resume in (False, True):
-            run = run_tiled([*stages, writer], 40, per="tile", workers=0, resume=resume, brief=True)
+            run = run_tiled([*stages, writer], 40, per="tile", workers=0, resume=resume)
             assert not run.failures
         assert any("nothing is to be done" in message for message in run.messages)
         for path in tmp_path.glob("own_*.las"):
