@@ -129,7 +129,7 @@ def judged(one: Classified) -> tuple[int, int, float, float, float]:
     return len(codes), int(wrong.sum()), float(cells.errors.sum()), *found
 
 
-def _first(cells: Cells, true: np.ndarray) -> float:
+def _first(cells: ReviewCells, true: np.ndarray) -> float:
     """Share of the wrong points in the patches that come first, up to a tenth of the area; of the last as much as fits."""
     patches = find_patches(cells)
     area, held = np.cumsum(patches.area), np.cumsum(np.bincount(patches.of_cell, true, len(patches)))
