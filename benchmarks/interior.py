@@ -25,7 +25,7 @@ from pdal_stages.pipeline.work import perform
 from pdal_stages.synthetic import TownOptions, write_town
 from pdal_stages.tiling import firstround
 from pdal_stages.tiling.classify import ClassifyTask
-from pdal_stages.tiling.cloudindex import index_las
+from pdal_stages.tiling.index import sort_points
 from pdal_stages.tiling.dispatch import run_all, run_first_round
 from pdal_stages.tiling.pool import Here
 from pdal_stages.tiling.settings import TilingOptions
@@ -97,7 +97,7 @@ def main() -> None:
         plan = survey.plan
         pool = Timed(o.threads)
         with Store(folder / "out") as store, contextlib.suppress(KeyboardInterrupt):
-            survey.read_indexes(store, pool, 0, False)
+            survey.read_inputs(store, pool, 0, False)
             work = Worklist(plan, survey)
             inside = next(out for out in work.outputs if out.source.path == str(middle))
             for item in [*work.jobs, *work.outputs]:
@@ -109,7 +109,7 @@ def main() -> None:
             costs["Call"] = []
             for _ in range(3):
                 began = time.process_time()
-                index_las(str(middle), survey.grid, str(folder / "copy"))
+                sort_points(str(middle), survey.grid, str(folder / "copy"))
                 costs["Call"].append(time.process_time() - began)
             pool.costs.clear()
             for _ in range(o.runs + 1):  # the first compiles, or loads what is compiled

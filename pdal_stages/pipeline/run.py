@@ -20,7 +20,7 @@ from ..base.lascheck import check_readable
 from ..base.outputs import Output, check_outputs
 from ..base.report import Report
 from ..stages import registry
-from . import describe, interrupts, las_output, runtime, straight
+from . import describe, interrupts, las_output, runtime
 from . import pdal as pdal_env
 from .callbacks import Callbacks
 from .filenames import (
@@ -152,13 +152,11 @@ class Pipeline:
         *,
         arrays: bool = True,
         loglevel: int = logging.WARNING,
-        read: Mapping[str, straight.View] | None = None,
     ) -> int:
         """Run the pipeline in this process; the number of points that came out.
 
         Files are written in hidden folders and renamed at the end, so an output is whole
-        or absent, and an older one stays if the run fails. With `read`, what readers give by their tags, PDAL is left out:
-        see :mod:`.straight`.
+        or absent, and an older one stays if the run fails.
 
         Raises
         ------
@@ -187,12 +185,9 @@ class Pipeline:
                         run[number] = las_output.uncompressed_writer(stage, run[:number])
                 try:
                     with interrupts.gentle(signal.SIGINT):
-                        if read is not None:
-                            result = straight.execute(callbacks.check_ground(run), read)
-                        else:
-                            result = pdal_env.execute(
-                                callbacks.check_ground(run), arrays=arrays, loglevel=loglevel
-                            )
+                        result = pdal_env.execute(
+                            callbacks.check_ground(run), arrays=arrays, loglevel=loglevel
+                        )
                         interrupts.check()
                     compressed = las_output.compress(partials)
                 finally:
