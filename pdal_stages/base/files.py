@@ -4,8 +4,7 @@ The hidden folder has a random name, only its owner may enter it, and it is lock
 writer left is therefore known to be dead, and goes when the next file is written to the same place.
 
 * An existing file is replaced; the new one takes over its mode, and its owner where that may be given.
-* A link is followed: the file it leads to is replaced, the link stays; not so another user's in a folder that others may
-  write to (:mod:`.links`).
+* A link is followed: the file it leads to is replaced, the link stays.
 * A device, pipe or terminal (``/dev/stdout``) is written into, once all is there.
 * A write-protected file, a file of another kind, a folder, a socket and a block device are refused.
 """
@@ -26,7 +25,6 @@ from typing import Any
 
 from .errors import StageError
 from .kinds import kind_of
-from .links import followed
 
 #: How the hidden folders' names begin, and what the file in them is called that their writer holds locked.
 PREFIX, _LOCK = ".pdal-stages-partial-", ".lock"
@@ -60,7 +58,7 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
         write-protected file, a file that is known to be of another kind.
     """
     name = Path(path)
-    real = _real(name, what)
+    real = _real(name)
     if is_stream(name):
         if not os.access(name, os.W_OK) or stat.S_IFMT(os.stat(name).st_mode) in (
             stat.S_IFBLK,
@@ -118,11 +116,9 @@ def _is_open(path: str | os.PathLike) -> bool:
     return False
 
 
-def _real(path: Path, what: str = "output") -> Path:
-    """The file that a name leads to; StageError where a stranger's link is on the way."""
-    if not hasattr(os, "geteuid"):  # Windows
-        return Path(os.path.realpath(path))
-    return followed(path, what)
+def _real(path: Path) -> Path:
+    """The file that a name leads to."""
+    return Path(os.path.realpath(path))
 
 
 def open_to_append(path: str | os.PathLike, what: str) -> Any:
@@ -130,11 +126,9 @@ def open_to_append(path: str | os.PathLike, what: str) -> Any:
 
     Raises
     ------
-    StageError
-        If a stranger's link is on the way.
     OSError
     """
-    real = _real(Path(path), what)
+    real = _real(Path(path))
     if is_stream(path):
         return open(path, "a", encoding="utf-8", errors="backslashreplace")
     flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)

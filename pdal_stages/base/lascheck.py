@@ -9,16 +9,16 @@ from __future__ import annotations
 import math
 import os
 import struct
-from itertools import accumulate
 from pathlib import Path
 from typing import BinaryIO
 
-from . import chunks, copc
+from . import chunks
 from .errors import StageError
 from .las import POINT_BYTES, WAVES, LasHeader, read_header, records
 
 #: What to do about a damaged file.
 DAMAGED = "Get the file again from its source, or repair it with a tool made for that (e.g. lasinfo -repair)"
+
 #: Steps of the coordinates that points may lie beyond the box: programs round it differently.
 _BOX_STEPS = 100
 
@@ -40,7 +40,7 @@ def check_readable(path: str | os.PathLike) -> str | None:
         if header is not None and header.records_after and not wrong:
             wrong = _wrong_records(path, header, size)
         if header is not None and header.compressed and header.count and not wrong:
-            wrong = _wrong_chunks(path, header, table, size)
+            wrong = _wrong_chunks(path, header, table)
     except OSError as error:
         raise StageError("the file cannot be read", where=str(path), found=error) from None
     if header is None:
@@ -183,9 +183,7 @@ def _wrong_records(path: str | os.PathLike, header: LasHeader, size: int) -> tup
     return None
 
 
-def _wrong_chunks(
-    path: str | os.PathLike, header: LasHeader, table: int, size: int
-) -> tuple[str, str] | None:
+def _wrong_chunks(path: str | os.PathLike, header: LasHeader, table: int) -> tuple[str, str] | None:
     """What is wrong with the chunks of a LAZ file whose table is at `table`."""
     with open(path, "rb") as file:
         coding = chunks.coding_of(file, header)
@@ -202,10 +200,7 @@ def _wrong_chunks(
         )
         if not wrong and header.point_format >= 6 and of_chunk is not None:
             wrong = _wrong_last_chunk(file, header, of_chunk, number, data)
-        if wrong or not Path(path).name.lower().endswith(".copc.laz"):
-            return wrong
-        listed = of_chunk is None and number <= chunks.MOST_DECODED
-        return _wrong_octree(file, header, size, data if listed else b"")
+        return wrong
 
 
 def _wrong_last_chunk(
@@ -222,18 +217,3 @@ def _wrong_last_chunk(
         found = of_chunk * (number - 1) + struct.unpack("<I", held)[0]
         return "its header counts other points than it holds", f"{header.count:,} counted, {found:,} held"
     return None
-
-
-def _wrong_octree(file: BinaryIO, header: LasHeader, size: int, table: bytes) -> tuple[str, str] | None:
-    """What is wrong with the octree of a file that calls itself COPC; `table`: of its chunks, where each has its count."""
-    first = next(records(file, header), None)
-    if first is None or first.user != b"copc" or first.number != 1:
-        return "it is called .copc.laz, but its first record does not describe an octree", str(
-            first and first.user
-        )
-    known = None
-    if table:
-        sizes, counts = chunks.decode(table, variable=True)
-        places = accumulate(sizes, initial=header.offset + 8)
-        known = [place for place in zip(places, sizes, counts, strict=False) if place[2]]
-    return copc.what_is_wrong(file, first.data, size, header.count, known)

@@ -134,53 +134,6 @@ def test_latin_1_beside_others(cell, tmp_path, cloud):
     )
 
 
-# ---- COPC --------------------------------------------------------------------------------------------------
-
-COPC = Path(__file__).resolve().parents[1] / "data" / "town.copc.laz"
-
-
-def _root(data: bytearray) -> int:
-    return struct.unpack_from("<Q", data, 429 + 40)[0]
-
-
-def _put(at, form: str, *values):
-    """A change: values at a place, or where a function of the file says."""
-
-    def change(data: bytearray) -> None:
-        struct.pack_into(form, data, at(data) if callable(at) else at, *values)
-
-    return change
-
-
-COPCS = [
-    ("COPC: no octree record first", _put(377, "<4s", b"none"), ["does not describe an octree"]),
-    ("COPC: half size of NaN", _put(429 + 24, "<d", float("nan")), ["its octree has an invalid extent"]),
-    ("COPC: octree beyond the file", _put(429 + 40, "<Q", 2**62), ["outside the file"]),
-    ("COPC: octree of 2^62 bytes", _put(429 + 48, "<Q", 2**62), ["outside the file"]),
-    ("COPC: octree that leads back to itself", lambda d: _put(lambda d: _root(d) + 16, "<Qii", _root(d), 32, -1)(d), ["leads back to itself"]),
-    ("COPC: node of level -1", _put(_root, "<i", -1), ["a node that cannot be"]),
-    ("COPC: node of level 31", _put(_root, "<4i", 31, -5, 0, 0), ["a node that cannot be"]),
-    ("COPC: node of -7 points", _put(lambda d: _root(d) + 28, "<i", -7), ["a node that cannot be"]),
-    ("COPC: node without its points", _put(lambda d: _root(d) + 24, "<ii", 0, 0), ["does not hold its points"]),
-    ("COPC: node elsewhere in the file", _put(lambda d: _root(d) + 16, "<Q", 600), ["are not the chunks"]),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("case", "change", "says"), COPCS, ids=[row[0] for row in COPCS])
-def test_copc(cell, tmp_path, case, change, says):
-    """PDAL's reader crashes with most of these, or leaves points out."""
-    data = bytearray(COPC.read_bytes())
-    change(data)
-    (tmp_path / "town.copc.laz").write_bytes(data)
-    path = job(
-        tmp_path,
-        str(tmp_path / "town.copc.laz"),
-        HAG,
-        {"type": "writers.las", "filename": str(tmp_path / "o.las")},
-    )
-    cell("LAS files", case).refused(["pipeline", path], "the LAS file is damaged", *says)
-
-
 # ---- many files, one output each ------------------------------------------------------------------------------
 
 

@@ -14,8 +14,6 @@ import pytest
 from robustness_kit import job
 from test_robust_models import repack
 
-from pdal_stages.base.errors import StageError
-from pdal_stages.base.links import followed
 from pdal_stages.classifier import load_model
 from pdal_stages.tiling import run_tiled
 
@@ -203,106 +201,6 @@ def test_files_of_the_same_kind_are_replaced(cell, files, monkeypatch):
 
 #: A user that is neither the superuser nor anybody here.
 STRANGER = 54_321
-
-
-@pytest.fixture()
-def open_place(tmp_path):
-    """A sticky folder that all may write to, and a file elsewhere that must stay as it is."""
-    if os.geteuid() != 0:
-        pytest.skip("only a superuser can make another user's links")
-    victim = tmp_path / "victim.txt"
-    victim.write_text("precious\n")
-    place = tmp_path / "open"
-    place.mkdir()
-    place.chmod(0o1777)
-    return place, victim
-
-
-def put(link, target, owner=STRANGER):
-    link.symlink_to(target)
-    os.lchown(link, owner, owner)
-    return link
-
-
-def test_links_of_strangers(cell, open_place, tmp_path, cloud, model):
-    place, victim = open_place
-    las = tmp_path / "victim.las"
-    shutil.copy(cloud, las)
-    for case, name, target, words in (
-        ("output", "out.las", las, ["classify", cloud, "LINK", "--model", model]),
-        ("output of a pipeline", "pipe.las", las, ["pipeline", job(tmp_path, str(cloud), HAG, str(place / "pipe.las"))]),
-        ("metadata", "m.json", victim, ["pipeline", job(tmp_path, str(cloud), HAG, name="m.json"), "--metadata", "LINK"]),
-        ("log", "run.log", victim, ["classify", cloud, tmp_path / "o.las", "--model", model, "--log", "LINK"]),
-        ("log into a file that is not there", "new.log", tmp_path / "new",
-         ["classify", cloud, tmp_path / "o.las", "--model", model, "--log", "LINK"]),
-    ):  # fmt: skip
-        link, before = put(place / name, target), target.read_bytes() if target.exists() else None
-        words = [link if word == "LINK" else word for word in words]
-        it = cell(GROUP, f"{case}: another user's link in a folder that all may write to")
-        it.refused(words, "another user put", name)
-        assert (target.read_bytes() if target.exists() else None) == before
-    tiled = job(tmp_path, str(cloud), HAG, str(put(place / "tiles.las", las)), name="t.json")
-    cell(GROUP, "output of a tiled run: another user's link in a folder that all may write to").refused(
-        ["pipeline", tiled, "--tile", "20", "--workers", "0"], "another user put"
-    )
-    assert las.read_bytes() == Path(cloud).read_bytes()
-
-
-def test_a_way_through_links_of_strangers(cell, open_place, tmp_path, cloud):
-    """A folder on the way, and a link of one's own that leads to a stranger's."""
-    place, _ = open_place
-    inside = tmp_path / "inside"
-    inside.mkdir()
-    put(place / "folder", inside)
-    it = cell(GROUP, "output beyond another user's link to a folder")
-    it.refused(
-        ["pipeline", job(tmp_path, str(cloud), HAG, str(place / "folder" / "o.las"))], "another user put"
-    )
-    (tmp_path / "mine.las").symlink_to(put(place / "theirs.las", tmp_path / "victim.las"))
-    it.refused(["pipeline", job(tmp_path, str(cloud), HAG, str(tmp_path / "mine.las"))], "another user put")
-    assert not any(inside.iterdir()) and not (tmp_path / "victim.las").exists()
-
-
-def test_a_pipe_of_a_stranger(cell, open_place, tmp_path, cloud):
-    place, _ = open_place
-    os.mkfifo(place / "out.las")
-    os.chown(place / "out.las", STRANGER, STRANGER)
-    it = cell(GROUP, "another user's pipe in a folder that all may write to")
-    it.refused(["pipeline", job(tmp_path, str(cloud), HAG, str(place / "out.las"))], "another user put")
-
-
-@pytest.mark.parametrize("mode", [0o755, 0o1777])
-def test_links_of_the_folders_owner_and_ones_own(open_place, tmp_path, mode):
-    """These are followed, and everybody's where only the owner may write."""
-    place, _ = open_place
-    os.chown(place, STRANGER, STRANGER)
-    place.chmod(mode)
-    for name, owner in (("his", STRANGER), ("mine", 0)):
-        target = tmp_path / f"{name}.txt"
-        assert followed(put(place / name, target, owner)) == target
-    other = put(place / "other", tmp_path / "o", STRANGER + 1)
-    if mode == 0o755:
-        assert followed(other) == tmp_path / "o"
-    else:
-        with pytest.raises(StageError, match="another user"):
-            followed(other)
-
-
-def test_the_way_is_the_systems(tmp_path, monkeypatch):
-    """Names with .., links to links, loops and names that are not there: as ``os.path.realpath``."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "a" / "b").mkdir(parents=True)
-    for link, target in (
-        ("l1", "a/b"),
-        ("l2", "l1/../b"),
-        ("l3", str(tmp_path / "l2")),
-        ("gone", "nix/there"),
-    ):
-        (tmp_path / link).symlink_to(target)
-    for name in ("a", "l1", "l2/x", "l3/../b", "gone", "./l3//y", "nix", "/dev/null", "..", "l1/.."):
-        assert str(followed(name)) == os.path.realpath(name), name
-    (tmp_path / "loop").symlink_to("loop")
-    assert followed("loop").is_symlink()
 
 
 def test_a_lock_that_only_writers_can_hold(tmp_path, cloud):
