@@ -1,10 +1,15 @@
-"""How much memory there is, and sizes of memory as people write them."""
+"""How much memory there is, sizes of memory as people write them, and memory given back."""
 
 from __future__ import annotations
 
+import ctypes
+import mmap
 import os
 import re
+import sys
 from pathlib import Path
+
+import numpy as np
 
 from .errors import OptionError
 
@@ -45,6 +50,21 @@ def free_memory() -> int:
     found = [_available(), _left_in_container()]
     known = [size for size in found if size]
     return min(known) if known else _UNKNOWN
+
+
+def give_back(array: np.ndarray) -> None:
+    """Give the memory of an array, whose values are lost, back to the system; who allocated it still has to free it.
+
+    For arrays that someone else holds longer than they are needed. Whole pages, on Linux; nothing happens elsewhere.
+    """
+    if sys.platform != "linux" or not array.flags.c_contiguous:
+        return
+    begin = array.ctypes.data
+    first = -(-begin // mmap.PAGESIZE) * mmap.PAGESIZE
+    last = (begin + array.nbytes) // mmap.PAGESIZE * mmap.PAGESIZE
+    if last > first:
+        libc = ctypes.CDLL(None)
+        libc.madvise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), ctypes.c_int(mmap.MADV_DONTNEED))
 
 
 def _available() -> int:

@@ -130,6 +130,7 @@ def run_on_view(
     for name in stage.reads():
         if name not in ins:
             stage.take(points, name)  # raises, naming the stage that makes it
+    points.lent_by_pdal = isinstance(ins, dict)
     for name, values in stage.run(points).items():
         target = ins[name].dtype
         # PDAL copies raw memory: exactly this type, contiguous, one value per point.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..base.asprs import LEGACY_LIMIT, OVERLAP
 from ..base.errors import DimensionError, StageError
+from ..base.memory import give_back
 from ..base.report import Report
 from ..base.units import Units, reprojection_cure, units_of_wkt
 from .selection import Selection
@@ -58,6 +59,9 @@ class Points:
     own : (n,) ndarray, optional
         Below zero for the points whose results are used: :meth:`counted` counts those alone.
     """
+
+    #: Whether the arrays are PDAL's, so that :meth:`keep_only` may give memory of the others back.
+    lent_by_pdal = False
 
     def __init__(
         self,
@@ -155,6 +159,9 @@ class Points:
         if isinstance(lent, dict):
             kept |= {name for name, array in lent.items() if array is self._own}
         self.arrays = {name: lent[name] for name in lent if name in kept}
+        if self.lent_by_pdal:  # which makes these arrays for this one call, and frees them after it
+            for name in lent.keys() - kept:
+                give_back(lent[name])
         if hasattr(lent, "forget"):  # dimensions that are made as they are asked for
             lent.forget()
 
