@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from ..base.progress import Progress
 from . import crowns, lines, measure, roofs
@@ -139,7 +139,7 @@ def _spans(near: CellView, core: Window, found: Found) -> None:
 
     view, mask, sure = whole(near, core, masked, beside=False)
     high = view.high(Kind.SPAN)
-    joined, _ = ndimage.label(mask)
+    joined, _ = scipy.ndimage.label(mask)
     number = _without_small(np.where(np.isnan(high), -1, joined - 1), 4)
     number = _parted(number, chosen)
 
@@ -237,9 +237,9 @@ def _without_small(number: NDArray[np.int64], smallest: float) -> NDArray[np.int
 def _beside(number: NDArray[np.int64]) -> NDArray[np.int64]:
     """The lowest number among each cell and its eight neighbors, -1 where none has one."""
     none = np.iinfo(np.int64).max
-    lowest = ndimage.minimum_filter(np.where(number < 0, none, number), 3, mode="constant", cval=none)
+    lowest = scipy.ndimage.minimum_filter(np.where(number < 0, none, number), 3, mode="constant", cval=none)
     return np.where(lowest == none, -1, lowest)
 
 
 def _dilated(mask: NDArray[np.bool_], cells: int) -> NDArray[np.bool_]:
-    return ndimage.binary_dilation(mask, AROUND, iterations=cells) if cells else mask
+    return scipy.ndimage.binary_dilation(mask, AROUND, iterations=cells) if cells else mask

@@ -8,8 +8,8 @@ cells), and those that run side by side are put together again: conductors of on
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 #: Width of a strip, meters.
 STRIP = 1.6
@@ -52,7 +52,7 @@ def parted(row: NDArray[np.int64], column: NDArray[np.int64], size: float, gap: 
     if len(found) < 2:
         return one
     known = owner >= 0
-    owner[~known] = owner[known][cKDTree(xy[known]).query(xy[~known])[1]]
+    owner[~known] = owner[known][scipy.spatial.cKDTree(xy[known]).query(xy[~known])[1]]
     owner = _side_by_side(xy, owner, found, gap + 1.5 * size)
     length = sum(np.ptp(xy[owner == n] @ ways[found[n]]) + size for n in np.unique(owner).tolist())
     if len(row) * size**2 > max(WIDTH, 2 * size) * length:
@@ -85,7 +85,7 @@ def _side_by_side(xy: NDArray, owner: NDArray, ways: list[int], near: float) -> 
             turn = abs(ways[n] - ways[m])
             if min(turn, 180 - turn) > PARALLEL:
                 continue
-            away, _ = cKDTree(xy[owner == m]).query(xy[owner == n], distance_upper_bound=near)
+            away, _ = scipy.spatial.cKDTree(xy[owner == m]).query(xy[owner == n], distance_upper_bound=near)
             if np.isfinite(away).any():
                 a, b = out[owner == n][0], out[owner == m][0]
                 out[out == max(a, b)] = min(a, b)

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from .cells import MM
 from .planes import roof_planes
@@ -55,13 +55,13 @@ class Body(NamedTuple):
     def edge(self) -> NDArray[np.bool_]:
         """Whether each cell lies at the object's edge."""
         inside = ~np.isnan(self.image(np.zeros(len(self.row))))
-        inner = ndimage.binary_erosion(inside)
+        inner = scipy.ndimage.binary_erosion(inside)
         return ~inner[self.row - self.row.min(), self.column - self.column.min()]
 
     def holds_square(self, side: int) -> bool:
         """Whether a square of so many cells a side lies inside."""
         inside = ~np.isnan(self.image(np.zeros(len(self.row))))
-        return bool(ndimage.binary_erosion(inside, np.ones((side, side), bool)).any())
+        return bool(scipy.ndimage.binary_erosion(inside, np.ones((side, side), bool)).any())
 
     @property
     def reliability(self) -> float:

@@ -16,9 +16,8 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from ..base.errors import DependencyError, StageError, how_to_add
 from ..base.lean import imported
@@ -131,8 +130,8 @@ def _touching(shapely: Any, shapes: list[Any]) -> list[NDArray[np.int64]]:
     a, b = shapely.STRtree(shapes).query(shapes, predicate="touches")
     all_shapes = np.array(shapes, object)
     shared = shapely.length(shapely.intersection(all_shapes[a], all_shapes[b])) > 0
-    pairs = coo_matrix((np.ones(shared.sum()), (a[shared], b[shared])), (len(shapes),) * 2)
-    count, group = connected_components(pairs, directed=False)
+    pairs = scipy.sparse.coo_matrix((np.ones(shared.sum()), (a[shared], b[shared])), (len(shapes),) * 2)
+    count, group = scipy.sparse.csgraph.connected_components(pairs, directed=False)
     order = np.argsort(group, kind="stable")
     return np.split(order, np.searchsorted(group[order], np.arange(1, count)))
 

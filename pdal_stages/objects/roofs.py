@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from ..base.jit import device, njit
 from .planes import plane_around
@@ -110,9 +108,9 @@ def covered(high: NDArray, seen: NDArray, reach: int) -> NDArray:
     reach : int
     """
     roof = ~np.isnan(high)
-    holes, _ = ndimage.label(~roof & ~seen)
+    holes, _ = scipy.ndimage.label(~roof & ~seen)
     out, rows, columns = high.copy(), *high.shape
-    boxes, beside = ndimage.find_objects(holes), np.unique(holes[ndimage.binary_dilation(roof)])
+    boxes, beside = scipy.ndimage.find_objects(holes), np.unique(holes[scipy.ndimage.binary_dilation(roof)])
     for number in beside[beside > 0].tolist():
         box = boxes[number - 1]
         (top, bottom), (left, right) = ((part.start - 1, part.stop + 1) for part in box)
@@ -126,14 +124,14 @@ def covered(high: NDArray, seen: NDArray, reach: int) -> NDArray:
             continue
         part = slice(top, bottom), slice(left, right)
         hole = holes[part] == number
-        rim = ndimage.binary_dilation(hole) & ~hole
+        rim = scipy.ndimage.binary_dilation(hole) & ~hole
         levels = high[part][rim & roof[part]]
         if len(levels) < RIM * np.count_nonzero(rim):
             continue
         level = np.median(levels)
         if (
             np.mean(np.abs(levels - level) <= LEVEL) < RIM
-            or ndimage.distance_transform_cdt(hole).max() > reach
+            or scipy.ndimage.distance_transform_cdt(hole).max() > reach
         ):
             continue
         out[part][hole] = level
@@ -144,14 +142,14 @@ def _closed(high: NDArray) -> NDArray:
     """Heights with those of empty cells that have at least seven neighbors: the mean of them."""
     known = ~np.isnan(high)
     around = np.ones((3, 3))
-    count = ndimage.correlate(known.astype(np.float64), around, mode="constant")
-    total = ndimage.correlate(np.where(known, high, 0.0), around, mode="constant")
+    count = scipy.ndimage.correlate(known.astype(np.float64), around, mode="constant")
+    total = scipy.ndimage.correlate(np.where(known, high, 0.0), around, mode="constant")
     return np.where(~known & (count >= 7), total / np.maximum(count, 1), high)
 
 
 def opened(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Cells of the mask that lie in a square of two by two of it."""
-    return ndimage.binary_opening(mask, np.ones((2, 2), bool))
+    return scipy.ndimage.binary_opening(mask, np.ones((2, 2), bool))
 
 
 def connected(mask: NDArray, z: NDArray, step: float) -> NDArray[np.int64]:
@@ -173,8 +171,8 @@ def connected(mask: NDArray, z: NDArray, step: float) -> NDArray[np.int64]:
 
 def _sets(a: NDArray, b: NDArray, count: int) -> NDArray[np.int64]:
     """Of each of `count` members the number of its set, in the order of their first members; a and b are joined."""
-    pairs = coo_matrix((np.ones(len(a), np.bool_), (a, b)), (count, count))
-    _, of = connected_components(pairs, directed=False)
+    pairs = scipy.sparse.coo_matrix((np.ones(len(a), np.bool_), (a, b)), (count, count))
+    _, of = scipy.sparse.csgraph.connected_components(pairs, directed=False)
     _, first, at = np.unique(of, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int64)
     rank[np.argsort(first)] = np.arange(len(first))

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from . import crowns, roofs
 from .cells import GROUND_CELLS, MM, Cells, Kind, unpack
@@ -148,7 +148,7 @@ def whole(
     view, around = near, near.seen.rows - core.rows >> 1
     while True:
         mask = masked(view)
-        first, _ = ndimage.label(ndimage.binary_dilation(mask, AROUND) if beside else mask)
+        first, _ = scipy.ndimage.label(scipy.ndimage.binary_dilation(mask, AROUND) if beside else mask)
         first -= 1
         sure = widened(view.seen, -margin)
         reached = np.zeros(mask.size + 1, bool)  # the last: no part
