@@ -14,10 +14,9 @@ from ..base import kinds
 from ..base.errors import OptionError
 from ..base.outputs import Output
 from ..base.version import __version__
-from ..classifier.clouds import TrainingCloud, label_classes
+from ..classifier.clouds import TrainingCloud, densities, label_classes
 from ..classifier.dimensions import gather, with_returns
 from ..classifier.model import Model
-from ..classifier.thinning import density_range
 from ..classifier.trainoptions import TrainingOptions
 from ..features.index import check_xyz
 from .epochs import LabeledCloud, train_network
@@ -91,11 +90,11 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
             "count": int(count.sum()),
             "seed": options.seed,
             "samples": int(count.sum()),
-            **known.training_notes(options),
+            **({"contradicted": dict(known.left_out)} if known.left_out else {}),
             **trained.notes,
             **{name: number for name, number in counts.items() if number},
         },
-        "densities": density_range(cloud.density for cloud in clouds),
+        "densities": densities(clouds),
         "voxel": options.voxel,
         "accuracy": {"cross_validation": None},
         "passes": [

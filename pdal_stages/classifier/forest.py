@@ -67,10 +67,10 @@ class Forest:
     }
 
     def __post_init__(self) -> None:
-        sizes, nodes = self.tree_sizes, len(self.feature)
-        if not len(sizes) or not nodes or len(self.threshold) != nodes or self.leaf_counts.ndim != 2:
+        sizes, count = self.tree_sizes, len(self.feature)
+        if not len(sizes) or not count or len(self.threshold) != count or self.leaf_counts.ndim != 2:
             raise ModelError("the forest's arrays do not fit each other", found=self._shapes())
-        if int(sizes.min()) < 1 or int(sizes.sum(dtype=np.int64)) != nodes:
+        if int(sizes.min()) < 1 or int(sizes.sum(dtype=np.int64)) != count:
             raise ModelError("the trees' sizes do not add up to the nodes", found=self._shapes())
         left, depths = _laid_out(sizes, self.feature, self.threshold, self.n_features)
         leaves = int(np.count_nonzero(self.feature < 0))

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -42,7 +43,8 @@ class TiledCloud:
         arrays = {"xyz": cloud.xyz, "labels": cloud.labels, "mask": cloud.mask}
         arrays |= {f"d.{name}": values for name, values in cloud.dimensions.items()}
         try:
-            np.savez(self._file(tile), **{k: np.asarray(v) for k, v in arrays.items() if v is not None})
+            kept: dict[str, Any] = {k: np.asarray(v) for k, v in arrays.items() if v is not None}
+            np.savez(self._file(tile), **kept)
         except OSError as error:
             raise StageError(
                 "the tiles of the cloud cannot be kept",

@@ -123,7 +123,7 @@ def consistent(
             points.kind[rows] = new
         other = np.flatnonzero(points.kind != before)
         made = np.array([GROUND, VEGETATION[-1], BUILDING], np.uint8)[points.kind[other]]
-        if vegetation_heights is not None:
+        if vegetation_heights is not None and high is not None:
             by_height(made, np.ones(len(made), bool), high[other], vegetation_heights)
         else:
             leaves = made == VEGETATION[-1]

@@ -7,6 +7,8 @@ cells), and those that run side by side are put together again: conductors of on
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import scipy
 from numpy.typing import NDArray
@@ -41,7 +43,8 @@ def parted(row: NDArray[np.int64], column: NDArray[np.int64], size: float, gap: 
     xy = np.column_stack([column - column.min(), row - row.min()]).astype(np.float64) * size
     turns = np.radians(np.arange(180.0))
     ways = np.column_stack([np.cos(turns), np.sin(turns)])
-    owner, found = one - 1, []
+    owner = one - 1
+    found: list[Any] = []
     while (left := np.flatnonzero(owner < 0)).size:
         line = _longest(xy[left], ways, max(STRIP, 2 * size))
         if line is None:

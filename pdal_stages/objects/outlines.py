@@ -159,7 +159,8 @@ def _straight(shapely: Any, shapes: NDArray) -> NDArray:
         kept = shapely.get_coordinates(
             shapely.simplify(shapely.LineString(xy), _TOLERANCE, preserve_topology=False)
         )
-        at, ends = 0, []
+        at = 0
+        ends: list[int] = []
         for place in kept:
             at += (
                 int(np.flatnonzero((xy[at:] == place).all(axis=1))[0])

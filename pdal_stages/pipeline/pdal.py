@@ -332,7 +332,7 @@ def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """
     if version() >= (2, 4, 0):
         return stages
-    out = []
+    out: list[Any] = []
     for stage in stages:
         kind = stage.get("type") if isinstance(stage, dict) else None
         if kind == "writers.las" and "forward" not in stage:

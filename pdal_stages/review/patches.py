@@ -58,7 +58,7 @@ def find_patches(cells: ReviewCells) -> Patches:
     of_cell, n = of_cell.reshape(-1), len(blocks)
 
     def summed(values: NDArray) -> NDArray[np.float64]:
-        return np.bincount(of_cell, values, n)
+        return np.bincount(of_cell, values, n).astype(np.float64)
 
     errors, area = summed(total), summed(np.full(len(cells), cells.side**2))
     minutes = (GETTING_THERE + LOOKING * area / 100.0) / 60.0

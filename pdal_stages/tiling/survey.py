@@ -238,7 +238,7 @@ class Survey:
             mark = self.mark_of(source.path)
             known = self.indexes.get(source.path) or store.index(mark)
             there = known is not None and (needed is None or source.path not in needed)
-            if there or (known is not None and os.path.exists(known.copy)):
+            if known is not None and (there or os.path.exists(known.copy)):
                 self.indexes[source.path] = known
             else:
                 waiting.append(_Reading(source.path, mark))

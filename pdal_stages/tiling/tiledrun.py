@@ -131,7 +131,7 @@ def run_plan(
         store.keep_sides(survey.grid.size, None if plan.first is None else plan.first.blocks.side)
         try:
             with open_pool(chosen, str(store.folder)) as pool:
-                store.forget_copies(map(survey.mark_of, survey.paths))
+                store.forget_copies([survey.mark_of(path) for path in survey.paths])
                 survey.read_inputs(store, pool, chosen.retries, progress)
                 work = Worklist(plan, survey)
                 if chosen.resume:
