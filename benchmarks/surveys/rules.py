@@ -68,12 +68,13 @@ def count(data: Path, survey: str, model: Model) -> dict[str, Any]:
 
 def table(runs: list[dict[str, Any]]) -> str:
     """As Markdown."""
+    rules = list(runs[0]["changed"])  # those that there were when it was measured
     lines = [
-        f"| survey | points | noise | decks | {' | '.join(RULES)} | labeled and changed | wrong before | after | OA |",
-        f"|---|---:|---:|---:|{'---:|' * len(RULES)}---:|---:|---:|---:|",
+        f"| survey | points | noise | decks | {' | '.join(rules)} | labeled and changed | wrong before | after | OA |",
+        f"|---|---:|---:|---:|{'---:|' * len(rules)}---:|---:|---:|---:|",
     ]
     for run in runs:
-        counts = [run["noise"], run["decks"], *(run["changed"][rule] for rule in RULES)]
+        counts = [run["noise"], run["decks"], *(run["changed"][rule] for rule in rules)]
         shares = " | ".join(_share(n, run["points"]) for n in counts)
         rest = f"{run['judged']:,} | {run['wrong_before']:,} | {run['wrong_after']:,}"
         gained = 100 * (run["wrong_before"] - run["wrong_after"]) / run["labeled"]

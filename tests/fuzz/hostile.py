@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pdal_stages.tiling.cloudindex import index_las
 
 from pdal_stages.base import las, lascheck
 from pdal_stages.base.errors import StageError
@@ -31,6 +30,7 @@ from pdal_stages.pipeline.pdal import version
 from pdal_stages.stages.where import Expression
 from pdal_stages.tiling import results, sources
 from pdal_stages.tiling.grid import TileGrid
+from pdal_stages.tiling.index import sort_points
 from pdal_stages.tiling.store import Store
 
 PATIENCE = 10.0
@@ -110,8 +110,8 @@ def cloud(data: bytes) -> str:
         las.projection(path)
         las.odd_text(path)
         found = sources.las_extent(str(path))
-        index = index_las(str(path), TileGrid(10.0))
-        assert index.count == found.count == sum(n for _, _, n in index.tiles)
+        index = sort_points(str(path), TileGrid(10.0), str(path.with_suffix(".copy")))
+        assert index.count == found.count
         las.supersede_copc(path)
         return "read"
     except StageError as error:
