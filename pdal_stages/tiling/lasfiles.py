@@ -75,7 +75,12 @@ def record_blocks(path: str, start: int = 0, end: int | None = None, most: int =
 def header_of(path: str) -> laspy.LasHeader:
     """The header of a file, with its records."""
     with open_las(path) as reader:
-        return reader.header
+        header = reader.header
+    # Points in another order have no octree
+    header.vlrs[:] = [record for record in header.vlrs if record.user_id != "copc"]
+    if header.evlrs:
+        header.evlrs[:] = [record for record in header.evlrs if record.user_id != "copc"]
+    return header
 
 
 def write_records(path: str, header: laspy.LasHeader, records: Iterable[NDArray]) -> None:

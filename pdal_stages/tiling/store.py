@@ -213,7 +213,7 @@ class Store:
     def index(self, mark: str) -> CloudIndex | None:
         """The index of an input that is still the same."""
         known = _read(self.indexes / f"{mark}.json")
-        if known is None:
+        if known is None or "cells" not in known:  # of an earlier version
             return None
         cells = np.array(known["cells"], np.int64).reshape(-1, 4)
         tiles = [(i, j, n) for i, j, n in known["tiles"]]

@@ -166,11 +166,11 @@ def _kept() -> tuple[Store, tuple[Path, ...]]:
 
 def _notes() -> tuple[dict, dict]:
     report = {"fingerprint": "f", "outputs": [["/no/such", 1, 2]], "points": 3}
-    return report, {"count": 3, "boxes": [[0, 0, 1, 1]], "tiles": [[0, 0, 3]], "copy": ""}
+    return report, {"count": 3, "box": [0, 0, 1, 1], "tiles": [[0, 0, 3]], "cells": [[0, 0, 0, 3]]}
 
 
 def _plain(index: Any) -> dict:
-    return {name: np.asarray(value).tolist() for name, value in asdict(index).items()}
+    return {name: np.asarray(value).tolist() for name, value in asdict(index).items() if name != "copy"}
 
 
 def store(data: bytes) -> str:
