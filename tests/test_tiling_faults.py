@@ -370,7 +370,7 @@ def test_a_straggler_of_an_ended_run_changes_nothing(tmp_path, folder, monkeypat
             reason = perform(task).reason
         assert (
             "the run that wanted this has ended" in reason
-            or "cannot be read back" in reason
+            or "cannot be read" in reason
             or "not there" in reason
         )
         shutil.rmtree(own / "scratch", ignore_errors=True)
@@ -496,24 +496,6 @@ def test_workers_that_never_begin(tmp_path, folder, impatient, monkeypatch):
     monkeypatch.setattr(processes, "_command", lambda: [*before[:-1], "while True: pass"])
     with pytest.raises(StageError, match=r"could not be started.*did not begin within"):
         run_tiled(pipeline(folder, tmp_path / "o_#.laz"), 40, workers=1, progress=False)
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="limits of addresses are Linux's")
-@pytest.mark.parametrize("words", [(), ("--tile", "40", "--workers", "1")])
-@pytest.mark.parametrize("limit", [500, 650, 740])
-def test_too_little_memory_for_the_libraries(tmp_path, folder, words, limit):
-    (tmp_path / "job.json").write_text(
-        json.dumps(
-            [str(sorted(folder.glob("*.laz"))[0]), {"type": "filters.hag_minima"}, str(tmp_path / "o_#.laz")]
-        )
-    )
-    done = subprocess.run(
-        [sys.executable, "-m", "pdal_stages.cli", "pipeline", str(tmp_path / "job.json"), *words],
-        capture_output=True, text=True, timeout=120,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit * 10**6, limit * 10**6)),
-    )  # fmt: skip
-    assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
-    assert "need 770 MB" in done.stderr and f"a limit of {limit} MB" in done.stderr and "1 GB" in done.stderr
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
