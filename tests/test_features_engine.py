@@ -443,7 +443,8 @@ def test_importing_and_loading_a_model_are_light():
         from pdal_stages.classifier import load_model
         from pdal_stages.models import find
         load_model(find("standard"))
-        print([name for name in ("numba", "scipy.ndimage", "scipy.spatial", "scipy.sparse", "sklearn", "joblib") if name in sys.modules])
+        heavy = "numba", "scipy.ndimage", "scipy.spatial", "scipy.sparse", "sklearn", "joblib"
+        print([name for name in heavy if name in sys.modules])
         """
     )
     assert out.strip() == "[]"

@@ -299,41 +299,6 @@ def test_classify_goes_on_to_objects(folder, tmp_path, capsys):
     assert "ends in .gpkg" in capsys.readouterr().err and not (tmp_path / "0.laz").exists()
 
 
-@pytest.mark.pdal
-@pytest.mark.parametrize("parts", [None, 2000])
-@pytest.mark.parametrize("names", [["0.laz"], ["0.laz", "1.laz"]])
-def test_outputs_are_not_read_again_for_objects(folder, tmp_path, monkeypatch, names, parts):
-    """Cells taken while outputs are written, in one piece, in tiles, part by part, are those of the files, to the bit."""
-    from pdal_stages.tiling import objects, sizing
-
-    if parts:
-        monkeypatch.setattr(sizing, "MOST_AT_ONCE", parts)
-    out, target = tmp_path / "out", tmp_path / "town.gpkg"
-    kept, read = {}, []
-    real, points_of = objects._load, objects._points_of
-
-    def load(name, size):
-        kept[name] = real(name, size)
-        return kept[name]
-
-    monkeypatch.setattr(objects, "_load", load)
-    monkeypatch.setattr(objects, "_points_of", lambda path: read.append(path) or points_of(path))
-    inputs = [str(folder / "parts" / name) for name in names]
-    command = ["classify", *inputs, f"{out}/", "--model", "standard", "--tile", "60", "--workers", "0"]
-    assert cli.main([*(command if len(names) > 1 else command[:-4]), "--objects", str(target)]) == 0
-    assert read == [] and len(kept) == len(names)
-    held = dict(kept)
-    assert cli.main(["objects", str(out), str(tmp_path / "two.gpkg")]) == 0
-    assert len(read) == len(names)
-    again = {name: cells for name, cells in kept.items() if name not in held}
-    by_size = lambda all_cells: sorted(all_cells.values(), key=len)  # noqa: E731
-    for one, other in zip(by_size(held), by_size(again), strict=True):
-        assert len(one) > 100
-        np.testing.assert_array_equal(one.key, other.key)
-        for name, values in one.columns.items():
-            np.testing.assert_array_equal(values, other.columns[name])
-
-
 def test_cells_twice_as_wide(folder):
     las = laspy.read(folder / "parts" / "0.laz")
     xyz = np.asarray(las.x) - 500_020.0, np.asarray(las.y) - 5_400_020.0, np.asarray(las.z)
