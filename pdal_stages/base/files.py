@@ -118,7 +118,14 @@ def _is_open(path: str | os.PathLike) -> bool:
 
 def _real(path: Path) -> Path:
     """The file that a name leads to."""
-    return Path(os.path.realpath(path))
+    try:
+        return Path(os.path.realpath(path))
+    except UnicodeEncodeError as error:
+        raise StageError(
+            "the name of the file cannot be written in this locale",
+            found=ascii(str(path)),
+            cure=f"Set PYTHONUTF8=1: this locale's file names are {sys.getfilesystemencoding()}",
+        ) from error
 
 
 def open_to_append(path: str | os.PathLike, what: str) -> Any:
