@@ -82,5 +82,5 @@ def test_one_library_for_both_is_taken(monkeypatch):
     pytest.importorskip("shapely")
     monkeypatch.setattr(outlines.ctypes, "CDLL", lambda _: SimpleNamespace(GEOSversion=None))
     spec = SimpleNamespace(submodule_search_locations=["/nowhere/shapely"])
-    monkeypatch.setattr(outlines.importlib.util, "find_spec", lambda _: spec)
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: spec)
     assert outlines.with_vector(os.getpid) == os.getpid()
