@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from stage_message import message_of
 
 import pdal_stages as ps
-from pdal_stages.objects import outlines
 
 pytestmark = pytest.mark.pdal
 HAG = {"type": "filters.hag_minima"}
@@ -75,12 +72,3 @@ def test_arrays_of_python_pdal(pdal_module):
             pipeline.arrays[0]["HeightAboveGround"], ps.hag_minima(array["X"], array["Y"], array["Z"])
         )
     assert pdal
-
-
-def test_one_library_for_both_is_taken(monkeypatch):
-    """As conda has it: the program's library is that of the packages."""
-    pytest.importorskip("shapely")
-    monkeypatch.setattr(outlines.ctypes, "CDLL", lambda _: SimpleNamespace(GEOSversion=None))
-    spec = SimpleNamespace(submodule_search_locations=["/nowhere/shapely"])
-    monkeypatch.setattr("importlib.util.find_spec", lambda _: spec)
-    assert outlines.with_vector(os.getpid) == os.getpid()
