@@ -23,8 +23,8 @@ from types import SimpleNamespace
 
 import laspy
 
+from pdal_stages.base.complete import remember
 from pdal_stages.tiling.classify import ClassifyTask
-from pdal_stages.tiling.complete import remember
 from pdal_stages.tiling.store import Store
 from pdal_stages.tiling.survey import Survey
 
