@@ -22,6 +22,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import laspy
+from pdal_stages.tiling.complete import remember
 
 from pdal_stages.base.complete import remember
 from pdal_stages.tiling.classify import ClassifyTask

@@ -22,12 +22,13 @@ from pathlib import Path
 from typing import Any
 
 from pdal_stages.pipeline.work import perform
+from pdal_stages.tiling.pool import Here
+
 from pdal_stages.synthetic import TownOptions, write_town
 from pdal_stages.tiling import firstround
 from pdal_stages.tiling.classify import ClassifyTask
 from pdal_stages.tiling.dispatch import run_all, run_first_round
 from pdal_stages.tiling.index import sort_points
-from pdal_stages.tiling.pool import Here
 from pdal_stages.tiling.settings import TilingOptions
 from pdal_stages.tiling.store import Store
 from pdal_stages.tiling.survey import Survey

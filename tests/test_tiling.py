@@ -486,7 +486,6 @@ def test_moving_points_before_our_stages_is_refused(tmp_path, town_file):
         ({"workers": 1, "scheduler": "tcp://x:1"}, "one of them"),
         ({"per": "day"}, "one of"),
         ({"buffer": -1.0}, "0 meters or more"),
-        ({"retries": -1}, "0 or more"),
     ],
 )
 def test_options_are_checked(change, message):

@@ -116,7 +116,7 @@ def test_resume_makes_what_is_missing_alone(tmp_path, survey, monkeypatch):
     monkeypatch.setattr(FirstRoundTask, "run", noted)
     monkeypatch.setattr(tile_task, "run_head", failing)
     folder = tmp_path / "out"
-    assert len(in_tiles(survey, [HEIGHTS], folder, retries=0).failures) >= 1
+    assert len(in_tiles(survey, [HEIGHTS], folder).failures) >= 1
     assert len(made) == len(set(made)) == 16
     left = folder / ".pdal-stages" / "tiles"
     assert len(list(left.glob("*.first.npz"))) == 16
@@ -185,13 +185,13 @@ def test_what_is_left_of_an_input_that_is_gone_is_removed(tmp_path, survey, monk
 
     monkeypatch.setattr(tile_task, "run_head", failing)
     folder = tmp_path / "out"
-    assert in_tiles(survey, [HEIGHTS], folder, retries=0).failures
+    assert in_tiles(survey, [HEIGHTS], folder).failures
     left = folder / ".pdal-stages" / "tiles"
     names = {path.name for path in left.glob("*.first.npz")}
     np.savez(
         left / "-200_0.first.npz", around=np.array([[-1.0, 100.0, -500.0]])
     )  # of a tile without points now
-    assert in_tiles(survey, [HEIGHTS], folder, resume=True, retries=0).failures
+    assert in_tiles(survey, [HEIGHTS], folder, resume=True).failures
     assert {path.name for path in left.glob("*.first.npz")} == names
 
 
@@ -209,7 +209,7 @@ def test_a_damaged_file_of_the_first_round_is_made_again(tmp_path, survey, monke
         return answer
 
     monkeypatch.setattr(FirstRoundTask, "run", damaged)
-    run = in_tiles(survey, [HEIGHTS], tmp_path / "out", retries=0)
+    run = in_tiles(survey, [HEIGHTS], tmp_path / "out")
     assert any("first round left" in job.reason for job in run.tiles)
     monkeypatch.setattr(FirstRoundTask, "run", real)
     assert not in_tiles(survey, [HEIGHTS], tmp_path / "out", resume=True).failures
@@ -228,12 +228,12 @@ def test_what_fails_in_the_first_round_is_said_of_the_tiles_that_need_it(tmp_pat
 
     monkeypatch.setattr(FirstRoundTask, "run", failing)
     small = {**HEIGHTS, "window": 1, "openings": []}
-    run = in_tiles(survey, [small], tmp_path / "out", retries=0)
+    run = in_tiles(survey, [small], tmp_path / "out")
     failed = {job.tile for job in run.tiles if job.state == "failed"}
     assert (0, 0) in failed and all("no luck" in job.reason for job in run.tiles if job.tile in failed)
     monkeypatch.setattr(FirstRoundTask, "run", lambda self: (_ for _ in ()).throw(ps.StageError("no luck")))
     with pytest.raises(ps.StageError, match="all tiles failed for one reason"):
-        in_tiles(survey, [small], tmp_path / "other", retries=0)
+        in_tiles(survey, [small], tmp_path / "other")
 
 
 def blocks_of(points, options, near, cells=BLOCK_SIDE):

@@ -30,8 +30,8 @@ from ..stages.heights import PREPARATION, made_of_coordinates
 from ..stages.loading import loaded_model
 from .inputs_outputs import input_files
 from .parts import Part, parts_of, reads_in_parts, reference_and_wkt
-from .processes import each_file
 from .references import check_one_reference, without_reference
+from .workers import each_file
 
 #: Classes by which a model's own class is known under another code.
 _SAME = {3: 5, 4: 5}

@@ -16,8 +16,8 @@ from ..base.files import write_whole
 from ..base.outputs import Output, check_outputs
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of
-from ..pipeline.processes import each_file
 from ..pipeline.run import Pipeline
+from ..pipeline.workers import each_file
 from .oneformat import one_format
 from .outcome import FileJob, TiledRun, TileJob, left_alone
 from .settings import TilingOptions

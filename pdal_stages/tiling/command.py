@@ -47,7 +47,6 @@ def add_arguments(command: argparse.ArgumentParser, survey: bool = False) -> Non
         help=argparse.SUPPRESS if survey else "Surroundings for PDAL filters that look at neighbors",
     )
     takes("--resume", action="store_true", help="Keep what an earlier run in this folder finished")
-    takes("--retries", type=int, default=2, metavar="N", help="How often a failed tile is tried again (2)")
     takes("--dry-run", action="store_true", help="Show the tiles and an estimate, then stop")
     takes(
         "--report",

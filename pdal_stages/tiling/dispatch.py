@@ -5,18 +5,18 @@ from __future__ import annotations
 import contextlib
 import os
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 from ..base.errors import StageError
 from ..base.progress import Progress
 from ..base.version import build
-from ..pipeline.work import Task, TaskResult
+from ..pipeline.workers import TaskResult, run_tasks
 from .firstround import BlockTask, FirstRoundTask, block_grid, blocks_around, blocks_of, tiles_around
 from .grid import Box
 from .outcome import Costs, FileJob, TileJob
-from .pool import Pool, last_tries
 from .store import Store, block_file, fingerprint, left_file
 from .worklist import Worklist
 
@@ -27,8 +27,7 @@ _HOPELESS = 10
 def run_all(
     work: Worklist,
     store: Store,
-    pool: Pool,
-    retries: int,
+    workers: Any,
     show: bool | None,
     finished: Callable[[TileJob | FileJob], None] | None = None,
 ) -> None:
@@ -53,13 +52,9 @@ def run_all(
         _make_ready(out, waiting)
     total = sum(item.points for item in waiting if isinstance(item, TileJob))
     failed = 0
-    costs = work.survey.costs
-
-    def spent(item: TileJob | FileJob, cost: Mapping[str, float]) -> None:
-        costs.add("tiles" if isinstance(item, TileJob) else "outputs", cost)
-
     with Progress(total, f"{done} of {len(jobs)} tiles", enabled=show) as progress:
-        for item, answer in last_tries(pool, waiting, work.tasks(store, pool.threads), retries, spent):
+        for item, answer in run_tasks(workers, waiting, work.tasks(store, workers.threads)):
+            work.survey.costs.add("tiles" if isinstance(item, TileJob) else "outputs", answer.cost)
             if answer.reason:
                 item.state, item.reason = "failed", answer.reason
             else:
@@ -114,12 +109,11 @@ class _Item:
     at: tuple[int, int]
     name: str  #: of its file
     mark: str
-    task: Callable[[], Task]
+    task: Callable[[], Callable[[], Any]]
     points: int = 0
-    tries: int = 0
 
 
-def run_first_round(work: Worklist, store: Store, pool: Pool, retries: int, show: bool | None) -> None:
+def run_first_round(work: Worklist, store: Store, workers: Any, show: bool | None) -> None:
     """Make what tiles that are to be run need, but what an earlier run left; tiles near one that fails fail too.
 
     Raises
@@ -154,17 +148,17 @@ def run_first_round(work: Worklist, store: Store, pool: Pool, retries: int, show
             if job.state == "waiting" and not apart:
                 job.state, job.reason = "failed", reason
 
-    def first_task(job: TileJob) -> FirstRoundTask:
+    def first_task(job: TileJob) -> Callable[[], Any]:
         sources = [s for s in survey.near(job.tile, halo) if s.path not in survey.unreadable]
         with_index = [work.with_index(s) for s in sources]
-        return FirstRoundTask(context, first, job.tile, with_index, str(store.left(job.name)))
+        return FirstRoundTask(context, first, job.tile, with_index, str(store.left(job.name))).run
 
-    def block_task(block: tuple[int, int]) -> BlockTask:
+    def block_task(block: tuple[int, int]) -> Callable[[], Any]:
         left = [str(store.left(by_tile[t].name)) for t in near[block] if t not in failed]
-        return BlockTask(context.plan, block, left, str(store.block(block)), context.scratch)
+        return BlockTask(context.plan, block, left, str(store.block(block)), context.scratch).run
 
     halo = first.halo_m / unit
-    context = work.context(store, pool.threads)
+    context = work.context(store, workers.threads)
     before = work.plan.head[: first.at + 1]
     marks: dict[tuple[int, int], str] = {}
     items = []
@@ -181,7 +175,7 @@ def run_first_round(work: Worklist, store: Store, pool: Pool, retries: int, show
             _Item(job.tile, left_file(job.name), marks[job.tile], partial(first_task, job), job.points)
         )
     failed: set[tuple[int, int]] = set()
-    made = partial(_made, store=store, pool=pool, retries=retries, show=show, costs=survey.costs)
+    made = partial(_made, store=store, workers=workers, show=show, costs=survey.costs)
     for item, answer in made(items, "lowest points of cells"):
         if answer.reason:
             failed.add(item.at)
@@ -204,8 +198,7 @@ def _made(
     what: str,
     *,
     store: Store,
-    pool: Pool,
-    retries: int,
+    workers: Any,
     show: bool | None,
     costs: Costs,
 ) -> Iterator[tuple[_Item, TaskResult]]:
@@ -219,9 +212,8 @@ def _made(
     count, failures = len(waiting), []
     points = sum(item.points for item in waiting)
     with Progress(points or count, what, "points" if points else "blocks", enabled=show) as progress:
-        for item, answer in last_tries(
-            pool, waiting, lambda item: item.task(), retries, lambda _, cost: costs.add("first_rounds", cost)
-        ):
+        for item, answer in run_tasks(workers, waiting, lambda item: item.task()):
+            costs.add("first_rounds", answer.cost)
             progress.update(item.points or 1)
             if answer.reason:
                 failures.append(answer.reason)

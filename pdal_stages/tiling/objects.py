@@ -33,8 +33,8 @@ from ..pipeline import pdal as pdal_env
 from ..pipeline.inputs_outputs import input_files, outputs_of, overlooked
 from ..pipeline.overrides import Override
 from ..pipeline.parts import reads_in_parts, reference_and_wkt
-from ..pipeline.processes import each_file
 from ..pipeline.references import check_one_reference, without_reference
+from ..pipeline.workers import each_file
 from ..reports.objectlayers import check_target, object_layers, target_files, write_layers
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter
 from .lasfiles import BLOCK, open_las, read_block

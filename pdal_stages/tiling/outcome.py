@@ -56,7 +56,6 @@ class _Work:
     record: dict[str, Any] = field(default_factory=dict)
     reason: str = ""  #: why it failed
     blocked_by: str = ""  #: the unreadable input that it failed for, where that is the reason
-    tries: int = 0
 
 
 @dataclass
@@ -164,7 +163,7 @@ class TiledRun:
             "messages": self.messages,
             "failures": [{"what": what, "reason": reason} for what, reason in self.failures],
             "tiles": [
-                {"name": j.name, "tile": list(j.tile), "state": j.state, "tries": j.tries, "points": j.points}
+                {"name": j.name, "tile": list(j.tile), "state": j.state, "points": j.points}
                 | {k: v for k, v in j.record.items() if k != "fingerprint"}
                 | ({"reason": j.reason} if j.reason else {})
                 for j in self.tiles

@@ -36,8 +36,6 @@ class TilingOptions:
         what is free.
     resume : bool
         Keep what an earlier run finished.
-    retries : int
-        How often a failed tile is tried again.
     most_points : int
         A tile whose neighborhoods turn out to reach farther than its halo is read again with a
         wider one, up to so many points.
@@ -50,7 +48,6 @@ class TilingOptions:
     buffer: float | None = None
     memory: int | None = None
     resume: bool = False
-    retries: int = 2
     most_points: int = 5_000_000
 
     def __post_init__(self) -> None:
@@ -75,7 +72,6 @@ class TilingOptions:
         checks.one_of("--per", self.per, PER)
         if self.buffer is not None:
             checks.number("--buffer", self.buffer, 0, unit="meters")
-        checks.whole("--retries", self.retries, 0)
         cores = available_threads()
         if self.workers is not None and self.workers > cores:
             raise OptionError(

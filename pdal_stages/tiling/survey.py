@@ -6,8 +6,9 @@ import math
 import os
 import time
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,11 +21,10 @@ from ..base.units import Units
 from ..pipeline.filenames import named_files
 from ..pipeline.inputs_outputs import in_folders
 from ..pipeline.references import Reference, check_one_reference, reference_of, without_reference
-from ..pipeline.work import Call
+from ..pipeline.workers import run_tasks
 from .grid import Box, TileGrid, check_number, touching, union
 from .index import CloudIndex, sort_points
 from .outcome import Costs
-from .pool import Pool, last_tries
 from .settings import TilingOptions
 from .sizing import Density, block_bytes, room_of_worker, settled, widened, worker_bytes
 from .sources import Extent, InputSource, check_source, find_sources, read_ept, read_extent
@@ -225,7 +225,7 @@ class Survey:
         return fingerprint(path, self.stamps[path], self.grid.size)
 
     def read_inputs(
-        self, store: Store, pool: Pool, retries: int, show: bool | None, needed: Collection[str] | None = None
+        self, store: Store, workers: Any, show: bool | None, needed: Collection[str] | None = None
     ) -> None:
         """Read LAS and LAZ files once, sort their points by place, and note where they lie.
 
@@ -243,14 +243,13 @@ class Survey:
             else:
                 waiting.append(_Reading(source.path, mark))
 
-        def task_of(reading: _Reading) -> Call:
-            return Call(sort_points, (reading.path, self.grid, str(store.copy(reading.mark))))
+        def task_of(reading: _Reading) -> Callable[[], Any]:
+            return partial(sort_points, reading.path, self.grid, str(store.copy(reading.mark)))
 
         total = sum(self.extents[reading.path].count for reading in waiting)
         with Progress(total, "reading the inputs", enabled=show) as progress:
-            for reading, answer in last_tries(
-                pool, waiting, task_of, retries, lambda _, cost: self.costs.add("index", cost)
-            ):
+            for reading, answer in run_tasks(workers, waiting, task_of):
+                self.costs.add("index", answer.cost)
                 if answer.reason:
                     self.unreadable[reading.path] = answer.reason
                     continue
@@ -266,4 +265,3 @@ class Survey:
 class _Reading:
     path: str
     mark: str
-    tries: int = 0

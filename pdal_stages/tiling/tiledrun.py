@@ -20,11 +20,11 @@ from ..pipeline.read import PipelineSource
 from ..pipeline.run import Pipeline
 from ..stages.points import HOLDS_NOWHERE
 from ..stages.polygons import TOUCH_NONE
+from .cluster import open_workers
 from .dispatch import run_all, run_first_round
 from .estimate import estimate
 from .oneformat import following
 from .outcome import FileJob, InterruptedRun, TiledRun, TileJob, summarize
-from .pool import open_pool
 from .rasters import remarks
 from .settings import TilingOptions
 from .sources import InputSource
@@ -130,24 +130,24 @@ def run_plan(
             store.clear()
         store.keep_sides(survey.grid.size, None if plan.first is None else plan.first.blocks.side)
         try:
-            with open_pool(chosen, str(store.folder)) as pool:
+            with open_workers(chosen, str(store.folder)) as workers:
                 store.forget_copies([survey.mark_of(path) for path in survey.paths])
-                survey.read_inputs(store, pool, chosen.retries, progress)
+                survey.read_inputs(store, workers, progress)
                 work = Worklist(plan, survey)
                 if chosen.resume:
                     work.take_over(store)
-                    survey.read_inputs(store, pool, chosen.retries, progress, work.inputs())
+                    survey.read_inputs(store, workers, progress, work.inputs())
                 with contextlib.suppress(KeyboardInterrupt):
                     interrupted = True
-                    run_first_round(work, store, pool, chosen.retries, progress)
-                    run_all(work, store, pool, chosen.retries, progress, finished)
+                    run_first_round(work, store, workers, progress)
+                    run_all(work, store, workers, progress, finished)
                     interrupted = False
                     work.forget_results(store)
                     store.forget_copies()
         finally:
             for each in folders:
                 sweep(each)  # what workers left that were killed
-    summary = survey.figures(plan) | {"workers": pool.slots, "threads_per_worker": pool.threads}
+    summary = survey.figures(plan) | {"workers": workers.slots, "threads_per_worker": workers.threads}
     summary |= summarize(work.jobs, survey.costs, time.monotonic() - started)
     survey.messages += _messages_of_tiles(work)
     short = [job.name for job in work.jobs if job.state == "done" and job.record.get("short")]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -159,7 +159,7 @@ class Worklist:
         far = self.farthest
         before = str(store.tiles) if plan.first is not None and len(self.jobs) > 1 else ""
 
-        def task_of(item: TileJob | FileJob) -> TileTask | FileTask:
+        def task_of(item: TileJob | FileJob) -> Callable[[], Any]:
             if isinstance(item, FileJob):
                 count = survey.indexes[item.source.path].count
                 results = [str(store.result(job.name)) for job in item.jobs]
@@ -172,7 +172,7 @@ class Worklist:
                     item.outputs,
                     scratch,
                     plan.makes,
-                )
+                ).run
             sources = survey.near(item.tile, far)
             return TileTask(
                 context,
@@ -182,7 +182,7 @@ class Worklist:
                 str(store.result(item.name)),
                 item.outputs,
                 before,
-            )
+            ).run
 
         return task_of
 

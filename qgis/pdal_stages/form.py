@@ -18,7 +18,6 @@ LEFT_OUT = (
     "progress",
     "scheduler",
     "dry_run",
-    "retries",
     "inputs",
     "output",
     "threads",

@@ -1,0 +1,227 @@
+"""Worker processes on this machine: one-process pools of the standard library, so that one may die without the others."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+import types
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass, field
+from functools import partial
+from multiprocessing import get_context, parent_process
+from typing import Any
+
+from ..base import checks
+from ..base.errors import InterruptedStage, StageError
+from ..base.files import NO_ROOM
+from ..base.plain import PlainStream
+from ..base.shortage import check_limit, is_short, shortage
+from ..base.threads import CORES, available_threads
+from .interrupts import check, gentle
+
+#: Of a worker that died.
+KILLED = "it killed its worker: too little memory, or a crash in a library"
+#: One task at a time in a process: PDAL's threads are ours, and memory is stated for one.
+_one = threading.Lock()
+
+
+@dataclass
+class TaskResult:
+    """What became of a task."""
+
+    result: Any = None
+    reason: str = ""  #: why it failed; empty where it did not
+    #: ``seconds``, ``cpu_seconds``, ``peak_mb`` (the most memory the process has held so far).
+    cost: dict[str, float] = field(default_factory=dict)
+
+
+def perform(task: Callable[[], Any]) -> TaskResult:
+    """Call a task; what goes wrong is in the answer, except Ctrl-C."""
+    with _one:
+        started, cpu = time.perf_counter(), time.process_time()
+        answer = TaskResult()
+        try:
+            answer.result = task()
+        except InterruptedStage:
+            raise KeyboardInterrupt from None
+        except Exception as error:
+            answer.reason = _reason(error)
+        answer.cost = {
+            "seconds": time.perf_counter() - started,
+            "cpu_seconds": time.process_time() - cpu,
+            "peak_mb": _peak(),
+        }
+        return answer
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, StageError):
+        return str(error)
+    if isinstance(error, MemoryError):
+        return "memory ran out. Take smaller tiles or fewer workers"
+    if getattr(error, "errno", None) in NO_ROOM:
+        return f"a temporary file beside the outputs could not be written ({error}). Make room on the disk"
+    if isinstance(error, ImportError | OSError) and is_short(error):
+        return str(shortage(f"{type(error).__name__}: {error}"))
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {error} ({last.name}, line {last.lineno})"
+
+
+def _peak() -> float:
+    """The most memory this process has held, megabytes."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0.0
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+class ThisProcess(AbstractContextManager):
+    """Tasks one after the other in this process."""
+
+    slots = 1
+
+    def __init__(self, threads: int) -> None:
+        self.threads = threads
+
+    def __exit__(self, *exc: object) -> None: ...
+
+    def submit(self, task: Callable[[], Any]) -> Future:
+        """Do a task at once."""
+        future: Future = Future()
+        with gentle():
+            future.set_result(perform(task))
+            check()
+        return future
+
+    def wait(self, futures: Iterable[Future]) -> set[Future]:
+        """All of them."""
+        return set(futures)
+
+
+class WorkerProcesses(AbstractContextManager):
+    """Tasks in processes of their own, one at a time in each; they end with this process, however that ends."""
+
+    def __init__(self, slots: int, threads: int) -> None:
+        check_limit()
+        self.slots, self.threads = slots, threads
+        self._idle: list[ProcessPoolExecutor] = []
+        self._busy: dict[Future, ProcessPoolExecutor] = {}
+
+    def __exit__(self, *exc: object) -> None:
+        for pool in [*self._idle, *self._busy.values()]:
+            processes = list((pool._processes or {}).values())
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in processes:
+                process.kill()
+                process.join(10.0)
+
+    def submit(self, task: Callable[[], Any]) -> Future:
+        """Send a task to a free worker."""
+        if self._idle:
+            pool = self._idle.pop()
+            future = pool.submit(perform, task)
+        else:
+            with _environment(self.threads):
+                pool = ProcessPoolExecutor(1, get_context("spawn"), _begin)
+                future = pool.submit(perform, task)
+        self._busy[future] = pool
+        return future
+
+    def wait(self, futures: Iterable[Future]) -> set[Future]:
+        """Those that are done, at least one."""
+        done = wait(list(futures), return_when=FIRST_COMPLETED).done
+        for future in done:
+            pool = self._busy.pop(future)
+            if not isinstance(future.exception(), BrokenExecutor):
+                self._idle.append(pool)
+        return done
+
+
+def _begin() -> None:
+    """First in a worker."""
+    os.dup2(2, 1)  # what libraries print is no result of the command
+    sys.stdout, sys.stderr = PlainStream(sys.stdout), PlainStream(sys.stderr)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+@contextmanager
+def _environment(threads: int) -> Iterator[None]:
+    """What a process that starts meanwhile inherits: its share of the cores, no modules of the current folder, no Ctrl-C.
+
+    The program is not imported in it, so a script needs no ``if __name__ == "__main__"``.
+    """
+    names = [*(f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL")), CORES]
+    wanted = dict.fromkeys(names, str(threads)) | {"PDAL_STAGES_PROGRESS": "0", "PYTHONSAFEPATH": "1"}
+    before = {name: os.environ.get(name) for name in wanted}
+    program = sys.modules["__main__"]
+    os.environ.update(wanted)
+    sys.modules["__main__"] = types.ModuleType("__main__")
+    with suppress(AttributeError):  # Windows
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = program
+        for name, value in before.items():
+            os.environ.pop(name)
+            if value is not None:
+                os.environ[name] = value
+        with suppress(AttributeError):
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+def run_tasks(
+    workers: Any, waiting: deque, task_of: Callable[[Any], Callable[[], Any]]
+) -> Iterator[tuple[Any, TaskResult]]:
+    """Yield (item, answer) for every waiting item, as they finish; more may be put in after every answer.
+
+    `workers` have slots, submit and wait; `task_of` is asked for an item's task just before that is sent.
+    """
+    out: dict[Any, Any] = {}
+    while waiting or out:
+        while waiting and len(out) < workers.slots:
+            item = waiting.popleft()
+            out[workers.submit(task_of(item))] = item
+        for future in workers.wait(out):
+            yield out.pop(future), _answer(future)
+
+
+def _answer(future: Any) -> TaskResult:
+    error = future.exception()
+    if error is None:
+        return future.result()
+    if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":  # of Dask
+        return TaskResult(reason=KILLED)
+    return TaskResult(reason=f"{type(error).__name__}: {error}")
+
+
+def each_file(
+    function: Callable[..., Any], work: Sequence[tuple], workers: int = 1, *, apart: bool = False
+) -> Iterator[tuple[tuple, TaskResult]]:
+    """Each item of work, the function's arguments, with what became of it, as they finish; failures do not stop the rest.
+
+    The function is a module's own, so that other processes find it. They share the cores. A single worker is this process,
+    unless the work is to be `apart`.
+    """
+    count = min(checks.whole("--workers", workers, 1, 1024), len(work))
+    if count == 1 and not apart:
+        yield from ((item, perform(partial(function, *item))) for item in work)
+        return
+    with WorkerProcesses(count, max(1, available_threads() // count)) as pool:
+        yield from run_tasks(pool, deque(work), lambda item: partial(function, *item))

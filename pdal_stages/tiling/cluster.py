@@ -1,0 +1,160 @@
+"""Tasks on a Dask scheduler that runs already, with workers on this or other hosts."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import socket
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import CancelledError
+from typing import Any
+
+from ..base.errors import StageError, optional_import
+from ..base.version import build
+from ..pipeline import pdal as pdal_env
+from ..pipeline.workers import TaskResult, ThisProcess, WorkerProcesses, perform
+from .settings import TilingOptions
+
+#: Seconds to wait for a worker: at the beginning, and when all are gone.
+_WAIT = 120.0
+#: Seconds after which it is asked whether scheduler and workers are still there.
+_ASK = 10.0
+
+
+class Cluster(contextlib.AbstractContextManager):
+    """Tasks on the workers of a scheduler, one at a time on each; they may join and leave."""
+
+    def __init__(self, options: TilingOptions, folder: str) -> None:
+        self.address, self.folder = options.scheduler, folder
+        self._out: set[Any] = set()
+        self._slots = 1
+
+    def __enter__(self) -> Cluster:
+        self._dask: Any = optional_import("distributed", "dask", "a Dask scheduler (--scheduler)")
+        try:
+            self._client = self._dask.Client(self.address, timeout=10, set_as_default=False)
+        except (OSError, ValueError) as error:  # ValueError: an address of another kind
+            raise StageError(
+                "the Dask scheduler cannot be reached",
+                found=f"{self.address}: {error}",
+                cure="Is dask scheduler running there, and is that the address it printed?",
+            ) from None
+        try:
+            with contextlib.suppress(TimeoutError):
+                self._client.wait_for_workers(1, timeout=_WAIT)
+            threads = self._client.nthreads()
+            if not threads:
+                raise StageError(
+                    "the scheduler has no workers", found=self.address, cure="Start dask worker on some hosts"
+                )
+            self._check_workers()
+        except BaseException:
+            self._client.close()
+            raise
+        # One tile at a time in a process; what Dask calls its threads are the cores it may use.
+        self.threads = max(1, min(threads.values()))
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        with contextlib.suppress(Exception):
+            self._client.cancel(list(self._out), force=True)
+        self._client.close()
+
+    @property
+    def slots(self) -> int:
+        """How many workers there are."""
+        with contextlib.suppress(Exception):  # lost, or closed
+            self._slots = max(1, len(self._client.nthreads()))
+        return self._slots
+
+    def _check_workers(self) -> None:
+        """Refuse workers whose results would not be those of this program, or would not get here."""
+        try:
+            found = self._client.run(unfit, _versions(), self.folder)
+        except Exception as error:
+            found = {self.address: f"a worker cannot say which pdal-stages it has ({error}). {_SAME}"}
+        for reason in filter(None, found.values()):
+            raise StageError(reason)
+
+    def submit(self, task: Callable[[], Any]) -> Any:
+        """Send a task; as bytes, because Dask would look for its own keys in all that it holds."""
+        given = _versions(), self.folder, socket.gethostname(), pickle.dumps(task)
+        with self._lost():
+            future = self._client.submit(perform_for, *given, pure=False)
+        self._out.add(future)
+        return future
+
+    def wait(self, futures: Iterable[Any]) -> set[Any]:
+        """Those that are done, at least one; StageError where scheduler or workers are lost."""
+        gone: float | None = None
+        while True:
+            try:
+                with self._lost(), self._client.as_current():
+                    done = self._dask.wait(list(futures), timeout=_ASK, return_when="FIRST_COMPLETED").done
+                self._out -= done
+                return done
+            except (TimeoutError, self._dask.TimeoutError):
+                pass
+            with self._lost():
+                if self._client.status != "running":
+                    raise OSError
+                gone = None if self._client.nthreads() else gone or time.monotonic()
+            if gone is not None and time.monotonic() - gone > _WAIT:
+                raise StageError("all workers of the Dask scheduler are gone", cure=_RESUME)
+
+    @contextlib.contextmanager
+    def _lost(self):
+        try:
+            yield
+        except (TimeoutError, self._dask.TimeoutError):
+            raise
+        except (OSError, RuntimeError, CancelledError):
+            raise StageError("the Dask scheduler cannot be reached any more", cure=_RESUME) from None
+
+
+_RESUME = "Once it is there again, --resume goes on"
+_SAME = "Install the same versions of pdal-stages and PDAL on all hosts"
+
+
+def _versions() -> tuple[str, str]:
+    """Of this package and of PDAL, where it is called."""
+    return build(), pdal_env.dotted_version()
+
+
+def unfit(wanted: tuple[str, str], folder: str) -> str:
+    """Why this worker may have no tasks of a program with `wanted` versions that writes to `folder`; empty if it may."""
+    host, theirs = socket.gethostname(), _versions()
+    if theirs != wanted:
+        return (
+            f"a worker of the scheduler has other versions than this program (found pdal-stages {theirs[0]} and PDAL "
+            f"{theirs[1]} on {host}, here {wanted[0]} and {wanted[1]}). {_SAME}"
+        )
+    for _ in range(5):  # network file systems may show a new folder late
+        if os.path.isdir(folder):
+            return ""
+        time.sleep(1)
+    return (
+        f"a worker of the scheduler does not see the output folder (found no {folder} on {host}). Inputs, model and outputs "
+        "must be there under the same paths on all hosts"
+    )
+
+
+def perform_for(wanted: tuple[str, str], folder: str, host: str, task: bytes) -> TaskResult:
+    """Do a task on a worker, if it is fit for the program that sent it, from `host`."""
+    if reason := unfit(wanted, folder):
+        return TaskResult(reason=reason)
+    answer = perform(pickle.loads(task))
+    here = socket.gethostname()
+    if answer.reason and here != host:
+        answer.reason = f"on {here}: {answer.reason}"
+    return answer
+
+
+def open_workers(options: TilingOptions, folder: str) -> ThisProcess | WorkerProcesses | Cluster:
+    """What does the tasks of a run, which keeps what it makes in `folder`."""
+    if options.scheduler:
+        return Cluster(options, folder)
+    workers, threads = options.local_workers, options.threads
+    return WorkerProcesses(workers, threads) if workers else ThisProcess(threads)
