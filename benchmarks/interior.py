@@ -21,8 +21,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from pdal_stages.pipeline.work import perform
-from pdal_stages.tiling.pool import Here
+from pdal_stages.pipeline.workers import ThisProcess
 
 from pdal_stages.synthetic import TownOptions, write_town
 from pdal_stages.tiling import firstround
@@ -49,20 +48,18 @@ def repeated(town: Path, folder: Path, side: float, around: int) -> Path:
     return folder / f"{around}_{around}.laz"
 
 
-class Timed(Here):
+class Timed(ThisProcess):
     """Notes what tasks cost, by their kind."""
 
     def __init__(self, threads: int) -> None:
         super().__init__(threads)
         self.costs: dict[str, list[float]] = {}
 
-    def run(self, waiting: Any, task_of: Any) -> Any:
-        while waiting:
-            item = waiting.popleft()
-            task = task_of(item)
-            answer = perform(task)
-            self.costs.setdefault(type(task).__name__, []).append(answer.cost["cpu_seconds"])
-            yield item, answer
+    def submit(self, task: Any) -> Any:
+        future = super().submit(task)
+        kind = type(getattr(task, "__self__", None)).__name__
+        self.costs.setdefault(kind, []).append(future.result().cost["cpu_seconds"])
+        return future
 
 
 def main() -> None:
@@ -98,25 +95,25 @@ def main() -> None:
         plan = survey.plan
         pool = Timed(o.threads)
         with Store(folder / "out") as store, contextlib.suppress(KeyboardInterrupt):
-            survey.read_inputs(store, pool, 0, False)
+            survey.read_inputs(store, pool, False)
             work = Worklist(plan, survey)
             inside = next(out for out in work.outputs if out.source.path == str(middle))
             for item in [*work.jobs, *work.outputs]:
                 if item is not inside and item not in inside.jobs:
                     item.state = "kept"
             assert len(inside.jobs) == 1, "the file in the middle is not one tile"
-            run_first_round(work, store, pool, 0, False)
+            run_first_round(work, store, pool, False)
             costs = {kind: list(values) for kind, values in pool.costs.items()}
-            costs["Call"] = []
+            costs["index"] = []
             for _ in range(3):
                 began = time.process_time()
                 sort_points(str(middle), survey.grid, str(folder / "copy"))
-                costs["Call"].append(time.process_time() - began)
+                costs["index"].append(time.process_time() - began)
             pool.costs.clear()
             for _ in range(o.runs + 1):  # the first compiles, or loads what is compiled
                 for item in (inside, *inside.jobs):
                     item.state = "waiting"
-                run_all(work, store, pool, 0, False)
+                run_all(work, store, pool, False)
                 if inside.state != "done":
                     sys.exit(inside.reason)
             costs |= {kind: values[1:] for kind, values in pool.costs.items()}
@@ -131,7 +128,7 @@ def main() -> None:
         assert plan.first is not None
         share = min(1.0, (o.side / firstround.block_grid(plan.first).size) ** 2)
         parts = {
-            "index": statistics.median(costs["Call"]),
+            "index": statistics.median(costs["index"]),
             "first round": statistics.median(costs["FirstRoundTask"]),
             "share of a block": share * max(costs["BlockTask"]),
             "tile": statistics.median(costs["TileTask"]),
