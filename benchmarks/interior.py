@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 from pdal_stages.pipeline.workers import ThisProcess
-
 from pdal_stages.synthetic import TownOptions, write_town
 from pdal_stages.tiling import firstround
 from pdal_stages.tiling.classify import ClassifyTask
