@@ -10,7 +10,6 @@ import numpy as np
 from ..features import compute_features
 from ..features.voxels import represent
 from ..terrain import detached_noise, filtered_ground, hag_minima
-from ..terrain.progressive import objects_of
 from .clouds import TrainingCloud
 from .context import OWN, Context
 from .forest import Forest
@@ -70,7 +69,6 @@ def _heights(xyz: np.ndarray) -> dict[str, np.ndarray]:
     axes = np.ascontiguousarray(xyz.T)
     detached_noise(*axes)
     filtered_ground(*np.ascontiguousarray(_bridge().T), openings=(5,), decks=True, threads=1)
-    objects_of(np.array([[0, 1e-6, 1]], np.float32), 1.0, 0.15, 1)  # more heights than can be numbered
     dimensions = filtered_ground(*axes, openings=(5,), threads=1)
     dimensions["HeightAboveGround"] = hag_minima(*axes)
     return dimensions

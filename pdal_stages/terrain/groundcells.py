@@ -21,14 +21,12 @@ from .decks import REACH as DECKS_REACH
 from .islands import FAR as ISLANDS_FAR
 from .islands import REACH as ISLANDS_REACH
 from .lowest import COMPANY, SURROUNDINGS, heights_of, lowest_points, pits, places_of
-from .openings import HOLE
+from .openings import HOLE, objects_of, opening_radius
 from .patches import SIDE
-from .planes import GroundPyramid, plane_of_cell
+from .planes import from_parents, planes_of_blocks
 from .planes import reach as planes_reach
 from .plateaus import reach as plateau_reach
 from .plateaus import remove_plateaus
-from .profile import opening_radius
-from .progressive import objects_of
 from .sheets import reach as sheets_reach
 
 #: Blocks, in meters, from which the surface is made: that for telling ground, and that of the heights.
@@ -206,11 +204,9 @@ def ground_raster(
     del lowest, bad
     ground = np.isfinite(raster) & ~objects
 
-    def near(pyramid: GroundPyramid, cells: NDArray[np.int64], block: float) -> NDArray[np.bool_]:
+    def near(cells: NDArray[np.int64], block: float) -> NDArray[np.bool_]:
         """Which of the cells lie near the surface that is made from such blocks of the ground found so far."""
-        seen = np.zeros(shape, bool)
-        seen.ravel()[cells] = True
-        blocks = pyramid.planes(seen, options.levels(block))
+        blocks = planes_of_blocks(ground, place, floor, raster, left, bottom, options.levels(block))
         found = np.zeros(len(cells), bool)
         _near(cells, place, *blocks, left, bottom, cell, options.threshold, options.scalar, found)
         return found
@@ -221,21 +217,16 @@ def ground_raster(
         seen[grown(by)] = True
         return cells[seen.ravel()[cells]]
 
-    pyramid = GroundPyramid(ground, place, floor, raster, left, bottom, options.levels(FAR))
-    asked = np.flatnonzero(np.isfinite(raster) & ~ground)  # cells
     for number in range(1, ROUNDS + 1):
+        asked = np.flatnonzero(np.isfinite(raster) & ~ground)
         asked = within(asked, plateaus + (ROUNDS - number) * step)
         if not asked.size:
             break
-        found = near(pyramid, asked, NEAR)
-        ground.ravel()[asked[found]] = True
-        pyramid.add(asked[found])
-        asked = _still_asked(asked, found, left, bottom, shape, options.levels(NEAR))
+        ground.ravel()[asked[near(asked, NEAR)]] = True
     # What lies above a scarp may be cut off uphill by the rim of the cloud. It looks no farther than plateaus do.
     cut = within(np.flatnonzero(wide & ~ground), 0)
     if cut.size:
-        cut = cut[near(pyramid, cut, FAR)]
-    del pyramid
+        cut = cut[near(cut, FAR)]
     remove_plateaus(ground, floor, raster, cell, cut)
     # The terrain runs below: no level of a deck stands for it either.
     ground &= ~on_deck
@@ -249,32 +240,10 @@ def _near(cells, place, blocks, blocks_left, blocks_bottom, left, bottom, cell, 
     w = place.shape[1]
     for k in range(len(cells)):
         j, i = cells[k] // w, cells[k] % w
-        height, across, along = plane_of_cell(blocks, blocks_left, blocks_bottom, i + left, j + bottom)
+        height, across, along = from_parents(blocks, blocks_left, blocks_bottom, i + left, j + bottom, 1.0)
         x, y, z = place[j, i, 0], place[j, i, 1], place[j, i, 2]
         gradient = np.sqrt(across * across + along * along) / cell
         out[k] = abs(z - height - x * across - y * along) <= threshold + scalar * gradient
-
-
-def _still_asked(
-    cells: NDArray[np.int64],
-    found: NDArray[np.bool_],
-    left: int,
-    bottom: int,
-    shape: tuple[int, int],
-    levels: int,
-) -> NDArray[np.int64]:
-    """The cells that were not found to be ground but may be once those found are: those near them.
-
-    A surface takes what it knows from the coarsest blocks beside a cell's own, and these from those beside them.
-    """
-    j, i = np.divmod(cells, shape[1])
-    j, i = (j + bottom >> levels) - (bottom >> levels), (i + left >> levels) - (left >> levels)
-    near = np.zeros((j.max() + 5, i.max() + 5), bool)
-    near[j[found], i[found]] = True
-    for _ in range(4):  # two blocks to each side, read two farther on
-        near[1:] |= near[:-1].copy()
-        near[:, 1:] |= near[:, :-1].copy()
-    return cells[~found & near[j + 2, i + 2]]
 
 
 #: Arrays of :class:`GroundCells` that have rows for some of the cells, or for none.

@@ -9,11 +9,6 @@ import numpy as np
 from ..base.jit import njit
 
 
-def opening_radius(window: float, cell: float) -> int:
-    """Radius in cells of a window of about `window` meters, the middle cell counted."""
-    return max(1, round((window / cell - 1) / 2))
-
-
 def opening_names(windows: Sequence[float]) -> list[str]:
     """Dimensions of the windows: ``HeightAboveOpening_5``; a decimal point becomes ``_``."""
     return [f"HeightAboveOpening_{window:g}".replace(".", "_") for window in windows]
