@@ -2,9 +2,8 @@
 
 python benchmarks/bridges.py --data FOLDER
 
-Decks of scenes (tests/bridge_scenes.py, tests/long_bridge_scenes.py,
-tests/roof_bridge_scenes.py, tests/other_bridge_scenes.py, which also has what is no bridge,
-tests/upright_bridge_scenes.py; 16 points/m2), of the generated town and of the labeled clouds; wires of the town, of
+Decks of scenes (tests/bridge_scenes.py, tests/more_bridge_scenes.py, which also has what is no bridge; 16 points/m2),
+of the generated town and of the labeled clouds; wires of the town, of
 generated corridors (tests/corridor_scenes.py) and of those clouds. Cars, lamps and what was never labeled count
 neither way. `false` is the share of all points that are wrongly taken; seconds are of one process.
 """
@@ -30,10 +29,7 @@ from pdal_stages.terrain.wires import find_wires
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from bridge_scenes import SCENES, scan
 from corridor_scenes import CORRIDORS
-from long_bridge_scenes import LONG_SCENES
-from other_bridge_scenes import OTHER_SCENES, TRAPS
-from roof_bridge_scenes import ROOF_SCENES
-from upright_bridge_scenes import UPRIGHT_SCENES
+from more_bridge_scenes import MORE_SCENES, TRAPS, UPRIGHT_SCENES
 
 CLOUDS = (
     "bridge/ign_0299_6802.laz", "delft/train.laz", "forest/neon_osbs.laz", "isprs_filter/samp11.laz",
@@ -95,7 +91,7 @@ def main() -> None:
     folder = parser.parse_args().data
     print("| cloud | what | points | F1 % | false % | CPU s |")
     print("|---|---|---:|---:|---:|---:|")
-    for name, make in {**SCENES, **LONG_SCENES, **OTHER_SCENES, **ROOF_SCENES, **TRAPS}.items():
+    for name, make in {**SCENES, **MORE_SCENES, **TRAPS}.items():
         xyz, codes = scan(make())
         decks(name, xyz, np.ones(len(xyz), bool), codes == 17, codes == 1)
     for name, points in UPRIGHT_SCENES.items():

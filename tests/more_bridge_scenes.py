@@ -1,0 +1,422 @@
+"""Bridges over rivers, valleys and railways with all that stands on and beside them, and what only looks like one in part.
+
+As in :mod:`bridge_scenes`, whose scanner sees them; an axis may bend.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from bridge_scenes import BUILDING, DECK, GROUND, LEAF, OTHER, WATER, Scene, Slab, _cars, _deck, _road
+
+WIRE = 14
+
+
+def _valley(s, reach, deep, grade=0.5):
+    """A terrain level with the deck's ends, and so deep between them."""
+    return -np.clip((reach - np.abs(s)) * grade, 0.0, deep)
+
+
+def _masts(slabs, top, reach, sides, step, tall, code=OTHER):
+    for s in np.arange(-reach + step / 2, reach, step):
+        for t in sides:
+            slabs.append(Slab(s, s + 0.3, t - 0.15, t + 0.15, lambda a: top(a) + tall, tall, code))
+
+
+def _piers(slabs, top, reach, half, step, foot):
+    for s in np.arange(-reach + step, reach - 1, step):
+        slabs.append(Slab(s - 0.8, s + 0.8, -half + 1, half - 1, lambda a: top(a) - 1.4, -foot + 12.0, OTHER))
+
+
+def _trees(rng, ends, sides, count, tall):
+    return [
+        (rng.uniform(*ends), side * rng.uniform(*sides), rng.uniform(2, 4.5), rng.uniform(*tall))
+        for side in (-1, 1)
+        for _ in range(count)
+    ]
+
+
+def deep_valley(seed=0, half=7.0, reach=130.0, deep=30.0, bend=0.0, grade=0.0, turn=0.4, trees=80):
+    """Level with the land at both ends, over a wooded valley whose trees come up to the deck."""
+    rng = np.random.default_rng(seed)
+
+    def top(s):
+        return 0.3 + grade * s
+
+    def terrain(s, t):
+        z = _valley(s, reach, deep, 0.6) + grade * s + 0.3 * np.sin(s / 13.0) * np.cos(t / 17.0)
+        return np.where((np.abs(s) > reach) & (np.abs(t) < half + 2), top(s), z), np.full(len(s), GROUND)
+
+    slabs: list[Slab] = []
+    _deck(slabs, -reach, reach, -half, half, top, 2.5)
+    _cars(slabs, rng, -reach - 30, reach + 30, (-half + 3, half - 3), top, 25.0)
+    _piers(slabs, top, reach, half, 40.0, -deep)
+    plants = _trees(rng, (-reach - 20, reach + 20), (half + 1, 60), trees, (8, 30))
+    plants = [p for p in plants if abs(p[0]) < reach or abs(p[1]) > half + p[2] + 1]
+    return Scene(terrain, slabs, plants, turn, 2 * reach + 140.0, 150.0, bend)
+
+
+def wide_river(seed=0, half=10.0, reach=180.0, clear=9.0, turn=0.9, water=np.nan, arch=4.0):
+    """A long arched deck over water without returns, between flood plains with trees."""
+    rng = np.random.default_rng(seed)
+
+    def top(s):
+        return clear + arch * np.cos(np.clip(s / reach, -1.6, 1.6) * np.pi / 2)
+
+    def terrain(s, t):
+        land = np.clip((np.abs(s) - (reach - 40)) * 0.3, 0.0, 3.0) - 2.0
+        z = np.where(np.abs(s) > reach, np.maximum(_road(t, top(s), land, half + 1.0, 0.5), land), land)
+        wet = np.abs(s) < reach - 40
+        return np.where(wet, water, z), np.where(wet, WATER, GROUND)
+
+    slabs: list[Slab] = []
+    _deck(slabs, -reach, reach, -half, half, top, 1.8)
+    _cars(slabs, rng, -reach, reach, np.arange(-half + 2.5, half - 2, 3.5), top, 30.0)
+    _masts(slabs, top, reach, (-half + 0.5, half - 0.5), 35.0, 10.0)
+    plants = _trees(rng, (reach + 5, reach + 70), (half + 8, 65), 25, (6, 18))
+    plants += [(-s, t, r, h) for s, t, r, h in plants]
+    return Scene(terrain, slabs, plants, turn, 2 * reach + 150.0, 150.0)
+
+
+def railway(seed=0, half=5.5, reach=100.0, height=9.0, turn=0.7):
+    """Two tracks with masts and wires on a viaduct across a town."""
+    rng = np.random.default_rng(seed)
+
+    def top(s):
+        return height + 0.01 * s
+
+    def terrain(s, t):
+        bank = _road(t, top(s), 0.0, half + 1.0, 0.6)
+        front = np.clip(bank - 0.66 * np.clip(reach - np.abs(s), 0, None), 0, None)
+        return np.where(np.abs(s) > reach, bank, front), np.full(len(s), GROUND)
+
+    slabs: list[Slab] = []
+    _deck(slabs, -reach, reach, -half, half, top, 1.5, 1.2)
+    for t in (-2.7, -1.3, 1.3, 2.7):  # rails
+        slabs.append(Slab(-reach, reach, t - 0.08, t + 0.08, lambda s: top(s) + 0.2, 0.2, DECK))
+    slabs.append(Slab(-30.0, 60.0, 1.0, 4.0, lambda s: top(s) + 4.0, 3.8, OTHER))  # a train
+    _masts(slabs, top, reach, (-half + 0.4, half - 0.4), 50.0, 7.5)
+    for t in (-2.0, 2.0):
+        for up in (5.5, 6.7):
+            slabs.append(
+                Slab(-reach - 30, reach + 30, t - 0.03, t + 0.03, lambda s, u=up: top(s) + u, 0.05, WIRE)
+            )
+    for s in np.arange(-80, 81, 40.0):
+        for side in (-1, 1):
+            t = side * rng.uniform(14, 18)
+            slabs.append(
+                Slab(
+                    s,
+                    s + 25,
+                    min(t, t + side * 12),
+                    max(t, t + side * 12),
+                    lambda a: 10.0 + 0 * a,
+                    10.0,
+                    BUILDING,
+                )
+            )
+    _piers(slabs, top, reach, half, 25.0, 0.0)
+    return Scene(terrain, slabs, _trees(rng, (-100, 100), (9, 13), 12, (4, 9)), turn, 330.0, 120.0)
+
+
+def low_river(seed=0, half=5.0, reach=50.0, turn=0.8):
+    """Three meters above a river that answers, with trees on both banks up to the parapets."""
+    rng = np.random.default_rng(seed)
+
+    def top(s):
+        return 3.2 + 0.6 * np.cos(np.clip(s / reach, -1, 1) * np.pi / 2)
+
+    def terrain(s, t):
+        bank = np.clip((np.abs(s) - reach + 8) * 0.4, 0.0, 3.2)
+        return np.where(np.abs(s) < reach - 8, 0.0, bank), np.where(np.abs(s) < reach - 8, WATER, GROUND)
+
+    slabs: list[Slab] = []
+    _deck(slabs, -reach, reach, -half, half, top, 1.0)
+    trees = _trees(rng, (reach - 3, reach + 40), (half + 3, 50), 30, (6, 16))
+    trees += [(-s, t, r, h) for s, t, r, h in trees]
+    return Scene(terrain, slabs, trees, turn, 220.0, 120.0)
+
+
+@dataclass
+class Skewed(Slab):
+    """A slab whose ends are cut askew: so many meters along per meter across."""
+
+    skew: float = 0.0
+
+    def inside(self, s, t, beyond=0.0):
+        along = s - self.skew * t
+        east = (along > self.start - beyond) & (along < self.end + beyond)
+        return east & (t < self.left + beyond) & (t > self.right - beyond)
+
+
+def skewed(seed=0, half=6.0, reach=35.0, skew=1.2, turn=0.5):
+    """A road crosses a river at 40 degrees: its abutments are not square to it."""
+    rng = np.random.default_rng(seed)
+
+    def top(s):
+        return 6.0 + 0.0 * s
+
+    def terrain(s, t):
+        away = np.abs(s - skew * t)
+        bank = _road(t, 6.0 + 0 * s, 0.0, half + 1.0, 0.6)
+        front = np.clip(bank - 0.6 * np.clip(reach - away, 0, None), -1.5, None)
+        z = np.where(away > reach, bank, front)
+        wet = away < reach - 14
+        return np.where(wet, -1.5, z), np.where(wet, WATER, GROUND)
+
+    slabs: list[Slab] = [Skewed(-reach, reach, -half, half, top, 1.3, DECK, skew)]
+    for low, high in ((-half, -half + 0.3), (half - 0.3, half)):
+        slabs.append(Skewed(-reach, reach, low, high, lambda s: top(s) + 1.0, 1.0, DECK, skew))
+    _cars(slabs, rng, -reach - 40, reach + 40, (-3.0, 3.0), top, 22.0)
+    return Scene(terrain, slabs, _trees(rng, (-90, 90), (22, 60), 25, (6, 15)), turn, 260.0, 140.0)
+
+
+def motorway(seed=0, half=17.0, reach=90.0, gap=4.0, turn=0.9):
+    """Two decks of three lanes full of trucks, over a river that answers, with signs across and barriers."""
+    rng = np.random.default_rng(seed)
+
+    def top(s):
+        return 9.0 + 0.0 * s
+
+    def terrain(s, t):
+        bank = _road(t, top(s), 0.0, half + 2.0, 0.5)
+        front = np.clip(bank - 0.5 * np.clip(reach - np.abs(s), 0, None), -1.0, None)
+        wet = np.abs(s) < reach - 24
+        z = np.where(np.abs(s) > reach, bank, front)
+        return np.where(wet, -1.0, z), np.where(wet, WATER, GROUND)
+
+    slabs: list[Slab] = []
+    for right, left in ((-half, -gap / 2), (gap / 2, half)):
+        _deck(slabs, -reach, reach, right, left, top, 2.2, 1.0)
+        for lane in np.arange(right + 2.5, left - 1.5, 3.7):
+            for s in np.arange(-reach - 30, reach + 30, 24.0):
+                s = s + rng.uniform(-5, 5)
+                long, tall = (15.0, 3.9) if rng.random() < 0.5 else (4.5, 1.6)
+                slabs.append(
+                    Slab(s, s + long, lane - 1.2, lane + 1.2, lambda a, h=tall: top(a) + h, tall, OTHER)
+                )
+    for s in (-45.0, 50.0):  # signs across
+        slabs.append(Slab(s, s + 0.8, -half, half, lambda a: top(a) + 7.5, 2.0, OTHER))
+    return Scene(terrain, slabs, _trees(rng, (-150, 150), (24, 60), 30, (6, 16)), turn, 330.0, 140.0)
+
+
+def in_a_wood(seed=0, half=2.5, reach=14.0, turn=0.2):
+    """A forest road over a brook in a ravine; crowns close over it here and there."""
+    rng = np.random.default_rng(seed)
+
+    def top(s):
+        return 0.1 + 0.0 * s
+
+    def terrain(s, t):
+        z = _valley(s, reach, 7.0, 0.8) + 0.2 * np.sin(s / 5) * np.cos(t / 6)
+        return np.where((np.abs(s) > reach) & (np.abs(t) < half + 1), top(s), z), np.full(len(s), GROUND)
+
+    slabs: list[Slab] = []
+    _deck(slabs, -reach, reach, -half, half, top, 0.8, 1.0)
+    trees = _trees(rng, (-70, 70), (half + 2, 55), 130, (9, 20))
+    return Scene(terrain, slabs, trees, turn, 150.0, 120.0)
+
+
+def very_long(seed=0, half=8.0, reach=300.0, deep=35.0, turn=0.25):
+    """600 m over a valley on piers, its ends seen."""
+    rng = np.random.default_rng(seed)
+
+    def top(s):
+        return 0.2 + 0.01 * s
+
+    def terrain(s, t):
+        z = _valley(s, reach, deep, 0.5) + 0.01 * s + 0.3 * np.sin(s / 19.0) * np.cos(t / 23.0)
+        return np.where((np.abs(s) > reach) & (np.abs(t) < half + 2), top(s), z), np.full(len(s), GROUND)
+
+    slabs: list[Slab] = []
+    _deck(slabs, -reach, reach, -half, half, top, 2.5)
+    _cars(slabs, rng, -reach, reach, (-5.0, 5.0), top, 40.0)
+    _piers(slabs, top, reach, half, 50.0, -deep)
+    return Scene(terrain, slabs, _trees(rng, (-280, 280), (half + 2, 50), 60, (8, 28)), turn, 730.0, 130.0)
+
+
+def beside_roofs(seed=0, half=7.0, reach=80.0, height=8.0, turn=0.6, side=3.0):
+    """A viaduct between flat roofs as high as its deck, 3 m beside it, with crowns in the gap."""
+    rng = np.random.default_rng(seed)
+
+    def top(s):
+        return height + 0.0 * s
+
+    def terrain(s, t):
+        bank = _road(t, top(s), 0.0, half + 1.0, 0.7)
+        front = np.clip(bank - 0.8 * np.clip(reach - np.abs(s), 0, None), 0, None)
+        return np.where(np.abs(s) > reach, bank, front), np.full(len(s), GROUND)
+
+    slabs: list[Slab] = []
+    _deck(slabs, -reach, reach, -half, half, top, 1.4, 1.0)
+    for s in np.arange(-60, 46, 26.0):
+        for sign in (-1, 1):
+            one, other = sorted((sign * (half + side), sign * (half + side + 14)))
+            slabs.append(Slab(s, s + 18, one, other, lambda a: height + 0.1 + 0 * a, height, BUILDING))
+    gap = (half + 0.8, half + side)
+    return Scene(terrain, slabs, _trees(rng, (-70, 70), gap, 25, (8, 11)), turn, 260.0, 110.0)
+
+
+def _flat(s, t):
+    return 0.05 * np.sin(s / 17), np.full(len(s), GROUND)
+
+
+def _profile(reach, rise, grade):
+    return lambda s: np.clip(rise - grade * np.clip(np.abs(s) - reach, 0, None), 0, None)
+
+
+def _massive(slabs, start, end, half, top, rise, step=0.35):
+    """Layers, so that beams hit upright faces where they meet them."""
+    for down in np.arange(0.0, rise, step):
+        slabs.append(Slab(start, end, -half, half, lambda s, d=down: top(s) - d, step, GROUND))
+
+
+def walled_ramps(seed=0, half=6.0, reach=60.0, rise=7.0, grade=0.05, turn=0.4):
+    """A bridge of 120 m whose ramps rise between upright walls on both sides."""
+    rng = np.random.default_rng(seed)
+    top, far = _profile(reach, rise, grade), reach + rise / grade
+    slabs: list[Slab] = []
+    _deck(slabs, -reach, reach, -half, half, top, 1.6)
+    for start, end in ((-far, -reach), (reach, far)):
+        _massive(slabs, start, end, half, top, rise)
+        for low, high in ((-half, -half + 0.3), (half - 0.3, half)):
+            slabs.append(Slab(start, end, low, high, lambda s: top(s) + 1.0, 1.0, OTHER))
+    _cars(slabs, rng, -reach - 90, reach + 90, (-2.5, 2.5), top, 22.0)
+    _piers(slabs, top, reach, half, 25.0, 0.0)
+    return Scene(_flat, slabs, [], turn, 2 * far + 90.0, 120.0)
+
+
+def walled_road(seed=0, turn=0.6):
+    """A road that rises to 6 m between upright walls, and falls again."""
+    top = _profile(20.0, 6.0, 0.06)
+    slabs: list[Slab] = []
+    _massive(slabs, -120, 120, 4.5, top, 6.0)
+    return Scene(_flat, slabs, [], turn, 300.0, 110.0)
+
+
+def upright(
+    density=16.0, seed=0, reach=100.0, half=6.0, high=8.0, bank=16.0, raised=False, wet=None, below=True
+):
+    """A deck over a valley of such banks (0: upright ones), or `raised` on banks above a plain; points and true classes.
+
+    With `wet` there is water between the banks, and it is its share that answers.
+    """
+    rng = np.random.default_rng(seed)
+    long, wide = 2 * reach + 100.0, 120.0
+    s, t = rng.uniform((-long / 2, -wide / 2), (long / 2, wide / 2), (int(density * long * wide), 2)).T
+    over = np.clip(reach - np.abs(s), 0, None)
+    rise = np.minimum(over * high / bank, high) if bank else high * (over > 0)
+    ground = np.clip(high - rise - 0.6 * np.clip(np.abs(t) - half - 1, 0, None), 0, None) if raised else -rise
+    top = np.full(len(s), high if raised else 0.0)
+    code = np.full(len(s), GROUND)
+    deck = (np.abs(s) < reach) & (np.abs(t) < half)
+    seen = ~deck | below
+    if wet is not None:
+        water = over > bank
+        code[water] = WATER
+        seen &= ~water | (rng.random(len(s)) < wet)
+    ground = ground + 0.04 * np.sin(s / 7) * np.cos(t / 9)
+    xyz = [np.column_stack([s, t, ground])[seen], np.column_stack([s, t, top])[deck]]
+    codes = [code[seen], np.full(int(deck.sum()), DECK)]
+    for _ in range(40):
+        a, b, radius = (
+            rng.uniform(-long / 2, long / 2),
+            rng.uniform(half + 6, wide / 2 - 4),
+            rng.uniform(3, 5),
+        )
+        if wet is not None and abs(a) < reach + 6:
+            continue
+        ball = rng.uniform(-1, 1, (int(radius**2 * density), 3))
+        ball = radius * ball[(ball**2).sum(axis=1) < 1]
+        side = rng.choice((-1.0, 1.0))
+        foot = ground[np.argmin((s - a) ** 2 + (t - side * b) ** 2)]
+        xyz.append(ball + np.array([a, side * b, foot + 2 * radius]))
+        codes.append(np.full(len(ball), LEAF))
+    points = np.concatenate(xyz)
+    c, d = np.cos(0.3), np.sin(0.3)
+    turned = np.column_stack(
+        [points[:, 0] * c - points[:, 1] * d, points[:, 0] * d + points[:, 1] * c, points[:, 2]]
+    )
+    turned += rng.normal(0, 0.03, turned.shape) + np.array([85_000.0, 447_000.0, 0.0])
+    return np.round(turned, 3), np.concatenate(codes).astype(np.uint8)
+
+
+def terraces(seed=0, turn=0.4):
+    """Vineyards: strips of 7 m between walls of 2.6 m, a path up to them."""
+
+    def terrain(s, t):
+        step = np.floor(s / 7.0)
+        z = 2.6 * step + 0.05 * (s - 7 * step) + 0.02 * np.sin(t)
+        path = np.abs(t - 20) < 2
+        return np.where(path, 2.6 * s / 7.0, z), np.full(len(s), GROUND)
+
+    return Scene(terrain, [], [], turn, 130.0, 120.0)
+
+
+def parking_roof(seed=0, turn=0.8):
+    """A parking deck on a hall's roof with a straight ramp of 4 m up to it and parapets."""
+    rng = np.random.default_rng(seed)
+    slabs = [Slab(0, 60, -25, 25, lambda s: 6.0 + 0 * s, 6.0, BUILDING)]
+    for low, high in ((-25, -24.7), (24.7, 25)):
+        slabs.append(Slab(0, 60, low, high, lambda s: 7.0 + 0 * s, 1.0, BUILDING))
+    slabs.append(Slab(-50, 0.2, 2, 6, lambda s: np.clip(6.0 + 0.12 * s, 0, 6), 6.0, BUILDING))
+    _cars(slabs, rng, 5, 50, (-18.0, -8.0, 12.0), lambda s: 6.0 + 0 * s, 7.0)
+    flat = lambda s, t: (0.02 * np.sin(s / 7), np.full(len(s), GROUND))  # noqa: E731
+    return Scene(flat, slabs, [], turn, 160.0, 110.0)
+
+
+def levee(seed=0, turn=0.5):
+    """A dike with a road between two waters, one of which does not answer, and a mole of 5 m into it."""
+
+    def terrain(s, t):
+        z = np.clip(4.0 - 0.45 * np.clip(np.abs(t) - 3, 0, None), -0.5, 4.0)
+        wet = np.abs(t) > 13
+        mole = (np.abs(s - 20) < 2.5) & (t > 0) & (t < 50)
+        z = np.where(mole, 2.5, np.where(wet, np.where(t > 0, np.nan, -0.5), z))
+        return z, np.where(wet & ~mole, WATER, GROUND)
+
+    return Scene(terrain, [], [], turn, 240.0, 130.0)
+
+
+def platform(seed=0, turn=0.3):
+    """A railway station: platforms of 0.8 m, roofs over them on poles, a stepped hill behind."""
+    slabs = []
+    for t in (-10.0, 8.0):
+        slabs.append(Slab(-70, 70, t, t + 6, lambda s: 0.8 + 0 * s, 0.8, GROUND))
+        slabs.append(Slab(-40, 40, t + 0.5, t + 5.5, lambda s: 5.0 + 0 * s, 0.4, BUILDING))
+
+    def terrain(s, t):
+        return np.where(t > 30, 4.0 + np.where(t > 42, 4.0, 0.0), 0.0), np.full(len(s), GROUND)
+
+    return Scene(terrain, slabs, [], turn, 200.0, 110.0)
+
+
+MORE_SCENES = {
+    "deep valley, bent": lambda seed=0: deep_valley(seed, bend=260.0, turn=0.1),
+    "deep valley, climbing": lambda seed=0: deep_valley(seed, grade=0.06, turn=1.0),
+    "deep valley, 40 m wide": lambda seed=0: deep_valley(seed, half=20.0, turn=0.7),
+    "wide river": wide_river,
+    "railway": railway,
+    "low river": low_river,
+    "skewed": skewed,
+    "motorway of two decks": motorway,
+    "in a wood": in_a_wood,
+    "600 m long": very_long,
+    "walled ramps": walled_ramps,
+}
+#: As simple simulators make them: points and classes.
+UPRIGHT_SCENES = {
+    "valley, ground below the deck": upright,
+    "on banks, ground below the deck": lambda density=16.0: upright(density, raised=True),
+    "5 m above a river without returns": lambda density=16.0: upright(
+        density, high=5.0, bank=10.0, wet=0.0, below=False
+    ),
+}
+TRAPS = {
+    "terraces": terraces,
+    "parking on a roof, with a ramp": parking_roof,
+    "dike and mole": levee,
+    "station": platform,
+    "a road between walls": walled_road,
+}
