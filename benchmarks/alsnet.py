@@ -150,7 +150,7 @@ def trained(cloud: TrainingCloud, classes, network: dict, args, what: str) -> tu
         "labeled_points": notes["samples"],
         "spacing": model.algorithm.spacing,
         "halo_m": round(model.halo_m, 1),
-        "weights": model.algorithm.parameters()["weights"],
+        "weights": model.algorithm.to_file([])["parameters"]["weights"],
         "largest_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
     }
     print(
@@ -163,8 +163,7 @@ def kernels(configuration: str) -> dict:
     """CPU seconds of one batch, part by part, on one thread."""
     from threadpoolctl import threadpool_limits
 
-    from pdal_stages.alsnet.farthest import ball_query, farthest_points, three_nearest
-    from pdal_stages.alsnet.pyramid import build, scramble
+    from pdal_stages.alsnet.geometry import ball_query, build, farthest_points, scramble, three_nearest
     from pdal_stages.alsnet.weights import Folded, fresh
 
     one = CONFIGURATIONS[configuration]
@@ -190,9 +189,7 @@ def kernels(configuration: str) -> dict:
         pyramid = timed("whole geometry", lambda: build(xyz, xyz[:, 2:].astype(np.float32), one))
         net = Folded(fresh(one, 1, 5, 0), one)
         timed("network applied", lambda: net(pyramid))
-        out["estimated_mb"] = {
-            k: round(one.memory_mb(2, training=k == "training")) for k in ("applying", "training")
-        }
+        out["estimated_mb"] = round(one.memory_mb(2))
         out["largest_memory_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
     print(json.dumps(out), flush=True)
     return out
@@ -202,8 +199,8 @@ def training_step(configuration: str) -> dict:
     """CPU seconds and memory of one training step of one batch, on one thread."""
     import torch
 
+    from pdal_stages.alsnet.geometry import build
     from pdal_stages.alsnet.network import Network, tensors
-    from pdal_stages.alsnet.pyramid import build
 
     torch.set_num_threads(1)
     one = CONFIGURATIONS[configuration]
@@ -216,7 +213,7 @@ def training_step(configuration: str) -> dict:
     labels = torch.from_numpy(random.integers(0, 5, one.points))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
     start = time.process_time()
-    torch.nn.functional.cross_entropy(network(*tensors(pyramid)), labels).backward()
+    torch.nn.functional.cross_entropy(network(tensors(pyramid)), labels).backward()
     out = {
         "configuration": configuration,
         "training step": round(time.process_time() - start, 2),

@@ -29,8 +29,7 @@ from pdal_stages.pipeline.inputs_outputs import input_files
 from pdal_stages.pipeline.overrides import parse_overrides
 from pdal_stages.pipeline.run import Pipeline
 from pdal_stages.pipeline.training import train_pipeline
-from pdal_stages.reports.panels import triptych
-from pdal_stages.reports.pictures import write_png
+from pdal_stages.reports.views import triptych, write_png
 
 CLOUDS = {
     "montpellier": {
@@ -82,7 +81,7 @@ def job(name: str, options: argparse.Namespace, work: Path) -> dict:
     if options.pictures:
         x, y, z, given, truth = np.concatenate(drawn).T
         picture = triptych(x, y, z, given.astype(np.uint8), truth.astype(np.uint8))
-        write_png(options.pictures / f"{name}-errors.png", picture, palette=True)
+        write_png(options.pictures / f"{name}-errors.png", picture)
     return {
         "overall_accuracy": total.overall_accuracy,
         "kappa": total.kappa,

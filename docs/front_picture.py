@@ -16,8 +16,7 @@ import laspy
 import numpy as np
 
 from pdal_stages.cli import main as command
-from pdal_stages.reports.pictures import write_png
-from pdal_stages.reports.views import top_view
+from pdal_stages.reports.views import top_view, write_png
 
 TARGET = Path(__file__).resolve().parent / "pictures" / "raw-and-classified.png"
 GAP = 24  # pixels between the halves
@@ -44,4 +43,4 @@ def picture(folder: Path, width: int = 620) -> np.ndarray:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", required=True, type=Path)
-    write_png(TARGET, picture(parser.parse_args().data), palette=True)
+    write_png(TARGET, picture(parser.parse_args().data))

@@ -1,8 +1,6 @@
 """Networks in model files and on clouds: averaging, order, tiles, files that lie. No PyTorch."""
 
 import dataclasses
-import json
-import zipfile
 
 import numpy as np
 import pytest
@@ -11,10 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.alsnet import AlsNet, Circles
-from pdal_stages.alsnet.algorithm import make_pyramid
-from pdal_stages.alsnet.pyramid import build, scramble
-from pdal_stages.alsnet.weights import Folded, check
-from pdal_stages.base.errors import DimensionError, ModelError, OptionError
+from pdal_stages.alsnet.algorithm import make_pyramid, scaled
+from pdal_stages.alsnet.geometry import build, scramble
+from pdal_stages.base.errors import ModelError, OptionError
 from pdal_stages.classifier import load_model, modelfile
 from pdal_stages.classifier.algorithms import PredictRequest
 
@@ -92,7 +89,7 @@ def test_averages_equal_a_hand_computation():
     net = net_with()
     predicted = net.predict(PredictRequest(xyz, dimensions), lambda p: p)
     (found,) = predicted.blocks
-    columns = net.inputs_of(xyz, dimensions)
+    columns = scaled(xyz, dimensions, net.inputs, net.mean, net.scale)
     np.testing.assert_allclose(columns[:, 1], (dimensions["HeightAboveGround"] - 1.0) / 2.0, rtol=1e-5)
     circles = Circles(xyz, TINY.points, net.spacing, columns)
     each = [[] for _ in xyz]
@@ -160,17 +157,6 @@ def test_small_and_empty_clouds():
     assert same.report.figures["batches_per_point"]["least"] >= 1
 
 
-def test_missing_dimension_and_coordinates_that_are_none():
-    xyz, _, dimensions = scene(300, 8.0)
-    model = model_of(net_with())
-    assert model.required_dimensions == ("HeightAboveGround", "Intensity")
-    with pytest.raises(DimensionError, match=r"HeightAboveGround.*filtered_ground"):
-        model.predict(xyz, {"Intensity": dimensions["Intensity"]})
-    xyz[3, 1] = np.nan
-    with pytest.raises(Exception, match="finite"):
-        model.predict(xyz, dimensions)
-
-
 def test_absurd_weights_give_an_error_not_nan():
     net = net_with()
     weights = {name: array * np.float32(1e30) for name, array in net.weights.items()}
@@ -205,7 +191,7 @@ def rewritten(path, weights=None, **parameters):
     arrays = {**net.arrays(), **(weights or {})}
     arrays = {name: array for name, array in arrays.items() if array is not None}
     manifest = model.manifest()
-    manifest["passes"][0]["parameters"] = {**net.parameters(), **parameters}
+    manifest["passes"][0]["parameters"] = {**net.to_file([])["parameters"], **parameters}
     modelfile.write(path, manifest, [arrays])
     return path
 
@@ -220,13 +206,10 @@ def spoiled(name, value, at=(0, 0)):
     "weights, text",
     [
         (spoiled("sa1_1", np.nan), "finite"),
-        (spoiled("scores", np.inf), "finite"),
         (spoiled("fp1_2", -1.0, (3, -1)), "negative variance"),
         ({"sa2_1": None}, "lacks an array"),
         ({"sa2_1": np.zeros((32, 9), np.float32)}, r"must be \(32, "),
-        ({"scores": np.zeros((4, 33), np.float32)}, "must be"),
         ({"sa9_1": np.zeros((3, 3), np.float32)}, "does not know"),
-        ({"extra": np.zeros((3, 3), np.float32)}, "does not know"),
         ({"scores": np.zeros(3, np.float32)}, "2 axes"),
         ({"sa1_1": net_with().weights["sa1_1"].astype(np.float64)}, "<f4"),
     ],
@@ -248,15 +231,12 @@ def greedy():
 @pytest.mark.parametrize(
     "parameters, text",
     [
-        ({"spacing": 0}, "spacing"),
         ({"spacing": "3"}, "spacing"),
         ({"configuration": 7}, "parameters are not right"),
         ({"configuration": shallow(points=10**9)}, "points"),
         ({"configuration": shallow(levels=TINY.to_dict()["levels"][:1])}, "does not know|must be"),
         ({"configuration": greedy()}, "too much memory"),
-        ({"inputs": []}, "inputs"),
         ({"inputs": [{"name": n, "mean": 0, "scale": 0} for n in INPUTS]}, "scale"),
-        ({"inputs": [{"name": n, "mean": True, "scale": 1} for n in INPUTS]}, "mean"),
         ({"inputs": [{"name": n, "mean": 0, "scale": 1} for n in ("Z", "Z", "Intensity")]}, "inputs"),
         ({"more": 1}, "parameters are not right"),
     ],
@@ -264,21 +244,6 @@ def greedy():
 def test_hostile_parameters_are_refused(parameters, text, tmp_path):
     with pytest.raises(ModelError, match=text):
         load_model(rewritten(tmp_path / "bad.model", **parameters))
-
-
-def test_the_file_is_data_only(tmp_path):
-    rewritten(tmp_path / "a.model")
-    with zipfile.ZipFile(tmp_path / "a.model") as archive:
-        names = archive.namelist()
-        manifest = json.loads(archive.read("manifest.json"))
-    assert manifest["passes"][0]["algorithm"] == "alsnet"
-    assert all(name == "manifest.json" or name.endswith(".npy") for name in names)
-
-
-def test_check_accepts_what_fresh_makes():
-    net = random_net()
-    check(net.weights, TINY, 1, 3)
-    assert Folded(net.weights, TINY) is not None
 
 
 def test_where_no_torch_is_training_says_what_to_install(monkeypatch):
@@ -303,8 +268,6 @@ def test_where_no_torch_is_training_says_what_to_install(monkeypatch):
         ({"alsnet": {"epochs": 3}}, "only with algorithm"),
         ({"algorithm": "alsnet", "alsnet": {"epoch": 3}}, "Did you mean 'epochs'"),
         ({"algorithm": "alsnet", "alsnet": {"epochs": 0}}, "epochs"),
-        ({"algorithm": "alsnet", "alsnet": {"thin": 1.5}}, "thin"),
-        ({"algorithm": "alsnet", "alsnet": {"class_weights": "more"}}, "class_weights"),
         ({"algorithm": "alsnet", "alsnet": {"configuration": "tinny"}}, "tiny"),
         ({"algorithm": "alsnet", "alsnet": [1]}, "mapping"),
         ({"algorithm": "alsnet", "alsnet": {"rotate": 1}}, "rotate"),

@@ -122,6 +122,7 @@ def test_one_word_trains_a_network(cloud, tmp_path, pdal_module):
         "configuration": TINY.to_dict(),
         "epochs": 2,
         "validation": 0,
+        "histogram_threshold": 40,
         "checkpoint": str(tmp_path / "run.ckpt"),
     }
     result = ps.run_pipeline(
@@ -145,7 +146,7 @@ def test_one_word_trains_a_network(cloud, tmp_path, pdal_module):
 def test_color_and_echo_width_of_a_file_are_inputs(tmp_path, write_las, pdal_module):
     """Color is LAS's own; echo width is an extra dimension, which the reader of LAS 1.4 gives by its name."""
     laspy = pytest.importorskip("laspy")
-    xyz, labels, _ = scene(4000, 36.0, origin=(500_000.0, 5_400_000.0, 100.0))
+    xyz, labels, _ = scene(2000, 24.0, origin=(500_000.0, 5_400_000.0, 100.0))
     arrays = {
         **dict(zip("XYZ", xyz.T, strict=True)),
         "Classification": labels,
@@ -155,7 +156,7 @@ def test_color_and_echo_width_of_a_file_are_inputs(tmp_path, write_las, pdal_mod
     path = write_las(tmp_path / "in.las", arrays, point_format=7)
     reader = {"type": "readers.las", "filename": str(path), "use_eb_vlr": True}
     made, out = str(tmp_path / "a.model"), str(tmp_path / "out.las")
-    network = {"configuration": TINY.to_dict(), "epochs": 12, "validation": 0, "learning_rate": 0.01}
+    network = {"configuration": TINY.to_dict(), "epochs": 8, "validation": 0, "learning_rate": 0.02}
     writer = {"type": WRITER, "filename": made, "algorithm": "alsnet", "alsnet": network}
     ps.run_pipeline([reader, {**writer, "dimensions": "Red,EchoWidth"}])
     assert load_model(made).required_dimensions == ("Red", "EchoWidth")

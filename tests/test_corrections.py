@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 import pdal_stages as ps
 from pdal_stages import cli
 from pdal_stages.base.errors import StageError
-from pdal_stages.pipeline.correcting import CorrectionRequest, write_corrections
-from pdal_stages.review.matching import near_any, partners
+from pdal_stages.pipeline.correcting import CorrectionRequest, near_any, partners, write_corrections
 from pdal_stages.synthetic import write_town
 
 

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 import pdal_stages as ps
 from pdal_stages import cli
-from pdal_stages.review import ReviewCells, find_patches, side_for
-from pdal_stages.review.patches import BLOCK
+from pdal_stages.accuracy.expected import BLOCK, ReviewCells, find_patches, side_for
 from pdal_stages.synthetic import write_town
 
 

@@ -284,34 +284,6 @@ def test_many_small_inputs(survey, classify, tmp_path, write_las):
             assert np.array_equal(before[axis], after[axis])
 
 
-def test_a_map_of_many_tiles_shows_several_as_one_square():
-    from pdal_stages.reports.runpage import DRAWN, run_page
-
-    side = 200
-    states = ["failed" if n == 777 else "done" for n in range(side * side)]
-    tiles = [
-        {
-            "name": f"t{n}",
-            "tile": [n % side, n // side],
-            "state": state,
-            "points": 10,
-            "seconds": 1.0,
-            "tries": 1,
-        }
-        | ({"reason": "broken"} if state == "failed" else {"read": 20, "halo_m": 3.0})
-        for n, state in enumerate(states)
-    ]
-    found = {"done": side * side - 1, "kept": 0, "failed": 1}
-    run = {
-        "tile": 100.0, "tiles": tiles, "outputs": [], "messages": [], "failures": [], "states": found, "inputs": 1,
-        "per": "file", "points": 10 * side * side, "seconds": 5.0, "points_per_second": 2.0, "workers": 1,
-        "peak_mb_of_a_worker": 1.0, "dropped": 0,
-    }  # fmt: skip
-    page = run_page(run)
-    assert DRAWN / 2 < page.count("<rect") <= DRAWN and len(page) < 2_000_000
-    assert "1 failed: broken" in page and "9 tiles" in page
-
-
 def test_a_worker_has_room_for_the_blocks_before_the_tiles():
     blocks = Blocks(1024.0, 494.0, 100.0, 2.0)
     whole = block_bytes(blocks, 1e9)

@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 from pdal_stages import synthetic
 from pdal_stages.base.errors import OptionError
 from pdal_stages.synthetic import Town, TownOptions, make_town, town_chunks, write_town
-from pdal_stages.synthetic.raycast import first_hit
-from pdal_stages.synthetic.solids import BUILDING, COUNT, FIRST, VEGETATION, Site, build_scene
+from pdal_stages.synthetic.solids import BUILDING, COUNT, FIRST, VEGETATION, Site, build_scene, first_hit
 from pdal_stages.synthetic.townplan import plan_town
 
 COLUMNS = [f.name for f in dataclasses.fields(Town) if f.name != "options"]
@@ -62,13 +61,6 @@ def test_chunks_joined_are_the_town(monkeypatch):
 def test_density_is_met(size, density, more):
     t = make_town(size, density, progress=False, **more)
     assert len(t) / size**2 == pytest.approx(density, rel=0.06)
-
-
-def test_the_square_is_filled_and_not_left(town):
-    local = town.xyz[:, :2] - town.options.origin[:2]
-    assert 0 <= local.min() < 1 and 199 < local.max() < 200
-    cells = np.unique((local // 10).astype(int) @ (1, 100)).size
-    assert cells == 400, "no hole of 10 m"
 
 
 @settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -147,11 +139,6 @@ def test_beams_pass_canopies_and_meet_walls(town):
     np.minimum.at(low, which, town.z[town.classification == 6])
     np.maximum.at(high, which, town.z[town.classification == 6])
     assert ((high - low) > 3.0).mean() > 0.02, "facades are hit"
-
-
-def test_intensity_tells_surfaces_apart(town):
-    mean = {code: town.intensity[town.classification == code].mean() for code in (2, 3, 9)}
-    assert mean[3] > 1.3 * mean[2] > 3 * mean[9] > 0
 
 
 # ---- the ray caster against a slow, obvious one ------------------------------------------------------------
@@ -267,37 +254,12 @@ def test_bad_files_are_refused_and_leave_nothing(tmp_path, name, srs, word):
     [
         ({"size": 5}, "size"),
         ({"density": math.nan}, "density"),
-        ({"size": "big"}, "size"),
         ({"seed": 1.5}, "seed"),
-        ({"seed": True}, "seed"),
         ({"scan_angle": 60}, "scan_angle"),
         ({"origin": (0, 0)}, "origin"),
-        ({"origin": (0, 0, math.inf)}, "origin"),
-        ({"origin": "abc"}, "origin"),
         ({"sead": 1}, "seed"),
     ],
 )
 def test_bad_options_are_named(options, word):
     with pytest.raises(OptionError, match=word):
         make_town(**options)
-
-
-def test_command(tmp_path, capsys):
-    out = tmp_path / "t.laz"
-    assert synthetic.main([str(out), "--points", "5000", "--density", "4", "--origin", "0", "0", "9"]) == 0
-    said = capsys.readouterr().out
-    assert "Ground" in said and "per square meter" in said
-    assert len(laspy.read(out)) == pytest.approx(5000, rel=0.1) and laspy.read(out).x.min() < 1
-
-
-@pytest.mark.parametrize(
-    ("arguments", "word"),
-    [
-        (["--density", "-1"], "density"),
-        (["--points", "100", "--size", "50"], "not both"),
-        (["--points", "-3"], "above 0"),
-    ],
-)
-def test_command_reports_errors(tmp_path, capsys, arguments, word):
-    assert synthetic.main([str(tmp_path / "t.laz"), *arguments]) == 1
-    assert word in capsys.readouterr().err and list(tmp_path.iterdir()) == []

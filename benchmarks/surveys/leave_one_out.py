@@ -25,8 +25,7 @@ from recipe import OPTIONS
 from pdal_stages.accuracy import Accuracy
 from pdal_stages.classifier import Model, TrainingCloud, load_model
 from pdal_stages.classifier.clouds import contradicted
-from pdal_stages.reports.panels import triptych
-from pdal_stages.reports.pictures import write_png
+from pdal_stages.reports.views import triptych, write_png
 
 SAMPLES = (11, 12, 21, 31, 41, 51, 54, 61)
 NAMES = {2: "ground", 5: "vegetation", 6: "building"}
@@ -38,7 +37,7 @@ def score(model: Model, cloud: Cloud, pictures: Path | None = None) -> dict[str,
     if pictures is not None:
         shown = cloud.truth > 0
         drawn = triptych(*cloud.xyz[shown].T, found[shown], cloud.truth[shown])
-        write_png(pictures / f"standard-{cloud.name.replace(' ', '-')}.png", drawn, palette=True)
+        write_png(pictures / f"standard-{cloud.name.replace(' ', '-')}.png", drawn)
     known = cloud.truth > 0
     codes = sorted(set(cloud.truth[known].tolist()) | {2, 5, 6})
     result = Accuracy.from_labels(cloud.truth[known], found[known], classes=codes)

@@ -1,10 +1,10 @@
-"""Binary detection: buildings against everything else, learned in one town, found in another; a vertical section."""
+"""Binary detection: buildings against everything else, learned in one town, found in another."""
 
 import numpy as np
 from _common import save, town
 
 import pdal_stages as ps
-from pdal_stages.reports.views import section_view
+from pdal_stages.reports.views import top_view
 
 
 def with_height(points):
@@ -26,6 +26,4 @@ model = ps.train(
 found = model.predict(other.xyz, with_height(other)).classification == 6
 true = other.classification == 6
 print(f"recall {np.mean(found[true]):.3f}, precision {np.mean(true[found]):.3f}")
-middle = np.median(other.y[true])
-ends = {"start": (other.x.min(), middle), "end": (other.x.max(), middle)}
-save("6_buildings", section_view(other.x, other.y, other.z, np.where(found, 6, 1), **ends, thickness=6))
+save("6_buildings", top_view(other.x, other.y, other.z, np.where(found, 6, 1)))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pdal_stages.reports.pictures import write_png
+from pdal_stages.reports.views import write_png
 from pdal_stages.synthetic import Town, make_town
 
 #: Tests set a smaller town and another folder.
@@ -27,5 +27,5 @@ def halves(points: Town) -> tuple[np.ndarray, np.ndarray]:
 
 def save(name: str, rgb: np.ndarray) -> None:
     OUTPUT.mkdir(parents=True, exist_ok=True)
-    write_png(OUTPUT / f"{name}.png", rgb, palette=True)
+    write_png(OUTPUT / f"{name}.png", rgb)
     print(OUTPUT / f"{name}.png")

@@ -130,19 +130,7 @@ class Merge:
 def pair_counts(
     reference: npt.NDArray[Any], predicted: npt.NDArray[Any]
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """How often each pair of codes occurs.
-
-    Parameters
-    ----------
-    reference, predicted : (n,) int
-        See :func:`as_codes`.
-
-    Returns
-    -------
-    rows, columns : (R,), (C,) int64
-        Codes of the reference and of the prediction, ascending.
-    counts : (R, C) int64
-    """
+    """Codes of the reference (R,) and of the prediction (C,), ascending, and how often each pair occurs (R, C)."""
     codes, positions = [], []
     for what, labels in (("reference", reference), ("prediction", predicted)):
         there = np.zeros(MAX_CODE + 1, bool)
@@ -167,25 +155,14 @@ def pair_counts(
 def regroup(
     rows: Sequence[int], *tables: tuple[npt.NDArray[np.int64], Iterable[int], Iterable[int]]
 ) -> tuple[tuple[int, ...], npt.NDArray[np.int64]]:
-    """One matrix of several tables, with the rows and columns of one class added up.
+    """One matrix of several tables of counts with the classes of their rows and columns, those of one class added up.
 
-    Parameters
-    ----------
-    rows : sequence of int
-        Classes of the matrix's rows; every table's are among them.
-    *tables : ((R, C) int64, R codes, C codes)
-        Counts, and the class that each row and column belongs to.
-
-    Returns
-    -------
-    columns : tuple of int
-        `rows`, then the other classes of the tables' columns, ascending.
-    matrix : (len(rows), len(columns)) int64
+    Its columns are `rows`, among which every table's are, then the other classes of the tables' columns, ascending.
     """
     columns = (*rows, *sorted({int(c) for _, _, given in tables for c in given} - set(rows)))
+    place = {code: k for k, code in enumerate(columns)}
     out = np.zeros((len(rows), len(columns)), np.int64)
-    for counts, of_rows, of_columns in tables:
-        i = np.array([rows.index(int(c)) for c in of_rows], dtype=int)
-        j = np.array([columns.index(int(c)) for c in of_columns], dtype=int)
+    for counts, *sides in tables:
+        i, j = (np.array([place[int(c)] for c in side], dtype=int) for side in sides)
         np.add.at(out, (i[:, None], j[None, :]), counts)
     return columns, out

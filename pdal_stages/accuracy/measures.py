@@ -101,8 +101,6 @@ class Accuracy:
     margin: Grading | None = None
     merged: Mapping[int, int] = field(default_factory=dict)
 
-    # ---- making one ----------------------------------------------------------------------------------
-
     @classmethod
     def from_labels(
         cls,
@@ -285,16 +283,13 @@ class Accuracy:
                 found=f"{dict(self.merged)} and {dict(other.merged)}",
                 cure="Compare both with the same 'merge'",
             )
-        graded = {}
+        # An empty tile has nothing to grade; anything else that lacks one would make it a curve of some points.
+        graded: dict[str, Grading | None] = {}
         for key in ("reliability", "margin"):
-            a, b = getattr(self, key), getattr(other, key)
-            # An empty tile has nothing to grade; anything else that lacks one would make it a curve of some points.
-            if a is not None and b is not None:
-                graded[key] = a + b
-            elif b is None:
-                graded[key] = a if other.points == 0 else None
-            else:
-                graded[key] = b if self.points == 0 else None
+            parts = [
+                getattr(one, key) for one in (self, other) if one.points or getattr(one, key) is not None
+            ]
+            graded[key] = None if None in parts or not parts else sum(parts[1:], parts[0])
         return Accuracy(
             rows,
             columns[len(rows) :],
@@ -312,8 +307,6 @@ class Accuracy:
     def __repr__(self) -> str:
         what = f"overall_accuracy={self.overall_accuracy:.4f}" if self.points else "empty"
         return f"<Accuracy of {self.points:,} points, classes {list(self.classes)}: {what}>"
-
-    # ---- the matrix ----------------------------------------------------------------------------------
 
     @property
     def columns(self) -> tuple[int, ...]:
@@ -352,8 +345,6 @@ class Accuracy:
         total = self.matrix.sum(axis=0, keepdims=True)
         return np.divide(self.matrix, total, out=np.zeros(self.matrix.shape), where=total > 0)
 
-    # ---- measures ------------------------------------------------------------------------------------
-
     def _checked(self) -> None:
         if self.points == 0:
             raise StageError("no point was compared, so there is no accuracy", found="0 points")
@@ -380,25 +371,11 @@ class Accuracy:
         chance = sum(r * c for r, c in zip(rows, columns, strict=True))  # exact whole numbers
         return (self.correct * n - chance) / (n * n - chance) if chance != n * n else None
 
-    @property
-    def mean_class_recall(self) -> float:
-        """MCR [B16]: the mean of the classes' recall."""
-        return self._mean("recall")
-
-    @property
-    def mean_class_precision(self) -> float:
-        """MCP [B16]: the mean of the classes' precision."""
-        return self._mean("precision")
-
-    @property
-    def mean_f1(self) -> float:
-        """Mean F1 [W18]: the unweighted mean of the classes' F1."""
-        return self._mean("f1")
-
-    @property
-    def mean_iou(self) -> float:
-        """The mean of the classes' intersection over union."""
-        return self._mean("iou")
+    #: MCR and MCP [B16], mean F1 [W18], mean intersection over union: unweighted means of the classes'.
+    mean_class_recall = property(lambda self: self._mean("recall"))
+    mean_class_precision = property(lambda self: self._mean("precision"))
+    mean_f1 = property(lambda self: self._mean("f1"))
+    mean_iou = property(lambda self: self._mean("iou"))
 
     def _mean(self, name: str) -> float:
         self._checked()
@@ -429,30 +406,15 @@ class Accuracy:
             )
         return tuple(figures)
 
-    @property
-    def recall(self) -> dict[int, float | None]:
-        """Class code to recall (completeness)."""
-        return {f.code: f.recall for f in self.per_class}
+    def _by_class(self, name: str) -> dict[int, Any]:
+        return {f.code: getattr(f, name) for f in self.per_class}
 
-    @property
-    def precision(self) -> dict[int, float | None]:
-        """Class code to precision (correctness)."""
-        return {f.code: f.precision for f in self.per_class}
-
-    @property
-    def f1(self) -> dict[int, float | None]:
-        """Class code to F1."""
-        return {f.code: f.f1 for f in self.per_class}
-
-    @property
-    def iou(self) -> dict[int, float | None]:
-        """Class code to intersection over union."""
-        return {f.code: f.iou for f in self.per_class}
-
-    @property
-    def support(self) -> dict[int, int]:
-        """Class code to reference points."""
-        return {f.code: f.support for f in self.per_class}
+    #: Class code to recall (completeness), precision (correctness), F1, intersection over union, reference points.
+    recall = property(lambda self: self._by_class("recall"))
+    precision = property(lambda self: self._by_class("precision"))
+    f1 = property(lambda self: self._by_class("f1"))
+    iou = property(lambda self: self._by_class("iou"))
+    support = property(lambda self: self._by_class("support"))
 
     def confusions(self, most: int | None = None) -> list[tuple[int, int, int]]:
         """The errors, largest first: (reference class, predicted class, points)."""
@@ -467,8 +429,6 @@ class Accuracy:
     def name(self, code: int) -> str:
         """A class's name."""
         return self.names.get(code) or class_name(code)
-
-    # ---- output --------------------------------------------------------------------------------------
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as JSON types; ``accuracy-1.json`` describes it."""

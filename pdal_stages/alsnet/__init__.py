@@ -2,8 +2,7 @@
 
 from .algorithm import AlsNet
 from .circles import Circles
-from .configuration import CONFIGURATIONS, Configuration, Level, parse_configuration
-from .networkoptions import NetworkOptions
+from .configuration import CONFIGURATIONS, Configuration, Level, NetworkOptions, parse_configuration
 
 __all__ = [
     "CONFIGURATIONS",

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
-import shutil
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -21,10 +17,9 @@ from ..base.threads import map_blocks, resolve_threads
 from ..classifier.algorithms import ArrayRule, Block, Column, InputPlan, PredictRequest, PredictResult
 from ..classifier.dimensions import gather, with_returns
 from ..features.index import check_xyz
-from . import circles as circles_
-from .circles import Circles
+from .circles import Circles, halo_m
 from .configuration import Configuration, parse_configuration
-from .pyramid import Pyramid, build, scramble
+from .geometry import Pyramid, build, scramble
 from .weights import Folded, Weights, check
 
 #: A network whose batch would need more megabytes is not loaded; the published ones need a few thousand.
@@ -56,8 +51,6 @@ class AlsNet:
         "scores": ArrayRule(("<f4",), 2),
     }
 
-    # ---- file ----------------------------------------------------------------------------------------------
-
     @classmethod
     def from_file(
         cls, entry: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]], codes: Sequence[int]
@@ -88,22 +81,18 @@ class AlsNet:
         """What the file stores."""
         return dict(self.weights)
 
-    def parameters(self) -> dict[str, Any]:
-        """What the manifest says of the network itself."""
-        return {
-            "configuration": self.configuration.to_dict(),
-            "spacing": self.spacing,
-            "inputs": [
-                {"name": name, "mean": mean, "scale": scale}
-                for name, mean, scale in zip(self.inputs, self.mean, self.scale, strict=True)
-            ],
-            "weights": int(sum(array.size for array in self.weights.values())),
-        }
-
     def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
         """What a model file says of it beside its arrays; nothing is fitted but the weights."""
         return {
-            "parameters": self.parameters(),
+            "parameters": {
+                "configuration": self.configuration.to_dict(),
+                "spacing": self.spacing,
+                "inputs": [
+                    {"name": name, "mean": mean, "scale": scale}
+                    for name, mean, scale in zip(self.inputs, self.mean, self.scale, strict=True)
+                ],
+                "weights": int(sum(array.size for array in self.weights.values())),
+            },
             "features": {"neighborhoods": [], "features": [], "dimensions": list(self.inputs)},
             "feature_names": list(self.inputs),
             "dimensions": list(self.inputs),
@@ -120,20 +109,12 @@ class AlsNet:
     @property
     def plan(self) -> InputPlan:
         """Its inputs; X, Y and Z are taken from the batch's center, and batches are cut by area."""
-        return InputPlan(self.inputs, self.inputs, circles_.halo_m(self.spacing))
-
-    # ---- applying ------------------------------------------------------------------------------------------
+        return InputPlan(self.inputs, self.inputs, halo_m(self.spacing))
 
     @cached_property
     def folded(self) -> Folded:
         """The network, ready to apply."""
         return Folded(self.weights, self.configuration)
-
-    def inputs_of(
-        self, xyz: npt.NDArray[np.float64], dimensions: Mapping[str, npt.ArrayLike]
-    ) -> npt.NDArray[np.float32]:
-        """The inputs that do not depend on the batch, scaled; columns of X, Y and Z are left 0."""
-        return scaled(xyz, dimensions, self.inputs, self.mean, self.scale)
 
     def predict(
         self, request: PredictRequest, finish: Callable[[npt.NDArray[np.float64]], Any]
@@ -163,27 +144,24 @@ class AlsNet:
 
         rows, progress = request.rows, request.progress
         xyz = check_xyz(request.xyz)
-        columns = self.inputs_of(xyz, dimensions)
+        columns = scaled(xyz, dimensions, self.inputs, self.mean, self.scale)
         circles = Circles(xyz, self.configuration.points, self.spacing, columns)
         numbers = circles.needed(rows)
-        n = len(xyz)
-        place = np.arange(n) if rows is None else np.full(n, -1, np.int64)
-        if rows is not None:
-            place[rows] = np.arange(len(rows))
         m = request.count
+        place = np.full(len(xyz), -1)
+        place[slice(None) if rows is None else rows] = np.arange(m)
         total = np.zeros((m, self.n_classes))
         squares = np.zeros(m)
         count = np.zeros(m, np.int64)
         each = self.configuration.memory_mb(len(self.inputs))
         side_by_side = max(1, min(resolve_threads(request.threads), int(request.memory_mb / each)))
-        apply, device = _applied(self)
 
         def one(number: int):
             members = circles.members(number)
             order, pyramid = make_pyramid(
                 xyz, columns, members, circles.centers[number], self.inputs, self.configuration
             )
-            return members[order], apply(pyramid)
+            return members[order], self.folded(pyramid)
 
         seen = 0
         # BLAS on one thread: a batch's result then does not depend on how many are computed side by side.
@@ -207,33 +185,8 @@ class AlsNet:
         counted = {
             "batches": len(numbers),
             "batches_per_point": {"mean": round(float(count.mean()), 2), "least": int(count.min())},
-            "device": device,
         }
         return mean, variance, counted
-
-
-def _applied(net: AlsNet) -> tuple[Callable[[Pyramid], npt.NDArray[np.float64]], str]:
-    """What gives a pyramid's probabilities, and on which device: CUDA where PyTorch finds one, otherwise NumPy."""
-    if not _cuda():
-        return net.folded, "cpu"
-    from .network import Applied
-
-    return Applied(net.weights, net.configuration, "cuda"), "cuda"
-
-
-def _cuda() -> bool:
-    """Whether PyTorch is installed and sees a CUDA device; PyTorch is not imported where there is no driver."""
-    if importlib.util.find_spec("torch") is None:
-        return False
-    if (
-        "torch" not in sys.modules
-        and not Path("/proc/driver/nvidia").exists()
-        and not shutil.which("nvidia-smi")
-    ):
-        return False
-    import torch
-
-    return bool(torch.cuda.is_available())
 
 
 def scaled(

@@ -31,9 +31,7 @@ def density(clouds: Sequence[npt.NDArray[np.float64]]) -> float:
             continue
         span = np.maximum(np.ptp(xyz[:, :2], axis=0), 1.0)
         side = max(math.sqrt(16.0 * span[0] * span[1] / len(xyz)), 0.1)  # some 16 points a cell
-        cells = np.floor(xyz[:, :2] / side).astype(np.int64)
-        cells -= cells.min(axis=0)
-        area += len(np.unique(cells[:, 1] * (int(cells[:, 0].max()) + 1) + cells[:, 0])) * side * side
+        area += len(np.unique(np.floor(xyz[:, :2] / side), axis=0)) * side * side
         points += len(xyz)
     return points / area if area else 1.0
 
@@ -88,49 +86,26 @@ class Circles:
         spacing: float,
         inputs: npt.NDArray[Any] | None = None,
     ) -> None:
+        from scipy.spatial import cKDTree
+
         if not spacing > 0.0:
             raise OptionError("the spacing of batches must be more than 0 m", found=spacing)
         self.points, self.spacing, self.reach = int(points), float(spacing), REACH * float(spacing)
-        keys = [xyz[:, 2], xyz[:, 1], xyz[:, 0]]
-        if inputs is not None:
-            keys = [*(inputs[:, k] for k in range(inputs.shape[1])), *keys]
-        canonical = np.lexsort(keys)
-        self._side = self.spacing / 2.0
-        cell = np.floor(xyz[canonical, :2] / self._side).astype(np.int64)
-        self._first = cell.min(axis=0) if len(cell) else np.zeros(2, np.int64)
-        self._last = cell.max(axis=0) if len(cell) else np.zeros(2, np.int64)
-        if np.any(self._last - self._first > 2**31):
-            raise OptionError("the cloud is too wide for the batches' spacing", found=f"{spacing:g} m")
-        self._width = int(self._last[0] - self._first[0]) + 1
-        key = (cell[:, 1] - self._first[1]) * self._width + (cell[:, 0] - self._first[0])
-        by_cell = np.argsort(key, kind="stable")
-        self._key = key[by_cell]
-        self._rank = by_cell  # place in the canonical order
-        self._row = canonical[by_cell]  # row of the cloud
+        more = () if inputs is None else inputs.T
+        self._row = np.lexsort([*more, xyz[:, 2], xyz[:, 1], xyz[:, 0]])  # the canonical order
         self._xy = np.ascontiguousarray(xyz[self._row, :2])
+        self._tree = cKDTree(self._xy)
         self.centers, self.sizes = self._place()
 
     def __len__(self) -> int:
         return len(self.centers)
 
-    # ---- what is near --------------------------------------------------------------------------------------
-
-    def _near(self, x: float, y: float, radius: float) -> npt.NDArray[np.int64]:
-        """Places (in cell order) of the points in the cells that a circle touches."""
-        first = np.floor(np.array([x - radius, y - radius]) / self._side).astype(np.int64) - self._first
-        last = np.floor(np.array([x + radius, y + radius]) / self._side).astype(np.int64) - self._first
-        x0, x1 = max(int(first[0]), 0), min(int(last[0]), self._width - 1)
-        y0, y1 = max(int(first[1]), 0), min(int(last[1]), int(self._last[1] - self._first[1]))
-        if x0 > x1 or y0 > y1:
-            return np.zeros(0, np.int64)
-        rows = np.arange(y0, y1 + 1) * self._width
-        lo = np.searchsorted(self._key, rows + x0)
-        hi = np.searchsorted(self._key, rows + x1, side="right")
-        return np.concatenate([np.arange(a, b) for a, b in zip(lo, hi, strict=True)])
-
-    def _distance2(self, at: npt.NDArray[np.int64], x: float, y: float) -> npt.NDArray[np.float64]:
-        dx, dy = self._xy[at, 0] - x, self._xy[at, 1] - y
-        return dx * dx + dy * dy
+    def _near(self, x: float, y: float, radius: float) -> tuple[npt.NDArray[np.int64], npt.NDArray[Any]]:
+        """Places in the canonical order of the points around (x, y), a few beyond `radius` too; squared distances."""
+        at = np.array(
+            self._tree.query_ball_point((x, y), radius * (1.0 + 1e-9), return_sorted=True), np.int64
+        )
+        return at, ((self._xy[at] - (x, y)) ** 2).sum(axis=1)
 
     def around(self, x: float, y: float, size: int | None = None) -> npt.NDArray[np.int64]:
         """Rows of the points nearest to a place in plan, at most `size` and none beyond ``reach``.
@@ -138,40 +113,43 @@ class Circles:
         In the canonical order. Of points equally far the first in that order are taken.
         """
         size = self.points if size is None else size
-        at = self._near(x, y, self.reach)
-        d2 = self._distance2(at, x, y)
-        inside = d2 <= self.reach * self.reach
-        at, d2 = at[inside], d2[inside]
+        at, d2 = self._near(x, y, self.reach)
+        at, d2 = at[d2 <= self.reach**2], d2[d2 <= self.reach**2]
         if len(at) > size:
             limit = np.partition(d2, size - 1)[size - 1]
-            sure = at[d2 < limit]
-            equal = at[d2 == limit]
-            equal = equal[np.argsort(self._rank[equal])][: size - len(sure)]
-            at = np.concatenate([sure, equal])
-        return self._row[at[np.argsort(self._rank[at])]]
+            mine = d2 < limit
+            mine[np.flatnonzero(d2 == limit)[: size - np.count_nonzero(mine)]] = True
+            at = at[mine]
+        return self._row[at]
 
     def members(self, number: int) -> npt.NDArray[np.int64]:
         """Rows of the points of a circle, in the canonical order."""
         x, y = self.centers[number]
         return self.around(float(x), float(y), int(self.sizes[number]))
 
-    # ---- where circles are ---------------------------------------------------------------------------------
+    def needed(self, rows: npt.NDArray[np.int64] | None) -> npt.NDArray[np.int64]:
+        """Numbers of the circles that can hold any of these rows; all for None."""
+        from scipy.spatial import cKDTree
+
+        if rows is None or not len(rows) or not len(self):
+            return np.arange(len(self) if rows is None else 0)
+        wanted = np.zeros(len(self._xy), bool)
+        wanted[rows] = True
+        distance, _ = cKDTree(self._xy[wanted[self._row]]).query(self.centers)
+        return np.flatnonzero(distance <= self.reach * (1.0 + 1e-9))
 
     def _place(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
         """Centers and sizes."""
         found: list[tuple[float, float, int]] = []
-        waiting = list(_parts(np.arange(len(self._xy)), self._xy, self.spacing))
-        waiting = [(0, *part) for part in reversed(waiting)]
+        waiting = [(0, *part) for part in _parts(np.arange(len(self._xy)), self._xy, self.spacing)][::-1]
         while waiting:
             level, cell, at = waiting.pop()
             side = self.spacing / 2.0**level
-            x, y = (cell[0] + 0.5) * side, (cell[1] + 0.5) * side
-            size = self._fits(at, x, y, level)
-            if size == 0:
-                parts = list(_parts(at, self._xy, side / 2.0))
-                waiting.extend((level + 1, *part) for part in reversed(parts))
-                continue
-            found.append((x, y, size))
+            x, y = (cell + 0.5) * side
+            if size := self._fits(at, x, y, level):
+                found.append((x, y, size))
+            else:
+                waiting += [(level + 1, *part) for part in _parts(at, self._xy, side / 2.0)][::-1]
         table = np.array(found, dtype=np.float64).reshape(-1, 3)
         return table[:, :2].copy(), table[:, 2].astype(np.int64)
 
@@ -179,36 +157,17 @@ class Circles:
         """The size of the cell's circle, or 0 where the cell must be quartered."""
         if level < DEEPEST and len(at) > max(self.points // 2, 1):
             return 0
-        far2 = float(self._distance2(at, x, y).max())
-        near = self._near(x, y, math.sqrt(far2))
-        within = int(np.count_nonzero(self._distance2(near, x, y) <= far2))
+        far2 = float(((self._xy[at] - (x, y)) ** 2).sum(axis=1).max())
+        within = int(np.count_nonzero(self._near(x, y, math.sqrt(far2))[1] <= far2))
         if within <= self.points:
             return self.points
         return 0 if level < DEEPEST else within
 
-    def needed(self, rows: npt.NDArray[np.int64] | None) -> npt.NDArray[np.int64]:
-        """Numbers of the circles that can hold any of these rows; all for None."""
-        if rows is None:
-            return np.arange(len(self))
-        wanted = np.zeros(len(self._xy), bool)
-        wanted[rows] = True
-        wanted = wanted[self._row]
-        keep = []
-        for number, (x, y) in enumerate(self.centers):
-            at = self._near(float(x), float(y), self.reach)
-            at = at[wanted[at]]
-            if len(at) and float(self._distance2(at, float(x), float(y)).min()) <= self.reach * self.reach:
-                keep.append(number)
-        return np.array(keep, np.int64)
-
 
 def _parts(at: npt.NDArray[np.int64], xy: npt.NDArray[np.float64], side: float):
-    """The occupied cells of some points: ((ix, iy), places), ordered by iy, then ix."""
-    if not len(at):
-        return
-    cell = np.floor(xy[at] / side).astype(np.int64)
-    order = np.lexsort((cell[:, 0], cell[:, 1]))
+    """The occupied cells of some points: (ix and iy, places), ordered by iy, then ix."""
+    cell = np.floor(xy[at] / side)
+    order = np.lexsort(cell.T)
     cell, at = cell[order], at[order]
-    starts = np.flatnonzero(np.concatenate(([True], (cell[1:] != cell[:-1]).any(axis=1))))
-    for lo, hi in zip(starts, [*starts[1:], len(at)], strict=True):
-        yield (int(cell[lo, 0]), int(cell[lo, 1])), at[lo:hi]
+    starts = np.flatnonzero((cell[1:] != cell[:-1]).any(axis=1)) + 1
+    return list(zip(cell[[0, *starts]], np.split(at, starts), strict=True)) if len(at) else []

@@ -1,4 +1,4 @@
-"""Network configurations as data: what a model file stores and an option names.
+"""Network configurations and options of training, as data: what a model file stores and an option names.
 
 A configuration lists the levels of set abstraction [WM19; Qi et al. 2017, PointNet++]: how many centers are
 sampled, the radius of the ball around each, how many points are taken from it, the widths of the shared
@@ -8,7 +8,7 @@ perceptron that describes the ball, and the widths of the one that carries featu
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
@@ -67,67 +67,46 @@ class Configuration:
         """Number of linear layers."""
         return sum(len(level.mlp) + len(level.up) for level in self.levels) + len(self.head) + 1
 
-    def shapes(self, inputs: int, classes: int) -> dict[str, tuple[int, int]]:
-        """Array name to shape, in the order of the computation.
-
-        A layer with batch normalization is (out, in + 4): the weights, then per output the scale, shift, running
-        mean and running variance. The last, ``scores``, is (classes, in + 1): weights, then bias.
-        """
-        out: dict[str, tuple[int, int]] = {}
-        width = [inputs]
+    def _linear(self, inputs: int) -> Iterator[tuple[str, int, int, int, int]]:
+        """Of every layer but the last, in the order of the computation: name, rows, inputs, outputs, depth below."""
+        width, rows = [inputs], [self.points]
         for number, level in enumerate(self.levels, 1):
+            rows.append(min(level.centers, rows[-1]))
             before = width[-1] + 3  # the offset from the ball's center
             for step, after in enumerate(level.mlp, 1):
-                out[f"sa{number}_{step}"] = (after, before + 4)
+                yield f"sa{number}_{step}", rows[-1] * level.samples, before, after, 0
                 before = after
             width.append(before)
         below = width[-1]
         for number in range(len(self.levels), 0, -1):
             before = below + width[number - 1]
             for step, after in enumerate(self.levels[number - 1].up, 1):
-                out[f"fp{number}_{step}"] = (after, before + 4)
+                yield f"fp{number}_{step}", rows[number - 1], before, after, below
                 before = after
             below = before
         for step, after in enumerate(self.head, 1):
-            out[f"head_{step}"] = (after, below + 4)
+            yield f"head_{step}", rows[0], below, after, 0
             below = after
-        out["scores"] = (classes, below + 1)
-        return out
 
-    def memory_mb(self, inputs: int, training: bool = False) -> float:
-        """Megabytes one batch takes at most, beside the cloud; in training every layer's output is kept.
+    def shapes(self, inputs: int, classes: int) -> dict[str, tuple[int, int]]:
+        """Array name to shape, in the order of the computation.
 
-        Counted from the sizes of the arrays; measured figures are in the documentation.
+        A layer with batch normalization is (out, in + 4): the weights, then per output the scale, shift, running
+        mean and running variance. The last, ``scores``, is (classes, in + 1): weights, then bias.
         """
-        most = kept = 0.0
-        rows_above, width = self.points, [inputs]
-        count = [self.points]
-        for level in self.levels:
-            rows = min(level.centers, rows_above) * level.samples
-            before = width[-1] + 3
-            for after in level.mlp:
-                most = max(most, rows * (before + 2 * after))
-                kept += rows * after * 3.0
-                before = after
-            width.append(before)
-            rows_above = min(level.centers, rows_above)
-            count.append(rows_above)
-        below = width[-1]
-        for number in range(len(self.levels), 0, -1):
-            rows, before = count[number - 1], below + width[number - 1]
-            for after in self.levels[number - 1].up:
-                most = max(most, rows * (before + 2 * after + 3 * below))
-                kept += rows * (after * 3.0 + before)
-                before = after
-            below = before
-        for after in self.head:
-            most = max(most, count[0] * (below + 2 * after))
-            kept += count[0] * after * 3.0
-            below = after
-        geometry = self.points * 200.0 + sum(
-            c * level.samples * 8.0 for c, level in zip(count[1:], self.levels, strict=True)
+        out = {name: (after, before + 4) for name, _, before, after, _ in self._linear(inputs)}
+        return {**out, "scores": (classes, self.head[-1] + 1)}
+
+    def memory_mb(self, inputs: int) -> float:
+        """Megabytes one batch takes at most where the network is applied, counted from the sizes of its arrays."""
+        most = max(
+            rows * (before + 2 * after + 3 * below) for _, rows, before, after, below in self._linear(inputs)
         )
-        return (4.0 * (kept if training else most) + geometry) / 2**20
+        centers, balls = self.points, 0.0
+        for level in self.levels:
+            centers = min(level.centers, centers)
+            balls += centers * level.samples * 8.0
+        return (4.0 * most + self.points * 200.0 + balls) / 2**20
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data; :func:`parse_configuration` reads it."""
@@ -243,3 +222,111 @@ CONFIGURATIONS = {
         ),
     )
 }
+
+
+CLASS_WEIGHTS = ("none", "sqrt", "balanced")
+DEVICES = ("auto", "cpu", "cuda")
+
+
+@dataclass(frozen=True)
+class NetworkOptions:
+    """How a network is trained.
+
+    Attributes
+    ----------
+    configuration : str or mapping
+        A named configuration (``small``, ``tiny``, ``alsnet4``, ``alsnet3``) or one of your own.
+    points : int or None
+        Points of a batch, instead of the configuration's.
+    spacing : float or None
+        Of the batches' grid in meters. None: from the clouds' density, for four batches a point.
+    coordinates : str
+        Which of X, Y and Z, from the batch's center, are inputs: ``"Z"``, ``"XYZ"`` or ``""``. Offsets within a
+        ball are inputs always.
+    epochs : int
+        At most; each sees every chosen batch once.
+    batches_per_step : int
+        Batches whose gradients make one step.
+    learning_rate : float
+        At the start; it falls to 1 % of that along a cosine.
+    class_weights : {"sqrt", "none", "balanced"}
+        Weight of a class in the loss: 1 / sqrt(share), 1 [WM19], or 1 / share.
+    histogram_threshold : float
+        Batches whose class shares have a standard deviation of this or more (per cent) are not trained on:
+        they hold next to nothing but one class [WM19: 20 %]. 100: all are used.
+    rotate : bool
+        Turn each batch about its center by a random angle.
+    shift : float
+        Move batch centers by up to this share of the spacing, anew in each epoch.
+    jitter : float
+        Standard deviation of noise on coordinates, meters; cut at three times that.
+    thin : float
+        Most points a batch may lose; the share is drawn anew for each.
+    validation : float
+        Share of the ground held out, in whole blocks, to choose the best epoch; 0: none.
+    block_size : float
+        Side of those blocks, meters.
+    patience : int
+        Epochs without a better mean F1 on the held out blocks after which training ends; 0: never.
+    checkpoint : str or None
+        File written after every epoch; where it exists, training goes on from it.
+    start_from : str or None
+        Model file whose weights training starts from. Classes it shares keep theirs, others start afresh.
+    device : {"auto", "cpu", "cuda"}
+    """
+
+    configuration: Any = "small"
+    points: int | None = None
+    spacing: float | None = None
+    coordinates: str = "Z"
+    epochs: int = 60
+    batches_per_step: int = 2
+    learning_rate: float = 0.002
+    class_weights: str = "sqrt"
+    histogram_threshold: float = 20.0
+    rotate: bool = True
+    shift: float = 0.5
+    jitter: float = 0.01
+    thin: float = 0.4
+    validation: float = 0.2
+    block_size: float = 25.0
+    patience: int = 20
+    checkpoint: str | None = None
+    start_from: str | None = None
+    device: str = "auto"
+
+    def __post_init__(self) -> None:
+        set_ = object.__setattr__
+        set_(self, "configuration", parse_configuration(self.configuration, self.points))
+        set_(self, "epochs", checks.whole("'epochs'", self.epochs, 1, 100_000))
+        set_(self, "batches_per_step", checks.whole("'batches_per_step'", self.batches_per_step, 1, 1024))
+        set_(self, "patience", checks.whole("'patience'", self.patience, 0, 100_000))
+        limits = {
+            "learning_rate": (1e-8, 10.0), "histogram_threshold": (0.0, 100.0), "shift": (0.0, 0.5),
+            "jitter": (0.0, 10.0), "thin": (0.0, 0.95), "validation": (0.0, 0.5), "block_size": (0.1, 1e6),
+        }  # fmt: skip
+        for name, (low, high) in limits.items():
+            set_(self, name, checks.number(f"'{name}'", getattr(self, name), low, high))
+        if self.spacing is not None:
+            set_(self, "spacing", checks.number("'spacing'", self.spacing, 0.01, 1e5))
+        checks.flag("'rotate'", self.rotate)
+        checks.one_of("'class_weights'", self.class_weights, CLASS_WEIGHTS)
+        checks.one_of("'device'", self.device, DEVICES)
+        checks.one_of("'coordinates'", self.coordinates, ("", "Z", "XYZ"))
+        for name in ("checkpoint", "start_from"):
+            if getattr(self, name) is not None and not isinstance(getattr(self, name), str):
+                raise OptionError(f"'{name}' must be a file name", found=repr(getattr(self, name)))
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> NetworkOptions:
+        """Options by name; an unknown name is an error."""
+        if not isinstance(values, Mapping):
+            raise OptionError("'alsnet' must be a mapping of options", found=repr(values)[:60])
+        known = [f.name for f in fields(cls)]
+        for name in values:
+            if name not in known:
+                raise OptionError(
+                    f"unknown alsNet option '{name}'",
+                    cure=f"{suggest(str(name), known)}Options: {', '.join(known)}",
+                )
+        return cls(**values)

@@ -1,12 +1,9 @@
-"""A network's weights as named arrays: made, checked, and applied with NumPy alone.
-
-Applying a network needs no PyTorch; only training does. The two agree to rounding (a test compares them).
-"""
+"""A network's weights as named arrays: made, checked, and applied with NumPy alone; only training needs PyTorch."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,7 +11,7 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError
 from .configuration import Configuration
-from .pyramid import Pyramid
+from .geometry import Pyramid
 
 Weights = dict[str, npt.NDArray[np.float32]]
 
@@ -60,6 +57,39 @@ def check(
             raise ModelError(f"the network's array '{name}' has a negative variance")
 
 
+def forward(
+    configuration: Configuration,
+    pyramid: Any,
+    layer: Callable,
+    take: Callable,
+    join: Callable,
+    highest: Callable,
+) -> Any:
+    """What enters the last layer, (n, width): PointNet++ with the levels of a configuration [WM19; Qi et al. 2017].
+
+    `pyramid` holds arrays of NumPy or tensors of PyTorch; the functions are those of the one or the other: a named
+    layer, rows by number, columns side by side, the maximum over the middle axis.
+    """
+
+    def shared(prefix: str, values: Any, widths: tuple[int, ...]) -> Any:
+        for step in range(1, len(widths) + 1):
+            values = layer(f"{prefix}_{step}", values)
+        return values
+
+    levels, features = configuration.levels, [pyramid.inputs]
+    for number, (level, step) in enumerate(zip(levels, pyramid.steps, strict=True), 1):
+        m, samples = step.groups.shape
+        rows = join([step.offsets.reshape(-1, 3), take(features[-1], step.groups.reshape(-1))])
+        described = shared(f"sa{number}", rows, level.mlp)
+        features.append(highest(described.reshape(m, samples, -1)))
+    below = features[-1]
+    for number in range(len(levels), 0, -1):
+        step = pyramid.steps[number - 1]
+        carried = sum(take(below, step.near[:, k]) * step.weights[:, k : k + 1] for k in range(3))
+        below = shared(f"fp{number}", join([carried, features[number - 1]]), levels[number - 1].up)
+    return shared("head", below, configuration.head)
+
+
 class Folded:
     """A network for applying: weights that :func:`check` accepts, batch normalization folded into the linear layers."""
 
@@ -75,43 +105,28 @@ class Folded:
             matrix = (array[:, :-4] * factor[:, None]).astype(np.float32)
             self._layers[name] = (np.ascontiguousarray(matrix.T), (shift - mean * factor).astype(np.float32))
 
-    def _shared(self, prefix: str, values: npt.NDArray[np.float32], depth: int) -> npt.NDArray[np.float32]:
-        for step in range(1, depth + 1):
-            matrix, bias = self._layers[f"{prefix}_{step}"]
-            with np.errstate(all="ignore"):  # scores that are not finite are an error in the end
-                values = values @ matrix
-                values += bias
-            np.maximum(values, 0.0, out=values)
-        return values
+    def _layer(self, name: str, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        matrix, bias = self._layers[name]
+        values = values @ matrix
+        values += bias
+        return np.maximum(values, 0.0, out=values)
 
     def __call__(self, pyramid: Pyramid) -> npt.NDArray[np.float64]:
         """Class probabilities of a batch's points, (n, classes) float64."""
-        levels = self.configuration.levels
-        features = [pyramid.inputs]
-        for number, (level, step) in enumerate(zip(levels, pyramid.steps, strict=True), 1):
-            m, samples = step.groups.shape
-            groups = np.concatenate([step.offsets, features[-1][step.groups]], axis=2).reshape(
-                m * samples, -1
+        with np.errstate(all="ignore"):  # scores that are not finite are an error in the end
+            below = forward(
+                self.configuration,
+                pyramid,
+                self._layer,
+                lambda values, rows: values[rows],
+                lambda parts: np.concatenate(parts, axis=1),
+                lambda values: values.max(axis=1),
             )
-            described = self._shared(f"sa{number}", groups, len(level.mlp))
-            features.append(described.reshape(m, samples, -1).max(axis=1))
-        below = features[-1]
-        for number in range(len(levels), 0, -1):
-            step = pyramid.steps[number - 1]
-            carried = below[step.near[:, 0]] * step.weights[:, :1]
-            carried += below[step.near[:, 1]] * step.weights[:, 1:2]
-            carried += below[step.near[:, 2]] * step.weights[:, 2:]
-            below = self._shared(
-                f"fp{number}",
-                np.concatenate([carried, features[number - 1]], axis=1),
-                len(levels[number - 1].up),
-            )
-        below = self._shared("head", below, len(self.configuration.head))
-        matrix, bias = self._layers["scores"]
-        scores = (below @ matrix + bias).astype(np.float64)
-        scores -= scores.max(axis=1, keepdims=True)
-        np.exp(scores, out=scores)
-        scores /= scores.sum(axis=1, keepdims=True)
+            matrix, bias = self._layers["scores"]
+            scores = (below @ matrix + bias).astype(np.float64)
+            scores -= scores.max(axis=1, keepdims=True)
+            np.exp(scores, out=scores)
+            scores /= scores.sum(axis=1, keepdims=True)
         if not np.isfinite(scores).all():
             raise ModelError(
                 "the network gave probabilities that are not numbers",

@@ -22,7 +22,7 @@ ALGORITHMS = {
         "pdal_stages.classifier.featureforest:FeatureForest",
         "pdal_stages.classifier.foresttraining",
     ),
-    "alsnet": ("pdal_stages.alsnet.algorithm:AlsNet", "pdal_stages.alsnet.networkmodel"),
+    "alsnet": ("pdal_stages.alsnet.algorithm:AlsNet", "pdal_stages.alsnet.training"),
 }
 
 

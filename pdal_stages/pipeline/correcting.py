@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,6 @@ from ..base.outputs import Output, check_outputs
 from ..classifier.dimensions import CHECKED
 from ..objects.outlines import vector
 from ..objects.overlay import Overlay, points_inside, polygons_of
-from ..review.matching import near_any, partners
 from .parts import las_chunks, reads_in_parts, reference_and_wkt
 
 #: Points without a partner beyond this share: the files are of other points.
@@ -28,26 +28,15 @@ _PATCHES, _DONE = "patches", "done"
 
 @dataclass(frozen=True)
 class CorrectionRequest:
-    """What was corrected, and where the marked points go.
+    """What was corrected, and where the marked points go."""
 
-    Attributes
-    ----------
-    before : str
-        The file as it was classified.
-    after : str
-        The same points as a person left them; empty for none.
-    output : str
-    areas : tuple of str
-        Files of polygons inside of which all was looked at, and what was not changed is right.
-    around : float
-        Meters around a changed point within which all was looked at.
-    """
-
-    before: str
+    before: str  #: the file as it was classified
     output: str
-    after: str = ""
-    areas: tuple[str, ...] = ()
-    around: float = 1.0
+    after: str = ""  #: the same points as a person left them; empty for none
+    areas: tuple[
+        str, ...
+    ] = ()  #: files of polygons inside of which all was looked at, and what was not changed is right
+    around: float = 1.0  #: meters around a changed point within which all was looked at
 
     def __post_init__(self) -> None:
         checks.number("'--around'", self.around, 0, 100, unit="m")
@@ -55,23 +44,13 @@ class CorrectionRequest:
 
 @dataclass
 class Corrections:
-    """What was found.
-
-    Attributes
-    ----------
-    points, changed, checked : int
-        All points; those with another class now; those that a person has checked, then or now.
-    moves : dict
-        (class before, class after) -> points.
-    notes : list of str
-        What the user should know.
-    """
+    """What was found."""
 
     points: int
-    changed: int
-    checked: int
-    moves: dict[tuple[int, int], int]
-    notes: list[str] = field(default_factory=list)
+    changed: int  #: points with another class now
+    checked: int  #: points that a person has checked, then or now
+    moves: dict[tuple[int, int], int]  #: (class before, class after) -> points
+    notes: list[str] = field(default_factory=list)  #: what the user should know
 
     def lines(self) -> list[str]:
         """As text."""
@@ -121,7 +100,7 @@ def write_corrections(request: CorrectionRequest) -> Corrections:
         checked |= _inside(area, xyz, wkt, notes)
     if CHECKED in las.point_format.extra_dimension_names:
         checked |= np.asarray(las[CHECKED]) > 0
-    elif _holds(las, CHECKED):
+    elif CHECKED in las.point_format.dimension_names:
         raise StageError(f"'{CHECKED}' is a dimension of another kind", where=request.before)
     if not checked.any():
         raise StageError(
@@ -151,10 +130,6 @@ def _read(path: str) -> Any:
     return out
 
 
-def _holds(las: Any, name: str) -> bool:
-    return name in las.point_format.dimension_names
-
-
 def _from_points(
     request: CorrectionRequest, las: Any, xyz: NDArray[np.float64], new: NDArray[np.uint8], notes: list[str]
 ) -> None:
@@ -162,10 +137,9 @@ def _from_points(
     other = _read(request.after)
     theirs = np.column_stack([other.x, other.y, other.z])
     step = float(max(*las.header.scales, *other.header.scales))
-    named = [
-        n for n in ("gps_time", "return_number", "number_of_returns") if _holds(las, n) and _holds(other, n)
-    ]
-    more = [(np.asarray(las[n]), np.asarray(other[n])) for n in (*named, "classification")]
+    both = {*las.point_format.dimension_names} & {*other.point_format.dimension_names}
+    named = [n for n in ("gps_time", "return_number", "number_of_returns", "classification") if n in both]
+    more = [(np.asarray(las[n]), np.asarray(other[n])) for n in named]
     found = partners(xyz, theirs, step, more, apart=3.0 * step)
     lost, extra = int((found < 0).sum()), len(theirs) - int((found >= 0).sum())
     if lost > _MOST_LOST * len(xyz) or extra > _MOST_LOST * len(xyz):
@@ -238,3 +212,60 @@ def _write(
     las[CHECKED] = checked.astype(np.uint8)
     with whole_files(request.output) as (part,):
         las.write(str(part))
+
+
+def partners(
+    before: NDArray[np.float64],
+    after: NDArray[np.float64],
+    step: float,
+    more: Sequence[tuple[NDArray, NDArray]] = (),
+    apart: float = 0.0,
+) -> NDArray[np.int64]:
+    """For each point of `before` its place in `after`, -1 where there is none; each of `after` is taken once.
+
+    Parameters
+    ----------
+    before, after : (n, 3) and (m, 3) float64
+        Coordinates.
+    step : float
+        What coordinates are whole numbers of, the coarser of both files.
+    more : sequence of pairs of arrays
+        Values that tell points of one place apart: times, return numbers, then classes. Values that no longer agree only
+        change which of them are paired.
+    apart : float
+        Points that have no partner at their place take the nearest left within this distance.
+    """
+    from scipy.spatial import cKDTree
+
+    out, n, m = np.full(len(before), -1, np.int64), len(before), len(after)
+    if not n or not m:
+        return out
+    low = np.minimum(before.min(axis=0), after.min(axis=0))
+    places = np.rint((np.concatenate([before, after]) - low) / step).astype(np.int64)
+    _, name = np.unique(places, axis=0, return_inverse=True)
+    orders, keys = [], []
+    for side, named in enumerate(np.split(name.reshape(-1), [n])):
+        orders.append(np.lexsort((*(pair[side] for pair in reversed(more)), named)))
+        ordered = named[orders[-1]]
+        # The first of a place is paired with the first of the same place, and so on.
+        keys.append(ordered * max(n, m) + np.arange(len(ordered)) - np.searchsorted(ordered, ordered))
+    _, mine, theirs = np.intersect1d(keys[0], keys[1], assume_unique=True, return_indices=True)
+    out[orders[0][mine]] = orders[1][theirs]
+    lost, free = np.flatnonzero(out < 0), np.setdiff1d(np.arange(m), out)
+    if apart > 0 and len(lost) and len(free):
+        far, near = cKDTree(after[free]).query(before[lost], distance_upper_bound=apart)
+        good = np.flatnonzero(np.isfinite(far))
+        good = good[np.argsort(far[good], kind="stable")]
+        _, first = np.unique(near[good], return_index=True)  # of several the nearest
+        out[lost[good[first]]] = free[near[good[first]]]
+    return out
+
+
+def near_any(xyz: NDArray[np.float64], chosen: NDArray[np.bool_], within: float) -> NDArray[np.bool_]:
+    """(n,) points that lie `within` so many meters of a chosen one."""
+    from scipy.spatial import cKDTree
+
+    if within <= 0 or not chosen.any():
+        return chosen.copy()
+    far, _ = cKDTree(xyz[chosen]).query(xyz, distance_upper_bound=np.nextafter(within, np.inf))
+    return np.isfinite(far)

@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..accuracy.expected import Patches, ReviewCells, find_patches, side_for
 from ..base import checks, kinds
 from ..base.errors import StageError
 from ..base.files import write_whole
@@ -23,9 +25,7 @@ from ..base.version import __version__
 from ..models import STANDARD
 from ..objects.outlines import vector
 from ..reports.objectlayers import Layer, check_target, write_layers
-from ..reports.reviewlayers import patch_style, tile_style
-from ..reports.reviewpage import review_page
-from ..review import Patches, ReviewCells, find_patches, side_for
+from ..reports.reviewpage import review_page, styles
 from ..stages.heights import PREPARATION, made_of_coordinates
 from ..stages.loading import loaded_model
 from .inputs_outputs import input_files
@@ -33,8 +33,6 @@ from .parts import Part, parts_of, reads_in_parts, reference_and_wkt
 from .references import check_one_reference, without_reference
 from .workers import each_file
 
-#: Classes by which a model's own class is known under another code.
-_SAME = {3: 5, 4: 5}
 #: What is written, in this order.
 LAYERS = ("patches", "tiles")
 
@@ -89,16 +87,7 @@ class ReviewRequest:
 
 @dataclass
 class Review:
-    """What was found.
-
-    Attributes
-    ----------
-    cells : ReviewCells
-    patches : Patches
-    listed : int
-        Patches that are written: those that come first.
-    files : list of str
-    """
+    """What was found; of the patches those `listed`, which come first, are written."""
 
     cells: ReviewCells
     patches: Patches
@@ -108,10 +97,9 @@ class Review:
     @cached_property
     def tiles(self) -> list[dict[str, Any]]:
         """A row for each file: points, points expected wrong, patches listed, minutes to look at these; worst first."""
-        n, listed = len(self.files), self.patches.file[: self.listed]
-        points = np.bincount(self.cells.place[:, 0], self.cells.points.sum(axis=1), n)
-        errors = np.bincount(self.cells.place[:, 0], self.cells.errors.sum(axis=1), n)
-        number = np.bincount(listed, minlength=n)
+        n, listed, of = len(self.files), self.patches.file[: self.listed], self.cells.place[:, 0]
+        points = np.bincount(of, self.cells.points.sum(axis=1), n)
+        errors = np.bincount(of, self.cells.errors.sum(axis=1), n)
         minutes = np.bincount(listed, self.patches.minutes[: self.listed], n)
         rows = [
             {
@@ -119,12 +107,30 @@ class Review:
                 "points": int(points[k]),
                 "expected": float(errors[k]),
                 "share": float(errors[k] / max(points[k], 1)),
-                "patches": int(number[k]),
+                "patches": int(np.count_nonzero(listed == k)),
                 "minutes": float(minutes[k]),
             }
             for k, name in enumerate(self.files)
         ]
         return sorted(rows, key=lambda row: (-row["expected"], row["tile"]))
+
+    @cached_property
+    def rows(self) -> list[dict[str, Any]]:
+        """The patches listed, as plain values."""
+        p = self.patches
+        return [
+            {
+                "rank": k + 1,
+                "tile": Path(self.files[p.file[k]]).name,
+                "expected": round(float(p.errors[k]), 1),
+                "points": int(p.points[k]),
+                "area": float(p.area[k]),
+                "seconds": round(60.0 * float(p.minutes[k]), 1),
+                "reason": p.reason[k],
+                "box": [round(float(v), 3) for v in p.box[k]],
+            }
+            for k in range(self.listed)
+        ]
 
     def to_dict(self) -> dict[str, Any]:
         """Figures, for JSON."""
@@ -136,21 +142,7 @@ class Review:
             "listed": self.listed,
             "cell": self.cells.side,
             "tiles": self.tiles,
-            "worst": [self.row(number) for number in range(min(self.listed, 1000))],
-        }
-
-    def row(self, number: int) -> dict[str, Any]:
-        """A patch as plain values."""
-        p = self.patches
-        return {
-            "rank": number + 1,
-            "tile": Path(self.files[p.file[number]]).name,
-            "expected": round(float(p.errors[number]), 1),
-            "points": int(p.points[number]),
-            "area": float(p.area[number]),
-            "seconds": round(60.0 * float(p.minutes[number]), 1),
-            "reason": p.reason[number],
-            "box": [round(float(v), 3) for v in p.box[number]],
+            "worst": self.rows[:1000],
         }
 
 
@@ -190,12 +182,20 @@ def review_files(request: ReviewRequest) -> Review:
 
 
 def cells_of(path: str, wkt: str, model: str, side: float, number: int) -> list[ReviewCells]:
-    """The cells of a file; `number` is the file's."""
-    found = [
-        ReviewCells.of(part.xyz, part.codes, part.arrays["Reliability"], side, number)
-        for part in complete_parts(path, wkt, model)
-        if len(part)
-    ]
+    """The cells of a file, whose number it is; reliabilities are as they are there, or made now, which is said."""
+    found: list[ReviewCells] = []
+    whole: list[Part] = []
+    for part in parts_of(path, wkt):
+        if "Reliability" not in part.arrays:
+            whole.append(part)
+        elif len(part):
+            found.append(ReviewCells.of(part.xyz, part.codes, part.arrays["Reliability"], side, number))
+    if whole:
+        print_messages(
+            f"{path} has no Reliability: made now by the model {model}, which takes as long as classifying"
+        )
+        part = Part.join(whole)
+        found.append(ReviewCells.of(part.xyz, part.codes, reliability_of(part, model), side, number))
     return [ReviewCells.join(found)] if found else []
 
 
@@ -211,44 +211,21 @@ def _extent(files: Sequence[str], references: dict[str, Any]) -> tuple[int, floa
     return (points, area) if area > 0 else (1, 1e-9)
 
 
-def complete_parts(path: str, wkt: str, model: str) -> Any:
-    """The points of a file with reliabilities: as they are there, or made now, which is said."""
-    whole: list[Part] = []
-    for part in parts_of(path, wkt):
-        if "Reliability" in part.arrays:
-            yield part
-        else:
-            whole.append(part)
-    if whole:
-        print_messages(
-            f"{path} has no Reliability: made now by the model {model}, which takes as long as classifying"
-        )
-        yield completed(Part.join(whole), model)
-
-
-def completed(points: Part, model: str) -> Part:
-    """The points with the probability that the model gives to the class each has."""
+def reliability_of(points: Part, model: str) -> NDArray[np.float32]:
+    """The probability that a model gives to the class each point has; 1 for classes that it does not know."""
     loaded = loaded_model(model)
     made = {}
-    if list(loaded.info.get("preparation") or []) == list(
-        PREPARATION
-    ):  # else it says what it needs, or how it is made
+    if list(loaded.info.get("preparation") or []) == list(PREPARATION):  # else it says what it needs
         made = dict(made_of_coordinates(PREPARATION, points.xyz))
     given = {name: points.arrays[name] for name in loaded.welcome_dimensions if name in points.arrays}
-    found = loaded.predict(points.xyz, {**made, **given}, probabilities=True)
+    found: Any = loaded.predict(points.xyz, {**made, **given}, probabilities=True).probabilities
     place = np.full(256, -1)
     place[loaded.codes] = np.arange(len(loaded.codes))
-    for code, known in _SAME.items():
-        if place[code] < 0:
-            place[code] = place[known]
+    lower = [code for code in (3, 4) if place[code] < 0]
+    place[lower] = place[5]  # vegetation as one class
     mine = place[points.codes]
-    probability: Any = found.probabilities
-    own = np.take_along_axis(probability, np.maximum(mine, 0)[:, None], axis=1)[:, 0]
-    reliability = np.where(mine >= 0, own, 1.0).astype(np.float32)
-    return Part(points.xyz, points.codes, {**points.arrays, "Reliability": reliability})
-
-
-# ---- writing -----------------------------------------------------------------------------------------------
+    own = np.take_along_axis(found, np.maximum(mine, 0)[:, None], axis=1)[:, 0]
+    return np.where(mine >= 0, own, 1.0).astype(np.float32)
 
 
 def write_review(request: ReviewRequest) -> Review:
@@ -261,9 +238,7 @@ def write_review(request: ReviewRequest) -> Review:
     found = review_files(request)
     reference, wkt = reference_and_wkt(request.files[0])
     layers = review_layers(found, reference.units.horizontal)
-    write_layers(
-        request.output, layers, wkt, {"patches": patch_style(found.patches.errors), "tiles": tile_style()}
-    )
+    write_layers(request.output, layers, wkt, styles(found.patches.errors))
     if request.json:
         write_whole(request.json, (json.dumps(found.to_dict(), indent=1) + "\n").encode())
     if request.html:
@@ -284,33 +259,30 @@ def _minutes(found: Review) -> list[tuple[float, float]]:
 def review_layers(found: Review, across: float = 1.0) -> dict[str, Layer]:
     """Layers ``patches``, best first, and ``tiles``; coordinates in units of `across` meters."""
     shapely = vector("shapely")
-    patches, n = found.patches, found.listed
-    corners = found.cells.corners / across
+    patches, n, corners = found.patches, found.listed, found.cells.corners / across
     boxes = shapely.box(*corners.T)
-    mine = np.flatnonzero(patches.of_cell < n)
-    order = mine[np.argsort(patches.of_cell[mine], kind="stable")]
+    order = np.argsort(patches.of_cell, kind="stable")
     ends = np.searchsorted(patches.of_cell[order], np.arange(n + 1))
     shapes = [shapely.union_all(boxes[order[a:b]]) for a, b in pairwise(ends)]
-    rows = [found.row(k) for k in range(n)]
     columns = {
-        "rank": np.arange(1, n + 1),
-        "expected": np.round(patches.errors[:n], 1),
-        "points": patches.points[:n],
-        "area": patches.area[:n],
-        "seconds": np.round(60.0 * patches.minutes[:n], 1),
-        "per_minute": np.round(patches.errors[:n] / patches.minutes[:n], 1),
-        "reason": np.array([row["reason"] for row in rows], object),
-        "tile": np.array([row["tile"] for row in rows], object),
-        "done": np.zeros(n, np.int32),
+        name: np.array([row[name] for row in found.rows], kind)
+        for name, kind in (
+            ("rank", int),
+            ("expected", float),
+            ("points", int),
+            ("area", float),
+            ("seconds", float),
+        )
     }
-    whole = Layer([_many(shape) for shape in shapes], "MultiPolygon", columns)
+    columns["per_minute"] = np.round(patches.errors[:n] / patches.minutes[:n], 1)
+    columns |= {name: np.array([row[name] for row in found.rows], object) for name in ("reason", "tile")}
+    columns["done"] = np.zeros(n, np.int32)
+    number = {Path(name).name: k for k, name in reversed(list(enumerate(found.files)))}
     outlines, kept = [], []
     for row in found.tiles:
-        number = next(k for k, name in enumerate(found.files) if Path(name).name == row["tile"])
-        at = found.cells.place[:, 0] == number
+        at = found.cells.place[:, 0] == number[row["tile"]]
         if at.any():
-            low, high = corners[at, :2].min(axis=0), corners[at, 2:].max(axis=0)
-            outlines.append(_many(shapely.box(*low, *high)))
+            outlines.append(shapely.box(*corners[at, :2].min(axis=0), *corners[at, 2:].max(axis=0)))
             kept.append(row)
     tiles = {
         "tile": np.array([row["tile"] for row in kept], object),
@@ -320,8 +292,8 @@ def review_layers(found: Review, across: float = 1.0) -> dict[str, Layer]:
         "patches": np.array([row["patches"] for row in kept], np.int64),
         "minutes": np.round([row["minutes"] for row in kept], 1),
     }
-    return {"patches": whole, "tiles": Layer(outlines, "MultiPolygon", tiles)}
-
-
-def _many(shape: Any) -> Any:
-    return shape if shape.geom_type == "MultiPolygon" else vector("shapely").MultiPolygon([shape])
+    layers = {"patches": (shapes, columns), "tiles": (outlines, tiles)}
+    return {
+        name: Layer([shapely.MultiPolygon(shapely.get_parts(s)) for s in of], "MultiPolygon", fields)
+        for name, (of, fields) in layers.items()
+    }

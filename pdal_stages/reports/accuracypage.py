@@ -1,7 +1,9 @@
-"""The accuracy report: one self-contained HTML page about a classification and its reference."""
+"""The accuracy report: one self-contained HTML page about a classification and its reference, with maps from above."""
 
 from __future__ import annotations
 
+import base64
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,14 +13,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..accuracy.labels import as_codes, same_length
 from ..accuracy.measures import Accuracy
 from ..accuracy.text import percent
+from ..base.asprs import class_color
+from ..base.errors import StageError
 from ..base.files import write_whole
-from .maps import DrawnScene, MapScene, draw_scene
 from .page import render
+from .raster import paint, shading, surface
+from .views import IGNORED, RIGHT, WRONG, nice_step, png, verdict
 
 #: Files within so many meters share a map, and places that are drawn at most.
 TOGETHER, DRAWN = 1000.0, 12
+#: Most pixels across a map and in all of it, fewest along its longer side.
+MAP_WIDTH, MAP_PIXELS, MAP_LEAST = 820, 800_000, 240
 
 
 @dataclass(frozen=True)
@@ -33,34 +41,22 @@ class Place:
 
 def places(files: Sequence[Place], systems: Sequence[str] = ()) -> list[Place]:
     """Files that lie within :data:`TOGETHER` of one another, in one reference system, joined: a map of each."""
-    left = [k for k, one in enumerate(files) if len(one.xyz)]
-    boxes = {k: (files[k].xyz[:, :2].min(axis=0), files[k].xyz[:, :2].max(axis=0)) for k in left}
+    from scipy.sparse.csgraph import connected_components
+
+    there = [k for k, one in enumerate(files) if len(one.xyz)]
+    if not there:
+        return []
+    low, high = (np.array([how(files[k].xyz[:, :2], axis=0) for k in there]) for how in (np.min, np.max))
+    apart = np.linalg.norm((low[:, None] - high[None]).clip(0) + (low[None] - high[:, None]).clip(0), axis=2)
+    system = np.array([systems[k] if systems else "" for k in there])
+    _, group = connected_components((apart <= TOGETHER) & (system[:, None] == system))
     out = []
-    while left:
-        group, waiting = [left.pop(0)], left
-        for one in group:  # grows
-            near = [k for k in waiting if _together(boxes[one], boxes[k]) and _same(systems, one, k)]
-            group += near
-            waiting = [k for k in waiting if k not in near]
-        left = waiting
-        group.sort()
-        names = [files[k].name for k in group]
-        listed = ", ".join(names[:3]) + f" and {len(names) - 3:,} more" * (len(names) > 3)
-        joined = (
-            np.concatenate([getattr(files[k], side) for k in group])
-            for side in ("xyz", "reference", "predicted")
-        )
-        out.append(Place(listed, *joined))
+    for number in dict.fromkeys(group.tolist()):
+        mine = [files[there[k]] for k in np.flatnonzero(group == number)]
+        listed = ", ".join(one.name for one in mine[:3]) + f" and {len(mine) - 3:,} more" * (len(mine) > 3)
+        sides = ("xyz", "reference", "predicted")
+        out.append(Place(listed, *(np.concatenate([getattr(one, side) for one in mine]) for side in sides)))
     return out
-
-
-def _together(one: Any, other: Any) -> bool:
-    apart = np.maximum(np.maximum(one[0] - other[1], other[0] - one[1]), 0.0)
-    return bool(np.hypot(*apart) <= TOGETHER)
-
-
-def _same(systems: Sequence[str], one: int, other: int) -> bool:
-    return not systems or systems[one] == systems[other]
 
 
 def write_accuracy_report(
@@ -114,13 +110,20 @@ def write_accuracy_report(
     StageError
         Arrays of different lengths, coordinates that are not numbers, or a file that cannot be written.
     """
-    scenes: list[tuple[str, DrawnScene]] = []
-    if xyz is not None or reference is not None or predicted is not None:
-        scene = MapScene.of(accuracy, xyz, reference, predicted)
-        scenes = [("", draw_scene(accuracy, scene, unit))]
+    scenes: list[tuple[str, dict[str, Any]]] = []
+    given = {"xyz": xyz, "reference": reference, "predicted": predicted}
+    if any(values is not None for values in given.values()):
+        if missing := [name for name, values in given.items() if values is None]:
+            raise StageError(
+                "maps need coordinates and both classifications",
+                where="accuracy report",
+                found="no " + " and no ".join(missing),
+                cure="Give 'xyz', 'reference' and 'predicted', or none of them",
+            )
+        scenes = [("", _maps(accuracy, xyz, reference, predicted, unit))]
     for one in places[:DRAWN]:
-        scene = MapScene.of(accuracy, one.xyz, one.reference, one.predicted)
-        scenes.append((one.name if len(places) > 1 else "", draw_scene(accuracy, scene, unit)))
+        drawn = _maps(accuracy, one.xyz, one.reference, one.predicted, unit)
+        scenes.append((one.name if len(places) > 1 else "", drawn))
     ordered = sorted((importances or {}).items(), key=lambda item: (-item[1], item[0]))
     page = render(
         "accuracy.html",
@@ -136,6 +139,71 @@ def write_accuracy_report(
         settings=settings,
     )
     return write_whole(path, page.encode())
+
+
+def _maps(a: Accuracy, xyz: Any, reference: Any, predicted: Any, unit: str) -> dict[str, Any]:
+    """Maps of reference, prediction and errors for the template; none where the points lie on one spot or in a line."""
+    points = np.asarray(xyz, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise StageError("'xyz' must be n x 3", where="accuracy report", found=f"shape {points.shape}")
+    if not len(points):
+        raise StageError("there is nothing to draw", where="accuracy report", found="0 points")
+    if bad := int((~np.isfinite(points).all(axis=1)).sum()):
+        what = f"{bad:,} of {len(points):,} points have coordinates that are not finite"
+        raise StageError(what, where="accuracy report")
+    to = np.arange(1 << 16)
+    to[list(a.merged)] = list(a.merged.values())
+    true, given = as_codes(reference, "reference"), as_codes(predicted, "prediction")
+    same_length(true, {"prediction": given, "list of coordinates": points})
+    compared = np.isin(to[true], a.classes) & ~np.isin(true, list(a.left_out))
+    true, given = to[true], to[given]
+    wrong = compared & (true != given)
+    across, up = np.ptp(points[:, :2], axis=0)
+    n = int(compared.sum())
+    out: dict[str, Any] = {"points": len(points), "compared": n, "maps": []}
+    if min(across, up) < 0.02 * max(across, up) or max(across, up) == 0:
+        return out
+    x, y, z = points.T
+    # Three pixels to the distance of neighboring points, within the limits; see `surface` for what is tall.
+    width = min(
+        max(3 * across / math.sqrt(across * up / len(points)), MAP_LEAST * min(1.0, across / up)), MAP_WIDTH
+    )
+    width = max(16, min(width, math.sqrt(MAP_PIXELS * across / up)))
+    s = surface(x, y, z, math.ceil(max(width, width * up / across / 2.5)))
+    light, (tall, wide) = shading(s), s.which.shape
+    length = nice_step(wide * s.pixel / 6)
+
+    def picture(colors: npt.NDArray[np.uint8], heading: str, alt: str) -> dict[str, Any]:
+        data = base64.b64encode(png(paint(s, colors, light))).decode("ascii")
+        scale = (100 * length / (wide * s.pixel), f"{length:g} {unit}")
+        return {"heading": heading, "alt": alt, "base64": data, "wide": wide, "tall": tall, "scale": scale}
+
+    def classes(codes: npt.NDArray[Any], heading: str, word: str) -> dict[str, Any]:
+        count = np.bincount(codes)
+        found = sorted(np.flatnonzero(count), key=lambda c: -count[c])[:8]
+        listed = ", ".join(f"{a.name(int(c))} {percent(count[c] / len(codes), 1)} %" for c in found)
+        colors = palette[np.searchsorted(there, s.spread(codes, there[0]))]
+        return picture(
+            colors, heading, f"Map of the {word} classes from above, by number of points: {listed}"
+        )
+
+    alt = f"Map of the errors from above: {wrong.sum():,} of {n:,} compared points are wrong"
+    there = np.union1d(true, given).tolist()
+    palette = np.array([class_color(code) for code in there], np.uint8)
+    return {
+        **out,
+        "caption": f"{len(points):,} points, {wide * s.pixel:,.0f} x {tall * s.pixel:,.0f} {unit}, north up; lower left "
+        f"corner: x {s.x0:.0f}, y {s.y0:.0f}. Each pixel of {s.pixel:.2g} {unit} shows its highest point; on the map of "
+        "errors a wrong point lies above right ones.",
+        "classes": [(class_color(code), f"{code} {a.name(code)}") for code in there],
+        "verdicts": [(RIGHT, "right"), (WRONG, "wrong"), (IGNORED, "not compared")][: 2 + (n < len(points))],
+        "maps": [
+            classes(true, "Reference", "reference"),
+            classes(given, "Prediction", "predicted"),
+            picture(verdict(s, x, y, z, wrong, ~compared), "Errors", alt),
+        ],
+        "in_a_row": wide < 1.7 * tall,
+    }
 
 
 def _matrix_width(a: Accuracy) -> int:
@@ -161,19 +229,11 @@ def _confidence(a: Accuracy) -> list[dict[str, Any]]:
         titles = ["Reliability %", "Points", "Right %"]
         out.append({"heading": "Reliability", "caption": caption, "titles": titles, "rows": rows})
     if (g := a.margin) is not None and g.points:
-        groups = g.quantiles()
-        caption = "Share of wrong points by the winning probability minus the second."
-        wrong = sum(d["points"] - d["right"] for d in groups)
-        if wrong:
-            caught = groups[0]["points"] - groups[0]["right"]
-            caption += (
-                f" The {percent(groups[0]['points'] / g.points, 0)} % of points with the least margin hold "
-                f"{percent(caught / wrong, 0)} % of the errors."
-            )
         rows = [
             (f"{100 * d['lower']:.1f} to {100 * d['upper']:.1f}", d["points"], d["share_wrong"])
-            for d in groups
+            for d in g.quantiles()
         ]
+        caption = "Share of wrong points by the winning probability minus the second."
         titles = ["Margin %", "Points", "Wrong %"]
         out.append({"heading": "Errors against margin", "caption": caption, "titles": titles, "rows": rows})
     return out

@@ -1,26 +1,27 @@
-"""The page of ``review``: what is expected wrong, tile by tile, and the worst patches."""
+"""What ``review`` shows people: its page, the same in a few lines of text, and QGIS styles of its layers."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..base.plain import one_line
 from .page import duration, render
 
-#: Tiles and patches in the page's tables, and in text.
-_TILES, _PATCHES, _WORST = 200, 200, 10
+#: Rows in the page's tables, and in text.
+_ROWS, _WORST = 200, 10
+#: Fill of patches, from those with least to expect to those with most; of those looked at.
+_INKS = ("255,237,160,110", "254,178,76,150", "240,59,32,170", "165,0,38,190")
+_LOOKED_AT = "120,170,120,90"
 
 
 def review_page(found: Mapping[str, Any], minutes: Sequence[tuple[float, float]] = ()) -> str:
-    """The page.
+    """The page of what ``Review.to_dict`` gives.
 
-    Parameters
-    ----------
-    found : mapping
-        What ``Review.to_dict`` gives.
-    minutes : sequence of (float, float)
-        Shares of the expected errors, and minutes of looking at the patches that hold them.
+    `minutes` are shares of the expected errors, and minutes of looking at the patches that hold them.
     """
     points, expected = found["points"], found["expected"]
     figures = [
@@ -37,9 +38,9 @@ def review_page(found: Mapping[str, Any], minutes: Sequence[tuple[float, float]]
         title="Where to look",
         subtitle=f"{len(found['tiles']):,} file{'s' * (len(found['tiles']) > 1)}",
         figures=figures,
-        tiles=found["tiles"][:_TILES],
-        hidden=max(0, len(found["tiles"]) - _TILES),
-        patches=found["worst"][:_PATCHES],
+        tiles=found["tiles"][:_ROWS],
+        hidden=max(0, len(found["tiles"]) - _ROWS),
+        patches=found["worst"][:_ROWS],
     )
 
 
@@ -67,3 +68,39 @@ def lines(found: Mapping[str, Any]) -> list[str]:
             f"{one_line(row['tile'])} at {x:.0f}, {y:.0f}"
         )
     return out
+
+
+def styles(errors: NDArray[np.float64]) -> dict[str, str]:
+    """Of layer ``patches`` in four steps of the points expected wrong, green where ``done`` is 1; of ``tiles`` outlines."""
+    positive = errors[errors > 0]
+    steps = np.quantile(positive, [0.5, 0.8, 0.95]) if len(positive) else np.array([1.0, 2.0, 3.0])
+    low, middle, high = (f"{value:.0f}" for value in steps)
+    rules = {
+        f"below {low} points expected wrong": f"done = 0 and expected &lt; {low}",
+        f"{low} to {middle}": f"done = 0 and expected >= {low} and expected &lt; {middle}",
+        f"{middle} to {high}": f"done = 0 and expected >= {middle} and expected &lt; {high}",
+        f"{high} and more": f"done = 0 and expected >= {high}",
+        "looked at": "done = 1",
+    }
+    listed = "".join(
+        f'<rule key="{{{n}}}" symbol="{n}" label="{label}" filter="{rule}"/>'
+        for n, (label, rule) in enumerate(rules.items())
+    )
+    symbols = "".join(_symbol(n, ink, "80,40,20,255", 0.3) for n, ink in enumerate((*_INKS, _LOOKED_AT)))
+    patches = f'type="RuleRenderer"><rules key="{{root}}">{listed}</rules><symbols>{symbols}</symbols>'
+    outline = _symbol(0, "0,0,0,0", "60,60,60,255", 0.5)
+    renderers = {"patches": patches, "tiles": f'type="singleSymbol"><symbols>{outline}</symbols>'}
+    return {
+        layer: "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
+        f'<qgis version="3.22" styleCategories="Symbology"><renderer-v2 {renderer}</renderer-v2></qgis>\n'
+        for layer, renderer in renderers.items()
+    }
+
+
+def _symbol(number: int, color: str, edge: str, width: float) -> str:
+    options = {"color": color, "outline_color": edge, "outline_width": width}
+    listed = "".join(f'<Option type="QString" name="{k}" value="{v}"/>' for k, v in options.items())
+    return (
+        f'<symbol type="fill" name="{number}" alpha="1"><layer class="SimpleFill" enabled="1" pass="0">'
+        f'<Option type="Map">{listed}</Option></layer></symbol>'
+    )

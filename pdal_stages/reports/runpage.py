@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,10 +15,8 @@ from ..base.asprs import class_name
 from ..base.files import write_whole
 from .page import duration, render
 
-#: Most squares drawn, and most rows of the table of times.
-DRAWN, ROWS = 8_000, 200
-#: States of a tile, the one that a square of several tiles shows first.
-_WORST = ("failed", "waiting", "done", "kept")
+#: Most tiles drawn, and most rows of the table of times.
+DRAWN, ROWS = 20_000, 200
 #: Settings shown, by their names in the report.
 _SETTINGS = {
     "pipeline": "pipeline",
@@ -58,33 +55,19 @@ def run_page(run: Mapping[str, Any], objects: NDArray[np.uint8] | None = None) -
         run=run,
         figures=_figures(run),
         what=_what(run),
-        plan=_plan(*_drawn(run["tiles"], run["tile"])),
+        plan=_plan(run["tiles"], run["tile"]),
         classes=[(int(code), class_name(int(code)), count) for code, count in classes.items()],
         slowest=[(t, _corner(t["tile"], run["tile"])) for t in done[:ROWS]],
         done=len(done),
-        objects=_objects(run.get("objects") or {}),
+        objects={k: one for k, one in (run.get("objects") or {}).items() if k != "files" and one["objects"]},
         object_map=None if objects is None else _embedded(objects),
     )
 
 
-def _objects(objects: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Of each kind that was found: how many, how many are to be checked, and why."""
-    kinds = [(kind, one) for kind, one in objects.items() if kind != "files" and one["objects"]]
-    return [
-        {
-            "kind": kind,
-            "found": one["objects"],
-            "check": one["to_be_checked"],
-            "reasons": ", ".join(f"{reason} {count:,}" for reason, count in one["reasons"].items()),
-        }
-        for kind, one in kinds
-    ]
-
-
 def _embedded(picture: NDArray[np.uint8]) -> dict[str, Any]:
-    from .pictures import png
+    from .views import png
 
-    data = base64.b64encode(png(picture, palette=True)).decode("ascii")
+    data = base64.b64encode(png(picture)).decode("ascii")
     return {"base64": data, "tall": picture.shape[0], "wide": picture.shape[1]}
 
 
@@ -125,34 +108,9 @@ def _corner(tile: Sequence[int], side: float, right: int = 0, up: int = 0) -> st
     return f"{(tile[0] + right) * side:.10g}, {(tile[1] + up) * side:.10g}"
 
 
-def _drawn(tiles: Sequence[Mapping[str, Any]], side: float) -> tuple[Sequence[Mapping[str, Any]], float]:
-    """What the map shows as squares of a side: tiles, or where there are too many, several of them as one."""
-    if len(tiles) <= DRAWN:
-        return tiles, side
-    together = math.ceil(math.sqrt(len(tiles) / DRAWN))
-    groups: dict[tuple[int, int], list[Mapping[str, Any]]] = {}
-    for t in tiles:
-        groups.setdefault((t["tile"][0] // together, t["tile"][1] // together), []).append(t)
-    squares = []
-    for place, group in groups.items():
-        state = next(s for s in (*_WORST, group[0]["state"]) if any(t["state"] == s for t in group))
-        failed = [t for t in group if t["state"] == "failed"]
-        squares.append(
-            {
-                "name": f"{len(group)} tiles",
-                "tile": place,
-                "state": state,
-                "points": sum(t["points"] for t in group),
-                "seconds": sum(t.get("seconds", 0.0) for t in group),
-                **({"reason": f"{len(failed)} failed: {failed[0].get('reason', '')}"} if failed else {}),
-            }
-        )
-    return squares, side * together
-
-
 def _plan(tiles: Sequence[Mapping[str, Any]], side: float) -> dict[str, Any] | None:
-    """Every tile as a square: darker took longer."""
-    if not tiles:
+    """Every tile as a square, the darker the longer it took; none where there are too many for a page."""
+    if not 0 < len(tiles) <= DRAWN:
         return None
     columns, rows = zip(*(t["tile"] for t in tiles), strict=True)
     left, low, right, top = min(columns), min(rows), max(columns), max(rows)

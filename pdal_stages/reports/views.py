@@ -1,23 +1,28 @@
-"""Views of a cloud: from above by class, height, value or error, and in section."""
+"""Pictures of a cloud from above, by class, height, value or error, and PNG files of them."""
 
 from __future__ import annotations
 
+import io
 import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 from scipy import ndimage
 
-from ..base.asprs import class_color
+from ..base.asprs import class_color, class_name
 from ..base.errors import StageError
-from .pictures import font
-from .raster import BACKGROUND, Frame, Surface, paint, shading, surface
+from ..base.files import write_whole
+from .raster import BACKGROUND, Surface, paint, shading, surface
 
-INK, FAINT, GRIDLINE = (34, 38, 44), (110, 114, 120), (226, 226, 222)
+INK = (34, 38, 44)
 RIGHT, WRONG, IGNORED = (196, 196, 192), (204, 24, 32), (232, 232, 228)
-
-# Color ramps, as a few anchors: heights like a tinted map; values dark to bright with even lightness.
+#: The color of each class code, (256, 3) uint8.
+CLASS_COLORS = np.array([class_color(code) for code in range(256)], dtype=np.uint8)
+#: Color ramps, as a few anchors: heights like a tinted map; values dark to bright with even lightness.
 _RAMPS = {
     "height": (
         (38, 84, 106),
@@ -30,64 +35,68 @@ _RAMPS = {
     ),
     "value": ((68, 1, 84), (65, 68, 135), (42, 120, 142), (34, 168, 132), (122, 209, 81), (253, 231, 37)),
 }
+_GAP = 12
 
 
-def ramp(values: np.ndarray, low: float, high: float, name: str = "value") -> np.ndarray:
-    """Colors, (..., 3) uint8, of values between `low` and `high`; NaN becomes mid gray."""
-    if name not in _RAMPS:
-        raise StageError(
-            "unknown color ramp", where="picture", found=name, cure=f"Use one of {', '.join(_RAMPS)}"
-        )
-    anchors = np.array(_RAMPS[name], dtype=float)
-    share = (np.asarray(values, dtype=float) - low) / max(high - low, 1e-12) * (len(anchors) - 1)
-    good = np.isfinite(share)
-    share = np.clip(np.where(good, share, 0.0), 0, len(anchors) - 1)
+def png(rgb: npt.NDArray[np.uint8]) -> bytes:
+    """A (height, width, 3) uint8 image as a PNG file of at most 256 colors; the same image gives the same bytes.
+
+    Class maps are few colors in many shades, so channels in steps of 4 to 16 levels do, and a rare class keeps its color.
+    """
+    image = Image.fromarray(np.ascontiguousarray(rgb))
+    for step in (1, 4, 8, 12, 16, 24, 32, 48, 64):  # 64: at most 5 x 5 x 5 colors
+        rounded = np.minimum((rgb.astype(np.uint16) + step // 2) // step * step, 255)
+        image = Image.fromarray(rounded.astype(np.uint8))
+        if image.getcolors(256):
+            break
+    file = io.BytesIO()
+    image.quantize(256, dither=Image.Dither.NONE).save(file, "PNG")
+    return file.getvalue()
+
+
+def write_png(path: str | os.PathLike[str], rgb: npt.NDArray[np.uint8]) -> Path:
+    """Write an image as a PNG file of all its colors, whole or not at all."""
+    file = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(rgb)).save(file, "PNG")
+    return write_whole(path, file.getvalue(), what="picture")
+
+
+def ramp(values: np.ndarray, limits: tuple[float, float] | None = None, name: str = "value") -> np.ndarray:
+    """Colors, (..., 3) uint8, of values between limits, by default the 1st and 99th percentile; NaN becomes mid gray."""
+    good, anchors = np.isfinite(values), np.array(_RAMPS[name], dtype=float)
+    low, high = limits or (np.percentile(values[good], [1, 99]) if good.any() else (0.0, 1.0))
+    if limits is None and high <= low:
+        high = low + 1.0
+    share = np.where(good, values - low, 0.0) / max(high - low, 1e-12) * (len(anchors) - 1)
     out = np.stack([np.interp(share, np.arange(len(anchors)), anchors[:, c]) for c in range(3)], axis=-1)
     out[~good] = 150
     return np.round(out).astype(np.uint8)
 
 
-#: The color of each class code, (256, 3) uint8.
-CLASS_COLORS = np.array([class_color(code) for code in range(256)], dtype=np.uint8)
-#: Discs of 5 and 21 pixels that a point of a section is drawn as.
-_SMALL_DOT = ndimage.generate_binary_structure(2, 1)
-_DOT = np.hypot(*np.mgrid[-2:3, -2:3]) <= 2.3
+def columns(**arrays: npt.ArrayLike | None) -> list[np.ndarray]:
+    """Arrays of one value per point, all as long as the first and not empty; their names are for messages.
 
-
-def checked_columns(**arrays: npt.ArrayLike) -> list[np.ndarray]:
-    """Arrays of one value per point, all as long as the first and not empty; their names are for messages."""
-    out = [np.asarray(a) for a in arrays.values()]
-    size = out[0].shape
-    for a, name in zip(out, arrays, strict=True):
+    ``classes``, ``predicted`` and ``truth`` are codes from 0 to 255, and become (n,) uint8.
+    """
+    given = {name: np.asarray(a) for name, a in arrays.items() if a is not None}
+    first, size = next((name, a.shape) for name, a in given.items())
+    for name, a in given.items():
         if a.ndim != 1 or a.shape != size:
-            found = f"shape {a.shape}, '{next(iter(arrays))}' has {size}"
+            found = f"shape {a.shape}, '{first}' has {size}"
             raise StageError(f"'{name}' must be one value per point", where="picture", found=found)
-    if not size[0]:
-        raise StageError(
-            "there is nothing to draw: the cloud is empty",
-            where="picture",
-            found="0 points",
-            cure="Check that the pipeline before the picture leaves points",
-        )
-    return out
-
-
-def class_codes(classes: np.ndarray) -> np.ndarray:
-    """Codes from 0 to 255 as (n,) uint8, or an error."""
-    if classes.dtype.kind not in "iub" or (classes.size and (classes.min() < 0 or classes.max() > 255)):
-        raise StageError(
-            "classes must be whole numbers from 0 to 255",
-            where="picture",
-            found=f"{classes.dtype} {classes.min()}..{classes.max()}",
-        )
-    return classes.astype(np.uint8)
-
-
-def window(x: np.ndarray, y: np.ndarray, z: np.ndarray, width: int) -> Surface:
-    """The surface of all points, `width` pixels wide."""
-    if not 16 <= int(width) <= 20_000:
-        raise StageError("'width' must be from 16 to 20000 pixels", where="picture", found=width)
-    return surface(x, y, z, Frame.around(x, y, int(width)))
+        if not len(a):
+            raise StageError(
+                "there is nothing to draw: the cloud is empty",
+                where="picture",
+                found="0 points",
+                cure="Check that the pipeline before the picture leaves points",
+            )
+        if name in ("classes", "predicted", "truth"):
+            if a.dtype.kind not in "iub" or a.min() < 0 or a.max() > 255:
+                found = f"{a.dtype} {a.min()}..{a.max()}"
+                raise StageError("classes must be whole numbers from 0 to 255", where="picture", found=found)
+            given[name] = a.astype(np.uint8)
+    return list(given.values())
 
 
 def top_view(
@@ -123,154 +132,104 @@ def top_view(
     StageError
         If the cloud is empty, or arrays do not fit together.
     """
-    if classes is not None and values is not None:
-        raise StageError("give 'classes' or 'values', not both", where="picture")
-    given = {"x": x, "y": y, "z": z, "classes": classes, "values": values}
-    x, y, z, *by = checked_columns(**{name: array for name, array in given.items() if array is not None})
-    s = window(x, y, z, width)
+    x, y, z, *by = columns(x=x, y=y, z=z, classes=classes, values=values)
+    s = surface(x, y, z, width)
     if classes is not None:
-        shown = CLASS_COLORS[s.spread(class_codes(by[0]), 0)]
+        shown = CLASS_COLORS[s.spread(by[0], 0)]
     elif values is not None:
-        numbers = by[0].astype(np.float64)
-        shown = ramp(s.spread(numbers, np.nan), *(limits or span(numbers)), "value")
+        shown = ramp(s.spread(by[0].astype(np.float64), np.nan), limits)
     else:
-        shown = ramp(s.z, *(limits or span(s.z)), "height")
+        shown = ramp(s.z, limits, "height")
     return paint(s, shown, shading(s))
-
-
-def span(values: np.ndarray) -> tuple[float, float]:
-    """The 1st and 99th percentile of the finite values: what a ramp shows."""
-    finite = values[np.isfinite(values)]
-    if not finite.size:
-        return 0.0, 1.0
-    low, high = np.percentile(finite, [1, 99])
-    return float(low), float(high if high > low else low + 1.0)
-
-
-def error_view(
-    x: npt.ArrayLike,
-    y: npt.ArrayLike,
-    z: npt.ArrayLike,
-    wrong: npt.ArrayLike,
-    left_out: npt.ArrayLike,
-    *,
-    width: int = 900,
-) -> np.ndarray:
-    """The cloud from above: gray where points are right, red where they are `wrong`, pale where they are `left_out`.
-
-    A wrong point is drawn over right ones of the same pixel, so that no error hides under a roof or a crown. Arrays are as
-    for :func:`top_view`.
-    """
-    x, y, z, wrong, left_out = checked_columns(x=x, y=y, z=z, wrong=wrong, left_out=left_out)
-    s = window(x, y, z, width)
-    return paint(s, verdict(s, x, y, z, wrong, left_out), shading(s))
 
 
 def verdict(
     s: Surface, x: np.ndarray, y: np.ndarray, z: np.ndarray, wrong: np.ndarray, left_out: np.ndarray
 ) -> np.ndarray:
-    """Colors of the pixels of a surface, (height, width, 3) uint8: right, wrong or left out."""
+    """Colors of the pixels of a surface, (height, width, 3) uint8: right, wrong or left out.
+
+    A wrong point is drawn over right ones of the same pixel, so that no error hides under a roof or a crown.
+    """
     kinds = s.spread(np.where(left_out, 2, wrong).astype(np.int64), 0)
     shown = np.array([RIGHT, WRONG, IGNORED], dtype=np.uint8)[kinds]
-    if wrong.any():
-        f = s.frame
-        good = wrong & np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
-        i = np.minimum(((x[good] - f.x0) / f.pixel).astype(np.int64), f.width - 1)
-        j = np.minimum(((y[good] - f.y0) / f.pixel).astype(np.int64), f.height - 1)
-        mask = np.zeros((f.height, f.width), dtype=bool)
-        mask[f.height - 1 - j, i] = True
-        grow = min(int(0.4 * s.spacing), 5)  # about as large as a point's share of the surface
-        shown[ndimage.binary_dilation(mask, iterations=grow) if grow else mask] = WRONG
+    good = wrong & np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
+    mask = np.zeros(s.which.shape, bool)
+    mask[s.cells(x[good], y[good])] = True
+    grow = min(int(0.4 * s.spacing), 5)  # about as large as a point's share of the surface
+    shown[ndimage.binary_dilation(mask, iterations=grow) if grow else mask] = WRONG
     return shown
 
 
-def section_view(
+def triptych(
     x: npt.ArrayLike,
     y: npt.ArrayLike,
     z: npt.ArrayLike,
-    classes: npt.ArrayLike | None = None,
+    predicted: npt.ArrayLike,
+    truth: npt.ArrayLike | None = None,
     *,
-    start: tuple[float, float] | None = None,
-    end: tuple[float, float] | None = None,
-    thickness: float = 3.0,
-    width: int = 1400,
+    width: int = 1500,
 ) -> np.ndarray:
-    """A vertical slice through the cloud, with a scale.
+    """Heights, classes and errors side by side, with captions, a scale and a legend.
 
     Parameters
     ----------
     x, y, z : (n,) float
-    classes : (n,) integer, optional
-        Colors; heights where not given.
-    start, end : (x, y), optional
-        Ends of the section line; west to east through the middle where not given.
-    thickness : float
-        Depth of the slice in the cloud's unit, half on each side of the line.
+    predicted : (n,) integer
+    truth : (n,) integer, optional
+        Reference classes; without them there is no panel of errors.
     width : int
-        Pixels across.
+        Pixels across all panels.
+
+    Returns
+    -------
+    (height, width, 3) uint8
     """
-    x, y, z = checked_columns(x=x, y=y, z=z)
-    frame = Frame.around(x, y, 1000)
-    middle = frame.y0 + 0.5 * frame.pixel * frame.height
-    start = (frame.x0, middle) if start is None else start
-    end = (frame.x0 + frame.pixel * frame.width, middle) if end is None else end
-    run = (end[0] - start[0], end[1] - start[1])
-    length = math.hypot(*run)
-    if not (length > 0 and thickness > 0):
-        raise StageError(
-            "a section needs two different ends and a thickness above 0",
-            where="section_view",
-            found=(start, end, thickness),
+    x, y, z, predicted, *true = columns(x=x, y=y, z=z, predicted=predicted, truth=truth)
+    panels = 2 + len(true)
+    each = (int(width) - _GAP * (panels + 1)) // panels
+    s = surface(x, y, z, each)
+    shown = {
+        "Heights (shaded)": ramp(s.z, name="height"),
+        "Predicted classes": CLASS_COLORS[s.spread(predicted, 0)],
+    }
+    entries = [(f"{c} {class_name(c)}", class_color(c)) for c in np.unique(predicted).tolist()]
+    for known in true:
+        wrong = predicted != known
+        title = f"Errors: {100 * wrong.mean():.1f} % of {len(x):,} points"
+        shown[title] = verdict(s, x, y, z, wrong, np.zeros_like(wrong))
+        entries += [("right", RIGHT), ("wrong", WRONG)]
+
+    font, light, top = ImageFont.load_default(16), shading(s), 36  # Pillow's own: alike on every machine
+    below = top + s.which.shape[0]
+    legend, high = _legend(entries, int(width), font)
+    sheet = Image.new("RGB", (int(width), below + 36 + high), BACKGROUND)
+    pen = ImageDraw.Draw(sheet)
+    for n, (text, colors) in enumerate(shown.items()):
+        left = _GAP + n * (each + _GAP)
+        pen.text((left + 2, top - 14), text, INK, font, anchor="lm")
+        sheet.paste(Image.fromarray(paint(s, colors, light)), (left, top))
+    length = nice_step(0.2 * each * s.pixel)
+    long = max(2, round(length / s.pixel))
+    pen.rectangle((_GAP + 2, below + 15, _GAP + 1 + long, below + 19), fill=INK)
+    pen.text((_GAP + long + 10, below + 17), f"{length:g} m", INK, font, anchor="lm")
+    for left, down, text, color in legend:
+        pen.rectangle(
+            (left, below + 36 + down, left + 17, below + 53 + down), fill=color, outline=(90, 90, 90)
         )
-    s = ((x - start[0]) * run[0] + (y - start[1]) * run[1]) / length
-    off = ((y - start[1]) * run[0] - (x - start[0]) * run[1]) / length
-    keep = np.flatnonzero((s >= 0) & (s <= length) & (np.abs(off) <= thickness / 2) & np.isfinite(z))
-    if not keep.size:
-        raise StageError(
-            "the section holds no points",
-            where="section_view",
-            found=f"{start} to {end}",
-            cure="Move it into the cloud, or give a larger 'thickness'",
-        )
-    keep = keep[np.argsort(off[keep], kind="stable")[::-1]]  # far ones first
-    low, high = float(z[keep].min()), float(z[keep].max())
-    left, bottom, above = 64, 46, 16
-    scale = (width - left - 16) / length
-    tall = max(24, math.ceil((high - low) * scale) + 8)
-    if tall > 4 * width:
-        raise StageError(
-            "the section is much higher than wide",
-            where="section_view",
-            found=f"{length:g} long, {high - low:g} high",
-            cure="Give a longer line, or remove points far from the rest",
-        )
-    base = above + tall - 4
-    canvas = Image.new("RGB", (width, tall + bottom + above), BACKGROUND)
-    pen = ImageDraw.Draw(canvas)
-    step = nice_step(length / 8)
-    for n in range(int(length / step) + 1):
-        at = left + round(n * step * scale)
-        pen.line((at, above, at, above + tall), GRIDLINE)
-        pen.text((at, above + tall + 8), f"{n * step:g}", FAINT, font(), anchor="ma")
-    step = nice_step(max((high - low) / 5, 1e-6))
-    for n in range(math.ceil(low / step), math.floor(high / step) + 1):
-        at = base - round((n * step - low) * scale)
-        pen.line((left, at, width - 16, at), GRIDLINE)
-        pen.text((left - 8, at), f"{n * step:g}", FAINT, font(), anchor="rm")
-    if classes is not None:
-        color = CLASS_COLORS[class_codes(np.asarray(classes))[keep]]
-    else:
-        color = ramp(z[keep], low, high, "height")
-    # The nearest point of each pixel, then the nearest of each disc around a pixel.
-    nearest = np.full((canvas.height, canvas.width), -1)
-    column = left + np.round(s[keep] * scale).astype(np.int64)
-    row = base - np.round((z[keep] - low) * scale).astype(np.int64)
-    nearest[row, column] = np.arange(keep.size)
-    spacing = math.sqrt(length * (high - low + 1) / keep.size) * scale
-    nearest = ndimage.maximum_filter(nearest, footprint=_SMALL_DOT if spacing < 5 else _DOT)
-    out = np.array(canvas)
-    out[nearest >= 0] = color[nearest[nearest >= 0]]
-    return out
+        pen.text((left + 26, below + 45 + down), text, INK, font, anchor="lm")
+    return np.array(sheet)
+
+
+def _legend(entries: Sequence[tuple[str, tuple[int, int, int]]], width: int, font) -> tuple[list, int]:
+    """Where the color patches with their texts stand in lines of some width (left, down, text, color); their height."""
+    spots, left, down = [], 16, 6
+    for text, color in entries:
+        need = 48 + round(font.getlength(text))
+        if left + need > width and left > 16:
+            left, down = 16, down + 28
+        spots.append((left, down, text, color))
+        left += need
+    return spots, down + 30
 
 
 def nice_step(rough: float) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 
 import numpy as np
@@ -14,10 +14,13 @@ from ..base.errors import OptionError, suggest
 from ..base.progress import Progress
 from ..base.threads import map_blocks
 from .districts import fill
-from .flight import Flight
-from .raycast import cast
-from .solids import VEGETATION, build_scene
+from .solids import VEGETATION, build_scene, cast
 from .townplan import block_at, heights, plan_town
+
+SPEED = 60.0  # meters a second
+TURN = 240.0  # seconds from the end of a strip to the start of the next
+GPS_START = 270_000_000.0  # adjusted standard GPS time: April 2020
+BESIDE = 25.0  # meters beyond the square that are flown as well: what stands outside throws shadows into it
 
 PULSES_PER_CHUNK = 60_000
 SAMPLE = 20_000  # pulses that tell how many returns a pulse gives
@@ -25,29 +28,31 @@ SIDEWAYS = 45.0  # meters a beam may travel between the highest thing and the lo
 SPAN = 65.0  # meters a thing may stand out of its block: the wires to the next
 
 
-def _option(default, what: str, low=None, high=None):
-    return dataclasses.field(default=default, metadata={"low": low, "high": high, "what": what})
+#: Bounds of the options that have any.
+LIMITS = {
+    "size": (20, 20_000), "density": (0.05, 500), "seed": (0, 2**31 - 1), "altitude": (150, 4_000),
+    "scan_angle": (3, 35), "overlap": (0, 0.8), "noise": (0, 0.5),
+}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
 class TownOptions:
     """How to make a town; wrong values raise an OptionError."""
 
-    size: float = _option(200.0, "side of the square, meters", 20, 20_000)
-    density: float = _option(7.0, "returns per square meter, met within a few per cent", 0.05, 500)
-    seed: int = _option(1, "another number, another town", 0, 2**31 - 1)
-    altitude: float = _option(350.0, "flying height, meters", 150, 4_000)
-    scan_angle: float = _option(25.0, "half opening of the scanner, degrees", 3, 35)
-    overlap: float = _option(0.3, "share of a swath seen twice", 0, 0.8)
-    noise: float = _option(0.02, "standard deviation of a range, meters", 0, 0.5)
-    origin: tuple = _option((500_000.0, 5_400_000.0, 60.0), "x, y of the low corner; height of the quays")
-    srs: str = _option("EPSG:25832", "of files: EPSG:25828 to EPSG:25838, or none")
+    size: float = 200.0  #: side of the square, meters
+    density: float = 7.0  #: returns per square meter, met within a few per cent
+    seed: int = 1  #: another number, another town
+    altitude: float = 350.0  #: flying height, meters
+    scan_angle: float = 25.0  #: half opening of the scanner, degrees
+    overlap: float = 0.3  #: share of a swath seen twice
+    noise: float = 0.02  #: standard deviation of a range, meters
+    origin: tuple = (500_000.0, 5_400_000.0, 60.0)  #: x, y of the low corner; height of the quays
+    srs: str = "EPSG:25832"  #: of files: EPSG:25828 to EPSG:25838, or none
 
     def __post_init__(self) -> None:
-        for option in dataclasses.fields(self)[:-2]:
-            check = checks.whole if option.name == "seed" else checks.number
-            limits = option.metadata["low"], option.metadata["high"]
-            check(f"'{option.name}'", getattr(self, option.name), *limits)
+        for name, limits in LIMITS.items():
+            check: Callable = checks.whole if name == "seed" else checks.number
+            check(f"'{name}'", getattr(self, name), *limits)
         if np.shape(self.origin) != (3,):
             raise OptionError("'origin' must be three numbers: x, y, z", found=self.origin)
         for value in self.origin:
@@ -81,6 +86,57 @@ class Town:
         plan = plan_town(int(self.options.seed))
         local = np.column_stack([x, y]) - self.options.origin[:2] - self.options.size / 2
         return heights(local @ plan.turn, plan) + self.options.origin[2]
+
+
+class Flight:
+    """Pulses over a square of `size` meters, `spacing` meters apart below the sensor."""
+
+    def __init__(self, options, size: float, spacing: float) -> None:
+        self.size, self.altitude, self.spacing = size, options.altitude, spacing
+        rng, half = np.random.default_rng([int(options.seed), 0xF117]), math.radians(options.scan_angle)
+        self.heading = math.radians(rng.uniform(70, 110))  # from east
+        swath = 2.0 * self.altitude * math.tan(half)
+        self.reach = 0.5 * size * (abs(math.cos(self.heading)) + abs(math.sin(self.heading))) + BESIDE
+        apart = swath * (1.0 - options.overlap)
+        # At least two strips, so that every town is seen from two sides.
+        self.strips = max(2, math.ceil((2 * self.reach - swath * options.overlap) / apart))
+        self.across = (np.arange(self.strips) - 0.5 * (self.strips - 1)) * apart
+        self.lines = math.ceil(2 * self.reach / spacing)
+        self.per_line = math.ceil(2 * half * self.altitude / spacing)
+        # A turning polygon: every line runs from right to left.
+        self.angles = half - (np.arange(self.per_line) + 0.5) * (2 * half / self.per_line)
+
+    def parts(self, pulses: int) -> list[tuple[int, int, int]]:
+        """The flight in order of time: strip, first line, line after the last, with about so many pulses each."""
+        step = max(1, int(pulses / min(self.per_line, 2 * self.reach / self.spacing)))
+        firsts = range(0, self.lines, step)
+        return [(strip, n, min(n + step, self.lines)) for strip in range(self.strips) for n in firsts]
+
+    def aimed(self, part: int) -> int:
+        """How many of all pulses, made so many at a time, would meet level ground inside the square."""
+        return sum((np.abs(self.pulses(*p)[2]) < self.size / 2).all(axis=1).sum() for p in self.parts(part))
+
+    def pulses(self, strip: int, first: int, last: int) -> list[np.ndarray]:
+        """The pulses of some scan lines of a strip that come near the square, in order of time.
+
+        Origin (n, 3) in meters from the middle of the square at its mean height, unit direction (n, 3), place (n, 2)
+        where the beam would meet level ground, GPS time in seconds, scan angle in degrees (right of the flight: positive).
+        """
+        forward = 1.0 - 2.0 * (strip % 2)
+        left = self.across[strip] - forward * self.altitude * np.tan(self.angles)
+        step = np.flatnonzero(np.abs(left) < self.reach + 5.0)
+        line, step = np.repeat(np.arange(first, last), step.size), np.tile(step, last - first)
+        angle, when = self.angles[step], (line + step / self.per_line) * (self.spacing / SPEED)
+        # The aircraft drifts a little to the side, and its nose goes up and down.
+        along = forward * (when * SPEED - self.reach) + 1.4 * np.sin(0.7 * when + 2.0 * strip)
+        side = self.across[strip] + 1.5 * np.sin(0.23 * when + strip)
+        c, s, out = math.cos(self.heading), math.sin(self.heading), -forward * np.sin(angle)
+        origin = np.column_stack([along * c - side * s, along * s + side * c, 0 * along + self.altitude])
+        direction = np.column_stack([-out * s, out * c, -np.cos(angle)])
+        level = origin[:, :2] - self.altitude / direction[:, 2:] * direction[:, :2]
+        near = (np.abs(level) < self.size / 2 + BESIDE).all(axis=1)
+        time = GPS_START + strip * (2 * self.reach / SPEED + TURN) + when
+        return [column[near] for column in (origin, direction, level, time, np.degrees(angle))]
 
 
 class FlownTown:

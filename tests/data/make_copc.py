@@ -1,6 +1,6 @@
 """How town.copc.laz was made: a corner of the generated town as COPC, which neither PDAL 2.2 nor laspy writes.
 
-pdal-stages-town's own options and the package copclib (2.6.3, from PyPI):
+The town's own options and the package copclib (2.6.3, from PyPI):
 
     python tests/data/make_copc.py tests/data/town.copc.laz
 """

@@ -1,8 +1,9 @@
-"""Which batches are trained on, and which ground is held out. No PyTorch here."""
+"""Which batches are trained on and how they are changed, and which ground is held out. No PyTorch here."""
 
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +14,7 @@ import numpy.typing as npt
 from ..base.errors import OptionError
 from ..classifier import crossval
 from .circles import Circles
+from .configuration import NetworkOptions
 
 #: A batch of a cloud: (cloud, circle).
 Batch = tuple[int, int]
@@ -122,3 +124,26 @@ def class_weights(count: npt.NDArray[Any], kind: str) -> npt.NDArray[np.float64]
         return np.ones(len(count))
     weight = 1.0 / np.sqrt(share) if kind == "sqrt" else 1.0 / share
     return weight / (weight * share).sum()
+
+
+#: Fewest points thinning leaves.
+LEAST = 16
+
+
+def augmented(
+    xyz: npt.NDArray[np.float64], options: NetworkOptions, random: np.random.Generator
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+    """A batch turned about z, shaken and thinned: from coordinates (n, 3) around its center to (m, 3), and the rows kept."""
+    kept = np.arange(len(xyz))
+    if options.thin > 0.0:
+        share = 1.0 - random.uniform(0.0, options.thin)
+        kept = np.sort(random.permutation(len(xyz))[: max(min(LEAST, len(xyz)), round(share * len(xyz)))])
+    out = xyz[kept]
+    if options.rotate:
+        angle = random.uniform(0.0, 2.0 * math.pi)
+        c, s = math.cos(angle), math.sin(angle)
+        out = out @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    if options.jitter > 0.0:
+        noise = random.normal(0.0, options.jitter, out.shape)
+        out = out + np.clip(noise, -3.0 * options.jitter, 3.0 * options.jitter)
+    return out, kept

@@ -1,0 +1,491 @@
+"""Training a network: epochs of chosen batches, scored on ground held out, resumable at any epoch."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import pickle
+import platform
+import time
+import zipfile
+from collections.abc import Sequence
+from dataclasses import asdict
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..base import kinds
+from ..base.errors import DependencyError, ModelError, OptionError
+from ..base.files import write_whole
+from ..base.hashing import coordinate_hash
+from ..base.outputs import Output
+from ..base.progress import Progress
+from ..base.threads import map_blocks, resolve_threads
+from ..base.version import __version__
+from ..classifier import crossval
+from ..classifier.classes import ClassMap
+from ..classifier.clouds import TrainingCloud, densities, label_classes
+from ..classifier.dimensions import gather, with_returns
+from ..classifier.model import Model, load_model
+from ..classifier.trainoptions import TrainingOptions
+from ..features.index import check_xyz
+from . import batches
+from .algorithm import AlsNet, make_pyramid, scaled
+from .circles import Circles, density, spacing_for
+from .configuration import NetworkOptions
+from .geometry import stack
+from .weights import Weights, check, fresh
+
+#: Of a checkpoint, a file of PyTorch's own that is read with ``weights_only``: nothing in it is executed.
+FORMAT = "pdal-stages alsnet checkpoint 3"
+
+optional_inputs: dict[str, tuple[str, ...]] = {}
+reports_training = True
+
+
+def outputs(options: TrainingOptions) -> list[Output]:
+    """The checkpoint, if one is wanted."""
+    path = options.alsnet.checkpoint
+    return [Output(path, "checkpoint", kinds.CHECKPOINT)] if path else []
+
+
+def own_options(given: Any) -> NetworkOptions:
+    """The options of the network."""
+    return (
+        given
+        if isinstance(given, NetworkOptions)
+        else NetworkOptions.from_dict({} if given is None else given)
+    )
+
+
+def inputs(options: TrainingOptions) -> tuple[str, ...]:
+    """The network's inputs: coordinates from the batch's center, then dimensions; OptionError where there are none."""
+    names = tuple(dict.fromkeys([*options.alsnet.coordinates, *options.dimensions]))
+    if not names:
+        raise OptionError(
+            "a network needs at least one input", cure="Name a dimension, or set 'coordinates' to Z or XYZ"
+        )
+    return names
+
+
+def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model:
+    """See :func:`pdal_stages.classifier.train`. A batch sees only its own cloud."""
+    from .network import torch  # before any work: says what to install where it is missing
+
+    started = time.perf_counter()
+    names = inputs(options)
+    xyz = [check_xyz(np.asarray(cloud.xyz), cloud.name) for cloud in clouds]
+    known = label_classes(clouds, options)
+    classes, positions = known.classes, [np.asarray(position) for _, position in known]
+    values: list[dict[str, npt.NDArray[Any]]] = []
+    missing: dict[str, int] = {}
+    for cloud, places in zip(clouds, xyz, strict=True):
+        there = with_returns(names, places, cloud.dimensions, options.threads)
+        found, counted = gather(names, there, len(places), where=cloud.name)
+        values.append(found)
+        for name, number in counted.items():
+            missing[name] = missing.get(name, 0) + number
+    threads = resolve_threads(options.threads)
+    before = torch.get_num_threads()
+    session = _Session(xyz, positions, values, names, classes, options.alsnet, options.seed, threads)
+    try:
+        torch.set_num_threads(threads)
+        with torch.random.fork_rng(devices=[torch.cuda.current_device()] if session.device == "cuda" else []):
+            net = session.run(progress)
+    finally:
+        torch.set_num_threads(before)
+    used = np.concatenate(positions)
+    count = np.bincount(used[used >= 0], minlength=len(classes.codes))
+    ranges = [_range(name, values) for name in names]
+    info: dict[str, Any] = {
+        **known.described(
+            options, ({"available": int(m), "samples": int(m), "duplicates": 0} for m in count)
+        ),
+        "training": {
+            "clouds": [{"name": os.path.basename(c.name), "points": len(c.xyz)} for c in clouds],
+            "count": int(count.sum()),
+            "seed": options.seed,
+            "samples": int(count.sum()),
+            **({"contradicted": dict(known.left_out)} if known.left_out else {}),
+            **session.notes(),
+            **{name: number for name, number in missing.items() if number},
+        },
+        "densities": densities(clouds),
+        "voxel": options.voxel,
+        "accuracy": {"cross_validation": None},
+        "passes": [
+            {
+                "percentiles": {
+                    "low": [low for low, _ in ranges],
+                    "high": [high for _, high in ranges],
+                    "limited": False,
+                },
+                "importances": None,
+                "out_of_bag": None,
+            }
+        ],
+        "created_by": {
+            "pdal_stages": __version__,
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            "torch": str(torch.__version__),
+        },
+    }
+    seconds = {"whole": round(time.perf_counter() - started, 3)}
+    return Model((net,), list(zip(classes.codes, classes.names, strict=True)), info, seconds)
+
+
+def _range(name: str, values: Sequence[dict[str, npt.NDArray[Any]]]) -> tuple[float, float]:
+    """Smallest and largest value of an input; 0 and 0 for coordinates, which depend on the batch."""
+    if name in ("X", "Y", "Z"):
+        return 0.0, 0.0
+    parts = [np.asarray(one[name], np.float64) for one in values if len(one[name])]
+    return min(float(part.min()) for part in parts), max(float(part.max()) for part in parts)
+
+
+class _Session:
+    """One training: its data, the network, the optimizer, what has been reached.
+
+    `positions` are (n,) places of the points' classes, -1 for those that are only neighbors; `values` the inputs that are
+    dimensions.
+    """
+
+    def __init__(
+        self,
+        xyz: Sequence[npt.NDArray[np.float64]],
+        positions: Sequence[npt.NDArray[Any]],
+        values: Sequence[dict[str, npt.NDArray[Any]]],
+        names: tuple[str, ...],
+        classes: ClassMap,
+        options: NetworkOptions,
+        seed: int,
+        threads: int,
+    ) -> None:
+        from .network import Network, torch
+
+        self.torch, self.xyz, self.positions, self.inputs, self.options = (
+            torch,
+            xyz,
+            positions,
+            names,
+            options,
+        )
+        self.classes, self.seed, self.threads, self.n_classes = classes, seed, threads, len(classes.codes)
+        there = torch.cuda.is_available()
+        if options.device == "cuda" and not there:
+            raise DependencyError(
+                "'device' is cuda, but PyTorch sees no CUDA device",
+                cure="Install a CUDA build of PyTorch and the driver, or use device auto",
+            )
+        self.device = "cuda" if there and options.device != "cpu" else "cpu"
+        source = None if options.start_from is None else _source(options, names)
+        if source is None:
+            self.mean, self.scale = _statistics(values, positions, names)
+        else:
+            self.mean, self.scale = source.algorithm.mean, source.algorithm.scale
+        points = options.configuration.points
+        self.spacing = options.spacing or spacing_for(points, density(xyz))
+        self.columns = [
+            scaled(places, own, names, self.mean, self.scale) for places, own in zip(xyz, values, strict=True)
+        ]
+        self.circles = [
+            Circles(places, points, self.spacing, columns)
+            for places, columns in zip(xyz, self.columns, strict=True)
+        ]
+        held = batches.hold_out(xyz, positions, options.validation, options.block_size)
+        pairs = list(zip(positions, held, strict=True))
+        self.train_labels = [np.where(h, -1, p).astype(np.int64) for p, h in pairs]
+        self.held_labels = [np.where(h, p, -1).astype(np.int64) for p, h in pairs]
+        count = np.bincount(np.concatenate([p[p >= 0] for p in self.train_labels]), minlength=self.n_classes)
+        if not count.all():
+            k = int(np.argmin(count))
+            raise OptionError(
+                f"class {classes.codes[k]} ({classes.names[k]}) has no points outside the ground held out",
+                cure="Make block_size smaller, set validation to 0, or give more training data",
+            )
+        self.choice = batches.choose(
+            self.circles, self.train_labels, self.n_classes, options.histogram_threshold
+        )
+        self.held_batches = [
+            (k, number)
+            for k, (one, label) in enumerate(zip(self.circles, self.held_labels, strict=True))
+            for number in batches.covering(one, label >= 0)
+        ]
+        start = fresh(options.configuration, len(names), self.n_classes, seed)
+        if source is not None:
+            start = _transfer(source, start, classes)
+        self.network = Network(options.configuration, len(names), self.n_classes).load(start).to(self.device)
+        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=options.learning_rate)
+        weight = batches.class_weights(count, options.class_weights)
+        self.weight = torch.tensor(weight, dtype=torch.float32, device=self.device)
+        self.curve: list[dict[str, Any]] = []
+        self.best: Weights = self.network.dump()
+        self.best_epoch = 0
+
+    def run(self, progress: bool) -> AlsNet:
+        """All epochs, or those that are left."""
+        options = self.options
+        if options.checkpoint and os.path.exists(options.checkpoint):
+            self._resume(options.checkpoint)
+        left = max(options.epochs - len(self.curve), 0)
+        total = left * (len(self.choice.batches) + len(self.held_batches))
+        with Progress(total, "training alsNet", "batches", enabled=progress) as bar:
+            while len(self.curve) < options.epochs and not self._patience_is_over():
+                epoch = len(self.curve)
+                row: dict[str, Any] = {"epoch": epoch + 1, "loss": self._epoch(epoch, bar)}
+                bar.label = f"training alsNet, epoch {epoch + 1}, loss {row['loss']:.3f}"
+                if self.held_batches:
+                    row |= self._validate(bar)
+                    bar.label += f", held out mean F1 {100 * _score(row):.1f} %"
+                self.curve.append(row)
+                if not self.held_batches or not self.best_epoch or _score(row) > _score(self._best_row()):
+                    self.best, self.best_epoch = self.network.dump(), epoch + 1
+                if options.checkpoint:
+                    self._save(options.checkpoint)
+        check(self.best, options.configuration, len(self.inputs), self.n_classes)
+        return AlsNet(
+            self.best, options.configuration, self.inputs, self.mean, self.scale, self.spacing, self.n_classes
+        )
+
+    def _best_row(self) -> dict[str, Any]:
+        return self.curve[self.best_epoch - 1] if self.best_epoch else {}
+
+    def _patience_is_over(self) -> bool:
+        patience = self.options.patience
+        return bool(patience and self.held_batches and len(self.curve) - self.best_epoch >= patience)
+
+    def _epoch(self, epoch: int, bar: Progress) -> float:
+        """Train on every chosen batch once; the mean loss."""
+        options = self.options
+        order = np.random.default_rng([self.seed, epoch]).permutation(len(self.choice.batches))
+        size = options.batches_per_step
+        steps = [order[k : k + size].tolist() for k in range(0, len(order), size)]
+        self.torch.manual_seed(int(np.random.default_rng([self.seed, epoch, 1]).integers(2**62)))
+        phase = min(epoch / options.epochs, 1.0)
+        for group in self.optimizer.param_groups:
+            group["lr"] = options.learning_rate * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * phase)))
+        self.network.train()
+        total, weight = 0.0, 0
+
+        def prepare(numbers: list[int]):
+            made = [self._augmented(*self.choice.batches[k], epoch) for k in numbers]
+            return stack([pyramid for pyramid, _ in made]), np.concatenate([labels for _, labels in made])
+
+        for numbers, (pyramid, labels) in zip(steps, map_blocks(prepare, steps, self.threads), strict=True):
+            known = int(np.count_nonzero(labels >= 0))
+            if known and len(labels) > 1:
+                total += self._step(pyramid, labels) * known
+                weight += known
+            bar.update(len(numbers))
+        return total / weight if weight else 0.0
+
+    def _augmented(self, cloud: int, number: int, epoch: int):
+        """(pyramid, labels) of a batch, changed as the options say."""
+        random = np.random.default_rng([self.seed, epoch, 2, cloud, number])
+        circles, shift = self.circles[cloud], self.options.shift * self.spacing
+        center = circles.centers[number] + random.uniform(-1.0, 1.0, 2) * shift
+        members = circles.around(float(center[0]), float(center[1]))
+        if not len(members):  # moved off the cloud's edge
+            center, members = circles.centers[number], circles.members(number)
+        order, pyramid = self._pyramid(
+            cloud, members, center, lambda xyz: batches.augmented(xyz, self.options, random)
+        )
+        return pyramid, self.train_labels[cloud][members[order]]
+
+    def _pyramid(self, cloud: int, members, center, change: Any = None):
+        xyz, columns, configuration = self.xyz[cloud], self.columns[cloud], self.options.configuration
+        return make_pyramid(xyz, columns, members, center, self.inputs, configuration, change)
+
+    def _step(self, pyramid, labels: npt.NDArray[np.int64]) -> float:
+        from .network import tensors
+
+        torch = self.torch
+        scores = self.network(tensors(pyramid, self.device))
+        target = torch.from_numpy(labels).to(self.device)
+        loss = torch.nn.functional.cross_entropy(scores, target, weight=self.weight, ignore_index=-1)
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            raise ModelError(
+                "training diverged: the loss is not a number any more",
+                found=f"epoch {len(self.curve) + 1}",
+                cure="Lower learning_rate",
+            )
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimizer.step()
+        return value
+
+    def _validate(self, bar: Progress) -> dict[str, Any]:
+        """Scores on the ground held out."""
+        from .network import tensors
+
+        self.network.eval()
+        sums = [np.zeros((len(xyz), self.n_classes), np.float32) for xyz in self.xyz]
+
+        def prepare(batch):
+            cloud, number = batch
+            members = self.circles[cloud].members(number)
+            order, pyramid = self._pyramid(cloud, members, self.circles[cloud].centers[number])
+            return cloud, members[order], pyramid
+
+        with self.torch.no_grad():
+            for cloud, rows, pyramid in map_blocks(prepare, self.held_batches, self.threads):
+                scores = self.network(tensors(pyramid, self.device))
+                sums[cloud][rows] += self.torch.softmax(scores, dim=1).cpu().numpy()
+                bar.update(1)
+        matrix = np.zeros((self.n_classes, self.n_classes), np.int64)
+        for p, label in zip(sums, self.held_labels, strict=True):
+            rows = np.flatnonzero(label >= 0)
+            np.add.at(matrix, (label[rows], p[rows].argmax(axis=1)), 1)
+        return crossval.figures(matrix, self.classes.codes)
+
+    def _identity(self) -> str:
+        """What a checkpoint must agree with, as JSON: options, classes and data."""
+        options = asdict(self.options)
+        for free in ("epochs", "patience", "device", "checkpoint"):
+            options.pop(free)
+        options["start_from"] = options["start_from"] and os.path.basename(options["start_from"])
+        labels = [list(self.classes.codes), [list(part) for part in self.classes.labels]]
+        data = [
+            [len(xyz), str(coordinate_hash(xyz, 0).sum()), int(position.astype(np.int64).sum())]
+            for xyz, position in zip(self.xyz, self.positions, strict=True)
+        ]
+        return json.dumps([options, self.seed, self.inputs, labels, data])
+
+    def _save(self, path: str) -> None:
+        """Write all that training changes, whole or not at all."""
+        torch, buffer = self.torch, BytesIO()
+        best = {name: torch.from_numpy(array) for name, array in self.best.items()}
+        torch.save(
+            {
+                "format": FORMAT,
+                "identity": self._identity(),
+                "curve": self.curve,
+                "best_epoch": self.best_epoch,
+                "best": best,
+                "network": self.network.state_dict(),
+                "adam": self.optimizer.state_dict()["state"],
+            },
+            buffer,
+        )
+        write_whole(path, buffer.getvalue())
+
+    def _resume(self, path: str) -> None:
+        """Go on from a checkpoint of this very training; ModelError where it is damaged, hostile or of another."""
+        torch = self.torch
+        try:
+            if not zipfile.is_zipfile(path):
+                raise ModelError("this is not a checkpoint")
+            found = torch.load(BytesIO(Path(path).read_bytes()), map_location="cpu", weights_only=True)
+            if not isinstance(found, dict) or found.get("format") != FORMAT:
+                raise ModelError("this is not a checkpoint of this release")
+            if found["identity"] != self._identity():
+                raise ModelError(
+                    "the checkpoint belongs to another training, of other options, classes or data"
+                )
+            self.network.load_state_dict(found["network"])
+            self.best = {name: tensor.numpy() for name, tensor in found["best"].items()}
+            for weights in (self.best, self.network.dump()):
+                check(weights, self.options.configuration, len(self.inputs), self.n_classes)
+            for k, parameter in enumerate(self.network.parameters()):
+                moments = found["adam"].get(k) or {}
+                shapes = {"step": (), "exp_avg": parameter.shape, "exp_avg_sq": parameter.shape}
+                for name, moment in moments.items():
+                    if moment.shape != shapes[name] or not bool(torch.isfinite(moment).all()):
+                        raise ModelError("the checkpoint's moments do not fit the network or are not finite")
+            self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": found["adam"]})
+            self.curve = [
+                {"epoch": int(row["epoch"]), **row, "loss": float(row["loss"])} for row in found["curve"]
+            ]
+            self.best_epoch = int(found["best_epoch"])
+            if self.best_epoch not in range(len(self.curve) + 1):
+                raise ModelError("the checkpoint's best epoch is none of its own")
+            for row in self.curve if self.held_batches else ():
+                _score(row)
+        except ModelError as error:
+            error.cure = error.cure or "Delete the checkpoint to begin anew, or name another file"
+            raise error.at(path) from None
+        except (pickle.UnpicklingError, OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError,
+                EOFError, MemoryError) as error:  # fmt: skip
+            raise ModelError(
+                "the checkpoint cannot be read",
+                where=path,
+                found=f"{type(error).__name__}: {error}".splitlines()[0][:200],
+                cure="Delete the checkpoint to begin anew, or name another file",
+            ) from error
+
+    def notes(self) -> dict[str, Any]:
+        """For the manifest: batches, epochs, curve, validation."""
+        options = asdict(self.options)
+        for own in ("configuration", "checkpoint", "start_from", "device", "points"):
+            options.pop(own)
+        start, best = self.options.start_from, self._best_row()
+        return {
+            "network": {**options, "spacing": self.spacing, "start_from": start and os.path.basename(start)},
+            "batches": {
+                "all": self.choice.all,
+                "chosen": len(self.choice.batches),
+                "added_for_a_class": self.choice.added,
+            },
+            "epochs": len(self.curve),
+            "best_epoch": self.best_epoch,
+            "points_held_out": int(sum(np.count_nonzero(label >= 0) for label in self.held_labels)),
+            "held_out": {k: v for k, v in best.items() if k not in ("epoch", "loss")} or None,
+            "curve": self.curve,
+        }
+
+
+def _score(row: dict[str, Any]) -> float:
+    return float(row["mean_f1"] or 0.0)
+
+
+def _statistics(values, positions, names: tuple[str, ...]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Mean and standard deviation of each input over the labeled points; 0 and 1 for coordinates."""
+    mean, scale = [], []
+    for name in names:
+        middle, deviation = 0.0, 1.0
+        if name not in ("X", "Y", "Z"):
+            parts = [
+                np.asarray(own[name], np.float64)[p >= 0] for own, p in zip(values, positions, strict=True)
+            ]
+            every = np.concatenate(parts)
+            middle, deviation = float(every.mean()), float(every.std())
+        mean.append(middle)
+        scale.append(deviation if deviation > 1e-6 else 1.0)
+    return tuple(mean), tuple(scale)
+
+
+def _source(options: NetworkOptions, names: tuple[str, ...]) -> Model:
+    """The model that training starts from, if its network is the same."""
+    path = str(options.start_from)
+    model = load_model(path)
+    net, wanted = model.algorithm, options.configuration
+    if not isinstance(net, AlsNet):
+        raise ModelError("training can start from a network only", where=path, found=net.name)
+    if (net.configuration.levels, net.configuration.head) != (wanted.levels, wanted.head):
+        raise ModelError(
+            "the model to start from has another network",
+            where=path,
+            found=f"configuration {net.configuration.name}",
+            cure="Use its configuration",
+        )
+    if net.inputs != names:
+        raise ModelError(
+            "the model to start from has other inputs", where=path, found=", ".join(net.inputs),
+            cure=f"Here they are {', '.join(names)}: change dimensions or coordinates",
+        )  # fmt: skip
+    return model
+
+
+def _transfer(source: Model, start: Weights, classes: ClassMap) -> Weights:
+    """The source's weights; the last layer's rows only for classes both have."""
+    weights, codes = source.algorithm.weights, source.codes.tolist()
+    scores = start["scores"].copy()
+    for k, code in enumerate(classes.codes):
+        if code in codes:
+            scores[k] = weights["scores"][codes.index(code)]
+    return {**weights, "scores": scores}
