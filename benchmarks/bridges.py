@@ -20,7 +20,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pdal_stages.synthetic import make_town
-from pdal_stages.synthetic.truth import true_objects
 from pdal_stages.terrain.decks import find_decks
 from pdal_stages.terrain.morphological import filtered_ground
 from pdal_stages.terrain.towers import find_towers
@@ -30,6 +29,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from bridge_scenes import SCENES, scan
 from corridor_scenes import CORRIDORS
 from more_bridge_scenes import MORE_SCENES, TRAPS, UPRIGHT_SCENES
+from town_truth import true_objects
 
 CLOUDS = (
     "bridge/ign_0299_6802.laz", "delft/train.laz", "forest/neon_osbs.laz", "isprs_filter/samp11.laz",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import sys
 import time
 from pathlib import Path
 
@@ -19,7 +20,9 @@ from pdal_stages.objects.cells import Kind
 from pdal_stages.objects.compare import compare_buildings, matched_by_overlap, matched_by_place
 from pdal_stages.objects.outlines import raw_outlines, straight_outlines
 from pdal_stages.synthetic import TownOptions, make_town
-from pdal_stages.synthetic.truth import true_objects
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from town_truth import true_objects
 
 SIZE, DENSITY = 300.0, 8.0
 #: Two roofs are one building where they differ by at most STEP along a third of the wall they share.

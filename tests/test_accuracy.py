@@ -251,12 +251,6 @@ def test_merged_classes_get_a_name_that_says_so():
     assert b.name(100) == "Vegetation"
 
 
-def test_confusions_come_largest_first():
-    a = Accuracy.from_confusion([[5, 3, 0], [7, 1, 2]], [2, 6], extra=[1])
-    assert a.confusions() == [(6, 2, 7), (2, 6, 3), (6, 1, 2)]
-    assert a.confusions(1) == [(6, 2, 7)]
-
-
 def test_more_points_than_one_chunk(monkeypatch):
     reference, predicted, reliability = town(2000)
     whole = Accuracy.from_labels(reference, predicted, reliability=reliability)
@@ -356,11 +350,6 @@ def test_tiles_compared_differently_do_not_add():
         _ = a + Accuracy.from_labels([1, 2], [1, 2], merge={2: 5}, ignore=[])
     with pytest.raises(StageError, match=r"left out.*class 2"):
         b.merge({1: 2})
-
-
-def test_a_curve_of_only_some_points_is_not_kept():
-    a = Accuracy.from_labels([2], [2], reliability=[0.9]) + Accuracy.from_labels([2], [2])
-    assert a.reliability is None
 
 
 # ---- real clouds -----------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from town_truth import true_objects
 
 import pdal_stages as ps
 from pdal_stages.base.errors import StageError
@@ -14,7 +15,6 @@ from pdal_stages.objects.cells import CLASSES, Kind, cell_keys, kind_of_code, ob
 from pdal_stages.objects.rasters import fill_gaps
 from pdal_stages.objects.roofs import connected
 from pdal_stages.synthetic import TownOptions
-from pdal_stages.synthetic.truth import true_objects
 
 
 def house(x0, y0, x1, y1, z, step=0.3, code=6):

@@ -6,7 +6,6 @@ import base64
 import io
 import re
 from html.parser import HTMLParser
-from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -187,37 +186,6 @@ def test_odd_accuracies_make_a_page(a):
 
 
 # ---- colors ---------------------------------------------------------------------------------------------
-
-
-def luminance(color):
-    c = np.asarray(color) / 255
-    return float(np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4) @ (0.2126, 0.7152, 0.0722))
-
-
-def contrast(a, b):
-    a, b = sorted((luminance(a), luminance(b)))
-    return (b + 0.05) / (a + 0.05)
-
-
-def palettes():
-    """The colors that the style sheet gives light, dark and printed pages, in that order."""
-    sheet = files("pdal_stages.reports").joinpath("templates/style.css").read_text()
-    blocks = re.findall(r":root \{(.*?)\}", sheet, re.S)
-    return [
-        {name: np.array(color.split(), float) for name, color in re.findall(r"--(\w+): ([\d ]+);", block)}
-        for block in blocks
-    ]
-
-
-@pytest.mark.parametrize("colors", palettes(), ids=["light", "dark", "print"])
-def test_text_has_contrast(colors):
-    for text in ("ink", "muted"):
-        for ground in ("page", "panel"):
-            assert contrast(colors[text], colors[ground]) >= 4.5
-    for heat in ("right", "wrong"):
-        cell = 0.5 * colors[heat] + 0.5 * colors["page"]
-        assert contrast(colors["ink"], cell) >= 4.5
-        assert contrast(colors[heat], colors["page"]) >= 3  # graphics
 
 
 # ---- maps ------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from pdal_stages.base.errors import OptionError
 from pdal_stages.base.memory import free_memory, parse_size
 from pdal_stages.cli import main
 from pdal_stages.stages.base import Blocks
-from pdal_stages.synthetic.townfile import wkt
+from pdal_stages.synthetic.townfile import WKT
 from pdal_stages.tiling import TilingOptions
 from pdal_stages.tiling.classify import ClassifyTask
 from pdal_stages.tiling.sizing import (
@@ -47,7 +47,7 @@ def survey(tmp_path_factory, write_las):
     }
     how = {
         "point_format": 6,
-        "wkt": wkt("EPSG:25832"),
+        "wkt": WKT,
         "scale": 0.001,
         "offset": (499_000.0, 5_399_000.0, 0.0),
     }
@@ -268,7 +268,7 @@ def test_many_small_inputs(survey, classify, tmp_path, write_las):
                 tmp_path / "in" / f"t{i}{j}.laz",
                 part,
                 point_format=6,
-                wkt=wkt("EPSG:25832"),
+                wkt=WKT,
                 scale=0.001,
                 offset=offset,
             )

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, PipelineError, StageError
 from pdal_stages.pipeline.tindex import locations
-from pdal_stages.synthetic.townfile import wkt
+from pdal_stages.synthetic.townfile import WKT
 from pdal_stages.terrain.minima import terrain_reach
 from pdal_stages.tiling import TilingOptions, run_tiled
 from pdal_stages.tiling.classify import ClassifyTask
@@ -28,7 +28,6 @@ from pdal_stages.tiling.sources import InputSource, find_sources, las_extent
 from pdal_stages.tiling.tileplan import make_plan
 
 pytestmark = pytest.mark.pdal
-WKT = wkt("EPSG:25832")
 
 
 @pytest.fixture(scope="session")

@@ -40,11 +40,6 @@ def test_wkt2_units_may_sit_on_axes():
     assert units_of_wkt(WKT2).horizontal == 0.3048
 
 
-def test_no_reference_means_meters_and_says_so():
-    assert units_of_wkt("").assumed
-    assert not units_of_wkt(METERS).assumed
-
-
 def test_options_overrule():
     units = units_of_wkt(METERS, vertical="ft")
     assert (units.horizontal, units.vertical) == (1.0, 0.3048)

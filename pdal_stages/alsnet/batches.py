@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,18 +28,9 @@ def spread(histogram: npt.NDArray[Any]) -> float:
     return float(np.std(histogram / total) * 100.0) if total else float("inf")
 
 
-@dataclass(frozen=True, eq=False)
-class Choice:
-    """Batches chosen for training."""
-
-    batches: list[Batch]
-    all: int  #: how many there were
-    added: int  #: how many were taken in spite of their spread, for a class that had no other
-
-
 def choose(
     circles: Sequence[Circles], labels: Sequence[npt.NDArray[Any]], n_classes: int, threshold: float
-) -> Choice:
+) -> list[Batch]:
     """Batches whose classes are mixed; see ``NetworkOptions.histogram_threshold``.
 
     Where that leaves a class without any batch, the most mixed one that has it is taken too.
@@ -56,14 +46,12 @@ def choose(
             mine = label[one.members(number)]
             histograms[cloud, number] = np.bincount(mine[mine >= 0], minlength=n_classes)
     spreads = {batch: spread(histogram) for batch, histogram in histograms.items()}
-    good = {batch for batch, value in spreads.items() if value < threshold}
-    chosen = set(good)
+    chosen = {batch for batch, value in spreads.items() if value < threshold}
     for position in range(n_classes):
-        if not any(histograms[batch][position] for batch in chosen):
-            having = [batch for batch in histograms if histograms[batch][position]]
-            if having:
-                chosen.add(min(having, key=lambda batch: (spreads[batch], batch)))
-    return Choice(sorted(chosen), len(histograms), len(chosen) - len(good))
+        having = [batch for batch in histograms if histograms[batch][position]]
+        if having and not chosen.intersection(having):
+            chosen.add(min(having, key=lambda batch: (spreads[batch], batch)))
+    return sorted(chosen)
 
 
 def hold_out(

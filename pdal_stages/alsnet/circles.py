@@ -158,7 +158,8 @@ class Circles:
         if level < DEEPEST and len(at) > max(self.points // 2, 1):
             return 0
         far2 = float(((self._xy[at] - (x, y)) ** 2).sum(axis=1).max())
-        within = int(np.count_nonzero(self._near(x, y, math.sqrt(far2))[1] <= far2))
+        radius = math.sqrt(far2) * (1.0 + 1e-9)
+        within = int(self._tree.query_ball_point((x, y), radius, return_length=True))
         if within <= self.points:
             return self.points
         return 0 if level < DEEPEST else within

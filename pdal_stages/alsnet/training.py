@@ -207,7 +207,7 @@ class _Session:
                 f"class {classes.codes[k]} ({classes.names[k]}) has no points outside the ground held out",
                 cure="Make block_size smaller, set validation to 0, or give more training data",
             )
-        self.choice = batches.choose(
+        self.chosen = batches.choose(
             self.circles, self.train_labels, self.n_classes, options.histogram_threshold
         )
         self.held_batches = [
@@ -232,7 +232,7 @@ class _Session:
         if options.checkpoint and os.path.exists(options.checkpoint):
             self._resume(options.checkpoint)
         left = max(options.epochs - len(self.curve), 0)
-        total = left * (len(self.choice.batches) + len(self.held_batches))
+        total = left * (len(self.chosen) + len(self.held_batches))
         with Progress(total, "training alsNet", "batches", enabled=progress) as bar:
             while len(self.curve) < options.epochs and not self._patience_is_over():
                 epoch = len(self.curve)
@@ -261,7 +261,7 @@ class _Session:
     def _epoch(self, epoch: int, bar: Progress) -> float:
         """Train on every chosen batch once; the mean loss."""
         options = self.options
-        order = np.random.default_rng([self.seed, epoch]).permutation(len(self.choice.batches))
+        order = np.random.default_rng([self.seed, epoch]).permutation(len(self.chosen))
         size = options.batches_per_step
         steps = [order[k : k + size].tolist() for k in range(0, len(order), size)]
         self.torch.manual_seed(int(np.random.default_rng([self.seed, epoch, 1]).integers(2**62)))
@@ -272,7 +272,7 @@ class _Session:
         total, weight = 0.0, 0
 
         def prepare(numbers: list[int]):
-            made = [self._augmented(*self.choice.batches[k], epoch) for k in numbers]
+            made = [self._augmented(*self.chosen[k], epoch) for k in numbers]
             return stack([pyramid for pyramid, _ in made]), np.concatenate([labels for _, labels in made])
 
         for numbers, (pyramid, labels) in zip(steps, map_blocks(prepare, steps, self.threads), strict=True):
@@ -426,11 +426,7 @@ class _Session:
         start, best = self.options.start_from, self._best_row()
         return {
             "network": {**options, "spacing": self.spacing, "start_from": start and os.path.basename(start)},
-            "batches": {
-                "all": self.choice.all,
-                "chosen": len(self.choice.batches),
-                "added_for_a_class": self.choice.added,
-            },
+            "batches": {"all": sum(map(len, self.circles)), "chosen": len(self.chosen)},
             "epochs": len(self.curve),
             "best_epoch": self.best_epoch,
             "points_held_out": int(sum(np.count_nonzero(label >= 0) for label in self.held_labels)),

@@ -17,7 +17,8 @@ from .districts import fill
 from .solids import VEGETATION, build_scene, cast
 from .townplan import block_at, heights, plan_town
 
-SPEED = 60.0  # meters a second
+ALTITUDE, SPEED = 350.0, 60.0  # meters, meters a second
+SCAN_ANGLE, OVERLAP = 25.0, 0.3  # half opening in degrees, share of a swath seen twice
 TURN = 240.0  # seconds from the end of a strip to the start of the next
 GPS_START = 270_000_000.0  # adjusted standard GPS time: April 2020
 BESIDE = 25.0  # meters beyond the square that are flown as well: what stands outside throws shadows into it
@@ -29,10 +30,7 @@ SPAN = 65.0  # meters a thing may stand out of its block: the wires to the next
 
 
 #: Bounds of the options that have any.
-LIMITS = {
-    "size": (20, 20_000), "density": (0.05, 500), "seed": (0, 2**31 - 1), "altitude": (150, 4_000),
-    "scan_angle": (3, 35), "overlap": (0, 0.8), "noise": (0, 0.5),
-}  # fmt: skip
+LIMITS = {"size": (20, 20_000), "density": (0.05, 500), "seed": (0, 2**31 - 1), "noise": (0, 0.5)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,12 +40,8 @@ class TownOptions:
     size: float = 200.0  #: side of the square, meters
     density: float = 7.0  #: returns per square meter, met within a few per cent
     seed: int = 1  #: another number, another town
-    altitude: float = 350.0  #: flying height, meters
-    scan_angle: float = 25.0  #: half opening of the scanner, degrees
-    overlap: float = 0.3  #: share of a swath seen twice
     noise: float = 0.02  #: standard deviation of a range, meters
     origin: tuple = (500_000.0, 5_400_000.0, 60.0)  #: x, y of the low corner; height of the quays
-    srs: str = "EPSG:25832"  #: of files: EPSG:25828 to EPSG:25838, or none
 
     def __post_init__(self) -> None:
         for name, limits in LIMITS.items():
@@ -91,18 +85,18 @@ class Town:
 class Flight:
     """Pulses over a square of `size` meters, `spacing` meters apart below the sensor."""
 
-    def __init__(self, options, size: float, spacing: float) -> None:
-        self.size, self.altitude, self.spacing = size, options.altitude, spacing
-        rng, half = np.random.default_rng([int(options.seed), 0xF117]), math.radians(options.scan_angle)
+    def __init__(self, seed: int, size: float, spacing: float) -> None:
+        self.size, self.spacing = size, spacing
+        rng, half = np.random.default_rng([seed, 0xF117]), math.radians(SCAN_ANGLE)
         self.heading = math.radians(rng.uniform(70, 110))  # from east
-        swath = 2.0 * self.altitude * math.tan(half)
+        swath = 2.0 * ALTITUDE * math.tan(half)
         self.reach = 0.5 * size * (abs(math.cos(self.heading)) + abs(math.sin(self.heading))) + BESIDE
-        apart = swath * (1.0 - options.overlap)
+        apart = swath * (1.0 - OVERLAP)
         # At least two strips, so that every town is seen from two sides.
-        self.strips = max(2, math.ceil((2 * self.reach - swath * options.overlap) / apart))
+        self.strips = max(2, math.ceil((2 * self.reach - swath * OVERLAP) / apart))
         self.across = (np.arange(self.strips) - 0.5 * (self.strips - 1)) * apart
         self.lines = math.ceil(2 * self.reach / spacing)
-        self.per_line = math.ceil(2 * half * self.altitude / spacing)
+        self.per_line = math.ceil(2 * half * ALTITUDE / spacing)
         # A turning polygon: every line runs from right to left.
         self.angles = half - (np.arange(self.per_line) + 0.5) * (2 * half / self.per_line)
 
@@ -123,7 +117,7 @@ class Flight:
         where the beam would meet level ground, GPS time in seconds, scan angle in degrees (right of the flight: positive).
         """
         forward = 1.0 - 2.0 * (strip % 2)
-        left = self.across[strip] - forward * self.altitude * np.tan(self.angles)
+        left = self.across[strip] - forward * ALTITUDE * np.tan(self.angles)
         step = np.flatnonzero(np.abs(left) < self.reach + 5.0)
         line, step = np.repeat(np.arange(first, last), step.size), np.tile(step, last - first)
         angle, when = self.angles[step], (line + step / self.per_line) * (self.spacing / SPEED)
@@ -131,9 +125,9 @@ class Flight:
         along = forward * (when * SPEED - self.reach) + 1.4 * np.sin(0.7 * when + 2.0 * strip)
         side = self.across[strip] + 1.5 * np.sin(0.23 * when + strip)
         c, s, out = math.cos(self.heading), math.sin(self.heading), -forward * np.sin(angle)
-        origin = np.column_stack([along * c - side * s, along * s + side * c, 0 * along + self.altitude])
+        origin = np.column_stack([along * c - side * s, along * s + side * c, 0 * along + ALTITUDE])
         direction = np.column_stack([-out * s, out * c, -np.cos(angle)])
-        level = origin[:, :2] - self.altitude / direction[:, 2:] * direction[:, :2]
+        level = origin[:, :2] - ALTITUDE / direction[:, 2:] * direction[:, :2]
         near = (np.abs(level) < self.size / 2 + BESIDE).all(axis=1)
         time = GPS_START + strip * (2 * self.reach / SPEED + TURN) + when
         return [column[near] for column in (origin, direction, level, time, np.degrees(angle))]
@@ -148,10 +142,12 @@ class FlownTown:
         self.block = lru_cache(1500)(lambda i, j: fill(self.plan, i, j))
         # The spacing that gives the wanted density: from the returns of a coarse flight over the middle of the town.
         sizes = min(options.size, 400.0), options.size
-        trial, coarse = (Flight(options, size, size / math.sqrt(SAMPLE)) for size in sizes)
+        trial, coarse = (Flight(int(options.seed), size, size / math.sqrt(SAMPLE)) for size in sizes)
         returns = sum(len(self.town(trial, *part)) for part in trial.parts(SAMPLE))
         density = max(returns, 1) / trial.aimed(SAMPLE) * coarse.aimed(SAMPLE) / options.size**2
-        self.flight = Flight(options, options.size, coarse.spacing * math.sqrt(density / options.density))
+        self.flight = Flight(
+            int(options.seed), options.size, coarse.spacing * math.sqrt(density / options.density)
+        )
 
     def town(self, flight: Flight, strip: int, first: int, last: int) -> Town:
         """The points of some scan lines of a strip."""
@@ -175,7 +171,7 @@ class FlownTown:
         mm, pulse, distance, (code, echo) = mm[keep], pulse[keep], hits[keep, 0], hits[keep, 4:6].T
         above = mm[:, 2] / 1000.0 - heights((mm[:, :2] / 1000.0 - flight.size / 2) @ turn, plan)
         code = np.where(code == VEGETATION, np.select([above < 0.5, above < 2.0], [3, 4], 5), code)
-        echo = 4000.0 * echo * (o.altitude / distance) ** 2 * np.exp(0.12 * rng.standard_normal(len(echo)))
+        echo = 4000.0 * echo * (ALTITUDE / distance) ** 2 * np.exp(0.12 * rng.standard_normal(len(echo)))
         _, start, nth, count = np.unique(pulse, return_index=True, return_inverse=True, return_counts=True)
         return Town(
             xyz=(mm + np.round(np.array(o.origin) * 1000.0)) / 1000.0,

@@ -16,25 +16,16 @@ from ..base.files import whole_files
 from ..base.version import __version__
 from .town import Town, TownOptions, town_chunks
 
-_UTM = (
-    'PROJCS["ETRS89 / UTM zone {zone}N",GEOGCS["ETRS89",DATUM["European_Terrestrial_Reference_System_1989",'
+#: The reference system of a town's file.
+WKT = (
+    'PROJCS["ETRS89 / UTM zone 32N",GEOGCS["ETRS89",DATUM["European_Terrestrial_Reference_System_1989",'
     'SPHEROID["GRS 1980",6378137,298.257222101,AUTHORITY["EPSG","7019"]],AUTHORITY["EPSG","6258"]],'
     'PRIMEM["Greenwich",0,AUTHORITY["EPSG","8901"]],UNIT["degree",0.0174532925199433,AUTHORITY["EPSG","9122"]],'
     'AUTHORITY["EPSG","4258"]],PROJECTION["Transverse_Mercator"],PARAMETER["latitude_of_origin",0],'
-    'PARAMETER["central_meridian",{meridian}],PARAMETER["scale_factor",0.9996],PARAMETER["false_easting",500000],'
+    'PARAMETER["central_meridian",9],PARAMETER["scale_factor",0.9996],PARAMETER["false_easting",500000],'
     'PARAMETER["false_northing",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]],AXIS["Easting",EAST],'
-    'AXIS["Northing",NORTH],AUTHORITY["EPSG","258{zone}"]]'
+    'AXIS["Northing",NORTH],AUTHORITY["EPSG","25832"]]'
 )
-
-
-def wkt(srs: str) -> str:
-    """OGC WKT 1 of a UTM zone on ETRS89, EPSG:25828 to EPSG:25838."""
-    zones = {f"EPSG:258{zone}": zone for zone in range(28, 39)}
-    if srs not in zones:
-        cure = "For another one, write none and give PDAL's readers 'override_srs'"
-        what = "'srs' must be EPSG:25828 to EPSG:25838, or none"
-        raise OptionError(what, where="synthetic", found=srs, cure=cure)
-    return _UTM.format(zone=zones[srs], meridian=6 * zones[srs] - 183)
 
 
 def write_town(town: Town | TownOptions, path: str | os.PathLike, *, threads=None) -> dict[int, int]:
@@ -55,8 +46,7 @@ def write_town(town: Town | TownOptions, path: str | os.PathLike, *, threads=Non
     header.system_identifier, header.generating_software = "generated town", f"pdal-stages {__version__}"
     header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
     header.global_encoding.wkt = True
-    if options.srs != "none":
-        header.vlrs.append(laspy.VLR("LASF_Projection", 2112, "OGC WKT", wkt(options.srs).encode() + b"\0"))
+    header.vlrs.append(laspy.VLR("LASF_Projection", 2112, "OGC WKT", WKT.encode() + b"\0"))
     counts = np.zeros(256, dtype=np.int64)
     compress = target.suffix.lower() == ".laz"
     with (

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .districts import filled
-from .solids import Site
-from .town import SPAN, TownOptions
-from .townplan import block_at, plan_town
+from pdal_stages.synthetic.districts import filled
+from pdal_stages.synthetic.solids import Site
+from pdal_stages.synthetic.town import SPAN, TownOptions
+from pdal_stages.synthetic.townplan import block_at, plan_town
 
 
 class House(NamedTuple):
