@@ -88,7 +88,7 @@ def figures(accuracy: Accuracy) -> dict[str, float]:
     return {name: round(100 * getattr(accuracy, name), 2) for name in names}
 
 
-def score(data: Path, scene: str, options: TrainingOptions, smooth: float, progress: bool) -> dict:
+def score(data: Path, scene: str, options: TrainingOptions, progress: bool) -> dict:
     """Train on the training part, classify the test part, compare."""
     timer = Timer()
     with timer("read"):
@@ -101,7 +101,7 @@ def score(data: Path, scene: str, options: TrainingOptions, smooth: float, progr
     with timer("train"):
         model = train([TrainingCloud(xyz, labels, dimensions, name=scene)], options, progress=progress)
     with timer("classify"):
-        prediction = model.predict(test, test_dimensions, threads=options.threads, smooth=smooth)
+        prediction = model.predict(test, test_dimensions, threads=options.threads)
     reference, merged = truth, MERGED[scene]
     classes: tuple[int, ...] = SCENES[scene]
     if options.strategy == "binary":
@@ -116,13 +116,12 @@ def score(data: Path, scene: str, options: TrainingOptions, smooth: float, progr
         "features": len(model.plan.names),
         "dimensions": list(options.dimensions),
         "prior_weight": options.prior_weight,
-        "smooth": smooth,
         "strategy": options.strategy,
         "target": options.target,
         **figures(result),
         "f1": {str(one.code): round(100 * (one.f1 or 0), 2) for one in result.per_class},
         "merged": figures(result.merge(merged)) if merged else None,
-        "out_of_bag": model.info["passes"][-1]["out_of_bag"]["overall_accuracy"],
+        "cross_validated": (model.info["accuracy"]["cross_validation"] or {}).get("chosen"),
         "train_points": len(xyz),
         "samples": sum(entry["samples"] for entry in model.info["classes"]),
         "duplicates": sum(entry["duplicates"] for entry in model.info["classes"]),
@@ -197,7 +196,6 @@ def main() -> None:
     parser.add_argument("--leaf", type=int, default=TrainingOptions.min_samples_leaf)
     parser.add_argument("--prior-weight", type=float, default=TrainingOptions.prior_weight)
     parser.add_argument("--max-features", type=number, default=TrainingOptions.max_features)
-    parser.add_argument("--smooth", type=float, default=0.0, help="radius in meters")
     parser.add_argument("--target", type=int, help="binary: this class against the rest")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int)
@@ -225,7 +223,7 @@ def main() -> None:
                 seed=args.seed,
                 threads=args.threads,
             )
-            results.append(score(Path(args.data), scene, options, args.smooth, args.progress))
+            results.append(score(Path(args.data), scene, options, args.progress))
     if args.json:
         import numba
         import sklearn

@@ -57,17 +57,7 @@ def model_of(net, codes=(2, 5, 6)):
         ],
         "training": {"clouds": [{"name": "a.laz", "points": 9}], "count": 9, "seed": 0, "samples": 27},
         "accuracy": {"cross_validation": None},
-        "passes": [
-            {
-                "percentiles": {
-                    "low": [0.0] * len(net.inputs),
-                    "high": [1.0] * len(net.inputs),
-                    "limited": False,
-                },
-                "importances": None,
-                "out_of_bag": None,
-            }
-        ],
+        "passes": [{"importances": None}],
         "created_by": {"pdal_stages": "0.1.0"},
     }
     return Model((net,), [(c, str(c)) for c in codes], info)

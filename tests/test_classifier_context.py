@@ -8,9 +8,8 @@ from hypothesis import strategies as st
 from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier import passes
 from pdal_stages.classifier.algorithms import Block, PredictRequest, PredictResult
-from pdal_stages.classifier.context import CELLS, OWN, Context, around
+from pdal_stages.classifier.context import CELLS, OWN, WHOLE, Context, around, count_shares
 from pdal_stages.classifier.passes import PassRun, Strips
-from pdal_stages.classifier.smoothing import WHOLE, count_shares
 
 TOKENS = ("own", "box0.5", "box1", "column2", "columnvotes4", "boxvotes1", "column0.125")
 

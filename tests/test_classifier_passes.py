@@ -17,7 +17,6 @@ from pdal_stages.classifier import (
     passes,
     train,
 )
-from pdal_stages.classifier.folds import Folds
 from pdal_stages.classifier.trainoptions import CONTEXT_OF_BASE, DEFAULT_CONTEXT
 from pdal_stages.features import FeatureEngine
 
@@ -81,7 +80,7 @@ def test_equals_passes_by_hand(two, other):
     """Features, first forest, context by loops, second forest."""
     from test_classifier_context import reference
 
-    from pdal_stages.classifier.smoothing import count_shares
+    from pdal_stages.classifier.context import count_shares
 
     xyz, _, dimensions = other
     first, second = two.passes
@@ -133,14 +132,12 @@ def test_features_that_are_not_kept_are_computed_again(two, other, monkeypatch):
     assert kept.report == again.report
 
 
-def test_smoothing_rejection_and_empty_clouds(two, other):
-    xyz, label, dimensions = other
+def test_rejection_and_empty_clouds(two, other):
+    xyz, _, dimensions = other
     whole = everything(two, xyz, dimensions)
     low = whole.reliability < np.float32(0.7)
     some = two.predict(xyz, dimensions, reject_below=0.7, rejected_code=30)
     assert low.sum() > 0 and (some.classification[low] == 30).all() and some.rejected == low.sum()
-    calm = two.predict(xyz, dimensions, smooth=1.0)
-    assert calm.report.figures["smooth"] == 1.0 and (calm.classification == label).mean() > 0.8
     assert len(two.predict(np.zeros((0, 3)), {"HeightAboveGround": np.zeros(0)}).classification) == 0
     lone = two.predict(np.array([[1e6, 2e6, 3.0]]), {"HeightAboveGround": np.zeros(1)})
     assert lone.classified == 1
@@ -232,33 +229,6 @@ def test_a_pass_may_come_from_elsewhere(two, other):
     assert part.report.figures["batches"] == 1
 
 
-def test_folds_are_strips_or_whole_surveys():
-    random = np.random.default_rng(0)
-    clouds = [
-        (xyz, np.where(random.random(len(xyz)) < 0.8, 1, -1))
-        for xyz in (
-            random.random((n, 3)) * (90, 70, 3) + shift for n, shift in ((900, 0), (500, 100), (700, 300))
-        )
-    ]
-    folds = Folds.of(clouds[:2], ("x", "y"), 4)
-    for xyz, position in clouds[:2]:
-        mine = folds.points(xyz, "x")
-        share = np.bincount(mine[position >= 0], minlength=4) / (position >= 0).sum()
-        assert (share > 0.1).all()
-        strip = np.floor((xyz[:, 0] + xyz[:, 1]) / (10 * np.sqrt(2))).astype(int)
-        assert np.array_equal(mine, strip % 4)
-        some = random.permutation(len(xyz))[:50]  # a thinned copy: the same ground in the same fold
-        assert np.array_equal(folds.points(xyz[some], "x"), mine[some])
-    folds = Folds.of(clouds, ("x", "y", "z"), 5)
-    assert folds.count == 3 and sorted(folds.surveys.values()) == [0, 1, 2]
-    assert (folds.points(clouds[1][0], "y") == folds.surveys["y"]).all()
-    assert Folds.of(clouds, ("x", "y", "x"), 5).surveys is None
-    small = [(clouds[0][0] / 20, clouds[0][1])]
-    assert 0.01 < Folds.of(small, ("x",), 5).width < 10
-    with pytest.raises(OptionError, match="too small"):
-        Folds.of([(np.ones((9, 3)), np.ones(9, int))], ("x",), 5)
-
-
 def test_options():
     for bad in (
         {"passes": 4},
@@ -295,4 +265,3 @@ def test_of_many_samples_a_tree_draws_some(monkeypatch):
     asked = learned(max_samples=0.4)
     for one, same in zip(few.passes, asked.passes, strict=True):
         assert np.array_equal(one.forest.threshold, same.forest.threshold)
-    assert few.info["passes"][0]["out_of_bag"]["samples"] <= few.info["training"]["samples"] // 2 + 1

@@ -1,12 +1,9 @@
 """Training and prediction on small clouds: labels, files, blocks, threads, where, rejection, dimensions."""
 
 import json
-import os
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from sklearn.tree import DecisionTreeClassifier
 
 from pdal_stages.base.errors import DimensionError, ModelError, OptionError, StageError
 from pdal_stages.classifier import (
@@ -14,12 +11,11 @@ from pdal_stages.classifier import (
     Prediction,
     TrainingCloud,
     TrainingOptions,
+    foresttraining,
     load_model,
     train,
-    trees,
 )
-from pdal_stages.classifier.samplefeatures import percentiles
-from pdal_stages.features import FeatureEngine, FeaturePlan
+from pdal_stages.features import FeatureEngine
 
 SMALL = {
     "neighborhoods": "c1,s2,kopt(5,20)",
@@ -95,35 +91,15 @@ def test_another_place_is_classified(trained, other):
     assert sum(result.report.figures["classes"].values()) == len(xyz)
 
 
-def test_equals_sklearn_on_the_same_features(other, monkeypatch):
-    """The same features into scikit-learn's own trees: identical labels, identical probabilities."""
-    xyz, label, dimensions = scene()
-    kept = []
-    original = trees.grow_tree
-
-    def beside(ranked, label, weight, tried, seed, *, min_samples_leaf):
-        columns = zip(ranked.start[:-1], ranked.start[1:], ranked.place, strict=True)
-        values = np.stack([ranked.different[a:b][place] for a, b, place in columns], axis=1)
-        theirs = DecisionTreeClassifier(
-            max_features=tried, random_state=seed, min_samples_leaf=min_samples_leaf
-        )
-        kept.append(theirs.fit(values, label, sample_weight=weight.astype(float)).tree_)
-        return original(ranked, label, weight, tried, seed, min_samples_leaf=min_samples_leaf)
-
-    monkeypatch.setattr(trees, "grow_tree", beside)
-    model = train(
-        [TrainingCloud(xyz, label, dimensions)],
-        TrainingOptions(**SMALL, prior_weight=0, folds=0, threads=1),
-        progress=False,
-    )
-    xyz, label, dimensions = other
-    engine = FeatureEngine(xyz, model.plan, bins=model.algorithm.features.bins)
+def test_equals_the_forest_on_the_same_features(trained, other):
+    xyz, _, dimensions = other
+    engine = FeatureEngine(xyz, trained.plan, bins=trained.algorithm.features.bins)
     values = engine.table(dimensions={"HeightAboveGround": dimensions["HeightAboveGround"]}).values
-    expected = sum(tree.predict(values) for tree in kept) / len(kept)
-    result = model.predict(xyz, dimensions, probabilities=True)
-    assert np.array_equal(result.probabilities, expected.astype(np.float32))
-    assert np.array_equal(result.classification, model.codes[expected.argmax(axis=1)])
-    assert np.array_equal(model.algorithm.probabilities(values), expected)
+    p = trained.algorithm.forest.predict_proba(values) * trained.factors
+    p /= p.sum(axis=1, keepdims=True)
+    assert np.array_equal(
+        trained.predict(xyz, dimensions, probabilities=True).probabilities, p.astype(np.float32)
+    )
 
 
 def test_blocks_and_threads_change_nothing(trained, other):
@@ -277,8 +253,8 @@ def test_return_ratio_and_intensity(other):
 def test_counts_scores_and_importances(trained):
     classes = {entry["code"]: entry for entry in trained.info["classes"]}
     assert [entry["samples"] + entry["duplicates"] for entry in classes.values()] == [150] * 3
-    bag = trained.info["passes"][0]["out_of_bag"]
-    assert 0.85 < bag["overall_accuracy"] <= 1 and set(bag["f1"]) == {"2", "5", "6"}
+    found = trained.info["accuracy"]["cross_validation"]["chosen"]
+    assert 0.8 < found["overall_accuracy"] <= 1 and set(found["f1"]) == {"2", "5", "6"}
     for by in ("column", "feature", "group", "neighborhood", "dimension"):
         assert sum(trained.importances(by).values()) == pytest.approx(1)
     assert set(trained.importances("neighborhood")) == {"c1", "s2", "kopt(5,20)", "(dimension)"}
@@ -286,7 +262,7 @@ def test_counts_scores_and_importances(trained):
     with pytest.raises(OptionError, match="grouped"):
         trained.importances("color")
     text = str(trained)
-    for word in ("Ground", "Building", "c1 s2 kopt(5,20)", "HeightAboveGround", "a.laz", "out of bag"):
+    for word in ("Ground", "Building", "c1 s2 kopt(5,20)", "HeightAboveGround", "a.laz", "held out"):
         assert word in text
 
 
@@ -341,9 +317,8 @@ def test_errors_say_what_was_found(monkeypatch):
         train([], TrainingOptions(**SMALL), progress=False)
     with pytest.raises(OptionError, match="mask"):
         train([TrainingCloud(xyz, label, dimensions, mask=label)], TrainingOptions(**SMALL), progress=False)
-    sysconf = os.sysconf
-    monkeypatch.setattr(os, "sysconf", lambda name: 1 if name == "SC_PHYS_PAGES" else sysconf(name))
-    with pytest.raises(OptionError, match="do not fit in this machine's memory"):
+    monkeypatch.setattr(foresttraining, "free_memory", lambda: 1000)
+    with pytest.raises(OptionError, match="do not fit into the free memory"):
         train([cloud], TrainingOptions(**SMALL), progress=False)
 
 
@@ -386,38 +361,6 @@ def test_merged_and_named_classes(tmp_path):
     assert load_model(tmp_path / "m").classes == model.classes
 
 
-def test_limits_to_percentiles_are_in_the_thresholds(trained):
-    """No threshold lies beyond the percentiles: a value beyond goes the way its limit would [B16 3.3]."""
-    low = np.array(trained.info["passes"][0]["percentiles"]["low"], np.float32)
-    high = np.array(trained.info["passes"][0]["percentiles"]["high"], np.float32)
-    forest = trained.algorithm.forest
-    split = forest.feature >= 0
-    column, limit = forest.feature[split], forest.threshold[split]
-    assert (limit >= low[column]).all() and (limit < high[column]).all()
-    random = np.random.default_rng(0)
-    values = (low + (high - low) * (random.random((500, len(low))) * 3 - 1)).astype(np.float32)
-    cut = np.clip(values, low, high)
-    assert np.array_equal(forest.predict_proba(values), forest.predict_proba(cut))
-
-
-def test_what_is_limited_is_what_the_paper_scales():
-    """Geometric features and heights between their percentiles; histograms and other dimensions as they are."""
-    names = ("HeightAboveGround", "Intensity")
-    plan = FeaturePlan.parse("c1", ("Linearity", "D2_0"), names)
-    values = np.random.default_rng(0).random((1000, 4)).astype(np.float32)
-    before = values.copy()
-    low, high = percentiles(values, plan, TrainingOptions())
-    for column, limited in enumerate((True, False, True, False)):
-        ends = (
-            np.percentile(before[:, column], [1, 99])
-            if limited
-            else [before[:, column].min(), before[:, column].max()]
-        )
-        assert np.allclose([low[column], high[column]], ends)
-        assert np.array_equal(values[:, column], np.clip(before[:, column], low[column], high[column]))
-        assert limited == (values[:, column] != before[:, column]).any()
-
-
 # ---- hostile manifests ---------------------------------------------------------------------------------
 
 
@@ -430,7 +373,6 @@ def test_what_is_limited_is_what_the_paper_scales():
         lambda m: m["passes"][0].update(feature_names=m["passes"][0]["feature_names"][::-1]),
         lambda m: m["passes"][0].update(dimensions=[]),
         lambda m: m["passes"][0].update(context=["box1"]),
-        lambda m: m["passes"][0]["percentiles"].update(low=[0.0]),
         lambda m: m["passes"][0].update(importances=[1.0]),
         lambda m: m["priors"].update(factors=[1.0]),
         lambda m: m["classes"].reverse(),
@@ -454,38 +396,3 @@ def test_manifests_that_do_not_fit_themselves(trained, tmp_path, edit, other):
 
 def test_any_model_error_is_a_stage_error():
     assert issubclass(ModelError, StageError)
-
-
-def test_labels_that_their_height_contradicts_are_left_out():
-    """Of 4, 5 and 6 alone, where Ground and lower than asked; counted, and kept as neighbors."""
-    rng = np.random.default_rng(5)
-    n = 4000
-    xyz = rng.uniform(0, 60, (n, 3)) * (1, 1, 0)
-    labels = rng.choice([2, 3, 5, 6], n)
-    height = np.where(labels > 3, 4.0, 0.0)
-    wrong = (labels > 3) & (rng.random(n) < 0.2)
-    height[wrong] = rng.uniform(0, 0.5, wrong.sum())
-    ground = ((height < 0.5) & (rng.random(n) < 0.8)).astype(np.uint8)
-    xyz[:, 2] = height
-    dimensions = {"HeightAboveGround": height, "Ground": ground}
-    mask = rng.random(n) < 0.9
-    cloud = TrainingCloud(xyz, labels, dimensions, mask=mask)
-    gone = mask & np.isin(labels, (5, 6)) & (ground > 0) & (height < 0.3)
-    expected = {str(code): int(np.count_nonzero(gone & (labels == code))) for code in (5, 6)}
-    assert all(expected.values())
-    options = TrainingOptions(
-        neighborhoods="k10", dimensions=tuple(dimensions), count=50, trees=3, passes=1, voxel=0
-    )
-    plain = train([cloud], options, progress=False)
-    told = train([cloud], replace(options, contradicted_below=0.3), progress=False)
-    assert "contradicted" not in plain.info["training"] and told.info["training"]["contradicted"] == expected
-    available = [
-        {entry["code"]: entry["available"] for entry in model.info["classes"]} for model in (plain, told)
-    ]
-    left = {code: before - available[1][code] for code, before in available[0].items()}
-    assert left == {2: 0, 3: 0, 5: expected["5"], 6: expected["6"]}
-    assert "their height contradicts" in str(told) and "contradicts" not in str(plain)
-    # no ground, nothing to contradict
-    bare = TrainingCloud(xyz, labels, {"HeightAboveGround": height}, mask=mask)
-    options = replace(options, dimensions=("HeightAboveGround",), contradicted_below=0.3)
-    assert "contradicted" not in train([bare], options, progress=False).info["training"]

@@ -8,8 +8,8 @@ from test_classifier_training import SMALL, scene
 
 from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, train
+from pdal_stages.classifier.clouds import density, prepared
 from pdal_stages.classifier.sampling import draw_samples, share_out
-from pdal_stages.classifier.thinning import density, thinned
 
 FEW = {**SMALL, "feature_set": "covariance", "neighborhoods": "s1", "trees": 6}
 
@@ -46,17 +46,22 @@ def test_density_is_robust_and_knows_no_order():
     assert density(np.zeros((0, 3))) == 0.0 and density(np.zeros((7, 3))) == 7 / 4
 
 
-@settings(max_examples=20, deadline=None)
+def copies(xyz, *wanted, seed=0):
+    """The thinned copies of a cloud."""
+    options = TrainingOptions(thin=wanted, seed=seed, dimensions=(), voxel=0)
+    return list(prepared([TrainingCloud(xyz, np.zeros(len(xyz), int))], options))[1:]
+
+
+@settings(max_examples=8, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from([0.5, 2.0, 7.0]))
 def test_a_copy_has_its_density_in_any_order_and_tile(seed, wanted):
     random = np.random.default_rng(seed)
     xyz = random.random((30_000, 3)) * (50, 40, 9) + (6e5, 6e6, 0)
-    rows = thinned(xyz, wanted, seed)
-    assert len(rows) / 2000 == pytest.approx(wanted, rel=0.15)
-    p = random.permutation(len(xyz))
-    assert np.array_equal(np.sort(p[thinned(xyz[p], wanted, seed)]), rows)
-    assert thinned(xyz, 14.0) is None and thinned(xyz, 1e5) is None and thinned(xyz[:0], 1.0) is None
-    assert not np.array_equal(rows, thinned(xyz, wanted, seed + 1))
+    (one,) = copies(xyz, wanted, 14.0, 1e5, seed=seed)  # none that would hardly be sparser
+    assert len(one) / 2000 == pytest.approx(wanted, rel=0.15)
+    (other,) = copies(xyz[random.permutation(len(xyz))], wanted, seed=seed)
+    assert np.array_equal(np.unique(one.xyz, axis=0), np.unique(other.xyz, axis=0))
+    assert not copies(xyz[:0], 1.0) and len(copies(xyz, wanted, seed=seed + 1)[0].xyz) > 0
 
 
 def test_copies_are_trained_on_as_clouds_of_the_same_survey():
@@ -71,9 +76,6 @@ def test_copies_are_trained_on_as_clouds_of_the_same_survey():
     assert names[0][1] > names[1][1] > names[2][1] > 0
     assert model.info["densities"]["low"] < 0.5 < model.info["densities"]["high"]
     assert "0.25 to " in str(model) and "points/m2" in str(model)
-    by_hand = [one[0], *(one[0].part(thinned(one[0].xyz, d), f"thinned to {d:g} per m2") for d in (0.3, 0.1))]
-    again = learned(by_hand, passes=2, context=["own"])
-    assert np.array_equal(again.passes[1].forest.threshold, model.passes[1].forest.threshold)
 
 
 def test_a_cloud_of_another_density_is_told(tmp_path):
@@ -81,7 +83,7 @@ def test_a_cloud_of_another_density_is_told(tmp_path):
     xyz, _, dimensions = scene(5, 3000)
     report = model.predict(xyz, dimensions).report
     assert not report.warnings and report.figures["density"] == pytest.approx(3000 / 3600, rel=0.3)
-    some = thinned(np.repeat(xyz, 1, axis=0), 0.1, 1)
+    some = slice(None, None, 9)
     report = model.predict(xyz[some], {k: v[some] for k, v in dimensions.items()}).report
     assert "points/m2, the model was trained on" in report.warnings[0]
     assert "fewer than three neighbors in s1" in report.warnings[0]
@@ -96,7 +98,7 @@ def test_a_cloud_of_another_density_is_told(tmp_path):
 # ---- surveys -------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.lists(st.integers(0, 500), min_size=1, max_size=6).filter(any), st.integers(1, 900))
 def test_shares_are_exact_and_as_even_as_can_be(available, count):
     available = np.array(available)
@@ -219,14 +221,3 @@ def test_clouds_made_one_at_a_time(tmp_path):
     )
     with pytest.raises(OptionError, match="no training cloud"):
         learned(iter(()))
-
-
-def test_options():
-    for bad in (
-        {"thin": [0]},
-        {"thin": "x"},
-        {"ignore": [-1]},
-    ):
-        with pytest.raises(OptionError):
-            TrainingOptions(**bad)
-    assert TrainingOptions(thin=2, ignore=7).thin == (2.0,)

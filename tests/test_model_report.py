@@ -50,9 +50,9 @@ def test_a_forest(searched, tmp_path, capsys):
     assert main(["model", str(tmp_path / "town.model"), "--html", str(tmp_path / "m.html")]) == 0
     said = capsys.readouterr().out
     words = read((tmp_path / "m.html").read_text())
-    assert "Model town.model" in words and "2 folds of blocks of 25 m" in words and "a<b>.laz" in words
-    for row in searched.info["accuracy"]["cross_validation"]["tried"]:
-        assert f"{100 * row['overall_accuracy']:.2f}" in words
+    assert "Model town.model" in words and "blocks held out" in words and "a<b>.laz" in words
+    row = searched.info["accuracy"]["cross_validation"]["chosen"]
+    assert f"{100 * row['overall_accuracy']:.1f}" in words
     assert "Prior factor" in words and not re.search(r"\d\.\d{7,}", words)
     assert "By neighborhood" in words and "Epoch" not in words and "random_forest" in said
 
@@ -81,14 +81,3 @@ def _with(model, curve):
     info["training"]["curve"] = curve
     object.__setattr__(other, "info", info)
     return other
-
-
-def test_what_was_held_out(searched):
-    for held, words in (
-        ({"by": "surveys"}, "2 folds of whole surveys with"),
-        ({"by": "groups", "groups": "FileNumber"}, "2 folds of whole files with"),
-    ):
-        other = _with(searched, None)
-        other.info["accuracy"]["cross_validation"] |= held
-        shown = read(model_page(other, "x"))
-        assert words in shown and words.split()[-2] + " held out" in shown

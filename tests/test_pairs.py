@@ -18,8 +18,8 @@ import pytest
 from alsnet_scenes import model_of, random_net
 
 import pdal_stages as ps
+from pdal_stages.classifier.modelfile import find
 from pdal_stages.cli import main
-from pdal_stages.models import find
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.stages.loading import load_model
 
@@ -39,7 +39,6 @@ VALUES = {
         "ignore",
         "keep",
         "reject_below",
-        "smooth",
         "vegetation_heights",
         "probabilities",
     ],
@@ -51,7 +50,6 @@ OPTIONS = {
     "ignore": {"ignore": "7"},
     "keep": {"keep": "1,12"},
     "reject_below": {"reject_below": 0.6, "rejected_code": 0},
-    "smooth": {"smooth": 1.0},
     "vegetation_heights": {"vegetation_heights": "0.5,2"},
     "probabilities": {"probabilities": True},
 }

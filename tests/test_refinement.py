@@ -17,13 +17,13 @@ import pdal_stages as ps
 from pdal_stages.base.errors import ModelError, OptionError
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, foresttraining, load_model, train
 from pdal_stages.classifier.algorithms import PredictRequest
+from pdal_stages.classifier.context import count_shares
+from pdal_stages.classifier.modelfile import shipped
 from pdal_stages.classifier.passes import weighed
 from pdal_stages.classifier.refinement import EVEN, blended, trust
-from pdal_stages.classifier.smoothing import count_shares
 from pdal_stages.classifier.trainoptions import MOST_PASSES
 from pdal_stages.features import FeatureEngine
 from pdal_stages.features.cells import WHOLE
-from pdal_stages.models import shipped
 
 BEFORE = (2, 5, 6)
 
@@ -283,17 +283,17 @@ def test_two_passes_equal_the_passes_by_hand(base):
 def test_the_second_is_trained_on_ground_that_the_first_has_not_seen(base, monkeypatch):
     from test_classifier_context import reference
 
-    kept, inner = [], foresttraining._Passes._context
+    kept, inner = [], foresttraining._ForestTraining._context
 
-    def keep(self, held_out):
-        kept.append((self, held_out, inner(self, held_out)))
-        return kept[-1][2]
+    def keep(self, folds, held_out):
+        kept.append((self, folds, held_out, inner(self, folds, held_out)))
+        return kept[-1][3]
 
-    monkeypatch.setattr(foresttraining._Passes, "_context", keep)
+    monkeypatch.setattr(foresttraining._ForestTraining, "_context", keep)
     model = on_top(base, passes=2, voxel=0, n=300)
-    ((passes, (forests,), context),) = kept
+    ((passes, folds, (forests,), context),) = kept
     (cloud,) = passes.clouds
-    xyz, fold = cloud.xyz, passes.folds.points(cloud.xyz, cloud.flight)
+    xyz, fold = cloud.xyz, folds.points(cloud.xyz, cloud.flight)
     values = computed(passes.features, xyz, cloud.dimensions)
     read = np.hstack([values, (of_the_base(base, xyz, cloud.dimensions) / WHOLE).astype(np.float32)])
     grown = np.array([forests[k].predict_proba(read[i : i + 1])[0] for i, k in enumerate(fold.tolist())])
@@ -362,7 +362,7 @@ def test_through_pdal(tmp_path, write_las):
     assert made.codes.tolist() == [2, 5, 6, 11]
     assert made.info["base"]["name"] == "standard" and len(made.info["base"]["sha256"]) == 64
     assert f"on top of      standard, the passes before (SHA-256 {made.info['base']['sha256']})" in str(made)
-    assert "pass 4" in str(made) and "pass 3" not in str(made) and "out of bag 1" not in str(made)
+    assert "pass 4" in str(made) and "pass 3" not in str(made)
     assert made.info["preparation"] == ps.load_model("standard").info["preparation"]
 
 

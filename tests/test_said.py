@@ -160,7 +160,7 @@ def test_objects_like_those_of_python_pdal(cloud, tmp_path, pdal_module):
 
 def test_signatures_and_completion():
     first, *others = inspect.signature(ps.Filter.modelclassifier).parameters.values()
-    assert first.name == "model" and {"smooth", "ignore", "tag"} <= {p.name for p in others}
+    assert first.name == "model" and {"margin", "ignore", "tag"} <= {p.name for p in others}
     assert inspect.signature(ps.Filter.hag_minima).parameters["cell"].default == 20.0
     assert ps.Filter.modelclassifier("standard").options == {
         "type": "filters.modelclassifier",

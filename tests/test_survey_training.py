@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 from test_training_scores import QUICK_WORDS, scene
 
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier.unscored import why_unscored
 from pdal_stages.cli import main
 from pdal_stages.pipeline.training import surveys_of
 
@@ -77,16 +75,3 @@ def test_it_is_said_that_there_is_no_score_and_what_to_label_next(tmp_path, writ
     assert main(["train", str(tmp_path / "a.laz"), "--model", str(tmp_path / "m.model"), *QUICK_WORDS,
                  "--writers.classifiermodel.folds=0"]) == 0  # fmt: skip
     assert "no score" not in capsys.readouterr().err
-
-
-def test_the_classes_that_stand_in_one_place_are_named():
-    random = np.random.default_rng(0)
-    label = np.repeat([0, 1], 200)
-    xy = np.where(label[:, None] == 1, random.uniform(100, 110, (400, 2)), random.uniform(0, 400, (400, 2)))
-    error = OptionError("without fold 1 a class has no samples left", found="class 6")
-    said = why_unscored([error], xy, label, [(2, "Ground"), (6, "Building")], 25.0, 5.0)
-    assert (
-        "6 Building, all within 10 x 10 m at 105, 105" in said
-        and "2 Ground" not in said
-        and "30 m away" in said
-    )

@@ -159,20 +159,6 @@ def test_names_as_long_as_any(tmp_path, town_file):
         assert list(tmp_path.glob(f"{per}_*.las"))
 
 
-def test_smoothed_over_seams(tmp_path, town_file, model_file):
-    """Points beside the tile are classified too, as far as smoothing looks."""
-
-    def job(output):
-        stages = clouds.stages([town_file], output, model_file)
-        stages[-2].update(smooth=1.5, margin=True)
-        return stages
-
-    ps.Pipeline(job(tmp_path / "whole.laz")).execute(arrays=False)
-    run = run_tiled(job(tmp_path / "out.laz"), 30, workers=0)
-    assert not run.failures
-    clouds.same_points(tmp_path / "whole.laz", tmp_path / "out.laz")
-
-
 def test_two_worker_processes_give_the_same(tmp_path, town_file, model_file, whole):
     pytest.importorskip("distributed")
     run = run_tiled(

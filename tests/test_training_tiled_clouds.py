@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
-from pdal_stages.classifier.samplefeatures import SHORT
-from pdal_stages.classifier.tiledcloud import TiledCloud
+from pdal_stages.classifier.clouds import TiledCloud
+from pdal_stages.classifier.foresttraining import SHORT
 from pdal_stages.classifier.training import train_tiles
 
 QUICK = {

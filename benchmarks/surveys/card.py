@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from clouds import SURVEYS
 from leave_one_out import tables
-from recipe import DENSITIES, MOST, ONE_RETURN, OPTIONS, SLOPES
+from recipe import BELOW, DENSITIES, MOST, ONE_RETURN, OPTIONS, SLOPES
 from rules import table
 
 from pdal_stages.classifier import load_model
@@ -62,7 +62,7 @@ def main() -> None:
             rules=table(json.loads(args.rules.read_text())),
             count=OPTIONS.count,
             most=MOST,
-            below=OPTIONS.contradicted_below,
+            below=BELOW,
             densities=", ".join(f"{density:g}" for density in DENSITIES),
             one_return=" and ".join(f"{density:g}" for density in ONE_RETURN),
             slopes=f"{100 * max(slope for slope, *_ in SLOPES):.0f}",

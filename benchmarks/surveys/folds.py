@@ -20,13 +20,12 @@ from recipe import OPTIONS, training_clouds
 from pdal_stages.classifier import FeatureForest, Forest, Model, TrainingCloud
 from pdal_stages.classifier.algorithms import PredictRequest
 from pdal_stages.classifier.clouds import label_classes
-from pdal_stages.classifier.context import Context
+from pdal_stages.classifier.context import Context, count_shares
 from pdal_stages.classifier.featureforest import CloudFeatures, Features
+from pdal_stages.classifier.forest import TreeOptions, grow_forest
 from pdal_stages.classifier.foresttraining import FOLD_TREES, feature_plan
 from pdal_stages.classifier.passes import joined
 from pdal_stages.classifier.sampling import draw_samples
-from pdal_stages.classifier.smoothing import count_shares
-from pdal_stages.classifier.trees import Ranked, TreeOptions, grow
 from pdal_stages.stages.loading import load_model
 
 #: Of a forest of a model that misses a survey, by default: what the card's and the review's figures are of.
@@ -65,18 +64,18 @@ class LeaveOneOut:
         of = [cloud.flight for cloud in self.clouds]
         self.samples = draw_samples(labeled, len(self.classes), OPTIONS.count, OPTIONS.seed, of)
         self.survey = np.array([self.names.index(name) for name in of])[self.samples.cloud]
-        self.ranked = Ranked.of(self.samples.take(self.tables.__getitem__))
+        self.values = self.samples.take(self.tables.__getitem__)
         self._pair = cache(self._grown_without)
 
-    def _grow(self, ranked: Ranked, kept: npt.NDArray[np.bool_], trees: int) -> Forest:
+    def _grow(self, values: npt.NDArray[np.float32], kept: npt.NDArray[np.bool_], trees: int) -> Forest:
         setting = TreeOptions(OPTIONS.min_samples_leaf, OPTIONS.max_samples, OPTIONS.max_features)
         weight = self.samples.weight * kept
-        grown = grow(ranked, self.samples.label, weight, trees, setting, OPTIONS.seed)
-        return Forest.from_trees([tree for tree, _, _ in grown], ranked.columns)
+        values = np.asfortranarray(values)
+        return grow_forest(values, self.samples.label, weight, trees, setting, OPTIONS.seed)[0]
 
     def _grown_without(self, one: int, other: int) -> Forest:
         kept = (self.survey != one) & (self.survey != other)
-        return self._grow(self.ranked, kept, self._few)
+        return self._grow(self.values, kept, self._few)
 
     @property
     def _few(self) -> int:
@@ -87,30 +86,22 @@ class LeaveOneOut:
         """The model of all surveys but this one."""
         left = self.names.index(name)
         kept = self.survey != left
-        passes, scores, ranked = [], [], self.ranked
+        passes, values = [], self.values
         votes: Votes = {}
         for number in range(OPTIONS.passes):
             if number:
-                votes = self._votes(left, ranked, votes)
-                ranked = self.ranked.beside(Ranked.of(self._around(votes)))
-            forest = self._grow(ranked, kept, self.trees)
+                votes = self._votes(left, values, votes)
+                values = joined(self.values, self._around(votes))
+            forest = self._grow(values, kept, self.trees)
             passes.append(FeatureForest(FEATURES, forest, CONTEXT if number else None))
-            scores.append(ranked.limits(0))
         # What is known of the shipped model, which is of the same make, but for what is known of its samples.
         info = {**copy.deepcopy(load_model("standard").info), "training": self._training(name)}
-        info["passes"] = [
-            {
-                **info["passes"][0],
-                "percentiles": {"low": low, "high": high, "limited": False},
-                "importances": None,
-            }
-            for low, high in scores
-        ]
+        info["passes"] = [{"importances": None}] * len(passes)
         return Model(tuple(passes), self.classes, {**info, "voxel": OPTIONS.voxel})
 
-    def _votes(self, left: int, ranked: Ranked, before: Votes) -> Votes:
+    def _votes(self, left: int, values: npt.NDArray[np.float32], before: Votes) -> Votes:
         """What a pass says of all points of the clouds that are trained on where a survey is left out, by forests that have
-        seen neither that nor the cloud's own: `ranked` is what the pass reads of the samples, `before` what the pass before
+        seen neither that nor the cloud's own: `values` is what the pass reads of the samples, `before` what the pass before
         said, nothing of the first pass."""
         found = {}
         for other in range(len(self.names)):
@@ -118,7 +109,7 @@ class LeaveOneOut:
                 continue
             if before:
                 kept = (self.survey != left) & (self.survey != other)
-                forest = self._grow(ranked, kept, self._few)
+                forest = self._grow(values, kept, self._few)
             else:
                 forest = self._pair(*sorted((left, other)))
             for number, (cloud, table) in enumerate(zip(self.clouds, self.tables, strict=True)):

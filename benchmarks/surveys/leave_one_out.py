@@ -20,11 +20,10 @@ import laspy
 import numpy as np
 from clouds import SURVEYS, Cloud, load, slug, thinned, with_heights
 from folds import TREES, LeaveOneOut
-from recipe import OPTIONS
+from recipe import contradicted
 
 from pdal_stages.accuracy import Accuracy
 from pdal_stages.classifier import Model, TrainingCloud, load_model
-from pdal_stages.classifier.clouds import contradicted
 from pdal_stages.reports.views import triptych, write_png
 
 SAMPLES = (11, 12, 21, 31, 41, 51, 54, 61)
@@ -48,7 +47,7 @@ def score(model: Model, cloud: Cloud, pictures: Path | None = None) -> dict[str,
         if a != b
     }
     whole = TrainingCloud(cloud.xyz, cloud.truth, cloud.dimensions)
-    gone = contradicted(whole, OPTIONS.contradicted_below)
+    gone = contradicted(whole)
     worst = max(matrix, key=lambda key: matrix[key])
     return {
         "cloud": cloud.name,
@@ -57,7 +56,7 @@ def score(model: Model, cloud: Cloud, pictures: Path | None = None) -> dict[str,
         "oa": 100 * float(np.mean(found[known] == cloud.truth[known])),
         "f1": {NAMES[c]: 100 * f for c, f in result.f1.items() if f is not None and (cloud.truth == c).any()},
         "ground_as_building": 100 * matrix["ground as building"] / int(known.sum()),
-        "contradicted": 0 if gone is None else int(np.count_nonzero(gone)),
+        "contradicted": int(np.count_nonzero(gone)),
         "worst": worst,
         "share": 100 * matrix[worst] / int(known.sum()),
     }

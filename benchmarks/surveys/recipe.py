@@ -11,7 +11,6 @@ from clouds import SURVEYS, Cloud, load, on_slopes, one_return, thinned, without
 
 from pdal_stages.base.hashing import coordinate_hash
 from pdal_stages.classifier import Model, TrainingCloud, TrainingOptions, train
-from pdal_stages.classifier.clouds import contradicted
 from pdal_stages.features.voxels import represent
 from pdal_stages.stages.heights import PREPARATION
 
@@ -21,6 +20,8 @@ DENSITIES = (8.0, 2.0, 0.6)
 SLOPES = ((0.3, 8.0, False), (0.6, 3.0, False), (0.9, 1.0, False), (0.5, 0.3, False), (0.5, 1.0, True))
 #: Points per square meter, at most, of copies that have one return of each pulse, the first or the last.
 ONE_RETURN = (12.0, 3.0)
+#: Height in meters below which a label of something standing is not believed.
+BELOW = 0.3
 #: Points of a copy at most: a strip of it, each copy's somewhere else.
 MOST = 50_000
 #: Steps by this share of a whole, over and over, fall evenly everywhere.
@@ -32,7 +33,6 @@ OPTIONS = TrainingOptions(
     dimensions=("HeightAboveGround", "Ground", "HeightAboveOpening_5", "HeightAboveOpening_17", "returns"),
     classes={"2": 2, "5": 5, "6": 6},
     count=40_000,
-    contradicted_below=0.3,
     trees=27,
     max_samples=1.0,
     min_samples_leaf=10,
@@ -40,7 +40,6 @@ OPTIONS = TrainingOptions(
     passes=3,
     pass_folds=len(SURVEYS),
     context=("own", "box1", "box4", "columnvotes2", "columnvotes4"),
-    scale=False,
     folds=0,
     voxel=0.25,
 )
@@ -75,11 +74,16 @@ def training_cloud(cloud: Cloud, number: int) -> TrainingCloud:
     order = np.argsort(coordinate_hash(cloud.xyz, 1), kind="stable")
     mask = np.zeros(len(order), np.bool_)
     whole = TrainingCloud(cloud.xyz, cloud.labels, cloud.dimensions, name=cloud.name, survey=cloud.survey)
-    gone = contradicted(whole, OPTIONS.contradicted_below)
-    usable = cloud.labels if gone is None else np.where(gone, 0, cloud.labels)
+    usable = np.where(contradicted(cloud), 0, cloud.labels)
     for code in (2, 5, 6):
         mask[order[usable[order] == code][: SURVEYS[cloud.survey].samples]] = True
-    return replace(whole, mask=mask | (gone if gone is not None else False))
+    return replace(whole, mask=mask)
+
+
+def contradicted(cloud: Cloud | TrainingCloud) -> np.ndarray:
+    """(n,) points labeled as standing (4, 5, 6) that are Ground and lower than :data:`BELOW`: feet of walls, courtyards."""
+    low = np.asarray(cloud.dimensions["HeightAboveGround"]) < BELOW
+    return np.isin(cloud.labels, (4, 5, 6)) & (np.asarray(cloud.dimensions["Ground"]) > 0) & low
 
 
 def strip(xyz: np.ndarray, most: int, where: float) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OptionError
-from ..classifier import crossval
+from ..classifier.holdout import Folds
 from .circles import Circles
 from .configuration import NetworkOptions
 
@@ -68,7 +68,7 @@ def hold_out(
     label = np.concatenate([one[rows] for one, rows in zip(labels, use, strict=True)])
     folds = max(2, round(1.0 / share))
     try:
-        fold = crossval.block_folds(xy, label, np.ones(len(xy)), folds, block_size)
+        fold = Folds.of_blocks(xy, label, np.ones(len(xy)), folds, block_size).points(xy)
     except OptionError as error:
         raise OptionError(
             error.what,

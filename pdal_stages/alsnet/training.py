@@ -26,10 +26,10 @@ from ..base.outputs import Output
 from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
 from ..base.version import __version__
-from ..classifier import crossval
 from ..classifier.classes import ClassMap
 from ..classifier.clouds import TrainingCloud, densities, label_classes
 from ..classifier.dimensions import gather, with_returns
+from ..classifier.holdout import figures
 from ..classifier.model import Model, load_model
 from ..classifier.trainoptions import TrainingOptions
 from ..features.index import check_xyz
@@ -100,7 +100,6 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
         torch.set_num_threads(before)
     used = np.concatenate(positions)
     count = np.bincount(used[used >= 0], minlength=len(classes.codes))
-    ranges = [_range(name, values) for name in names]
     info: dict[str, Any] = {
         **known.described(
             options, ({"available": int(m), "samples": int(m), "duplicates": 0} for m in count)
@@ -110,24 +109,13 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
             "count": int(count.sum()),
             "seed": options.seed,
             "samples": int(count.sum()),
-            **({"contradicted": dict(known.left_out)} if known.left_out else {}),
             **session.notes(),
             **{name: number for name, number in missing.items() if number},
         },
         "densities": densities(clouds),
         "voxel": options.voxel,
         "accuracy": {"cross_validation": None},
-        "passes": [
-            {
-                "percentiles": {
-                    "low": [low for low, _ in ranges],
-                    "high": [high for _, high in ranges],
-                    "limited": False,
-                },
-                "importances": None,
-                "out_of_bag": None,
-            }
-        ],
+        "passes": [{"importances": None}],
         "created_by": {
             "pdal_stages": __version__,
             "python": platform.python_version(),
@@ -137,14 +125,6 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     }
     seconds = {"whole": round(time.perf_counter() - started, 3)}
     return Model((net,), list(zip(classes.codes, classes.names, strict=True)), info, seconds)
-
-
-def _range(name: str, values: Sequence[dict[str, npt.NDArray[Any]]]) -> tuple[float, float]:
-    """Smallest and largest value of an input; 0 and 0 for coordinates, which depend on the batch."""
-    if name in ("X", "Y", "Z"):
-        return 0.0, 0.0
-    parts = [np.asarray(one[name], np.float64) for one in values if len(one[name])]
-    return min(float(part.min()) for part in parts), max(float(part.max()) for part in parts)
 
 
 class _Session:
@@ -341,7 +321,7 @@ class _Session:
         for p, label in zip(sums, self.held_labels, strict=True):
             rows = np.flatnonzero(label >= 0)
             np.add.at(matrix, (label[rows], p[rows].argmax(axis=1)), 1)
-        return crossval.figures(matrix, self.classes.codes)
+        return figures(matrix, self.classes.codes)
 
     def _identity(self) -> str:
         """What a checkpoint must agree with, as JSON: options, classes and data."""

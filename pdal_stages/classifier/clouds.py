@@ -1,8 +1,10 @@
-"""Labeled clouds to train on: prepared, kept on disk where they need not fit in memory, and the classes they have."""
+"""Labeled clouds to train on: prepared, kept on disk where they need not fit in memory, in tiles or not; their classes."""
 
 from __future__ import annotations
 
+import math
 import os
+import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,12 +15,19 @@ import numpy.typing as npt
 
 from ..base.asprs import UNINFORMATIVE
 from ..base.errors import OptionError, StageError
+from ..base.hashing import coordinate_hash
 from ..base.progress import Progress
-from ..features.voxels import Representatives, represent
+from ..base.runs import begins_run
+from ..features.cells import cell_keys
+from ..features.voxels import represent
 from .classes import MAX_LABEL, ClassMap, as_labels
 from .dimensions import known
-from .thinning import density, density_range, thinned
 from .trainoptions import TrainingOptions
+
+#: Side in meters of the cells that density is measured in.
+CELL = 2.0
+#: A thinned copy is made where it would have less than this share of the points.
+WORTH = 0.75
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,15 +105,19 @@ CloudSource = TrainingCloud | Callable[[], TrainingCloud]
 def prepared(sources: Iterable[CloudSource], options: TrainingOptions) -> Iterator[TrainingCloud]:
     """The clouds without ignored points and with one point per voxel, each followed by its thinned copies."""
     for source in sources:
-        cloud = cleaned(source() if callable(source) else source, options)
+        cloud = _cleaned(source() if callable(source) else source, options)
         yield cloud
+        there = density(cloud.xyz)
         for wanted in options.thin:
-            copy = thinned_copy(cloud, wanted, options.seed)
-            if copy is not None:
-                yield copy
+            if wanted < WORTH * there:
+                # A point stays or goes by a hash of its coordinates: the same ones in any order.
+                limit = np.uint64(wanted / there * (2.0**64 - 2048.0))
+                rows = np.flatnonzero(coordinate_hash(cloud.xyz, options.seed) <= limit)
+                if len(rows):
+                    yield cloud.part(rows, f"thinned to {wanted:g} per m2")
 
 
-def cleaned(cloud: TrainingCloud, options: TrainingOptions) -> TrainingCloud:
+def _cleaned(cloud: TrainingCloud, options: TrainingOptions) -> TrainingCloud:
     """A cloud without ignored points and with one point per voxel."""
     named: set[int] = set()
     if options.classes is not None:
@@ -112,51 +125,24 @@ def cleaned(cloud: TrainingCloud, options: TrainingOptions) -> TrainingCloud:
     labels = _checked_labels(cloud)
     ignored = [label for label in options.ignore if label not in named]
     if ignored and (gone := np.isin(labels, ignored)).any():
-        cloud = cloud.part(np.flatnonzero(~gone))
+        cloud, labels = cloud.part(np.flatnonzero(~gone)), labels[~gone]
     values = known(options.inputs, cloud.dimensions, len(cloud.xyz), where=cloud.name)
     representatives = represent(cloud.xyz, options.voxel, values)
     if representatives is None:
         return cloud
-    few = options.base is not None  # then each label counts, whichever point stands for its voxel
-    return _told(cloud, representatives, named) if few else cloud.part(representatives.rows)
-
-
-def thinned_copy(cloud: TrainingCloud, wanted: float, seed: int) -> TrainingCloud | None:
-    """A copy with `wanted` points per square meter; None where there are hardly more."""
-    rows = thinned(cloud.xyz, wanted, seed)
-    if rows is None or not len(rows):
-        return None
-    return cloud.part(rows, f"thinned to {wanted:g} per m2")
-
-
-def joined(parts: Sequence[TrainingCloud]) -> TrainingCloud:
-    """Clouds of the same dimensions as one, named as the first."""
-    first = parts[0]
-    return replace(
-        first,
-        xyz=np.concatenate([one.xyz for one in parts]),
-        labels=np.concatenate([np.asarray(one.labels) for one in parts]),
-        dimensions={
-            name: np.concatenate([np.asarray(one.dimensions[name]) for one in parts])
-            for name in first.dimensions
-        },
-        mask=None if first.mask is None else np.concatenate([np.asarray(one.mask) for one in parts]),
-    )
-
-
-def _told(cloud: TrainingCloud, representatives: Representatives, named: set[int]) -> TrainingCloud:
-    """The representatives, each with its own label or else the least of its voxel that may be trained on."""
-    labels = as_labels(cloud.labels, cloud.name)
+    rows = representatives.rows
+    part = cloud.part(rows)
+    if options.base is None:
+        return part
+    # Labels are few, and each counts: a representative without one gets the least of its voxel that may be trained on.
     usable = np.isin(labels, list(named)) if named else ~np.isin(labels, UNINFORMATIVE)
     if cloud.mask is not None:
         usable &= np.asarray(cloud.mask)
-    rows = representatives.rows
     points, place = representatives.members(slice(None))
     good = usable[points]
     least = np.full(len(rows), MAX_LABEL + 1, np.int64)
     np.minimum.at(least, place[good], labels[points[good]])
     lent = ~usable[rows] & (least <= MAX_LABEL)
-    part = cloud.part(rows)
     told = np.where(lent, least, labels[rows])
     return replace(part, labels=told, mask=None if cloud.mask is None else usable[rows] | lent)
 
@@ -176,21 +162,70 @@ def _mapped(cloud: TrainingCloud, folder: Path, number: int) -> TrainingCloud:
             return np.load(path, mmap_mode="r", allow_pickle=False)
         except OSError as error:
             raise StageError(
-                "training clouds cannot be kept in a temporary folder",
+                "training clouds cannot be kept on disk while training lasts",
                 found=f"{folder}: {error.strerror or error}",
-                cure="Set TMPDIR to a folder with more room",
+                cure="Make room there, set TMPDIR to another disk, or write the model to one",
             ) from error
 
-    return TrainingCloud(
-        kept("xyz", cloud.xyz),
-        kept("labels", cloud.labels),
-        {name: kept(f"d{place}", cloud.dimensions[name]) for place, name in enumerate(cloud.dimensions)},
-        cloud.name,
-        kept("mask", cloud.mask),
-        cloud.survey,
-        cloud.copy,
-        kept("own", cloud.own),
+    return replace(
+        cloud,
+        xyz=kept("xyz", cloud.xyz),
+        labels=kept("labels", cloud.labels),
+        dimensions={k: kept(f"d{i}", v) for i, (k, v) in enumerate(cloud.dimensions.items())},
+        mask=kept("mask", cloud.mask),
+        own=kept("own", cloud.own),
     )
+
+
+class TiledCloud:
+    """A cloud in square tiles on disk: each is trained on with the points around it at hand.
+
+    Parameters
+    ----------
+    folder : Path
+        Made for them alone.
+    side : float
+        Of the squares, meters: (i, j) begins at ``i * side, j * side``. Points on an edge may belong to either.
+    """
+
+    def __init__(self, folder: Path, side: float) -> None:
+        self.folder, self.side = folder, side
+        self.tiles: dict[tuple[int, int], TrainingCloud] = {}
+        folder.mkdir()
+
+    def put(self, tile: tuple[int, int], cloud: TrainingCloud) -> None:
+        """Write a tile; nothing where it is empty."""
+        if len(cloud):
+            self.tiles[tile] = _mapped(cloud, self.folder, len(self.tiles))
+
+    def clouds(self, halo: float) -> Iterator[TrainingCloud]:
+        """Each tile with the points up to `halo` meters around it, row by row; the files are gone in the end."""
+        steps = math.ceil(halo * (1 + 1e-6) / self.side)
+        for tile in sorted(self.tiles, key=lambda t: (t[1], t[0])):
+            low = np.array(tile) * self.side - halo
+            high = low + self.side + 2 * halo
+            parts, own = [], []
+            for b in range(tile[1] - steps, tile[1] + steps + 1):
+                for a in range(tile[0] - steps, tile[0] + steps + 1):
+                    part = self.tiles.get((a, b))
+                    if part is None:
+                        continue
+                    mine = (a, b) == tile
+                    near = mine | ((part.xyz[:, :2] >= low) & (part.xyz[:, :2] <= high)).all(axis=1)
+                    parts.append(part.part(np.flatnonzero(near)))
+                    own.append(np.full(len(parts[-1]), mine))
+            first = self.tiles[tile]
+            yield TrainingCloud(
+                np.concatenate([one.xyz for one in parts]),
+                np.concatenate([np.asarray(one.labels) for one in parts]),
+                {k: np.concatenate([one.dimensions[k] for one in parts]) for k in first.dimensions},
+                first.name,
+                None if first.mask is None else np.concatenate([np.asarray(one.mask) for one in parts]),
+                first.survey,
+                first.copy,
+                np.concatenate(own),
+            )
+        shutil.rmtree(self.folder, ignore_errors=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,8 +234,6 @@ class Labeled:
 
     clouds: Sequence[TrainingCloud]
     classes: ClassMap
-    contradicted_below: float = 0.0  #: meters; see ``TrainingOptions``
-    left_out: Mapping[str, int] = field(default_factory=dict)  #: points of each label that are so left out
 
     def __len__(self) -> int:
         return len(self.clouds)
@@ -209,9 +242,6 @@ class Labeled:
         cloud = self.clouds[number]
         position = self.classes.index(as_labels(cloud.labels, cloud.name))
         position[~cloud.usable] = -1
-        gone = contradicted(cloud, self.contradicted_below)
-        if gone is not None:
-            position[gone] = -1
         return cloud.xyz, position
 
     def __iter__(self) -> Iterator[tuple[npt.NDArray[np.float64], npt.NDArray[np.int16]]]:
@@ -231,35 +261,16 @@ class Labeled:
         }
 
 
-#: Labels of what stands above the ground: vegetation from medium height on, buildings.
-STANDING = (4, 5, 6)
-
-
-def contradicted(cloud: TrainingCloud, below: float) -> npt.NDArray[np.bool_] | None:
-    """(n,) points whose label their height contradicts: of :data:`STANDING`, but Ground and lower than `below` meters.
-
-    None where nothing can be said.
-    """
-    if below == 0 or not {"Ground", "HeightAboveGround"} <= set(cloud.dimensions):
-        return None
-    low = np.asarray(cloud.dimensions["HeightAboveGround"]) < below
-    ground = np.asarray(cloud.dimensions["Ground"]) > 0
-    return np.isin(as_labels(cloud.labels, cloud.name), STANDING) & ground & low
-
-
 def label_classes(
     clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool = False
 ) -> Labeled:
     """The classes that the clouds' labels make."""
-    number, left_out = np.zeros((2, MAX_LABEL + 1), np.int64)
-    for cloud in watched(clouds, "counting labels", progress):
-        labels = as_labels(cloud.labels, cloud.name)
-        used = cloud.usable
-        gone = contradicted(cloud, options.contradicted_below)
-        if gone is not None:
-            left_out += np.bincount(labels[used & gone], minlength=len(number))
-            used = used & ~gone
-        number += np.bincount(labels[used], minlength=len(number))
+    number = np.zeros(MAX_LABEL + 1, np.int64)
+    with Progress(sum(map(len, clouds)), "counting labels", enabled=progress) as bar:
+        for cloud in clouds:
+            labels = as_labels(cloud.labels, cloud.name)
+            number += np.bincount(labels[cloud.usable], minlength=len(number))
+            bar.update(len(cloud))
     found = {int(label): int(number[label]) for label in np.flatnonzero(number)}
     listing = ", ".join(f"{label}: {n:,}" for label, n in sorted(found.items())[:20]) or "no points"
     classes = ClassMap.parse(options.classes, found)
@@ -278,16 +289,7 @@ def label_classes(
             found=f"labels {listing}",
             cure=f"Labels {', '.join(map(str, UNINFORMATIVE))} are left out unless 'classes' names them",
         )
-    counted = {str(label): int(left_out[label]) for label in np.flatnonzero(left_out)}
-    return Labeled(clouds, classes, options.contradicted_below, counted)
-
-
-def watched(clouds: Sequence[TrainingCloud], what: str, progress: bool) -> Iterator[TrainingCloud]:
-    """The clouds, with progress on stderr that counts their points."""
-    with Progress(sum(map(len, clouds)), what, enabled=progress) as bar:
-        for cloud in clouds:
-            yield cloud
-            bar.update(len(cloud))
+    return Labeled(clouds, classes)
 
 
 def listed(clouds: Iterable[TrainingCloud]) -> list[dict[str, Any]]:
@@ -303,6 +305,19 @@ def listed(clouds: Iterable[TrainingCloud]) -> list[dict[str, Any]]:
     return rows
 
 
+def density(xyz: npt.NDArray[np.float64]) -> float:
+    """Points per square meter: the median over the occupied cells of :data:`CELL` meters, 0 for an empty cloud.
+
+    Strays, holes and the cloud's outline do not matter, and the order of the points does not.
+    """
+    if not len(xyz):
+        return 0.0
+    keys, _ = cell_keys(xyz[:, :2], CELL)
+    keys.sort()
+    starts = np.flatnonzero(begins_run(keys))
+    return float(np.median(np.diff(np.append(starts, len(keys))))) / CELL**2
+
+
 def densities(clouds: Iterable[TrainingCloud]) -> dict[str, float]:
     """Smallest and largest density of some clouds, as a manifest has it; of tiles the median by their points."""
     found: dict[object, list[tuple[float, int]]] = {}
@@ -313,7 +328,8 @@ def densities(clouds: Iterable[TrainingCloud]) -> dict[str, float]:
     for tiles in found.values():
         value, points = (np.array(column) for column in zip(*sorted(tiles), strict=True))
         medians.append(float(value[np.searchsorted(np.cumsum(points), points.sum() / 2)]))
-    return density_range(medians)
+    there = [one for one in medians if one]  # empty clouds do not count
+    return {"low": min(there, default=0.0), "high": max(there, default=0.0)}
 
 
 def _checked_labels(cloud: TrainingCloud) -> npt.NDArray[Any]:

@@ -113,7 +113,7 @@ class Context:
         xyz : (n, 3) float64
             Meters. Cells that points at hand lie in must be complete, and so must those around them.
         shares : (n, classes) uint16
-            Of each point; see ``smoothing.count_shares``.
+            Of each point; see :func:`count_shares`.
         """
 
         def means(scale: Scale):
@@ -142,7 +142,9 @@ class Tables:
                 take_means(*self.cells[token], points, part)
 
 
-# ---- kernels -----------------------------------------------------------------------------------------------
+def count_shares(probabilities: npt.NDArray[Any]) -> npt.NDArray[np.uint16]:
+    """Probabilities (n, classes) in 65535ths."""
+    return np.rint(np.asarray(probabilities) * WHOLE).astype(np.uint16)
 
 
 @njit

@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from ..base import checks
 from ..base.report import Report
-from .smoothing import FARTHEST
 
 #: The class of a rejected point where its old class is not known: ASPRS "Unclassified".
 UNCLASSIFIED = 1
@@ -33,9 +32,6 @@ class PredictionOptions:
         Class of rejected points, instead of their old one.
     limits : mapping of int to float, optional
         The same as `reject_below`, for points of each class; the larger one counts.
-    smooth : float
-        Meters, 0 for none: probabilities become half the point's own, half the mean over the classified
-        points in a sphere of that radius around it. Classes, reliability and margin follow from these.
     """
 
     threads: int | None = None
@@ -46,10 +42,8 @@ class PredictionOptions:
     reject_below: float | None = None
     rejected_code: int | None = None
     limits: Mapping[int, float] | None = None
-    smooth: float = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "smooth", checks.number("'smooth'", self.smooth, 0, FARTHEST, unit="m"))
         checks.number("'memory_mb'", self.memory_mb, 1, unit="MB")
         if self.reject_below is not None:
             checks.number("'reject_below'", self.reject_below, 0, 1)
@@ -130,14 +124,10 @@ class Outcome:
         self.variance = np.zeros(n, np.float32) if options.variance else None
         self.probabilities = np.zeros((n, classes), np.float32) if options.probabilities else None
 
-    def write(
-        self, rows: Any, decided: Decided | None, variance: npt.NDArray[np.floating] | None = None
-    ) -> None:
+    def write(self, rows: Any, decided: Decided, variance: npt.NDArray[np.floating] | None = None) -> None:
         """Write what is known of a block: `rows` index the cloud."""
         if self.variance is not None and variance is not None:
             self.variance[rows] = variance
-        if decided is None:
-            return
         self.reliability[rows] = decided.reliability
         if self.margin is not None:
             self.margin[rows] = decided.margin
@@ -153,15 +143,13 @@ class Outcome:
             instead = np.uint8(UNCLASSIFIED) if self._current is None else self._current[rows]
         self.classification[rows] = np.where(low, instead, decided.code)
 
-    def prediction(self, asked: npt.NDArray[np.bool_] | None, ignored: int, counted: Report) -> Prediction:
+    def prediction(self, asked: npt.NDArray[np.bool_], ignored: int, counted: Report) -> Prediction:
         """The result once all blocks are written.
 
-        `asked` (n,) are the points that were to be classified, None for all; so many others were `ignored`.
+        `asked` (n,) are the points that were to be classified; so many others were `ignored`.
         """
-        n = len(self.classification)
-        count = n if asked is None else int(np.count_nonzero(asked))
-        given = self.classification if asked is None else self.classification[asked]
-        code, number = np.unique(given, return_counts=True)
+        n, count = len(asked), int(np.count_nonzero(asked))
+        code, number = np.unique(self.classification[asked], return_counts=True)
         report = Report(
             {
                 "points": n,

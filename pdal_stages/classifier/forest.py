@@ -1,4 +1,4 @@
-"""A random forest as plain arrays: made from trees, checked, and applied.
+"""A random forest as plain arrays: grown by scikit-learn, checked, and applied.
 
 Trees are stored level by level (root, its children, theirs, ...). The children of the k-th split node of
 a tree (k from 0) are then its nodes 2k+1 and 2k+2, so no child pointers are needed. See docs/model-file.md.
@@ -6,6 +6,7 @@ a tree (k from 0) are then its nodes 2k+1 and 2k+2, so no child pointers are nee
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -15,8 +16,9 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError
 from ..base.jit import njit
+from ..base.progress import Progress
+from ..base.threads import map_blocks
 from .algorithms import ArrayRule
-from .trees import GrownTree
 
 #: Levels below the root a tree may have.
 MAX_DEPTH = 10_000
@@ -116,17 +118,7 @@ class Forest:
             Trained on float32 features with whole-number sample weights (bootstrap counts), one output.
         n_features : int
         """
-        return cls._of([_of_sklearn(getattr(tree, "tree_", tree)) for tree in trees], n_features)
-
-    @classmethod
-    def from_trees(cls, trees: Sequence[GrownTree], n_features: int) -> Forest:
-        """Of trees as they were grown."""
-        return cls._of(
-            [_level_order(t.left, t.right, t.feature, t.threshold, t.counts) for t in trees], n_features
-        )
-
-    @classmethod
-    def _of(cls, parts: Sequence[Any], n_features: int) -> Forest:
+        parts = [_level_order(getattr(tree, "tree_", tree)) for tree in trees]
         kind = np.int16 if n_features <= np.iinfo(np.int16).max else np.int32
         return cls(
             np.array([len(part[0]) for part in parts], np.int32),
@@ -218,6 +210,70 @@ def walk(values, sizes, nodes, shares, out):
                         out[row + lane, c] += shares[leaf, c]
 
 
+@dataclass(frozen=True)
+class TreeOptions:
+    """How each tree is grown; see ``TrainingOptions``."""
+
+    min_samples_leaf: int = 1
+    max_samples: float = 1.0
+    max_features: str | int | float = "auto"
+
+    def tried(self, features: int) -> str | int | float:
+        """Features tried at a split, as scikit-learn takes it; ``auto``: a tenth of them, but at least their root."""
+        if self.max_features == "auto":
+            return max(1, math.isqrt(features), features // 10)
+        if isinstance(self.max_features, int | np.integer):
+            return min(int(self.max_features), features)
+        return self.max_features
+
+
+def grow_forest(
+    values: npt.NDArray[np.float32],
+    label: npt.NDArray[Any],
+    weight: npt.NDArray[np.int64],
+    trees: int,
+    options: TreeOptions,
+    seed: int,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> tuple[Forest, npt.NDArray[np.float64]]:
+    """A random forest, each tree of its own bootstrap sample, and (features,) importances that sum to 1, or to 0.
+
+    Parameters
+    ----------
+    values : (n, features) float32
+        Finite; in Fortran order trees grow faster.
+    label : (n,) int
+        Class positions; every class occurs, if only with weight 0.
+    weight : (n,) int
+        Times a row counts; rows of weight 0 take no part.
+    """
+    from sklearn.tree import DecisionTreeClassifier
+
+    ends = np.cumsum(weight)
+    draws = max(1, round(options.max_samples * int(ends[-1])))
+    tried = options.tried(values.shape[1])
+
+    def one(number: int) -> tuple[Any, npt.NDArray[np.float64]]:
+        random = np.random.default_rng([seed, number])
+        drawn = np.searchsorted(ends, random.integers(0, ends[-1], draws), side="right")
+        bag = np.bincount(drawn, minlength=len(weight)).astype(np.float64)
+        state = int(random.integers(0, 2**31 - 1))
+        tree = DecisionTreeClassifier(
+            max_features=tried, min_samples_leaf=options.min_samples_leaf, random_state=state
+        )
+        tree.fit(values, label, sample_weight=bag, check_input=False)
+        return tree.tree_, tree.feature_importances_
+
+    grown, total = [], np.zeros(values.shape[1])
+    for tree, importances in map_blocks(one, range(trees), threads):
+        grown.append(tree)
+        total += importances
+        if progress is not None:
+            progress.update(1)
+    return Forest.from_sklearn(grown, values.shape[1]), total / (total.sum() or 1.0)
+
+
 def _laid_out(
     sizes, feature, threshold, n_features: int
 ) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.int32]]:
@@ -255,32 +311,23 @@ def _laid_out(
     return np.where(split, 2 * before + 1, node).astype(np.uint32), depths
 
 
-def _of_sklearn(tree) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
-    """:func:`_level_order` of a scikit-learn tree."""
+def _level_order(tree) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
+    """(feature, threshold, leaf counts) of a scikit-learn tree, level by level."""
     shares = tree.value[:, 0, :]
     # scikit-learn keeps shares (before 1.3: counts) and the weight of a node; bootstrap weights are whole.
     exact = shares / shares.sum(axis=1, keepdims=True) * tree.weighted_n_node_samples[:, None]
     counts = np.rint(exact)
     if tree.n_outputs != 1 or np.abs(counts - exact).max(initial=0) > 1e-3 or counts.max() >= 2**32:
         raise ModelError("these trees were not grown with whole-number sample weights and one output")
-    return _level_order(tree.children_left, tree.children_right, tree.feature, tree.threshold, counts)
-
-
-def _level_order(
-    left, right, feature, threshold, counts
-) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
-    """(feature, threshold, leaf counts) of a tree, level by level."""
+    left, right = tree.children_left, tree.children_right
     levels = [np.zeros(1, np.int64)]
-    while True:
-        splits = levels[-1][left[levels[-1]] >= 0]
-        if not len(splits):
-            break
+    while len(splits := levels[-1][left[levels[-1]] >= 0]):
         levels.append(np.column_stack([left[splits], right[splits]]).reshape(-1))
     order = np.concatenate(levels)
     leaf = left[order] < 0
     return (
-        np.where(leaf, -1, feature[order]),
-        np.where(leaf, 0.0, float32_at_most(threshold[order])).astype(np.float32),
+        np.where(leaf, -1, tree.feature[order]),
+        np.where(leaf, 0.0, float32_at_most(tree.threshold[order])).astype(np.float32),
         counts[order[leaf]].astype(np.uint32),
     )
 

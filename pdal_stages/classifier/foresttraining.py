@@ -1,45 +1,41 @@
-"""Training a forest: sample, compute features for the samples only, search, grow, score."""
+"""Training a forest: sample, compute features for the samples only, grow, score on ground held out."""
 
 from __future__ import annotations
 
 import math
 import platform
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..base.errors import OptionError
+from ..base.errors import DimensionError, OptionError
+from ..base.memory import free_memory
 from ..base.outputs import Output
 from ..base.progress import Progress
 from ..base.version import __version__
-from ..features import FeaturePlan
+from ..features.fitting import fit_clouds
 from ..features.returns import SOURCES
-from . import crossval
 from .algorithms import PredictRequest
-from .clouds import Labeled, TrainingCloud, densities, label_classes, listed
+from .clouds import TrainingCloud, densities, label_classes, listed
 from .context import Context
-from .dimensions import WHERE_THERE, gather, required
+from .dimensions import WHERE_THERE, gather, required, with_returns
 from .featureforest import FeatureForest, Features
-from .folds import FoldForests, Folds, sample_context
-from .forest import Forest
+from .forest import Forest, TreeOptions, grow_forest
+from .holdout import BLOCK, FoldForests, Folds, figures, sample_context, split
 from .model import Model
 from .passes import weighed
 from .refinement import Below, Blend, blended, held_by_base, on_top
-from .samplefeatures import fitted, must_fit, percentiles, sample_features
-from .sampling import Samples, draw_samples
+from .sampling import draw_samples
 from .sureness import Sureness, counted
 from .trainoptions import PER_TREE, TrainingOptions, feature_plan
-from .trees import GrownTree, Ranked, TreeOptions, grow
-from .unscored import why_unscored
 
 #: Trees of a forest that judges a fold, as a share of the final one's.
 FOLD_TREES = 0.25
-#: Side in meters of blocks of ground that are held out.
-BLOCK = 25.0
-
+#: In the counts: samples of tiles whose nearest neighbors lie beyond the halo of their features.
+SHORT = "short_of_neighbors"
 
 optional_inputs = {**{name: (name,) for name in WHERE_THERE}, "returns": SOURCES}
 reports_training = False
@@ -62,108 +58,287 @@ def inputs(options: TrainingOptions) -> tuple[str, ...]:
 
 def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model:
     """See :func:`pdal_stages.classifier.train`."""
-    started = time.perf_counter()
-    plan = feature_plan(options)
-    _check_groups(clouds, options)  # before any work: a dimension may be missing
-    labeled = label_classes(clouds, options, progress)
-    classes = labeled.classes
-    shares = [f"{cloud.flight} {cloud.copy}" for cloud in clouds]
-    total = sum(map(len, clouds)) * (1 + len(classes.codes))  # which are read for each class
-    with Progress(total, "drawing samples", enabled=progress) as bar:
-        samples = draw_samples(labeled, len(classes.codes), options.count, options.seed, shares, progress=bar)
-    base = options.base
-    known = set() if base is None else set(base.codes.tolist())
-    read = 0 if options.passes == 1 and base is None else len(known | set(classes.codes))
-    must_fit(len(plan.names) + len(options.context) * read, len(samples))
-    features = Features(plan, *fitted(clouds, samples, plan, options), options.seed)
-    values, counted = sample_features(clouds, samples, features, options, progress)
-    timed = {"features": time.perf_counter() - started}
-    limits = percentiles(values, plan, options)
-    below = None if base is None else Below(base, clouds, samples, options, progress)
-    xy = samples.take(lambda number: clouds[number].xyz[:, :2])
-    priors = _priors(samples, len(classes.codes), options.prior_weight)
-    ranked = alone = Ranked.of(values, options.threads)
-    del values  # as large again
-    if below is not None:
-        ranked = ranked.beside(Ranked.of(below.columns, options.threads))
-    heard = _Heard(samples, classes.codes, priors, below, options)
-    group = samples.take(lambda number: _groups(clouds[number], options))
-    setting = TreeOptions(
-        options.min_samples_leaf, _share_drawn(options, samples, len(classes.codes)), options.max_features
-    )
-    validation = _validate(ranked, samples, xy, group, classes.codes, plan, setting, options, progress, heard)
-    started = time.perf_counter()
-    passes = _Passes(labeled, samples, (alone, ranked), features, setting, options, progress, below)
-    passes.grow(*limits)
-    timed["trees"] = time.perf_counter() - started
-    info = {
-        **labeled.described(options, map(samples.counts, range(len(classes.codes)))),
-        "training": {
-            "clouds": listed(clouds),
-            "count": options.count,
-            "seed": options.seed,
-            "samples": len(samples),
-            **({"contradicted": dict(labeled.left_out)} if labeled.left_out else {}),
-            "max_samples": setting.max_samples,
-            "max_features": options.max_features,
-            "min_samples_leaf": options.min_samples_leaf,
-            **passes.notes,
-            **_unscored(heard, validation, xy, samples, labeled, options, _gap(plan)),
-            **({} if below is None or options.target is not None else _held(below, classes.codes)),
-            **counted,
-        },
-        "priors": priors,
-        **heard.of(validation),
-        "densities": densities(clouds),
-        "voxel": options.voxel,
-        "accuracy": {"cross_validation": validation},
-        "passes": passes.scores,
-        "created_by": _versions(),
-    }
-    made = Model(tuple(passes.made), list(zip(classes.codes, classes.names, strict=True)), info, timed)
-    return made if below is None else on_top(below, made)
+    return _ForestTraining(clouds, options, progress).model()
 
 
-def _unscored(
-    heard: _Heard,
-    validation: Any,
-    xy: npt.NDArray[np.float64],
-    samples: Samples,
-    labeled: Labeled,
-    options: TrainingOptions,
-    gap: float,
-) -> dict[str, str]:
-    if validation is not None or options.folds == 0:
-        return {}
-    named = list(zip(labeled.classes.codes, labeled.classes.names, strict=True))
-    return {"unscored": why_unscored(heard.errors, xy, samples.label, named, BLOCK, gap)}
+class _ForestTraining:
+    """Samples of labeled clouds and what is computed of them."""
+
+    def __init__(self, clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> None:
+        self.started = time.perf_counter()
+        self.clouds, self.options, self.progress = clouds, options, progress
+        _check_groups(clouds, options)  # before any work: a dimension may be missing
+        plan = feature_plan(options)
+        self.labeled = label_classes(clouds, options, progress)
+        self.codes = self.labeled.classes.codes
+        self.flights = [cloud.flight for cloud in clouds]
+        shares = [f"{cloud.flight} {cloud.copy}" for cloud in clouds]
+        total = sum(map(len, clouds)) * (1 + len(self.codes))  # which are read for each class
+        with Progress(total, "drawing samples", enabled=progress) as bar:
+            self.samples = draw_samples(
+                self.labeled, len(self.codes), options.count, options.seed, shares, progress=bar
+            )
+        used = [clouds[number].xyz for number in np.unique(self.samples.cloud).tolist()]
+        bins, threshold = fit_clouds(used, plan, seed=options.seed, threads=options.threads)
+        self.features = Features(plan, bins, threshold, options.seed)
+        self.context = Context(tuple(options.context))
+        self.counts: dict[str, int] = {}
+        self.own = self._features_of_samples()
+        self.below = (
+            None if options.base is None else Below(options.base, clouds, self.samples, options, progress)
+        )
+        #: What the first pass reads of the samples.
+        self.first = self.own if self.below is None else _beside(self.own, self.below.columns)
+        self.xy = self.samples.take(lambda number: clouds[number].xyz[:, :2])
+        weight = self.samples.weight
+        drawn = np.bincount(self.samples.label, weight, len(self.codes))
+        frequent = np.array(self.samples.available) / drawn
+        #: How many points each sample stands for.
+        self.stands_for = weight * frequent[self.samples.label]
+        factors = frequent**options.prior_weight
+        self.factors = factors / factors.max() if options.prior_weight else None
+        share = options.max_samples
+        if share is None:
+            share = min(1.0, PER_TREE * len(self.codes) / int(weight.sum()))
+        self.setting = TreeOptions(options.min_samples_leaf, share, options.max_features)
+        self.fold_trees = max(1, math.ceil(options.trees * FOLD_TREES))
+
+    def _features_of_samples(self) -> npt.NDArray[np.float32]:
+        """(samples, features), filled cloud by cloud."""
+        o, samples, names, own = (
+            self.options,
+            self.samples,
+            self.features.plan.names,
+            self.features.plan.dimensions,
+        )
+        if (needed := 4 * len(samples) * len(names)) > free_memory():
+            raise OptionError(
+                f"{len(samples):,} samples of {len(names)} features do not fit into the free memory",
+                found=f"{needed / 2**30:.1f} GiB needed",
+                cure="Lower 'count', or use fewer neighborhoods or features",
+            )
+        values = np.empty((len(samples), len(names)), np.float32, order="F")
+        with Progress(len(samples), "features of the samples", enabled=self.progress) as bar:
+            for number, cloud in enumerate(self.clouds):
+                at, rows = samples.of_cloud(number)
+                if not len(at):
+                    continue
+                engine = self.features.engine(cloud.xyz, o.threads)
+                there = with_returns(own, cloud.xyz, cloud.dimensions, o.threads)
+                fed, counts = gather(own, there, len(cloud), rows, cloud.name)
+                if cloud.own is not None:
+                    counts[SHORT] = 0
+                for part, block in engine.blocks(
+                    queries=rows, dimensions=fed, threads=o.threads, memory_mb=o.memory_mb, progress=bar
+                ):
+                    values[at[np.searchsorted(rows, part)]] = block
+                if cloud.own is not None:
+                    counts[SHORT] = max(engine.report.beyond_halo.values(), default=0)
+                for key, n in counts.items():
+                    self.counts[key] = self.counts.get(key, 0) + n
+        bad = ~np.isfinite(values).all(axis=0)
+        if bad.any():
+            raise DimensionError(f"the feature {names[int(bad.argmax())]} is not finite for some samples")
+        return values
+
+    def model(self) -> Model:
+        """Score, grow, and put together."""
+        o = self.options
+        timed = {"features": time.perf_counter() - self.started}
+        validation, notes = self._validate()
+        started = time.perf_counter()
+        forests, importances = self._passes()
+        timed["trees"] = time.perf_counter() - started
+        priors = (
+            None if self.factors is None else {"weight": o.prior_weight, "factors": self.factors.tolist()}
+        )
+        info = {
+            **self.labeled.described(o, map(self.samples.counts, range(len(self.codes)))),
+            "training": {
+                "clouds": listed(self.clouds),
+                "count": o.count,
+                "seed": o.seed,
+                "samples": len(self.samples),
+                "max_samples": self.setting.max_samples,
+                "max_features": o.max_features,
+                "min_samples_leaf": o.min_samples_leaf,
+                **({"pass_folds": o.pass_folds} if o.passes > 1 else {}),
+                **notes,
+                **(held_by_base(self.below, self.codes) if self.below else {}),
+                **{key: n for key, n in self.counts.items() if n},
+            },
+            "priors": priors,
+            "densities": densities(self.clouds),
+            "voxel": o.voxel,
+            "accuracy": {"cross_validation": validation},
+            "passes": [{"importances": one} for one in importances],
+            "created_by": _versions(),
+        }
+        if validation is not None and self.sureness.right:
+            info["sureness"] = self.sureness.to_dict()
+        names = list(zip(self.codes, self.labeled.classes.names, strict=True))
+        made = Model(tuple(forests), names, info, timed)
+        return made if self.below is None else on_top(self.below, made)
+
+    def _grow(
+        self, values: npt.NDArray[np.float32], weight: npt.NDArray[np.int64], trees: int, bar: Progress
+    ) -> tuple[Forest, npt.NDArray[np.float64]]:
+        o = self.options
+        return grow_forest(values, self.samples.label, weight, trees, self.setting, o.seed, o.threads, bar)
+
+    def _without_each(
+        self,
+        values: npt.NDArray[np.float32],
+        fold: npt.NDArray[np.int16],
+        what: str,
+        gap: float = 0.0,
+        needed: int = 2,
+    ) -> Iterator[tuple[npt.NDArray[np.int64], Forest]]:
+        """For each fold the samples held out, and a forest grown on those that are farther from them than `gap` meters.
+
+        OptionError where so few samples are left that fewer classes have any than are `needed`.
+        """
+        label, weight, count = self.samples.label, self.samples.weight, int(fold.max()) + 1
+        with Progress(count * self.fold_trees, what, "trees", enabled=self.progress) as bar:
+            for number in range(count):
+                train, rows = split(self.xy, fold, number, gap)
+                there = np.bincount(label[train], minlength=len(self.codes)) > 0
+                if np.count_nonzero(there) < needed:
+                    raise OptionError(
+                        f"without fold {number + 1} and its gap of {gap:g} m a class has no samples left",
+                        found=f"class {self.codes[int(np.argmin(there))]}",
+                        cure="Give more training data, or set passes to 1",
+                    )
+                yield rows, self._grow(values, weight * train, self.fold_trees, bar)[0]
+
+    # ---- score ---------------------------------------------------------------------------------------------
+
+    def _validate(self) -> tuple[dict[str, Any] | None, dict[str, str]]:
+        """The cross-validation for the manifest, over groups or surveys where there are several, else over blocks; and
+        why there is none, where one was wanted."""
+        o, samples, codes = self.options, self.samples, self.codes
+        if o.folds == 0:
+            return None, {}
+        folds, gap = o.folds or 5, _gap(self.features.plan)
+        group = samples.take(lambda number: _groups(self.clouds[number], o))
+        names, index = np.unique(group, return_inverse=True)
+        asked = {"groups": o.groups} if o.groups else {}
+        for by in (["groups" if o.groups else "surveys"] if len(names) > 1 else []) + ["blocks"]:
+            self.sureness = Sureness(about=f"{by} held out, forests of {self.fold_trees} trees")
+            here = 0.0 if by == "surveys" else gap  # which do not see each other, whatever their coordinates
+            try:
+                if by == "blocks":
+                    fold = Folds.of_blocks(self.xy, samples.label, samples.weight, folds, BLOCK).points(
+                        self.xy
+                    )
+                else:
+                    fold = (index % folds).astype(np.int16)
+                matrix = np.zeros((len(codes), len(codes)), np.int64)
+                for rows, forest in self._without_each(
+                    self.first, fold, "cross-validation", here, len(codes)
+                ):
+                    p = forest.predict_proba(self.first[rows])
+                    np.add.at(matrix, (samples.label[rows], p.argmax(axis=1)), samples.weight[rows])
+                    self._count_sure(rows, p)
+            except OptionError as error:  # too little ground, or a class in one place
+                reason = f"{error.what}: {error.found}"
+                if by == "groups":
+                    asked["instead"] = reason
+                continue
+            score = {"trees": self.fold_trees, **figures(matrix, codes)}
+            more = {"folds": int(fold.max()) + 1, "block_size": BLOCK, "gap": here, "chosen": score}
+            return {"by": by, **asked, **more}, {}
+        return None, {"unscored": self._unscored(reason, gap)}
+
+    def _count_sure(self, rows: npt.NDArray[np.int64], p: npt.NDArray[np.float64]) -> None:
+        """Count in how far samples that were held out were right where they were sure, as the points lie."""
+        codes: Sequence[int] = self.codes
+        if self.below is None:
+            p = weighed(p, self.factors)
+        elif self.options.target is not None:
+            return  # what the others truly are is not known
+        else:
+            before = self.below.base.codes.tolist()
+            p = blended(self.below.own[rows], p, before, codes, self.below.trusted)
+            codes = sorted({*before, *codes})
+        true = np.asarray(self.codes)[self.samples.label[rows]]
+        counted(p, codes, true, self.stands_for[rows], self.sureness)
+
+    def _unscored(self, reason: str, gap: float) -> str:
+        """Why there is no score, and which class to label next, and where not: that of the fewest blocks of ground."""
+        cell = np.floor(self.xy / BLOCK)
+        mine = [self.samples.label == place for place in range(len(self.codes))]
+        least = int(np.argmin([len(np.unique(cell[one], axis=0)) for one in mine]))
+        low, high = self.xy[mine[least]].min(axis=0), self.xy[mine[least]].max(axis=0)
+        x, y = (low + high) / 2
+        return (
+            f"there is no score on ground held out: {reason}. Label next, at least {BLOCK + gap:.0f} m away: "
+            f"{self.codes[least]} {self.labeled.classes.names[least]}, which lies around {x:.0f}, {y:.0f}"
+        )
+
+    # ---- passes --------------------------------------------------------------------------------------------
+
+    def _passes(self) -> tuple[list[FeatureForest], list[list[float]]]:
+        """One forest after the other, each reading what the one before says of ground it has not seen."""
+        o, samples = self.options, self.samples
+        made, importances = [], []
+        held_out: list[list[Forest]] = []
+        values = self.first
+        if o.passes > 1:
+            folds = Folds.of_ground(self.xy, samples.label, samples.weight, self.flights, o.pass_folds)
+            fold = samples.take(lambda number: folds.points(self.clouds[number].xyz, self.flights[number]))
+        for number in range(o.passes):
+            if number:
+                # Ground beside a fold is not left out as for the score: the forests miss the fold's samples already,
+                # and the next pass should see probabilities as good as those it will see when the model is used.
+                what = f"pass {number} without each fold"
+                held_out.append([forest for _, forest in self._without_each(values, fold, what)])
+                values = _beside(self.own, self._context(folds, held_out))
+            with Progress(o.trees, f"growing pass {number + 1}", "trees", enabled=self.progress) as bar:
+                forest, shares = self._grow(values, samples.weight, o.trees, bar)
+            made.append(FeatureForest(self.features, forest, self._read_by(number)))
+            importances.append(shares.tolist())
+        return made, importances
+
+    def _read_by(self, number: int) -> Context | None:
+        """What a pass reads of the one before."""
+        if number:
+            return self.context
+        return None if self.below is None else self.below.context
+
+    def _context(self, folds: Folds, held_out: Sequence[Sequence[Forest]]) -> npt.NDArray[np.float32]:
+        """The samples' context, (samples, columns), by passes that have not seen them."""
+        o, below, count = self.options, self.below, len(held_out)
+        reads = [self._read_by(number) for number in range(count)]
+        blends: Sequence[Blend | None] = [None] * count
+        classes = [len(self.codes)] * count
+        first: Sequence[Any] = ()
+        factors: Sequence[Any] = ()
+        if below is not None:
+            blends = below.blends(self.codes, len(self.features.plan.names), reads)
+            classes = [*below.classes, *(len(one.codes) for one in blends if one)]
+            first, factors = below.passes, below.factors
+        out = np.empty((len(self.samples), len(self.context.tokens) * classes[-1]), np.float32)
+        with Progress(len(out), f"context for pass {count + 1}", enabled=self.progress) as bar:
+            for number, cloud in enumerate(self.clouds):
+                at, rows = self.samples.of_cloud(number)
+                if not len(at):
+                    continue
+                fold = folds.points(cloud.xyz, self.flights[number])
+                passes = [
+                    FoldForests(self.features, context, forests, fold, blend)
+                    for context, forests, blend in zip(reads, held_out, blends, strict=True)
+                ]
+                request = PredictRequest(cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb, bar)
+                out[at] = sample_context(request, [*first, *passes], self.context, classes, factors)
+        return out
 
 
-def _held(below: Below, codes: Sequence[int]) -> dict[str, Any]:
-    held = held_by_base(below, codes)
-    return {"held_by_base": held} if held else {}
+def _beside(values: npt.NDArray[np.float32], more: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    return np.asfortranarray(np.concatenate([values, more], axis=1))
 
 
-def _priors(samples: Samples, n_classes: int, weight: float) -> dict[str, Any] | None:
-    """Factors of the classes' probabilities: frequency in the clouds over frequency in the samples, tempered."""
-    if weight == 0:
-        return None
-    drawn = np.bincount(samples.label, samples.weight, n_classes)
-    factors = (np.array(samples.available) / drawn) ** weight
-    return {"weight": weight, "factors": (factors / factors.max()).tolist()}
-
-
-# ---- trees -------------------------------------------------------------------------------------------------
-
-
-def _share_drawn(options: TrainingOptions, samples: Samples, classes: int) -> float:
-    """The share of the samples that each tree draws."""
-    if options.max_samples is not None:
-        return options.max_samples
-    return min(1.0, PER_TREE * classes / int(samples.weight.sum()))
-
-
-def _gap(plan: FeaturePlan) -> float:
+def _gap(plan: Any) -> float:
     """Meters between samples trained on and ground held out."""
     return max((one.reach or 0.0 for one in plan.neighborhoods), default=0.0)
 
@@ -185,264 +360,6 @@ def _groups(cloud: TrainingCloud, options: TrainingOptions) -> npt.NDArray[Any]:
     if not name:
         return np.broadcast_to(np.array(cloud.flight), len(cloud))
     return gather((name,), cloud.dimensions, len(cloud), where=cloud.name)[0][name]
-
-
-def _validate(
-    ranked: Ranked,
-    samples: Samples,
-    xy: npt.NDArray[np.float64],
-    group: npt.NDArray[Any],
-    codes: Sequence[int],
-    plan: FeaturePlan,
-    setting: TreeOptions,
-    options: TrainingOptions,
-    progress: bool,
-    heard: _Heard,
-) -> dict[str, Any] | None:
-    """The cross-validation for the manifest, over groups where there are several, else over blocks; None without."""
-    if options.folds == 0:
-        return None
-    trees = max(1, math.ceil(options.trees * FOLD_TREES))
-    ways: list[tuple[str, int, npt.NDArray[np.int16] | None]] = [("blocks", options.folds or 5, None)]
-    names, index = np.unique(group, return_inverse=True)
-    if len(names) > 1:
-        folds = min(options.folds or 5, len(names))
-        ways.insert(0, ("groups" if options.groups else "surveys", folds, (index % folds).astype(np.int16)))
-    asked = {"groups": options.groups} if options.groups else {}
-    for by, folds, fold in ways:
-        heard.said = Sureness()
-        gap = (
-            0.0 if by == "surveys" else _gap(plan)
-        )  # which do not see each other, whatever their coordinates
-        try:
-            if fold is None:
-                fold = crossval.block_folds(xy, samples.label, samples.weight, folds, BLOCK)
-            row = crossval.score(
-                ranked,
-                samples.label,
-                samples.weight,
-                xy,
-                codes,
-                setting,
-                trees,
-                fold,
-                gap=gap,
-                seed=options.seed,
-                threads=options.threads,
-                progress=progress,
-                heard=heard,
-            )
-        except OptionError as error:  # too little ground, or a class in one place
-            heard.errors.append(error)
-            if by == "groups":
-                asked["instead"] = f"{error.what}: {error.found}"
-            continue
-        more = {"folds": folds, "block_size": BLOCK, "gap": gap, "tried": [row], "chosen": row}
-        return {"by": by, **asked, **more}
-    return None
-
-
-class _Heard:
-    """What forests said of ground they had not seen, for :class:`Sureness`: as the points lie, not as they were drawn."""
-
-    def __init__(
-        self,
-        samples: Samples,
-        codes: Sequence[int],
-        priors: Mapping[str, Any] | None,
-        below: Below | None,
-        options: TrainingOptions,
-    ) -> None:
-        self.samples, self.codes, self._below, self._options = samples, codes, below, options
-        self._factors = None if priors is None else np.array(priors["factors"])
-        drawn = np.bincount(samples.label, samples.weight, len(codes))
-        self._weight = samples.weight * (np.array(samples.available) / np.maximum(drawn, 1))[samples.label]
-        self.said = Sureness()
-        self.errors: list[OptionError] = []
-
-    def __call__(self, rows: npt.NDArray[np.int64], p: npt.NDArray[np.float64]) -> None:
-        """Rows of the samples, and their probabilities (rows, classes)."""
-        codes = self.codes
-        if self._below is None:
-            p = weighed(p, self._factors)
-        else:
-            if self._options.target is not None:
-                return  # what the others truly are is not known
-            before = self._below.base.codes.tolist()
-            p = blended(self._below.own[rows], p, before, codes, self._below.trusted)
-            codes = sorted({*before, *codes})
-        true = np.asarray(self.codes)[self.samples.label[rows]]
-        counted(p, codes, true, self._weight[rows], self.said)
-
-    def of(self, validation: Mapping[str, Any] | None) -> dict[str, Any]:
-        """What a manifest says, where anything was heard."""
-        if validation is None or not self.said.right:
-            return {}
-        passes = "" if self._options.passes == 1 else ", of the first pass"
-        trees = validation["chosen"]["trees"]
-        self.said.about = f"{validation['by']} held out, forests of {trees} trees{passes}"
-        return {"sureness": self.said.to_dict()}
-
-
-class _Passes:
-    """Growing one forest after the other, each reading what the one before says of ground it has not seen."""
-
-    def __init__(
-        self,
-        labeled: Labeled,
-        samples: Samples,
-        ranked: tuple[Ranked, Ranked],
-        features: Features,
-        setting: TreeOptions,
-        options: TrainingOptions,
-        progress: bool,
-        below: Below | None = None,
-    ) -> None:
-        self.below = below
-        self.clouds, self.codes = labeled.clouds, labeled.classes.codes
-        self.samples, self.features = samples, features
-        self.alone, self.ranked = ranked  # the features, and all that the first pass reads
-        self.setting, self.options, self.progress = setting, options, progress
-        self.context = Context(tuple(options.context))
-        self.made: list[FeatureForest] = []
-        self.scores: list[dict[str, Any]] = []
-        self.notes: dict[str, Any] = {}
-        self.flights = [cloud.flight for cloud in self.clouds]
-        if options.passes > 1:
-            self.folds = Folds.of(labeled, self.flights, options.pass_folds)
-            self.notes["pass_folds"] = self.folds.count
-
-    def grow(self, low: list[float], high: list[float]) -> None:
-        """Fill `made` and `scores`; `low` and `high` are the percentiles of the features."""
-        for number, ranked in enumerate(self._ranked(self.samples.weight)):
-            forest, importances, bag = self._forest(ranked, number)
-            self.made.append(FeatureForest(self.features, forest, self._context_of(number)))
-            least, largest = ranked.limits(len(low))
-            percentiles = {
-                "low": [*low, *least],
-                "high": [*high, *largest],
-                "limited": self.options.scale,
-            }
-            self.scores.append({"percentiles": percentiles, "importances": importances, "out_of_bag": bag})
-
-    def _ranked(self, weight: npt.NDArray[np.int64]) -> Iterator[Ranked]:
-        """What each pass reads of the samples; those of weight 0 teach none of them anything."""
-        held_out: list[list[Forest]] = []
-        ranked = self.ranked
-        yield ranked
-        for number in range(1, self.options.passes):
-            held_out.append(self._hold_out(ranked, weight, number))
-            ranked = self.alone.beside(Ranked.of(self._context(held_out), self.options.threads))
-            yield ranked
-
-    def _context_of(self, number: int) -> Context | None:
-        """What a pass reads of the one before."""
-        if number:
-            return self.context
-        return None if self.below is None else self.below.context
-
-    def _hold_out(self, ranked: Ranked, weight: npt.NDArray[np.int64], number: int) -> list[Forest]:
-        """The pass `number` once more, a forest without each fold.
-
-        Ground beside a fold is not left out as in cross-validation: the forests miss the fold's samples already, and the
-        next pass should see probabilities as good as those it will see when the model is used.
-        """
-        trees = max(1, math.ceil(self.options.trees * FOLD_TREES))
-        fold = np.empty(len(self.samples), np.int16)
-        for k, cloud in enumerate(self.clouds):
-            mine = self.samples.cloud == k
-            fold[mine] = self.folds.points(cloud.xyz[self.samples.row[mine]], self.flights[k])
-        forests, what = [], f"pass {number} without each fold"
-        with Progress(trees * self.folds.count, what, "trees", enabled=self.progress) as bar:
-            for k in range(self.folds.count):
-                train = (fold != k) & (weight > 0)
-                if len(np.unique(self.samples.label[train])) < 2:
-                    raise OptionError(
-                        "without one of its folds the training ground has fewer than two classes left",
-                        cure="Give more training data, or set passes to 1",
-                    )
-                grown = self._grown(ranked, weight * train, trees, bar)
-                forests.append(Forest.from_trees([tree for tree, _, _ in grown], ranked.columns))
-        return forests
-
-    def _context(self, held_out: Sequence[Sequence[Forest]]) -> npt.NDArray[np.float32]:
-        """The samples' context, (samples, columns), by passes that have not seen them."""
-        o, below, count = self.options, self.below, len(held_out)
-        reads = [self._context_of(number) for number in range(count)]
-        first: Any = () if below is None else below.passes
-        factors = () if below is None else below.factors
-        blends: Sequence[Blend | None] = [None] * count if below is None else self._blends(reads)
-        classes = [] if below is None else list(below.classes)
-        classes += [len(self.codes) if one is None else len(one.codes) for one in blends]
-        out = np.empty((len(self.samples), len(self.context.tokens) * classes[-1]), np.float32)
-        with Progress(len(self.samples), f"context for pass {count + 1}", enabled=self.progress) as bar:
-            for number, cloud in enumerate(self.clouds):
-                at, rows = self.samples.of_cloud(number)
-                if not len(at):
-                    continue
-                fold = self.folds.points(cloud.xyz, self.flights[number])
-                passes = [
-                    FoldForests(self.features, context, forests, fold, blend)
-                    for context, forests, blend in zip(reads, held_out, blends, strict=True)
-                ]
-                request = PredictRequest(cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb, bar)
-                out[at] = sample_context(request, [*first, *passes], self.context, classes, factors)
-        return out
-
-    def _blends(self, reads: Sequence[Context | None]) -> list[Blend]:
-        """What each pass on top of the base makes of the one before."""
-        assert self.below is not None
-        blends, before = [], self.below.base.codes.tolist()
-        for context in reads:
-            assert context is not None
-            blends.append(self.below.blend(before, self.codes, len(self.features.plan.names), context))
-            before = blends[-1].codes
-        return blends
-
-    def _grown(
-        self,
-        ranked: Ranked,
-        weight: npt.NDArray[np.int64],
-        trees: int,
-        bar: Progress,
-        **more: Any,
-    ) -> Iterator[tuple[GrownTree, Any, Any]]:
-        """The trees of a forest, as :func:`grow` gives them."""
-        label, o = self.samples.label, self.options
-        return grow(
-            ranked, label, weight, trees, self.setting, o.seed, threads=o.threads, progress=bar, **more
-        )
-
-    def _forest(self, ranked: Ranked, number: int) -> tuple[Forest, list[float], dict[str, Any] | None]:
-        """(forest, importances, out-of-bag score)."""
-        total = np.zeros((len(self.samples), len(self.codes)))
-        trees = []
-        importance = np.zeros(ranked.columns)
-        what = f"growing pass {number + 1}" if self.options.passes > 1 else "growing"
-        count, weight = self.options.trees, self.samples.weight
-        # Trees that draw few of the samples leave nearly all out of their bags: a share of these is judged.
-        every = max(1, round(1.0 / self.setting.max_samples))
-        with Progress(count, what, "trees", enabled=self.progress) as bar:
-            for tree, rows, shares in self._grown(
-                ranked, weight, count, bar, score="out of bag", every=every
-            ):
-                trees.append(tree)
-                importance += tree.importances(ranked.columns)
-                total[rows] += shares
-        scored = total.sum(axis=1) > 0
-        bag = None
-        if scored.any():
-            bag = self._figures(scored, total[scored].argmax(axis=1))
-            bag["samples"] = int(np.count_nonzero(scored))
-        whole = importance.sum()
-        importances = (importance / whole if whole else importance).tolist()
-        return Forest.from_trees(trees, ranked.columns), importances, bag
-
-    def _figures(self, mine: npt.NDArray[np.bool_], best: npt.NDArray[np.int64]) -> dict[str, Any]:
-        """Scores of some samples by their most probable classes."""
-        matrix = np.zeros((len(self.codes), len(self.codes)), np.int64)
-        np.add.at(matrix, (self.samples.label[mine], best), self.samples.weight[mine])
-        return crossval.figures(matrix, self.codes)
 
 
 def _versions() -> dict[str, str]:

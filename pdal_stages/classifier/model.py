@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -15,18 +15,17 @@ import numpy.typing as npt
 from ..base.errors import DimensionError, ModelError, OptionError
 from ..base.report import Report
 from ..features import FeaturePlan
-from ..features.index import CellGrid, build_grid, check_xyz
-from ..features.voxels import Representatives, check_side, represent
+from ..features.index import build_grid, check_xyz
+from ..features.voxels import check_side, represent
 from . import modelfile, summary
 from .algorithms import InputPlan, PredictRequest, algorithm
+from .clouds import density
 from .deciding import Outcome, Prediction, PredictionOptions, decide
 from .dimensions import known, preparing, required, welcome
 from .passes import Passes, weighed
-from .smoothing import count_shares, smooth
-from .thinning import density, out_of_range, range_text
 
-#: Points decided on at a time after smoothing.
-_DECIDED = 500_000
+#: How many times sparser or denser a cloud may be than those trained on before that is said.
+TOLERANCE = 2.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -40,8 +39,7 @@ class Model:
     classes : list of (code, name)
         In the order of the columns of probabilities.
     info : dict
-        The rest of the manifest: how it was trained, scores; ``info["passes"]`` has the percentiles, importances and
-        score of each pass.
+        The rest of the manifest: how it was trained, scores; ``info["passes"]`` has the importances of each pass.
     seconds : dict
         What training took, by part; not stored.
     """
@@ -193,38 +191,21 @@ class Model:
         """
         how = PredictionOptions(**options)
         xyz = np.asarray(xyz, dtype=np.float64)
-        given, preparation = dict(dimensions or {}), self.info.get("preparation") or []
-        missing = [name for name in self.required_dimensions if name not in given]
-        if missing:
-            usable = None if ignore is None else ~np.asarray(ignore, bool)
-            made = preparing().made_of_coordinates(preparation, xyz, usable, how.threads)
-            if made.keys() & given.keys() and made.keys() & set(
-                missing
-            ):  # heights of two kinds would be mixed
-                raise DimensionError(
-                    f"the dimension {missing[0]} is missing",
-                    found=", ".join(given),
-                    cure=f"Leave out {', '.join(sorted(made.keys() & given.keys()))}: all are then made as in training, by "
-                    f"{json.dumps(preparation[0])}",
-                )
-            given = {**made, **given}
+        n = len(xyz)
+        given = self._prepared(xyz, dict(dimensions or {}), ignore, how.threads)
         if how.variance and not self.gives_variance:
             raise OptionError(
                 "only a network gives a variance",
                 found=f"a model of {self.algorithm.name}",
                 cure="Use 'margin'",
             )
-        n = len(xyz)
-        asked = None if where is None else mask_of("where", where, n)
-        old = None if current is None else _codes_now(current, n)
+        asked = np.ones(n, np.bool_) if where is None else mask_of("where", where, n)
         there, ignored = None, 0
         if ignore is not None and (gone := mask_of("ignore", ignore, n)).any():
             there, ignored = np.flatnonzero(~gone), int(np.count_nonzero(gone))
-            asked = ~gone if asked is None else asked & ~gone
-        if asked is not None and asked.all():
-            asked = None
-        rows = None if asked is None else np.flatnonzero(asked)
-        outcome = Outcome(n, len(self.codes), old, how)
+            asked = asked & ~gone
+        rows = None if asked.all() else np.flatnonzero(asked)
+        outcome = Outcome(n, len(self.codes), None if current is None else _codes_now(current, n), how)
         values = known(self.plan.dimensions, given, n, there)
         representatives = represent(xyz, self.voxel, values, rows, there)
         del values, there
@@ -234,9 +215,8 @@ class Model:
             xyz = xyz[taken]
             representatives = replace(representatives, rows=taken[:0])
         order, grid = None, None
-        if self._cell is not None and len(
-            xyz
-        ):  # one copy of the coordinates, in the order in which all is computed
+        if self._cell is not None and len(xyz):
+            # one copy of the coordinates, in the order in which all is computed
             grid = build_grid(check_xyz(xyz), self._cell)
             order, xyz = grid.order, grid.coordinates
             grid = replace(grid, order=np.arange(len(order), dtype=order.dtype))
@@ -245,73 +225,56 @@ class Model:
         if taken is not None:
             needed = (*self.required_dimensions, *self.welcome_dimensions)
             given = {name: np.asarray(given[name])[taken] for name in needed if name in given}
-        report = self._predict(xyz, given, rows, grid, order, representatives, outcome, how, progress)
+        codes, factors = self.codes, self.factors
+        shown = progress if representatives is None else None
+        request = PredictRequest(xyz, given, rows, how.threads, how.memory_mb, shown, grid)
+        # Before the search structures are there, with which it would be the most that is held.
+        found = density(xyz) if self.info.get("densities") is not None and request.count else 0.0
+        predicted = self.algorithm.predict(request, lambda p: decide(weighed(p, factors), codes, how))
+        for block in predicted.blocks:
+            at, decided, variance = block.rows, block.result, block.variance
+            if order is not None:
+                at = order[at]
+            if representatives is not None:
+                at, place = representatives.members(at)
+                decided = decided.taken(place)
+                variance = None if variance is None else variance[place]
+                if progress is not None:
+                    progress.update(len(at))
+            outcome.write(at, decided, variance)
+        report = predicted.report
+        self._report_density(report, found, request.count)
         if len(xyz) < n - ignored:
             report.figures["representatives"] = len(xyz)
         return outcome.prediction(asked, ignored, report)
+
+    def _prepared(
+        self,
+        xyz: npt.NDArray[np.float64],
+        given: dict[str, npt.ArrayLike],
+        ignore: npt.ArrayLike | None,
+        threads: int | None,
+    ) -> dict[str, npt.ArrayLike]:
+        """The dimensions, with heights made as in training where they are missing and the model says how."""
+        missing = [name for name in self.required_dimensions if name not in given]
+        preparation = self.info.get("preparation") or []
+        if not missing:
+            return given
+        usable = None if ignore is None else ~np.asarray(ignore, bool)
+        made = preparing().made_of_coordinates(preparation, xyz, usable, threads)
+        if made.keys() & given.keys() and made.keys() & set(missing):  # heights of two kinds would be mixed
+            raise DimensionError(
+                f"the dimension {missing[0]} is missing",
+                found=", ".join(given),
+                cure=f"Leave out {', '.join(sorted(made.keys() & given.keys()))}: all are then made as in training, by "
+                f"{json.dumps(preparation[0])}",
+            )
+        return {**made, **given}
 
     @property
     def _cell(self) -> float | None:
         """Of the grid that its features are computed by; None where it has none."""
         return next((one.features.plan.cell for one in self.passes if one.features is not None), None)
-
-    def _predict(
-        self,
-        xyz: npt.NDArray[np.float64],
-        dimensions: Mapping[str, npt.ArrayLike],
-        rows: npt.NDArray[np.int64] | None,
-        grid: CellGrid | None,
-        order: npt.NDArray[Any] | None,
-        representatives: Representatives | None,
-        outcome: Outcome,
-        how: PredictionOptions,
-        progress: Any,
-    ) -> Report:
-        """Classify the points `rows` (None: all), each for those that it represents.
-
-        `order` are the points' places among the representatives, or in the cloud; None where these are their own.
-        """
-        codes, factors = self.codes, self.factors
-
-        def finish(p):
-            p = weighed(p, factors)
-            return count_shares(p) if how.smooth else decide(p, codes, how)
-
-        def write(at, decided, variance=None):
-            if order is not None:
-                at = order[at]
-            if representatives is not None:
-                at, place = representatives.members(at)
-                decided = None if decided is None else decided.taken(place)
-                variance = None if variance is None else variance[place]
-            outcome.write(at, decided, variance)
-            return at
-
-        request = PredictRequest(
-            xyz,
-            dimensions,
-            rows,
-            how.threads,
-            how.memory_mb,
-            progress if representatives is None else None,
-            grid,
-        )
-        # Before the search structures are there, with which it would be the most that is held.
-        found = density(xyz) if self.info.get("densities") is not None and request.count else 0.0
-        predicted = self.algorithm.predict(request, finish)
-        shares = np.zeros((len(xyz), len(codes)), np.uint16) if how.smooth else None
-        for block in predicted.blocks:
-            if shares is not None:
-                shares[block.rows] = block.result
-            written = write(block.rows, None if how.smooth else block.result, block.variance)
-            if representatives is not None and progress is not None:
-                progress.update(len(written))
-        if shares is not None and request.count:
-            for part, p in _smoothed(xyz, rows, shares, how):
-                write(part, decide(p, codes, how))
-            predicted.report.figures["smooth"] = how.smooth
-        self._report_density(predicted.report, found, request.count)
-        return predicted.report
 
     def _report_density(self, report: Report, found: float, count: int) -> None:
         """How dense the cloud is; a warning where that is not what the model was trained for."""
@@ -319,7 +282,7 @@ class Model:
         if trained is None or not count:
             return
         report.figures["density"] = round(found, 3)
-        if out_of_range(found, trained):
+        if not trained["low"] / TOLERANCE <= found <= trained["high"] * TOLERANCE:
             lonely_in = report.figures.get("fewer_than_three", {})
             token = max(lonely_in, key=lambda one: lonely_in[one], default="")
             lonely = (
@@ -329,7 +292,7 @@ class Model:
             )
             report.warnings.append(
                 f"the cloud has {found:.3g} points/m2, the model was trained on "
-                f"{range_text(trained)}{lonely}. Expect lower accuracy, or train with 'thin'"
+                f"{summary.range_text(trained)}{lonely}. Expect lower accuracy, or train with 'thin'"
             )
 
 
@@ -382,35 +345,18 @@ def assemble(manifest: dict[str, Any], arrays: modelfile.Arrays) -> Model:
         before = own
         if (number > 0) != bool(entry["context"]):
             raise ModelError("every pass but the first must read context", found=f"pass {number + 1}")
-        for key, group in (
-            ("percentiles/low", entry["percentiles"]["low"]),
-            ("percentiles/high", entry["percentiles"]["high"]),
-            ("importances", entry["importances"]),
-        ):
-            if group is not None and len(group) != len(entry["feature_names"]):
-                raise ModelError(f"the manifest's {key} must have one value per feature", found=len(group))
+        importances = entry["importances"]
+        if importances is not None and len(importances) != len(entry["feature_names"]):
+            raise ModelError(
+                "the manifest's importances must have one value per feature", found=len(importances)
+            )
         passes.append(made)
     info = {key: value for key, value in manifest.items() if key not in ("format", "version", "arrays")}
-    scores = ("percentiles", "importances", "out_of_bag", "codes", "factors")
+    scores = ("importances", "codes", "factors")
     info["passes"] = [{key: entry[key] for key in scores if key in entry} for entry in manifest["passes"]]
     if before != codes:
         raise ModelError("the last pass has other classes than the model", found=before[:10])
     return Model(tuple(passes), classes, info)
-
-
-def _smoothed(
-    xyz: npt.NDArray[np.float64],
-    rows: npt.NDArray[np.int64] | None,
-    shares: npt.NDArray[np.uint16],
-    how: PredictionOptions,
-) -> Iterator[tuple[Any, npt.NDArray[np.float32]]]:
-    """(rows of the cloud, smoothed probabilities), a part at a time; only classified points are averaged."""
-    if rows is not None:
-        xyz, shares = xyz[rows], shares[rows]
-    means = smooth(xyz, shares, how.smooth, how.threads)
-    for start in range(0, len(means), _DECIDED):
-        part = slice(start, start + _DECIDED)
-        yield part if rows is None else rows[part], means[part]
 
 
 def _places(order: npt.NDArray[Any], rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

@@ -19,9 +19,8 @@ from ..base.runs import begins_run
 from ..base.threads import map_blocks
 from ..features.index import cell_numbers
 from .algorithms import Block, InputPlan, PredictRequest, PredictResult
-from .context import Context, around
+from .context import Context, around, count_shares
 from .featureforest import CloudFeatures, Features
-from .smoothing import count_shares
 
 #: Points of a band at most, but for a band of one strip.
 BAND = 150_000

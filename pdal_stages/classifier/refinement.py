@@ -7,7 +7,7 @@ the labels lack is left alone, and of the others it is believed the more the few
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -19,8 +19,8 @@ from ..base.progress import Progress
 from .algorithms import PredictRequest
 from .context import OWN, Context
 from .featureforest import FeatureForest, Features, check_names
-from .folds import sample_context
 from .forest import Forest
+from .holdout import sample_context
 from .model import Model
 from .passes import weighed
 
@@ -264,12 +264,16 @@ class Below:
                 out[at] = sample_context(request, self.passes, self.context, self.classes, self.factors)
         return out
 
-    def blend(self, before: Sequence[int], labeled: Sequence[int], features: int, context: Context) -> Blend:
-        """What a pass on top makes of the one before, whose classes are `before`; `features` it computes itself."""
-        o = self.options
-        first = own_column(features, context, len(before))
+    def blends(self, labeled: Sequence[int], features: int, reads: Sequence[Context | None]) -> list[Blend]:
+        """What passes on top, which compute so many features, make of the one before, whose context they read."""
+        o, out, before = self.options, [], self.base.codes.tolist()
         target = o.target if o.strategy == "binary" else None
-        return Blend(tuple(before), tuple(labeled), self.trusted, target, first)
+        for context in reads:
+            assert context is not None
+            first = own_column(features, context, len(before))
+            out.append(Blend(tuple(before), tuple(labeled), self.trusted, target, first))
+            before = out[-1].codes
+        return out
 
     @property
     def own(self) -> npt.NDArray[np.float64]:
@@ -282,15 +286,16 @@ class Below:
 
 def on_top(below: Below, made: Model) -> Model:
     """The model of the base's passes and those of `made`, with the classes of both."""
-    base, priors, added = below.base, made.info["priors"], []
-    before = base.codes.tolist()
-    for forest in made.passes:
-        shared = {field.name: getattr(forest, field.name) for field in fields(forest)}
-        blend = below.blend(before, made.codes.tolist(), len(forest.plan.names), forest.context)
-        added.append(RefinedForest(**shared, blend=blend))
-        before = blend.codes
-    if len(added) > 1 and priors is not None:  # a few labels say nothing of how frequent a class is
-        added[-1] = replace(added[-1], blend=replace(blend, factors=tuple(priors["factors"])))
+    base, priors = below.base, made.info["priors"]
+    reads = [forest.context for forest in made.passes]
+    blends = below.blends(made.codes.tolist(), len(made.passes[0].plan.names), reads)
+    if len(blends) > 1 and priors is not None:  # a few labels say nothing of how frequent a class is
+        blends[-1] = replace(blends[-1], factors=tuple(priors["factors"]))
+    added = [
+        RefinedForest(one.features, one.forest, one.context, blend)
+        for one, blend in zip(made.passes, blends, strict=True)
+    ]
+    before = blends[-1].codes
     names, entries = dict(base.classes), {one["code"]: one for one in made.info["classes"]}
     names.update((code, name) for code, name in made.classes if code in before and code not in names)
     unseen = {"available": 0, "samples": 0, "duplicates": 0}
@@ -317,21 +322,20 @@ def on_top(below: Below, made: Model) -> Model:
     return Model((*base.passes, *added), [(code, names[code]) for code in before], info, made.seconds)
 
 
-def held_by_base(below: Below, codes: Sequence[int]) -> dict[str, list[int]]:
+def held_by_base(below: Below, codes: Sequence[int]) -> dict[str, Any]:
     """Labeled classes new to the base: [different samples, of these what it calls a class that the labels lack].
 
     Such points stay what the base calls them.
     """
-    base, samples = below.base, below.samples
-    before = base.codes.tolist()
+    samples, before = below.samples, below.base.codes.tolist()
     said = np.array(before)[below.own.argmax(axis=1)]
     out = {}
     for place, code in enumerate(codes):
         mine = samples.label == place
         held = int(np.count_nonzero(~np.isin(said[mine], codes)))
-        if code not in before and held:
+        if code not in before and held and below.options.target is None:
             out[str(code)] = [int(np.count_nonzero(mine)), held]
-    return out
+    return {"held_by_base": out} if out else {}
 
 
 def _array(given: Any) -> npt.NDArray[np.float64] | None:

@@ -13,11 +13,10 @@ import numpy.typing as npt
 
 from ..base.errors import OptionError
 from .algorithms import trainer
-from .clouds import CloudSource, TrainingCloud, prepared, spooled
+from .clouds import CloudSource, TiledCloud, TrainingCloud, prepared, spooled
 from .context import Context
 from .dimensions import ALWAYS, WHERE_THERE, preparing, required
 from .model import Model
-from .tiledcloud import TiledCloud
 from .trainoptions import TrainingOptions, feature_plan
 
 

@@ -93,18 +93,6 @@ class TrainingOptions:
         low=1,
         high=10**8,
     )
-    contradicted_below: float = setting(
-        0.0,
-        "number",
-        "Labels 4, 5 and 6 (vegetation from medium height on, buildings) of points that are Ground and not this high above "
-        "it are left out of training: their height contradicts them; 0 for none",
-        "Such labels are the feet of walls, courtyards inside a roof's outline, and what lies under a crown. A model that "
-        "learns them calls steep ground building. They are counted, and serve as neighbors. Without the dimensions Ground "
-        "and HeightAboveGround nothing is left out.",
-        low=0,
-        high=10,
-        unit="m",
-    )
     seed: int = setting(
         0,
         "integer",
@@ -156,11 +144,6 @@ class TrainingOptions:
     )
     ignore: Sequence[int] = setting(
         NOISE, "list", "Labels whose points are not even neighbors, unless `classes` names them: noise"
-    )
-    scale: bool = setting(
-        True,
-        "boolean",
-        "Limit features to the 1st and 99th percentile of the samples, from 0 where the smallest value is 0 [B16 3.3]",
     )
     folds: int | None = setting(
         None,

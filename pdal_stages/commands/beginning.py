@@ -34,18 +34,35 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def _warmup(options: argparse.Namespace) -> None:
-    from concurrent.futures import ProcessPoolExecutor
-    from multiprocessing import get_context
+    """What the demo, the default heights, training and classification use, on a few points of no meaning."""
+    import numpy as np
 
-    from ..base.threads import available_threads
-    from ..classifier.warmup import features_part, other_part, warmup
+    from ..classifier import TrainingCloud, TrainingOptions, train
     from ..synthetic.demo import compile_kernels
+    from ..terrain import detached_noise, filtered_ground, hag_minima
 
-    workers = min(2, available_threads())
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        for done in [pool.submit(part) for part in (features_part, other_part, compile_kernels)]:
-            done.result()
-    warmup()  # shows that all are there and work together
+    compile_kernels()
+    # A deck over a valley, with land at both of its ends: what is asked of decks is asked only where one may be.
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-120.0, 120.0), np.arange(-80.0, 80.0)))
+    z = np.where(abs(y) <= 4.0, 6.0, np.clip((abs(x) - 15.0) / 7.5, 0.0, 6.0))
+    filtered_ground(x, y, z, openings=(5,), decks=True, threads=1)
+    xyz = np.random.default_rng(0).uniform(0.0, 12.0, (400, 3))
+    axes = np.ascontiguousarray(xyz.T)
+    detached_noise(*axes)
+    dimensions = filtered_ground(*axes, openings=(5,), threads=1)
+    dimensions["HeightAboveGround"] = hag_minima(*axes)
+    dimensions |= dict.fromkeys(("ReturnNumber", "NumberOfReturns"), np.ones(len(xyz), np.uint8))
+    how = TrainingOptions(
+        neighborhoods="s5,k10",
+        feature_set="covariance,geometric,surfaces",
+        dimensions=("HeightAboveGround", "Ground", "HeightAboveOpening_5", "returns"),
+        context=("own", *TrainingOptions().context),  # shipped models read the point's own as well
+        trees=1,
+        count=50,
+        threads=1,
+    )
+    model = train(TrainingCloud(xyz, np.where(xyz[:, 2] > 6.0, 6, 2), dimensions), how, progress=False)
+    model.predict(xyz, dimensions, threads=1)
     if options.all:
         from ..features import warmup as every_neighborhood
 

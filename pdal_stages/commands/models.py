@@ -98,7 +98,7 @@ def add_commands(add: Adder) -> None:
 
 def _models(options: argparse.Namespace) -> None:
     from ..base.asprs import class_name
-    from ..models import shipped
+    from ..classifier.modelfile import shipped
     from ..stages.loading import load_model
 
     for name, path in shipped().items():

@@ -8,7 +8,7 @@ from typing import Any
 
 from ..base.asprs import BRIDGE
 from ..base.errors import ModelError, OptionError, suggest
-from ..models import STANDARD
+from ..classifier.modelfile import STANDARD
 from ..stages import preparation, registry
 from ..stages.heights import preparation_of
 from ..stages.loading import loaded_model

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..base import kinds
 from ..base.outputs import Output
-from ..models import find
+from ..classifier.modelfile import find
 from ..stages.base import Stage
 
 #: Writers of LAS and what is made of it.

@@ -22,7 +22,7 @@ from ..base.outputs import Output, check_outputs
 from ..base.plain import print_messages
 from ..base.progress import Progress
 from ..base.version import __version__
-from ..models import STANDARD
+from ..classifier.modelfile import STANDARD
 from ..objects.outlines import vector
 from ..reports.objectlayers import Layer, check_target, write_layers
 from ..reports.reviewpage import review_page, styles

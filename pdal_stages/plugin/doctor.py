@@ -16,7 +16,7 @@ from ..base.jit import kept_kernels
 from ..base.memory import free_memory
 from ..base.threads import available_threads
 from ..base.version import __version__
-from ..models import STANDARD
+from ..classifier.modelfile import STANDARD
 from ..pipeline import pdal as pdal_env
 from ..stages.loading import loaded_model
 from . import building

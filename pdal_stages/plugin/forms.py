@@ -9,7 +9,7 @@ from typing import Any
 
 from ..base.asprs import NAMES, class_color
 from ..base.version import __version__
-from ..models import shipped
+from ..classifier.modelfile import shipped
 from ..stages import registry
 
 #: Changes where a reader of the JSON must.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ..accuracy.text import percent
 from ..base import checks
 from ..base.files import write_whole
-from ..classifier.summary import held_out_by, out_of_bag
+from ..classifier.summary import held_out, held_out_by
 from .page import render
 
 #: A curve with more is nonsense: the manifest's free parts may hold anything.
@@ -50,27 +50,21 @@ def model_page(model: Model, name: str = "") -> str:
         subtitle=f"{last['algorithm'].replace('_', ' ')}, {len(last['feature_names']):,} features of a point",
         model=described,
         scores=_scores(described),
-        out_of_bag=out_of_bag(described).get("f1") or {},
+        f1=held_out(described).get("f1") or {},
         prior_factors=priors,
         curves=_curves(described["training"].get("curve")),
-        crossed=described["accuracy"]["cross_validation"],
-        held_out=held_out_by(described["accuracy"]["cross_validation"]).removesuffix(" held out"),
         settings=_settings(described),
     )
 
 
 def _scores(d: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
-    """The headline figures: on the ground held out, cross-validated, or out of bag, whichever there is first."""
-    held = d["training"].get("held_out")
-    crossed = d["accuracy"]["cross_validation"]
-    if isinstance(held, dict) and held:
-        row, detail = held, "on ground held out, which chose the epoch"
-    elif crossed:
-        row, detail = crossed["chosen"], f"{held_out_by(crossed)}; classes weigh the same"
-    elif bag := out_of_bag(d):
-        row, detail = dict(bag), "out of bag, flattered by neighboring samples"
-    else:
+    """The headline figures, of ground held out."""
+    row = held_out(d)
+    if not row:
         return []
+    crossed = d["accuracy"]["cross_validation"]
+    by = held_out_by(crossed) if crossed else "ground, which chose the epoch,"
+    detail = f"{by} held out; classes weigh the same" if crossed else f"{by} held out"
     titles = {"overall_accuracy": "Overall accuracy", "kappa": "Kappa", "mean_f1": "Mean F1"}
     return [
         (title, percent(checks.finite(row.get(key)), 1), "%", detail if key == "overall_accuracy" else "")

@@ -204,10 +204,6 @@ class Stage(ABC):
         """At last, :attr:`from_blocks` in a box, meters, out of these arrays of the blocks that it touches."""
         raise NotImplementedError
 
-    def inner_halo_m(self) -> float:
-        """How far apart, in meters, points use each other's results of this very stage; part of the halo."""
-        return 0.0
-
     def largest_class(self) -> int:
         """The largest class code the stage may write to `Classification` (0: none)."""
         return 0

@@ -20,10 +20,10 @@ from ..classifier import Model, TrainingCloud, TrainingOptions, summary, train
 from ..classifier.algorithms import ALGORITHMS, Trainer, trainer
 from ..classifier.classes import ClassMap
 from ..classifier.dimensions import ALWAYS, CHECKED, required, welcome
+from ..classifier.foresttraining import SHORT
+from ..classifier.modelfile import find
 from ..classifier.refinement import MANY
-from ..classifier.samplefeatures import SHORT
 from ..classifier.sureness import of_the_base
-from ..models import find
 from .base import Stage, files_read
 from .checked import CheckedChoice, Looked
 from .loading import digest_of, loaded_model
@@ -89,7 +89,6 @@ class ClassifierModel(Stage):
     target: int | None = trained("target")
     background: int = trained("background")
     count: int = trained("count")
-    contradicted_below: float = trained("contradicted_below")
     seed: int = trained("seed")
     trees: int = trained("trees")
     min_samples_leaf: int = trained("min_samples_leaf")
@@ -126,8 +125,8 @@ class ClassifierModel(Stage):
         "memory_mb", kind="integer", default=512, name="memory", minimum=16, exclusive=False, maximum=None
     )
     details = """
-Samples `count` points of each class, spread over space; computes features for the samples only; fits the percentiles
-and histogram thresholds; grows a Random Forest; writes [one model file](../model-file.md). A class with fewer points
+Samples `count` points of each class, spread over space; computes features for the samples only; fits
+histogram thresholds; grows a Random Forest; writes [one model file](../model-file.md). A class with fewer points
 has them several times, and the counts are in the file. For its score a forest of a quarter of the trees is
 cross-validated over spatial blocks, so that neighbors never stand on both sides (`folds` 0: not). With `groups`,
 points of one tile or flight are held out together instead of blocks; `pdal-stages train` holds out each of several
@@ -289,8 +288,6 @@ classes.
         model.save(self.filename)
         shown = {key: model.info[key] for key in _SHOWN if key in model.info}
         report.figures |= {"model": self.filename, **shown, "seconds": model.seconds}
-        if gone := model.info["training"].get("contradicted"):
-            report.figures["contradicted"] = gone
         for code, (all_, held) in model.info["training"].get("held_by_base", {}).items():
             report.warnings.append(
                 f"{held:,} of {all_:,} samples of class {code} are, to the base, of a class that no label has, and stay it: "
@@ -314,9 +311,9 @@ classes.
             report.notes.append(
                 f"blocks are held out, not {summary.groups_word(self.groups)}: {crossed['instead']}"
             )
-        if scores := summary.scores(model.info):
-            report.figures["score"] = scores[0]
-            report.notes.append(scores[0])
+        if summary.held_out(model.info):
+            report.figures["score"] = summary.score(model.info)
+            report.notes.append(report.figures["score"])
         if self._trainer.reports_training:
             report.figures["training"] = model.info["training"]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from ..base.errors import ModelError, suggest
 from ..classifier import Model
 from ..classifier import load_model as read_model
-from ..models import find, shipped
+from ..classifier.modelfile import find, shipped
 
 
 def load_model(path: str | os.PathLike) -> Model:

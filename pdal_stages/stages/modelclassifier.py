@@ -14,10 +14,9 @@ from ..base.vegetation import HIGH as HIGH_VEGETATION
 from ..base.vegetation import LOW, MEDIUM, bands, by_height
 from ..classifier import Model, Prediction
 from ..classifier.deciding import UNCLASSIFIED
+from ..classifier.modelfile import find
 from ..classifier.passes import BAND
-from ..classifier.smoothing import FARTHEST
 from ..classifier.sureness import Limit, Sureness, said, sureness_of
-from ..models import find
 from .base import Stage
 from .dimensions import parts_of
 from .loading import loaded_model
@@ -82,14 +81,6 @@ class ModelClassifier(Stage):
         "Points that are neighbors but keep the class they have, written as for ignore; 12 (overlap of strips) says of a "
         "point what a class would overwrite"
     )
-    smooth: float = option(
-        "number",
-        0.0,
-        "Smoothing radius: average each point's probabilities with its neighbors' mean; 0 disables",
-        minimum=0,
-        maximum=FARTHEST,
-        unit="m",
-    )
     vegetation_heights: list = vegetation_heights_option(
         "points the model calls vegetation (5) become low (3) below the first and medium (4) below the second"
     )
@@ -105,9 +96,8 @@ class ModelClassifier(Stage):
     details = """
 Computes the features the model needs block by block and classifies them at once, so memory does not grow with their
 number. A model asked for a dimension that the points lack names the dimension and the stage that makes it.
-`Reliability` is the probability of the winning class. `smooth` (1 m, say)
-reduces speckle: a point's probabilities become half its own and half the mean over its neighbors, as far as
-these are classified too; class, reliability and margin follow.
+`Reliability` is the probability of the winning class. PDAL's `filters.neighborclassifier` after this stage takes speckle
+out of a model of one pass.
 Noise and withheld points would spoil the features of all around them, so by default these are as good as not there
 (`ignore`), and keep their class. `keep` names what is a neighbor but is not overwritten. Both are counted in the
 metadata; `"ignore": "", "keep": ""` classifies everything.
@@ -118,7 +108,7 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
 """
     dimensions_help = """- Reads: X, Y, Z, `Classification`, and what the model names (`pdal-stages model FILE`)
 - Writes: `Classification` (uint8_t), `Reliability` (float); on request `Margin`, `Variance` and `Probability_<code>` (float)
-- Halo: that of the model's neighborhoods, and `smooth`"""
+- Halo: that of the model's neighborhoods"""
     before = ({"type": "filters.hag_minima"},)
     after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)
     example = {"type": "filters.modelclassifier", "model": "town.model"}
@@ -220,10 +210,7 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         return out
 
     def halo_m(self) -> float:
-        return self.model.halo_m + self.inner_halo_m()
-
-    def inner_halo_m(self) -> float:
-        return self.smooth + 0.001 if self.smooth else 0.0  # a distance rounds
+        return self.model.halo_m
 
     def largest_class(self) -> int:
         return max([code for code, _ in self.model.classes] + [self._rejected or 0])
@@ -273,7 +260,6 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
                 limits=None
                 if self.limits is None
                 else {c: one.reliability for c, one in self.limits.items()},
-                smooth=self.smooth,
                 progress=progress,
             )
         if self.bands:

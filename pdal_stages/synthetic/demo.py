@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ..base.errors import StageError
 from ..base.files import write_whole
-from ..models import STANDARD
+from ..classifier.modelfile import STANDARD
 from ..stages.heights import PREPARATION
 
 #: Classes of the town that the demo tells apart; small ones are left to the reader.

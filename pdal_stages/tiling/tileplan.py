@@ -11,7 +11,7 @@ from typing import Any
 from ..base import kinds
 from ..base.errors import PipelineError, StageError
 from ..base.outputs import Output, check_outputs
-from ..models import shipped
+from ..classifier.modelfile import shipped
 from ..pipeline.filenames import writes_las
 from ..pipeline.run import Pipeline
 from ..stages.base import Blocks, Stage
@@ -316,8 +316,7 @@ def _narrowed(step: _Step, later: float) -> dict[str, Any]:
             if name and (option.kind == "filename" or (option.kind == "model" and name not in shipped())):
                 stage[option.name] = str(Path(stage[option.name]).absolute())
         if ours.where_chooses:
-            seen_to = later + ours.inner_halo_m()
-            seen = f"{OUTSIDE} <= {seen_to!r}" if seen_to > 0 else f"{OUTSIDE} < 0"
+            seen = f"{OUTSIDE} <= {later!r}" if later > 0 else f"{OUTSIDE} < 0"
             stage["where"] = f"({ours.where}) && ({seen})" if ours.where else seen
         if (memory := ours.memory_in_tiles()) is not None:
             stage.setdefault("memory", memory)

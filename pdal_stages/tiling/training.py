@@ -17,9 +17,9 @@ from ..base.errors import StageError
 from ..base.extrabytes import extra_dimensions
 from ..base.report import Report
 from ..classifier import TrainingCloud
+from ..classifier.clouds import TiledCloud
 from ..classifier.dimensions import CHECKED
 from ..classifier.summary import FILE_NUMBER
-from ..classifier.tiledcloud import TiledCloud
 from ..classifier.training import train_tiles
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env

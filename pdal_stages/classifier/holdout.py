@@ -1,0 +1,212 @@
+"""Ground that is held out: whole surveys or blocks in turn, and what forests say of ground they have not seen.
+
+Neighboring points share most of their features, so a forest nearly knows the neighbors of its samples: a score on them
+flatters, and a next pass trained on what it says there would trust what nobody knows elsewhere.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..accuracy.measures import Accuracy
+from ..base.errors import OptionError
+from .algorithms import PredictRequest
+from .context import Context
+from .featureforest import Features
+from .forest import Forest
+from .passes import PassRun
+
+#: Side of a block in meters; where too few have samples it is halved down to the other.
+BLOCK, SMALLEST = 25.0, 0.02
+#: Fewer surveys than this are cut into blocks: else too little would be left to train the next pass on.
+SURVEYS = 3
+#: Rows handed to scikit-learn to deal out blocks, which counts them one by one.
+_DEALT = 50_000
+
+
+@dataclass(frozen=True, eq=False)
+class Folds:
+    """Which part of the training ground a point belongs to.
+
+    Attributes
+    ----------
+    count : int
+    surveys : dict of str to int
+        Fold of each survey, where whole surveys are folds; otherwise empty.
+    side : float
+        Of blocks, meters. They are anchored to absolute coordinates, so that clouds that overlap share them.
+    blocks, fold : (m,) int64, (m,) int16
+        Number of each block that has samples, ascending, and its fold. Others follow from their number.
+    """
+
+    count: int
+    surveys: dict[str, int]
+    side: float = BLOCK
+    blocks: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    fold: npt.NDArray[np.int16] = field(default_factory=lambda: np.zeros(0, np.int16))
+
+    @classmethod
+    def of_blocks(
+        cls,
+        xy: npt.NDArray[np.float64],
+        label: npt.NDArray[Any],
+        weight: npt.NDArray[Any],
+        folds: int,
+        side: float,
+    ) -> Folds:
+        """Blocks dealt out so that every fold has its share of each class.
+
+        Parameters
+        ----------
+        xy : (n, 2) float64
+            Of the samples, meters.
+        label, weight : (n,) int
+            Class position of each sample and how often it counts.
+        """
+        blocks, block = np.unique(_numbers(xy, side), return_inverse=True)
+        if len(blocks) < folds:
+            raise OptionError(
+                f"the samples cover {len(blocks)} block(s) of {side:g} m, fewer than the {folds} folds",
+                found=f"folds {folds}",
+                cure="Make folds smaller, or give more training data",
+            )
+        from sklearn.model_selection import StratifiedGroupKFold
+
+        content = np.zeros((len(blocks), int(label.max()) + 1))
+        np.add.at(content, (block, label), weight)
+        rows = np.ceil(content * min(1.0, _DEALT / content.sum())).astype(np.int64)
+        of_block, of_class = (np.repeat(i.reshape(-1), rows.reshape(-1)) for i in np.indices(rows.shape))
+        fold = np.full(len(blocks), -1, np.int16)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of a class with fewer rows than folds
+            for number, (_, held) in enumerate(
+                StratifiedGroupKFold(folds).split(of_block, of_class, of_block)
+            ):
+                fold[of_block[held]] = number
+        return cls(folds, {}, side, blocks, fold)
+
+    @classmethod
+    def of_ground(
+        cls,
+        xy: npt.NDArray[np.float64],
+        label: npt.NDArray[Any],
+        weight: npt.NDArray[Any],
+        surveys: Sequence[str],
+        folds: int,
+    ) -> Folds:
+        """Whole surveys where there are enough, else blocks as small as need be."""
+        names = sorted(set(surveys))
+        if len(names) >= SURVEYS:
+            folds = min(folds, len(names))
+            return cls(folds, {name: number % folds for number, name in enumerate(names)})
+        side = BLOCK
+        while True:
+            try:
+                return cls.of_blocks(xy, label, weight, folds, side)
+            except (OptionError, ValueError):  # the latter of scikit-learn, for classes of very few samples
+                side /= 2.0
+                if side < SMALLEST:
+                    raise OptionError(
+                        f"the labeled ground is too small to be cut into {folds} parts",
+                        cure="Give more training data, or set passes to 1",
+                    ) from None
+
+    def points(self, xyz: npt.NDArray[np.float64], survey: str = "") -> npt.NDArray[np.int16]:
+        """The fold of each point of a cloud."""
+        if self.surveys:
+            return np.full(len(xyz), self.surveys[survey], np.int16)
+        number = _numbers(xyz, self.side)
+        at = np.minimum(np.searchsorted(self.blocks, number), len(self.blocks) - 1)
+        return np.where(self.blocks[at] == number, self.fold[at], number % self.count).astype(np.int16)
+
+
+def _numbers(xyz: npt.NDArray[np.float64], side: float) -> npt.NDArray[np.int64]:
+    """The number of each point's block."""
+    cell = np.floor(xyz[:, :2] / side).astype(np.int64)
+    return (cell[:, 0] << 32) + cell[:, 1]
+
+
+def split(
+    xy: npt.NDArray[np.float64], fold: npt.NDArray[Any], number: int, gap: float
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
+    """(training mask, rows held out) of one fold; none of the former is within `gap` meters of the latter."""
+    from scipy.spatial import cKDTree
+
+    held = fold == number
+    train = ~held
+    if gap > 0 and held.any():
+        others = np.flatnonzero(train)
+        distance, _ = cKDTree(xy[held]).query(xy[others], distance_upper_bound=np.nextafter(gap, np.inf))
+        train[others[distance <= gap]] = False
+    return train, np.flatnonzero(held)
+
+
+def figures(matrix: npt.NDArray[np.int64], codes: Sequence[int]) -> dict[str, Any]:
+    """The measures kept in a model file; rows of the matrix are the truth."""
+    accuracy = Accuracy.from_confusion(matrix, codes)
+    return {
+        "overall_accuracy": accuracy.overall_accuracy,
+        "kappa": accuracy.kappa,
+        "mean_f1": accuracy.mean_f1,
+        "f1": {str(one.code): one.f1 if one.support else None for one in accuracy.per_class},
+    }
+
+
+# ---- what a pass says of points it has not seen ------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class FoldForests:
+    """A forest per fold, each grown without it, as one pass over one cloud."""
+
+    features: Features
+    context: Context | None
+    forests: Sequence[Forest]
+    fold: npt.NDArray[np.int16]  #: (n,) of every point of the cloud: the forest that judges it
+    #: of a pass on top of others: what it makes of all that it reads and of what its forests say
+    blend: Callable[[npt.NDArray[np.float32], npt.NDArray[np.float64]], npt.NDArray[np.float64]] | None = None
+
+    def probabilities(
+        self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.float64]:
+        """Of each point from the forest that has not seen its fold."""
+        out = np.empty((len(values), self.forests[0].n_classes))
+        fold = self.fold[rows]
+        for number in np.unique(fold).tolist():
+            out[fold == number] = self.forests[number].predict_proba(values[fold == number])
+        return out if self.blend is None else self.blend(values, out)
+
+
+@dataclass(frozen=True, eq=False)
+class _ContextOnly:
+    """A pass of which nothing but its context is wanted."""
+
+    context: Context
+    features: None = None
+
+
+def sample_context(
+    request: PredictRequest,
+    passes: Sequence[Any],
+    context: Context,
+    classes: Sequence[int],
+    factors: Sequence[npt.NDArray[np.float64] | None] = (),
+) -> npt.NDArray[np.float32]:
+    """(m, columns): the context of the m points asked for, ascending, as passes say that have not seen them.
+
+    `classes` and `factors` of each pass: see :class:`Passes`.
+    """
+    asked: Any = request.rows
+    out = np.empty((len(asked), len(context.tokens) * classes[-1]), np.float32)
+    padded = (*factors, *[None] * (len(passes) - len(factors) + 1))
+    members: list[Any] = [*passes, _ContextOnly(context)]
+    run = PassRun(members, [*classes, classes[-1]], request, padded)
+    for rows, columns in run.blocks(lambda values, rows, columns: columns):
+        out[np.searchsorted(asked, rows)] = columns
+    return out
