@@ -8,7 +8,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from pdal_stages.base.complete import check_complete
+from pdal_stages.base.lascheck import check_complete
 from pdal_stages.base.errors import StageError
 
 COUNT = 300
@@ -67,10 +67,10 @@ def test_other_formats_are_held_against_disk_and_limits(tmp_path, monkeypatch):
     path.write_bytes(b"x" * 100)
     writer = {"type": "writers.gdal", "filename": "x.tif"}
     assert not check_complete(path, path, writer)
-    monkeypatch.setattr("pdal_stages.base.complete._largest", lambda: 100)
+    monkeypatch.setattr("pdal_stages.base.lascheck._largest_file", lambda: 100)
     with pytest.raises(StageError, match="Make room"):
         check_complete(path, path, writer)
     monkeypatch.undo()
-    monkeypatch.setattr("pdal_stages.base.complete.disk_is_full", lambda path: True)
+    monkeypatch.setattr("pdal_stages.base.lascheck.disk_is_full", lambda path: True)
     with pytest.raises(StageError, match="Make room"):
         check_complete(path, path, writer)

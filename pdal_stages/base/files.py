@@ -18,7 +18,6 @@ import shutil
 import stat
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -26,18 +25,13 @@ from typing import Any
 from .errors import StageError
 from .kinds import kind_of
 
-#: How the hidden folders' names begin, and what the file in them is called that their writer holds locked.
-PREFIX, _LOCK = ".pdal-stages-partial-", ".lock"
-#: Seconds after which a hidden folder without that file is no longer taken for one just made.
-_GRACE = 3600.0
+#: How the hidden folders' names begin.
+PREFIX = ".pdal-stages-partial-"
 #: What the system says where a file has no room, or none is left to this user.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 #: Bytes a file's name may have, on every usual file system.
 _LONGEST_NAME = 255
 _swept: set[str] = set()
-
-
-# ---- before the work ---------------------------------------------------------------------------------------
 
 
 def check_writable(path: str | os.PathLike, what: str = "output", kind: str = "") -> None:
@@ -57,21 +51,20 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
         If its folder is missing or read-only, its name is too long, or what is there must not be replaced: a folder, a
         write-protected file, a file that is known to be of another kind.
     """
-    name = Path(path)
-    real = _real(name)
-    if is_stream(name):
-        if not os.access(name, os.W_OK) or stat.S_IFMT(os.stat(name).st_mode) in (
+    if is_stream(path):
+        if not os.access(path, os.W_OK) or stat.S_IFMT(os.stat(path).st_mode) in (
             stat.S_IFBLK,
             stat.S_IFSOCK,
         ):
             raise StageError(f"the {what} file is a device that cannot be written to", found=str(path))
         return
+    real = _real(path)
     if len(real.name.encode(errors="surrogateescape")) > _LONGEST_NAME:
         raise StageError(f"the name of the {what} file is longer than {_LONGEST_NAME} bytes", found=str(path))
     if not real.parent.is_dir():
         cure = "Create it first"
         if not str(real.parent).isascii() and sys.getfilesystemencoding() != "utf-8":
-            cure = f"Set PYTHONUTF8=1: this locale's file names are {sys.getfilesystemencoding()}"
+            cure = _locale_cure()
         raise StageError(f"the folder of the {what} file does not exist", found=str(real.parent), cure=cure)
     if real.is_symlink():
         raise StageError(f"the {what} file is a link that leads to itself", found=str(path))
@@ -80,69 +73,45 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
     if not os.access(real.parent, os.W_OK):
         raise StageError(f"the folder of the {what} file cannot be written to", found=str(real.parent))
     if real.exists() and not (os.access(real, os.W_OK) and real.stat().st_mode & 0o222):
-        raise StageError(
-            f"the {what} file is write-protected",
-            found=str(path),
-            cure="Give another name, or change its mode",
-        )
+        cure = "Give another name, or change its mode"
+        raise StageError(f"the {what} file is write-protected", found=str(path), cure=cure)
     older = kind_of(real) if kind else ""
     if older and older != kind:
-        raise StageError(
-            f"the {what} file would replace {older}",
-            found=str(path),
-            cure="Give another name, or remove that file first",
-        )
+        cure = "Give another name, or remove that file first"
+        raise StageError(f"the {what} file would replace {older}", found=str(path), cure=cure)
 
 
 def is_stream(path: str | os.PathLike) -> bool:
     """Whether a name stands for something to write into: a device, a pipe, or what this process has open."""
     try:
         kind = stat.S_IFMT(os.stat(path).st_mode)
-        return kind not in (stat.S_IFREG, stat.S_IFDIR) or (kind == stat.S_IFREG and _is_open(path))
     except (OSError, ValueError):
         return False
+    opened = os.path.abspath(path).startswith(("/dev/std", "/dev/fd/", "/proc/"))
+    return kind not in (stat.S_IFREG, stat.S_IFDIR) or (kind == stat.S_IFREG and opened)
 
 
-def _is_open(path: str | os.PathLike) -> bool:
-    """Whether links lead to the system's list of open files, as ``/dev/stdout`` does."""
-    name = os.path.abspath(path)
-    for _ in range(40):
-        folder = os.path.realpath(os.path.dirname(name))
-        if folder.startswith(("/proc/", "/dev/fd")):
-            return True
-        if not os.path.islink(name):
-            return False
-        name = os.path.join(folder, os.readlink(name))
-    return False
-
-
-def _real(path: Path) -> Path:
+def _real(path: str | os.PathLike) -> Path:
     """The file that a name leads to."""
     try:
         return Path(os.path.realpath(path))
     except UnicodeEncodeError as error:
-        raise StageError(
-            "the name of the file cannot be written in this locale",
-            found=ascii(str(path)),
-            cure=f"Set PYTHONUTF8=1: this locale's file names are {sys.getfilesystemencoding()}",
-        ) from error
+        what = "the name of the file cannot be written in this locale"
+        raise StageError(what, found=ascii(str(path)), cure=_locale_cure()) from error
 
 
-def open_to_append(path: str | os.PathLike, what: str) -> Any:
+def _locale_cure() -> str:
+    return f"Set PYTHONUTF8=1: this locale's file names are {sys.getfilesystemencoding()}"
+
+
+def open_to_append(path: str | os.PathLike) -> Any:
     """A text file at whose end lines go, made where it is not there; a device or pipe is written into.
 
     Raises
     ------
     OSError
     """
-    real = _real(Path(path))
-    if is_stream(path):
-        return open(path, "a", encoding="utf-8", errors="backslashreplace")
-    flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
-    return open(os.open(real, flags, 0o666), "a", encoding="utf-8", errors="backslashreplace")
-
-
-# ---- writing -----------------------------------------------------------------------------------------------
+    return open(path if is_stream(path) else _real(path), "a", encoding="utf-8", errors="backslashreplace")
 
 
 def write_whole(path: str | os.PathLike, content: bytes, what: str = "output") -> Path:
@@ -228,8 +197,7 @@ class _Place:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        stream = is_stream(path)
-        parent = Path(tempfile.gettempdir()) if stream else _real(path).parent
+        parent = Path(tempfile.gettempdir()) if is_stream(path) else _real(path).parent
         if str(parent) not in _swept:
             _swept.add(str(parent))
             sweep(parent)
@@ -238,24 +206,25 @@ class _Place:
 
     def made(self) -> list[tuple[Path, Path]]:
         """Files that were written, and the names they are to get."""
-        found = sorted(self.folder / name for name in os.listdir(self.folder) if name != _LOCK)
+        found = sorted(self.folder.iterdir())
         if self.partial not in found and "#" not in self.path.name:
             raise StageError("the writer wrote no file", found=str(self.path))
         return [(f, self.path if f == self.partial else self.path.with_name(f.name)) for f in found]
 
     def close(self) -> None:
         """Remove the folder and whatever it holds."""
-        _remove(self.folder)
-        self._lock.close()
+        shutil.rmtree(self.folder, ignore_errors=True)
+        if self._lock is not None:
+            os.close(self._lock)
 
 
 def _give_name(made: Path, target: Path) -> None:
     """Move a file to its place, or write it into what is there."""
-    real = _real(target)
     if is_stream(target):
         with open(made, "rb") as file:
             _pour(file, target)
         return
+    real = _real(target)
     with contextlib.suppress(FileNotFoundError):
         older = real.stat()
         if hasattr(os, "chown") and (older.st_uid, older.st_gid) != (os.geteuid(), os.getegid()):
@@ -279,23 +248,19 @@ def _pour(file: Any, target: Path) -> None:
         shutil.copyfileobj(file, out)
 
 
-# ---- hidden folders ----------------------------------------------------------------------------------------
-
-
-def _locked_folder(parent: Path) -> tuple[Path, Any]:
-    """A new folder that only we may enter, and the open file that says we live."""
+def _locked_folder(parent: Path) -> tuple[Path, int | None]:
+    """A new folder that only we may enter, and what holds it locked; None where folders have no locks."""
     while True:
         folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent))
         try:
-            lock = open(folder / _LOCK, "x+b")  # noqa: SIM115  open as long as the folder is
+            lock = os.open(folder, os.O_RDONLY)
         except FileNotFoundError:  # swept before it was locked
             continue
-        except OSError:
-            folder.rmdir()
-            raise
-        with contextlib.suppress(OSError):  # a file system without locks: nothing is swept there
-            if not try_lock(lock) or not (folder / _LOCK).exists():
-                lock.close()
+        except OSError:  # Windows: nothing is swept there
+            return folder, None
+        with contextlib.suppress(OSError):  # a file system without locks: the same
+            if not try_lock(lock) or not folder.exists():
+                os.close(lock)
                 continue
         return folder, lock
 
@@ -303,42 +268,22 @@ def _locked_folder(parent: Path) -> tuple[Path, Any]:
 def sweep(folder: str | os.PathLike) -> None:
     """Remove what writers that live no more left in a folder; other users' and live writers' files stay."""
     with contextlib.suppress(OSError):
-        for name in os.listdir(folder):
-            if name.startswith(PREFIX):
-                _remove_dead(Path(folder, name))
+        for left in Path(folder).glob(f"{PREFIX}*"):
+            with contextlib.suppress(OSError):
+                _remove_dead(left)
 
 
 def _remove_dead(folder: Path) -> None:
-    with contextlib.suppress(OSError):
-        found = os.lstat(folder)
-        if not stat.S_ISDIR(found.st_mode) or (hasattr(os, "geteuid") and found.st_uid != os.geteuid()):
-            return
-        try:
-            lock = os.fdopen(os.open(folder / _LOCK, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0)), "r+b")
-        except FileNotFoundError:
-            with contextlib.suppress(OSError):
-                folder.rmdir()  # an empty one; who has just made it makes another
-            if time.time() - found.st_mtime > _GRACE:
-                shutil.rmtree(folder, ignore_errors=True)
-            return
-        with lock:
-            if try_lock(lock):
-                _remove(folder)
-
-
-def _remove(folder: Path) -> None:
-    """The lock goes last, so that what a killed process leaves here is known to be dead, or empty."""
-    with contextlib.suppress(OSError), os.scandir(folder) as entries:
-        for entry in entries:
-            if entry.is_dir(follow_symlinks=False):
-                shutil.rmtree(entry.path, ignore_errors=True)
-            elif entry.name != _LOCK:
-                os.unlink(entry.path)
-    shutil.rmtree(folder, ignore_errors=True)
+    lock = os.open(folder, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_DIRECTORY", 0))
+    try:
+        if os.fstat(lock).st_uid == os.geteuid() and try_lock(lock):
+            shutil.rmtree(folder, ignore_errors=True)
+    finally:
+        os.close(lock)
 
 
 def try_lock(file: Any) -> bool:
-    """Lock an open file until it is closed or this process ends; False where another has it locked.
+    """Lock an open file or its descriptor until it is closed or this process ends; False where another has it locked.
 
     Raises
     ------

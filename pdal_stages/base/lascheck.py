@@ -1,26 +1,38 @@
 """LAS and LAZ files held against what their headers say, before PDAL reads one and after it wrote one.
 
-PDAL reads a file that is cut short as if it were whole, giving points made of nothing, and some damaged headers
-end the process.
+PDAL reads a file that is cut short as if it were whole, giving points made of nothing; some damaged headers and chunk
+tables end the process, or let it wait forever. Its writers do not notice that a disk is full.
 """
 
 from __future__ import annotations
 
+import io
 import math
 import os
 import struct
+from collections.abc import Mapping
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
-from . import chunks
 from .errors import StageError
-from .las import POINT_BYTES, WAVES, LasHeader, read_header, records
+from .files import disk_is_full
+from .las import LARGEST_RECORD, POINT_BYTES, WAVES, LasHeader, read_header, records
 
 #: What to do about a damaged file.
 DAMAGED = "Get the file again from its source, or repair it with a tool made for that (e.g. lasinfo -repair)"
-
 #: Steps of the coordinates that points may lie beyond the box: programs round it differently.
 _BOX_STEPS = 100
+#: Scales below and offsets above are no lengths, but bytes of a header that was written in part.
+_SMALLEST, _LARGEST = 1e-30, 1e15
+#: Bytes that a header has at least, by its version.
+_HEADER_BYTES = (227, 227, 227, 235, 375, 375)
+#: More chunks than this (ten billion points in chunks of the usual size) are not decoded one by one.
+_MOST_CHUNKS = 200_000
+#: Points of a chunk, for which lazrs takes memory at once; 50,000 are usual.
+_LARGEST_CHUNK = 2**24
+
+#: What is wrong, and what was found.
+Wrong = tuple[str, str]
 
 
 def check_readable(path: str | os.PathLike) -> str | None:
@@ -32,35 +44,29 @@ def check_readable(path: str | os.PathLike) -> str | None:
         What is wrong with the file, or why it cannot be opened: PDAL says little then, or crashes. Or that no PDAL reads
         its point format.
     """
+    where = str(path)
     try:
-        size = Path(path).stat().st_size
-        header = read_header(path)
-        table = chunks.table_place(path, size, header) if header is not None and header.compressed else 0
-        wrong = None if header is None else _what_is_wrong(header, size, table)
-        if header is not None and header.records_after and not wrong:
-            wrong = _wrong_records(path, header, size)
-        if header is not None and header.compressed and header.count and not wrong:
-            wrong = _wrong_chunks(path, header, table)
+        size, header = Path(path).stat().st_size, read_header(path)
+        if header is None:
+            found = f"{size:,} bytes without a LAS header"
+            raise StageError("not a LAS file", where=where, found=found, cure=DAMAGED)
+        with open(path, "rb") as file:
+            wrong = _wrong_header(header, size) or _wrong_records(file, header, size)
+            wrong = wrong or (_wrong_chunks if header.compressed else _wrong_count)(file, header, size)
     except OSError as error:
-        raise StageError("the file cannot be read", where=str(path), found=error) from None
-    if header is None:
-        raise StageError(
-            "not a LAS file", where=str(path), found=f"{size:,} bytes without a LAS header", cure=DAMAGED
-        )
+        raise StageError("the file cannot be read", where=where, found=error) from None
     if wrong:
-        raise StageError(
-            f"the LAS file is damaged: {wrong[0]}", where=str(path), found=wrong[1], cure=DAMAGED
-        )
+        raise StageError(f"the LAS file is damaged: {wrong[0]}", where=where, found=wrong[1], cure=DAMAGED)
     if without := WAVES.get(header.point_format):
         raise StageError(
             "PDAL does not read points with waveforms",
-            where=str(path),
+            where=where,
             found=f"point format {header.point_format}",
             cure=f"Write the file anew in format {without}, which has all but the waveforms: "
             f"laspy.convert(laspy.read(IN), point_format_id={without}).write(OUT)",
         )
-    beyond = _bytes_beyond(header, size)
-    if beyond >= header.point_bytes:
+    beyond = _end_of_points(header, size) - header.offset - header.count * header.point_bytes
+    if not header.compressed and beyond >= header.point_bytes:
         return (
             f"{path}: the file holds {beyond:,} bytes beyond the {header.count:,} points that its header counts; "
             "they are not read"
@@ -92,128 +98,198 @@ def beyond_box(path: str | os.PathLike, lie: tuple[float, float, float, float]) 
     )
 
 
-def _bytes_beyond(header: LasHeader, size: int) -> int:
-    """Bytes after the points of a file that is not compressed, and before what the header says comes then."""
-    ends = [header.after] if header.records_after else []
-    ends += [header.waveforms] if header.waveforms else []
-    if header.compressed or any(not header.end_of_points <= end <= size for end in ends):
-        return 0
-    return min([size, *ends]) - header.end_of_points
+def check_complete(
+    path: str | os.PathLike, name: str | os.PathLike, writer: Mapping[str, Any], count: int | None = None
+) -> bool:
+    """Refuse a file that a writer could not finish; whether it could be judged by its content.
+
+    LAS and LAZ files are held against their own headers and the points there were; of other formats it is only known
+    that disk and limits left room.
+
+    Parameters
+    ----------
+    path : path
+        The file as it was written.
+    name : path
+        The name it is to get, for the message.
+    writer : mapping
+        The stage that wrote it.
+    count : int, optional
+        The points it must hold, where that is known.
+
+    Raises
+    ------
+    StageError
+        If it is not whole.
+    """
+    path = Path(path)
+    las = writer.get("type") in ("writers.las", "writers.copc") or path.suffix.lower() in (".las", ".laz")
+    try:
+        size = path.stat().st_size
+        with open(path, "rb+") as file:
+            os.fsync(file.fileno())  # some file systems report a full disk only here
+        whole = _is_whole(path, count) if las else not disk_is_full(path) and size < _largest_file()
+    except OSError as error:
+        raise StageError("the output file cannot be read back", found=f"{name}: {error}") from error
+    if not whole:
+        raise StageError(
+            "the output file could not be written completely",
+            found=f"{name}: {size:,} bytes were written",
+            cure="Make room on the disk (or raise the limit on file sizes)",
+        )
+    return las
 
 
-#: Scales below and offsets above are no lengths, but bytes of a header that was written in part.
-_SMALLEST, _LARGEST = 1e-30, 1e15
-#: Bytes that a header has at least, by its version.
-_HEADER_BYTES = (227, 227, 227, 235, 375, 375)
+def _is_whole(path: Path, count: int | None) -> bool:
+    try:
+        check_readable(path)
+    except StageError:
+        return False
+    header = read_header(path)
+    return header is not None and count in (None, header.count)
 
 
-def _what_is_wrong(header: LasHeader, size: int, table: int) -> tuple[str, str] | None:
+def _largest_file() -> float:
+    """Bytes that a file of this process may have."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return math.inf
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+    return math.inf if limit == resource.RLIM_INFINITY else limit
+
+
+def _end_of_points(header: LasHeader, size: int) -> int:
+    """Where the first of what may follow the points begins, or the file ends."""
+    after = [header.after] * bool(header.records_after) + [header.waveforms] * bool(header.waveforms)
+    return min([size, *(place for place in after if place >= header.offset)])
+
+
+def _wrong_header(header: LasHeader, size: int) -> Wrong | None:
+    """What no header has, whatever follows."""
+    least = POINT_BYTES[header.point_format] if header.point_format < len(POINT_BYTES) else 0
     if header.minor > 5:
         return "its version is not known", f"LAS 1.{header.minor}"
-    if header.point_format >= len(POINT_BYTES):
+    if not least:
         return "its point format is not known", f"point format {header.point_format}"
-    least = POINT_BYTES[header.point_format]
     if header.point_bytes < least:
-        return (
-            "its points are shorter than their format",
-            f"{header.point_bytes} bytes, format {header.point_format} has {least}",
-        )
+        found = f"{header.point_bytes} bytes, format {header.point_format} has {least}"
+        return "its points are shorter than their format", found
     if header.header_bytes < _HEADER_BYTES[header.minor]:
-        least = _HEADER_BYTES[header.minor]
-        return "its header is too short", f"{header.header_bytes} bytes, LAS 1.{header.minor} has {least}"
+        found = f"{header.header_bytes} bytes, LAS 1.{header.minor} has {_HEADER_BYTES[header.minor]}"
+        return "its header is too short", found
     if header.header_bytes > min(header.offset, size):
-        return (
-            "its points begin inside the header",
-            f"header of {header.header_bytes} bytes, points at {header.offset}",
-        )
+        found = f"header of {header.header_bytes} bytes, points at {header.offset}"
+        return "its points begin inside the header", found
     if header.records * 54 > header.offset - header.header_bytes:
         return (
             "it counts more records than there is room for",
             f"{header.records:,} records before the points",
         )
-    if not all(_SMALLEST <= abs(v) < math.inf for v in header.scales) or not all(
-        abs(v) <= _LARGEST for v in header.offsets
-    ):
-        return (
-            "its scales or offsets are not valid numbers",
-            f"scales {header.scales}, offsets {header.offsets}",
-        )
+    scaled = all(_SMALLEST <= abs(value) < math.inf for value in header.scales)
+    if not scaled or not all(abs(value) <= _LARGEST for value in header.offsets):
+        found = f"scales {header.scales}, offsets {header.offsets}"
+        return "its scales or offsets are not valid numbers", found
     if header.count and header.offset > size:
         return "it is cut short", f"{size:,} bytes, points begin at {header.offset:,}"
-    if header.compressed:
-        if header.count and not header.offset + 8 <= table <= size - 8:
-            return "it is cut short", f"{size:,} bytes, its table of chunks should be at {table:,}"
-    elif header.end_of_points > size:
-        held = max(0, size - header.offset) // header.point_bytes
-        return "it is cut short", f"{held:,} whole points, its header counts {header.count:,}"
-    if header.count and header.minor >= 4 and header.by_return != header.count:
-        beyond = _bytes_beyond(header, size)
-        if beyond >= header.point_bytes:  # either alone may be the work of a careless program
-            return (
-                "its header counts fewer points than it holds, and others by return",
-                f"{header.count:,} points, {header.by_return:,} by return, {beyond:,} bytes after them",
-            )
-    if not header.count:
-        end = header.after if header.records_after else size
-        if header.compressed and header.offset + 8 <= table <= size - 8:
-            end = min(end, table - 8)  # which is where an empty file has it
-        if end >= header.offset + (8 + 1 if header.compressed else header.point_bytes):
-            return (
-                "its header counts no points, but holds some, as programs leave it that end before they are done",
-                f"{end - header.offset:,} bytes where points are",
-            )
     return None
 
 
-def _wrong_records(path: str | os.PathLike, header: LasHeader, size: int) -> tuple[str, str] | None:
+def _wrong_records(file: BinaryIO, header: LasHeader, size: int) -> Wrong | None:
     """What is wrong with the records after the points."""
-    begin = header.offset if header.compressed else header.end_of_points
-    if not begin <= header.after <= size - 60 * header.records_after:
-        return (
-            "the records after its points are not where it says",
-            f"{header.records_after:,} records at {header.after:,}, a file of {size:,} bytes",
-        )
-    with open(path, "rb") as file:
-        held = [r for r in records(file, header) if r.after and r.data + r.length <= size]
-    if len(held) < header.records_after:
-        return (
-            "the records after its points do not end within the file",
-            f"{len(held):,} of {header.records_after:,} do",
-        )
-    return None
-
-
-def _wrong_chunks(path: str | os.PathLike, header: LasHeader, table: int) -> tuple[str, str] | None:
-    """What is wrong with the chunks of a LAZ file whose table is at `table`."""
-    with open(path, "rb") as file:
-        coding = chunks.coding_of(file, header)
-        if coding is None:
-            return "it has no record of how it is compressed", "no 'laszip encoded' among its records"
-        of_chunk = chunks.points_of_chunk(coding)
-        number, data = chunks.table_at(file, table)
-        wrong = chunks.what_is_wrong(
-            data,
-            table - header.offset - 8,
-            points=header.count,
-            point_bytes=header.point_bytes,
-            chunk_points=of_chunk,
-        )
-        if not wrong and header.point_format >= 6 and of_chunk is not None:
-            wrong = _wrong_last_chunk(file, header, of_chunk, number, data)
-        return wrong
-
-
-def _wrong_last_chunk(
-    file: BinaryIO, header: LasHeader, of_chunk: int, number: int, table: bytes
-) -> tuple[str, str] | None:
-    """What the last chunk of points of formats 6 to 10 says against the header: each begins with a point and its count."""
-    if not 0 < number <= chunks.MOST_DECODED:
+    points = 0 if header.compressed else header.count * header.point_bytes
+    if not header.records_after or header.offset + points > size:
         return None
-    sizes, _ = chunks.decode(table, variable=False)
-    file.seek(header.offset + 8 + sum(sizes[:-1]) + header.point_bytes)
-    held = file.read(4)
-    counted = header.count - of_chunk * (number - 1)
-    if len(held) == 4 and struct.unpack("<I", held)[0] != counted:
-        found = of_chunk * (number - 1) + struct.unpack("<I", held)[0]
-        return "its header counts other points than it holds", f"{header.count:,} counted, {found:,} held"
+    if not header.offset + points <= header.after <= size - 60 * header.records_after:
+        found = f"{header.records_after:,} records at {header.after:,}, a file of {size:,} bytes"
+        return "the records after its points are not where it says", found
+    held = sum(r.after and r.data + r.length <= size for r in records(file, header))
+    if held < header.records_after:
+        found = f"{held:,} of {header.records_after:,} do"
+        return "the records after its points do not end within the file", found
     return None
+
+
+def _wrong_count(file: BinaryIO, header: LasHeader, size: int) -> Wrong | None:
+    """What is wrong with the number of points that are not compressed."""
+    held = max(0, _end_of_points(header, size) - header.offset) // header.point_bytes
+    if held < header.count:
+        return "it is cut short", f"{held:,} whole points, its header counts {header.count:,}"
+    return _none_counted(held * header.point_bytes) if held and not header.count else None
+
+
+def _none_counted(size: int) -> Wrong:
+    what = "its header counts no points, but holds some, as programs leave it that end before they are done"
+    return what, f"{size:,} bytes where points are"
+
+
+def _wrong_chunks(file: BinaryIO, header: LasHeader, size: int) -> Wrong | None:
+    """What is wrong with the chunks of a LAZ file and the table of them, which is written last.
+
+    Layout: "LAZ specification 1.4", chunk table.
+    """
+    file.seek(header.offset)
+    place = file.read(8)
+    if place == b"\xff" * 8:  # a stream that could not be rewound has it at its end
+        file.seek(size - 8)
+        place = file.read(8)
+    table, begin = int.from_bytes(place, "little", signed=True), header.offset + 8
+    inside = len(place) == 8 and begin <= table <= size - 8
+    if not header.count:
+        room = (
+            table - 8 if inside else _end_of_points(header, size)
+        ) - begin  # an empty file may have 8 bytes
+        return _none_counted(room) if room > 0 else None
+    if not inside:
+        return "it is cut short", f"{size:,} bytes, its table of chunks should be at {table:,}"
+    coding = b""
+    for record in records(file, header):
+        if (record.user, record.number) == (b"laszip encoded", 22204):
+            file.seek(record.data)
+            coding = file.read(min(record.length, LARGEST_RECORD))
+            break
+    if len(coding) < 16:
+        return "it has no record of how it is compressed", "no 'laszip encoded' among its records"
+    (of_chunk,) = struct.unpack_from("<I", coding, 12)
+    file.seek(table)
+    head = file.read(8)
+    version, number = struct.unpack("<II", head)
+    if version:
+        return "its table of chunks is of an unknown version", str(version)
+    varies = of_chunk in (0, 2**32 - 1)
+    if not varies and of_chunk > _LARGEST_CHUNK:
+        return "its chunks are larger than any program makes them", f"{of_chunk:,} points"
+    room = table - begin
+    if number * header.point_bytes > room:  # a chunk begins with a whole point
+        return "it has more chunks than there is room for", f"{number:,} chunks in {room:,} bytes"
+    if number > _MOST_CHUNKS:
+        return None
+    try:
+        sizes, counts = _decoded(head + file.read(56 + 16 * number), varies)
+    except EOFError:
+        return "it is cut short", f"its table of {number:,} chunks does not end"
+    if sum(sizes) != room:
+        return "its chunks do not fill the file", f"{sum(sizes):,} bytes in chunks, {room:,} bytes there"
+    held = sum(counts) if varies else number * of_chunk
+    if not varies and header.point_format >= 6 and number:  # whose chunks begin with a point and their count
+        file.seek(table - sizes[-1] + header.point_bytes)
+        held += int.from_bytes(file.read(4), "little") - of_chunk
+    exact = varies or header.point_format >= 6
+    if held < header.count or (exact and held > header.count):
+        return "its header counts other points than it holds", f"{header.count:,} counted, {held:,} held"
+    return None
+
+
+def _decoded(table: bytes, varies: bool) -> tuple[list[int], list[int]]:
+    """Bytes of each chunk, and its points where they vary; EOFError where the table does not end."""
+    import lazrs
+
+    if any(table[4:8]) and table[8:12] == b"\xff" * 4:  # which no encoder writes, and where lazrs panics
+        raise EOFError
+    try:
+        coding = lazrs.LazVlr.new_for_compression(0, 0, varies)
+        entries = lazrs.read_chunk_table_only(io.BytesIO(table), coding)
+    except lazrs.LazrsError:
+        raise EOFError from None
+    # The numbers have 32 bits; lazrs takes the upper half of them for negative ones.
+    return [size % 2**32 for _, size in entries], [points % 2**32 for points, _ in entries] if varies else []

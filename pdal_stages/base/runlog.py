@@ -38,7 +38,7 @@ class RunLog:
         if kind := kind_of(path):
             raise StageError(f"the log would be added to {kind}", where="--log", found=path)
         try:
-            self._file: Any = open_to_append(path, "log")
+            self._file: Any = open_to_append(path)
         except StageError as error:
             raise error.at("--log") from None
         except OSError as error:

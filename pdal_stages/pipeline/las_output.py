@@ -15,8 +15,7 @@ from typing import Any
 
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import DimensionError, OptionError, PipelineError, StageError
-from ..base.extrabytes import extra_dimensions
-from ..base.las import LasHeader, read_header, supersede_copc
+from ..base.las import LasHeader, extra_dimensions, read_header, supersede_copc
 from ..stages import registry
 from ..stages.base import CodeLimit, Stage
 from . import pdal as pdal_env

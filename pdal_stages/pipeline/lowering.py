@@ -19,8 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..base.errors import DimensionError, OptionError, PipelineError, StageError, suggest
-from ..base.extrabytes import extra_dimensions
-from ..base.las import read_header
+from ..base.las import extra_dimensions, read_header
 from ..stages import preparation, registry
 from ..stages.base import Stage
 from ..stages.points import MAKERS

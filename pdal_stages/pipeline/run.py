@@ -12,11 +12,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from ..base.complete import check_complete
 from ..base.errors import InterruptedStage, PipelineError, StageError
 from ..base.files import whole_files
 from ..base.las import odd_text, supersede_copc
-from ..base.lascheck import check_readable
+from ..base.lascheck import check_complete, check_readable
 from ..base.outputs import Output, check_outputs
 from ..base.report import Report
 from ..stages import registry

@@ -1,18 +1,15 @@
-"""PDAL's `where` expressions, evaluated on NumPy arrays.
+"""PDAL's `where` expressions on NumPy arrays, read by Python's own parser.
 
-PDAL hands a filter with `where` only the points inside. Our stages need the points outside
-too, as neighbors, so they evaluate the expression themselves: comparisons
-(``== != < <= > >=``), ``&&``, ``||``, ``!``, arithmetic, parentheses and PDAL's functions over
-dimension names and numbers, with PDAL's precedence. What any PDAL from 2.2 to 2.10 takes is taken
-here with the same meaning, whatever PDAL is at hand; some of them refuse a little more:
-``(X + Y) == X`` and ``(Z) > 2`` the newer ones, functions those before 2.7 or 2.9.
+PDAL hands a filter with `where` only the points inside; our stages need those outside too, as neighbors, so they evaluate
+the expression themselves. What any PDAL from 2.2 to 2.10 takes is taken here with the same meaning.
 """
 
 from __future__ import annotations
 
+import ast
+import functools
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,12 +19,11 @@ from ..base.errors import DimensionError, OptionError, suggest
 
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
-    r"|(?P<mark>&&|\|\||==|!=|<=|>=|[-+*/()<>!]))"
+    r"|(?P<mark>&&|\|\||==|!=|<=|>=|[-+*/()<>!]))",
+    re.ASCII,
 )
-_COMPARISONS = ("==", "!=", "<", "<=", ">", ">=")
-_LEVELS: tuple[tuple[str, ...], ...] = (("||",), ("&&",), _COMPARISONS, ("+", "-"), ("*", "/"))
-_BOOLEAN = _LEVELS[0] + _LEVELS[1]
-_DEEPEST = 100
+_DEEPEST = 200
+_IN_PYTHON = {"&&": "and", "||": "or", "!": "not"}
 
 
 def _divide(a, b):
@@ -41,37 +37,41 @@ def _round(a):
     return np.where(np.abs(a - whole) >= 0.5, whole + np.sign(a), whole)
 
 
-_OPERATIONS: dict[str, Callable] = {
-    "||": np.logical_or,
-    "&&": np.logical_and,
-    "==": np.equal,
-    "!=": np.not_equal,
-    "<": np.less,
-    "<=": np.less_equal,
-    ">": np.greater,
-    ">=": np.greater_equal,
-    "+": np.add,
-    "-": np.subtract,
-    "*": np.multiply,
-    "/": _divide,
+_COMPARISONS: dict[type, Callable] = {
+    ast.Eq: np.equal,
+    ast.NotEq: np.not_equal,
+    ast.Lt: np.less,
+    ast.LtE: np.less_equal,
+    ast.Gt: np.greater,
+    ast.GtE: np.greater_equal,
+}
+_ARITHMETIC: dict[type, Callable] = {
+    ast.Add: np.add,
+    ast.Sub: np.subtract,
+    ast.Mult: np.multiply,
+    ast.Div: _divide,
 }
 _LIMITS = np.finfo(np.float64)
-_CONSTANTS = {"nan": np.nan, "lowest": float(_LIMITS.min), "highest": float(_LIMITS.max)}
+_CONSTANTS: dict[str, Callable] = {
+    "nan": lambda: np.nan,
+    "lowest": lambda: float(_LIMITS.min),
+    "highest": lambda: float(_LIMITS.max),
+}
 _CONDITIONS: dict[str, Callable] = {
     "isnan": np.isnan,
     "ismin": lambda a: np.equal(a, _LIMITS.min),
     "ismax": lambda a: np.equal(a, _LIMITS.max),
 }
 _FUNCTIONS: dict[str, Callable] = {
+    **{name: getattr(np, name) for name in ("abs", "fabs", "floor", "ceil", "sqrt", "exp", "exp2")},
     **{
         name: getattr(np, name)
-        for name in ("floor", "ceil", "fabs", "sqrt", "sin", "cos", "tan", "sinh", "cosh")
+        for name in ("log", "log2", "log10", "sin", "cos", "tan", "sinh", "cosh", "tanh")
     },
-    **{name: getattr(np, name) for name in ("tanh", "log", "log2", "log10", "exp", "exp2")},
     **{name: getattr(np, f"arc{name[1:]}") for name in ("asin", "acos", "atan", "asinh", "acosh")},
-    "abs": np.abs,
     "round": _round,
 }
+_CALLED = _FUNCTIONS | _CONDITIONS | _CONSTANTS
 #: Other names that PDAL takes for dimensions, in small letters.
 _ALIASES = {
     "class": "Classification",
@@ -82,23 +82,8 @@ _ALIASES = {
 }
 
 
-@dataclass(frozen=True)
-class _Node:
-    """A function with its operands, a dimension name, or a number; `truth` marks booleans."""
-
-    kind: str
-    value: Any
-    parts: tuple[_Node, ...] = ()
-    truth: bool = False
-
-
 class Expression:
-    """A parsed `where` expression.
-
-    Parameters
-    ----------
-    text : str
-        E.g. ``"Classification == 2 && Z > 3"``.
+    """A parsed `where` expression, such as ``Classification == 2 && Z > 3``.
 
     Raises
     ------
@@ -108,25 +93,35 @@ class Expression:
 
     def __init__(self, text: str) -> None:
         self.text = text
-        self._tokens: list[tuple[str, str, int]] = []
+        python, self._places = "", list[int]()  # where in the text the characters of the Python come from
         position, end = 0, len(text.rstrip())
         while position < end:
             match = _TOKEN.match(text, position)
             if match is None:
-                while text[position].isspace():
-                    position += 1
+                position += len(text[position:]) - len(text[position:].lstrip())
                 raise self._error(f"'{text[position]}' is not understood", position)
             kind = str(match.lastgroup)
-            self._tokens.append((kind, match.group(kind), match.start(kind)))
+            word = _IN_PYTHON.get(match[kind], match[kind])
+            if kind == "number":
+                word = repr(float(word)).replace("inf", "1e999")
+            elif kind == "name":
+                word = f"_{word}"  # some are words of Python
+            python += f"{word} "
+            self._places += [match.start(kind)] * (len(word) + 1)
             position = match.end()
-        self._at = 0
-        self._depth = 0
+        self._places.append(end)
         self._names: set[str] = set()
-        self._root = self._level(0)
-        if self._at < len(self._tokens):
-            kind, word, place = self._tokens[self._at]
-            raise self._error(f"'{word}' is not expected here", place)
-        if not self._root.truth:
+        try:
+            self._root = ast.parse(python, mode="eval").body
+            if _depth(self._root) > _DEEPEST:
+                raise RecursionError
+            truth = self._is_truth(self._root)
+        except SyntaxError as error:
+            place = self._places[min(max(error.offset or 1, 1), len(self._places)) - 1]
+            raise self._error("it is not a condition of this form", place) from None
+        except (MemoryError, RecursionError):
+            raise self._error("it is nested too deeply", 0) from None
+        if not truth:
             raise self._error("it gives a number, not true or false", 0)
         self.dimensions = tuple(sorted(self._names))
 
@@ -150,75 +145,46 @@ class Expression:
             cure='Example: "Classification == 2 && Z > 3"',
         )
 
-    def _peek(self) -> str:
-        return self._tokens[self._at][1] if self._at < len(self._tokens) else ""
+    def _is_truth(self, node: ast.expr) -> bool:
+        """Whether a part gives true or false, not a number; an error where it does not fit together."""
+        match node:
+            case ast.Constant():
+                return False
+            case ast.Name(id=name):
+                self._names.add(name[1:])
+                return False
+            case ast.BoolOp(values=parts):
+                return self._needs(True, *parts)
+            case ast.UnaryOp(op=ast.Not(), operand=part):
+                return self._needs(True, part)
+            case ast.UnaryOp(op=ast.USub(), operand=part):
+                return self._needs(False, part)
+            case ast.BinOp(left=left, op=op, right=right) if type(op) in _ARITHMETIC:
+                return self._needs(False, left, right)
+            case ast.Compare(left=left, comparators=[right]):
+                return not self._needs(False, left, right)
+            case ast.Call(func=ast.Name(id=word), args=parts):
+                name = word[1:]
+                if len(parts) == (0 if name in _CONSTANTS else 1) and name in _CALLED:
+                    self._needs(False, *parts)
+                    return name in _CONDITIONS
+                raise self._error(
+                    f"'{name}' is not a function; known are {', '.join(_CALLED)}", self._at(node)
+                )
+        raise self._error("it is not a condition of this form", self._at(node))
 
-    def _level(self, level: int) -> _Node:
-        if level == len(_LEVELS):
-            return self._unary()
-        left = self._level(level + 1)
-        while self._peek() in _LEVELS[level]:
-            place = self._tokens[self._at][2]
-            mark = self._peek()
-            self._at += 1
-            right = self._level(level + 1)
-            if (left.truth, right.truth) != (mark in _BOOLEAN,) * 2:
-                raise self._error(f"'{mark}' does not fit its two sides", place)
-            left = _Node("operation", _OPERATIONS[mark], (left, right), truth=level < 3)
-        return left
+    def _needs(self, truth: bool, *parts: ast.expr) -> bool:
+        for part in parts:
+            if self._is_truth(part) != truth:
+                raise self._error(f"{'a condition' if truth else 'a number'} is needed", self._at(part))
+        return truth
 
-    def _unary(self) -> _Node:
-        if self._at >= len(self._tokens):
-            raise self._error("it ends too early", len(self.text))
-        kind, word, place = self._tokens[self._at]
-        self._at += 1
-        if kind == "number":
-            return _Node("number", float(word))
-        if kind == "name" and self._peek() != "(":
-            self._names.add(word)
-            return _Node("name", word)
-        self._depth += 1
-        if self._depth > _DEEPEST:
-            raise self._error("it is nested too deeply", place)
-        try:
-            if kind == "name":
-                return self._call(word, place)
-            if word == "(":
-                return self._closed(self._level(0), place)
-            if word == "!":
-                # PDAL: before a comparison without parentheses it turns that round as a whole.
-                operand = self._unary() if self._peek() in ("(", "!") else self._level(2)
-                if not operand.truth:
-                    raise self._error("'!' needs a condition after it, in parentheses", place)
-                return _Node("call", np.logical_not, (operand,), truth=True)
-            if word == "-":
-                operand = self._unary()
-                if operand.truth:
-                    raise self._error("'-' needs a number after it", place)
-                return _Node("call", np.negative, (operand,))
-        finally:
-            self._depth -= 1
-        raise self._error(f"'{word}' is not expected here", place)
+    def _at(self, node: ast.expr) -> int:
+        return self._places[node.col_offset]
 
-    def _closed(self, inner: _Node, place: int) -> _Node:
-        if self._peek() != ")":
-            raise self._error("a ')' is missing", place)
-        self._at += 1
-        return inner
 
-    def _call(self, name: str, place: int) -> _Node:
-        """A function of one number, or a constant of PDAL's."""
-        self._at += 1  # the parenthesis
-        if name in _CONSTANTS:
-            return self._closed(_Node("number", _CONSTANTS[name]), place)
-        called = _FUNCTIONS.get(name) or _CONDITIONS.get(name)
-        if called is None:
-            known = [*_FUNCTIONS, *_CONDITIONS, *_CONSTANTS]
-            raise self._error(f"'{name}' is not a function; known are {', '.join(known)}", place)
-        argument = self._level(0)
-        if argument.truth:
-            raise self._error(f"'{name}' needs a number", place)
-        return self._closed(_Node("call", called, (argument,), truth=name in _CONDITIONS), place)
+def _depth(node: ast.AST) -> int:
+    return 1 + max(map(_depth, ast.iter_child_nodes(node)), default=0)
 
 
 def _find(name: str, arrays: Mapping[str, NDArray]) -> str:
@@ -236,20 +202,22 @@ def _find(name: str, arrays: Mapping[str, NDArray]) -> str:
     )
 
 
-def _value(node: _Node, arrays: Mapping[str, NDArray]):
-    chain = []  # a row of terms, as long as it may be, is nested to the left
-    while node.kind == "operation":
-        chain.append(node)
-        node = node.parts[0]
-    value = _operand(node, arrays)
-    for operation in reversed(chain):
-        value = operation.value(value, _value(operation.parts[1], arrays))
-    return value
-
-
-def _operand(node: _Node, arrays: Mapping[str, NDArray]):
-    if node.kind == "number":
-        return node.value
-    if node.kind == "name":
-        return np.asarray(arrays[node.value], np.float64)
-    return node.value(_value(node.parts[0], arrays))
+def _value(node: ast.expr, arrays: Mapping[str, NDArray]) -> Any:
+    match node:
+        case ast.Constant(value=number):
+            return float(number)
+        case ast.Name(id=name):
+            return np.asarray(arrays[name[1:]], np.float64)
+        case ast.BoolOp(op=op, values=parts):
+            join = np.logical_and if isinstance(op, ast.And) else np.logical_or
+            return functools.reduce(join, (_value(part, arrays) for part in parts))
+        case ast.UnaryOp(op=op, operand=part):
+            return (np.logical_not if isinstance(op, ast.Not) else np.negative)(_value(part, arrays))
+        case ast.BinOp(left=left, op=op, right=right):
+            return _ARITHMETIC[type(op)](_value(left, arrays), _value(right, arrays))
+        case ast.Compare(left=left, ops=[op], comparators=[right]):
+            return _COMPARISONS[type(op)](_value(left, arrays), _value(right, arrays))
+        case ast.Call(func=ast.Name(id=name), args=parts):
+            called = _CALLED[name[1:]]
+            return called(*(_value(part, arrays) for part in parts))
+    raise AssertionError(node)

@@ -11,7 +11,6 @@ import numpy as np
 
 from ..base import las
 from ..base.asprs import LEGACY_LIMIT
-from ..base.extrabytes import number_type
 from ..pipeline.filenames import LAS_WRITERS
 from ..pipeline.las_output import extra_dims_option
 from . import sizing
@@ -45,7 +44,7 @@ class FileTask:
         def new_values(start: int, end: int) -> NewValues:
             values = read_range(self.results, self.source, self.count, start, end)
             if not self.count:  # no tile tells which dimensions its points would have got
-                nothing = {name: np.empty(0, number_type(kind)) for name, kind in self.makes.items()}
+                nothing = {name: np.empty(0, las.number_type(kind)) for name, kind in self.makes.items()}
                 values = NewValues(values.kept, {name: (None, column) for name, column in nothing.items()})
             if start == 0:  # begun, or begun anew
                 classes[:] = 0

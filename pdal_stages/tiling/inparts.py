@@ -9,8 +9,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from ..base.complete import check_complete
 from ..base.files import whole_files
+from ..base.lascheck import check_complete
 from .lasfiles import BLOCK, header_of, open_las, read_block, record_blocks, write_records
 from .results import NewValues
 from .sources import InputSource

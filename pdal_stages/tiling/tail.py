@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ..base.complete import check_complete
 from ..base.errors import StageError
 from ..base.files import whole_files
 from ..base.las import supersede_copc
+from ..base.lascheck import check_complete
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
 from ..pipeline.callbacks import Callbacks

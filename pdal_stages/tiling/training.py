@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
-from ..base.extrabytes import extra_dimensions
+from ..base.las import extra_dimensions
 from ..base.report import Report
 from ..classifier import TrainingCloud
 from ..classifier.clouds import TiledCloud
