@@ -112,14 +112,14 @@ def _refuse_globe(root: WktNode, wkt: str, place: tuple[float, float] | None) ->
 def reprojection_cure(name: str = "", place: tuple[float, float] | None = None) -> str:
     """What to do about degrees: reproject into the UTM zone of a place, on the datum that a reference's name tells."""
     zone = utm_code(*place, name) if place is not None else None
-    what = (
-        "the UTM zone of the points; or take the national grid of the area"
-        if zone
-        else "the UTM zone or national grid of the area in place of CODE"
+    code = f"EPSG:{zone or 'CODE'}"
+    what = "the UTM zone of the points; or take the national grid of the area"
+    if not zone:
+        what = "the UTM zone or national grid of the area in place of CODE"
+    return (
+        f'Add a reprojection before this stage, {{"type": "filters.reprojection", "out_srs": "{code}"}}, or reproject the '
+        f"files first, pdal translate IN OUT reprojection --filters.reprojection.out_srs={code}; with {what}"
     )
-    stage = f'{{"type": "filters.reprojection", "out_srs": "EPSG:{zone or "CODE"}"}}'
-    reproject = f"pdal translate IN OUT reprojection --filters.reprojection.out_srs=EPSG:{zone or 'CODE'}"
-    return f"Add a reprojection before this stage, {stage}, or reproject the files first, {reproject}; with {what}"
 
 
 def utm_code(longitude: float, latitude: float, name: str = "") -> int | None:
@@ -150,75 +150,49 @@ class WktNode:
 
     def find(self, *keywords: str) -> WktNode | None:
         """The first element, this one included, with one of the keywords."""
-        waiting = [self]
-        while waiting:
-            node = waiting.pop()
-            if node.keyword in keywords:
-                return node
-            waiting += reversed(node.children)
-        return None
+        if self.keyword in keywords:
+            return self
+        return next((found for child in self.children if (found := child.find(*keywords))), None)
 
     def unit(self) -> float | None:
-        """Meters per unit of this coordinate system: its own unit, or its first axis's."""
-        for keyword in ("LENGTHUNIT", "UNIT"):
-            for child in self.children:
-                if child.keyword == keyword:
-                    return child.factor()
-        for child in self.children:  # WKT 2 may put the unit on each axis
-            if child.keyword in ("AXIS", "CS"):
-                found = child.unit()
-                if found is not None:
-                    return found
-        return None
+        """Meters per unit of this coordinate system: its own unit, or its first axis's, where WKT 2 may put it."""
+        for child in self.children:
+            if child.keyword in ("LENGTHUNIT", "UNIT"):
+                try:
+                    value = float(child.values[1])
+                except (IndexError, ValueError):
+                    return None
+                return value if value > 0 else None
+        units = (child.unit() for child in self.children if child.keyword in ("AXIS", "CS"))
+        return next((unit for unit in units if unit is not None), None)
 
     def code(self) -> str:
         """The authority's code of this element, as ``EPSG:25832``; empty where it has none."""
         codes = [c.values[:2] for c in self.children if c.keyword in ("AUTHORITY", "ID") and c.values[1:]]
         return ":".join(codes[-1]) if codes else ""
 
-    def factor(self) -> float | None:
-        try:
-            value = float(self.values[1])
-        except (IndexError, ValueError):
-            return None
-        return value if value > 0 else None
-
 
 #: Deeper text is not well-known text.
 _DEEPEST = 100
-_TOKEN = re.compile(r'\s*(?:"((?:[^"]|"")*)"|([A-Za-z_0-9.+\-]+)|([\[\](),]))')
+_TOKEN = re.compile(r'\s*(?:"((?:[^"]|"")*)"|([\w.+-]+)|([\[(])|([\])])|,)')
 
 
 def parse_wkt(text: str) -> WktNode | None:
     """Parse well-known text into its elements; None where it is not WKT."""
     stack = [WktNode("", [], [])]
-    word: str | None = None
     position = 0
-    while position < len(text):
-        match = _TOKEN.match(text, position)
-        if match is None:
-            break
+    while len(stack) <= _DEEPEST and (match := _TOKEN.match(text, position)):
         position = match.end()
-        quoted, bare, mark = match.groups()
-        if mark is None:
-            if word is not None:
-                stack[-1].values.append(word)
-            word = quoted if quoted is not None else bare
-        elif mark in "[(":
-            if len(stack) > _DEEPEST:
-                break
-            node = WktNode((word or "").upper(), [], [])
-            stack[-1].children.append(node)
-            stack.append(node)
-            word = None
-        else:
-            if word is not None:
-                stack[-1].values.append(word)
-                word = None
-            if mark in "])" and len(stack) > 1:
-                stack.pop()
-    top = stack[0].children
-    return top[0] if top else None
+        quoted, bare, opens, closes = match.groups()
+        if quoted is not None or bare:
+            stack[-1].values.append(bare or quoted)
+        elif opens:
+            values = stack[-1].values
+            stack[-1].children.append(WktNode(values.pop().upper() if values else "", [], []))
+            stack.append(stack[-1].children[-1])
+        elif closes and len(stack) > 1:
+            stack.pop()
+    return stack[0].children[0] if stack[0].children else None
 
 
 def name_of_wkt(wkt: str) -> str:

@@ -18,7 +18,6 @@ from ..classifier.modelfile import find
 from ..classifier.passes import BAND
 from ..classifier.sureness import Limit, Sureness, said, sureness_of
 from .base import Stage
-from .dimensions import parts_of
 from .loading import loaded_model
 from .options import ignore_option, keep_option, option, vegetation_heights_option
 from .points import Points, class_counts
@@ -277,13 +276,11 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
                 values[f"Probability_{code}"] = found.probabilities[:, column]
         if self.compact:
             values |= {
-                name: _rounded(value, parts_of(name))
-                for name, value in values.items()
-                if name != "Classification"
+                name: _rounded(value, _PARTS) for name, value in values.items() if name != "Classification"
             }
             if HEIGHT in points.arrays:
                 height = points.arrays[HEIGHT]
-                values[HEIGHT] = np.where(inside, _rounded(height, parts_of(HEIGHT)), height)
+                values[HEIGHT] = np.where(inside, _rounded(height, _PARTS_OF_HEIGHT), height)
         if points.mask is not None:  # what was there before stays outside `where`
             for name in self.creates():
                 if name != "Classification":
@@ -324,6 +321,10 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
             raise OptionError(
                 self.code_limit.what, found=f"codes that points keep, {listed}", cure=self.code_limit.cure
             )
+
+
+#: Parts of the unit that compact outputs are rounded to: probabilities and the like, and heights.
+_PARTS, _PARTS_OF_HEIGHT = 64, 32
 
 
 def _rounded(values: NDArray, parts: int) -> NDArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import math
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -77,15 +77,7 @@ class Option:
     def parse(self, value: Any) -> Any:
         """The value as the stage wants it, from JSON or from command-line text; OptionError where it does not fit."""
         parsed: Any = getattr(self, f"_parse_{self.kind}", self._parse_string)(value)
-        if self.kind in ("number", "integer"):
-            self._check_range(parsed)
-        if self.choices and parsed not in self.choices:
-            raise OptionError(
-                f"option '{self.name}' must be one of {', '.join(map(repr, self.choices))}",
-                found=repr(value),
-                cure=suggest(str(value), map(str, self.choices)) or None,
-            )
-        return parsed
+        return checks.one_of(f"option '{self.name}'", parsed, self.choices) if self.choices else parsed
 
     def _wrong(self, value: Any) -> OptionError:
         return OptionError(
@@ -93,21 +85,18 @@ class Option:
         )
 
     def _parse_number(self, value: Any) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float | str):
-            raise self._wrong(value)
         try:
-            number = float(value)
-        except (ValueError, OverflowError):
-            raise self._wrong(value) from None
-        if not math.isfinite(number):
+            number = checks.finite(float(value) if isinstance(value, str) else value)
+        except ValueError:
+            number = None
+        if number is None or (self.kind == "integer" and number != int(number)):
             raise self._wrong(value)
-        return number
+        what = f"option '{self.name}'"
+        if self.kind == "integer":
+            return checks.whole(what, number, self.minimum, self.maximum, unit=self.unit)
+        return checks.number(what, number, self.minimum, self.maximum, above=self.exclusive, unit=self.unit)
 
-    def _parse_integer(self, value: Any) -> int:
-        number = self._parse_number(value)
-        if number != int(number):
-            raise self._wrong(value)
-        return int(number)
+    _parse_integer = _parse_number
 
     def _parse_boolean(self, value: Any) -> bool:
         word = str(value).strip().lower()
@@ -127,7 +116,7 @@ class Option:
     def _parse_list(self, value: Any) -> list:
         if isinstance(value, str):
             value = split_list(value)
-        elif isinstance(value, int | float) and not isinstance(value, bool):
+        elif checks.finite(value) is not None:
             value = [value]
         if not isinstance(value, list | tuple) or not all(
             isinstance(v, str | int | float) and not isinstance(v, bool) for v in value
@@ -164,16 +153,6 @@ class Option:
             raise self._wrong(value)
         return value
 
-    def _check_range(self, value: float) -> None:
-        low, high = self.minimum, self.maximum
-        if (low is not None and (value < low or (self.exclusive and value == low))) or (
-            high is not None and value > high
-        ):
-            limits = checks.bounds(low, high, self.exclusive, self.unit)
-            raise OptionError(
-                f"option '{self.name}' must be {_KINDS[self.kind][1]}{limits}", found=f"{value:g}"
-            )
-
 
 def option(kind: str, default: Any, help: str, **more: Any) -> Any:
     """Declare an option in a stage's class body: ``cell: float = option("number", 20.0, "Side of the cells")``.
@@ -201,16 +180,7 @@ def vegetation_heights_option(points: str) -> Any:
 
 def split_list(text: str) -> list[str]:
     """Split at commas outside parentheses: ``c1,kopt(10,50)`` is two tokens."""
-    parts, depth, current = [], 0, ""
-    for character in text:
-        depth += (character == "(") - (character == ")")
-        if character == "," and depth <= 0:
-            parts.append(current)
-            current = ""
-        else:
-            current += character
-    parts.append(current)
-    return [p.strip() for p in parts if p.strip()]
+    return [part.strip() for part in re.split(r",(?![^(]*\))", text) if part.strip()]
 
 
 def parse_options(declared: Iterable[Option], given: Mapping[str, Any]) -> dict[str, Any]:

@@ -115,33 +115,25 @@ class Points:
 
     @cached_property
     def xyz(self) -> NDArray[np.float64]:
-        """Coordinates in meters, shape (n, 3).
-
-        Raises
-        ------
-        StageError
-            If any is NaN or infinite, with the count.
-        """
+        """Coordinates in meters, shape (n, 3); errors as of :attr:`axes`."""
         return np.column_stack(self.axes)
 
     @cached_property
     def axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """The same, x, y and z each by itself.
+        """Coordinates in meters, x, y and z each by itself.
 
         Raises
         ------
         StageError
             If any is NaN or infinite, with the count.
         """
-        across, up = self.units.horizontal, self.units.vertical
-        x, y, z = (
-            values if unit == 1.0 and values.dtype == np.float64 else values * unit
-            for values, unit in (
-                (np.asarray(self.dimension(name, meters=False)), unit)
-                for name, unit in (("X", across), ("Y", across), ("Z", up))
-            )
-        )
-        if not all(np.isfinite(values).all() for values in (x, y, z)):
+        found = []
+        for name in "XYZ":
+            values = np.asarray(self.dimension(name, meters=False))
+            unit = self.units.vertical if name == "Z" else self.units.horizontal
+            found.append(values if unit == 1.0 and values.dtype == np.float64 else values * unit)
+        x, y, z = found
+        if not all(np.isfinite(values).all() for values in found):
             bad = int(np.count_nonzero(~(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))))
             raise StageError(
                 "coordinates are not finite (NaN or infinite)",
@@ -162,8 +154,6 @@ class Points:
         if self.lent_by_pdal:  # which makes these arrays for this one call, and frees them after it
             for name in lent.keys() - kept:
                 give_back(lent[name])
-        if hasattr(lent, "forget"):  # dimensions that are made as they are asked for
-            lent.forget()
 
     def take_xyz(self) -> NDArray[np.float64]:
         """:attr:`xyz`, not kept here: who takes it may let go of it."""
@@ -171,6 +161,15 @@ class Points:
         del self.__dict__["xyz"]
         self.__dict__.pop("axes", None)
         return xyz
+
+    def _given(self, name: str) -> NDArray:
+        if name not in self.arrays:
+            raise DimensionError(
+                f"the dimension '{name}' is missing",
+                found=", ".join(self.arrays),
+                cure=MAKERS.get(name, "Add the stage that makes it before this one"),
+            )
+        return self.arrays[name]
 
     def dimension(self, name: str, *, meters: bool = True) -> NDArray:
         """A dimension's values; lengths upward are converted to meters.
@@ -180,15 +179,9 @@ class Points:
         DimensionError
             If the points do not have it, naming the stage that makes it.
         """
-        if name not in self.arrays:
-            raise DimensionError(
-                f"the dimension '{name}' is missing",
-                found=", ".join(self.arrays),
-                cure=MAKERS.get(name, "Add the stage that makes it before this one"),
-            )
-        values = self.arrays[name]
         if name == "Classification":
             return self.class_codes
+        values = self._given(name)
         if meters and (name == "Z" or name.startswith(_HEIGHTS)) and self.units.vertical != 1.0:
             return values * self.units.vertical
         return values
@@ -203,24 +196,13 @@ class Points:
 
         A copy made by ``filters.ferry`` carries the flag bits along, so they are taken off it too.
         """
-        if name not in self.arrays:
+        values = np.asarray(self._given(name))
+        with np.errstate(invalid="ignore"):
+            codes = values.astype(np.uint8)
+        if values.dtype != np.uint8 and (wrong := codes != values).any():
             raise DimensionError(
-                f"the dimension '{name}' is missing", found=", ".join(self.arrays), cure=MAKERS.get(name)
+                f"'{name}' must hold class codes (whole numbers of 0 to 255)", found=str(values[wrong][0])
             )
-        values = np.asarray(self.arrays[name])
-        if values.dtype.kind == "f":
-            whole = np.isfinite(values) & (values == np.floor(values)) & (values >= 0) & (values <= 255)
-            if not whole.all():
-                raise DimensionError(
-                    f"'{name}' must hold class codes (whole numbers of 0 to 255)",
-                    found=str(values[~whole][0]),
-                )
-        elif values.size and (int(values.min()) < 0 or int(values.max()) > 255):
-            raise DimensionError(
-                f"'{name}' must hold class codes (whole numbers of 0 to 255)",
-                found=f"{values.min()} to {values.max()}",
-            )
-        codes = values.astype(np.uint8)
         return codes & np.uint8(LEGACY_LIMIT) if self.legacy_flags else codes
 
     def flag(self, name: str) -> NDArray:

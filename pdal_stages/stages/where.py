@@ -117,6 +117,8 @@ class Expression:
                 raise RecursionError
             truth = self._is_truth(self._root)
         except SyntaxError as error:
+            if "nested" in error.msg:
+                raise self._error("it is nested too deeply", 0) from None
             place = self._places[min(max(error.offset or 1, 1), len(self._places)) - 1]
             raise self._error("it is not a condition of this form", place) from None
         except (MemoryError, RecursionError):
@@ -204,8 +206,8 @@ def _find(name: str, arrays: Mapping[str, NDArray]) -> str:
 
 def _value(node: ast.expr, arrays: Mapping[str, NDArray]) -> Any:
     match node:
-        case ast.Constant(value=number):
-            return float(number)
+        case ast.Constant(value=float(number)):
+            return number
         case ast.Name(id=name):
             return np.asarray(arrays[name[1:]], np.float64)
         case ast.BoolOp(op=op, values=parts):
