@@ -163,7 +163,7 @@ def parts(cloud: Path, model_file: str) -> dict[str, float]:
             Forest.predict_proba, contexts.cell_means = forest, around  # type: ignore[method-assign]
             feature_blocks.Run.compute = compute  # type: ignore[method-assign]
         ground, height = dimensions["Ground"], dimensions["HeightAboveGround"]
-        las.classification = timed("consistency", consistent)(
+        las.classification, _ = timed("consistency", consistent)(
             xyz, found.classification, height=height, ground=ground
         )
         timed("writing", las.write)(Path(folder, "out.laz"))

@@ -8,7 +8,6 @@ from sphinx.errors import ConfigError
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 try:
-    import robustness_cases
     import stage_pages
     import survey_table
 
@@ -20,7 +19,6 @@ except ModuleNotFoundError as error:
     ) from None
 
 stage_pages.write()
-robustness_cases.write()
 survey_table.write()
 
 project = "pdal_stages"

@@ -39,14 +39,12 @@ def count(data: Path, survey: str, model: Model) -> dict[str, Any]:
     codes[~seen] = noise[~seen]
     deck = (made["Deck"] != 0) & seen
     codes[deck] = BRIDGE
-    changed: dict[str, Any] = {}
-    after = consistent(
+    after, changed = consistent(
         xyz,
         codes,
         height=made["HeightAboveGround"],
         ground=made["Ground"],
         mask=seen,
-        figures=changed,
     )
     truth = true_classes(known, xyz[:, 0], xyz[:, 1], label, made["HeightAboveGround"])
     known_class = (truth > 0) & seen & ~deck

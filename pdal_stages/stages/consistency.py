@@ -9,7 +9,7 @@ from ..base.vegetation import bands
 from ..objects.consistency import RULES, consistent, reach
 from .base import Stage
 from .options import ignore_option, keep_option, option, vegetation_heights_option
-from .points import Points
+from .points import Points, class_counts
 from .selection import Selection
 
 
@@ -77,14 +77,11 @@ ground.
             return {}
         ignored, kept = points.ignored(self.ignore), points.chosen(self.keep)
         change = points.inside & ~ignored & ~kept
+        names = {"height": "HeightAboveGround", "ground": "Ground"}
         known = {
-            word: points.dimension(name) if name in points.arrays else None
-            for word, name in (
-                ("height", "HeightAboveGround"),
-                ("ground", "Ground"),
-            )
+            word: points.dimension(name) if name in points.arrays else None for word, name in names.items()
         }
-        if (known["height"] is None or known["ground"] is None) and (self.ground or self.islands):
+        if any(values is None for values in known.values()) and (self.ground or self.islands):
             points.report.warnings.append(
                 "there is no HeightAboveGround or no Ground: the rules ground and islands did nothing"
             )
@@ -93,18 +90,16 @@ ground.
         if limits:
             points.dimension("HeightAboveGround")  # refused where there is none
         points.keep_only(["Classification", "HeightAboveGround", "Ground"])
-        codes = consistent(
+        codes, changed = consistent(
             points.take_xyz(),
             before,
-            height=known["height"],  # by name: unpacked, they would keep the coordinates alive
-            ground=known["ground"],
+            **known,
             mask=~ignored,
             change=change,
             rules=self._rules,
             vegetation_heights=limits,
-            figures=points.report.figures,
         )
+        points.report.figures |= changed
         points.report.figures["changed"] = points.counted(codes != before)
-        there = np.unique(np.concatenate([before[change], codes[change]]))
-        points.report.figures["classes"] = {str(c): int(np.count_nonzero(codes[change] == c)) for c in there}
+        points.report.figures["classes"] = class_counts(codes[change])
         return {"Classification": points.with_codes(codes)}
