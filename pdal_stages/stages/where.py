@@ -119,7 +119,7 @@ class Expression:
         except SyntaxError as error:
             if "nested" in error.msg:
                 raise self._error("it is nested too deeply", 0) from None
-            place = self._places[min(max(error.offset or 1, 1), len(self._places)) - 1]
+            place = self._places[(error.offset or 0) - 1]  # 0: it ends too early
             raise self._error("it is not a condition of this form", place) from None
         except (MemoryError, RecursionError):
             raise self._error("it is nested too deeply", 0) from None

@@ -1,89 +1,329 @@
-"""What the fuzzers call: the two parsers of ours, given any bytes, and what must hold of them.
+"""What the fuzz tests call: readers of ours, given any bytes, and what must hold of them.
 
-Each takes bytes and returns normally or raises; only :class:`StageError` is caught here, so anything else that
-comes out is a finding. No atheris is needed: the tests run the same functions on stored cases.
+Each takes bytes and returns in a word how it ended, or raises; only :class:`StageError` is caught here, so anything else
+that comes out is a finding.
 """
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import hashlib
 import io
 import json
 import os
+import re
+import shutil
+import sqlite3
+import struct
+import sys
 import tempfile
-import time
 import zipfile
+from collections.abc import Callable
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
+from typing import Any
 
+import laspy
 import numpy as np
 
+from pdal_stages.base import las, lascheck
 from pdal_stages.base.errors import StageError
-from pdal_stages.classifier import modelfile
+from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, modelfile, train
+from pdal_stages.classifier.algorithms import algorithm
 from pdal_stages.classifier.model import assemble
+from pdal_stages.pipeline import tindex
 from pdal_stages.pipeline.lowering import lower
 from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
+from pdal_stages.pipeline.pdal import version
 from pdal_stages.pipeline.read import decode, parse_pipeline
+from pdal_stages.stages.where import Expression
+from pdal_stages.tiling import results, sources
+from pdal_stages.tiling.grid import TileGrid
+from pdal_stages.tiling.index import sort_points
+from pdal_stages.tiling.store import Store, _sealed
 
-#: CPU seconds one input may take; beyond it is a finding (the largest inputs of the fuzzers are a few kB).
-PATIENCE = 10.0
+TESTS = Path(__file__).resolve().parents[1]
+#: Name -> what is called, and good inputs to start from.
+TARGETS: dict[str, tuple[Callable[[bytes], str], Callable[[], list[bytes]]]] = {}
 
 
+def target(seeds: Callable[[], list[bytes]]):
+    """Register a function that may raise StageError: "refused" where it does."""
+
+    def register(function: Callable[[bytes], str]):
+        def call(data: bytes) -> str:
+            try:
+                return function(data)
+            except StageError as error:
+                assert str(error).strip().endswith((".", "?", "!")) and "Traceback" not in str(error)
+                return "refused"
+
+        TARGETS[function.__name__] = call, cache(seeds)
+        return call
+
+    return register
+
+
+@cache
+def folder() -> Path:
+    """A folder in memory, until the process ends."""
+    memory = Path("/dev/shm")
+    made = Path(tempfile.mkdtemp(prefix="fuzz-", dir=memory if os.access(memory, os.W_OK) else None))
+    atexit.register(shutil.rmtree, made, ignore_errors=True)
+    return made
+
+
+def put(name: str, data: bytes) -> Path:
+    path = folder() / name
+    path.write_bytes(data)
+    return path
+
+
+# ---- pipelines and conditions ------------------------------------------------------------------------------
+
+
+def _pipelines() -> list[bytes]:
+    ready = sorted((TESTS.parent / "pipelines").glob("*.json"))
+    return [path.read_bytes() for path in ready] + [
+        b'["a.las",{"type":"filters.hag_minima","tag":"a","cell":20,"where":"Z > 3 && !(Classification == 7)"},"b.laz"]',
+        b'\xef\xbb\xbf// c\r\n{"pipeline":[{"type":"readers.las","filename":"*.las","tag":"r"},'
+        b'{"type":"filters.multiscalefeatures","inputs":["r"],"neighborhoods":["c1","kopt(10,50)","copt"],'
+        b'"feature_set":"all","seed":3},/* x */{"type":"writers.las","filename":"o#.las","extra_dims":"all",'
+        b'"minor_version":4,"dataformat_id":6,"forward":"all"}]}',
+        b'[{"type":"writers.classifiermodel","filename":"m.model","classes":{"2":"Ground","3,4,5":"5 Vegetation",'
+        b'"6":6},"strategy":"binary","target":2,"trees":10,"dimensions":["Intensity"]}]',
+    ]
+
+
+@target(_pipelines)
 def pipeline(data: bytes) -> str:
-    """Parse, override, lower; "refused" or "lowered"."""
-    started = time.process_time()
-    try:
-        source = parse_pipeline(decode(data, "fuzz.json"), "fuzz.json")
-        assert len(source.lines) == len(source.stages)
-        assert all(line >= 1 for line in source.lines)
-        overrides, _ = parse_overrides(
-            ["--stage.a.cell=5", "--filters.hag_minima.resolution=0.25"][: len(data) % 3]
-        )
-        with contextlib.suppress(StageError):  # one that fits no stage
-            source.stages = apply_overrides(source.stages, overrides)
-        lowered = lower(source)
-        # What PDAL gets is JSON, with no stage of ours left and none of PDAL's lost.
-        again = json.loads(json.dumps(lowered.stages, allow_nan=False))
-        assert again == lowered.stages
-        types = [str(stage.get("type", "")) for stage in lowered.stages]
-        assert not any(
-            t in ("filters.hag_minima", "filters.multiscalefeatures", "writers.classifiermodel")
-            for t in types
-        )
-        assert types.count("filters.python") >= len(lowered.ours)
-        assert len(types) >= len(source.stages)
-        outcome = "lowered"
-    except StageError as error:
-        assert str(error).strip().endswith((".", "?", "!")) and "Traceback" not in str(error)
-        outcome = "refused"
-    assert time.process_time() - started < PATIENCE, "too slow"
-    return outcome
+    """Parse, override, lower: what PDAL gets is JSON, with no stage of ours left and none of PDAL's lost."""
+    source = parse_pipeline(decode(data, "fuzz.json"), "fuzz.json")
+    assert len(source.lines) == len(source.stages) and all(line >= 1 for line in source.lines)
+    overrides, _ = parse_overrides(
+        ["--stage.a.cell=5", "--filters.hag_minima.resolution=0.25"][: len(data) % 3]
+    )
+    with contextlib.suppress(StageError):  # one that fits no stage
+        source.stages = apply_overrides(source.stages, overrides)
+    lowered = lower(source)
+    assert json.loads(json.dumps(lowered.stages, allow_nan=False)) == lowered.stages
+    types = [str(stage.get("type", "")) for stage in lowered.stages]
+    assert not {"filters.hag_minima", "filters.multiscalefeatures", "writers.classifiermodel"} & set(types)
+    assert types.count("filters.python") >= len(lowered.ours) and len(types) >= len(source.stages)
+    return "lowered"
+
+
+NAMES = ("X", "Y", "Z", "Classification", "GpsTime")
+_MINUS = re.compile(r"(^|[^\w).\s])\s*-\s*(?![\d.])")
+
+
+@cache
+def points() -> np.ndarray:
+    rng = np.random.default_rng(7)
+    out = np.zeros(60, [(name, "u1" if name == "Classification" else "f8") for name in NAMES])
+    for name in NAMES[:4]:
+        out[name] = rng.integers(0, 6, len(out))
+    return out
+
+
+@target(lambda: [
+    b"Z > 3 && !(Classification == 2) || X <= 2 && Y != 1", b"20 < Z", b"X / 0 > 1", b"(X + Y) * 2 >= Z - -1",
+    b"!(!(Z == 2))", b"Z > 1e0 && .5 < X", b"3 > 2 && X == X", b"isnan(sqrt(Z)) || !(X < highest())",
+    b"round(-Z) == -3 && floor(Z / 2) < abs(X)", b"!X == 1 && Z > 0", b"1 + 2 * 3 == 7", b"((((Z)))) > 2",
+])  # fmt: skip
+def where(data: bytes) -> str:
+    """A condition that is taken means what it means to PDAL, where PDAL takes it too."""
+    import pdal
+
+    text = data.decode("utf-8", "replace")
+    mask = Expression(text).evaluate({name: points()[name] for name in NAMES})
+    assert mask.dtype == bool and mask.shape == (60,)
+    if version() < (2, 9, 0) and _MINUS.search(text):  # older ones crash on a minus before a name
+        return "evaluated"
+    stage = {"type": "filters.assign", "value": f"GpsTime = -1 WHERE {text}"}
+    theirs = pdal.Pipeline(json.dumps([stage]), arrays=[points()])
+    with contextlib.suppress(RuntimeError):  # refused
+        theirs.execute()
+        assert np.array_equal(mask, theirs.arrays[0]["GpsTime"] == -1), "PDAL sees other points"
+    return "evaluated"
+
+
+# ---- files of points, and what names many of them ------------------------------------------------------------
+
+
+def _clouds() -> list[bytes]:
+    out = []
+    for form in (0, 1, 3, 6, 7):
+        for suffix in ("las", "laz"):
+            header = laspy.LasHeader(point_format=form, version="1.4" if form > 5 else "1.2")
+            header.scales = np.full(3, 0.01)
+            header.vlrs.append(laspy.VLR("LASF_Projection", 2112, "wkt", b"x" * 40))
+            made = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(30, header=header))
+            made.x, made.y = np.arange(30.0), np.arange(30.0)
+            made.write(folder() / f"seed.{suffix}")
+            out.append((folder() / f"seed.{suffix}").read_bytes())
+    return [*out, (TESTS / "data" / "town.copc.laz").read_bytes()[:20_000]]
+
+
+@target(_clouds)
+def cloud(data: bytes) -> str:
+    """A LAS or LAZ file: what passes the look at its header is read, whole or with an error."""
+    path = put("cloud.laz", data)
+    lascheck.check_readable(path)
+    las.projection(path)
+    las.odd_text(path)
+    las.extra_dimensions(path)
+    found = sources.las_extent(str(path))
+    assert sort_points(str(path), TileGrid(10.0), str(path.with_suffix(".copy"))).count == found.count
+    las.supersede_copc(path)
+    return "read"
+
+
+def _indexes() -> list[bytes]:
+    rows = b"".join(b" " + name.ljust(20) for name in (b"a.las", b"b/c.laz"))
+    field = b"location".ljust(11, b"\0") + b"C" + bytes(4) + b"\x14" + bytes(15)
+    dbf = struct.pack("<B3xIHH20x", 3, 2, 32 + 32 + 1, 21) + field + b"\r" + rows
+    features = [
+        {"type": "Feature", "properties": {"location": name}, "geometry": None} for name in ("a.las", "b")
+    ]
+    path = folder() / "seed.gpkg"
+    path.unlink(missing_ok=True)
+    with contextlib.closing(sqlite3.connect(path)) as base, base:
+        base.execute("PRAGMA page_size = 512")
+        base.execute("CREATE TABLE pdal (fid INTEGER, location TEXT)")
+        base.execute("INSERT INTO pdal VALUES (1, 'a.las'), (2, 'b.las')")
+    collection = json.dumps({"type": "FeatureCollection", "features": features}).encode()
+    return [b"\0" + dbf, b"\1" + collection, b"\2" + path.read_bytes()]
+
+
+@target(_indexes)
+def index(data: bytes) -> str:
+    """A tile index; the first byte says of what kind."""
+    suffix = (".shp", ".geojson", ".gpkg")[data[0] % 3] if data else ".shp"
+    path = put(f"index{suffix}", data[1:])
+    if suffix == ".shp":
+        put("index.dbf", data[1:])
+    found = tindex.locations(str(path))
+    assert found and all(isinstance(name, str) and os.path.isabs(name) for name in found)
+    return "read"
+
+
+def _epts() -> list[bytes]:
+    schema = [{"name": n, "type": "signed", "size": 4, "scale": 0.01, "offset": 0} for n in "XYZ"]
+    schema += [{"name": "Classification", "type": "unsigned", "size": 1}]
+    box = [500000, 5400000, 0, 500100, 5400100, 50]
+    whole = {"bounds": box, "boundsConforming": box, "points": 1000, "schema": schema, "span": 128, "dataType": "laszip",
+             "hierarchyType": "json", "srs": {"authority": "EPSG", "horizontal": "25832", "wkt": ""}, "version": "1.0.0"}  # fmt: skip
+    return [json.dumps(whole).encode()]
+
+
+@target(_epts)
+def ept(data: bytes) -> str:
+    """The description of an EPT source."""
+    path = put("ept.json", data)
+    found = sources.read_extent(sources.InputSource(str(path), {"type": "readers.ept"}, "ept"))
+    assert found.count >= 0 and np.isfinite(found.box).all()
+    TileGrid(10.0).covering(found.box)
+    return "read"
+
+
+# ---- what a tiled run keeps ---------------------------------------------------------------------------------
+
+_REPORT = {"fingerprint": "f", "outputs": [["/no/such", 1, 2]], "points": 3}
+_INDEX = {"count": 3, "box": [0, 0, 1, 1], "tiles": [[0, 0, 3]], "cells": [[0, 0, 0, 3]]}
+
+
+@cache
+def _kept() -> tuple[Store, tuple[Path, ...]]:
+    keeping = Store(folder())
+    for place in (keeping.folder, keeping.tiles, keeping.indexes):
+        place.mkdir(exist_ok=True)
+    return keeping, (keeping.files, keeping.tiles / "a.json", keeping.indexes / "a.json")
+
+
+@target(
+    lambda: [
+        _sealed(p, note).encode()
+        for p, note in zip(_kept()[1], ({"a": _REPORT}, _REPORT, _INDEX), strict=True)
+    ]
+)
+def store(data: bytes) -> str:
+    """Notes of a run: what was changed, or belongs elsewhere, is not believed."""
+    keeping, paths = _kept()
+    for path in paths:
+        path.write_bytes(data)
+    with keeping:
+        written, finished, found = keeping.written("a"), keeping.finished("a"), keeping.index("a")
+    assert written is None and finished in (None, _REPORT)
+    if found is not None:
+        assert {n: np.asarray(v).tolist() for n, v in asdict(found).items() if n != "copy"} == _INDEX
+    return "read" if finished or found else "refused"
+
+
+_SOURCE = sources.InputSource("/a.las", {"type": "readers.las"}, "las")
+
+
+def _results() -> list[bytes]:
+    rows = np.arange(40, dtype=np.int64)
+    content = {
+        "index": rows,
+        "core": np.array(40),
+        "dim/Classification": (rows % 7).astype(np.uint8),
+        "dim/H": rows / 7,
+    }
+    content = {f"{_SOURCE.key}/{name}": value for name, value in content.items()}
+    np.savez(folder() / "result.npz", names=np.array(sorted(content)), **content)
+    return [(folder() / "result.npz").read_bytes()]
+
+
+@target(_results)
+def result(data: bytes) -> str:
+    """The results of a tile: what was changed is found, whatever it is."""
+    new = results.read_range([str(put("tile.npz", data))], _SOURCE, 40, 0, 40)
+    assert new.kept.all() and set(new.values) == {"Classification", "H"}
+    assert np.array_equal(new.values["Classification"][1], np.arange(40) % 7)
+    assert np.array_equal(new.values["H"][1], np.arange(40) / 7)
+    return "read"
 
 
 # ---- model files -----------------------------------------------------------------------------------------
 
 
+def members_of(path: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(path) as archive:
+        return {info.filename: archive.read(info) for info in archive.infolist()}
+
+
 @cache
 def good_model() -> dict[str, bytes]:
-    """Members of a small good model file."""
-    from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
-
+    """Members of a small good model file, which needs heights and says where from."""
     rng = np.random.default_rng(0)
     xyz = np.round(rng.uniform(0, 12, (400, 3)), 2)
-    labels = np.where(xyz[:, 2] > 6, 5, 2)
     options = TrainingOptions(
-        neighborhoods="c1,s2", feature_set=["covariance", "D1"], dimensions=(), count=60, trees=2, threads=1
+        neighborhoods="c1,s2", feature_set=["covariance", "D1"], dimensions=("HeightAboveGround",), count=60, trees=2,
+        threads=1, passes=1, folds=0,
+    )  # fmt: skip
+    labels = np.where(xyz[:, 2] > 6, 6, 2)
+    model = train(
+        [TrainingCloud(xyz, labels, {"HeightAboveGround": xyz[:, 2]}, "fuzz")], options, progress=False
     )
-    model = train([TrainingCloud(xyz=xyz, labels=labels, dimensions={}, name="fuzz")], options)
-    with tempfile.TemporaryDirectory() as folder:
-        model.save(Path(folder) / "m")
-        with zipfile.ZipFile(Path(folder) / "m") as archive:
-            return {info.filename: archive.read(info) for info in archive.infolist()}
+    model.info["preparation"] = [{"type": "filters.hag_minima", "cell": 5}]
+    model.save(folder() / "good.model")
+    return members_of(folder() / "good.model")
 
 
-def packed(members: dict[str, bytes]) -> bytes:
-    """A zip of members."""
+def packed(members: dict[str, bytes], manifest: bytes | None = None) -> bytes:
+    """A zip of members; with another manifest, where given, whose checksums are put right as an attacker would."""
+    if manifest is not None:
+        with contextlib.suppress(Exception):  # whatever else was made of it goes in as it is
+            head = json.loads(manifest)
+            for entry in head["arrays"].values():
+                if entry.get("file") in members:
+                    entry["sha256"] = hashlib.sha256(members[entry["file"]]).hexdigest()
+            manifest = json.dumps(head).encode()
+        members = {**members, modelfile.MANIFEST: manifest}
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in members.items():
@@ -91,99 +331,67 @@ def packed(members: dict[str, bytes]) -> bytes:
     return out.getvalue()
 
 
-def model_file(data: bytes) -> bytes:
-    """A model file from the fuzzer's bytes; the first byte says which part of a good file they replace.
+def _model_file(data: bytes) -> bytes:
+    """The first byte says which part of a good file the others replace.
 
-    0: the whole file; 1: the manifest; 2: the manifest, with checksums put right as an attacker would; from 3 on: the
-    values of one array, with its checksum put right.
+    0: the whole file; 1: the manifest; 2: the manifest, with checksums put right; from 3 on: the values of one array.
     """
     if not data or data[0] == 0:
         return data[1:]
     members = dict(good_model())
-    if data[0] in (1, 2):
-        members[modelfile.MANIFEST] = data[1:]
-        if data[0] == 2:
-            members[modelfile.MANIFEST] = _rehashed(data[1:], members)
-        return packed(members)
+    if data[0] == 1:
+        return packed(members | {modelfile.MANIFEST: data[1:]})
+    if data[0] == 2:
+        return packed(members, data[1:])
     names = sorted(name for name in members if name != modelfile.MANIFEST)
     name = names[(data[0] - 3) % len(names)]
-    whole, fresh = members[name], data[1:]
-    start = 10 + int.from_bytes(whole[8:10], "little")
-    values = bytearray(whole[start:])
-    values[: len(fresh)] = fresh[: len(values)]
-    members[name] = whole[:start] + bytes(values)
-    members[modelfile.MANIFEST] = _rehashed(members[modelfile.MANIFEST], members)
-    return packed(members)
+    start = 10 + int.from_bytes(members[name][8:10], "little")
+    values = bytearray(members[name][start:])
+    values[: len(data) - 1] = data[1 : len(values) + 1]
+    members[name] = members[name][:start] + bytes(values)
+    return packed(members, members[modelfile.MANIFEST])
 
 
-def _rehashed(manifest: bytes, members: dict[str, bytes]) -> bytes:
-    try:
-        head = json.loads(manifest)
-        for entry in head["arrays"].values():
-            if entry.get("file") in members:
-                entry["sha256"] = hashlib.sha256(members[entry["file"]]).hexdigest()
-        return json.dumps(head).encode()
-    except Exception:  # whatever the fuzzer made of it goes in as it is
-        return manifest
+def _models() -> list[bytes]:
+    manifest = good_model()[modelfile.MANIFEST]
+    parts = [bytes([k]) + b"\0" * 8 for k in range(3, 12)]
+    return [b"\0" + packed(good_model()), b"\1" + manifest, b"\2" + manifest, *parts]
+
+
+@target(_models)
+def model(data: bytes) -> str:
+    """Read a model file and, where it is accepted, classify with it."""
+    manifest, arrays = modelfile.read(
+        put("fuzz.model", _model_file(data)), lambda name: algorithm(name).rules
+    )
+    made = assemble(manifest, arrays)
+    assert str(made) and made.describe() and made.halo_m >= 0
+    made.importances()
+    codes = [code for code, _ in made.classes]
+    for one in made.passes:
+        values = np.random.default_rng(1).normal(size=(50, len(one.columns(codes)))).astype(np.float32)
+        shares = one.probabilities(values)
+        assert shares.shape == (50, len(codes)) and np.isfinite(shares).all() and (shares >= 0).all()
+        assert np.allclose(shares.sum(axis=1), 1, atol=1e-5)
+    return "loaded"
 
 
 @cache
-def _scratch() -> Path:
-    folder = Path("/dev/shm") if os.access("/dev/shm", os.W_OK) else Path(tempfile.gettempdir())
-    return folder / f"fuzz-{os.getpid()}.model"
+def _network_model() -> dict[str, bytes]:
+    sys.path.insert(0, str(TESTS))
+    from alsnet_scenes import model_of, random_net
+
+    model_of(random_net(("Z", "Intensity"))).save(folder() / "network.model")
+    return members_of(folder() / "network.model")
 
 
-def model(data: bytes) -> str:
-    """Read a model file and, where it is accepted, classify with it; "refused" or "loaded"."""
-    from pdal_stages.classifier.algorithms import algorithm
-
-    path = _scratch()
-    content = model_file(data)
-    started = time.process_time()
-    try:
-        path.write_bytes(content)
-        manifest, arrays = modelfile.read(path, lambda name: algorithm(name).rules)
-        made = assemble(manifest, arrays)
-        assert str(made) and made.describe() and made.halo_m >= 0
-        made.importances()
-        codes = [code for code, _ in made.classes]
-        for one in made.passes:
-            values = np.random.default_rng(1).normal(size=(50, len(one.columns(codes)))).astype(np.float32)
-            shares = one.probabilities(values)
-            assert shares.shape == (50, len(codes))
-            assert np.isfinite(shares).all() and (shares >= 0).all()
-            assert np.allclose(shares.sum(axis=1), 1, atol=1e-5)
-        outcome = "loaded"
-    except StageError as error:
-        assert str(error).strip().endswith((".", "?", "!")) and "Traceback" not in str(error)
-        outcome = "refused"
-    finally:
-        path.unlink(missing_ok=True)
-    assert time.process_time() - started < PATIENCE, "too slow"
-    return outcome
-
-
-TARGETS = {"pipeline": pipeline, "model": model}
-
-
-def seeds(name: str) -> list[bytes]:
-    """Good inputs to start from."""
-    if name == "model":
-        good = good_model()
-        manifest = good[modelfile.MANIFEST]
-        whole = packed(good)
-        return [b"\0" + whole, b"\1" + manifest, b"\2" + manifest] + [
-            bytes([k]) + b"\0" * 8 for k in range(3, 12)
-        ]
-    ready = sorted((Path(__file__).resolve().parents[2] / "pipelines").glob("*.json"))
-    return [path.read_bytes() for path in ready] + [
-        b'["a.las",{"type":"filters.hag_minima","tag":"a","cell":20,"where":"Z > 3 && !(Classification == 7)"},"b.laz"]',
-        b'\xef\xbb\xbf// c\r\n{"pipeline":[{"type":"readers.las","filename":"*.las","tag":"r"},'
-        b'{"type":"filters.multiscalefeatures","inputs":["r"],"neighborhoods":["c1","kopt(10,50)","copt"],'
-        b'"feature_set":"all","seed":3},/* x */{"type":"writers.las","filename":"o#.las","extra_dims":"all",'
-        b'"minor_version":4,"dataformat_id":6,"forward":"all"}]}',
-        b'[{"type":"filters.accuracy","dimension":"Classification","classes":[2,5],"merge":{"5":[3,4]}}]',
-        b'[{"type":"writers.classifiermodel","filename":"m.model","classes":{"2":"Ground","3,4,5":"5 Vegetation",'
-        b'"6":6},"strategy":"binary","target":2,"trees":10,"dimensions":["Intensity"]}]',
-        b'[{"type":"filters.modelclassifier","model":"m.model","reject_below":0.5}]',
-    ]
+@target(lambda: [_network_model()[modelfile.MANIFEST]])
+def network(data: bytes) -> str:
+    """The manifest of a model with a network; what is accepted classifies a small cloud."""
+    made: Any = load_model(put("hostile.model", packed(_network_model(), data)))
+    rng = np.random.default_rng(1)
+    xyz = np.round(rng.uniform(0, 30, (200, 3)), 2)
+    assert str(made) and made.halo_m >= 0
+    found = made.predict(xyz, {"Intensity": rng.uniform(0, 100, 200)}, threads=1, probabilities=True)
+    assert np.isfinite(found.probabilities).all()
+    return "loaded"
