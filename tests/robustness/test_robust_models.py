@@ -223,8 +223,8 @@ def test_names_that_command_a_terminal_or_pass_for_lines(command, tmp_path, clou
     ):
         assert not re.search("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202e]", done.out + done.err)
         assert (
-            "a\\noverall accuracy 100 %\\x1b[2J" in done.out
-            or "exit code 0 after 1.0 s\\x1b[2J" in done.out + done.err
+            "Roof\\x1b]0;title\\x07\\x1b[31mred\\u202eder" in done.out
+            or "after 1.0 s\\x1b[2J\\x07.las" in done.err
         )
     assert "\x1b" not in (tmp_path / "m.html").read_text() + log.read_text()
     lines = log.read_text().splitlines()
