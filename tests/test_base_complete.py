@@ -8,8 +8,8 @@ import subprocess
 import numpy as np
 import pytest
 
-from pdal_stages.base.lascheck import check_complete
 from pdal_stages.base.errors import StageError
+from pdal_stages.base.lascheck import check_complete
 
 COUNT = 300
 FAUX = {"type": "readers.faux", "count": COUNT, "mode": "uniform", "bounds": "([0,100],[0,100],[0,9])"}
