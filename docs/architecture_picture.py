@@ -20,7 +20,7 @@ COLUMNS = (
             ("Make each of our stages an object:", "checked options, plan, model", "stages/base.py"),
             ("Turn our stages into filters.python:", "plain PDAL JSON", "pipeline/lowering.py"),
             ("With --tile: find the inputs, lay", "the grid, hand out the tiles", "tiling/survey.py"),
-            ("With --tile: cut the tile and its", "surroundings out of the files", "tiling/extract.py"),
+            ("With --tile: cut the tile and its", "surroundings out of the files", "tiling/cut.py"),
         ),
     ),
     (

@@ -54,7 +54,7 @@ def test_what_the_build_needs_is_sent_to_it():
     setup = re.search(r"^    cat (pyproject.*)$", (ROOT / "scripts/setup").read_text(), re.MULTILINE)[
         1
     ].split()
-    assert copied | {name.split("/")[0] for name in setup} | {"pdal_stages", "native"} <= sent
+    assert copied | {name.split("/")[0] for name in setup} | {"pdal_stages"} <= sent
 
 
 def test_compose_has_one_image_one_folder_and_no_open_port():

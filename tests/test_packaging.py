@@ -19,7 +19,6 @@ _CONDA = {"laspy[lazrs]": "laspy"}
 
 
 def test_one_version_everywhere():
-    assert f'\nversion = "{__version__}"' in (ROOT / "native" / "pyproject.toml").read_text()
     assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text()
     assert f'\n  version: "{__version__}"\n' in (ROOT / "recipe" / "recipe.yaml").read_text()
     assert f'\n  version: "{__version__}"\n' in (ROOT / "recipe" / "plugin" / "recipe.yaml").read_text()
@@ -59,7 +58,7 @@ def test_a_wheel_has_all_that_it_needs(tmp_path):
     subprocess.run(["git", "-C", ROOT, "rev-parse"], check=True, capture_output=True)
     listed = subprocess.run(["git", "-C", ROOT, "ls-files", "-z"], check=True, capture_output=True, text=True)
     for name in filter(None, listed.stdout.split("\0")):
-        if name.startswith(("pdal_stages/", "native/")) or "/" not in name:
+        if name.startswith("pdal_stages/") or "/" not in name:
             (source / name).parent.mkdir(parents=True, exist_ok=True)
             (source / name).write_bytes((ROOT / name).read_bytes())
     wheels = tmp_path / "wheels"
@@ -74,22 +73,16 @@ def test_a_wheel_has_all_that_it_needs(tmp_path):
     names = set(zipfile.ZipFile(wheel).namelist())
     here = {path.relative_to(ROOT).as_posix() for path in (ROOT / "pdal_stages").rglob("*.py")}
     assert here - {name for name in here if name not in listed.stdout.split("\0")} <= names
-    for needed in (
-        "models/standard.model",
-        "reports/templates/style.css",
-        "native/stage.cpp",
-        "native/entry.cpp",
-        "py.typed",
-    ):
+    for needed in ("models/standard.model", "reports/templates/style.css", "plugin/stage.cpp", "py.typed"):
         assert f"pdal_stages/{needed}" in names, needed
     target = tmp_path / "env"
     subprocess.run(
         [sys.executable, "-m", "pip", "install", "--no-deps", "-q", "--target", target, wheel], check=True
     )
     code = (
-        "import pdal_stages, pdal_stages.plugin.places as places\n"
+        "import pdal_stages, pdal_stages.plugin.building as building\n"
         "from pdal_stages.stages.loading import loaded_model\n"
-        "print(pdal_stages.__file__, places.sources(), len(loaded_model('standard').classes))"
+        "print(pdal_stages.__file__, building.SOURCE, len(loaded_model('standard').classes))"
     )
     said = subprocess.run(
         [sys.executable, "-c", code], env={"PYTHONPATH": str(target)}, cwd=tmp_path,

@@ -142,10 +142,7 @@ def assert_same(one, other):
 
 
 def las(stages, output):
-    return [
-        *stages,
-        {"type": "writers.las", "filename": str(output), "forward": "all", "extra_dims": "all"},
-    ]
+    return [*stages, {"type": "writers.las", "filename": str(output), "forward": "all", "extra_dims": "all"}]
 
 
 # ---- what PDAL knows of the stages -------------------------------------------------------------------------
@@ -167,7 +164,7 @@ def test_what_is_declared_is_what_the_stage_has():
     for kind in registry.stages().values():
         for option in declarations.native_options(kind):
             assert f'"{option.name}", Kind::' in text
-    assert declarations._text('ü "a\\?') == '"\\303\\274 \\"a\\\\\\?"'
+    assert declarations._text('ü "a?') == '"\\303\\274 \\042a\\077"'
 
 
 # ---- the same bytes ----------------------------------------------------------------------------------------
@@ -447,7 +444,6 @@ def test_a_package_that_is_missing(pipeline, environment, town, tmp_path):
 
 
 def test_a_plugin_of_another_version(stock, environment, town, tmp_path, plugin, monkeypatch):
-    monkeypatch.setattr(declarations, "digest", lambda: "another")
     question = {
         "version": "9.9",
         "digest": "x",
@@ -614,10 +610,9 @@ def test_what_is_missing_is_told(tmp_path, monkeypatch):
 
 
 def test_code_that_does_not_compile_leaves_nothing(tmp_path, monkeypatch):
-    source, target = tmp_path / "source", tmp_path / "target"
-    source.mkdir(), target.mkdir()
-    (source / "stage.cpp").write_text("int broken(")
-    monkeypatch.setattr(places, "sources", lambda: source)
+    source, target = tmp_path / "stage.cpp", tmp_path / "target"
+    source.write_text("int broken("), target.mkdir()
+    monkeypatch.setattr(building, "SOURCE", source)
     with pytest.raises(ps.StageError, match="does not compile"):
         building.install(target)
     assert not list(target.iterdir())

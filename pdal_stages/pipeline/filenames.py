@@ -43,7 +43,12 @@ def named_files(stages: list[dict[str, Any]]) -> list[str]:
         own = ("filename",) if is_writer(stage, stages) else ()
         for name, value in stage.items():
             if name not in (*_NO_FILES, *own):
-                found += [file for text in _texts(value) if _is_file(text) for file in _parts(text)]
+                found += [
+                    file
+                    for text in _texts(value)
+                    if "\0" not in text and os.path.isfile(text)
+                    for file in _parts(text)
+                ]
     return found
 
 
@@ -60,13 +65,6 @@ def _texts(value: Any) -> Iterator[str]:
     elif isinstance(value, dict | list):
         for inner in value.values() if isinstance(value, dict) else value:
             yield from _texts(inner)
-
-
-def _is_file(text: str) -> bool:
-    try:
-        return os.path.isfile(text)
-    except ValueError:
-        return False
 
 
 def stage_files(stage: Stage) -> list[str]:

@@ -43,10 +43,8 @@ def input_files(names: Sequence[str]) -> list[str]:
 def _meant(name: str) -> list[str]:
     """The inputs that one name stands for."""
     if not name:  # which for a path is the current folder
-        raise StageError(
-            "the name of an input is empty",
-            cure="Name a file, or '.' for the current folder; is a variable not set?",
-        )
+        cure = "Name a file, or '.' for the current folder; is a variable not set?"
+        raise StageError("the name of an input is empty", cure=cure)
     path = Path(name)
     if "://" in name:
         return [name]
@@ -58,27 +56,20 @@ def _meant(name: str) -> list[str]:
         return [name]
     if matches := sorted(glob.glob(name, recursive=True)):
         return matches
-    raise StageError("there is no such file or folder", where=name, cure=_nearest_file(path))
-
-
-def _nearest_file(path: Path) -> str:
-    """What may have been meant, of the names beside it."""
     beside = os.listdir(path.parent) if path.parent.is_dir() else []
-    return f"{suggest(path.name, beside)}Check the path"
+    cure = f"{suggest(path.name, beside)}Check the path"
+    raise StageError("there is no such file or folder", where=name, cure=cure)
 
 
 def _inside(folder: Path) -> list[str]:
     """The LAS and LAZ files of a folder, or the EPT source that it is."""
     if (folder / EPT).is_file():
         return [str(folder / EPT)]
-    inside = sorted(str(path) for path in folder.iterdir() if path.suffix.lower() in (".las", ".laz"))
+    inside = sorted(str(path) for path in folder.iterdir() if is_las(str(path)))
     if not inside:
         deeper = next(folder.rglob("*.la[sz]"), None)
-        raise StageError(
-            "the folder holds no LAS or LAZ files",
-            found=str(folder),
-            cure=f"There are some further down: '{folder}/**/*{deeper.suffix}'" if deeper else None,
-        )
+        cure = f"There are some further down: '{folder}/**/*{deeper.suffix}'" if deeper else None
+        raise StageError("the folder holds no LAS or LAZ files", found=str(folder), cure=cure)
     return inside
 
 
@@ -87,24 +78,22 @@ def overlooked(names: Sequence[str], but: str = "") -> list[str]:
 
     `but`: an output, whose folder is not looked into; nor are hidden ones.
     """
-    beside = os.path.realpath(but) if but else ""
     found = []
-    for name in names:
-        if "://" in name or not os.path.isdir(name) or os.path.isfile(os.path.join(name, EPT)):
+    for folder in [Path(name) for name in names if "://" not in name]:
+        if not folder.is_dir() or (folder / EPT).is_file():
             continue
-        suffixes: list[str] = []
-        for folder, below, files in os.walk(name):
-            below[:] = [
-                each
-                for each in below
-                if each[0] != "." and os.path.realpath(os.path.join(folder, each)) != beside
-            ]
-            if folder != name:
-                suffixes += [end for each in files if (end := Path(each).suffix).lower() in (".las", ".laz")]
+        deeper = [
+            path
+            for path in folder.glob("*/**/*.[lL][aA][sSzZ]")
+            if not path.resolve().is_relative_to(Path(but or os.devnull).resolve())
+        ]
+        suffixes = [
+            p.suffix for p in deeper if not any(part[0] == "." for part in p.relative_to(folder).parts)
+        ]
         if suffixes:
-            every = os.path.join(name, "**", "*" + max(suffixes, key=suffixes.count))
+            every = folder / "**" / f"*{max(suffixes, key=suffixes.count)}"
             what = "file in folders below is" if len(suffixes) == 1 else "files in folders below are"
-            found.append(f"{name}: {len(suffixes):,} LAS or LAZ {what} not read; '{every}' names them, too")
+            found.append(f"{folder}: {len(suffixes):,} LAS or LAZ {what} not read; '{every}' names them, too")
     return found
 
 
@@ -128,8 +117,11 @@ def is_folder(target: str) -> bool:
 def _output_name(source: str) -> str:
     """The input's name; what this PDAL cannot write as COPC becomes plain LAZ."""
     name = Path(source).name
-    plain = name.lower().endswith(".copc.laz") and not pdal_env.writes_copc()
-    return name[: -len(".copc.laz")] + ".laz" if plain else name
+    return name[: -len(".copc.laz")] + ".laz" if _is_copc(name) and not pdal_env.writes_copc() else name
+
+
+def _is_copc(name: str) -> bool:
+    return name.lower().endswith(".copc.laz")
 
 
 def in_folders(sources: Sequence[str], names: Sequence[str]) -> list[str]:
@@ -180,22 +172,20 @@ def reader_of(source: str, tag: str) -> dict[str, Any]:
     stage: dict[str, Any] = {"filename": str(source), "tag": tag}
     if is_ept(source):
         stage["type"] = "readers.ept"
-    if Path(source).suffix.lower() in (".las", ".laz") and not str(source).lower().endswith(".copc.laz"):
-        stage.update({"type": "readers.las", "use_eb_vlr": True})
+    elif Path(source).suffix.lower() in (".las", ".laz") and not _is_copc(source):
+        stage |= {"type": "readers.las", "use_eb_vlr": True}
     return stage
 
 
 def writer_of(target: str) -> dict[str, Any]:
     """A writer that keeps the input's header, where it is a LAS file."""
     stage: dict[str, Any] = {"filename": target, "tag": "output"}
-    if target.lower().endswith(".copc.laz") and pdal_env.writes_copc():
-        stage.update({"type": "writers.copc", "forward": "all"})
-    elif Path(target).suffix.lower() in (".las", ".laz"):
-        stage.update({"type": "writers.las", "forward": "all"})
+    if Path(target).suffix.lower() in (".las", ".laz"):
+        kind = "writers.copc" if _is_copc(target) and pdal_env.writes_copc() else "writers.las"
+        stage |= {"type": kind, "forward": "all"}
     return stage
 
 
 def overridden(stage: dict[str, Any], overrides: Iterable[Override]) -> dict[str, Any]:
     """A stage with the overrides of its type."""
-    of_type = [o for o in overrides if not o.by_tag and o.selector == stage["type"]]
-    return apply_overrides([stage], of_type)[0]
+    return apply_overrides([stage], [o for o in overrides if not o.by_tag and o.selector == stage["type"]])[0]

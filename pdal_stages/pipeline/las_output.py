@@ -24,34 +24,26 @@ from .runtime import python_filter
 
 #: A variable-length record of LAS holds 65,535 bytes; the description of an extra dimension takes 192.
 _MOST_EXTRA = 65_535 // 192
-
-
-# ---- what a writer will write --------------------------------------------------------------------
+_AS_LAS_14 = '"minor_version": 4 and "dataformat_id": 6 (7 with colors, 8 with near infrared)'
 
 
 def las_version(writer: Mapping[str, Any], before: Iterable[Mapping[str, Any]]) -> tuple[int, int]:
     """(minor_version, dataformat_id) the writer will use: its options, the forwarded header, PDAL's defaults."""
-    minor, format_id = _whole(writer.get("minor_version")), _whole(writer.get("dataformat_id"))
-    forward = str(writer.get("forward", ""))
-    headers = las_headers(before)
-    if headers and ("all" in forward or "header" in forward or "minor_version" in forward):
-        if minor is None and len({h.minor for h in headers}) == 1:
-            minor = headers[0].minor
-        if format_id is None and len({h.point_format for h in headers}) == 1:
-            format_id = headers[0].point_format
-    if minor is None or format_id is None:  # PDAL is asked only then: it is another process
-        defaults = pdal_env.las_writer_defaults()
-        minor = defaults[0] if minor is None else minor
-        format_id = defaults[1] if format_id is None else format_id
+    found: list[int | None] = []
+    forward, headers = str(writer.get("forward", "")), las_headers(before)
+    forwards = any(word in forward for word in ("all", "header", "minor_version"))
+    for option, of_headers in (
+        ("minor_version", {header.minor for header in headers}),
+        ("dataformat_id", {header.point_format for header in headers}),
+    ):
+        try:
+            found.append(int(writer[option]))
+        except (KeyError, TypeError, ValueError, OverflowError):  # of a wrong one PDAL tells
+            found.append(of_headers.pop() if forwards and len(of_headers) == 1 else None)
+    # PDAL is asked only then: it is another process
+    defaults: Sequence[int] = pdal_env.las_writer_defaults() if None in found else (0, 0)
+    minor, format_id = (d if one is None else one for one, d in zip(found, defaults, strict=True))
     return minor, format_id
-
-
-def _whole(value: Any) -> int | None:
-    """An option as a whole number; anything else is left for PDAL to refuse."""
-    try:
-        return None if value is None else int(value)
-    except (TypeError, ValueError, OverflowError):
-        return None
 
 
 def las_headers(readers: Iterable[Mapping[str, Any]]) -> list[LasHeader]:
@@ -89,13 +81,11 @@ def check_writers(stages: list[dict[str, Any]], ours: list[tuple[Stage, str, int
         Naming the stage.
     """
     for stage, place, index in ours:
-        largest, extra = stage.largest_class(), len(stage.creates())
-        for writer in stages[index + 1 :]:
-            if not writes_las(writer):
-                continue
+        extra = len(stage.creates())
+        for writer in filter(writes_las, stages[index + 1 :]):
             if (limit := _code_limit(writer, stages[:index])) is not None:
                 stage.code_limit = limit
-                if largest > limit.largest:
+                if (largest := stage.largest_class()) > limit.largest:
                     raise OptionError(limit.what, where=place, found=f"code {largest}", cure=limit.cure)
             if extra > _MOST_EXTRA and str(writer.get("extra_dims", "")).strip() == "all":
                 raise DimensionError(
@@ -115,12 +105,11 @@ def _code_limit(writer: dict[str, Any], before: list[dict[str, Any]]) -> CodeLim
     minor, format_id = las_version(writer, before)
     if format_id > 5:
         return None
-    return CodeLimit(
-        LEGACY_LIMIT,
+    what = (
         f"class codes above {LEGACY_LIMIT} do not fit the LAS file that writers.las would write "
-        f"(LAS 1.{minor}, dataformat_id {format_id})",
-        'Give writers.las "minor_version": 4 and "dataformat_id": 6 (7 with colors, 8 with near infrared)',
+        f"(LAS 1.{minor}, dataformat_id {format_id})"
     )
+    return CodeLimit(LEGACY_LIMIT, what, f"Give writers.las {_AS_LAS_14}")
 
 
 def check_copc(stages: list[dict[str, Any]]) -> None:
@@ -131,15 +120,11 @@ def check_copc(stages: list[dict[str, Any]]) -> None:
         if not name.lower().endswith(".copc.laz") or not (kind == "writers.las" or (last and not kind)):
             continue
         if not pdal_env.writes_copc():
-            raise PipelineError(
-                f"PDAL {pdal_env.dotted_version()} cannot write COPC",
-                found=name,
-                cure="Name the output .laz, or use PDAL 2.4 or later",
-            )
+            what = f"PDAL {pdal_env.dotted_version()} cannot write COPC"
+            raise PipelineError(what, found=name, cure="Name the output .laz, or use PDAL 2.4 or later")
         if kind:
-            raise PipelineError(
-                "writers.las writes plain LAZ, not COPC", found=name, cure='Use "type": "writers.copc"'
-            )
+            what = "writers.las writes plain LAZ, not COPC"
+            raise PipelineError(what, found=name, cure='Use "type": "writers.copc"')
 
 
 # ---- flags of LAS 1.0-1.3, before PDAL 2.6 -------------------------------------------------------
@@ -159,7 +144,6 @@ def stage(ins, outs):
         outs["ClassFlags"] = both >> {LEGACY_LIMIT.bit_length()}
     return True
 """
-_LABEL = "pdal_stages_class_flags"
 
 
 def files_with_flags_to_split(stages: Sequence[dict[str, Any]], with_ours: bool = True) -> list[bool]:
@@ -175,25 +159,23 @@ def files_with_flags_to_split(stages: Sequence[dict[str, Any]], with_ours: bool 
     """
     if pdal_env.splits_class_flags():
         return []
-    readers = [stage for number, stage in enumerate(stages) if is_reader(stages, number)]
-    old: list[bool] = []
-    mixed = False
-    for reader in readers:
-        formats = [header.point_format for header in las_headers([reader])]
-        old += [one <= 5 for one in formats] or [False]
-        mixed |= any(one > 5 for one in formats)
+    read = [
+        [header.point_format for header in las_headers([stage])]
+        for number, stage in enumerate(stages)
+        if is_reader(stages, number)
+    ]
+    old = [one <= 5 for formats in read for one in formats or [6]]
     if True not in old:
         return []
-    writers = [stage for stage in stages if is_writer(stage, list(stages))]
-    writers = [stage for stage in writers if stage.get("type") not in registry.stages()]
+    mixed = any(one > 5 for formats in read for one in formats)
+    writers = [s for s in stages if is_writer(s, list(stages)) and s.get("type") not in registry.stages()]
     written = [las_version(one, stages)[1] for one in writers if writes_las(one)]
-    together = any(one <= 5 for one in written)
-    apart = any(one > 5 for one in written)
+    together, apart = any(one <= 5 for one in written), any(one > 5 for one in written)
     if together and (apart or mixed):
         raise PipelineError(
             "this PDAL cannot bring the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 into a pipeline with LAS 1.4",
             found=f"PDAL {pdal_env.dotted_version()}",
-            cure='Give all LAS writers "minor_version": 4 and "dataformat_id": 6 (7 with colors), or use PDAL 2.6',
+            cure=f"Give all LAS writers {_AS_LAS_14}, or use PDAL 2.6",
         )
     needed = apart or (with_ours and (writers or mixed))
     return old if needed and not together else []
@@ -201,7 +183,8 @@ def files_with_flags_to_split(stages: Sequence[dict[str, Any]], with_ours: bool 
 
 def flag_splitter(old: Sequence[bool], **wiring: Any) -> dict[str, Any]:
     """A filter that gives flags the dimension that they have in LAS 1.4; `old`: see :func:`files_with_flags_to_split`."""
-    return {**python_filter(_LABEL, _SPLIT, {"old": list(old)}, {"ClassFlags": "uint8_t"}), **wiring}
+    adds = {"ClassFlags": "uint8_t"}
+    return {**python_filter("pdal_stages_class_flags", _SPLIT, {"old": list(old)}, adds), **wiring}
 
 
 # ---- LAZ with class codes above 31, before PDAL 2.3 ----------------------------------------------
@@ -234,26 +217,24 @@ def compress(partials: Iterable[Path]) -> dict[str, str]:
         If a file cannot be written.
     """
     names: dict[str, str] = {}
-    for folder in {partial.parent for partial in partials}:
-        for made in sorted(folder.glob(f"*{UNCOMPRESSED}")):
-            target = made.with_name(made.name.removesuffix(UNCOMPRESSED))
-            _compress(made, target)
-            names[str(made)] = str(target)
+    for made in [
+        one for folder in {p.parent for p in partials} for one in sorted(folder.glob(f"*{UNCOMPRESSED}"))
+    ]:
+        target = made.with_name(made.name.removesuffix(UNCOMPRESSED))
+        import laspy  # which takes a moment
+
+        supersede_copc(made)  # of a COPC file that was read, whose record laspy does not write
+        try:
+            with laspy.open(made) as source:
+                header = source.header
+                with laspy.open(target, "w", header=header, do_compress=True) as out:
+                    for points in source.chunk_iterator(_BLOCK):
+                        out.write_points(points)
+                    if header.evlrs:
+                        out.write_evlrs(header.evlrs)
+        except Exception as error:  # laspy and lazrs raise many types
+            found = f"{target}: {error}"
+            raise StageError("the output file could not be compressed", found=found) from error
+        made.unlink()
+        names[str(made)] = str(target)
     return names
-
-
-def _compress(made: Path, target: Path) -> None:
-    import laspy
-
-    supersede_copc(made)  # of a COPC file that was read, whose record laspy does not write
-    try:
-        with laspy.open(made) as source:
-            header = source.header
-            with laspy.open(target, "w", header=header, do_compress=True) as out:
-                for points in source.chunk_iterator(_BLOCK):
-                    out.write_points(points)
-                if header.evlrs:
-                    out.write_evlrs(header.evlrs)
-    except Exception as error:  # laspy and lazrs raise many types
-        raise StageError("the output file could not be compressed", found=f"{target}: {error}") from error
-    made.unlink()

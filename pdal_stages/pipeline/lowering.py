@@ -16,7 +16,7 @@ import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ..base.errors import DimensionError, OptionError, PipelineError, StageError, suggest
 from ..base.las import extra_dimensions, read_header
@@ -65,22 +65,54 @@ def lower(source: PipelineSource, whole: bool = True) -> Lowered:
     PipelineError, OptionError
         Where a stage type or option of ours is wrong; PDAL's own stages are left to PDAL.
     """
-    stages: list[dict[str, Any]] = []
-    for place_of, given in enumerate(source.stages):
-        # File names stand for readers and writers; PDAL tells which, so they stay without a type.
-        stages.append(copy.deepcopy(given) if isinstance(given, dict) else {"filename": given})
-        _refuse_near_miss(stages[-1], source.where(place_of))
-    views = _Views()
+    # File names stand for readers and writers; PDAL tells which, so they stay without a type.
+    stages = [copy.deepcopy(one) if isinstance(one, dict) else {"filename": one} for one in source.stages]
+    places = [source.where(number) for number in range(len(stages))]
+    for stage, where in zip(stages, places, strict=True):
+        _refuse_near_miss(stage, where)
     out = Lowered([])
     run = run_by_pdal(stages)
     if len(run) < len(stages):
-        places = [source.where(number) for number in range(len(stages))]
         out.warnings.append(_warning_of_ends(stages, run, places))
         stages = [stages[number] for number in run]
     check_copc(stages)
     out.warnings += unread_extra_dimensions(stages)
-    has_ours = any(stage.get("type") in registry.stages() for stage in stages)
-    flags = files_with_flags_to_split(stages, has_ours) if whole else []
+    flags = _flags_to_split(stages) if whole else []
+    last_reader = max((n for n in range(len(stages)) if is_reader(stages, n)), default=None)
+    reaching = _views_reaching(stages)
+    tags = {str(stage["tag"]) for stage in stages if "tag" in stage}
+    for index, stage in enumerate(stages):
+        type_name = stage.get("type", "")
+        if type_name not in registry.stages():
+            out.stages.append(stage)
+            if flags and index == last_reader:
+                out.stages.append(flag_splitter(flags))
+            continue
+        try:
+            if reaching[index] > 1:  # points of several readers
+                merge: dict[str, Any] = {"type": "filters.merge"}
+                if "inputs" in stage:
+                    names = (f"pdal_stages_merge_{number}" for number in itertools.count(1))
+                    merge |= {
+                        "inputs": stage["inputs"],
+                        "tag": next(name for name in names if name not in tags),
+                    }
+                    tags.add(merge["tag"])
+                    stage["inputs"] = [merge["tag"]]
+                out.stages.append(merge)
+            taken = registry.get(type_name).from_pipeline(stage, stages[:index])
+            lowered = lower_stage({**taken, **stage}, run[index], len(out.stages))
+        except StageError as error:
+            raise error.within(places[run[index]]) from None
+        out.ours.append(lowered)
+        out.stages.append(lowered.plain)
+    _follow_preparations(out)
+    check_writers(out.stages, [(ours.stage, ours.place, ours.index) for ours in out.ours])
+    return out
+
+
+def _flags_to_split(stages: list[dict[str, Any]]) -> list[bool]:
+    flags = files_with_flags_to_split(stages, any(stage.get("type") in registry.stages() for stage in stages))
     readers = [number for number in range(len(stages)) if is_reader(stages, number)]
     if flags and (readers[-1] >= len(readers) or any("inputs" in stage for stage in stages)):
         raise PipelineError(
@@ -89,68 +121,55 @@ def lower(source: PipelineSource, whole: bool = True) -> Lowered:
             found=f"PDAL {pdal_env.dotted_version()}",
             cure="Leave 'inputs' out, write one file at a time, or use PDAL 2.6",
         )
-    tags = {str(s["tag"]) for s in stages if "tag" in s}
-    for index, stage in enumerate(stages):
-        type_name = stage.get("type", "")
-        if type_name not in registry.stages():
-            views.add(stage, last=0 < index == len(stages) - 1)
-            out.stages.append(stage)
-            if flags and index == readers[-1]:
-                out.stages.append(flag_splitter(flags))
-            continue
-        where = source.where(run[index])
-        try:
-            if views.reaching(stage) > 1:  # points of several readers
-                merge: dict[str, Any] = {"type": "filters.merge"}
-                if "inputs" in stage:
-                    merge["inputs"] = stage.pop("inputs")
-                    names = (f"pdal_stages_merge_{number}" for number in itertools.count(1))
-                    merge["tag"] = next(name for name in names if name not in tags)
-                    tags.add(merge["tag"])
-                    stage["inputs"] = [merge["tag"]]
-                views.add(merge)
-                out.stages.append(merge)
-            taken = registry.get(type_name).from_pipeline(stage, stages[:index])
-            lowered = lower_stage({**taken, **stage}, run[index], len(out.stages))
-        except StageError as error:
-            raise error.within(where) from None
-        views.add(stage)
-        out.ours.append(lowered)
-        out.stages.append(lowered.plain)
-    _follow_preparations(out)
-    check_writers(out.stages, [(ours.stage, ours.place, ours.index) for ours in out.ours])
-    return out
+    return flags
 
 
-# ---- which stages PDAL runs ----------------------------------------------------------------------
+# ---- how PDAL wires stages -----------------------------------------------------------------------
 
 
-def run_by_pdal(stages: Sequence[dict[str, Any]]) -> list[int]:
-    """The numbers of the stages that lead to the first end of a pipeline; PDAL runs no others."""
+def _wiring(stages: Sequence[dict[str, Any]]) -> list[list[int]] | None:
+    """The numbers of the stages from which each takes points; None where a tag is unknown, which PDAL refuses."""
     tagged: dict[str, int] = {}
     waiting: list[int] = []
     inputs: list[list[int]] = []
     for number, stage in enumerate(stages):
         named = stage.get("inputs") or []
-        chosen = [named] if isinstance(named, str) else named
-        if any(str(tag) not in tagged for tag in chosen):
-            return list(range(len(stages)))  # for PDAL to refuse
-        if is_reader(stages, number):
-            inputs.append([])
-            waiting = [*waiting, number]
-        else:
-            inputs.append([tagged[str(tag)] for tag in chosen] or waiting)
-            waiting = [number]
+        chosen = [str(tag) for tag in ([named] if isinstance(named, str) else named)]
+        if any(tag not in tagged for tag in chosen):
+            return None
+        reads = is_reader(stages, number)
+        inputs.append([] if reads else [tagged[tag] for tag in chosen] or waiting)
+        waiting = [*(waiting if reads else []), number]
         if "tag" in stage:
             tagged[str(stage["tag"])] = number
-    taken = {one for several in inputs for one in several}
+    return inputs
+
+
+def run_by_pdal(stages: Sequence[dict[str, Any]]) -> list[int]:
+    """The numbers of the stages that lead to the first end of a pipeline; PDAL runs no others."""
+    if (inputs := _wiring(stages)) is None:
+        return list(range(len(stages)))
+    taken = set(itertools.chain(*inputs))
     found: set[int] = set()
     left = [next(number for number in range(len(stages)) if number not in taken)]
     while left:
-        number = left.pop()
-        found.add(number)
+        found.add(number := left.pop())
         left += [one for one in inputs[number] if one not in found]
     return sorted(found)
+
+
+def _views_reaching(stages: Sequence[dict[str, Any]]) -> list[int]:
+    """How many views of points, of readers that are still apart, reach each stage; "several" counts as two."""
+    views: list[int] = []
+    reaching: list[int] = []
+    for number, inputs in enumerate(_wiring(stages) or [[]] * len(stages)):
+        kind = stages[number].get("type", "")
+        reaching.append(sum(views[one] for one in inputs))
+        if is_reader(stages, number):
+            views.append(2 if any(c in str(stages[number].get("filename", "")) for c in "*?[") else 1)
+        else:
+            views.append(1 if kind in _ONE_VIEW or kind in registry.stages() else reaching[-1])
+    return reaching
 
 
 def _warning_of_ends(stages: Sequence[dict[str, Any]], run: Sequence[int], where: Sequence[str]) -> str:
@@ -172,24 +191,18 @@ def _warning_of_ends(stages: Sequence[dict[str, Any]], run: Sequence[int], where
 # ---- what stages read, and whether it will be there ----------------------------------------------
 
 
-class Upstream(NamedTuple):
-    """What the stages before one are to it."""
-
-    preparation: list[dict[str, Any]]  #: those that made what it reads
-    makes_again: bool  #: whether one makes what it makes too
-    warning: str | None  #: for the user
-
-
-def settle_upstream(stage: Stage, before: Sequence[tuple[Mapping[str, Any], Mapping[str, str]]]) -> Upstream:
-    """Let a stage know which stages before it made what it reads.
+def settle_upstream(
+    stage: Stage, before: Sequence[tuple[Mapping[str, Any], Mapping[str, str]]]
+) -> tuple[list[dict[str, Any]], str | None]:
+    """Let a stage know which stages before it made what it reads: these, and a warning for the user.
 
     `before` are the stages before it in their order, as they are written, each with what :meth:`Stage.creates` says of it;
     for PDAL's own, :func:`heights_of`.
     """
     wanted = set(stage.reads()) - {"Classification"}  # which noise is marked in, too: it is no preparation
-    made = [preparation.entry(given) for given, creates in before if wanted & set(creates)]
-    stage.makes_again = bool({name for _, creates in before for name in creates} & set(stage.creates()))
-    return Upstream(made, stage.makes_again, stage.follows(made))
+    makers = [preparation.entry(given) for given, creates in before if wanted & set(creates)]
+    stage.makes_again = any(set(creates) & set(stage.creates()) for _, creates in before)
+    return makers, stage.follows(makers)
 
 
 def heights_of(stage: Mapping[str, Any]) -> dict[str, str]:
@@ -202,17 +215,16 @@ def _follow_preparations(lowered: Lowered) -> None:
     numbered = {ours.index: ours for ours in lowered.ours}
     before: list[tuple[Mapping[str, Any], Mapping[str, str]]] = []
     for index, plain in enumerate(lowered.stages):
-        ours = numbered.get(index)
-        if ours is None:
+        if (ours := numbered.get(index)) is None:
             before.append((plain, heights_of(plain)))
             continue
-        upstream = settle_upstream(ours.stage, before)
-        if upstream.makes_again:
-            ours.plain["pdalargs"]["makes_again"] = True
-        if upstream.preparation:
-            ours.plain["pdalargs"]["preparation"] = upstream.preparation
-        if upstream.warning is not None:
-            lowered.warnings.append(upstream.warning)
+        makers, warning = settle_upstream(ours.stage, before)
+        if ours.stage.makes_again:
+            plain["pdalargs"]["makes_again"] = True
+        if makers:
+            plain["pdalargs"]["preparation"] = makers
+        if warning is not None:
+            lowered.warnings.append(warning)
         before.append(({"type": ours.stage.type, **ours.given}, ours.stage.creates()))
 
 
@@ -220,8 +232,6 @@ def _follow_preparations(lowered: Lowered) -> None:
 _MADE = ("HeightAbove", "Ground", "Slope", "Reference")
 #: Stages of PDAL that make dimensions of any name, or name them in files.
 _MAKES_ANY = {f"filters.{name}" for name in ("python", "matlab", "colorization", "overlay", "hag_dem")}
-
-
 _DEGREES = re.compile(
     r"^\s*EPSG:\s*4\d{3}\s*$|longlat|latlong|^\s*(OGC:)?CRS:?84|^\s*(GEOGCS|GEOGCRS|GEODCRS)", re.IGNORECASE
 )
@@ -293,16 +303,14 @@ def unread_extra_dimensions(stages: Sequence[dict[str, Any]]) -> list[str]:
 
 def _refuse_near_miss(stage: dict[str, Any], where: str) -> None:
     """A mistyped type of ours would reach PDAL, whose message cannot name our stages."""
-    type_name = stage.get("type", "")
-    if type_name in registry.stages() or not type_name:
+    type_name, ours = stage.get("type", ""), list(registry.stages())
+    if not type_name or type_name in ours:
         return
-    ours = list(registry.stages())
     # Nearer than another of PDAL's stages, such as filters.hag_nn.
     misspelt = difflib.get_close_matches(type_name, ours, n=1, cutoff=0.88)
     if misspelt or type_name.rpartition(".")[2] in {name.partition(".")[2] for name in ours}:
-        raise PipelineError(
-            f"there is no stage '{type_name}'", where=where, cure=suggest(type_name, ours) or None
-        )
+        cure = suggest(type_name, ours) or None
+        raise PipelineError(f"there is no stage '{type_name}'", where=where, cure=cure)
 
 
 def lower_stage(given: dict[str, Any], number: int = 0, index: int = 0) -> LoweredStage:
@@ -320,7 +328,7 @@ def lower_stage(given: dict[str, Any], number: int = 0, index: int = 0) -> Lower
     if given.get("tag"):
         arguments["tag"] = given["tag"]
     plain = python_filter(label, TRAMPOLINE, arguments, stage.creates())
-    plain.update({key: given[key] for key in PDAL_OWN if key in given})
+    plain |= {key: given[key] for key in PDAL_OWN if key in given}
     made[label] = stage
     return LoweredStage(stage, named, label, number, index, given, plain)
 
@@ -338,15 +346,14 @@ def settled(stage: Mapping[str, Any]) -> dict[str, Any]:
     options = dict(stage)
     if "option_file" in options:
         options = {**_option_file(options.pop("option_file")), **options}
-    if "where_merge" in options:
-        word = str(options.pop("where_merge")).strip().lower()
-        if word not in ("auto", "true", "false"):
-            raise OptionError("option 'where_merge' must be one of 'auto', 'true', 'false'", found=repr(word))
-        if word == "false":
-            raise OptionError(
-                "option 'where_merge' cannot be false here: points outside 'where' stay beside the others, as neighbors",
-                cure='Leave it out, and tell the points apart afterwards, e.g. with {"type": "filters.expression"}',
-            )
+    word = str(options.pop("where_merge", "auto")).strip().lower()
+    if word not in ("auto", "true", "false"):
+        raise OptionError("option 'where_merge' must be one of 'auto', 'true', 'false'", found=repr(word))
+    if word == "false":
+        raise OptionError(
+            "option 'where_merge' cannot be false here: points outside 'where' stay beside the others, as neighbors",
+            cure='Leave it out, and tell the points apart afterwards, e.g. with {"type": "filters.expression"}',
+        )
     return options
 
 
@@ -360,10 +367,8 @@ def _option_file(path: Any) -> dict[str, Any]:
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise OptionError("the option file cannot be read", found=f"{str(path)[:200]!r}: {error}") from None
     if wired := {"type", "tag", "inputs"} & set(found):
-        raise OptionError(
-            "an option file sets options, not how stages are joined",
-            found=f"{path}: {', '.join(sorted(wired))}",
-        )
+        what = "an option file sets options, not how stages are joined"
+        raise OptionError(what, found=f"{path}: {', '.join(sorted(wired))}")
     return found
 
 
@@ -377,35 +382,3 @@ def _words(words: list[str]) -> dict[str, str]:
             raise ValueError(f"'{word}' has no value")
         found[name[2:]] = value
     return found
-
-
-class _Views:
-    """Follows PDAL's wiring to see where points of several readers are still apart."""
-
-    def __init__(self) -> None:
-        self._waiting: list[int] = []  # views of stages not yet taken as an input
-        self._tagged: dict[str, int] = {}
-
-    def reaching(self, stage: dict[str, Any]) -> int:
-        """How many views reach a stage."""
-        names = stage.get("inputs")
-        if names is None:
-            return sum(self._waiting)
-        names = [names] if isinstance(names, str) else names
-        return sum(self._tagged.get(str(n), 1) for n in names)
-
-    def add(self, stage: dict[str, Any], last: bool = False) -> None:
-        type_name = str(stage.get("type", ""))
-        filename = str(stage.get("filename", ""))
-        # A bare file name is read, unless it is the last stage of several: then it is written.
-        reader = type_name.startswith("readers.") or (not type_name and not last)
-        if reader:
-            count = 2 if any(c in filename for c in "*?[") else 1
-        else:
-            # One cloud, or pieces the user asked for, are one.
-            count = 1 if type_name in _ONE_VIEW else self.reaching(stage)
-            if "inputs" not in stage:
-                self._waiting = []
-        self._waiting.append(count)
-        if "tag" in stage:
-            self._tagged[str(stage["tag"])] = count

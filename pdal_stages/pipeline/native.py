@@ -6,8 +6,10 @@
 from __future__ import annotations
 
 import inspect
+import logging
 from typing import Any
 
+from ..base.errors import StageError
 from ..stages import registry
 from ..stages.base import Stage
 from . import pdal as pdal_env
@@ -26,7 +28,7 @@ class _Family:
             raise AttributeError(name)
         try:
             kind = registry.get(f"{self._family}.{name}")
-        except Exception as error:
+        except StageError as error:
             raise AttributeError(str(error)) from None  # as completion and hasattr expect
         signature = _signature(kind)
 
@@ -37,11 +39,10 @@ class _Family:
                 options["merge"], merge = merge, True
             # Points of several readers must see each other; of one reader merging costs nothing.
             wired = {"inputs": options["inputs"]} if merge and "inputs" in options else {}
-            own = {k: v for k, v in options.items() if k not in wired}
-            lowered = lower_stage({"type": kind.type, **own})
+            lowered = lower_stage({"type": kind.type, **{k: v for k, v in options.items() if k not in wired}})
             runtime.remember_stdout()
-            before = [{"type": "filters.merge", **wired}] if merge else []
-            return pdal_env.python_object([*before, lowered.plain], kind.type, options, lowered.stage)
+            stages = [*([{"type": "filters.merge", **wired}] if merge else []), lowered.plain]
+            return _joined(stages, kind.type, options, lowered.stage)
 
         make.__name__ = make.__qualname__ = name
         make.__signature__ = signature  # type: ignore[attr-defined]
@@ -55,19 +56,19 @@ class _Family:
 
 def _signature(kind: type[Stage]) -> inspect.Signature:
     """The required option first, by place or by name; the others by name, with their defaults."""
-    by_place, by_name = [], []
-    for option in kind.all_options():
-        if option.required:
-            by_place.append(inspect.Parameter(option.name, inspect.Parameter.POSITIONAL_OR_KEYWORD))
-        else:
-            by_name.append(
-                inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, default=option.default)
-            )
-    names = {parameter.name for parameter in by_name}
+    required = {option.name: inspect.Parameter.empty for option in kind.all_options() if option.required}
+    others = {option.name: option.default for option in kind.all_options() if not option.required}
     for name, default in (("tag", None), ("inputs", None), ("merge", True)):
-        if name not in names:
-            by_name.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default))
-    return inspect.Signature([*by_place, *by_name])
+        others.setdefault(name, default)
+    return inspect.Signature(
+        [
+            *(inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in required),
+            *(
+                inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default)
+                for name, default in others.items()
+            ),
+        ]
+    )
 
 
 def _help(kind: type[Stage]) -> str:
@@ -77,6 +78,48 @@ def _help(kind: type[Stage]) -> str:
         lines += [f"{option.name} : {option.kind}{unit}", f"    {option.help}"]
     lines += ["tag, inputs", "    As for PDAL's stages", "merge : bool"]
     return "\n".join([*lines, "    False keeps point views apart (after filters.splitter, say)"])
+
+
+def _joined(stages: list[dict[str, Any]], type_name: str, given: dict[str, Any], made_from: Stage):
+    """The filters that PDAL runs as one object, which joins others by ``|`` and answers as python-pdal's stages do.
+
+    `given` is what the user asked for; `made_from` is kept as long as the filters are.
+    """
+    pdal = pdal_env.bindings()
+
+    class Step(pdal.Filter):  # type: ignore[name-defined]
+        def __repr__(self) -> str:
+            return repr(made)
+
+    class Filter(pdal.Pipeline):  # type: ignore[name-defined]
+        type = type_name
+        tag = given.get("tag")
+
+        @property
+        def options(self) -> dict[str, Any]:
+            return {"type": type_name, **given}
+
+        def pipeline(self, *arrays, loglevel: int = logging.ERROR):
+            whole = pdal.Pipeline(arrays=arrays, loglevel=loglevel)
+            whole |= self
+            return whole
+
+        def __or__(self, other):
+            known = isinstance(other, pdal.Pipeline | pdal.pipeline.Stage)
+            return super().__or__(other) if known else NotImplemented
+
+        def __copy__(self):
+            return self.pipeline(loglevel=self.loglevel)
+
+        def __repr__(self) -> str:
+            return f"{type_name}({', '.join(f'{key}={value!r}' for key, value in given.items())})"
+
+    made = Filter()
+    for stage in stages:
+        one = Step(**stage)
+        one.made_from = made_from
+        made |= one
+    return made
 
 
 #: ``Filter.hag_minima(...)``, ``Filter.multiscalefeatures(...)``, ``Filter.modelclassifier(...)``, ...

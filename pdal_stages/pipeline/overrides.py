@@ -9,8 +9,9 @@ from typing import Any
 
 from ..base.errors import OptionError, suggest
 
-_TYPED = re.compile(r"^--((?:readers|filters|writers)\.\w+)\.(\w+)$")
-_TAGGED = re.compile(r"^--stage\.([^.=]+)\.(\w+)$")
+_FLAG = re.compile(
+    r"^--(?:stage\.(?P<tag>[^.=]+)|(?P<type>(?:readers|filters|writers)\.\w+))\.(?P<option>\w+)$"
+)
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ def parse_overrides(arguments: Iterable[str]) -> tuple[list[Override], list[str]
     while waiting:
         word = waiting.pop(0)
         flag, equals, value = word.partition("=")
-        match = _TAGGED.match(flag) or _TYPED.match(flag)
+        match = _FLAG.match(flag)
         if match is None:
             rest.append(word)
             continue
@@ -46,7 +47,9 @@ def parse_overrides(arguments: Iterable[str]) -> tuple[list[Override], list[str]
             if not waiting or waiting[0].startswith("--"):
                 raise OptionError(f"'{flag}' has no value", cure=f"Write {flag}=VALUE")
             value = waiting.pop(0)
-        found.append(Override(match.group(1), flag.startswith("--stage."), match.group(2), value))
+        found.append(
+            Override(match["tag"] or match["type"], match["tag"] is not None, match["option"], value)
+        )
     return found, rest
 
 
@@ -60,11 +63,11 @@ def apply_overrides(stages: list[Any], overrides: Iterable[Override]) -> list[An
             hits = _by_file_name(out, override.selector)
         if not hits:
             known = sorted({str(s[key]) for s in out if isinstance(s, dict) and key in s})
+            there = f"The pipeline's {key}s: {', '.join(known)}" if known else f"No stage has a {key}"
             raise OptionError(
                 f"no stage of the pipeline has the {key} '{override.selector}'",
                 found=override.flag,
-                cure=f"{suggest(override.selector, known)}"
-                + (f"The pipeline's {key}s: {', '.join(known)}" if known else f"No stage has a {key}"),
+                cure=suggest(override.selector, known) + there,
             )
         for stage in hits:
             stage[override.option] = override.value

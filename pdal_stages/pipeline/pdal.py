@@ -46,23 +46,18 @@ def bindings():
     try:
         import pdal
     except ImportError as error:
-        raise DependencyError(
-            "python-pdal cannot be imported", found=f"{sys.executable}: {error}", cure=INSTALL
-        ) from error
+        found = f"{sys.executable}: {error}"
+        raise DependencyError("python-pdal cannot be imported", found=found, cure=INSTALL) from error
     except (OSError, subprocess.SubprocessError) as error:  # it asks the program `pdal` for its drivers
-        raise DependencyError(
-            "python-pdal could not start the program 'pdal'",
-            found=str(error),
-            cure="Put pdal on PATH. " + INSTALL,
-        ) from error
+        what, cure = "python-pdal could not start the program 'pdal'", f"Put pdal on PATH. {INSTALL}"
+        raise DependencyError(what, found=str(error), cure=cure) from error
     return pdal
 
 
 @cache
 def version() -> tuple[int, int, int]:
     """PDAL's version, e.g. (2, 2, 0)."""
-    numbers = re.findall(r"\d+", str(bindings().info.version))[:3]
-    major, minor, patch = (int(n) for n in (*numbers, "0", "0", "0")[:3])
+    major, minor, patch, *_ = [*map(int, re.findall(r"\d+", str(bindings().info.version))), 0, 0, 0]
     return major, minor, patch
 
 
@@ -74,10 +69,9 @@ def dotted_version() -> str:
 def program() -> str:
     """Path of the program `pdal`, the one beside this Python first."""
     beside = os.path.join(os.path.dirname(sys.executable), "pdal")
-    found = beside if os.access(beside, os.X_OK) else shutil.which("pdal")
-    if not found:
-        raise DependencyError("the program 'pdal' is not on PATH", cure=INSTALL)
-    return found
+    if found := beside if os.access(beside, os.X_OK) else shutil.which("pdal"):
+        return found
+    raise DependencyError("the program 'pdal' is not on PATH", cure=INSTALL)
 
 
 def _run_program(*arguments: str, **how: Any) -> subprocess.CompletedProcess[str]:
@@ -87,11 +81,10 @@ def _run_program(*arguments: str, **how: Any) -> subprocess.CompletedProcess[str
 def ask_program(*arguments: str) -> str:
     """What `pdal` prints for some arguments."""
     done = _run_program(*arguments, timeout=120)
-    if done.returncode:
-        raise PipelineError(
-            f"pdal {' '.join(arguments)} failed", found=(done.stderr or done.stdout).strip()[-500:]
-        )
-    return done.stdout
+    if not done.returncode:
+        return done.stdout
+    said = (done.stderr or done.stdout).strip()[-500:]
+    raise PipelineError(f"pdal {' '.join(arguments)} failed", found=said)
 
 
 def execute(
@@ -133,36 +126,35 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
         count = pipeline.execute()
     except (RuntimeError, ValueError, IndexError, OverflowError) as error:  # C++'s errors, as Python has them
         keep(stdout)
-        failure = translate(str(error), log_lines(_log(pipeline))[-3:])
         if _CUT_POINTS.search(str(error)) and (read := readers_files(stages, las=True)):
-            failure = PipelineError(
+            raise PipelineError(
                 "the LAS file is damaged: its points cannot be decoded",
                 where=read[0] if len(read) == 1 else "one of " + ", ".join(read),
                 found=str(error).strip(),
                 cure=DAMAGED,
-            )
-        raise failure from None
+            ) from None
+        raise translate(str(error), log_lines(_log(pipeline))[-3:]) from None
     except MemoryError:
-        raise PipelineError(
-            "memory ran out", cure="Work in tiles (--tile), or read less, e.g. with filters.crop"
-        ) from None
+        cure = "Work in tiles (--tile), or read less, e.g. with filters.crop"
+        raise PipelineError("memory ran out", cure=cure) from None
     finally:
         # A stage that raises leaves sys.stdout pointing into PDAL's log.
         sys.stdout = stdout
     log = _log(pipeline)
     if failed := _FAILED_WRITER.search(log):  # after which PDAL goes on
         raise PipelineError("an output file could not be written", found=": ".join(failed.groups()))
-    return Execution(
-        count=int(count),
-        metadata=_metadata(pipeline),
-        arrays=list(pipeline.arrays) if arrays else [],
-        log=log,
-    )
+    metadata = pipeline.metadata  # text in older python-pdal, a dict in newer
+    if isinstance(metadata, str):
+        with contextlib.suppress(ValueError):
+            metadata = json.loads(metadata)
+    found = metadata if isinstance(metadata, dict) else {}
+    return Execution(int(count), found, list(pipeline.arrays) if arrays else [], log)
 
 
 _CUT_POINTS = re.compile(r"readers\.las: .*(reading point \d+ of \d+|[Cc]ouldn't read .*point)")
-
-
+_FAILED_WRITER = re.compile(r"(writers\.\w+) Error\) (GDAL failure.*)")
+#: How PDAL begins a line of its log; some stages say their name once more.
+_BY_PROGRAM = re.compile(r"^\((?:pypipeline|pdal pipeline)\s+(\S+?)\s+\w+\)\s*(?:\1:\s*)?", re.IGNORECASE)
 _kept: list[Any] = []
 
 
@@ -172,66 +164,10 @@ def keep(stdout: Any) -> None:
         _kept.append(stdout)
 
 
-_FAILED_WRITER = re.compile(r"(writers\.\w+) Error\) (GDAL failure.*)")
-
-
 def log_lines(log: str) -> list[str]:
     """Warnings and errors of a log, once each: ``filters.smrf: ...``."""
     lines = [_BY_PROGRAM.sub(r"\1: ", line.strip()) for line in str(log or "").splitlines()]
     return list(dict.fromkeys(line for line in lines if line))
-
-
-#: How PDAL begins a line of its log; some stages say their name once more.
-_BY_PROGRAM = re.compile(r"^\((?:pypipeline|pdal pipeline)\s+(\S+?)\s+\w+\)\s*(?:\1:\s*)?", re.IGNORECASE)
-
-
-def python_object(stages: list[dict[str, Any]], type_name: str, given: dict[str, Any], made_from: Any):
-    """Filters as one object that joins others by ``|`` and answers as python-pdal's stages do.
-
-    Parameters
-    ----------
-    stages : list of dict
-        What PDAL runs.
-    type_name, given
-        What the user asked for.
-    made_from : object
-        Kept as long as the filters are.
-    """
-    pdal = bindings()
-
-    class Step(pdal.Filter):  # type: ignore[name-defined]
-        def __repr__(self) -> str:
-            return repr(made)
-
-    class Filter(pdal.Pipeline):  # type: ignore[name-defined]
-        type = type_name
-        tag = given.get("tag")
-
-        @property
-        def options(self) -> dict[str, Any]:
-            return {"type": type_name, **given}
-
-        def pipeline(self, *arrays, loglevel: int = logging.ERROR):
-            whole = pdal.Pipeline(arrays=arrays, loglevel=loglevel)
-            whole |= self
-            return whole
-
-        def __or__(self, other):
-            known = isinstance(other, pdal.Pipeline | pdal.pipeline.Stage)
-            return super().__or__(other) if known else NotImplemented
-
-        def __copy__(self):
-            return self.pipeline(loglevel=self.loglevel)
-
-        def __repr__(self) -> str:
-            return f"{type_name}({', '.join(f'{key}={value!r}' for key, value in given.items())})"
-
-    made = Filter()
-    for stage in stages:
-        one = Step(**stage)
-        one.made_from = made_from
-        made |= one
-    return made
 
 
 def stages_of(thing: Any) -> list[dict[str, Any]] | None:
@@ -289,12 +225,9 @@ def translate(message: str, before: Sequence[str] = ()) -> PipelineError | Depen
         return PipelineError("a script of filters.python failed", found="; ".join([last, *place]))
     # On one line: what PDAL says quotes names of files, which may hold line breaks.
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    unknown = re.search(r"[Cc]annot determine (reader|writer) for", text)
-    cure = (
-        f'Is the suffix mistyped (.laz, .las)? Otherwise give the stage a type: "{unknown[1]}s.las"'
-        if unknown
-        else None
-    )
+    cure = None
+    if unknown := re.search(r"[Cc]annot determine (reader|writer) for", text):
+        cure = f'Is the suffix mistyped (.laz, .las)? Otherwise give the stage a type: "{unknown[1]}s.las"'
     return PipelineError("PDAL could not run the pipeline", found="; ".join([*lines, *before]), cure=cure)
 
 
@@ -306,14 +239,6 @@ def _log(pipeline) -> str:
         return error.object.decode(errors="backslashreplace")
     except RuntimeError:  # a pipeline that PDAL could not even make has none
         return ""
-
-
-def _metadata(pipeline) -> dict[str, Any]:
-    raw = pipeline.metadata  # text in older python-pdal, a dict in newer
-    if isinstance(raw, str):
-        with contextlib.suppress(ValueError):
-            raw = json.loads(raw)
-    return raw if isinstance(raw, dict) else {}
 
 
 # ---- what differs between versions ---------------------------------------------------------------
@@ -337,11 +262,15 @@ def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
         kind = stage.get("type") if isinstance(stage, dict) else None
         if kind == "writers.las" and "forward" not in stage:
             stage = {"filesource_id": 0, **stage}
-        elif kind == "writers.ogr" or (not kind and len(out) and _is_vector(stage)):
+        elif kind == "writers.ogr" or (
+            not kind
+            and out
+            and isinstance(stage, dict)
+            and str(stage.get("filename", "")).lower().endswith((".shp", ".geojson"))
+        ):
             stage = {"measure_dim": "Z", **stage}
         elif kind == "readers.copc":
-            beyond = [name for name in stage if name in _COPC_OPTIONS]
-            if beyond:
+            if beyond := [name for name in stage if name in _COPC_OPTIONS]:
                 raise PipelineError(
                     f"PDAL {dotted_version()} reads COPC files whole, without {', '.join(beyond)}",
                     where="readers.copc",
@@ -351,10 +280,6 @@ def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
             stage = {**{k: v for k, v in stage.items() if k not in _COPC_TUNING}, "type": "readers.las"}
         out.append(stage)
     return out
-
-
-def _is_vector(stage: Any) -> bool:
-    return isinstance(stage, dict) and str(stage.get("filename", "")).lower().endswith((".shp", ".geojson"))
 
 
 #: Options of readers.copc that choose points, and those that only make it faster.

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import re
+from bisect import bisect
 from dataclasses import dataclass
+from json.decoder import JSONArray  # type: ignore[attr-defined]
+from json.scanner import py_make_scanner  # type: ignore[attr-defined]
 from pathlib import Path
 from typing import Any
 
@@ -45,21 +48,19 @@ def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
     PipelineError
         If the file cannot be read, is not JSON, or is not a pipeline.
     """
-    if isinstance(source, Path) or (isinstance(source, str) and not _looks_like_json(source)):
-        path = Path(source)
-        try:
-            data = path.read_bytes()
-        except (OSError, ValueError) as error:
-            raise PipelineError(
-                "the pipeline file cannot be read", where=ascii(str(path)[:200])[1:-1], found=error
-            ) from None
-        return parse_pipeline(decode(data, str(path)), str(path))
-    if isinstance(source, str):
+    if isinstance(source, list | dict):
+        stages = source.get("pipeline") if isinstance(source, dict) else source
+        if not isinstance(stages, list):
+            raise PipelineError("a pipeline is a list of stages, or an object with a list named 'pipeline'")
+        return _checked(PipelineSource(stages, [0] * len(stages)))
+    if isinstance(source, str) and source.lstrip("\ufeff \t\r\n")[:2].startswith(("[", "{", "//", "/*")):
         return parse_pipeline(source)
-    stages = source.get("pipeline") if isinstance(source, dict) else source
-    if not isinstance(stages, list):
-        raise PipelineError("a pipeline is a list of stages, or an object with a list named 'pipeline'")
-    return _checked(PipelineSource(stages, [0] * len(stages)))
+    try:
+        data = Path(source).read_bytes()
+    except (OSError, ValueError) as error:
+        where = ascii(str(source)[:200])[1:-1]
+        raise PipelineError("the pipeline file cannot be read", where=where, found=error) from None
+    return parse_pipeline(decode(data, str(source)), str(source))
 
 
 def decode(data: bytes, name: str) -> str:
@@ -68,12 +69,9 @@ def decode(data: bytes, name: str) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         wide = data[:2] in (b"\xff\xfe", b"\xfe\xff")
-        raise PipelineError(
-            "the pipeline file is not UTF-8 text",
-            where=name,
-            found="UTF-16" if wide else f"byte {error.start} is 0x{data[error.start]:02x}",
-            cure="Save it as UTF-8",
-        ) from None
+        found = "UTF-16" if wide else f"byte {error.start} is 0x{data[error.start]:02x}"
+        what = "the pipeline file is not UTF-8 text"
+        raise PipelineError(what, where=name, found=found, cure="Save it as UTF-8") from None
 
 
 def parse_pipeline(text: str, name: str = "") -> PipelineSource:
@@ -82,8 +80,7 @@ def parse_pipeline(text: str, name: str = "") -> PipelineSource:
     if not clean.strip():
         raise PipelineError("the pipeline is empty", where=name or None)
     try:
-        # parse_constant: NaN and Infinity are not JSON, and PDAL refuses them too.
-        value = json.loads(clean, parse_constant=_no_constant)
+        value = _Decoder().decode(clean)
     except json.JSONDecodeError as error:
         raise PipelineError(
             f"the pipeline is not valid JSON: {error.msg}",
@@ -92,49 +89,49 @@ def parse_pipeline(text: str, name: str = "") -> PipelineSource:
             cure=_cure(clean, error),
         ) from None
     except (ValueError, RecursionError) as error:
-        raise PipelineError(
-            "the pipeline is not valid JSON", where=name or None, found=str(error)[:200]
-        ) from None
-    if isinstance(value, dict):
-        if not isinstance(value.get("pipeline"), list):
-            raise PipelineError(
-                "the pipeline has no list named 'pipeline'",
-                where=name or None,
-                found=f"an object with {', '.join(map(repr, value)) or 'nothing in it'}"[:200],
-                cure='Write {"pipeline": [...]}, or the list alone',
-            )
-        stages = value["pipeline"]
-    elif isinstance(value, list):
-        stages = value
-    else:
-        raise PipelineError(
-            "the pipeline must be a list or an object", where=name or None, found=type(value).__name__
-        )
-    lines = _lines(clean, len(stages), isinstance(value, dict))
-    return _checked(PipelineSource(stages, lines, name))
+        found = str(error)[:200]
+        raise PipelineError("the pipeline is not valid JSON", where=name or None, found=found) from None
+    stages = value.get("pipeline") if isinstance(value, dict) else value
+    if not isinstance(stages, _Stages):
+        what, found = "must be a list or an object", type(value).__name__
+        if isinstance(value, dict):
+            what = "has no list named 'pipeline'"
+            found = f"an object with {', '.join(map(repr, value)) or 'nothing in it'}"[:200]
+        cure = 'Write {"pipeline": [...]}, or the list alone'
+        raise PipelineError(f"the pipeline {what}", where=name or None, found=found, cure=cure)
+    ends = [match.start() for match in re.finditer("\n", clean)]
+    return _checked(PipelineSource(stages, [bisect(ends, at) + 1 for at in stages.starts], name))
 
 
-def _checked(source: PipelineSource) -> PipelineSource:
-    if not source.stages:
-        raise PipelineError("the pipeline has no stages", where=source.name or None)
-    for index, stage in enumerate(source.stages):
-        where = source.where(index)
-        if not isinstance(stage, str | dict):
-            raise PipelineError(
-                "a stage is an object, or a file name", where=where, found=json.dumps(stage, default=str)[:80]
-            )
-        _check_values(stage, where)
-        if not isinstance(stage, dict):
-            continue
-        for key, kinds, what in _SHAPES:
-            value = stage.get(key, "")
-            if not isinstance(value, kinds) or (
-                isinstance(value, list) and not all(isinstance(v, str) for v in value)
-            ):
-                raise PipelineError(
-                    f"a stage's '{key}' is {what}", where=where, found=json.dumps(value, default=str)[:80]
-                )
-    return source
+class _Stages(list):
+    """A list, and where in the text its items begin."""
+
+    starts: list[int]
+
+
+class _Decoder(json.JSONDecoder):
+    def __init__(self) -> None:
+        super().__init__(parse_constant=_no_constant)
+        self.parse_array: Any = self._array
+        self.scan_once = py_make_scanner(self)
+
+    @staticmethod
+    def _array(begin: tuple[str, int], scan: Any) -> tuple[_Stages, int]:
+        starts: list[int] = []
+
+        def noted(text: str, at: int) -> Any:
+            starts.append(at)
+            return scan(text, at)
+
+        values, end = JSONArray(begin, noted)
+        found = _Stages(values)
+        found.starts = starts
+        return found, end
+
+
+def _no_constant(word: str) -> None:
+    """NaN and Infinity, which PDAL refuses too."""
+    raise ValueError(f"{word} is not a JSON number")
 
 
 #: What PDAL wants of the options that wire stages together.
@@ -145,6 +142,24 @@ _SHAPES: tuple[tuple[str, tuple[type, ...], str], ...] = (
 )
 
 
+def _checked(source: PipelineSource) -> PipelineSource:
+    if not source.stages:
+        raise PipelineError("the pipeline has no stages", where=source.name or None)
+    for index, stage in enumerate(source.stages):
+        where = source.where(index)
+        if not isinstance(stage, str | dict):
+            found = json.dumps(stage, default=str)[:80]
+            raise PipelineError("a stage is an object, or a file name", where=where, found=found)
+        _check_values(stage, where)
+        for key, kinds, what in _SHAPES if isinstance(stage, dict) else ():
+            value = stage.get(key, "")  # type: ignore[union-attr]
+            tags = value if isinstance(value, list) else []
+            if not isinstance(value, kinds) or not all(isinstance(tag, str) for tag in tags):
+                found = json.dumps(value, default=str)[:80]
+                raise PipelineError(f"a stage's '{key}' is {what}", where=where, found=found)
+    return source
+
+
 def _check_values(stage: Any, where: str) -> None:
     """Refuse what PDAL cannot be given: it takes UTF-8 without NUL, and numbers that a double holds."""
     try:
@@ -153,52 +168,30 @@ def _check_values(stage: Any, where: str) -> None:
         if "\\u0000" in text:
             raise ValueError("a text holds a NUL character")
     except UnicodeEncodeError as error:
-        found = ascii(error.object[error.start - 40 if error.start > 40 else 0 : error.end])
+        found = ascii(error.object[max(0, error.start - 40) : error.end])
         cure = "If it is a file's name, rename the file"
         raise PipelineError("a text is not valid UTF-8", where=where, found=found, cure=cure) from None
     except (ValueError, RecursionError) as error:
         raise PipelineError("a stage holds what PDAL cannot be given", where=where, found=error) from None
 
 
-def _looks_like_json(text: str) -> bool:
-    start = text.lstrip("\ufeff \t\r\n")[:2]
-    return start[:1] in ("[", "{") or start in ("//", "/*")
-
-
 # The closing quote is optional, so that a match never fails: searching stays linear whatever the text.
-_STRING = r'"[^"\\\n]*(?:\\.[^"\\\n]*)*"?'
-_STRING_OR_COMMENT = re.compile(rf"{_STRING}|//|/\*")
+_STRING_OR_COMMENT = re.compile(r'"[^"\\\n]*(?:\\.[^"\\\n]*)*"?|//[^\n]*|/\*(?s:.*?)(\*/|\Z)')
 
 
-def _without_comments(text: str, name: str = "") -> str:
+def _without_comments(text: str, name: str) -> str:
     """Comments as spaces, so that places stay."""
-    if "/" not in text:
-        return text
-    parts, at = [], 0
-    while (match := _STRING_OR_COMMENT.search(text, at)) is not None:
-        start, end = match.span()
-        if match.group() == "//":
-            end = text.find("\n", start)
-            end = len(text) if end < 0 else end
-        elif match.group() == "/*":
-            end = text.find("*/", start + 2) + 2
-            if end < 2:
-                raise PipelineError(
-                    "a comment that begins with /* does not end",
-                    where=f"{name or 'pipeline'}, line {text.count(chr(10), 0, start) + 1}",
-                    cure="Close it with */",
-                )
-        else:
-            parts.append(text[at:end])
-            at = end
-            continue
-        parts += [text[at:start], re.sub(r"[^\n]", " ", text[start:end])]
-        at = end
-    return "".join([*parts, text[at:]])
 
+    def blank(match: re.Match[str]) -> str:
+        if match[0][0] == '"':
+            return match[0]
+        if match[1] == "":
+            where = f"{name or 'pipeline'}, line {text.count(chr(10), 0, match.start()) + 1}"
+            what = "a comment that begins with /* does not end"
+            raise PipelineError(what, where=where, cure="Close it with */")
+        return re.sub(r"[^\n]", " ", match[0])
 
-def _no_constant(word: str):
-    raise ValueError(f"{word} is not a JSON number")
+    return _STRING_OR_COMMENT.sub(blank, text)
 
 
 def _cure(text: str, error: json.JSONDecodeError) -> str | None:
@@ -212,39 +205,3 @@ def _cure(text: str, error: json.JSONDecodeError) -> str | None:
     if error.msg == "Extra data":
         return "A pipeline is one list or object; remove what follows it"
     return None
-
-
-_VISIBLE = re.compile(r"\S")
-
-
-def _lines(text: str, count: int, is_object: bool) -> list[int]:
-    """The line each stage begins on: walk the list item by item."""
-    decoder = json.JSONDecoder(parse_constant=_no_constant)
-
-    def skip(at: int) -> int:
-        return len(text) if (found := _VISIBLE.search(text, at)) is None else found.start()
-
-    at = skip(0)
-    begin = at
-    if is_object:
-        at = skip(at + 1)
-        begin = -1
-        while text[at] != "}":
-            key, at = decoder.raw_decode(text, at)
-            at = skip(skip(at) + 1)
-            if key == "pipeline":  # of equal keys the last counts, as in json.loads
-                begin = at
-            _, at = decoder.raw_decode(text, at)
-            at = skip(at)
-            if text[at] == ",":
-                at = skip(at + 1)
-    lines: list[int] = []
-    at = skip(begin + 1)
-    line, counted = 1, 0
-    while len(lines) < count:
-        line += text.count("\n", counted, at)
-        counted = at
-        lines.append(line)
-        _, at = decoder.raw_decode(text, at)
-        at = skip(skip(at) + 1)
-    return lines

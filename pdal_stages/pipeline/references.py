@@ -17,16 +17,8 @@ from .filenames import is_writer, readers_files
 MOVING = ("filters.reprojection", "filters.projpipeline", "filters.transformation", "filters.georeference")
 #: What differs between references whose coordinates lie within a meter: units are compared apart.
 _ALIKE = ("+datum=WGS84", "+datum=NAD83", "+ellps=WGS84", "+ellps=GRS80")
-_ASIDE = (
-    "+units",
-    "+vunits",
-    "+to_meter",
-    "+vto_meter",
-    "+towgs84",
-    "+geoidgrids",
-    "+no_defs",
-    "+type",
-    "+wktext",
+_ASIDE = tuple(
+    f"+{word}" for word in ["units", "vunits", "to_meter", "vto_meter", "towgs84", "geoidgrids", "no_defs", "type", "wktext"]
 )
 
 
@@ -96,11 +88,12 @@ def check_one_reference(found: Mapping[str, Reference]) -> list[str]:
             planes.setdefault(one.plane, f"{one.name} in {path}")
         if one.height:
             heights.setdefault(one.height, f"{one.name} in {path}")
-    for what, kinds in (
-        ("units of length", units),
-        ("reference systems", planes),
-        ("reference systems of heights", heights),
-    ):
+    kinds_of = {
+        "units of length": units,
+        "reference systems": planes,
+        "reference systems of heights": heights,
+    }
+    for what, kinds in kinds_of.items():
         if len(kinds) > 1:
             raise StageError(
                 f"the inputs have different {what}",

@@ -81,13 +81,13 @@ class Pipeline:
     @property
     def messages(self) -> list[str]:
         """Warnings of the pipeline, then warnings and notes of our stages; what several stages report comes once."""
-        by_text: dict[str, list[str]] = {}
+        places: dict[str, dict[str, None]] = {}
         for place, reports in self.reports:
-            for report in reports:
-                for text in report.messages:
-                    by_text.setdefault(text, []).append(place)
-        by_text = {text: list(dict.fromkeys(places)) for text, places in by_text.items()}
-        of_stages = [text if len(places) > 1 else f"{places[0]}: {text}" for text, places in by_text.items()]
+            for text in [text for report in reports for text in report.messages]:
+                places.setdefault(text, {})[place] = None
+        of_stages = [
+            text if len(said) > 1 else f"{next(iter(said))}: {text}" for text, said in places.items()
+        ]
         return [*self.warnings, *of_stages]
 
     @property
@@ -146,12 +146,7 @@ class Pipeline:
         stages = pdal_env.stages_of(other)
         return NotImplemented if stages is None else Pipeline(stages) | self
 
-    def execute(
-        self,
-        *,
-        arrays: bool = True,
-        loglevel: int = logging.WARNING,
-    ) -> int:
+    def execute(self, *, arrays: bool = True, loglevel: int = logging.WARNING) -> int:
         """Run the pipeline in this process; the number of points that came out.
 
         Files are written in hidden folders and renamed at the end, so an output is whole
@@ -184,9 +179,8 @@ class Pipeline:
                         run[number] = las_output.uncompressed_writer(stage, run[:number])
                 try:
                     with interrupts.gentle(signal.SIGINT):
-                        result = pdal_env.execute(
-                            callbacks.check_ground(run), arrays=arrays, loglevel=loglevel
-                        )
+                        run = callbacks.check_ground(run)
+                        result = pdal_env.execute(run, arrays=arrays, loglevel=loglevel)
                         interrupts.check()
                     compressed = las_output.compress(partials)
                 finally:
@@ -219,11 +213,9 @@ class Pipeline:
         stages = self.lowered.stages
         if stages and not is_reader(stages, 0):  # newer PDAL refuses it, older PDAL runs it on nothing
             first = [ours.stage.type for ours in self.lowered.ours if ours.index == 0]
-            raise PipelineError(
-                "the pipeline does not start with a reader",
-                found=(first or [stages[0].get("type", "")])[0],
-                cure="Put the file that is to be read first",
-            )
+            found = (first or [stages[0].get("type", "")])[0]
+            cure = "Put the file that is to be read first"
+            raise PipelineError("the pipeline does not start with a reader", found=found, cure=cure)
         check_dimensions(self.lowered)
         odd = (check_readable(path) for path in readers_files(self.lowered.stages, las=True))
         self.warnings = [*self.lowered.warnings, *filter(None, odd)]
@@ -235,26 +227,25 @@ class Pipeline:
         """PDAL's words, with the line of the stage that they name and the nearest stage there is."""
         if not isinstance(error, PipelineError) or error.where is not None:
             return error
-        if _NOT_UTF8.search(str(error.found)):
-            for path in readers_files(self.lowered.stages, las=True):
-                if (odd := odd_text(path)) is not None:
-                    return PipelineError(
-                        f"the {odd[0]} in the LAS file is not UTF-8, which PDAL's filters.python cannot take",
-                        where=path,
-                        found=str(odd[1])[1:],
-                        cure=f"Write the file anew first: pdal translate {path} clean.laz",
-                    )
-        named = _STAGE_TYPE.search(str(error.found or ""))
-        if named is None:
+        found = str(error.found or "")
+        for path in readers_files(self.lowered.stages, las=True) if _NOT_UTF8.search(found) else ():
+            if (odd := odd_text(path)) is not None:
+                return PipelineError(
+                    f"the {odd[0]} in the LAS file is not UTF-8, which PDAL's filters.python cannot take",
+                    where=path,
+                    found=str(odd[1])[1:],
+                    cure=f"Write the file anew first: pdal translate {path} clean.laz",
+                )
+        if (named := _STAGE_TYPE.search(found)) is None:
             return error
-        given = [s.get("type") if isinstance(s, dict) else None for s in self.source.stages]
-        if given.count(named.group()) == 1 and self.source.lines[given.index(named.group())]:
-            error.where = self.source.where(given.index(named.group()))
-        if error.cure is None and (option := _NO_OPTION.search(str(error.found))):
-            error.cure = describe.nearest_option(named.group(), option.group(1))
-        if error.cure is None and _NO_STAGE.search(str(error.found)):
-            error.found = str(error.found).splitlines()[0]
-            error.cure = describe.nearest_stage(named.group())
+        given = [stage.get("type") if isinstance(stage, dict) else None for stage in self.source.stages]
+        if given.count(named[0]) == 1 and self.source.lines[given.index(named[0])]:
+            error.where = self.source.where(given.index(named[0]))
+        if error.cure is None and (option := _NO_OPTION.search(found)):
+            error.cure = describe.nearest_option(named[0], option[1])
+        if error.cure is None and _NO_STAGE.search(found):
+            error.found = found.splitlines()[0]
+            error.cure = describe.nearest_stage(named[0])
         return error
 
 
@@ -277,7 +268,9 @@ def _named_metadata(metadata: dict[str, Any], reports: list[tuple[str, list[Repo
     if not isinstance(inner, dict):
         return metadata
     scripts = filter(None, _several(inner.pop("filters.python", None)))
-    theirs = [s for s in scripts if not (isinstance(s, dict) and s.keys() & registry.stages().keys())]
+    theirs = [
+        s for s in scripts if not (isinstance(s, dict) and any(name in registry.stages() for name in s))
+    ]
     named = [(name.partition(" ")[0], report.to_dict()) for name, views in reports for report in views]
     for kind, node in [*(("filters.python", node) for node in theirs), *named]:
         inner[kind] = [*_several(inner[kind]), node] if kind in inner else node

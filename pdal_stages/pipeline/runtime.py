@@ -56,16 +56,14 @@ def python_filter(
     label: str, source: str, arguments: dict[str, Any], adds: Mapping[str, str]
 ) -> dict[str, Any]:
     """A ``filters.python`` that runs `source` and adds dimensions (name -> PDAL type)."""
-    out: dict[str, Any] = {
+    out = {
         "type": "filters.python",
         "module": label,
         "function": "stage",
         "source": source,
         "pdalargs": arguments,
     }
-    if adds:
-        out["add_dimension"] = [f"{name}={kind}" for name, kind in adds.items()]
-    return out
+    return {**out, "add_dimension": [f"{name}={kind}" for name, kind in adds.items()]} if adds else out
 
 
 def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
@@ -89,9 +87,8 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
         module["out_metadata"] = node(arguments["stage"], leaves(report))
         _reports.setdefault(label, []).append(report)
     except BaseException as error:
-        failure = as_stage_error(error, place(arguments["stage"], arguments.get("tag")))
-        _failures[label] = failure
-        hand_over(failure, outs)
+        _failures[label] = as_stage_error(error, place(arguments["stage"], arguments.get("tag")))
+        hand_over(_failures[label], outs)
     return True
 
 
@@ -157,16 +154,12 @@ def as_stage_error(error: BaseException, where: str) -> StageError:
     if isinstance(error, StageError):
         return error.at(where)
     if isinstance(error, MemoryError):
-        return StageError(
-            "memory ran out",
-            where=where,
-            cure="Lower 'memory', work in tiles (--tile), or take fewer features",
-        )
+        cure = "Lower 'memory', work in tiles (--tile), or take fewer features"
+        return StageError("memory ran out", where=where, cure=cure)
     if isinstance(error, KeyboardInterrupt):
         return InterruptedStage("interrupted", where=where)
-    failure = StageError(
-        f"{type(error).__name__}: {error}", where=where, cure="Run with --debug and report it"
-    )
+    cure = "Run with --debug and report it"
+    failure = StageError(f"{type(error).__name__}: {error}", where=where, cure=cure)
     failure.__traceback__ = error.__traceback__
     return failure
 
@@ -178,11 +171,10 @@ def _encodable(text: str) -> str:
 
 def wkt_of(reference: Any) -> str:
     """The well-known text in PDAL's description of a spatial reference."""
-    if isinstance(reference, dict):
-        srs = reference.get("srs", reference)
-        if isinstance(srs, dict):
-            return str(srs.get("compoundwkt") or srs.get("wkt") or srs.get("horizontal") or "")
-    return ""
+    srs = reference.get("srs", reference) if isinstance(reference, dict) else None
+    if not isinstance(srs, dict):
+        return ""
+    return str(srs.get("compoundwkt") or srs.get("wkt") or srs.get("horizontal") or "")
 
 
 def node(name: str, children: list[dict[str, Any]]) -> dict[str, Any]:
@@ -210,9 +202,6 @@ def leaf(name: str, value: Any) -> dict[str, Any]:
     return {"name": name, "value": _encodable(text), "type": kind, "description": "", "children": []}
 
 
-# ---- for the runners in the same process -----------------------------------------------------------
-
-
 def remember_stdout() -> None:
     """Keep this process's ``sys.stdout``, to be put back if a stage fails."""
     global _usual_stdout
@@ -229,11 +218,6 @@ def restore_stdout() -> None:
 
 def _redirected() -> bool:
     return type(sys.stdout).__module__ == "redirector"  # PDAL's own type
-
-
-def failure_of(label: str) -> StageError | None:
-    """How a lowered stage failed, as far as that is not collected."""
-    return _failures.get(label)
 
 
 def collect(label: str) -> tuple[list[Report], StageError | None]:

@@ -37,7 +37,8 @@ def locations(path: str, column: str = "location") -> list[str]:
             )
         if odd := [name for name in names if not (isinstance(name, str) and name) or "\0" in name]:
             raise ValueError(f"{odd[0]!r} is not a file's name")
-        found = [_resolve(name, file.absolute().parent) for name in dict.fromkeys(names)]
+        there = {name: file.absolute().parent / name for name in names}
+        found = [str(path if path.exists() else Path(name).absolute()) for name, path in there.items()]
     except (
         OSError,
         ValueError,
@@ -58,11 +59,6 @@ def locations(path: str, column: str = "location") -> list[str]:
     return found
 
 
-def _resolve(name: str, folder: Path) -> str:
-    beside = folder / name
-    return str(beside if beside.exists() else Path(name).absolute())
-
-
 def _sqlite(file: Path, column: str) -> list[str]:
     file.stat()  # sqlite3 would make a missing file
     with sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro", uri=True) as base:
@@ -80,18 +76,11 @@ def _dbf(data: bytes, column: str) -> list[str]:
     if not width or start + rows * width > len(data):
         raise ValueError(f"{rows:,} rows in {len(data):,} bytes")
     at, offset = 32, 1
-    while data[at] != 0x0D:
-        name = data[at : at + 11].split(b"\0")[0].decode("latin-1")
-        length = data[at + 16]
-        if name == column[:10]:
-            break
-        offset += length
+    while data[at : at + 11].split(b"\0")[0].decode("latin-1") != column[:10]:
+        if data[at] == 0x0D:
+            raise KeyError(column)
+        offset += data[at + 16]
         at += 32
-    else:
-        raise KeyError(column)
-    out = []
-    for row in range(rows):
-        record = data[start + row * width : start + (row + 1) * width]
-        if record[:1] != b"*":
-            out.append(record[offset : offset + length].decode("utf-8", "replace").strip())
-    return out
+    records = (data[begin : begin + width] for begin in range(start, start + rows * width, width))
+    texts = (one[offset : offset + data[at + 16]] for one in records if one[:1] != b"*")
+    return [text.decode("utf-8", "replace").strip() for text in texts]

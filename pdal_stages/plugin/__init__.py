@@ -1,1 +1,1 @@
-"""Our stages as PDAL's own, for all that runs PDAL: what the C++ of ``native/`` is compiled from, and what it calls."""
+"""Our stages as PDAL's own, for all that runs PDAL: what ``stage.cpp`` is compiled with, and what it calls."""

@@ -1,4 +1,4 @@
-"""Where a native stage arrives in Python: the two questions that ``native/stage.cpp`` asks through ``filters.python``.
+"""Where a native stage arrives in Python: the two questions that ``stage.cpp`` asks through ``filters.python``.
 
 `prepare` is asked before any point is read: what is wrong with the options comes up here, and which dimensions they ask
 for. `run` does the work on one point view. An answer is metadata of the script, a list of named texts; a failure is the
@@ -10,8 +10,8 @@ from __future__ import annotations
 import json
 import signal
 import sys
-from collections import OrderedDict
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 from ..base.errors import StageError
@@ -23,8 +23,8 @@ from ..stages.options import Option, split_list
 from . import declarations
 
 #: Stages made when a pipeline was prepared, until it has run; of pipelines that never run, so many are kept.
-_KEPT = 16
-_prepared: OrderedDict[str, Stage] = OrderedDict()
+_MOST = 16
+_prepared: dict[str, Stage] = {}
 _Leaf = dict[str, Any]
 
 
@@ -40,15 +40,21 @@ def arrive(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any])
         PDAL's dimensions, and the ones to write back.
     """
     question = module["pdalargs"]
-    where = runtime.place(question["stage"], question.get("tag"))
+    label, where = question["label"], runtime.place(question["stage"], question.get("tag"))
     _end_on_interrupt()
     # PDAL's module object stays alive; the register need not grow.
-    sys.modules.pop(question["label"], None)
+    sys.modules.pop(label, None)
     try:
-        answer = _prepare(question) if question["step"] == "prepare" else _run(question, module, ins, outs)
+        if question["step"] == "prepare":
+            answer = _prepare(question)
+        else:
+            stage = _prepared.get(label) or _made(question)[0]
+            answer = runtime.leaves(runtime.run_on_view(stage, module, ins, outs))
+            if question.get("last"):
+                _prepared.pop(label, None)
     except BaseException as error:
         outs.clear()
-        _prepared.pop(question["label"], None)
+        _prepared.pop(label, None)
         answer = [runtime.leaf("pdal_stages_error", str(runtime.as_stage_error(error, where)))]
     module["out_metadata"] = runtime.node("pdal_stages", answer)
     return True
@@ -57,29 +63,22 @@ def arrive(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any])
 def _prepare(question: Mapping[str, Any]) -> list[_Leaf]:
     stage, warning = _made(question)
     _prepared[question["label"]] = stage
-    while len(_prepared) > _KEPT:
-        _prepared.popitem(last=False)
+    while len(_prepared) > _MOST:
+        del _prepared[next(iter(_prepared))]
     answer = [runtime.leaf("dimension", f"{name}={kind}") for name, kind in stage.creates().items()]
-    if warning is not None:
-        answer.append(runtime.leaf("pdal_stages_warning", warning))
-    return answer
-
-
-def _run(
-    question: Mapping[str, Any], module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]
-) -> list[_Leaf]:
-    label = question["label"]
-    stage = _prepared.get(label) or _made(question)[0]
-    report = runtime.run_on_view(stage, module, ins, outs)
-    if question.get("last"):
-        _prepared.pop(label, None)
-    return runtime.leaves(report)
+    return [*answer, *([] if warning is None else [runtime.leaf("pdal_stages_warning", warning)])]
 
 
 def _made(question: Mapping[str, Any]) -> tuple[Stage, str | None]:
     """The stage of a question, and what its user should know of the stages before it."""
-    _check_version(question)
     kind = registry.get(question["stage"])
+    if (question["version"], question["digest"]) != (__version__, declarations.digest(kind)):
+        raise StageError(
+            "PDAL's plugin of this stage was built for another version of pdal_stages",
+            found=f"plugin {question['version']} ({question['digest']}), package {__version__} "
+            f"({declarations.digest(kind)}) in {sys.prefix}",
+            cure="Build it again: pdal-stages plugin --install",
+        )
     texts: dict[str, list[str]] = {}
     for name, value in question["options"]:
         texts.setdefault(name, []).append(value)
@@ -87,18 +86,7 @@ def _made(question: Mapping[str, Any]) -> tuple[Stage, str | None]:
     given = lowering.settled({**kind.from_pipeline(texts, before), **_parsed(kind, texts)})
     where = runtime.place(kind.type, question.get("tag"))
     stage = kind({name: value for name, value in given.items() if name not in lowering.PDAL_OWN}, where)
-    warning = lowering.settle_upstream(stage, [(one, _creates(one)) for one in before]).warning
-    return stage, warning
-
-
-def _check_version(question: Mapping[str, Any]) -> None:
-    if question["version"] != __version__ or question["digest"] != declarations.digest():
-        raise StageError(
-            "PDAL's plugin of this stage was built for another version of pdal_stages",
-            found=f"plugin {question['version']} ({question['digest']}), package {__version__} "
-            f"({declarations.digest()}) in {sys.prefix}",
-            cure="Build it again: pdal-stages plugin --install",
-        )
+    return stage, lowering.settle_upstream(stage, [(one, _creates(one)) for one in before])[1]
 
 
 def _stages(text: str) -> list[dict[str, Any]]:
@@ -112,21 +100,23 @@ def _stages(text: str) -> list[dict[str, Any]]:
 
 def _typed(stage: Mapping[str, Any]) -> dict[str, Any]:
     """A stage of PDAL's serialized pipeline, its values as one writes them in JSON; before PDAL 2.9 all of them are text."""
-    if stage.get("type") in registry.stages():
-        kind = registry.get(stage["type"])
-        own = {name: _texts(value) for name, value in stage.items() if name not in ("type", "inputs")}
-        return {"type": kind.type, **lowering.settled(_parsed(kind, own))}
-    return {name: _number(value) if isinstance(value, str) else value for name, value in stage.items()}
+    if stage.get("type") not in registry.stages():
+        return {name: _number(value) if isinstance(value, str) else value for name, value in stage.items()}
+    kind, own = registry.get(stage["type"]), {}
+    for name, value in stage.items():
+        if name not in ("type", "inputs"):
+            values = value if isinstance(value, list) else [value]
+            own[name] = [one if isinstance(one, str) else json.dumps(one) for one in values]
+    return {"type": kind.type, **lowering.settled(_parsed(kind, own))}
 
 
 def _creates(stage: Mapping[str, Any]) -> Mapping[str, str]:
     """What a stage before makes, as far as it matters: of ours, what it says; of PDAL's, heights."""
     if stage.get("type") not in registry.stages():
         return lowering.heights_of(stage)
-    kind = registry.get(stage["type"])
     options = {k: v for k, v in stage.items() if k not in ("type", *lowering.PDAL_OWN)}
     try:
-        return kind(options).creates()
+        return registry.get(stage["type"])(options).creates()
     except StageError:  # its own preparation has said so
         return {}
 
@@ -137,24 +127,17 @@ def _parsed(kind: type[Stage], texts: Mapping[str, list[str]]) -> dict[str, Any]
     return {name: _value(known.get(name), values) for name, values in texts.items()}
 
 
-def _texts(value: Any) -> list[str]:
-    values = value if isinstance(value, list) else [value]
-    return [one if isinstance(one, str) else json.dumps(one) for one in values]
-
-
 def _value(option: Option | None, texts: list[str]) -> Any:
-    if option is None:
-        return texts[-1]
-    if declarations.is_list(option):
-        return [_number(part) for text in texts for part in split_list(text)]
     text = texts[-1]
+    if option is None:
+        return text
+    if declarations.is_list(option):
+        return [_number(part) for one in texts for part in split_list(one)]
     if option.kind == "boolean" and text in ("true", "false", "invert"):
         return text == "true" if text != "invert" else not option.default
     if option.kind == "mapping":
-        try:
+        with suppress(ValueError):
             return json.loads(text)
-        except ValueError:
-            return text
     return _number(text) if option.kind in ("number", "integer") else text
 
 
@@ -163,10 +146,8 @@ def _number(text: str) -> Any:
     if text in ("true", "false"):
         return text == "true"
     for kind in (int, float):
-        try:
+        with suppress(ValueError):
             return kind(text) if "_" not in text else text
-        except ValueError:
-            continue
     return text
 
 
@@ -176,7 +157,5 @@ def _end_on_interrupt() -> None:
     There filters.python starts an interpreter, which takes the signal and keeps it while PDAL works.
     """
     if not sys.orig_argv and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        try:
+        with suppress(ValueError):  # of another thread
             signal.signal(signal.SIGINT, signal.SIG_DFL)
-        except ValueError:  # of another thread
-            pass

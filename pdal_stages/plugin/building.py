@@ -10,7 +10,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,7 @@ from . import declarations, places
 
 #: Beside the libraries: what was put there, by which version, for which PDAL.
 RECORD = "pdal_stages_plugin.json"
-_PACKAGE = "pdal-stages-plugin"
-_FLAGS = ["-std=c++17", "-O1", "-fPIC", "-fvisibility=hidden", "-w"]
+SOURCE = Path(__file__).with_name("stage.cpp")
 
 
 def library_name(type_name: str) -> str:
@@ -50,7 +48,7 @@ def install(folder: Path | None = None) -> list[Path]:
         If it does not compile, or the folder cannot be written.
     """
     target = folder or usual_folder()
-    found = places.pdal()
+    found, cxx = places.pdal(), places.compiler()
     if folder is not None:
         with contextlib.suppress(OSError):  # told below
             folder.mkdir(parents=True, exist_ok=True)
@@ -62,48 +60,36 @@ def install(folder: Path | None = None) -> list[Path]:
         )
     # In the same folder, so that a file is renamed into place; PDAL looks only at names of its own.
     with tempfile.TemporaryDirectory(prefix=".pdal_stages_", dir=target) as work:
-        built = compile_into(Path(work), found)
+        library = Path(work, "library")
+        Path(work, "declarations.hpp").write_text(declarations.header())
+        link = ["-shared", f"-L{found.library}", "-lpdalcpp", f"-Wl,-rpath,{found.library}"]
+        link += [] if sys.platform == "darwin" else ["-Wl,-Bsymbolic", "-s"]
+        flags = ["-std=c++17", "-O1", "-fPIC", "-fvisibility=hidden", "-w", f"-I{work}", f"-I{found.headers}"]
+        _run([*cxx, *flags, str(SOURCE), *link, "-o", str(library)])
         uninstall(target)
-        files = []
-        for path in built:
-            files.append(target / path.name)
-            os.replace(path, files[-1])
+        files = [target / library_name(kind) for kind in registry.stages()]
         record = {
             "pdal_stages": __version__,
-            "digest": declarations.digest(),
+            "digest": _digest(),
             "pdal": found.version,
             "python": sys.prefix,
             "files": [path.name for path in files],
         }
-        written = Path(work) / RECORD
-        written.write_text(json.dumps(record, indent=2) + "\n")
-        os.replace(written, target / RECORD)
+        Path(work, RECORD).write_text(json.dumps(record, indent=2) + "\n")
+        for path in files:
+            os.replace(shutil.copy(library, Path(work, path.name)), path)
+        os.replace(Path(work, RECORD), target / RECORD)
     return files
 
 
-def compile_into(work: Path, pdal: places.Pdal) -> list[Path]:
-    """The libraries, one for each stage, compiled in a folder."""
-    source, cxx = places.sources(), places.compiler()
-    declarations.write(work)
-    flags = [*_FLAGS, f"-I{work}", f"-I{pdal.headers}"]
-    _run([*cxx, *flags, "-c", str(source / "stage.cpp"), "-o", str(work / "stage.o")])
-    link = ["-shared", f"-L{pdal.library}", "-lpdalcpp", f"-Wl,-rpath,{pdal.library}"]
-    if sys.platform != "darwin":
-        link += ["-Wl,-Bsymbolic", "-s"]
-    built = []
-    for type_name in registry.stages():
-        built.append(work / library_name(type_name))
-        define = f'-DPDAL_STAGES_TYPE="{type_name}"'
-        entry = [define, str(source / "entry.cpp"), str(work / "stage.o")]
-        _run([*cxx, *_FLAGS, *entry, *link, "-o", str(built[-1])])
-    return built
+def _digest() -> str:
+    """Changes with any stage, option, default or help."""
+    return " ".join(map(declarations.digest, registry.stages().values()))
 
 
 def uninstall(folder: Path | None = None) -> list[Path]:
     """Take the plugin away; the files that were there."""
     target = folder or usual_folder()
-    if record(target) is None and _by_pip() is not None:
-        raise StageError("the plugin came as a package", found=_PACKAGE, cure=f"pip uninstall {_PACKAGE}")
     names = [*(record(target) or {}).get("files", []), *map(library_name, registry.stages()), RECORD]
     files = [target / Path(name).name for name in dict.fromkeys(names)]  # never outside the folder
     gone = [path for path in files if path.is_file()]
@@ -128,16 +114,11 @@ def check(folder: Path | None = None) -> tuple[list[str], list[str]]:
     """What is there, and what is missing or wrong, each with its cure."""
     good: list[str] = []
     bad: list[str] = []
-    no_compiler: list[str] = []  # no fault where all is built
-    pdal_version = ""
-    try:
-        good.append(f"compiler: {shutil.which(places.compiler()[0])}")
-    except DependencyError as error:
-        no_compiler.append(str(error))
+    version = ""
     try:
         found = places.pdal()
-        pdal_version = found.version
-        good.append(f"PDAL {found.version}: {found.library}, headers {found.headers / 'pdal'}")
+        version = found.version
+        good.append(f"PDAL {version}: {found.library}, headers {found.headers / 'pdal'}")
     except DependencyError as error:
         bad.append(str(error))
     try:
@@ -145,55 +126,38 @@ def check(folder: Path | None = None) -> tuple[list[str], list[str]]:
         folder = folder or usual_folder()
     except DependencyError as error:
         bad.append(str(error))
-    if folder is None:
-        return good, no_compiler + bad
-    cure = "pdal-stages plugin --install"
-    if (kept := record(folder)) is None:
-        version = _by_pip()
-        if version == __version__:
-            return [*good, f"plugin: the package {_PACKAGE} {version}"], bad
-        if version is not None:
-            bad.append(
-                f"{_PACKAGE} is of another version (found {version}, pdal-stages {__version__}). Upgrade both"
-            )
-            return good, bad
-        return good, [*no_compiler, *bad, f"the plugin is not in {folder}. {cure}"]
-    missing = [name for kind in registry.stages() if not (folder / (name := library_name(kind))).is_file()]
-    wrong = {
-        f"libraries are missing in {folder} (found {', '.join(missing)})": bool(missing),
-        f"the plugin in {folder} is of another version (found {kept.get('pdal_stages')}, package {__version__})": (
-            kept.get("pdal_stages") != __version__
-        ),
-        f"the plugin in {folder} is out of date: options of stages have changed since": (
-            kept.get("digest") != declarations.digest()
-        ),
-        f"the plugin in {folder} was built for another PDAL (found {kept.get('pdal')})": (
-            bool(pdal_version) and kept.get("pdal") != pdal_version
-        ),
-    }
-    bad += [f"{text}. {cure}" for text, is_so in wrong.items() if is_so]
-    if bad:
-        return good, no_compiler + bad
-    return [*good, f"plugin: {len(kept['files'])} stages in {folder}"], []
-
-
-def _by_pip() -> str | None:
-    """The version of the plugin that pip or conda installed."""
+    kept = record(folder) if folder else None
+    if folder and kept is not None:
+        lacking = [n for kind in registry.stages() if not (folder / (n := library_name(kind))).is_file()]
+        place = f"the plugin in {folder}"
+        wrong = {
+            f"libraries are missing in {folder} (found {', '.join(lacking)})": bool(lacking),
+            f"{place} is of another version (found {kept.get('pdal_stages')}, package {__version__})": (
+                kept.get("pdal_stages") != __version__
+            ),
+            f"{place} is out of date: options of stages have changed since": kept.get("digest") != _digest(),
+            f"{place} was built for another PDAL (found {kept.get('pdal')})": version
+            not in ("", kept.get("pdal")),
+        }
+        bad += [f"{text}. pdal-stages plugin --install" for text, is_so in wrong.items() if is_so]
+        if not bad:
+            good.append(f"plugin: {len(kept['files'])} stages in {folder}")
+    elif folder:
+        bad.append(f"the plugin is not in {folder}. pdal-stages plugin --install")
     try:
-        return metadata.version(_PACKAGE)
-    except metadata.PackageNotFoundError:
-        return None
+        good.insert(0, f"compiler: {shutil.which(places.compiler()[0])}")
+    except DependencyError as error:
+        bad = [str(error), *bad] if bad else []  # no fault where all is built
+    return good, bad
 
 
 def _run(command: Sequence[str]) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        errors = [line for line in done.stderr.splitlines() if "error" in line] or done.stderr.splitlines()[
-            -1:
-        ]
+        lines = done.stderr.splitlines()
         raise StageError(
             "the plugin does not compile",
-            found=f"{' '.join(command[:1])}: {'; '.join(errors[:3])}",
+            found=f"{command[0]}: {'; '.join([line for line in lines if 'error' in line][:3] or lines[-1:])}",
             cure="Report it with PDAL's version; every other door works without the plugin: pdal-stages pipeline, "
             "pdal-stages expand",
         )

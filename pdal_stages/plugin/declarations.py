@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import hashlib
-import sys
-from functools import cache
-from pathlib import Path
 
 from ..base.version import __version__
 from ..stages import registry
 from ..stages.base import Stage
 from ..stages.options import Option
 
-#: Options that every PDAL filter declares by itself.
-OF_PDAL = ("where",)
 #: Kind of option -> how PDAL's parser takes it; all else as text, which Python parses.
-_KINDS = {"number": "Number", "integer": "Integer", "boolean": "Boolean"}
-_LISTS = ("list", "codes", "selection")
+_KINDS = {
+    "number": "Number",
+    "integer": "Integer",
+    "boolean": "Boolean",
+    "list": "List",
+    "codes": "List",
+    "selection": "List",
+}
 
 _HEADER = """\
-// Written by pdal_stages {version} from its stages' declarations.
+// Written by pdal_stages from its stages' declarations.
 #pragma once
 
 #include <cstddef>
@@ -29,8 +30,7 @@ namespace pdal_stages
 namespace declared
 {{
 
-constexpr const char *VERSION = {version_text};
-constexpr const char *DIGEST = "{digest}";
+constexpr const char *VERSION = {version};
 
 enum class Kind {{ Number, Integer, Boolean, List, Text }};
 
@@ -47,6 +47,7 @@ struct Option
 struct Stage
 {{
     const char *type;
+    const char *digest;
     const char *summary;
     const char *link;
     const Option *options;
@@ -54,6 +55,7 @@ struct Stage
 }};
 
 {options}
+
 const Stage STAGES[] = {{
 {stages}
 }};
@@ -66,67 +68,54 @@ constexpr std::size_t COUNT = {count};
 
 def header() -> str:
     """The text of ``declarations.hpp``."""
+    options, stages = [], []
+    for number, kind in enumerate(registry.stages().values()):
+        name = f"OPTIONS_{number}"
+        options.append(f"const Option {name}[] = {{{_options(kind)}}};")
+        texts = (kind.type, digest(kind), kind.summary, f"pdal-stages options {kind.type}")
+        stages.append(f"    {{ {', '.join(map(_text, texts))}, {name}, sizeof({name}) / sizeof(Option) }},")
     return _HEADER.format(
-        version=__version__,
-        version_text=_text(__version__),
-        digest=digest(),
-        options="\n".join(_options(n, kind) for n, kind in enumerate(registry.stages().values())),
-        stages=_stages(),
-        count=len(registry.stages()),
+        version=_text(__version__), options="\n".join(options), stages="\n".join(stages), count=len(stages)
     )
 
 
-def write(folder: Path) -> None:
-    """Write ``declarations.hpp``, and ``stages.txt`` with a type a line, for a compiler."""
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "declarations.hpp").write_text(header())
-    (folder / "stages.txt").write_text("".join(f"{name}\n" for name in registry.stages()))
-
-
-@cache
-def digest() -> str:
-    """Changes with any stage, option, default or help that the plugin holds."""
-    stages = [_options(n, kind) for n, kind in enumerate(registry.stages().values())]
-    return hashlib.sha256("\n".join([*stages, _stages()]).encode()).hexdigest()[:16]
+def digest(kind: type[Stage]) -> str:
+    """Changes with any option, default or help of a stage that the plugin holds."""
+    return hashlib.sha256(f"{kind.type} {kind.summary}{_options(kind)}".encode()).hexdigest()[:16]
 
 
 def native_options(kind: type[Stage]) -> list[Option]:
-    """A stage's options that the plugin declares; writers of older PDAL have no `where`, so ours declares it."""
-    return [o for o in kind.all_options() if o.name not in OF_PDAL or kind.type.startswith("writers.")]
+    """A stage's options that the plugin declares: PDAL's filters have `where` by themselves, writers of older PDAL not."""
+    return [o for o in kind.all_options() if o.name != "where" or kind.type.startswith("writers.")]
 
 
 def is_list(option: Option) -> bool:
     """Whether PDAL takes several values for an option."""
-    return option.kind in _LISTS
+    return _KINDS.get(option.kind) == "List"
 
 
-def _options(number: int, kind: type[Stage]) -> str:
-    lines = [f"const Option OPTIONS_{number}[] = {{  // {kind.type}"]
+def _options(kind: type[Stage]) -> str:
+    lines = [""]
     for option in native_options(kind):
-        default, value, text = option.default, 0.0, ""
-        given = default not in (None, "", ())
-        if option.kind in _KINDS and given:
-            value = float(default)
-        elif given:
-            text = ",".join(map(str, default)) if isinstance(default, tuple) else str(default)
+        default, given = option.default, option.default not in (None, "", ())
+        as_number = given and option.kind in ("number", "integer", "boolean")
+        text = (
+            ""
+            if as_number or not given
+            else ",".join(map(str, default))
+            if isinstance(default, tuple)
+            else str(default)
+        )
         fields = [
             _text(option.name),
-            f"Kind::{_KINDS.get(option.kind, 'List' if is_list(option) else 'Text')}",
+            f"Kind::{_KINDS.get(option.kind, 'Text')}",
             str(bool(given)).lower(),
-            repr(value),
+            repr(float(default) if as_number else 0.0),
             _text(text),
             _text(_help(kind, option)),
         ]
         lines.append(f"    {{ {', '.join(fields)} }},")
-    return "\n".join([*lines, "};\n"])
-
-
-def _stages() -> str:
-    return "\n".join(
-        f"    {{ {_text(kind.type)}, {_text(kind.summary)}, {_text('pdal-stages options ' + kind.type)}, "
-        f"OPTIONS_{number}, sizeof(OPTIONS_{number}) / sizeof(Option) }},"
-        for number, kind in enumerate(registry.stages().values())
-    )
+    return "\n".join([*lines, ""])
 
 
 def _help(kind: type[Stage], option: Option) -> str:
@@ -139,18 +128,9 @@ def _help(kind: type[Stage], option: Option) -> str:
 
 
 def _text(text: str) -> str:
-    """A C++ string literal of plain ASCII: what is beyond it stands as the bytes of its UTF-8."""
-    out = []
-    for byte in text.encode():
-        character = chr(byte)
-        if character in '"\\?':
-            out.append(f"\\{character}")
-        elif 32 <= byte < 127:
-            out.append(character)
-        else:
-            out.append(f"\\{byte:03o}")
-    return '"' + "".join(out) + '"'
-
-
-if __name__ == "__main__":  # CMake
-    write(Path(sys.argv[1]))
+    """A C++ string literal of plain ASCII: what is beyond it, and what C++ reads otherwise, stands as octal bytes."""
+    plain = (
+        chr(byte) if 32 <= byte < 127 and chr(byte) not in '"\\?' else f"\\{byte:03o}"
+        for byte in text.encode()
+    )
+    return f'"{"".join(plain)}"'

@@ -9,8 +9,8 @@ import re
 import shutil
 import sys
 import sysconfig
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from ..base.errors import DependencyError
 from ..pipeline import pdal as pdal_env
@@ -20,32 +20,15 @@ SUFFIX = ".dylib" if sys.platform == "darwin" else ".so"
 _PYTHON_FILTER = f"libpdal_plugin_filter_python{SUFFIX}"
 #: A function of PDAL's library, in every version: its address tells which file the library is.
 _OF_PDAL = "_ZN4pdal12StageFactoryC1Eb"
-_FILTER_CURE = (
-    "It comes with pdal-plugins: conda install -c conda-forge pdal-plugins, or pip install pdal-plugins; where it is "
-    "there already, set PDAL_DRIVER_PATH to the folder that holds it"
-)
+_OTHER_DOORS = "every other door works: pdal-stages pipeline, pdal-stages expand"
 
 
-@dataclass(frozen=True)
-class Pdal:
+class Pdal(NamedTuple):
     """The PDAL that python-pdal uses."""
 
     library: Path  #: the folder of its library
     headers: Path  #: the folder that holds ``pdal/``
     version: str
-
-
-def sources() -> Path:
-    """The folder of the C++ sources: in an installed package, or in a checkout."""
-    package = Path(__file__).resolve().parents[1]
-    for folder in (package / "native", package.parent / "native"):
-        if (folder / "stage.cpp").is_file():
-            return folder
-    raise DependencyError(
-        "the C++ sources of the plugin are missing",
-        found=package / "native",
-        cure="Install pdal-stages again",
-    )
 
 
 def compiler() -> list[str]:
@@ -58,15 +41,13 @@ def compiler() -> list[str]:
         "there is no C++ compiler",
         found=f"CXX={' '.join(named)}" if named else "neither c++, g++ nor clang++ on PATH",
         cure="Debian, Ubuntu: apt-get install g++. Fedora: dnf install gcc-c++. macOS: xcode-select --install. conda: "
-        "conda install -c conda-forge cxx-compiler. Without one every other door works: pdal-stages pipeline, "
-        "pdal-stages expand",
+        f"conda install -c conda-forge cxx-compiler. Without one {_OTHER_DOORS}",
     )
 
 
 def pdal() -> Pdal:
     """PDAL's library and headers; :class:`DependencyError` with the cure where they are missing or do not fit."""
-    library = _library_folder()
-    version = pdal_env.dotted_version()
+    library, version = _library_folder(), pdal_env.dotted_version()
     for prefix in dict.fromkeys([*library.parents, Path(sys.prefix)]):
         headers = prefix / "include"
         if not (headers / "pdal" / "Filter.hpp").is_file():
@@ -83,7 +64,7 @@ def pdal() -> Pdal:
         "PDAL's headers are missing",
         found=f"no include/pdal beside {library}",
         cure="Debian, Ubuntu: apt-get install libpdal-dev. conda-forge: conda install -c conda-forge libpdal-core. "
-        "Without them every other door works: pdal-stages pipeline, pdal-stages expand",
+        f"Without them {_OTHER_DOORS}",
     )
 
 
@@ -98,8 +79,18 @@ def plugin_folder() -> Path:
     raise DependencyError(
         "PDAL's plugin filters.python is missing, which runs our stages",
         found=f"{_PYTHON_FILTER} in none of {', '.join(map(str, tried))}",
-        cure=_FILTER_CURE,
+        cure="It comes with pdal-plugins: conda install -c conda-forge pdal-plugins, or pip install pdal-plugins; where it "
+        "is there already, set PDAL_DRIVER_PATH to the folder that holds it",
     )
+
+
+class _Found(ctypes.Structure):
+    """``Dl_info`` of dladdr(3)."""
+
+    _fields_ = [
+        (name, ctypes.c_char_p if "file" in name else ctypes.c_void_p)
+        for name in ("file", "base", "name", "address")
+    ]
 
 
 def _library_folder() -> Path:
@@ -115,19 +106,8 @@ def _library_folder() -> Path:
     raise DependencyError(
         "the library that python-pdal uses is not found",
         found=extension,
-        cure="On this system compile the plugin with CMake, from native/ of the sources",
+        cure=f"On this system the plugin cannot be built; {_OTHER_DOORS}",
     )
-
-
-class _Found(ctypes.Structure):
-    """``Dl_info`` of dladdr(3)."""
-
-    _fields_ = [
-        ("file", ctypes.c_char_p),
-        ("base", ctypes.c_void_p),
-        ("name", ctypes.c_char_p),
-        ("address", ctypes.c_void_p),
-    ]
 
 
 def _headers_version(headers: Path) -> str:
@@ -135,9 +115,7 @@ def _headers_version(headers: Path) -> str:
     for name in ("pdal_features.hpp", "pdal_config.hpp"):
         path = headers / "pdal" / name
         text = path.read_text(errors="replace") if path.is_file() else ""
-        numbers = [
-            re.search(rf"#define\s+PDAL_VERSION_{part}\s+(\d+)", text) for part in ("MAJOR", "MINOR", "PATCH")
-        ]
-        if all(numbers):
-            return ".".join(number.group(1) for number in numbers if number)
+        numbers = dict(re.findall(r"#define\s+PDAL_VERSION_(MAJOR|MINOR|PATCH)\s+(\d+)", text))
+        if len(numbers) == 3:
+            return f"{numbers['MAJOR']}.{numbers['MINOR']}.{numbers['PATCH']}"
     return ""

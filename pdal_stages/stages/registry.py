@@ -1,35 +1,53 @@
-"""Every stage by its type name: the modules of this package are the register."""
+"""Every stage by its type name; a stage's module is imported when it is asked for."""
 
 from __future__ import annotations
 
 import importlib
-import pkgutil
+from collections.abc import Iterator, Mapping
 from functools import cache
 
 from ..base.errors import PipelineError, suggest
 from .base import Stage
 
+#: Types of stages and the modules that hold them.
+_MODULES = {
+    **{f"filters.{name}": name for name in (
+        "accuracy", "bridges", "consistency", "detachednoise", "hag_minima", "hag_morphological", "modelclassifier",
+        "multiscalefeatures", "objects", "polygons", "wires",
+    )},
+    "writers.classifiermodel": "classifiermodel",
+    "writers.objects": "objectswriter",
+}  # fmt: skip
+
+
+class _Stages(Mapping[str, type[Stage]]):
+    def __getitem__(self, name: str) -> type[Stage]:
+        module = importlib.import_module(f"{__package__}.{_MODULES[name]}")
+        return next(
+            v for v in vars(module).values() if isinstance(v, type) and getattr(v, "type", "") == name
+        )
+
+    def __contains__(self, name: object) -> bool:
+        return name in _MODULES
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_MODULES)
+
+    def __len__(self) -> int:
+        return len(_MODULES)
+
 
 @cache
-def stages() -> dict[str, type[Stage]]:
+def stages() -> Mapping[str, type[Stage]]:
     """All stages, by type name, in alphabetical order."""
-    package = __name__.rpartition(".")[0]
-    path = importlib.import_module(package).__path__
-    found: dict[str, type[Stage]] = {}
-    for info in pkgutil.iter_modules(path):
-        module = importlib.import_module(f"{package}.{info.name}")
-        for value in vars(module).values():
-            if isinstance(value, type) and issubclass(value, Stage) and value is not Stage:
-                found[value.type] = value
-    return dict(sorted(found.items()))
+    return _Stages()
 
 
 def get(type_name: str) -> type[Stage]:
     """The stage of a type name; an error names the nearest one."""
-    try:
-        return stages()[type_name]
-    except KeyError:
+    if type_name not in _MODULES:
         raise PipelineError(
             f"there is no stage '{type_name}' in pdal_stages",
-            cure=f"{suggest(type_name, stages())}Stages: {', '.join(stages())}",
-        ) from None
+            cure=f"{suggest(type_name, _MODULES)}Stages: {', '.join(_MODULES)}",
+        )
+    return stages()[type_name]

@@ -258,13 +258,7 @@ class TerrainModels(_Showing):
         stage = {"type": self.stage, **self.options(parameters, context), "ground": True}
         source = self.parameterAsFile(parameters, "INPUT", context)
         # One line: of several ends PDAL runs only the first
-        job = [
-            reader(source),
-            {"type": "filters.detachednoise"},
-            stage,
-            *plain_classes(source),
-            NOT_NOISE,
-        ]
+        job = [reader(source), {"type": "filters.detachednoise"}, stage, *plain_classes(source), NOT_NOISE]
         if "SURFACE" in chosen:
             job.append(raster(chosen["SURFACE"], side, "Z", "max"))
         if "HEIGHTS" in chosen:

@@ -13,16 +13,7 @@ from qgis.core import (
 #: One of several: blanks in it stand between quotes.
 _WORDS = re.compile(r'(?:"[^"]*"|[^\s"])+')
 #: Settings of a terminal, of a batch system, or that a dialog has its own widgets for.
-LEFT_OUT = (
-    "log",
-    "progress",
-    "scheduler",
-    "dry_run",
-    "inputs",
-    "output",
-    "threads",
-    "inputs_option",
-)
+LEFT_OUT = ("log", "progress", "scheduler", "dry_run", "inputs", "output", "threads", "inputs_option")
 
 
 def label_of(declared):

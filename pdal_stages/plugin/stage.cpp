@@ -421,7 +421,7 @@ private:
         std::ostringstream out;
         out << "\"stage\":" << quoted(getName()) << ",\"label\":" << quoted(m_label) << ",\"tag\":" <<
             quoted(this->tag()) << ",\"version\":" << quoted(declared::VERSION) << ",\"digest\":" <<
-            quoted(declared::DIGEST) << ",\"pipeline\":" << quoted(before.str()) << ",\"options\":[";
+            quoted(m_declared.digest) << ",\"pipeline\":" << quoted(before.str()) << ",\"options\":[";
         const char *comma = "";
         for (const Option& option : this->m_options.getOptions())
         {
@@ -454,32 +454,33 @@ public:
 };
 
 template<size_t I>
-void registerIf(const std::string& type)
+void registerStage()
 {
     const declared::Stage& stage = declared::STAGES[I];
-    if (type != stage.type)
-        return;
     const PluginInfo info(stage.type, stage.summary, stage.link);
-    if (startsWith(type, "writers."))
+    if (startsWith(stage.type, "writers."))
         PluginManager<Stage>::registerPlugin<NativeWriter<I>>(info);
     else
         PluginManager<Stage>::registerPlugin<NativeFilter<I>>(info);
 }
 
 template<size_t... I>
-void registerAmong(const std::string& type, std::index_sequence<I...>)
+void registerStages(std::index_sequence<I...>)
 {
-    (registerIf<I>(type), ...);
+    (registerStage<I>(), ...);
 }
 
 } // unnamed namespace
 
-namespace pdal_stages
-{
+#ifdef _WIN32
+#define PDAL_STAGES_VISIBLE __declspec(dllexport)
+#else
+#define PDAL_STAGES_VISIBLE __attribute__((visibility("default")))
+#endif
 
-void registerStage(const char *type)
+// PDAL's loader looks for filters.NAME in libpdal_plugin_filter_NAME, and calls this: the library lies there under the name
+// of each of its stages, and makes all of them known, whichever was asked for.
+extern "C" PDAL_STAGES_VISIBLE void PF_initPlugin()
 {
-    registerAmong(type, std::make_index_sequence<declared::COUNT>());
+    registerStages(std::make_index_sequence<declared::COUNT>());
 }
-
-} // namespace pdal_stages

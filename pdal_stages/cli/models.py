@@ -11,15 +11,15 @@ from ..base.errors import StageError
 from ..base.outputs import Output, check_outputs
 from ..base.plain import print_messages
 from ..tiling.command import add_tile_arguments
-from .adder import INPUTS, OVERRIDES, Adder
-from .running import ran
+from .parser import INPUTS, OVERRIDES, Parser
+from .pipelines import executed
 
 
-def add_commands(add: Adder) -> None:
+def add_commands(parser: Parser) -> None:
     """``models``, ``train``, ``adapt``, ``accuracy`` and ``model``."""
-    add("models", _models, "List the models that come with the package")
+    parser.command("models", _models, "List the models that come with the package")
 
-    takes = add("train", _train, "Train a model on labeled clouds", overrides=True)
+    takes = parser.command("train", _train, "Train a model on labeled clouds", overrides=True, logged=True)
     takes("inputs", nargs="+", metavar="input", help=f"Labeled: {INPUTS[0].lower()}{INPUTS[1:]}")
     takes("--model", required=True, help="The model file to write")
     takes(
@@ -48,14 +48,19 @@ def add_commands(add: Adder) -> None:
         "other, weigh alike, and may have different reference systems",
     )
 
-    add_tile_arguments(add.choices["train"])
-    add.choices["train"].epilog = (
+    add_tile_arguments(parser.commands["train"])
+    parser.commands["train"].epilog = (
         "Of several files the score is by file. Of one file, --writers.classifiermodel.groups=PointSourceId makes it one by "
         "flight line (any dimension with a number for each group), and --writers.classifiermodel.survey=UserData says that "
         "points of another number there are of another survey. " + OVERRIDES
     )
 
-    takes = add("adapt", _adapt, "Make a model for a survey without labels, of what another is sure of there")
+    takes = parser.command(
+        "adapt",
+        _adapt,
+        "Make a model for a survey without labels, of what another is sure of there",
+        logged=True,
+    )
     takes("inputs", nargs="+", metavar="input", help=f"One survey's: {INPUTS[0].lower()}{INPUTS[1:]}")
     takes("--model", required=True, help="The model file to write, for classify --model")
     takes("--teacher", default="standard", metavar="MODEL", help="The model that is asked; default standard")
@@ -66,9 +71,11 @@ def add_commands(add: Adder) -> None:
         metavar="SHARE",
         help="How sure it must be of a point (Reliability) to be believed; default 0.7",
     )
-    add_tile_arguments(add.choices["adapt"])
+    add_tile_arguments(parser.commands["adapt"])
 
-    takes = add("accuracy", _accuracy, "Compare two class dimensions, or two files", overrides=True)
+    takes = parser.command(
+        "accuracy", _accuracy, "Compare two class dimensions, or two files", overrides=True, logged=True
+    )
     takes("inputs", nargs="+", metavar="input", help=f"Classified: {INPUTS[0].lower()}{INPUTS[1:]}")
     takes(
         "--reference",
@@ -90,7 +97,7 @@ def add_commands(add: Adder) -> None:
     takes("--json", help="Write figures to this file")
     takes("--html", help="Write a report to this file")
 
-    takes = add("model", _model, "Describe a model file")
+    takes = parser.command("model", _model, "Describe a model file")
     takes("file")
     takes("--showjson", action="store_true", help="Everything, as JSON")
     takes("--html", help="Write a page with its scores, training curve and importances to this file")
@@ -128,7 +135,7 @@ def _train(options: argparse.Namespace) -> None:
         said = train_surveys(surveys, options.model, options.overrides, **extra)
     else:
         stages = train_pipeline(files, options.model, options.overrides, **extra)
-        _, said = ran(options, Pipeline(stages, options.overrides))
+        said = executed(options, Pipeline(stages, options.overrides))
     # Nothing is said of one written into a pipe or device
     text = str(load_model(options.model)) if Path(options.model).is_file() else ""
     score = text.partition("\n")[0]

@@ -1,0 +1,85 @@
+"""The command ``pdal-stages``, with PDAL's own flag habits; a module for each group of commands."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Sequence
+
+from ..base.errors import StageError
+from ..base.lean import be_lean
+from ..base.outputs import Output, check_outputs
+from ..base.plain import PlainStream, print_messages
+from ..base.runlog import LoggedStream, RunLog
+
+#: Commands that run no code but ours: no stage of a user's, no notebook.
+_OWN_CODE = ("classify", "objects")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit code (0 fine, 1 an error, 2 wrong usage, 130 interrupted)."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in arguments or os.environ.get("PDAL_STAGES_DEBUG", "") not in ("", "0")
+    arguments = [word for word in arguments if word != "--debug"]
+    if argv is None and any(word in _OWN_CODE for word in arguments[:1]):
+        be_lean()
+    streams = sys.stdout, sys.stderr
+    for stream in streams:  # a locale that lacks a character shows its code, rather than ending the run
+        with contextlib.suppress(AttributeError, ValueError):  # a notebook's stream cannot
+            stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+    sys.stdout, sys.stderr = map(PlainStream, streams)  # type: ignore[assignment]
+    log: RunLog | None = None
+    shown = os.environ.get("PDAL_STAGES_PROGRESS")
+    code = 1
+    try:
+        from .parser import parsed  # here, where an environment that lacks something is told in a sentence
+
+        options = parsed(arguments, is_program=argv is None)
+        if getattr(options, "progress", None) is not None:
+            os.environ["PDAL_STAGES_PROGRESS"] = str(int(options.progress))
+        if getattr(options, "log", None):
+            check_outputs([Output(options.log, "log", "")], [])
+            log = RunLog(options.log, arguments, sys.stderr)
+            sys.stdout, sys.stderr = LoggedStream(sys.stdout, log), LoggedStream(sys.stderr, log)  # type: ignore[assignment]
+        code = int(options.run(options) or 0)
+        sys.stdout.flush()  # a full disk or a closed pipe shows here, not at exit
+    except BrokenPipeError:  # e.g. into head
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        code = 0
+    except KeyboardInterrupt:
+        code = 130
+        print_messages("interrupted; nothing half-written was left")
+    except Exception as error:
+        code = 1
+        if debug:
+            raise
+        print_messages(str(error if isinstance(error, StageError) else _unforeseen(error)))
+    finally:
+        if log is not None:
+            log.end(code)
+        sys.stdout, sys.stderr = streams
+        os.environ.pop("PDAL_STAGES_PROGRESS", None)
+        if shown is not None:
+            os.environ["PDAL_STAGES_PROGRESS"] = shown
+    return code
+
+
+def _unforeseen(error: Exception) -> StageError:
+    """An unforeseen error, as a message of one paragraph."""
+    if isinstance(error, MemoryError):
+        return StageError("memory ran out", cure="Work in tiles (--tile), or lower 'memory'")
+    if isinstance(error, OSError):
+        name = f"{error.filename}: " if error.filename is not None else ""
+        return StageError("the system refused", found=f"{name}{error.strerror or error}")
+    if isinstance(error, ImportError):
+        said = str(error).strip() or repr(error)
+        return StageError(
+            "a Python package cannot be imported",
+            found=f"{sys.executable}: {said.splitlines()[0]}",
+            cure="Install pdal-stages with its packages into one environment, e.g. with conda; packages built for "
+            "another NumPy or Python must be installed again",
+        )
+    return StageError(
+        f"internal error: {type(error).__name__}: {error}", cure="Run with --debug and report what it prints"
+    )

@@ -1,0 +1,239 @@
+"""Files in, files out: classes, objects, what to review, and what was corrected."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ..base.plain import print_messages
+from ..tiling.command import add_arguments
+from ..tiling.objects import add_arguments as add_objects_arguments
+from .parser import INPUTS, Parser, switch
+
+
+def add_commands(parser: Parser) -> None:
+    """``classify``, ``objects``, ``review`` and ``corrections``."""
+    takes = parser.command(
+        "classify", _classify, "Classify a cloud with a model file", overrides=True, logged=True
+    )
+    takes("inputs", nargs="+", metavar="input", help=INPUTS)
+    takes(
+        "output",
+        help="A file; of several inputs a folder, which is made, or a name with # where the input's goes. Other dimensions "
+        "and the header are kept",
+    )
+    takes(
+        "--model",
+        default="standard",
+        help="A model file, or a shipped model's name (pdal-stages models); default standard",
+    )
+    takes(
+        "--dimensions",
+        metavar="LIST",
+        help="Extra dimensions to write beside the input's own: e.g. Reliability,Margin,Probability_6, all, or none; "
+        "default HeightAboveGround,Reliability, rounded to 1/32 (3 cm) and 1/64 (1.6 %%), which keeps files small",
+    )
+    switch(takes, "--noise", True, "Mark low and high noise first (filters.detachednoise)")
+    takes(
+        "--polygons",
+        action="append",
+        default=[],
+        metavar="FILE=CODE",
+        help="Class of ground inside the polygons of an OGR file, e.g. lakes.gpkg=9; of other classes too: "
+        "bridges.gpkg=17:2,6; may be repeated (filters.polygons)",
+    )
+    takes(
+        "--objects",
+        metavar="FILE",
+        help="Then write buildings, trees, spans and decks of all outputs to this vector file (.gpkg, ...), as "
+        "pdal-stages objects does; its options too: --writers.objects.tree_height=5",
+    )
+    switch(
+        takes,
+        "--bridges",
+        True,
+        "Find bridge decks (17), which leave ground and buildings (filters.bridges), with models whose heights "
+        "filters.hag_morphological makes",
+    )
+    switch(
+        takes,
+        "--wires",
+        False,
+        "Find wires (14), whatever they were called (filters.wires); tiles are read with 85 m more around them",
+    )
+    switch(
+        takes,
+        "--towers",
+        False,
+        "Find wires, and towers and poles (15) where they meet; tiles are read with 145 m more around them",
+    )
+    switch(
+        takes,
+        "--consistency",
+        True,
+        "Mend classes that contradict their surroundings at the end (filters.consistency)",
+    )
+    takes(
+        "--vegetation-heights",
+        default="",
+        metavar="LOW,MEDIUM",
+        help="Vegetation below these heights in meters, e.g. 0.5,2, is low (3) and medium (4), the rest high (5)",
+    )
+    takes(
+        "--keep-sure",
+        type=float,
+        metavar="SHARE",
+        help="Leave points unclassified (1) where the model is not sure enough for this share of each class to be right, "
+        "e.g. 0.98, as measured on ground it had not seen",
+    )
+    takes("--where", help="Classify only the points for which this holds; the others serve as neighbors")
+    takes("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
+    add_arguments(parser.commands["classify"], survey=True)
+
+    parser.command(
+        "objects",
+        _objects,
+        "Write buildings, trees, spans of wires and bridge decks of classified files to a vector file",
+        overrides=True,
+        logged=True,
+    )
+    add_objects_arguments(parser.commands["objects"])
+
+    takes = parser.command(
+        "review", _review, "List where a person should look in classified files, worst first", logged=True
+    )
+    takes("inputs", nargs="+", metavar="input", help="Classified files PDAL can read, folders, patterns")
+    takes("output", help="Vector file to write: .gpkg, .geojson, .fgb or .shp")
+    takes("--html", metavar="FILE", help="A page; default: beside the vector file, under its name")
+    takes("--json", metavar="FILE", help="Write figures to a JSON file")
+    takes(
+        "--share",
+        type=float,
+        default=0.95,
+        metavar="SHARE",
+        help="Write patches until they hold this share of the errors that are expected (0.95)",
+    )
+    takes(
+        "--cell",
+        type=float,
+        default=0.0,
+        metavar="METERS",
+        help="Side of the cells that are judged; default: by the density, 1 m at least",
+    )
+    takes("--workers", type=int, default=1, metavar="N", help="Files read at the same time (1)")
+    takes(
+        "--model",
+        default="standard",
+        help="What tells how reliable classes are where the files have no Reliability; default standard",
+    )
+
+    takes = parser.command(
+        "corrections",
+        _corrections,
+        "Mark what a person has corrected, or looked at and found right, for train",
+    )
+    takes("before", help="The file as it was classified (LAS or LAZ)")
+    takes("after", nargs="?", help="The same points, in any order, as the person left them")
+    takes(
+        "--out",
+        required=True,
+        metavar="FILE",
+        help="The points of the first with the classes of the second, and Checked",
+    )
+    takes(
+        "--area",
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="Polygons inside of which all was looked at: what was not changed there is right. Of the patches of review, "
+        "those whose 'done' is 1; may be repeated",
+    )
+    takes(
+        "--around",
+        type=float,
+        default=1.0,
+        metavar="METERS",
+        help="So far around a changed point all was looked at (1)",
+    )
+
+
+def _classify(options: argparse.Namespace) -> int:
+    from ..pipeline.classify_request import WRITTEN, ClassifyRequest
+    from ..pipeline.inputs_outputs import overlooked
+    from ..tiling.classify import ClassifyTask
+    from ..tiling.command import classify, options_of
+
+    own, others = [], list(options.overrides)
+    if options.objects:
+        from ..tiling.objects import OPTIONS_OF
+
+        own = [one for one in others if not one.by_tag and one.selector in OPTIONS_OF]
+        others = [one for one in others if one not in own]
+    listed = options.dimensions
+    named = WRITTEN if listed is None else tuple(name.strip() for name in listed.split(",") if name.strip())
+    request = ClassifyRequest(
+        options.model,
+        tuple(others),
+        options.where,
+        named,
+        noise=options.noise,
+        bridges=options.bridges,
+        wires=options.wires or options.towers,
+        towers=options.towers,
+        consistency=options.consistency,
+        polygons=tuple(options.polygons),
+        vegetation_heights=options.vegetation_heights,
+        keep_sure=options.keep_sure,
+    )
+    print_messages(*request.cost, *overlooked(options.inputs, options.output))
+    task = ClassifyTask(
+        tuple(options.inputs),
+        options.output,
+        request,
+        options_of(options),
+        metadata=options.metadata or "",
+        log=options.log or "",
+    )
+    if not options.objects:
+        return classify(task, options)
+    from ..tiling.objects import objects_of_outputs, refuse_tiles, writer
+
+    stage = writer(options.objects, own)
+    refuse_tiles(task, options.objects)
+    return classify(task, options, lambda: objects_of_outputs(task, stage))
+
+
+def _objects(options: argparse.Namespace) -> int:
+    from ..tiling.objects import run_command
+
+    return run_command(options)
+
+
+def _review(options: argparse.Namespace) -> None:
+    from ..pipeline.inputs_outputs import overlooked
+    from ..pipeline.reviewing import ReviewRequest, write_review
+    from ..reports.reviewpage import lines
+
+    html = str(Path(options.output).with_suffix(".html")) if options.html is None else options.html
+    request = ReviewRequest(
+        tuple(options.inputs),
+        options.output,
+        html,
+        options.json or "",
+        options.share,
+        options.cell,
+        options.model,
+        options.workers,
+    )
+    print_messages(*overlooked(options.inputs))
+    print("\n".join(lines(write_review(request).to_dict())))
+    print(f"written to {', '.join(name for name in (request.output, request.html, request.json) if name)}")
+
+
+def _corrections(options: argparse.Namespace) -> None:
+    from ..pipeline.correcting import CorrectionRequest, write_corrections
+
+    areas = tuple(options.area)
+    request = CorrectionRequest(options.before, options.out, options.after or "", areas, options.around)
+    print("\n".join(write_corrections(request).lines()))
+    print(f"written to {request.output}; next: pdal-stages train --base MODEL {request.output} --model NEW")

@@ -1,0 +1,151 @@
+"""What there is on this machine: stages, commands, PDAL's own stages of ours, a first example."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from functools import partial
+from pathlib import Path
+
+from ..base.errors import OptionError
+from .parser import Parser
+
+
+def add_commands(parser: Parser) -> None:
+    """``drivers``, ``options``, ``commands``, ``doctor``, ``plugin``, ``demo`` and ``warmup``."""
+    takes = parser.command("drivers", _drivers, "List stages: ours, then PDAL's")
+    takes("--ours", action="store_true", help="Only ours")
+    takes("--showjson", action="store_true", help="As JSON, like pdal --drivers --showjson")
+
+    takes = parser.command("options", _options, "List the options of a stage")
+    takes("stage", help="e.g. filters.hag_minima; for PDAL's stages pdal --options is asked")
+    takes("--showjson", action="store_true", help="As JSON Schema")
+
+    takes = parser.command("commands", partial(_commands, parser), "List commands with their arguments")
+    told = "With stages, models and classes, as JSON: dialogs are made of it"
+    takes("--showjson", action="store_true", help=told)
+
+    parser.command("doctor", _doctor, "Tell what is there on this machine, and the cure for what is not")
+
+    parser.command(
+        "plugin", _plugin, "Build our stages into PDAL itself, so that all that runs PDAL has them"
+    )
+    command = parser.commands["plugin"]
+    what = command.add_mutually_exclusive_group(required=True)
+    what.add_argument("--install", action="store_true", help="Compile it and put it beside filters.python")
+    what.add_argument("--check", action="store_true", help="Tell what is there and what is missing")
+    what.add_argument("--uninstall", action="store_true", help="Take it away")
+    command.add_argument(
+        "--folder",
+        type=Path,
+        metavar="DIR",
+        help="Another folder, made where it is not there, which must then be in PDAL_DRIVER_PATH, together with that of "
+        "filters.python",
+    )
+
+    takes = parser.command(
+        "demo", _demo, "Generate a town, train on one half, classify the other", logged=True
+    )
+    takes("folder", nargs="?", default="pdal-stages-demo", help="Where results go")
+    takes("--size", type=float, default=200.0, help="Side of the town in meters")
+    takes("--density", type=float, default=7.0, help="Points per square meter")
+    takes("--seed", type=int, default=1)
+
+    takes = parser.command(
+        "warmup", _warmup, "Compile the kernels for this machine once, so that later runs start without delay"
+    )
+    takes("--all", action="store_true", help="Those of kopt, ropt, copt and shape distributions too")
+
+
+def _drivers(options: argparse.Namespace) -> None:
+    from ..pipeline import describe
+
+    print(describe.drivers(ours_only=options.ours, as_json=options.showjson), end="")
+
+
+def _options(options: argparse.Namespace) -> None:
+    from ..pipeline import describe
+
+    print(describe.stage_options(options.stage, as_json=options.showjson), end="")
+
+
+def _commands(parser: Parser, options: argparse.Namespace) -> None:
+    from ..plugin.forms import forms
+
+    if options.showjson:
+        print(forms(parser.commands), end="")
+        return
+    for name, command in parser.commands.items():
+        print(f"{name:12s} {command.description}")
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    from ..plugin.doctor import examine
+
+    missing = 0
+    for finding in examine():
+        print(finding, flush=True)
+        missing += bool(finding.cure and finding.needed)
+    return int(missing > 0)
+
+
+def _plugin(options: argparse.Namespace) -> int:
+    from ..plugin import building
+
+    if options.check:
+        good, bad = building.check(options.folder)
+        print("\n".join([*good, *(f"missing: {line}" for line in bad)]))
+        return int(bool(bad))
+    if options.uninstall:
+        gone = building.uninstall(options.folder)
+        print("\n".join(f"removed {path}" for path in gone) or "there is no plugin of ours")
+        return 0
+    files = building.install(options.folder)
+    print(f"{len(files)} stages in {files[0].parent}; see them with: pdal --drivers")
+    return 0
+
+
+def _demo(options: argparse.Namespace) -> None:
+    from ..synthetic.demo import run_demo
+
+    try:
+        run_demo(options.folder, size=options.size, density=options.density, seed=options.seed)
+    except OptionError as error:
+        error.what = re.sub(r"^'(\w+)'", r"'--\1'", error.what)
+        raise
+
+
+def _warmup(options: argparse.Namespace) -> None:
+    """What the demo, the default heights, training and classification use, on a few points of no meaning."""
+    import numpy as np
+
+    from ..classifier import TrainingCloud, TrainingOptions, train
+    from ..synthetic.demo import compile_kernels
+    from ..terrain import detached_noise, filtered_ground, hag_minima
+
+    compile_kernels()
+    # A deck over a valley, with land at both of its ends: what is asked of decks is asked only where one may be.
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-120.0, 120.0), np.arange(-80.0, 80.0)))
+    z = np.where(abs(y) <= 4.0, 6.0, np.clip((abs(x) - 15.0) / 7.5, 0.0, 6.0))
+    filtered_ground(x, y, z, openings=(5,), decks=True, threads=1)
+    xyz = np.random.default_rng(0).uniform(0.0, 12.0, (400, 3))
+    axes = np.ascontiguousarray(xyz.T)
+    detached_noise(*axes)
+    dimensions = filtered_ground(*axes, openings=(5,), threads=1)
+    dimensions["HeightAboveGround"] = hag_minima(*axes)
+    dimensions |= dict.fromkeys(("ReturnNumber", "NumberOfReturns"), np.ones(len(xyz), np.uint8))
+    how = TrainingOptions(
+        neighborhoods="s5,k10",
+        feature_set="covariance,geometric,surfaces",
+        dimensions=("HeightAboveGround", "Ground", "HeightAboveOpening_5", "returns"),
+        context=("own", *TrainingOptions().context),  # shipped models read the point's own as well
+        trees=1,
+        count=50,
+        threads=1,
+    )
+    model = train(TrainingCloud(xyz, np.where(xyz[:, 2] > 6.0, 6, 2), dimensions), how, progress=False)
+    model.predict(xyz, dimensions, threads=1)
+    if options.all:
+        from ..features import warmup as every_neighborhood
+
+        every_neighborhood()

@@ -1,0 +1,123 @@
+"""Words of the command line to what they mean."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
+
+from ..base.errors import StageError, suggest
+from ..base.version import __version__
+from ..pipeline.overrides import parse_overrides
+
+OVERRIDES = (
+    "Options of stages are set as in PDAL: --stage.TAG.option=VALUE for stages with a tag, "
+    "--filters.name.option=VALUE for all stages of a type."
+)
+INPUTS = "Files that PDAL reads, folders, patterns, tile indexes, EPT sources"
+_VERBOSE = ("-v", "--verbose")
+_NO_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)")
+
+
+class Parser(argparse.ArgumentParser):
+    """Says which of the choices may have been meant, and adds commands."""
+
+    def error(self, message: str) -> NoReturn:
+        if chosen := _NO_CHOICE.search(message):
+            message += f". {suggest(chosen[1], re.findall(r'[a-z_-]+', chosen[2]))}".rstrip(". ")
+        super().error(message)
+
+    @property
+    def commands(self) -> dict[str, argparse.ArgumentParser]:
+        """The commands that are there."""
+        if self._subparsers is None:
+            self.add_subparsers(dest="command", required=True, metavar="COMMAND")
+        return self._subparsers._group_actions[0].choices  # type: ignore
+
+    def command(
+        self,
+        name: str,
+        run: Callable[[argparse.Namespace], Any],
+        help: str,
+        overrides: bool = False,
+        logged: bool = False,
+        **more: Any,
+    ) -> Callable:
+        """Add a command; returns what adds its arguments. `logged`: it works long enough for a log and progress."""
+        assert self.commands is not None
+        more.setdefault("epilog", OVERRIDES if overrides else None)
+        made = self._subparsers._group_actions[0].add_parser(  # type: ignore
+            name, help=help, description=f"{help}.", **more
+        )
+        made.set_defaults(run=run, takes_overrides=overrides)
+        takes = made.add_argument
+        if logged:
+            takes("--log", metavar="FILE", help="Add all that the run and its workers print to a log file")
+            takes("--progress", action=argparse.BooleanOptionalAction, help="Show progress")
+        return takes
+
+
+def switch(takes: Callable, flag: str, default: bool, help: str) -> None:
+    """Add ``--flag`` and ``--no-flag``."""
+    takes(flag, action=argparse.BooleanOptionalAction, default=default, help=help)
+
+
+def make_parser() -> Parser:
+    """The parser of all commands."""
+    from . import files, machine, models, pipelines
+
+    parser = Parser(
+        prog="pdal-stages",
+        description="PDAL pipelines with stages that classify airborne laser scans.",
+        epilog=OVERRIDES + " --debug shows tracebacks.",
+    )
+    parser.add_argument("--version", action="version", version=f"pdal-stages {__version__}")
+    for group in (pipelines, files, models, machine):
+        group.add_commands(parser)
+    return parser
+
+
+def parsed(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
+    """The command, its arguments, and the stages' options among them; leaves the program where usage is wrong.
+
+    Raises
+    ------
+    StageError
+        Where a stage's option is incomplete, or the command takes none.
+    """
+    overrides, rest = parse_overrides(_levels(arguments))
+    parser = make_parser()
+    options, unknown = parser.parse_known_args(rest)
+    if unknown and not _taken(options, unknown):
+        command = parser.commands[options.command]
+        flags = re.findall(r"(?<!\S)--[\w-]+(?![\w.-])", command.format_help())
+        near = suggest(unknown[0].partition("=")[0], flags)
+        command.error(f"unrecognized arguments: {' '.join(unknown)}. {near}".rstrip(". "))
+    if overrides and not options.takes_overrides:
+        raise StageError(f"'{options.command}' takes no stage options", found=overrides[0].flag)
+    options.overrides, options.arguments, options.is_program = overrides, list(arguments), is_program
+    return options
+
+
+def _levels(arguments: Sequence[str]) -> list[str]:
+    """PDAL's ``-v 4``, and ``-v`` alone, in one form."""
+    out: list[str] = []
+    for before, word, after in zip(["", *arguments], arguments, [*arguments[1:], ""], strict=False):
+        if word in _VERBOSE:
+            out.append(f"--verbose={after if after.isdigit() else 2}")
+        elif not (word.isdigit() and before in _VERBOSE):
+            out.append(word)
+    return out
+
+
+def _taken(options: argparse.Namespace, words: list[str]) -> bool:
+    """Whether words left over are names of inputs, and of the output, behind a flag, where argparse does not look."""
+    inputs = getattr(options, "inputs", None)
+    if not isinstance(inputs, list) or any(word.startswith("-") for word in words):
+        return False
+    if hasattr(options, "output"):
+        *inputs[len(inputs) :], options.output = [options.output, *words]
+    else:
+        inputs += words
+    return True

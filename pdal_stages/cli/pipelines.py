@@ -1,0 +1,131 @@
+"""Run a pipeline, check it, or print it as PDAL runs it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..base import kinds
+from ..base.errors import StageError
+from ..base.files import write_whole
+from ..base.outputs import Output, check_outputs
+from ..base.plain import print_messages
+from ..tiling.command import add_arguments
+from .parser import Parser
+
+if TYPE_CHECKING:
+    from ..pipeline.read import PipelineSource
+    from ..pipeline.run import Pipeline
+
+#: Lines of PDAL's log that are shown without -v.
+_LOG_LINES = 10
+_LEVELS = {0: logging.ERROR, 1: logging.WARNING, 2: logging.INFO}
+
+
+def add_commands(parser: Parser) -> None:
+    """``pipeline``, ``expand`` and ``validate``."""
+    help = "Run a pipeline that may contain our stages"
+    takes = parser.command("pipeline", _pipeline, help, overrides=True, logged=True)
+    _input(takes)
+    takes("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
+    takes("--validate", action="store_true", help="Check the pipeline without reading points, then stop")
+    never = "Accepted for compatibility with PDAL; our stages never stream"
+    takes("--nostream", action="store_true", help=never)
+    levels = (
+        "Print more of PDAL's log: 1 warnings (default), 2 what it does (-v alone), 3 and more everything"
+    )
+    takes("-v", "--verbose", type=int, default=1, metavar="LEVEL", help=levels)
+    add_arguments(parser.commands["pipeline"])
+
+    help = "Print the plain PDAL JSON, which stock 'pdal pipeline' runs"
+    takes = parser.command("expand", _expand, help, overrides=True)
+    _input(takes)
+    takes("-o", "--output", metavar="FILE", help="Write it to a file instead")
+
+    _input(parser.command("validate", _validate, "Check a pipeline without reading points", overrides=True))
+
+
+def _input(takes: Callable) -> None:
+    takes("file", nargs="?", help="Pipeline JSON file")
+    takes("-i", "--input", dest="file_option", metavar="FILE", help="The same, as PDAL's --input")
+    takes("-s", "--stdin", action="store_true", help="Read the pipeline from standard input")
+
+
+def _source(options: argparse.Namespace) -> Path | PipelineSource:
+    """A file's path, or what was read from standard input."""
+    if options.stdin:
+        from ..pipeline.read import decode, parse_pipeline
+
+        raw = getattr(sys.stdin, "buffer", None)
+        text = decode(raw.read(), "standard input") if raw is not None else sys.stdin.read()
+        return parse_pipeline(text or " ", "standard input")
+    name = options.file or options.file_option
+    if not name:
+        raise StageError("no pipeline file was given", cure=f"Usage: pdal-stages {options.command} job.json")
+    return Path(name)
+
+
+def _built(options: argparse.Namespace) -> Pipeline:
+    from ..pipeline.run import Pipeline
+
+    return Pipeline(_source(options), options.overrides)
+
+
+def _pipeline(options: argparse.Namespace) -> int:
+    from ..tiling.command import run_command, wants_tiles
+
+    if wants_tiles(options):
+        return run_command(options, _source(options))
+    if options.validate:
+        return _validate(options)
+    print_messages(*executed(options, _built(options)))
+    return 0
+
+
+def executed(options: argparse.Namespace, pipeline: Pipeline) -> list[str]:
+    """Run a pipeline in this process; what PDAL and stages said."""
+    from ..tiling.command import end_at_once
+
+    metadata, verbose = getattr(options, "metadata", None), getattr(options, "verbose", 1)
+    more = [Output(options.log, "log")] if options.log else []
+    pipeline.check_outputs(*more, *([Output(metadata, "metadata", kinds.JSON)] if metadata else []))
+    before = list(pipeline.lowered.warnings)
+    print_messages(*before)
+    end_at_once(options)
+    pipeline.execute(arrays=False, loglevel=_LEVELS.get(verbose, logging.DEBUG))
+    # Warnings, and what PDAL calls an error although it goes on: a reader that sets what it cannot read to 0, say.
+    lines = pipeline.log_lines
+    messages = [f"PDAL says: {line}" for line in (lines if verbose > 1 else lines[:_LOG_LINES])]
+    if len(lines) > _LOG_LINES and verbose <= 1:
+        messages.append(f"PDAL says {len(lines) - _LOG_LINES:,} more lines; -v shows them")
+    if metadata:
+        write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
+    return messages + [line for line in pipeline.messages if line not in before]
+
+
+def _expand(options: argparse.Namespace) -> None:
+    pipeline = _built(options)
+    text = pipeline.json + "\n"
+    if options.output:
+        check_outputs([Output(options.output, "output", kinds.JSON)], pipeline.inputs())
+        write_whole(options.output, text.encode())
+    else:
+        sys.stdout.write(text)
+
+
+def _validate(options: argparse.Namespace) -> int:
+    """Print PDAL's verdict or ours as JSON, on standard output; an error goes to standard error too."""
+    try:
+        pipeline = _built(options)
+        print(pipeline.validate())
+        print_messages(*pipeline.lowered.warnings)
+        return 0
+    except StageError as error:
+        print(json.dumps({"valid": False, "error_detail": str(error), "streamable": False}, indent=2))
+        print_messages(str(error))
+        return 1
