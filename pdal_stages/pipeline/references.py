@@ -18,7 +18,18 @@ MOVING = ("filters.reprojection", "filters.projpipeline", "filters.transformatio
 #: What differs between references whose coordinates lie within a meter: units are compared apart.
 _ALIKE = ("+datum=WGS84", "+datum=NAD83", "+ellps=WGS84", "+ellps=GRS80")
 _ASIDE = tuple(
-    f"+{word}" for word in ["units", "vunits", "to_meter", "vto_meter", "towgs84", "geoidgrids", "no_defs", "type", "wktext"]
+    f"+{word}"
+    for word in [
+        "units",
+        "vunits",
+        "to_meter",
+        "vto_meter",
+        "towgs84",
+        "geoidgrids",
+        "no_defs",
+        "type",
+        "wktext",
+    ]
 )
 
 
