@@ -71,44 +71,19 @@ def test_the_optimal_neighborhood_of_pdal(cloud):
     """PDAL counts the point itself: its min_k and max_k are one more than ours."""
     stages = [
         {"type": "filters.optimalneighborhood", "min_k": 11, "max_k": 41},
-        {"type": "filters.ferry", "dimensions": "OptimalKNN=>TheirK,OptimalRadius=>TheirRadius"},
         {
             "type": "filters.multiscalefeatures",
             "neighborhoods": "kopt(10,40)",
-            "feature_set": "Radius",
-            "optimal": True,
+            "feature_set": "Radius,Density",
         },
     ]
     array = ps.run_pipeline([str(cloud), *stages]).arrays[0]
-    assert array.dtype["OptimalKNN"] == np.uint64 and array.dtype["OptimalRadius"] == np.float64
-    same = array["OptimalKNN"] == array["TheirK"]
+    radius = array["Radius_kopt10_40"].astype(float)
+    number = np.rint(array["Density_kopt10_40"] * 4 / 3 * np.pi * radius**3)
+    same = number == array["OptimalKNN"]
     assert np.mean(same) > 0.999  # the entropies of two sizes may tie
-    assert np.allclose(array["OptimalRadius"][same], array["TheirRadius"][same], rtol=1e-5)
-    assert {11, 41} <= set(array["OptimalKNN"].tolist())
-
-
-@pytest.mark.pdal
-def test_optimal_neighborhoods_serve_pdal(cloud):
-    """PDAL's filters.covariancefeatures takes the neighborhoods that ours chose."""
-    stages = [
-        {
-            "type": "filters.multiscalefeatures",
-            "neighborhoods": "c1,kopt",
-            "feature_set": "Linearity",
-            "optimal": True,
-        },
-        {"type": "filters.covariancefeatures", "feature_set": "Linearity", "mode": "raw", "optimized": True},
-    ]
-    array = ps.run_pipeline([str(cloud), *stages]).arrays[0]
-    assert np.allclose(array["Linearity_kopt"], array["Linearity"], atol=1e-4)
-
-
-def test_optimal_needs_one_kopt():
-    for tokens in ("c1,s2", "kopt,kopt(10,20)"):
-        with pytest.raises(OptionError, match="'optimal' needs one neighborhood kopt"):
-            ps.Pipeline(
-                ["in.las", {"type": "filters.multiscalefeatures", "neighborhoods": tokens, "optimal": True}]
-            )
+    assert np.allclose(radius[same], array["OptimalRadius"][same], rtol=1e-5)
+    assert {11, 41} <= set(number.tolist())
 
 
 @pytest.mark.parametrize(
@@ -116,8 +91,8 @@ def test_optimal_needs_one_kopt():
     [
         ("Dimensionality", "Linearity,Planarity,Scattering"),
         ("DemantkeVerticality", "Verticality"),
-        ("OptimalKNN", '"optimal": true'),
-        ("OptimalRadius", '"optimal": true'),
+        ("OptimalKNN", "filters.optimalneighborhood"),
+        ("OptimalRadius", "Radius"),
     ],
 )
 def test_words_of_pdal_are_explained(word, says):

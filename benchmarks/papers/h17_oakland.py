@@ -41,8 +41,8 @@ from tables import choose, spread, table, values
 
 from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.features import FeatureEngine, FeaturePlan
+from pdal_stages.features.adaptive import curvature_threshold, radii_of
 from pdal_stages.features.neighborhoods import LEAST_MEMBERS, ROPT_DEFAULT
-from pdal_stages.features.ropt import curvature_threshold, radii_of
 
 CLASSES = {2: "Ground", 5: "Vegetation", 6: "Facade", 14: "Wire", 15: "Pole/trunk"}
 SIX = ("Verticality", "HeightRange", "Linearity", "Planarity", "Scattering", "SurfaceVariation")

@@ -17,23 +17,11 @@ def duration(seconds: float) -> str:
 
 
 class Progress(AbstractContextManager):
-    """A line of progress: done, rate, time left.
+    """A line of progress: what is done (`label`), so many `unit` of `total` (0: not known), rate, time left.
 
-    Silent until `delay` seconds have passed. On a terminal the line is redrawn; elsewhere
-    (a log) a new line is written every 15 seconds. The environment variable
-    ``PDAL_STAGES_PROGRESS=0`` silences it; ``PDAL_STAGES_PROGRESS=lines`` writes a line every second, for a program that
-    shows a bar of its own.
-
-    Parameters
-    ----------
-    total : int
-        The number of units of work; 0 where it is not known.
-    label : str
-        What is being done, e.g. the stage type.
-    unit : str
-        The word after the count.
-    enabled : bool, optional
-        False silences it, too.
+    Silent until `delay` seconds have passed. On a terminal the line is redrawn; elsewhere (a log) a new line is written
+    every 15 seconds. The environment variable ``PDAL_STAGES_PROGRESS=0`` silences it, as ``enabled=False`` does;
+    ``PDAL_STAGES_PROGRESS=lines`` writes a line every second, for a program that shows a bar of its own.
     """
 
     delay = 2.0
@@ -46,8 +34,6 @@ class Progress(AbstractContextManager):
         silenced = enabled is False or wanted == "0"
         self.enabled = self.stream is not None and not silenced
         self.count = 0
-        #: Seconds left, where they are known better than from what was done since the beginning.
-        self.seconds_left: float | None = None
         self.started = time.monotonic()
         self._terminal = self.stream is not None and self.enabled and self.stream.isatty()
         if wanted == "lines":
@@ -76,8 +62,6 @@ class Progress(AbstractContextManager):
         text += f", {rate:,.0f} {self.unit}/s" if rate >= 10 else f", {rate:.2g} {self.unit}/s"
         if end:
             text += f", {seconds:.1f} s"
-        elif self.seconds_left is not None:
-            text += f", {duration(self.seconds_left)} left"
         elif self.total and 100 * self.count >= self.total:  # before, it is mostly what starting took
             text += f", {duration(max(self.total - self.count, 0) / rate)} left"
         if self.stream is None:

@@ -10,11 +10,11 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
-from threading import Event
 from typing import Any
 
 from . import checks
@@ -56,42 +56,23 @@ def resolve_threads(threads: int | None) -> int:
 def map_blocks(
     function: Callable[[Any], Any], blocks: Sequence[Any], threads: int | None = None, ahead: int = 2
 ) -> Iterator[Any]:
-    """Yield ``function(block)`` for every block, in order, computed by several threads.
+    """Yield ``function(block)`` for every block, in order, computed by several `threads`; it should release the GIL.
 
-    At most ``threads * ahead`` results wait unread, so memory stays bounded when the
-    reader is slower than the workers. An exception (Ctrl-C too) stops handing out blocks
-    and is raised once the blocks in work are finished.
-
-    Parameters
-    ----------
-    function : callable
-        Called with one block, in a worker thread; the work in it should release the GIL.
-    blocks : sequence
-        The pieces of work.
-    threads : int, optional
-        See :func:`resolve_threads`.
+    At most ``threads * ahead`` results wait unread, so memory stays bounded when the reader is slower than the workers. An
+    exception (Ctrl-C too) stops handing out blocks and is raised once the blocks in work are finished.
     """
     count = resolve_threads(threads)
     if count == 1 or len(blocks) <= 1:
         yield from map(function, blocks)
         return
-    stop = Event()
-
-    def guarded(block):
-        return None if stop.is_set() else function(block)
-
     pool = ThreadPoolExecutor(count, thread_name_prefix="pdal-stages")
-    pending: list[Future] = []
+    pending: deque[Future] = deque()
     try:
-        position = 0
-        while position < len(blocks) or pending:
-            while position < len(blocks) and len(pending) < count * ahead:
-                pending.append(pool.submit(guarded, blocks[position]))
-                position += 1
-            # A bounded wait keeps the main thread answering Ctrl-C.
-            while not pending[0].done():
-                wait([pending[0]], timeout=0.2, return_when=FIRST_COMPLETED)
-            yield pending.pop(0).result()
+        for block in blocks:
+            pending.append(pool.submit(function, block))
+            if len(pending) == count * ahead:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
     finally:
-        stop.set()
         pool.shutdown(wait=True, cancel_futures=True)

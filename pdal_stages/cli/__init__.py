@@ -8,13 +8,9 @@ import sys
 from collections.abc import Sequence
 
 from ..base.errors import StageError
-from ..base.lean import be_lean
 from ..base.outputs import Output, check_outputs
 from ..base.plain import PlainStream, print_messages
 from ..base.runlog import LoggedStream, RunLog
-
-#: Commands that run no code but ours: no stage of a user's, no notebook.
-_OWN_CODE = ("classify", "objects")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -22,8 +18,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments or os.environ.get("PDAL_STAGES_DEBUG", "") not in ("", "0")
     arguments = [word for word in arguments if word != "--debug"]
-    if argv is None and any(word in _OWN_CODE for word in arguments[:1]):
-        be_lean()
+    if argv is None:  # these threads spin while they wait, for next to nothing
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     streams = sys.stdout, sys.stderr
     for stream in streams:  # a locale that lacks a character shows its code, rather than ending the run
         with contextlib.suppress(AttributeError, ValueError):  # a notebook's stream cannot

@@ -1,134 +1,167 @@
-"""All neighborhoods of a plan whose size adapts to the points: k nearest, kopt, ropt, copt.
+"""Neighborhoods whose size adapts to the points: the k nearest, ``kopt``, ``ropt`` and ``copt``.
 
-The counterpart of ``fixed.FixedRadius``: prepared once for a grid, called by the engine for every block.
+All are chosen among nested ones, made of a query's neighbors in the order of distance, whose moments are summed up once. The
+k nearest are the point and its k nearest: n = k + 1 members, as in Weinmann et al. 2015. ``kopt`` takes the k, ``ropt`` the
+radius with the lowest eigenentropy. ``copt`` looks at the curvature (surface variation) of the sphere of 1 m first: where
+it is at least c_t the point is *scattered* and takes the best k of 10..50 within 3 m, otherwise it is *regular* and takes
+the best radius of 0.5..2 m [H17]. The threshold c_t follows from the curvatures of the whole cloud.
+
+A candidate needs members that do not all coincide, three of them, among radii ``neighborhoods.LEAST_MEMBERS``. Where none
+qualifies (a lone point, copies of one point) the largest is taken; its eigen-features then say "no structure". The
+curvature of a sphere with fewer is 1/3.
 """
 
 from __future__ import annotations
 
 import math
-import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..base.jit import njit
+from ..base.jit import device, njit
 from ..base.threads import map_blocks
 from .bins import ShapeBins
+from .entropy import add_up, eigenvalues_of, lowest_entropy, make_sums, write_moments
 from .index import CellGrid
-from .kdtree import KdTree, build_tree
-from .moments import BATCH, FEATURES, MOMENTS, WIDTH, finish
-from .names import MOMENT_FEATURES, SHAPE_FEATURES, SURFACES
-from .nearest import agreement_block, nearest_block, store_surfaces, surfaces_block
-from .neighborhoods import AROUND, LEAST_RADIUS
-from .optimal import kopt_block
-from .plan import Columns, FeaturePlan
-from .ropt import COPT_RADII, copt_block, curvature_block, radii_of, ropt_block
-from .shapes import Shapes, count_shapes, list_shapes, no_shapes, point_seeds
-from .surfaces import WIDTH as SURFACE
+from .kdtree import build_tree
+from .moments import COINCIDENT, RADIUS, REACH, ROWS, finish
+from .names import MOMENT_FEATURES, SURFACES
+from .neighborhoods import AROUND, COPT_REACH
+from .plan import Columns, FeaturePlan, columns_of
+from .search import CROWD, FIRST2, LEAST2, MORE, ROOM, gather_near, make_groups, make_near, sort_near
+from .shapes import Axes, shapes_of, write_shapes
+from .surfaces import SURFACE, agreement, write_surface
 
-#: Queries computed at a time when curvatures of a whole cloud are.
+#: Members of a candidate among numbers of neighbors.
+LEAST = 3
+
+#: Radius of the sphere whose curvature is looked at, meters, and curvature where too few neighbors tell [H17].
+CURVATURE_RADIUS, SCATTERED = 1.0, 1.0 / 3.0
+
+#: ``copt``: first and last radius and step of regular points, meters; fewest and most neighbors of scattered ones [H17].
+COPT_RADII = (0.5, 2.0, 0.05)
+COPT_K = (10, 50)
+
+#: Queries computed at a time for a whole cloud.
 CHUNK = 16_384
 
 #: Estimated cost of one query on one core, nanoseconds, to cut blocks of about equal time.
-NS_QUERY = {"knn": 2000.0, "kopt": 4500.0, "ropt": 3500.0, "copt": 5500.0}
+NS_QUERY = {"knn": 3000.0, "kopt": 6000.0, "ropt": 6000.0, "copt": 9000.0}
 NS_SHAPES = 2000.0
-NS_SURFACES = 200.0
 
-Point = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+def radii_of(first: float, last: float, step: float) -> np.ndarray:
+    """The radii first, first + step, ... up to `last`, rounded to nanometers.
+
+    >>> radii_of(0.25, 0.4, 0.05).tolist()
+    [0.25, 0.3, 0.35, 0.4]
+    """
+    count = math.floor((last - first) / step + 1e-9) + 1
+    return np.round(first + step * np.arange(count), 9)
+
+
+def curvature_threshold(curvatures: np.ndarray) -> float:
+    """The curvature from which on a point is scattered [H17 eq. 1-3]; ValueError where there is no finite value (n,).
+
+    Two means, started at the smallest and the largest value, give the centers cur1 and cur2 of two groups of n1 and
+    n2 = n - n1 values; c_t = cur1 + (cur2 - cur1) n2 / n. Where all values are equal that is the value, and all points are
+    scattered, which needs no radius to hold enough points.
+    """
+    values = np.sort(np.asarray(curvatures, dtype=np.float64).ravel())
+    n = len(values)
+    if not n or not np.isfinite(values[-1]) or not np.isfinite(values[0]):
+        raise ValueError("curvatures must be finite numbers, at least one")
+    sums = np.concatenate(([0.0], np.cumsum(values)))
+    low, high = values[0], values[-1]
+    split = -1
+    while low < high:
+        before, split = split, int(np.searchsorted(values, 0.5 * (low + high), side="right"))
+        split = min(max(split, 1), n - 1)
+        if split == before:
+            break
+        low, high = sums[split] / split, (sums[n] - sums[split]) / (n - split)
+    return float(low + (high - low) * (n - split) / n) if low < high else float(low)
 
 
 @dataclass(frozen=True)
-class _Spec:
-    token: str
-    kind: str
-    parameters: tuple[float, ...]
-    columns: np.ndarray  # (13,) int64: of the moment features and Radius, or -1
-    shape_columns: np.ndarray  # (50,) int64, or -1
-    surface_columns: np.ndarray  # (4,) int64, or -1
-    shaped: bool
-    surfaced: bool
-    unbounded: bool
+class Search:
+    """Neighborhoods that one search serves."""
+
+    numbers: tuple[int, ...]  # which of a plan's
+    radii: np.ndarray  # ascending, meters
+    ks: np.ndarray  # neighbors besides the point itself, ascending
+    within2: float  # all points within this squared distance are wanted
+    cap2: float  # and of those within this one as many as the last of `ks` says
+    choices: (
+        np.ndarray
+    )  # (numbers, 3) int64: first and end of the candidates among radii and ks; members they need
+    curved: bool = False  # copt: radii where it is regular
 
 
 class AdaptiveNeighborhoods:
-    """A tree over a grid's cloud, built by `threads`, and the adaptive neighborhoods of a plan."""
+    """A tree over a grid's cloud, built by `threads`, and the adaptive neighborhoods of a plan.
+
+    Prepared once for a grid; the engine calls :meth:`fill` for every block.
+    """
 
     def __init__(self, grid: CellGrid, plan: FeaturePlan, threads: int | None = None) -> None:
-        self.grid, self.halo_m, self.least = grid, plan.halo_m, plan.least_members
+        self.grid, self.halo_m = grid, plan.halo_m
         fixed = ("cylinder", "sphere")
-        self.specs = [_spec(c) for c in plan.layout if c.at and c.neighborhood.kind not in fixed]
+        self.chosen = [c for c in plan.layout if c.at and c.neighborhood.kind not in fixed]
         #: In the plan's order: what `few` and `far` of :meth:`fill` count for.
-        self.tokens = [spec.token for spec in self.specs]
+        self.tokens = [c.neighborhood.token for c in self.chosen]
+        self.columns = columns_of(self.chosen, (*MOMENT_FEATURES, "Radius"))
+        self.surface_columns = columns_of(self.chosen, SURFACES)
         #: Estimated cost of one query, and memory of one call of :meth:`fill` besides its rows.
-        self.query_ns = sum(
-            NS_QUERY[s.kind] * _load(s) + NS_SHAPES * s.shaped + NS_SURFACES * s.surfaced for s in self.specs
+        self.query_ns = sum(_cost(c) for c in self.chosen)
+        most = max(
+            (c.neighborhood.parameters[-1] for c in self.chosen if c.neighborhood.parameters), default=0.0
         )
-        largest = max((s.parameters[-1] for s in self.specs if s.parameters), default=0.0)
-        self.scratch_bytes = 2_000_000 + int(500 * largest)
-        nearest = [
-            n
-            for n, spec in enumerate(self.specs)
-            if spec.kind == "knn" and (spec.surfaced or not spec.shaped)
-        ]
-        nearest.sort(key=lambda n: self.specs[n].parameters[0])
-        #: Places in `specs` of nearest neighbors, which one search of the largest k serves; where shapes are wanted too,
-        #: for their surfaces alone.
-        self._nearest = nearest
-        self._tree: KdTree | None = None
-        #: Surfaces of the cloud's points, in the order of the grid, and which of them are there; under the lock.
-        count = len(grid) if any(spec.surfaced for spec in self.specs) else 0
-        self._surfaces, self._known = np.empty((count, SURFACE), np.float32), np.zeros(count, np.uint8)
-        self._lock = threading.Lock()
-        if len(grid):
-            self._tree = build_tree(grid.x, grid.y, grid.z, lambda f, b: list(map_blocks(f, b, threads)))
-            self._touch(len(plan.names))
+        self.scratch_bytes = 2_000_000 + int(500 * most)
+        self.searches = _searches(self.chosen, plan.least_members)
+        self.tree = build_tree(grid.x, grid.y, grid.z, threads)
+        self._surfaces = np.zeros((0, SURFACE), np.float32)
+        if (self.surface_columns >= 0).any():
+            self._surfaces = np.empty((len(grid), SURFACE), np.float32)
+            around = _by_number({}, True)
+
+            def surfaces(part: slice) -> None:
+                self.choose(around, self._part(part), made=self._surfaces[part])
+
+            self._for_all(surfaces, threads)
 
     def __len__(self) -> int:
-        return len(self.specs)
+        return len(self.chosen)
 
-    def _touch(self, columns: int) -> None:
-        """Compile what the plan, of so many columns, needs, on one point, before threads do."""
-        one = self.grid.x[:1], self.grid.y[:1], self.grid.z[:1]
-        copies, counted = np.ones(1, np.int64), np.zeros((2, len(self.specs)), np.int64)
-        out = np.zeros((1, columns), np.float32)
-        if self._nearest:
-            self._fill_nearest(*one, copies, counted[0], counted[1], out)
-            self._surfaces_of(np.zeros(len(self._known[:1]), np.uint32))
-        for number, spec in enumerate(self.specs):
-            if number in self._nearest and not spec.shaped:
-                continue
-            shapes = count_shapes(np.zeros((5, 9)), 1) if spec.shaped else no_shapes()
-            table, radius, _ = self._compute(spec, *one, 0, 0.0, shapes)
-            if number not in self._nearest:
-                nowhere = np.full(len(spec.columns), -1, np.int64)
-                write_columns(table, radius, one[2], np.zeros(1, np.int64), copies, nowhere, out)
+    def _part(self, part: slice) -> Axes:
+        return self.grid.x[part], self.grid.y[part], self.grid.z[part]
 
-    def curvatures(self, threads: int | None = None) -> np.ndarray:
-        """The curvature of every point of the cloud, in the order of the grid, (n,) float64 [H17]."""
-        grid = self.grid
-        curvatures = np.empty(len(grid))
-
-        def compute(start: int) -> None:
-            part = slice(start, start + CHUNK)
-            x, y, z = grid.x[part], grid.y[part], grid.z[part]
-            curvature_block(self._tree, x, y, z, self.least, no_shapes(), curvatures[part])
-
-        for _ in map_blocks(compute, range(0, len(grid), CHUNK), threads):
+    def _for_all(self, function, threads: int | None) -> None:
+        parts = [slice(start, start + CHUNK) for start in range(0, len(self.grid), CHUNK)]
+        for _ in map_blocks(function, parts, threads):
             pass
+
+    def curvatures(self, least: int, threads: int | None = None) -> np.ndarray:
+        """The curvature of every point of the cloud, in the order of the grid, (n,) float64 [H17]."""
+        curvatures = np.empty(len(self.grid))
+        radius = np.array([CURVATURE_RADIUS])
+        search = Search((), radius, np.zeros(0, np.int64), 1.0, 1.0, np.zeros((0, 3), np.int64), True)
+        self._for_all(
+            lambda part: self.choose(search, self._part(part), least=least, curvature=curvatures[part]),
+            threads,
+        )
         return curvatures
 
-    def shape_values(self, token: str, points: Point, seed: int, copt_threshold: float | None) -> np.ndarray:
-        """Metrics of all pulls of a neighborhood for a few points, (m, 5, 255) float32, comparable."""
-        spec = self.specs[self.tokens.index(token)]
-        shapes = list_shapes(len(points[0]))
-        self._compute(spec, *points, seed, copt_threshold, shapes)
-        return shapes.values
+    def shape_values(self, points: Axes, seed: int, copt_threshold: float | None) -> dict[str, np.ndarray]:
+        """By neighborhood the metrics of all pulls round a few points, (m, 5, 255) float32, comparable."""
+        shapes = shapes_of(self.chosen, points, seed, None)
+        for search in self.searches:
+            self.choose(search, points, copt_threshold, shapes)
+        return {} if shapes is None else _values(self.chosen, shapes)
 
     def fill(
         self,
-        qx: np.ndarray,
-        qy: np.ndarray,
-        qz: np.ndarray,
+        points: Axes,
         copies: np.ndarray,
         bins: ShapeBins | None,
         seed: int,
@@ -143,159 +176,201 @@ class AdaptiveNeighborhoods:
         copt. For each neighborhood, `few` is raised by the number of queries with fewer than three points, and `far` by
         that of queries whose result depends on points farther than the plan's halo.
         """
-        if self._nearest:
-            self._fill_nearest(qx, qy, qz, copies, few, far, out)
-        for number, spec in enumerate(self.specs):
-            done = number in self._nearest
-            if done and not spec.shaped:
-                continue
-            if spec.shaped:
-                assert bins is not None
-                shapes = count_shapes(bins.comparable([spec.token])[0], len(qx))
-            else:
-                shapes = no_shapes()
-            table, radius, reach = self._compute(spec, qx, qy, qz, seed, copt_threshold, shapes)
-            if not done:
-                write_columns(table, radius, qz, few[number : number + 1], copies, spec.columns, out)
-            if spec.shaped:
-                wanted = spec.shape_columns >= 0
-                out[:, spec.shape_columns[wanted]] = shapes.counts[:, wanted]
-            if spec.unbounded and not done:
-                far[number] += int(copies[reach > self.halo_m].sum())
+        shapes = shapes_of(self.chosen, points, seed, bins)
+        for search in self.searches:
+            table = self.choose(search, points, copt_threshold, shapes, out)
+            for number, rows in zip(search.numbers, table, strict=True):
+                finish(rows, 0.0, points[2], few[number : number + 1], copies, self.columns[number], out)
+                far[number] += int(copies[rows[REACH] > self.halo_m].sum())
 
-    def _fill_nearest(
+    def choose(
         self,
-        qx: np.ndarray,
-        qy: np.ndarray,
-        qz: np.ndarray,
-        copies: np.ndarray,
-        few: np.ndarray,
-        far: np.ndarray,
-        out: np.ndarray,
-    ) -> None:
-        """What :meth:`fill` does, for all of ``_nearest``; of shaped ones all but their shapes."""
-        specs = [self.specs[number] for number in self._nearest]
-        mine = [int(spec.parameters[0]) for spec in specs]
-        surfaced = [n for n, spec in enumerate(specs) if spec.surfaced]
-        ks = np.array(sorted({*mine, AROUND} if surfaced else mine), np.int64)
-        place = np.searchsorted(ks, mine)
-        columns = np.full((len(ks), FEATURES), -1, np.int64)
-        columns[place] = [spec.columns[:FEATURES] for spec in specs]
-        most = min(max((mine[n] + 1 for n in surfaced), default=0), len(self.grid))
-        near, own = np.empty((len(qx), most), np.uint32), np.empty((len(qx), SURFACE))
-        counted = np.zeros((2, len(ks)), np.int64)
-        nearest_block(
-            self._tree, qx, qy, qz, copies, ks, columns, self.halo_m, near, own, counted[0], counted[1], out
-        )
-        few[self._nearest] += counted[0, place]
-        reached = counted[1, place]
-        if surfaced:
-            with self._lock:  # what others have written is seen behind it
-                missing = store_surfaces(near, own, self._surfaces, self._known)
-            self._surfaces_of(missing)
-            wanted = np.array(surfaced)
-            agree = np.zeros(len(wanted), np.int64)
-            agreement_block(
-                self._tree, qx, qy, qz, copies, np.array(mine, np.int64)[wanted],
-                np.stack([specs[n].surface_columns for n in surfaced]), self.halo_m, near, own, self._surfaces,
-                agree, out,
-            )  # fmt: skip
-            reached[wanted] = agree
-        far[self._nearest] += reached
+        search: Search,
+        points: Axes,
+        threshold=None,
+        shapes=None,
+        out=None,
+        *,
+        least=0,
+        curvature=None,
+        made=None,
+    ) -> np.ndarray:
+        """Moments (numbers, ROWS, m) of what is chosen; shapes, surfaces and curvatures go where arguments say."""
+        m = len(points[0])
+        numbers = np.array(search.numbers, np.int64)
+        table = np.empty((len(numbers), ROWS, m))
+        curvature = np.empty(m if search.curved else 0) if curvature is None else curvature
+        made = np.empty((0, SURFACE), np.float32) if made is None else made
+        least = int(search.choices[0, 2]) if len(numbers) else least
+        # Surfaces of neighbors are looked at only where features are written, by a search that finds AROUND of them.
+        looked = out is not None and len(numbers) > 0 and search.cap2 == math.inf
+        surfaces = self._surfaces if looked else self._surfaces[:0]
+        out = np.empty((m, 0), np.float32) if out is None else out
+        adaptive_block(
+            self.tree, *points, numbers, search.radii, search.ks, search.within2, search.cap2, search.choices,
+            search.curved, least, math.nan if threshold is None else threshold, surfaces,
+            self.surface_columns, shapes, table, curvature, made, out,
+        )  # fmt: skip
+        return table
 
-    def _surfaces_of(self, missing: np.ndarray) -> None:
-        """Put the surfaces of some points, which may be made elsewhere at the same time, into the table."""
-        if not len(missing):
-            return
-        found = np.empty((len(missing), SURFACE))
-        surfaces_block(
-            self._tree, *(axis[missing] for axis in (self.grid.x, self.grid.y, self.grid.z)), found
-        )
-        with self._lock:
-            self._surfaces[missing] = found
-            self._known[missing] = 1
 
-    def _compute(
-        self,
-        spec: _Spec,
-        qx: np.ndarray,
-        qy: np.ndarray,
-        qz: np.ndarray,
-        seed: int,
-        threshold: float | None,
-        shapes: Shapes,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Moments (12, m), radii (m,) and reaches (m,); shapes go where `shapes` says."""
-        m = len(qx)
-        table, radius, reach = np.empty((MOMENTS, m)), np.empty(m), np.zeros(m)
-        seeds = point_seeds(qx, qy, qz, seed, spec.token) if spec.shaped else np.zeros(0, np.uint64)
-        if spec.kind in ("knn", "kopt"):
-            k_min, k_max = int(spec.parameters[0]), int(spec.parameters[-1])
-            kopt_block(self._tree, qx, qy, qz, k_min, k_max, math.inf, table, radius, reach, seeds, shapes)
-        elif spec.kind == "ropt":
-            radii = radii_of(*spec.parameters)
-            ropt_block(self._tree, qx, qy, qz, radii, self.least, table, radius, seeds, shapes)
-        else:
-            assert threshold is not None
-            copt_block(
-                self._tree, qx, qy, qz, threshold, radii_of(*COPT_RADII), self.least, table, radius, seeds, shapes,
-                no_shapes(),
-            )  # fmt: skip
-        return table, radius, reach
+def _cost(columns: Columns) -> float:
+    """Estimated nanoseconds of a query; relative to the usual numbers of neighbors, or the area of the largest radius."""
+    one = columns.neighborhood
+    load = 1.0
+    if one.reach is None:
+        load = max(one.parameters[-1], 20.0) / 100.0
+    elif one.kind == "ropt":
+        load = max(one.parameters[1] / 2.0, 0.5) ** 2
+    return NS_QUERY[one.kind] * load + NS_SHAPES * columns.shapes
+
+
+def _by_number(ranges: dict[int, tuple[int, int]], around: bool) -> Search:
+    """One search for several ranges of numbers of neighbors, by the neighborhood's number, and `around` a point."""
+    all_ks = {k for first, last in ranges.values() for k in range(first, last + 1)}
+    ks = np.array(sorted(all_ks | ({AROUND} if around else set())), np.int64)
+    choices = [
+        [np.searchsorted(ks, first), np.searchsorted(ks, last) + 1, LEAST] for first, last in ranges.values()
+    ]
+    return Search(tuple(ranges), np.zeros(0), ks, 0.0, math.inf, np.array(choices, np.int64).reshape(-1, 3))
+
+
+def _searches(chosen: list[Columns], least: int) -> list[Search]:
+    ranges, found = {}, []
+    for number, columns in enumerate(chosen):
+        one = columns.neighborhood
+        if one.reach is None:
+            ranges[number] = int(one.parameters[0]), int(one.parameters[-1])
+            continue
+        radii = radii_of(*(one.parameters or COPT_RADII))
+        within2 = float(radii[-1] * radii[-1])
+        choices = np.array([[0, len(radii), least]], np.int64)
+        search = Search((number,), radii, np.zeros(0, np.int64), within2, within2, choices)
+        if one.kind == "copt":
+            ks = np.arange(COPT_K[0], COPT_K[1] + 1)
+            search = replace(search, ks=ks, cap2=COPT_REACH * COPT_REACH, curved=True)
+        found.append(search)
+    around = any(name in columns.at for columns in chosen for name in SURFACES)
+    return ([_by_number(ranges, around)] if ranges else []) + found
+
+
+def _values(chosen: list[Columns], shapes) -> dict[str, np.ndarray]:
+    return {c.neighborhood.token: shapes.values[k] for k, c in enumerate(chosen) if c.shapes}
 
 
 @njit
-def write_columns(table, radius, heights, few, copies, columns, out):
-    """Write the features of neighborhoods with individual radii from their moments.
+def adaptive_block(
+    tree, qx, qy, qz, numbers, radii, ks, within2, cap2, choices, curved, least, threshold, surfaces,
+    surface_columns, shapes, table, curvature, made, out,
+):  # fmt: skip
+    """Moments, shapes and surfaces of the best nested neighborhoods of a block of queries.
 
     Parameters
     ----------
-    table : (12, m) float64 array
-        Moments about the queries.
-    radius, heights : (m,) float64 arrays
-        Of the neighborhoods, and z of the queries.
-    few : (1,) int64 array
-        Raised by the number of queries with fewer than three members.
-    copies : (m,) int64 array
-    columns : (14,) int64 array
-        Where in `out` each feature of ``moments.finish`` goes, and the radius; -1: nowhere.
-    out : (m, F) float32 array
+    tree : KdTree
+    qx, qy, qz : (m,) float64 arrays
+    numbers, radii, ks, within2, cap2, choices, curved
+        See :class:`Search`.
+    least, threshold : int, float
+        Members a sphere needs to have a curvature, and the curvature from which on a point is scattered.
+    surfaces : (n, SURFACE) float32 array
+        Of the cloud's points, n = 0 where none are wanted.
+    surface_columns : (k, 4) int64 array
+        Where in `out` (m, F) what surfaces make goes; -1: nowhere.
+    shapes : Shapes or None
+        None compiles to a kernel without them.
+    table : (numbers, ROWS, m) float64 array
+        Out: moments about the query, radius, and how far away points matter, infinite where there are too few.
+    curvature, made : (m,) float64, (m, SURFACE) float32 arrays
+        Out: the curvature where `curved`; the queries' own surfaces where `made` is not empty, of the only one of `ks`.
     """
-    volumes, moments = np.empty(BATCH), np.empty((MOMENTS, WIDTH))
-    for start in range(0, len(radius), BATCH):
-        count = min(BATCH, len(radius) - start)
-        for j in range(count):
-            r = max(radius[start + j], LEAST_RADIUS)
-            volumes[j] = 4.0 / 3.0 * math.pi * r * r * r
-            for row in range(MOMENTS):
-                moments[row, j] = table[row, start + j]
-        part = slice(start, start + count)
-        values = finish(moments, count, volumes, 0.0, heights[part], few, copies[part])
-        for f in range(FEATURES):
-            if columns[f] >= 0:
-                for j in range(count):
-                    out[start + j, columns[f]] = values[f, j]
-        if columns[FEATURES] >= 0:
-            for j in range(count):
-                out[start + j, columns[FEATURES]] = radius[start + j]
+    order, starts = make_groups(qx, qy, qz)
+    need = ks[-1] + 1 if len(ks) else 0
+    need = min(need, len(tree.perm))
+    near = make_near(CROWD * need + ROOM)
+    shells, count = len(radii), len(radii) + len(ks)
+    s, ends = make_sums(count), np.zeros(count, np.int64)
+    own, around = np.empty(SURFACE, np.float32), 0
+    for e in range(len(ks)):
+        around = e if ks[e] == AROUND else around
+    record = np.empty((0, 4), np.float32)
+    guess = FIRST2
+    for group in range(len(starts) - 1):
+        lo, end = starts[group], starts[group + 1]
+        reach2, farthest2 = min(max(guess, within2), cap2), 0.0
+        while lo < end:
+            hi, there, reach2, near = gather_near(
+                tree, qx, qy, qz, order, lo, end, need, within2, cap2, reach2, near
+            )
+            while lo < hi:
+                q = order[lo]
+                x, y, z = qx[q], qy[q], qz[q]
+                found = sort_near(near, there, x, y, z, need, within2, cap2, reach2)
+                if found < 0:
+                    reach2 = min(2.0 * reach2, cap2)
+                    break
+                lo += 1
+                i = 0
+                for e in range(shells):
+                    while i < found and near.sorted[i] <= radii[e] * radii[e]:
+                        i += 1
+                    ends[e] = i
+                for e in range(len(ks)):
+                    ends[shells + e] = min(ks[e] + 1, found)
+                add_up(near, x, y, z, ends, 0, shells, s)
+                add_up(near, x, y, z, ends, shells, count, s)
+                farthest2 = max(farthest2, near.sorted[min(found, need) - 1] if need and found else 0.0)
+                if curved:
+                    at = 0
+                    while radii[at] < CURVATURE_RADIUS:
+                        at += 1
+                    curvature[q] = curvature_of(s, at, least)
+                if len(made) or len(surfaces):
+                    k = shells + around
+                    far = math.sqrt(near.sorted[AROUND]) if found > AROUND else math.inf
+                    write_surface(s, k, far, own)
+                    if len(made):
+                        made[q] = own
+                for j in range(len(numbers)):
+                    first, last, members = choices[j, 0], choices[j, 1], choices[j, 2]
+                    if curved and curvature[q] >= threshold:
+                        first, last, members = shells, count, LEAST
+                    best = lowest_entropy(s, first, last, members)
+                    n = ends[best]
+                    write_moments(s, best, table[j], q)
+                    reach = 0.0
+                    if best < shells:
+                        table[j, RADIUS, q] = radii[best]
+                    else:
+                        table[j, RADIUS, q] = math.sqrt(near.sorted[n - 1]) if n > 0 else 0.0
+                        k = ks[last - 1 - shells]
+                        reach = math.sqrt(near.sorted[k]) if k < found else math.inf
+                    if len(surfaces) and surface_columns[numbers[j]].max() >= 0:
+                        beyond = agreement(surfaces, near, n, own, surface_columns[numbers[j]], out[q])
+                        reach = max(reach, beyond)
+                    table[j, REACH, q] = 0.0 if curved else reach
+                    if shapes is not None and shapes.shaped[numbers[j]]:
+                        if n > len(record):
+                            record = np.empty((2 * n, 4), np.float32)
+                        for i in range(n):
+                            p = near.pos[i]
+                            record[i, 0], record[i, 1] = near.x[p] - x, near.y[p] - y
+                            record[i, 2], record[i, 3] = near.z[p] - z, 0.0
+                        w = 1.0 / s.n[best]
+                        gx, gy, gz = (
+                            np.float32(s.x[best] * w),
+                            np.float32(s.y[best] * w),
+                            np.float32(s.z[best] * w),
+                        )
+                        write_shapes(shapes, numbers[j], q, record, n, gx, gy, gz, out)
+        guess = max(MORE * farthest2, LEAST2)
 
 
-def _spec(columns: Columns) -> _Spec:
-    one = columns.neighborhood
-
-    def at(names) -> np.ndarray:
-        return np.array([columns.at.get(name, -1) for name in names], np.int64)
-
-    moments, shapes = at((*MOMENT_FEATURES, "Radius")), at(SHAPE_FEATURES)
-    surfaces, unbounded = at(SURFACES), one.reach is None
-    surfaced = bool((surfaces >= 0).any())
-    return _Spec(
-        one.token, one.kind, one.parameters, moments, shapes, surfaces, columns.shapes, surfaced, unbounded
-    )
-
-
-def _load(spec: _Spec) -> float:
-    """Cost relative to the usual parameters: neighbors, or the area of the largest radius."""
-    if spec.kind in ("knn", "kopt"):
-        return max(spec.parameters[-1], 20.0) / 100.0
-    return max(spec.parameters[1] / 2.0, 0.5) ** 2 if spec.kind == "ropt" else 1.0
+@device
+def curvature_of(s, j, least):
+    """Surface variation of the sums `j`; 1/3 for fewer than `least` or coinciding points."""
+    if s.n[j] < least:
+        return SCATTERED
+    l1, l2, l3, spread = eigenvalues_of(s, j)
+    total = l1 + l2 + l3
+    return l3 / total if total > COINCIDENT * spread else SCATTERED

@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.jit import njit
-from ..base.lazycolumns import LazyColumn
 from ..base.runs import begins_run
 from .index import cell_numbers
 
@@ -90,17 +89,6 @@ def _without_gaps(number: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """Strays far apart: empty stretches become one empty cell."""
     there, at = np.unique(number, return_inverse=True)
     return np.concatenate(([0], np.cumsum(np.minimum(np.diff(there), 2))))[at]
-
-
-class MeanColumn(LazyColumn):
-    """A column of :func:`cell_means` for every point."""
-
-    def __init__(self, cell: npt.NDArray[np.int32], means: npt.NDArray[np.float32], number: int) -> None:
-        super().__init__(len(cell), means.dtype)
-        self._cell, self._means = cell, means[:, number]
-
-    def __getitem__(self, index: Any) -> npt.NDArray[np.float32]:
-        return self._means[self._cell[index]]
 
 
 # ---- kernels --------------------------------------------------------------------------------------------

@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import math
 
-from llvmlite import ir
+import numpy as np
 
-from ..base.jit import device, intrinsic
+from ..base.jit import device
 
 LN2_HI = 6.93147180369123816490e-01
 LN2_LO = 1.90821492927058770002e-10
@@ -25,24 +25,16 @@ LN2_LO = 1.90821492927058770002e-10
 LINE = 1e-12
 
 
-@intrinsic
-def bits_of(types, value):
-    """The 64 bits of a float64 as int64 (a register move; a view through memory would not vectorize)."""
-
-    def codegen(context, builder, signature, args):
-        return builder.bitcast(args[0], ir.IntType(64))
-
-    return types.int64(types.float64), codegen
+@device(forceinline=True)
+def bits_of(value):
+    """The 64 bits of a float64 as int64."""
+    return np.float64(value).view(np.int64)
 
 
-@intrinsic
-def from_bits(types, value):
+@device(forceinline=True)
+def from_bits(bits):
     """The float64 of 64 bits."""
-
-    def codegen(context, builder, signature, args):
-        return builder.bitcast(args[0], ir.DoubleType())
-
-    return types.float64(types.int64), codegen
+    return np.int64(bits).view(np.float64)
 
 
 @device(forceinline=True)

@@ -14,11 +14,10 @@ from ..base import checks
 from ..base.errors import OptionError, StageError, optional_import, suggest
 from ..base.progress import Progress
 from ..base.report import Report
-from ..base.threads import map_blocks, resolve_threads
-from .blocks import Fitted, Given, Run, Tally, compile_once
+from ..base.threads import resolve_threads
+from .blocks import Given, Run, Tally
 from .index import CellGrid, build_grid, check_xyz
 from .plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS, FeaturePlan
-from .samples import smallest_hashes
 
 if TYPE_CHECKING:
     from .adaptive import AdaptiveNeighborhoods
@@ -86,15 +85,14 @@ class FeatureEngine:
         resolve_threads(threads)
         self.plan, self.seed, self.threads = plan, checks.whole("'seed'", seed, 0, 2**63 - 1), threads
         self.bins, self.copt_threshold = bins, copt_threshold
-        self._cloud = check_xyz(xyz)
-        compile_once("index")
-        self._grid = build_grid(self._cloud, plan.cell) if grid is None else grid
+        self.cloud = check_xyz(xyz)
+        self.grid = build_grid(self.cloud, plan.cell) if grid is None else grid
         self._lock = threading.RLock()
         self._parts: tuple[FixedRadius, AdaptiveNeighborhoods | None] | None = None
-        self.report = Report({"points": len(self._grid), "queries": 0, "fewer_than_three": {}})
+        self.report = Report({"points": len(self.grid), "queries": 0, "fewer_than_three": {}})
 
     def __len__(self) -> int:
-        return len(self._grid)
+        return len(self.grid)
 
     # ---- fitting -------------------------------------------------------------------------------------------
 
@@ -116,44 +114,34 @@ class FeatureEngine:
             if (needs_copt or needs_bins) and not len(self):
                 raise StageError("the cloud has no points to fit shape thresholds or copt to")
             if needs_copt:
-                from .ropt import curvature_threshold
+                from .adaptive import curvature_threshold
 
                 self.copt_threshold = curvature_threshold(self.curvatures())
             if needs_bins:
-                from .bins import ShapeBins
+                from .bins import ShapeBins, smallest_hashes
 
-                self.bins = ShapeBins.fit(self.shape_values(smallest_hashes(self._cloud, self.seed)[1]))
+                self.bins = ShapeBins.fit(self.shape_values(smallest_hashes(self.cloud, self.seed)[1]))
         return self
 
-    def curvatures(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """The curvature of every point, in the order of the index, (n,) float64 [H17 eq. 1]; for plans with copt.
-
-        Of `rows` of the cloud alone in their order, where they are given.
-        """
-        _, adaptive = self._prepared()
+    def curvatures(self) -> np.ndarray:
+        """The curvature of every point, in the order of the cloud, (n,) float64 [H17 eq. 1]; for adaptive plans."""
+        adaptive = self.neighborhoods()[1]
         assert adaptive is not None
-        found = adaptive.curvatures(self.threads)
-        if rows is None:
-            return found
-        out = np.empty(len(found))
-        out[self._grid.order] = found
-        return out[rows]
+        out = np.empty(len(self))
+        out[self.grid.order] = adaptive.curvatures(self.plan.least_members, self.threads)
+        return out
 
     def shape_values(self, rows: np.ndarray) -> dict[str, np.ndarray]:
         """Neighborhood token -> metrics of all pulls round some points of the cloud, (m, 5, 255) float32, comparable."""
-        fixed, adaptive = self._prepared()
-        x, y, z = np.ascontiguousarray(self._cloud[rows].T)
-        tokens = [c.neighborhood.token for c in self.plan.layout if c.shapes]
+        fixed, adaptive = self.neighborhoods()
+        x, y, z = np.ascontiguousarray(self.cloud[rows].T)
+        found = fixed.shape_values((x, y, z), self.seed)
+        if adaptive is not None:
+            found |= adaptive.shape_values((x, y, z), self.seed, self.copt_threshold)
+        return {c.neighborhood.token: found[c.neighborhood.token] for c in self.plan.layout if c.shapes}
 
-        def values(token: str) -> np.ndarray:
-            if token in fixed.tokens:
-                return fixed.shape_values(token, (x, y, z), self.seed)
-            assert adaptive is not None
-            return adaptive.shape_values(token, (x, y, z), self.seed, self.copt_threshold)
-
-        return dict(zip(tokens, map_blocks(values, tokens, self.threads), strict=True))
-
-    def _prepared(self) -> tuple[FixedRadius, AdaptiveNeighborhoods | None]:
+    def neighborhoods(self) -> tuple[FixedRadius, AdaptiveNeighborhoods | None]:
+        """The plan's neighborhoods, made for the cloud once."""
         with self._lock:
             if self._parts is None:
                 from .fixed import FixedRadius
@@ -162,13 +150,9 @@ class FeatureEngine:
                 if any(c.at and c.neighborhood.kind not in ("cylinder", "sphere") for c in self.plan.layout):
                     from .adaptive import AdaptiveNeighborhoods
 
-                    adaptive = AdaptiveNeighborhoods(self._grid, self.plan, self.threads)
-                self._parts = FixedRadius(self._grid, self.plan), adaptive
+                    adaptive = AdaptiveNeighborhoods(self.grid, self.plan, self.threads)
+                self._parts = FixedRadius(self.grid, self.plan), adaptive
             return self._parts
-
-    def _fitted(self) -> Fitted:
-        self.fit()
-        return Fitted(*self._prepared(), self.bins, self.copt_threshold, self.seed)
 
     # ---- computing -----------------------------------------------------------------------------------------
 
@@ -214,7 +198,7 @@ class FeatureEngine:
         DimensionError
             Where a dimension of the plan is not given, or has not one value per query.
         """
-        run = self._run(queries, dimensions, threads, memory_mb)
+        run = Run(self, queries, dimensions, threads, memory_mb)
 
         def compute(block: tuple[int, int]):
             positions, values, tally = run.compute(*block)
@@ -233,7 +217,7 @@ class FeatureEngine:
         progress: Progress | bool | None = None,
     ) -> FeatureTable:
         """The features of all queries as one table, row i for query i; parameters as for :meth:`blocks`."""
-        run = self._run(queries, dimensions, threads, memory_mb)
+        run = Run(self, queries, dimensions, threads, memory_mb)
         values = np.empty((len(run.grid), len(self.plan.names)), np.float32)
 
         def compute(block: tuple[int, int]):
@@ -244,10 +228,6 @@ class FeatureEngine:
         for _ in run.iterate(compute, progress, self._count):
             pass
         return FeatureTable(values, self.plan.names, self.bins, self.copt_threshold, self.report)
-
-    def _run(self, queries, dimensions, threads: int | None, memory_mb: float) -> Run:
-        threads = self.threads if threads is None else threads
-        return Run(self.plan, self._cloud, self._grid, self._fitted, queries, dimensions, threads, memory_mb)
 
     def _count(self, count: int, tally: Tally) -> None:
         with self._lock:

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from .bins import ShapeBins
+from .bins import SAMPLES, ShapeBins, smallest_hashes
 from .engine import FeatureEngine
 from .plan import FeaturePlan
-from .samples import SAMPLES, smallest_hashes
 
 
 def fit_clouds(
@@ -30,7 +29,7 @@ def fit_clouds(
         return engine.bins, engine.copt_threshold
     threshold = None
     if plan.copt:
-        from .ropt import curvature_threshold  # numba is loaded here, not when the package is
+        from .adaptive import curvature_threshold  # numba is loaded here, not when the package is
 
         each = [FeatureEngine(cloud, plan, threads=threads).curvatures() for cloud in clouds]
         threshold = curvature_threshold(np.concatenate(each))

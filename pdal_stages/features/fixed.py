@@ -1,135 +1,209 @@
-"""All cylinders and spheres of a plan, prepared once for a grid: what the engine calls for every block."""
+"""Cylinders and spheres of fixed radii: masked sums over the points of the cells that a neighborhood can touch.
+
+All queries of a cell share these candidates, whose list depends on (cloud, cell, radius) only: rows of cells ascend, then
+columns, then the coordinates of the points. Members are the points where the squared distance is ``<= r * r``.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+import math
 
 import numpy as np
 
-from .candidates import LANES
+from ..base.jit import device, njit
+from .bins import ShapeBins
 from .index import CellGrid
-from .names import MOMENT_FEATURES, SHAPE_FEATURES
-from .plan import FeaturePlan
-from .radius import ShapeColumns, count_block, radius_block, radius_values, width_table
-from .shapes import PULLS, make_work, point_seeds
+from .moments import ROWS, SX, SY, SZ, N, distance2, finish, height_key, sums_within
+from .names import MOMENT_FEATURES
+from .plan import FeaturePlan, columns_of
+from .shapes import Axes, shapes_of, write_shapes
 
 #: Estimated cost on one core, to cut blocks of about equal time: nanoseconds.
-NS_CANDIDATE, NS_NEIGHBORHOOD, NS_SHAPES, NS_MEMBER = 0.6, 100.0, 1500.0, 1.2
-
-
-@dataclass(frozen=True)
-class _Spec:
-    token: str
-    radius: float
-    spherical: bool
-    shaped: bool
+NS_CANDIDATE, NS_NEIGHBORHOOD, NS_SHAPES, NS_MEMBER = 0.7, 150.0, 1500.0, 1.2
 
 
 class FixedRadius:
-    """Kernels' tables for the fixed-radius neighborhoods of `plan` on `grid`, the sorted cloud."""
+    """The fixed-radius neighborhoods of `plan` on `grid`, the sorted cloud; :meth:`fill` computes a block."""
 
     def __init__(self, grid: CellGrid, plan: FeaturePlan) -> None:
         self.grid = grid
-        chosen = [c for c in plan.layout if c.neighborhood.kind in ("cylinder", "sphere") and c.at]
-        self.specs = [
-            _Spec(
-                c.neighborhood.token, c.neighborhood.parameters[0], c.neighborhood.kind == "sphere", c.shapes
-            )
-            for c in chosen
-        ]
-        self.tokens = [spec.token for spec in self.specs]
-        self.radii = np.array(sorted({spec.radius for spec in self.specs}), np.float64)
-        self.wanted = np.full((len(self.radii), 2), -1, np.int64)
-        for number, spec in enumerate(self.specs):
-            self.wanted[np.searchsorted(self.radii, spec.radius), int(spec.spherical)] = number
-        self.columns = _columns(chosen, MOMENT_FEATURES)
-        self.shape_columns = _columns(chosen, SHAPE_FEATURES)
-        self.shaped = np.array([spec.shaped for spec in self.specs], np.bool_)
-        if self.specs:
-            self.widths, self.reaches = width_table(self.radii, grid.cell)
+        fixed = [c for c in plan.layout if c.neighborhood.kind in ("cylinder", "sphere") and c.at]
+        self.chosen = sorted(fixed, key=lambda c: c.neighborhood.parameters[0])
+        self.tokens = [c.neighborhood.token for c in self.chosen]
+        self.radii = np.array([c.neighborhood.parameters[0] for c in self.chosen], np.float64)
+        self.spherical = np.array([c.neighborhood.kind == "sphere" for c in self.chosen], np.float64)
+        self.columns = columns_of(self.chosen, MOMENT_FEATURES)
+        self.widths = widths_of(self.radii, grid.cell)
 
     def __len__(self) -> int:
-        return len(self.specs)
+        return len(self.chosen)
 
-    def candidates(self, iy: np.ndarray, ix: np.ndarray) -> np.ndarray:
-        """Candidates of the largest radius in the cells (iy, ix), sorted by row, then column."""
-        if not self.specs:
-            return np.zeros(len(ix), np.int64)
-        g = self.grid
-        return count_block(
-            g.cell_ix, g.cell_start, g.row_iy, g.row_start, iy, ix, self._width(len(self.radii) - 1)
-        )
+    def cost(self, points: np.ndarray) -> np.ndarray:
+        """Estimated nanoseconds of one query in cells of so many points, where those around hold as many."""
+        cells = np.pi * (self.radii / self.grid.cell + 1) ** 2
+        shaped = np.array([c.shapes for c in self.chosen], float)
+        each = len(self) * NS_NEIGHBORHOOD + shaped.sum() * NS_SHAPES
+        return each + points * float(cells @ (NS_CANDIDATE + NS_MEMBER * shaped))
 
-    def cost(self, candidates: np.ndarray) -> np.ndarray:
-        """Estimated nanoseconds of one query in cells with so many candidates; for plans with such neighborhoods."""
-        area = (self.radii / self.radii[-1]) ** 2
-        each = NS_NEIGHBORHOOD + NS_CANDIDATE * np.multiply.outer(candidates, area)
-        listed = NS_SHAPES + NS_MEMBER * np.multiply.outer(candidates, area)
-        number = (self.wanted >= 0).sum(axis=1)
-        shaped = np.where(self.wanted >= 0, self.shaped[self.wanted], False).sum(axis=1)
-        return each @ number.astype(float) + listed @ shaped.astype(float)
+    def scratch_bytes(self, points: int) -> int:
+        """Memory of one call of :meth:`fill` besides its rows, where cells hold at most so many points."""
+        return 48 * int(points * (2 * self.widths.max(initial=0) + 1)) + 100_000
 
-    def scratch_bytes(self, room: int) -> int:
-        """Memory of one call of :meth:`fill` besides its output."""
-        return (24 + (16 if self.shaped.any() else 0)) * (room + 4 * LANES) + 30_000 * (len(self.specs) + 2)
+    def shape_values(self, points: Axes, seed: int) -> dict[str, np.ndarray]:
+        """By neighborhood the metrics of all pulls round a few points, (m, 5, 255) float32, comparable."""
+        shapes = shapes_of(self.chosen, points, seed, None)
+        if shapes is None:
+            return {}
+        self._run(points, shapes, np.empty((len(points[0]), 0), np.float32))
+        return {c.neighborhood.token: shapes.values[k] for k, c in enumerate(self.chosen) if c.shapes}
 
     def fill(
         self,
-        qx: np.ndarray,
-        qy: np.ndarray,
-        qz: np.ndarray,
+        points: Axes,
         copies: np.ndarray,
-        bins: Any,
+        bins: ShapeBins | None,
         seed: int,
-        room: int,
         few: np.ndarray,
         out: np.ndarray,
     ) -> None:
-        """Compute the columns of these neighborhoods for queries sorted by cell; see ``radius.radius_block``."""
-        shapes = self._shapes(qx, qy, qz, bins, seed, room) if self.shaped.any() else None
-        radius_block(
-            self.grid.tables(), self.grid.cell, qx, qy, qz, copies, self.radii, self.widths, self.reaches,
-            self.wanted, self.columns, shapes, few, room, out,
-        )  # fmt: skip
+        """Compute the columns of these neighborhoods in `out` (m, F) for queries, those of one cell one after the other.
 
-    def _shapes(
-        self, qx: np.ndarray, qy: np.ndarray, qz: np.ndarray, bins: Any, seed: int, room: int
-    ) -> ShapeColumns:
-        thresholds = np.zeros((len(self.specs), 5, 9), np.float32)
-        seeds = np.zeros((len(self.specs), len(qx)), np.uint64)
-        for number, spec in enumerate(self.specs):
-            if spec.shaped:
-                thresholds[number] = bins.comparable([spec.token])[0]
-                seeds[number] = point_seeds(qx, qy, qz, seed, spec.token)
-        record, counts = np.empty((room + 4 * LANES, 4), np.float32), np.empty(50, np.float32)
-        return ShapeColumns(self.shaped, self.shape_columns, thresholds, seeds, record, counts, make_work())
+        Each stands for so many `copies` of the user's. `few` (neighborhoods,) is raised by the number with fewer than three
+        points. `bins` are needed where shapes are wanted.
+        """
+        table = self._run(points, shapes_of(self.chosen, points, seed, bins), out)
+        for k, (radius, spherical) in enumerate(zip(self.radii, self.spherical, strict=True)):
+            volume = 4.0 / 3.0 * math.pi * radius**3 if spherical else math.pi * radius * radius
+            columns = np.append(self.columns[k], -1)
+            finish(table[k], volume, points[2], few[k : k + 1], copies, columns, out)
 
-    def shape_values(
-        self, token: str, points: tuple[np.ndarray, np.ndarray, np.ndarray], seed: int
-    ) -> np.ndarray:
-        """Metrics of all pulls of a neighborhood for a few points, (m, 5, 255) float32, comparable."""
-        spec = self.specs[self.tokens.index(token)]
-        k = int(np.searchsorted(self.radii, spec.radius))
-        cells = [np.floor(points[axis] / self.grid.cell).astype(np.int64) for axis in (1, 0)]
-        g = self.grid
-        width = self._width(k)
-        room = 0
-        for iy, ix in zip(*cells, strict=True):  # the points need not be sorted by cell
-            one = np.array([iy]), np.array([ix])
-            room = max(room, int(count_block(g.cell_ix, g.cell_start, g.row_iy, g.row_start, *one, width)[0]))
-        out = np.empty((len(points[0]), 5, PULLS), np.float32)
-        radius_values(
-            g.tables(), g.cell, *points, spec.radius, width, float(spec.spherical),
-            point_seeds(*points, seed, token), make_work(), room, out,
-        )  # fmt: skip
-        return out
-
-    def _width(self, k: int) -> np.ndarray:
-        return np.ascontiguousarray(self.widths[k, :, : 2 * self.reaches[k] + 1])
+    def _run(self, points: Axes, shapes, out: np.ndarray) -> np.ndarray:
+        """Moments (neighborhoods, ROWS, m); shapes go where `shapes` says."""
+        table = np.empty((len(self), ROWS, len(points[0])))
+        fixed_block(
+            self.grid.tables(),
+            self.grid.cell,
+            *points,
+            self.radii,
+            self.spherical,
+            self.widths,
+            shapes,
+            table,
+            out,
+        )
+        return table
 
 
-def _columns(chosen, features) -> np.ndarray:
-    """Where each feature (column) of each neighborhood (row) goes; -1: nowhere."""
-    table = [[columns.at.get(feature, -1) for feature in features] for columns in chosen]
-    return np.array(table, np.int64).reshape(len(chosen), len(features))
+def widths_of(radii: np.ndarray, cell: float) -> np.ndarray:
+    """Cells a neighborhood of each radius can touch, (radii, 2 R + 1) int64.
+
+    For the rows -R..R of cells round a query's own, the largest column offset that some query in the cell may reach; -1:
+    none. A cell is half open, so one whose nearest border is the radius away holds no member.
+    """
+    reach = int(np.ceil(radii.max(initial=0.0) / cell)) + 1
+    away = np.maximum(np.abs(np.arange(-reach, reach + 1)) - 1, 0) * cell  # of a row, or column, at least
+    touched = away[:, None] ** 2 + away**2 < radii[:, None, None] ** 2
+    touched = touched[:, touched.any(axis=(0, 2))]
+    return touched[:, :, reach:].sum(axis=2) - 1
+
+
+@njit
+def fixed_block(grid, cell, qx, qy, qz, radii, spherical, widths, shapes, table, out):
+    """Moments and shapes of cylinders and spheres for a block of queries.
+
+    Parameters
+    ----------
+    grid : tuple
+        ``CellGrid.tables()`` of the cloud.
+    cell : float
+        Edge of a grid cell, meters.
+    qx, qy, qz : (m,) float64 arrays
+    radii, spherical, widths : (k,) float64, (k,) float64 and (k, rows) int64 arrays
+        Ascending, meters; 1 for spheres, 0 for cylinders; :func:`widths_of` the radii.
+    shapes : Shapes or None
+        None compiles to a kernel without them, in half the time.
+    table : (k, ROWS, m) float64 array
+        Out: moments about the queries.
+    out : (m, F) float32 array
+        Out: shapes.
+    """
+    reach = widths.shape[1] // 2
+    window = np.empty((2 * reach + 1, 2 * reach + 2), np.int64)
+    px, py, pz, keys = np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64)
+    record = np.empty((1, 4), np.float32)
+    a = 0
+    while a < len(qx):
+        ix, iy = math.floor(qx[a] / cell), math.floor(qy[a] / cell)
+        b = a + 1
+        while b < len(qx) and math.floor(qx[b] / cell) == ix and math.floor(qy[b] / cell) == iy:
+            b += 1
+        fill_window(grid[3], grid[4], grid[5], grid[6], iy, ix, reach, window)
+        count = 0
+        for k in range(len(radii)):
+            if k == 0 or radii[k] != radii[k - 1]:
+                room = 0
+                for row in range(2 * reach + 1):
+                    w = widths[k, row]
+                    room += window[row, reach + w + 1] - window[row, reach - w] if w >= 0 else 0
+                if room > len(px):
+                    px, py, pz = np.empty(2 * room), np.empty(2 * room), np.empty(2 * room)
+                    keys = np.empty(2 * room, np.int64)
+                count = 0
+                for row in range(2 * reach + 1):
+                    w = widths[k, row]
+                    if w >= 0:
+                        first, last = window[row, reach - w], window[row, reach + w + 1]
+                        copy_points(grid[0], grid[1], grid[2], first, last, px, py, pz, keys, count)
+                        count += last - first
+            r2 = radii[k] * radii[k]
+            for q in range(a, b):
+                sums_within(px, py, pz, keys, count, qx[q], qy[q], qz[q], spherical[k], r2, table[k], q)
+                if shapes is not None and shapes.shaped[k]:
+                    if count >= len(record):
+                        record = np.empty((2 * count + 1, 4), np.float32)
+                    n = members(px, py, pz, count, qx[q], qy[q], qz[q], spherical[k], r2, record)
+                    w = 1.0 / table[k, N, q]
+                    gx, gy, gz = table[k, SX, q] * w, table[k, SY, q] * w, table[k, SZ, q] * w
+                    write_shapes(shapes, k, q, record, n, np.float32(gx), np.float32(gy), np.float32(gz), out)
+        a = b
+
+
+@device
+def fill_window(cell_ix, cell_start, row_iy, row_start, iy, ix, reach, window):
+    """Fill where points begin in the cells round (iy, ix).
+
+    ``window[k, c]`` becomes the first point of row ``iy - reach + k`` whose column is not below ``ix - reach + c``.
+    """
+    row = np.searchsorted(row_iy, iy - reach)
+    for k in range(2 * reach + 1):
+        if row >= len(row_iy) or row_iy[row] != iy - reach + k:
+            window[k] = 0
+            continue
+        first, last = row_start[row], row_start[row + 1]
+        at = first + np.searchsorted(cell_ix[first:last], ix - reach)
+        for c in range(2 * reach + 2):
+            while at < last and cell_ix[at] < ix - reach + c:
+                at += 1
+            window[k, c] = cell_start[at]
+        row += 1
+
+
+@device
+def copy_points(x, y, z, first, last, px, py, pz, keys, at):
+    """Append the points first..last - 1."""
+    for i in range(last - first):
+        px[at + i] = x[first + i]
+        py[at + i] = y[first + i]
+        pz[at + i] = z[first + i]
+        keys[at + i] = height_key(z[first + i])
+
+
+@device
+def members(px, py, pz, count, qx, qy, qz, spherical, r2, record):
+    """List the members of one neighborhood in canonical order, as float32 offsets from the query; how many there are."""
+    n = 0
+    for i in range(count):
+        dx, dy, dz = px[i] - qx, py[i] - qy, pz[i] - qz
+        record[n, 0], record[n, 1], record[n, 2], record[n, 3] = dx, dy, dz, 0.0
+        n += 1 if distance2(dx, dy, dz, spherical) <= r2 else 0
+    return n

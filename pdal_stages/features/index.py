@@ -69,10 +69,6 @@ class CellGrid:
         x, y, z = self.xyz
         return x, y, z, self.cell_ix, self.cell_start, self.row_iy, self.row_start
 
-    def rows_of_cells(self) -> np.ndarray:
-        """Row number of every occupied cell, (m,) int64."""
-        return np.repeat(self.row_iy, np.diff(self.row_start))
-
 
 def check_xyz(xyz, what: str = "xyz") -> np.ndarray:
     """`xyz` as an (n, 3) float64 array, or a StageError that says what is wrong with it.
@@ -241,33 +237,3 @@ def _take(values, rows):
     before = values.copy()
     for k in range(len(rows)):
         values[k] = before[rows[k]]
-
-
-@njit
-def cut_blocks(cell_start, cost, most_cost, most_rows):
-    """Cut sorted queries into blocks, inside cells where one cell is too much for a block.
-
-    `cell_start` (m + 1,) is the first query of each cell, `cost` (m,) that of one query in each; a block has at least one
-    query. The first query of each block, and the number of queries: (b + 1,).
-    """
-    starts = [np.int64(0)]
-    spent, rows = 0.0, 0
-    for cell in range(len(cell_start) - 1):
-        first, last = cell_start[cell], cell_start[cell + 1]
-        while first < last:
-            room = most_rows - rows
-            if cost[cell] > 0.0:
-                room = min(room, int((most_cost - spent) / cost[cell]))
-            if room <= 0:
-                if rows > 0:
-                    starts.append(first)
-                    spent, rows = 0.0, 0
-                    continue
-                room = 1
-            take = min(room, last - first)
-            first += take
-            rows += take
-            spent += take * cost[cell]
-    if len(cell_start) > 1:
-        starts.append(cell_start[-1])
-    return np.array(starts)

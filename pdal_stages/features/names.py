@@ -77,14 +77,8 @@ OF_PDAL = {
         "1 - |nz|, PDAL's DemantkeVerticality)",
     ),
     "demantkeverticality": ("DemantkeVerticality", "It is Verticality here, 1 - |nz|"),
-    "optimalknn": (
-        "OptimalKNN",
-        'Give filters.multiscalefeatures "optimal": true, and kopt among its neighborhoods',
-    ),
-    "optimalradius": (
-        "OptimalRadius",
-        'Write Radius, or give filters.multiscalefeatures "optimal": true, with kopt among its neighborhoods',
-    ),
+    "optimalknn": ("OptimalKNN", "PDAL's filters.optimalneighborhood writes it"),
+    "optimalradius": ("OptimalRadius", "Write Radius, with kopt among the neighborhoods"),
 }
 
 

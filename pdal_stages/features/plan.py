@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
+
+import numpy as np
 
 from ..base import checks
 from ..base.errors import OptionError
@@ -33,6 +35,12 @@ class Columns:
     def shapes(self) -> bool:
         """Whether any shape distribution is wanted."""
         return any(name in self.at for name in GROUPS["shapes"])
+
+
+def columns_of(chosen: Sequence[Columns], features: Sequence[str]) -> np.ndarray:
+    """Where each feature (column) of each neighborhood (row) goes, int64; -1: nowhere."""
+    table = [[one.at.get(feature, -1) for feature in features] for one in chosen]
+    return np.array(table, np.int64).reshape(len(chosen), len(features))
 
 
 @dataclass(frozen=True)

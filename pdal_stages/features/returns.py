@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OptionError
-from .cells import WHOLE, MeanColumn, cell_means
+from .cells import WHOLE, cell_means
 from .neighborhoods import SIDES
 
 #: What they are made of.
@@ -75,10 +75,8 @@ def return_features(
     xyz: npt.NDArray[np.float64],
     dimensions: Mapping[str, npt.ArrayLike],
     threads: int | None = None,
-) -> dict[str, npt.NDArray[Any] | MeanColumn]:
+) -> dict[str, npt.NDArray[Any]]:
     """Those of `names` that are return features, for every point of a cloud: (n,) each, 0 to 1, whole numbers or float32.
-
-    Columns may be those of a table, or lazy: a point's cells take half the memory of its means.
 
     Of `dimensions`, ``ReturnNumber`` and ``NumberOfReturns`` are read, (n,) each; without them all is 0.
     """
@@ -90,13 +88,11 @@ def return_features(
     flags[:, 0] = np.where(total > 1, WHOLE, 0)
     flags[:, 1] = np.where((number > 0) & (number < total), WHOLE, 0)
     del number, total
-    # One after the other: each needs room for a while.
-    scales = list(dict.fromkeys((one.axes, one.side) for one in wanted.values() if one.axes))
-    tables = {scale: cell_means(xyz[:, : scale[0]], flags, scale[1]) for scale in scales}
     own = (flags > 0).view(np.uint8)
-
-    def values(one: ReturnFeature) -> Any:
-        number = list(FLAGS).index(one.flag)
-        return MeanColumn(*tables[one.axes, one.side], number) if one.axes else own[:, number]
-
-    return {name: values(one) for name, one in wanted.items()}
+    found: dict[str, npt.NDArray[Any]] = {}
+    for scale in dict.fromkeys((one.axes, one.side) for one in wanted.values()):
+        cell, means = cell_means(xyz[:, : scale[0]], flags, scale[1]) if scale[0] else (slice(None), own)
+        for name, one in wanted.items():
+            if (one.axes, one.side) == scale:
+                found[name] = means[:, list(FLAGS).index(one.flag)][cell]
+    return {name: found[name] for name in wanted}

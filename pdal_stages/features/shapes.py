@@ -25,12 +25,22 @@ as 6 volume (D4: 6 t^3) and as the negative signed square of the cosine (A3); al
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import hashlib
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ..base.hashing import GOLDEN, finalise
 from ..base.jit import device, njit
+from .names import SHAPE_FEATURES
+from .plan import Columns, columns_of
+
+if TYPE_CHECKING:
+    from .bins import ShapeBins
+
+#: x, y and z of points, (m,) float64 each.
+Axes = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 #: Random pulls per neighborhood [B16].
 PULLS = 255
@@ -53,17 +63,17 @@ class Work(NamedTuple):
     above: np.ndarray  # (5, 9) float32
 
 
-#: What a kernel is to do about shapes.
-NOTHING, COUNTS, VALUES = 0, 1, 2
-
-
 class Shapes(NamedTuple):
-    """What a kernel is to make of shapes, and where it writes it."""
+    """The shape distributions wanted of k neighborhoods for m queries, and what they take."""
 
-    mode: int  # NOTHING, COUNTS or VALUES
-    thresholds: np.ndarray  # (5, 9) float32, comparable: for COUNTS
-    counts: np.ndarray  # (m, 50) float32: out, for COUNTS
-    values: np.ndarray  # (m, 5, 255) float32: out, for VALUES
+    shaped: np.ndarray  # (k,) bool: of which neighborhoods
+    columns: np.ndarray  # (k, 50) int64: columns of the output, or -1
+    thresholds: np.ndarray  # (k, 5, 9) float32: of the bins, comparable
+    seeds: np.ndarray  # (k, m) uint64: ``point_seeds`` of the queries, used where `shaped`
+    values: (
+        np.ndarray
+    )  # (k, m, 5, 255) float32: gets the pulls' metrics in place of the output; m = 0 for none
+    counts: np.ndarray  # (50,) float32: scratch
     work: Work
 
 
@@ -73,64 +83,61 @@ def make_work() -> Work:
     return Work(np.zeros(4 * ROOM, u), np.zeros(16 * ROOM, f), np.zeros(5 * ROOM, f), np.zeros((5, 9), f))
 
 
-def no_shapes() -> Shapes:
-    """Shapes of which nothing is made."""
-    return _shapes(NOTHING, np.zeros((5, 9)), 0, 0)
+def shapes_of(chosen: Sequence[Columns], points: Axes, seed: int, bins: ShapeBins | None) -> Shapes | None:
+    """What a kernel makes of the shapes of the `chosen` neighborhoods of points; None where no shapes are wanted.
 
-
-def count_shapes(thresholds: np.ndarray, m: int) -> Shapes:
-    """Shapes counted in the bins of (5, 9) comparable thresholds, for m queries."""
-    return _shapes(COUNTS, thresholds, m, 0)
-
-
-def list_shapes(m: int) -> Shapes:
-    """Shapes whose values are kept, for m queries."""
-    return _shapes(VALUES, np.zeros((5, 9)), 0, m)
-
-
-def _shapes(mode: int, thresholds: np.ndarray, counts: int, values: int) -> Shapes:
+    Counts in `bins`, or, without, the metrics of all pulls, to which bins are fitted.
+    """
+    if not any(one.shapes for one in chosen):
+        return None
+    k, m = len(chosen), len(points[0])
+    thresholds, seeds = np.zeros((k, 5, 9), np.float32), np.zeros((k, m), np.uint64)
+    for number, one in enumerate(chosen):
+        if one.shapes:
+            seeds[number] = point_seeds(*points, seed, one.neighborhood.token)
+            if bins is not None:
+                thresholds[number] = bins.comparable([one.neighborhood.token])[0]
+    values = np.empty((k, m if bins is None else 0, 5, PULLS), np.float32)
+    shaped = np.array([one.shapes for one in chosen])
     return Shapes(
-        mode,
-        np.ascontiguousarray(thresholds, np.float32),
-        np.empty((counts, 5 * BINS), np.float32),
-        np.empty((values, 5, PULLS), np.float32),
+        shaped,
+        columns_of(chosen, SHAPE_FEATURES),
+        thresholds,
+        seeds,
+        values,
+        np.empty(50, np.float32),
         make_work(),
     )
 
 
-_mix64 = device(finalise, forceinline=True)
-
-
-@njit
-def _point_seeds(x, y, z, start, out):
-    for i in range(len(out)):
-        h = _mix64(start + x[i])
-        h = _mix64(h + GOLDEN + y[i])
-        out[i] = _mix64(h + GOLDEN + z[i])
-
-
 def point_seeds(x: np.ndarray, y: np.ndarray, z: np.ndarray, seed: int, token: str) -> np.ndarray:
-    """Where the random numbers of each query start.
+    """Where the random numbers of each query start, (m,) uint64, from coordinates, seed and the neighborhood's token.
 
-    Parameters
-    ----------
-    x, y, z : ndarray of float64, shape (m,)
-        The queries' coordinates as they are in the cloud; every bit counts, except that -0.0 is 0.0.
-    seed : int
-    token : str
-        The neighborhood's token, so that neighborhoods draw independently.
-
-    Returns
-    -------
-    ndarray of uint64, shape (m,)
+    Every bit of the coordinates (m,) counts, except that -0.0 is 0.0.
     """
-    import hashlib
-
-    start = np.uint64(int.from_bytes(hashlib.sha256(f"{int(seed)}:{token}".encode()).digest()[:8], "little"))
+    h: Any = np.uint64(int.from_bytes(hashlib.sha256(f"{int(seed)}:{token}".encode()).digest()[:8], "little"))
     bits = [(np.ascontiguousarray(v, dtype=np.float64) + 0.0).view(np.uint64) for v in (x, y, z)]
-    out = np.empty(len(bits[0]), np.uint64)
-    _point_seeds(*bits, start, out)
-    return out
+    h = finalise(h + bits[0])
+    h = finalise(h + GOLDEN + bits[1])
+    return finalise(h + GOLDEN + bits[2])
+
+
+@device
+def write_shapes(shapes, number, q, record, n, gx, gy, gz, out):
+    """Write the shapes of one neighborhood of a query, of n members with the centroid (gx, gy, gz)."""
+    seed = shapes.seeds[number, q]
+    if shapes.values.shape[1]:
+        shapes.values[number, q] = np.nan
+        if n > 0:
+            shape_values(record, n, gx, gy, gz, seed, shapes.work, shapes.values[number, q])
+        return
+    counts = shapes.counts
+    counts[:] = 0.0
+    if n > 0:
+        shape_counts(record, n, gx, gy, gz, seed, shapes.thresholds[number], shapes.work, counts)
+    for f in range(50):
+        if shapes.columns[number, f] >= 0:
+            out[q, shapes.columns[number, f]] = counts[f]
 
 
 @device(forceinline=True)

@@ -8,6 +8,7 @@ across the main direction get the same coordinate at both ends, the median of wh
 from __future__ import annotations
 
 import ctypes
+import importlib
 import itertools
 import math
 import sys
@@ -20,7 +21,6 @@ import scipy
 from numpy.typing import NDArray
 
 from ..base.errors import DependencyError, StageError, how_to_add
-from ..base.lean import imported
 from ..base.ownprocess import in_own_process
 from .found import Table
 
@@ -39,7 +39,7 @@ _LIKENESS, _LEAST = 0.75, 0.4
 def vector(name: str) -> Any:
     """shapely, pyogrio or pyproj; an error says how to get it."""
     try:
-        return imported(name)
+        return importlib.import_module(name)
     except ImportError as error:
         raise DependencyError(
             f"outlines need {name}",

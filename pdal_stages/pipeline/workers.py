@@ -22,7 +22,6 @@ from ..base import checks
 from ..base.errors import InterruptedStage, StageError
 from ..base.files import NO_ROOM
 from ..base.plain import PlainStream
-from ..base.shortage import check_limit, is_short, shortage
 from ..base.threads import CORES, available_threads
 from .interrupts import check, gentle
 
@@ -68,8 +67,6 @@ def _reason(error: Exception) -> str:
         return "memory ran out. Take smaller tiles or fewer workers"
     if getattr(error, "errno", None) in NO_ROOM:
         return f"a temporary file beside the outputs could not be written ({error}). Make room on the disk"
-    if isinstance(error, ImportError | OSError) and is_short(error):
-        return str(shortage(f"{type(error).__name__}: {error}"))
     last = traceback.extract_tb(error.__traceback__)[-1]
     return f"{type(error).__name__}: {error} ({last.name}, line {last.lineno})"
 
@@ -111,7 +108,6 @@ class WorkerProcesses(AbstractContextManager):
     """Tasks in processes of their own, one at a time in each; they end with this process, however that ends."""
 
     def __init__(self, slots: int, threads: int) -> None:
-        check_limit()
         self.slots, self.threads = slots, threads
         self._idle: list[ProcessPoolExecutor] = []
         self._busy: dict[Future, ProcessPoolExecutor] = {}

@@ -15,7 +15,7 @@ from ..base.files import write_whole
 from ..base.outputs import Output
 from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
-from ..features.neighborhoods import LEAST_RADIUS, Neighborhood, parse_neighborhoods
+from ..features.neighborhoods import parse_neighborhoods
 from ..features.plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS
 from ..features.voxels import LARGEST, check_side, represent
 from .base import Stage
@@ -25,9 +25,6 @@ from .selection import Selection
 
 #: Bytes a LAS extra-dimension name may have.
 _NAME_BYTES = 32
-#: What `optimal` writes, and the features of kopt that it follows from.
-_OPTIMAL = {"OptimalKNN": "uint64_t", "OptimalRadius": "double"}
-_OF_CHOSEN = ("Density", "Radius")
 
 
 class MultiscaleFeatures(Stage):
@@ -57,11 +54,6 @@ class MultiscaleFeatures(Stage):
         "these points and written, so that other tiles use the same ones",
     )
     ignore: Selection = ignore_option("Points that are not neighbors and get no features")
-    optimal: bool = option(
-        "boolean",
-        False,
-        "Also write the neighborhood that kopt chose as PDAL does: OptimalKNN (the point itself counted) and OptimalRadius",
-    )
     voxel: float = option(
         "number",
         0.0,
@@ -92,27 +84,13 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
 
     @cached_property
     def plan(self) -> FeaturePlan:
-        """The parsed neighborhoods and features, with what is needed of `chosen`."""
-        needed = [f"{name}_{self.chosen.suffix}" for name in _OF_CHOSEN] if self.chosen else []
-        return FeaturePlan.parse(self.neighborhoods, feature_set=[*self.feature_set, *needed])
-
-    @cached_property
-    def chosen(self) -> Neighborhood | None:
-        """The kopt whose choice is written as PDAL's OptimalKNN and OptimalRadius."""
-        found = [n for n in parse_neighborhoods(self.neighborhoods) if n.kind == "kopt"]
-        if not self.optimal:
-            return None
-        if len(found) != 1:
-            raise OptionError(
-                "option 'optimal' needs one neighborhood kopt", found=", ".join(map(str, self.neighborhoods))
-            )
-        return found[0]
+        """The parsed neighborhoods and features."""
+        return FeaturePlan.parse(self.neighborhoods, feature_set=self.feature_set)
 
     @cached_property
     def columns(self) -> list[str]:
         """Features to write: the point's own dimensions are there already."""
-        asked = FeaturePlan.parse(self.neighborhoods, feature_set=self.feature_set)
-        return [name for name in asked.names if name not in asked.dimensions]
+        return [name for name in self.plan.names if name not in self.plan.dimensions]
 
     def check(self) -> None:
         option = "neighborhoods"
@@ -125,7 +103,6 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
                 f"option '{option}': {error.what}", found=error.found, cure=error.cure
             ) from None
         check_side(self.voxel)
-        self.chosen  # noqa: B018  refused here where there is not one
         for name in names:
             if len(name.encode()) > _NAME_BYTES:
                 raise OptionError(
@@ -137,7 +114,7 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
         return [Output(self.bins, "bins", kinds.JSON)] if self.bins and not Path(self.bins).exists() else []
 
     def creates(self) -> dict[str, str]:
-        return {**dict.fromkeys(self.columns, "float"), **(_OPTIMAL if self.optimal else {})}
+        return dict.fromkeys(self.columns, "float")
 
     def halo_m(self) -> float:
         return self.plan.halo_m + self.voxel
@@ -182,9 +159,6 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
             own = {name: values[queries] for name, values in own.items()}
         columns = [plan.names.index(name) for name in names]
         out = {name: np.array(points.arrays[name]) for name in self.creates()}
-        of_chosen = (
-            [plan.names.index(f"{name}_{self.chosen.suffix}") for name in _OF_CHOSEN] if self.chosen else []
-        )
         with Progress(total, self.type) as progress:
             for rows, values in engine.blocks(
                 queries,
@@ -200,11 +174,6 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
                 rows = there[rows]
                 for name, column in zip(names, columns, strict=True):
                     out[name][rows] = values[:, column]
-                if of_chosen:
-                    density, radius = values[:, of_chosen].T.astype(np.float64)
-                    ball = 4 / 3 * np.pi * np.maximum(radius, LEAST_RADIUS) ** 3
-                    out["OptimalKNN"][rows] = np.rint(density * ball)
-                    out["OptimalRadius"][rows] = radius / points.units.horizontal
         if self.bins and not Path(self.bins).exists():
             _write_bins(self.bins, engine)
         points.report.figures.update(

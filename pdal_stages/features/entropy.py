@@ -1,0 +1,207 @@
+"""The best of nested neighborhoods: the one with the lowest eigenentropy [B16 eq. 1-2].
+
+It is found in two steps. A vectorized closed form estimates all entropies to 1e-7; those within ``MARGIN`` of the lowest are
+computed again by the exact method of the features. Entropies that then lie within ``TIE`` of each other count as equal, and
+the smallest neighborhood wins: in a perfect plane or line rounding noise would decide otherwise.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ..base.jit import FAST, device
+from .eigen import eigenentropy, eigenvalues3, log_fast
+from .moments import COINCIDENT, HIGH, LOW, SX, SXX, SXY, SXZ, SY, SYY, SYZ, SZ, SZZ, N
+
+#: Estimated entropies are off by less than half of this.
+MARGIN = 2e-6
+
+#: Entropies closer than this are equal.
+TIE = 1e-9
+
+#: Entropy of what is no candidate.
+NEVER = 9.0
+
+
+class Sums(NamedTuple):
+    """Moments about the query of nested neighborhoods: element j belongs to the j-th of them."""
+
+    n: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    z: np.ndarray
+    xx: np.ndarray
+    xy: np.ndarray
+    xz: np.ndarray
+    yy: np.ndarray
+    yz: np.ndarray
+    zz: np.ndarray
+    low: np.ndarray  # heights
+    high: np.ndarray
+    entropy: np.ndarray
+
+
+@device
+def make_sums(count):
+    return Sums(
+        np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count),
+        np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count),
+        np.empty(count),
+    )  # fmt: skip
+
+
+@device
+def add_up(near, qx, qy, qz, ends, first, last, s):
+    """Moments of the first ends[j] neighbors, for j from `first` to `last`, for which ends ascend."""
+    sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
+    low, high = np.inf, -np.inf
+    i = 0
+    for j in range(first, last):
+        while i < ends[j]:
+            p = near.pos[i]
+            height = near.z[p]
+            a, b, c = near.x[p] - qx, near.y[p] - qy, height - qz
+            sx += a
+            sy += b
+            sz += c
+            sxx += a * a
+            sxy += a * b
+            sxz += a * c
+            syy += b * b
+            syz += b * c
+            szz += c * c
+            low = height if height < low else low
+            high = height if height > high else high
+            i += 1
+        s.n[j] = i
+        s.x[j], s.y[j], s.z[j] = sx, sy, sz
+        s.xx[j], s.xy[j], s.xz[j] = sxx, sxy, sxz
+        s.yy[j], s.yz[j], s.zz[j] = syy, syz, szz
+        s.low[j], s.high[j] = low, high
+
+
+@device
+def write_moments(s, j, table, column):
+    """The sums `j` as a column of a table of moments."""
+    table[N, column] = s.n[j]
+    table[SX, column], table[SY, column], table[SZ, column] = s.x[j], s.y[j], s.z[j]
+    table[SXX, column], table[SXY, column], table[SXZ, column] = s.xx[j], s.xy[j], s.xz[j]
+    table[SYY, column], table[SYZ, column], table[SZZ, column] = s.yy[j], s.yz[j], s.zz[j]
+    table[LOW, column], table[HIGH, column] = s.low[j], s.high[j]
+
+
+@device(fastmath=set(FAST), forceinline=True)
+def estimate_entropy(xx, xy, xz, yy, yz, zz, noise):
+    """Eigenentropy of a covariance matrix to 1e-7, in closed form and without a branch.
+
+    ``NEVER`` where the trace is not above `noise`.
+
+    With unit trace, the eigenvalues are 1/3 + 2 p cos(phi + 2 pi i / 3), cos(3 phi) = r. For r >= 0 the
+    squared sine of phi is (1 - r) times a smooth function of r, here a polynomial of degree 8 (fitted at
+    Chebyshev nodes, error 7e-10); r < 0 is its mirror image.
+    """
+    trace = xx + yy + zz
+    some = trace > noise
+    scale = 1.0 / (trace if some else 1.0)
+    third = 1.0 / 3.0
+    a, b, c = xx * scale - third, yy * scale - third, zz * scale - third
+    d, e, f = xy * scale, xz * scale, yz * scale
+    pp = (a * a + b * b + c * c + 2.0 * (d * d + e * e + f * f)) * (1.0 / 6.0)
+    det = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
+    p = math.sqrt(pp)
+    round_ = pp > 1e-24
+    r = 0.5 * det / (pp * p if round_ else 1.0)
+    sign = 1.0 if r >= 0.0 else -1.0
+    r = abs(r)
+    r = r if r < 1.0 else 1.0
+    g = r * 0.0001390659792811512 - 0.0008013499216350227
+    g = g * r + 0.0022057097588815584
+    g = g * r - 0.004110695181066391
+    g = g * r + 0.0063985863615792496
+    g = g * r - 0.00981107968361836
+    g = g * r + 0.01687699899962807
+    g = g * r - 0.038675012833058346
+    g = g * r + 0.2499999992783597
+    ss = (1.0 - r) * g
+    cosine = sign * p * math.sqrt(1.0 - ss)
+    sine = 1.7320508075688772 * p * math.sqrt(ss)
+    one = third + 2.0 * cosine
+    two = third - cosine + sine
+    three = third - cosine - sine
+    one = one if one > 1e-16 else 1e-16
+    two = two if two > 1e-16 else 1e-16
+    three = three if three > 1e-16 else 1e-16
+    entropy = -(one * log_fast(one) + two * log_fast(two) + three * log_fast(three))
+    return entropy if some else NEVER
+
+
+@device
+def eigenvalues_of(s, j):
+    """Eigenvalues of the covariance matrix of the sums `j`, and the mean squared distance to the query."""
+    w = 1.0 / s.n[j]
+    x, y, z = s.x[j] * w, s.y[j] * w, s.z[j] * w
+    xx, yy, zz = s.xx[j] * w, s.yy[j] * w, s.zz[j] * w
+    l1, l2, l3 = eigenvalues3(
+        xx - x * x, s.xy[j] * w - x * y, s.xz[j] * w - x * z, yy - y * y, s.yz[j] * w - y * z, zz - z * z
+    )
+    return l1, l2, l3, xx + yy + zz
+
+
+@device
+def estimate_entropies(n, x, y, z, xx, xy, xz, yy, yz, zz, entropy, first, last, least):
+    """Estimate the eigenentropies of the candidates first..last - 1 of at least `least` members."""
+    for j in range(first, last):
+        w = 1.0 / n[j]
+        a, b, c = x[j] * w, y[j] * w, z[j] * w
+        value = estimate_entropy(
+            xx[j] * w - a * a, xy[j] * w - a * b, xz[j] * w - a * c, yy[j] * w - b * b, yz[j] * w - b * c,
+            zz[j] * w - c * c, COINCIDENT * w * (xx[j] + yy[j] + zz[j]),
+        )  # fmt: skip
+        entropy[j] = value if n[j] >= least else NEVER
+
+
+@device
+def lowest_entropy(s, first, last, least_members):
+    """The candidate of first..last - 1 with the lowest eigenentropy; last - 1 where none qualifies.
+
+    Parameters
+    ----------
+    s : Sums
+        Moments of the candidates, in ascending size; n > 0.
+    least_members : int
+        Members a candidate needs.
+    """
+    if last - first <= 1:
+        return last - 1
+    entropy = s.entropy
+    estimate_entropies(
+        s.n, s.x, s.y, s.z, s.xx, s.xy, s.xz, s.yy, s.yz, s.zz, entropy, first, last, least_members
+    )
+    least = NEVER
+    for j in range(first, last):
+        least = min(least, entropy[j])
+    if least >= NEVER:
+        return last - 1
+    limit = least + MARGIN
+    count, only = 0, first
+    for j in range(first, last):
+        if entropy[j] <= limit:
+            count += 1
+            only = j
+    if count == 1:
+        return only
+    least = NEVER
+    for j in range(first, last):
+        if entropy[j] > limit:
+            entropy[j] = NEVER
+            continue
+        l1, l2, l3, _ = eigenvalues_of(s, j)
+        entropy[j] = eigenentropy(l1, l2, l3)
+        least = min(least, entropy[j])
+    for j in range(first, last):
+        if entropy[j] <= least + TIE:
+            return j
+    return last - 1

@@ -1,0 +1,228 @@
+"""Neighbors of queries, exact and in one well-defined order: by (squared distance, x, y, z).
+
+Squared distances are those of float64 differences, so the answer is a function of the cloud as a set: neither the order of
+the points, nor the tile, nor which queries are searched together changes it. Points with equal coordinates are
+interchangeable.
+
+Eight queries that lie together share the candidates within a reach, guessed from the queries before; each sorts those
+within its own. In the plane the squared distance is uniformly distributed, so a counting sort by it fills its bins evenly.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..base.jit import device
+from .kdtree import STACK, bounding_box, enough2, gather, halve
+
+#: Queries that share one set of candidates.
+GROUP = 8
+
+#: Bins of squared distance; behind them what lies beyond the reach.
+BINS = 256
+
+#: First guess of the squared reach, the least, and by how much the next is larger than what the last needed.
+FIRST2, LEAST2, MORE = 1.0, 1e-6, 1.2
+
+#: A search for `need` neighbors that meets more than CROWD * need + ROOM candidates looks closer.
+CROWD = 4
+ROOM = 256
+
+#: Squared meters too small to divide by.
+TINY = 1e-200
+
+#: From this many points in one bin a heapsort takes the place of the insertion sort.
+HEAP = 48
+
+
+class Near(NamedTuple):
+    """Candidates of a group of queries, and room to sort them for one."""
+
+    x: np.ndarray  # float64
+    y: np.ndarray
+    z: np.ndarray
+    at: np.ndarray  # uint32: positions in the cloud
+    d2: np.ndarray  # float64
+    bins: np.ndarray  # int32
+    sorted: np.ndarray  # float64: squared distances of the neighbors, in order
+    pos: np.ndarray  # uint32: which candidates they are
+    hist: np.ndarray  # (BINS + 1,) int64
+    stack: np.ndarray
+
+
+@device
+def make_near(room):
+    f, u = np.float64, np.uint32
+    return Near(
+        np.empty(room, f), np.empty(room, f), np.empty(room, f), np.empty(room, u), np.empty(room, f),
+        np.empty(room, np.int32), np.empty(room, f), np.empty(room, u), np.empty(BINS + 1, np.int64),
+        np.empty((STACK, 4), np.int64),
+    )  # fmt: skip
+
+
+@device
+def make_groups(qx, qy, qz):
+    """Order of queries, (m,) uint32, and where groups of at most GROUP that lie together start, (groups + 1,)."""
+    m = len(qx)
+    order, keys = np.arange(m).astype(np.uint32), np.empty(m)
+    starts, count = np.empty(m + 1, np.int64), 0
+    stack = np.empty((STACK, 2), np.int64)
+    stack[0, 0], stack[0, 1] = 0, m
+    top = 1 if m > 0 else 0
+    while top > 0:
+        top -= 1
+        lo, hi = stack[top, 0], stack[top, 1]
+        if hi - lo <= GROUP:
+            starts[count] = lo
+            count += 1
+            continue
+        middle = halve(qx, qy, qz, order, keys, lo, hi, bounding_box(qx, qy, qz, order, lo, hi))
+        stack[top, 0], stack[top, 1] = middle, hi
+        top += 1
+        stack[top, 0], stack[top, 1] = lo, middle
+        top += 1
+    starts[count] = m
+    return order, starts[: count + 1]
+
+
+@device
+def gather_near(tree, qx, qy, qz, order, lo, hi, need, within2, cap2, reach2, near):
+    """Candidates of the queries order[lo:hi], or of the first alone where they are too many or lie too far apart.
+
+    At least the points within `within2` (squared meters) are wanted, at least `need` of those within `cap2`.
+
+    Returns
+    -------
+    hi : int
+        Up to where queries are served.
+    count : int
+    reach2 : float
+        Squared distance within which no point of the cloud is missing.
+    near : Near
+        With the candidates; it grows where it must.
+    """
+    room = len(near.x)
+    limit = room if within2 > 0.0 else min(room, CROWD * need + ROOM)
+    copies = need if within2 == 0.0 else len(tree.perm)
+    while True:
+        box = bounding_box(qx, qy, qz, order, lo, hi)
+        side = max(box[3] - box[0], box[4] - box[1], box[5] - box[2])
+        if hi - lo > 1 and side * side > reach2:
+            hi = lo + 1
+            continue
+        count = gather(tree, box, reach2, copies, limit, near.stack, near.x, near.y, near.z, near.at)
+        if count >= need or (count >= 0 and reach2 >= cap2):
+            return hi, count, reach2, near
+        if count >= 0:
+            reach2 = min(2.0 * reach2, cap2)
+            continue
+        if hi - lo > 1:
+            hi = lo + 1
+            continue
+        enough = max(enough2(tree, box, need), within2)
+        if reach2 > enough:
+            reach2 = enough
+        elif limit < room:
+            limit = room
+        else:
+            room = limit = 4 * room
+            near = make_near(room)
+
+
+@device
+def sort_near(near, count, qx, qy, qz, need, within2, cap2, reach2):
+    """Sort the neighbors of one query into near.sorted and near.pos; how many, or -1 where `reach2` is too short."""
+    x, y, z, d2, bins, hist = near.x, near.y, near.z, near.d2, near.bins, near.hist
+    scale = BINS / max(reach2, TINY)
+    for i in range(count):
+        dx, dy, dz = x[i] - qx, y[i] - qy, z[i] - qz
+        d = dx * dx + dy * dy + dz * dz
+        d2[i] = d
+        b = d * scale
+        b = b if b < BINS - 1 else BINS - 1.0
+        bins[i] = np.int32(b if d <= reach2 else float(BINS))
+    hist[:] = 0
+    for i in range(count):
+        hist[bins[i]] += 1
+    there = count - hist[BINS]
+    if there < need and reach2 < cap2:
+        return -1
+    most = there if within2 > 0.0 else min(need, there)
+    end, last = 0, 0  # where each bin starts; up to which the bins hold enough
+    crowded = False
+    while end < most:
+        size = hist[last]
+        hist[last] = end
+        end += size
+        last += 1
+        crowded = crowded or size > HEAP
+    place, pos = near.sorted, near.pos
+    for i in range(count):
+        b = bins[i]
+        if b < last:
+            p = hist[b]
+            hist[b] = p + 1
+            place[p] = d2[i]
+            pos[p] = i
+    if crowded:
+        first = np.int64(0)
+        for b in range(last):
+            if hist[b] - first > HEAP:
+                _heap_sort(place, pos, first, hist[b], x, y, z)
+            first = hist[b]
+    _insertion_sort(place, pos, end, x, y, z)
+    if within2 > 0.0 and within2 < reach2:
+        most = min(need, there)
+        while most < there and place[most] <= within2:
+            most += 1
+    return most
+
+
+@device(forceinline=True)
+def _before(d, a, e, b, x, y, z):
+    """Whether candidate a at squared distance d comes before candidate b at e."""
+    if d != e:
+        return d < e
+    if x[a] != x[b]:
+        return x[a] < x[b]
+    if y[a] != y[b]:
+        return y[a] < y[b]
+    return z[a] < z[b]
+
+
+@device
+def _insertion_sort(d, pos, end, x, y, z):
+    for i in range(1, end):
+        key, item = d[i], pos[i]
+        j = i
+        while j > 0 and d[j - 1] >= key:
+            if d[j - 1] == key and not _before(key, item, key, pos[j - 1], x, y, z):
+                break
+            d[j] = d[j - 1]
+            pos[j] = pos[j - 1]
+            j -= 1
+        d[j] = key
+        pos[j] = item
+
+
+@device
+def _heap_sort(d, pos, lo, hi, x, y, z):
+    start, end = (hi - lo) // 2, hi - lo
+    while end > 1:
+        if start > 0:
+            start -= 1
+        else:
+            end -= 1
+            d[lo + end], d[lo] = d[lo], d[lo + end]
+            pos[lo + end], pos[lo] = pos[lo], pos[lo + end]
+        r, a = lo + start, lo + 2 * start + 1
+        while a < lo + end:
+            if a + 1 < lo + end and _before(d[a], pos[a], d[a + 1], pos[a + 1], x, y, z):
+                a += 1
+            if not _before(d[r], pos[r], d[a], pos[a], x, y, z):
+                break
+            d[a], d[r] = d[r], d[a]
+            pos[a], pos[r] = pos[r], pos[a]
+            r, a = a, lo + 2 * (a - lo) + 1
