@@ -46,7 +46,7 @@ def town(n=5000, seed=1):
 # ---- against the oracle ----------------------------------------------------------------------------------
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(label_pairs())
 def test_all_measures_equal_scikit_learn(pair):
     reference, predicted = pair
@@ -139,7 +139,7 @@ def test_wilson_interval():
 # ---- properties ------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(label_pairs(2), st.integers(0, 60), st.sampled_from([(), (1,), (0, 1, 5)]))
 def test_tiles_add_to_the_whole(pair, cut, ignore):
     reference, predicted = pair
@@ -160,7 +160,7 @@ def test_tiles_add_to_the_whole(pair, cut, ignore):
         assert whole.table() == tiles.table()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(label_pairs())
 def test_merging_the_matrix_equals_merging_the_labels(pair):
     reference, predicted = pair

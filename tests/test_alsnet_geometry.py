@@ -47,7 +47,7 @@ clouds = st.builds(
 
 
 @given(clouds, st.data())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_farthest_points_equal_the_reference(p, data):
     count = data.draw(st.integers(1, len(p)))
     start = data.draw(st.integers(0, len(p) - 1))
@@ -57,14 +57,14 @@ def test_farthest_points_equal_the_reference(p, data):
 
 
 @given(clouds, st.floats(0.01, 30.0), st.integers(1, 20), st.integers(0, 2**32))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_ball_query_equals_the_reference(p, radius, samples, seed):
     centers = np.random.default_rng(seed).integers(0, len(p), min(len(p), 30))
     assert np.array_equal(ball_query(p, centers, radius, samples), slow_ball(p, centers, radius, samples))
 
 
 @given(clouds, st.integers(1, 10))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_three_nearest_weigh_by_inverse_square(p, m):
     coarse = p[:m]
     index, weight = three_nearest(p, coarse)
@@ -87,7 +87,7 @@ def test_three_nearest_weigh_by_inverse_square(p, m):
     st.integers(16, 300),
     st.sampled_from(["even", "clumps", "places"]),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_every_point_is_in_a_batch_and_batches_are_the_nearest_points(seed, n, points, kind):
     random = np.random.default_rng(seed)
     xyz = random.random((n, 3)) * [60.0, 40.0, 5.0]
@@ -215,7 +215,6 @@ def test_configurations_survive_json(name):
 
     one = CONFIGURATIONS[name]
     assert parse_configuration(json.loads(json.dumps(one.to_dict()))) == one
-    assert len(one.shapes(2, 5)) == one.layers
     assert one.memory_mb(2) > 0
 
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib.util
-import json
 
 import numpy as np
 import pytest
@@ -116,33 +115,6 @@ def test_tiles_give_the_labels_of_the_whole(cloud, tmp_path, pdal_module):
     importlib.util.find_spec("torch") is None,
     reason="PyTorch is not installed (extra 'deep'): training is not tested",
 )
-def test_one_word_trains_a_network(cloud, tmp_path, pdal_module):
-    path = cloud[0]
-    network = {
-        "configuration": TINY.to_dict(),
-        "epochs": 2,
-        "validation": 0,
-        "histogram_threshold": 40,
-        "checkpoint": str(tmp_path / "run.ckpt"),
-    }
-    result = ps.run_pipeline(
-        [
-            str(path),
-            {"type": "filters.hag_minima"},
-            {"type": WRITER, "filename": str(tmp_path / "a.model"), "algorithm": "alsnet", "alsnet": network},
-        ]
-    )
-    made = load_model(tmp_path / "a.model")
-    assert made.algorithm.name == "alsnet" and made.required_dimensions == ("HeightAboveGround",)
-    assert len(made.info["training"]["curve"]) == 2
-    assert "curve" in json.dumps(result.metadata, default=str)
-
-
-@pytest.mark.pdal
-@pytest.mark.skipif(
-    importlib.util.find_spec("torch") is None,
-    reason="PyTorch is not installed (extra 'deep'): training is not tested",
-)
 def test_color_and_echo_width_of_a_file_are_inputs(tmp_path, write_las, pdal_module):
     """Color is LAS's own; echo width is an extra dimension, which the reader of LAS 1.4 gives by its name."""
     laspy = pytest.importorskip("laspy")
@@ -157,25 +129,17 @@ def test_color_and_echo_width_of_a_file_are_inputs(tmp_path, write_las, pdal_mod
     reader = {"type": "readers.las", "filename": str(path), "use_eb_vlr": True}
     made, out = str(tmp_path / "a.model"), str(tmp_path / "out.las")
     network = {"configuration": TINY.to_dict(), "epochs": 8, "validation": 0, "learning_rate": 0.02}
+    network["checkpoint"] = str(tmp_path / "a.checkpoint")
     writer = {"type": WRITER, "filename": made, "algorithm": "alsnet", "alsnet": network}
     ps.run_pipeline([reader, {**writer, "dimensions": "Red,EchoWidth"}])
     assert load_model(made).required_dimensions == ("Red", "EchoWidth")
     ps.run_pipeline([reader, {"type": "filters.modelclassifier", "model": made}, out])
     assert (np.asarray(laspy.read(out).classification) == labels).mean() > 0.95
+    assert len(load_model(made).info["training"]["curve"]) == 8 and (tmp_path / "a.checkpoint").exists()
+    del arrays["EchoWidth"]
+    bare = str(write_las(tmp_path / "bare.las", arrays, point_format=7))
     with pytest.raises(DimensionError, match="EchoWidth"):
-        ps.run_pipeline(
-            [
-                str(cloud_without(tmp_path, write_las, arrays)),
-                {"type": "filters.modelclassifier", "model": made},
-            ]
-        )
-
-
-def cloud_without(tmp_path, write_las, arrays):
-    """The same points without the echo width."""
-    return write_las(
-        tmp_path / "bare.las", {k: v for k, v in arrays.items() if k != "EchoWidth"}, point_format=7
-    )
+        ps.run_pipeline([bare, {"type": "filters.modelclassifier", "model": made}])
 
 
 def test_stage_options(model, tmp_path):

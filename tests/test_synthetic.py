@@ -61,7 +61,7 @@ def test_density_is_met(size, density, more):
     assert len(t) / size**2 == pytest.approx(density, rel=0.06)
 
 
-@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     size=st.floats(20, 70),
     density=st.floats(0.5, 5),
@@ -112,7 +112,7 @@ def test_labels_and_heights_agree(town):
     assert (h[c == 17] > -0.2).all() and (h[c == 17] < 2.5).all()
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_both_halves_hold_every_class(seed):
     """Training on one half and classifying the other is a fair task."""
     t = make_town(200, 2, seed=seed, progress=False)
@@ -165,7 +165,7 @@ def test_first_hit_equals_marching_through_all_things():
         site.bar(rng.uniform(0, 15, 3), rng.uniform(5, 20, 3), 0.15, 14, "metal")
     scene, met = scene_of(site), 0
     tested = np.full(len(scene.things), -1)
-    for beam in range(90):
+    for beam in range(40):
         way, tilt = rng.uniform(0, 2 * math.pi), rng.uniform(0, math.tan(math.radians(35)))
         d = np.array([tilt * math.cos(way), tilt * math.sin(way), -1.0])
         d /= np.linalg.norm(d)
@@ -176,7 +176,7 @@ def test_first_hit_equals_marching_through_all_things():
         fast, index, _ = first_hit(scene, *o, *d, 60.0, tested, beam, rng)
         assert fast == pytest.approx(slow, abs=0.006)
         met += index >= 0
-    assert 30 < met < 90
+    assert 12 < met < 40
 
 
 @pytest.mark.parametrize("extinction", [0.2, 0.6, 1.5])
@@ -185,10 +185,10 @@ def test_leaves_follow_beer_and_lambert(extinction):
     site.box(0, 0, 0, 30, 30, 0, 4.0, VEGETATION, "leaf", leafy=extinction)
     scene, passed = scene_of(site), 0
     tested = np.full(1, -1)
-    for beam in range(4000):
+    for beam in range(2000):
         place = site.u0 + rng.uniform(-25, 25), site.v0 + rng.uniform(-25, 25), 50.0
         passed += first_hit(scene, *place, 0.0, 0.0, -1.0, 50.0, tested, beam, rng)[1] < 0
-    assert passed / 4000 == pytest.approx(math.exp(-4.0 * extinction), abs=0.03)
+    assert passed / 2000 == pytest.approx(math.exp(-4.0 * extinction), abs=0.03)
 
 
 # ---- files, the command, errors ----------------------------------------------------------------------------

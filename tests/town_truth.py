@@ -22,9 +22,8 @@ class House(NamedTuple):
     eave: float  # its height, absolute
     ridge: float
     walls: NDArray  # (4, 2): corners of the walls
-    slopes: (
-        tuple  # of a sloped roof's planes: fall along the length, fall along the width, height in the middle
-    )
+    #: of a sloped roof's planes: fall along the length, fall along the width, height in the middle
+    slopes: tuple
 
     def height(self, places: NDArray) -> NDArray[np.float64]:
         """Height of the roof at places (n, 2), without dormers, chimneys and the like."""

@@ -74,31 +74,19 @@ class Accuracy:
 
     Make one with :meth:`from_labels` or :meth:`from_confusion`. Two of them add (tiles), and
     ``sum(tiles)`` works.
-
-    Attributes
-    ----------
-    classes : tuple of int
-        Codes of the matrix's rows: the classes of the reference, ascending.
-    extra : tuple of int
-        Codes of the columns after those: classes that were predicted but are not in the reference.
-    matrix : (K, K + E) int64
-        Points; rows are the reference, columns the prediction.
-    names : mapping of code to name
-    left_out : mapping of code to count
-        Reference points that were not compared, by their reference class before any merge.
-    merged : mapping of code to code
-        Classes that were taken as another one on both sides.
-    reliability, margin : Grading or None
-        How well the two confidences tell right from wrong.
     """
 
-    classes: tuple[int, ...]
-    extra: tuple[int, ...]
-    matrix: npt.NDArray[np.int64]
+    classes: tuple[int, ...]  #: codes of the matrix's rows: the classes of the reference, ascending
+    extra: tuple[
+        int, ...
+    ]  #: of the columns after those: classes that were predicted but are not in the reference
+    matrix: npt.NDArray[np.int64]  #: (K, K + E) points; rows are the reference, columns the prediction
     names: Mapping[int, str] = field(default_factory=dict)
+    #: reference points that were not compared, by their reference class before any merge
     left_out: Mapping[int, int] = field(default_factory=dict)
-    reliability: Grading | None = None
+    reliability: Grading | None = None  #: how well it tells right from wrong
     margin: Grading | None = None
+    #: classes that were taken as another one on both sides
     merged: Mapping[int, int] = field(default_factory=dict)
 
     @classmethod

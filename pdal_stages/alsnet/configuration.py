@@ -59,13 +59,8 @@ class Configuration:
             raise OptionError("a network must have 1 to 8 levels", found=len(self.levels))
         set_(self, "head", _widths("head", self.head))
         set_(self, "dropout", checks.number("'dropout'", self.dropout, 0.0, 0.95))
-        if self.layers > MAX_LAYERS:
-            raise OptionError(f"a network may have {MAX_LAYERS} layers", found=self.layers)
-
-    @property
-    def layers(self) -> int:
-        """Number of linear layers."""
-        return sum(len(level.mlp) + len(level.up) for level in self.levels) + len(self.head) + 1
+        if (layers := len(self.shapes(1, 1))) > MAX_LAYERS:
+            raise OptionError(f"a network may have {MAX_LAYERS} layers", found=layers)
 
     def _linear(self, inputs: int) -> Iterator[tuple[str, int, int, int, int]]:
         """Of every layer but the last, in the order of the computation: name, rows, inputs, outputs, depth below."""
@@ -116,19 +111,10 @@ class Configuration:
 def parse_configuration(
     given: str | Mapping[str, Any] | Configuration, points: int | None = None
 ) -> Configuration:
-    """A configuration from its name or from data.
+    """A configuration from its name or from data, or an OptionError; `points` of a batch instead of its own.
 
-    Parameters
-    ----------
-    given : str, mapping or Configuration
-        A name of :data:`CONFIGURATIONS`, or a mapping with ``points``, ``levels`` (each ``centers``, ``radius``,
-        ``samples``, ``mlp``, ``up``) and optionally ``name``, ``head``, ``dropout``.
-    points : int, optional
-        Points of a batch, instead of the configuration's own.
-
-    Raises
-    ------
-    OptionError
+    A mapping has ``points``, ``levels`` (each ``centers``, ``radius``, ``samples``, ``mlp``, ``up``) and optionally
+    ``name``, ``head``, ``dropout``.
     """
     if isinstance(given, str):
         if given not in CONFIGURATIONS:
@@ -177,123 +163,67 @@ def _widths(name: str, value: Any) -> tuple[int, ...]:
     return tuple(checks.whole(f"'{name}'", width, 1, 4096) for width in value)
 
 
-def _levels(*rows) -> tuple[Level, ...]:
-    return tuple(Level(*row) for row in rows)
-
-
 #: The named ones. ``alsnet4`` and ``alsnet3`` are those of [WM19]'s program; the others are ours, for CPUs.
 CONFIGURATIONS = {
-    one.name: one
-    for one in (
-        Configuration(
-            "alsnet4",
-            200_000,
-            _levels(
+    name: Configuration(name, points, tuple(Level(*row) for row in levels), head)
+    for name, points, head, levels in (
+        (
+            "alsnet4", 200_000, (128,), (
                 (8192, 1.0, 16, (64, 128, 128), (128, 64)),
                 (4096, 2.0, 16, (128, 256, 256), (256, 256)),
                 (2048, 5.0, 16, (128, 256, 256), (256, 256)),
                 (512, 15.0, 32, (128, 512, 256), (256, 256)),
             ),
         ),
-        Configuration(
-            "alsnet3",
-            200_000,
-            _levels(
+        (
+            "alsnet3", 200_000, (128,), (
                 (16384, 1.0, 32, (128, 128, 128), (128, 128)),
                 (8192, 5.0, 64, (128, 128, 256), (256, 256)),
                 (4096, 15.0, 64, (128, 128, 256), (256, 256)),
             ),
         ),
-        Configuration(
-            "small",
-            16_384,
-            _levels(
+        (
+            "small", 16_384, (64,), (
                 (2048, 1.0, 16, (32, 32, 64), (64, 64)),
                 (512, 2.5, 16, (64, 64, 128), (128, 64)),
                 (128, 6.0, 16, (128, 128, 256), (128, 128)),
             ),
-            head=(64,),
         ),
-        Configuration(
-            "tiny",
-            2048,
-            _levels((256, 1.5, 8, (16, 16, 32), (32, 32)), (64, 4.0, 8, (32, 32, 64), (32, 32))),
-            head=(32,),
-        ),
+        ("tiny", 2048, (32,), ((256, 1.5, 8, (16, 16, 32), (32, 32)), (64, 4.0, 8, (32, 32, 64), (32, 32)))),
     )
-}
-
-
-CLASS_WEIGHTS = ("none", "sqrt", "balanced")
-DEVICES = ("auto", "cpu", "cuda")
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class NetworkOptions:
-    """How a network is trained.
+    """How a network is trained; docs/alsnet.md says more of each."""
 
-    Attributes
-    ----------
-    configuration : str or mapping
-        A named configuration (``small``, ``tiny``, ``alsnet4``, ``alsnet3``) or one of your own.
-    points : int or None
-        Points of a batch, instead of the configuration's.
-    spacing : float or None
-        Of the batches' grid in meters. None: from the clouds' density, for four batches a point.
-    coordinates : str
-        Which of X, Y and Z, from the batch's center, are inputs: ``"Z"``, ``"XYZ"`` or ``""``. Offsets within a
-        ball are inputs always.
-    epochs : int
-        At most; each sees every chosen batch once.
-    batches_per_step : int
-        Batches whose gradients make one step.
-    learning_rate : float
-        At the start; it falls to 1 % of that along a cosine.
-    class_weights : {"sqrt", "none", "balanced"}
-        Weight of a class in the loss: 1 / sqrt(share), 1 [WM19], or 1 / share.
-    histogram_threshold : float
-        Batches whose class shares have a standard deviation of this or more (per cent) are not trained on:
-        they hold next to nothing but one class [WM19: 20 %]. 100: all are used.
-    rotate : bool
-        Turn each batch about its center by a random angle.
-    shift : float
-        Move batch centers by up to this share of the spacing, anew in each epoch.
-    jitter : float
-        Standard deviation of noise on coordinates, meters; cut at three times that.
-    thin : float
-        Most points a batch may lose; the share is drawn anew for each.
-    validation : float
-        Share of the ground held out, in whole blocks, to choose the best epoch; 0: none.
-    block_size : float
-        Side of those blocks, meters.
-    patience : int
-        Epochs without a better mean F1 on the held out blocks after which training ends; 0: never.
-    checkpoint : str or None
-        File written after every epoch; where it exists, training goes on from it.
-    start_from : str or None
-        Model file whose weights training starts from. Classes it shares keep theirs, others start afresh.
-    device : {"auto", "cpu", "cuda"}
-    """
-
-    configuration: Any = "small"
-    points: int | None = None
-    spacing: float | None = None
-    coordinates: str = "Z"
-    epochs: int = 60
-    batches_per_step: int = 2
-    learning_rate: float = 0.002
+    configuration: Any = "small"  #: the name of one of :data:`CONFIGURATIONS`, or one of your own
+    points: int | None = None  #: of a batch, instead of the configuration's
+    spacing: float | None = None  #: of the batches' grid in meters; None: for four batches a point
+    coordinates: str = "Z"  #: of X, Y and Z from the batch's center, which are inputs: "Z", "XYZ" or ""
+    epochs: int = 60  #: at most; each sees every chosen batch once
+    batches_per_step: int = 2  #: batches whose gradients make one step
+    learning_rate: float = 0.002  #: at the start; it falls to 1 % of that along a cosine
+    #: weight of a class in the loss: 1 / sqrt(share), 1 ("none") [WM19], or 1 / share ("balanced")
     class_weights: str = "sqrt"
+    #: batches whose class shares have a standard deviation of this or more (per cent) are not trained on: they hold next
+    #: to nothing but one class [WM19: 20 %]; 100: all are used
     histogram_threshold: float = 20.0
-    rotate: bool = True
-    shift: float = 0.5
-    jitter: float = 0.01
-    thin: float = 0.4
+    rotate: bool = True  #: turn each batch about its center by a random angle
+    shift: float = 0.5  #: move batch centers by up to this share of the spacing, anew in each epoch
+    jitter: float = 0.01  #: standard deviation of noise on coordinates, meters; cut at three times that
+    thin: float = 0.4  #: most points a batch may lose; the share is drawn anew for each
+    #: share of the ground held out, in whole blocks, to choose the best epoch; 0: none
     validation: float = 0.2
-    block_size: float = 25.0
+    block_size: float = 25.0  #: side of those blocks, meters
+    #: epochs without a better mean F1 on the held out blocks after which training ends; 0: never
     patience: int = 20
+    #: file written after every epoch; where it exists, training goes on from it
     checkpoint: str | None = None
+    #: model file whose weights training starts from; classes it shares keep theirs, others start afresh
     start_from: str | None = None
-    device: str = "auto"
+    device: str = "auto"  #: or "cpu", "cuda"
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
@@ -310,8 +240,8 @@ class NetworkOptions:
         if self.spacing is not None:
             set_(self, "spacing", checks.number("'spacing'", self.spacing, 0.01, 1e5))
         checks.flag("'rotate'", self.rotate)
-        checks.one_of("'class_weights'", self.class_weights, CLASS_WEIGHTS)
-        checks.one_of("'device'", self.device, DEVICES)
+        checks.one_of("'class_weights'", self.class_weights, ("none", "sqrt", "balanced"))
+        checks.one_of("'device'", self.device, ("auto", "cpu", "cuda"))
         checks.one_of("'coordinates'", self.coordinates, ("", "Z", "XYZ"))
         for name in ("checkpoint", "start_from"):
             if getattr(self, name) is not None and not isinstance(getattr(self, name), str):

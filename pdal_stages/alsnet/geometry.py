@@ -20,23 +20,11 @@ BUCKET = 64
 
 
 def farthest_points(xyz: npt.NDArray[np.float64], count: int, start: int = 0) -> npt.NDArray[np.int64]:
-    """Farthest point sampling: each point chosen is the one farthest from those already chosen.
+    """Farthest point sampling, exact: each of `count` points is the one farthest from those chosen before, from `start` on.
 
-    Exact. Points are kept in buckets that follow a space-filling curve; a bucket whose box is farther from the
-    new point than its own farthest point cannot change and is passed over (the idea of QuickFPS, Han et al. 2023).
-
-    Parameters
-    ----------
-    xyz : (n, 3) float64
-    count : int
-        How many; at most n.
-    start : int
-        The first one.
-
-    Returns
-    -------
-    (count,) int64
-        Indices in the order they were chosen, each once (points that coincide included).
+    Indices come in the order they were chosen, each once (points that coincide included). Points are kept in buckets that
+    follow a space-filling curve; a bucket whose box is farther from the new point than its own farthest point cannot change
+    and is passed over (the idea of QuickFPS, Han et al. 2023).
     """
     n = len(xyz)
     if not 0 < count <= n or not 0 <= start < n:
@@ -107,23 +95,10 @@ def _farthest(p, order, count, first):
 def ball_query(
     xyz: npt.NDArray[np.float64], centers: npt.NDArray[np.int64], radius: float, samples: int
 ) -> npt.NDArray[np.int32]:
-    """The first `samples` points, by index, within `radius` of each center.
+    """(m, samples) int32 rows of the first `samples` points, by index, within `radius` (included) of each center (m,).
 
     A center is within its own ball, so none is empty. A ball with fewer points repeats its first one, which a
     maximum over the ball does not notice (as PointNet++ does).
-
-    Parameters
-    ----------
-    xyz : (n, 3) float64
-    centers : (m,) int64
-        Rows of `xyz`.
-    radius : float
-        Points at exactly this distance count.
-    samples : int
-
-    Returns
-    -------
-    (m, samples) int32
     """
     low = xyz[:, :2].min(axis=0)
     span = float((xyz[:, :2].max(axis=0) - low).max())
@@ -171,21 +146,11 @@ def _ball(p, centers, column, order, start, width, height, radius, samples):
 def three_nearest(
     xyz: npt.NDArray[np.float64], coarse: npt.NDArray[np.float64]
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
-    """The three nearest coarse points of each point, and weights by inverse squared distance.
+    """Rows (n, 3) of the three nearest coarse points of each point, and weights (n, 3) by inverse squared distance.
 
-    [WM19] says inverse distance, but its authors' program, which gave the published figures, takes the squared distances
-    of its search as they are, as PointNet++ does; so do we.
-
-    Parameters
-    ----------
-    xyz : (n, 3) float64
-    coarse : (m, 3) float64
-
-    Returns
-    -------
-    index : (n, 3) int32
-    weight : (n, 3) float32
-        They sum to 1. Where there are fewer than three coarse points the rest weigh nothing.
+    They sum to 1. Where there are fewer than three coarse points the rest weigh nothing. [WM19] says inverse distance, but
+    its authors' program, which gave the published figures, takes the squared distances of its search as they are, as
+    PointNet++ does; so do we.
     """
     from scipy.spatial import cKDTree
 

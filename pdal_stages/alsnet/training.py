@@ -43,6 +43,8 @@ from .weights import Weights, check, fresh
 #: Of a checkpoint, a file of PyTorch's own that is read with ``weights_only``: nothing in it is executed.
 FORMAT = "pdal-stages alsnet checkpoint 3"
 
+COORDINATES = ("X", "Y", "Z")
+
 optional_inputs: dict[str, tuple[str, ...]] = {}
 reports_training = True
 
@@ -424,7 +426,7 @@ def _statistics(values, positions, names: tuple[str, ...]) -> tuple[tuple[float,
     mean, scale = [], []
     for name in names:
         middle, deviation = 0.0, 1.0
-        if name not in ("X", "Y", "Z"):
+        if name not in COORDINATES:
             parts = [
                 np.asarray(own[name], np.float64)[p >= 0] for own, p in zip(values, positions, strict=True)
             ]

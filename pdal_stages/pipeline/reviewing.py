@@ -39,39 +39,16 @@ LAYERS = ("patches", "tiles")
 
 @dataclass(frozen=True)
 class ReviewRequest:
-    """What is reviewed, and what is written.
+    """What is reviewed, and what is written; OptionError if a number is out of bounds."""
 
-    Attributes
-    ----------
-    inputs : tuple of str
-        Classified files, folders, patterns.
-    output : str
-        Vector file.
-    html, json : str
-        A page, and figures; empty for none.
-    share : float
-        Patches are written until they hold this share of the expected errors.
-    cell : float
-        Side of a cell, meters; 0: chosen by the density.
-    model : str
-        What gives reliabilities where the files have none.
-    workers : int
-        Files read at the same time.
-
-    Raises
-    ------
-    OptionError
-        If a number is out of bounds.
-    """
-
-    inputs: tuple[str, ...]
-    output: str
-    html: str = ""
-    json: str = ""
-    share: float = 0.95
-    cell: float = 0.0
-    model: str = STANDARD
-    workers: int = 1
+    inputs: tuple[str, ...]  #: classified files, folders, patterns
+    output: str  #: vector file
+    html: str = ""  #: a page; empty for none
+    json: str = ""  #: figures; empty for none
+    share: float = 0.95  #: patches are written until they hold this share of the expected errors
+    cell: float = 0.0  #: side of a cell, meters; 0: chosen by the density
+    model: str = STANDARD  #: what gives reliabilities where the files have none
+    workers: int = 1  #: files read at the same time
 
     def __post_init__(self) -> None:
         if self.cell:
@@ -147,13 +124,7 @@ class Review:
 
 
 def review_files(request: ReviewRequest) -> Review:
-    """Read the files and find the patches.
-
-    Raises
-    ------
-    StageError
-        If a file cannot be read, or there is nothing to judge.
-    """
+    """Read the files and find the patches; StageError if one cannot be read, or there is nothing to judge."""
     references = {path: reference_and_wkt(path) for path in request.files}
     without = check_one_reference({path: one for path, (one, _) in references.items()})
     print_messages(*without_reference(without))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -25,7 +25,7 @@ from ..classifier.modelfile import find
 from ..classifier.refinement import MANY
 from ..classifier.sureness import of_the_base
 from .base import Stage, files_read
-from .checked import CheckedChoice, Looked
+from .checked import SURE, CheckedChoice, Looked
 from .loading import digest_of, loaded_model
 from .options import option
 from .points import Points
@@ -317,27 +317,30 @@ classes.
         if self._trainer.reports_training:
             report.figures["training"] = model.info["training"]
 
-    def choice(self) -> CheckedChoice:
-        """What chooses points to draw samples from, where some were checked by a person."""
-        return CheckedChoice(None if self.base is None else loaded_model(self.base).codes.tolist(), self.seed)
+    def choice(self, parts: Iterable[Mapping[str, Any]]) -> CheckedChoice:
+        """What chooses points to draw samples from, where some were checked by a person; `parts` as `looked` counts them."""
+        known = None if self.base is None else loaded_model(self.base).codes.tolist()
+        return CheckedChoice(known, self.seed, parts)
 
-    def looked(self, points: Points) -> Looked:
-        """Which points a person checked, and of which others the base is sure."""
-        arrays = points.arrays
+    def looked(self, points: Points) -> tuple[Looked, dict[str, Any]]:
+        """Which points a person checked, and of which others the base is sure; their counts."""
+        arrays, codes = points.arrays, points.codes_of(self.label)
         checked = np.asarray(arrays[CHECKED]) > 0 if CHECKED in arrays else np.zeros(points.count, np.bool_)
-        sure = np.asarray(arrays["Reliability"]) if self.base and "Reliability" in arrays else None
-        return Looked.at(checked, points.inside, sure, points.codes_of(self.label))
+        sure = np.zeros(points.count, np.bool_)
+        if self.base and "Reliability" in arrays:
+            sure = np.asarray(arrays["Reliability"]) >= SURE
+        looked = Looked(checked & points.inside, sure & points.inside & ~checked, codes)
+        return looked, looked.counts(int(np.count_nonzero(checked)))
 
     def _mask(self, points: Points) -> NDArray[np.bool_] | None:
         """The points that samples are drawn from: those inside `where`, and where any was checked by a person, of these
         the checked ones alone."""
         if CHECKED not in points.arrays or not self.checked_only:
             return points.mask
-        looked, choice = self.looked(points), self.choice()
-        choice.count(points.count, looked.checked, looked.told())
+        looked, counts = self.looked(points)
+        choice = self.choice([counts])
         if not choice:
             return points.mask
-        choice.settle([(looked.codes[looked.sure], choice.hashes(points.xyz[looked.sure]))])
         choice.say(points.report)
         return choice.mask(looked, points.xyz)
 

@@ -44,12 +44,7 @@ from .tileplan import TilePlan, make_plan
 #: Bytes of a point on the disk at most: as read, with heights, prepared.
 _DISK = 200
 #: Of points that a person checked, and of others of which a base is sure: see :mod:`..stages.checked`.
-_WANTED, _SURE, _SURE_CODES, _SURE_HASHES = (
-    "PdalStagesWanted",
-    "PdalStagesSure",
-    "sure/codes",
-    "sure/hashes",
-)
+_WANTED, _SURE = "PdalStagesWanted", "PdalStagesSure"
 #: Failed tiles that a message names.
 _NAMED = 3
 
@@ -201,14 +196,9 @@ class TrainTask:
 
     def _choice(self, jobs: Iterable[TileJob], report: Report) -> CheckedChoice | None:
         """What points samples are drawn from, where a person checked any."""
-        choice = self.stage.choice()
-        jobs = [job for job in jobs if "looked" in job.record]
-        for job in jobs:
-            choice.count(**job.record["looked"])
+        choice = self.stage.choice(job.record["looked"] for job in jobs if "looked" in job.record)
         if not choice:
             return None
-        kept = (load_arrays(job.outputs[0], [_SURE_CODES, _SURE_HASHES]) for job in jobs if job.outputs)
-        choice.settle((arrays[_SURE_CODES], arrays[_SURE_HASHES]) for arrays in kept)
         choice.say(report)
         return choice
 
@@ -275,7 +265,7 @@ def _read_back(path: str, number: int, name: str, survey: str, choice: CheckedCh
     mask, told = arrays.get("mask"), survey or None
     wanted, sure = (dimensions.pop(mark, np.zeros(0, np.bool_)) for mark in (_WANTED, _SURE))
     if choice is not None:
-        mask = choice.mask(Looked(0, wanted, sure, arrays["labels"]), arrays["xyz"])
+        mask = choice.mask(Looked(wanted, sure, arrays["labels"]), arrays["xyz"])
     return TrainingCloud(arrays["xyz"], arrays["labels"], dimensions, name, mask, told)
 
 
@@ -304,11 +294,8 @@ class Taking:
         marks: dict[str, NDArray] = {}
         looked: dict[str, Any] = {}
         if self.looks:
-            found = stage.looked(points)
+            found, looked = stage.looked(points)
             marks = {_WANTED: found.wanted, _SURE: found.sure}
-            hashes = stage.choice().hashes(points.xyz[found.sure])
-            arrays |= {_SURE_CODES: found.codes[found.sure], _SURE_HASHES: hashes}
-            looked = {"points": points.count, "checked": found.checked, "told": found.told()}
         clouds = []
         whole = stage.cloud_drawn(points, training, points.mask, marks)
         for number, (value, cloud) in enumerate(stage.surveys(whole, points)):
