@@ -15,7 +15,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.alsnet import Circles, Configuration, Level, NetworkOptions
-from pdal_stages.alsnet.batches import augmented, choose, class_weights, covering, hold_out, spread
+from pdal_stages.alsnet.batches import (
+    augmented,
+    choose,
+    class_weights,
+    covering,
+    hold_out,
+    side_by_side,
+    spread,
+)
 from pdal_stages.alsnet.geometry import build
 from pdal_stages.base import kinds
 from pdal_stages.base.errors import ModelError, OptionError
@@ -49,25 +57,37 @@ def test_batches_of_one_class_are_passed_over_unless_a_class_would_be_lost():
     lonely = (xyz[:, 0] < 4) & (xyz[:, 1] < 4)
     labels[lonely] = 2
     circles = Circles(xyz, 200, 6.0)
-    chosen = choose([circles], [labels], 3, 30.0)
-    shares = [np.bincount(labels[circles.members(k)], minlength=3) for _, k in chosen]
+    chosen = choose(circles, labels, 3, 30.0)
+    shares = [np.bincount(labels[circles.members(k)], minlength=3) for k in chosen]
     assert 1 < len(chosen) < len(circles)
     assert sum(spread(s) >= 30.0 for s in shares) == 1
     assert sum(shares)[2] > 0
-    assert len(choose([circles], [labels], 3, 100.0)) == len(circles)
+    assert len(choose(circles, labels, 3, 100.0)) == len(circles)
 
 
 def test_ground_held_out_is_whole_blocks_with_all_classes():
     xyz, labels, _ = scene(4000, 60.0)
     position = np.searchsorted([2, 5, 6], labels)
-    (mask,) = hold_out([xyz], [position], 0.2, 12.0)
+    mask = hold_out(xyz, position, 0.2, 12.0)
     block = np.floor(xyz[:, :2] / 12.0).astype(int) @ [1, 1000]
     assert all(len(set(mask[block == b])) == 1 for b in np.unique(block))
     assert 0.1 < mask.mean() < 0.3
     assert set(position[mask]) == {0, 1, 2}
-    assert not hold_out([xyz], [position], 0.0, 12.0)[0].any()
+    assert not hold_out(xyz, position, 0.0, 12.0).any()
     with pytest.raises(OptionError, match="validation to 0"):
-        hold_out([xyz], [position], 0.2, 1000.0)
+        hold_out(xyz, position, 0.2, 1000.0)
+
+
+def test_no_batch_holds_points_of_two_clouds():
+    clouds = [scene(n, 12.0)[0] for n in (500, 700, 0, 300)]  # all in one place
+    joined, of = side_by_side(clouds, 3.0), np.repeat(np.arange(4), [len(one) for one in clouds])
+    circles = Circles(joined, 100, 3.0)
+    assert all(len(set(of[circles.members(k)])) == 1 for k in range(len(circles)))
+    for k in (0, 1, 3):
+        away = joined[of == k] - clouds[k]
+        assert (
+            np.allclose(away, away[0], atol=1e-9) and abs(away[0, 0] / 3.0 - round(away[0, 0] / 3.0)) < 1e-9
+        )
 
 
 def test_covering_batches_hold_every_wanted_point():
@@ -256,7 +276,7 @@ def test_a_class_only_in_the_ground_held_out_is_an_error(monkeypatch):
     from pdal_stages.alsnet import batches
 
     xyz, labels, values = scene()
-    monkeypatch.setattr(batches, "hold_out", lambda clouds, positions, *_: [positions[0] == 2])
+    monkeypatch.setattr(batches, "hold_out", lambda xyz, position, *_: position == 2)
     with pytest.raises(OptionError, match=r"class 6 .* outside the ground held out"):
         fit([TrainingCloud(xyz, labels, values)], validation=0.5)
 

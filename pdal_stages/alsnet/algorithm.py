@@ -155,13 +155,14 @@ class AlsNet:
         count = np.zeros(m, np.int64)
         each = self.configuration.memory_mb(len(self.inputs))
         side_by_side = max(1, min(resolve_threads(request.threads), int(request.memory_mb / each)))
+        apply = self.folded  # once, before there are threads
 
         def one(number: int):
             members = circles.members(number)
             order, pyramid = make_pyramid(
                 xyz, columns, members, circles.centers[number], self.inputs, self.configuration
             )
-            return members[order], self.folded(pyramid)
+            return members[order], apply(pyramid)
 
         seen = 0
         # BLAS on one thread: a batch's result then does not depend on how many are computed side by side.

@@ -12,11 +12,21 @@ import numpy.typing as npt
 
 from ..base.errors import OptionError
 from ..classifier.holdout import Folds
-from .circles import Circles
+from .circles import REACH, Circles
 from .configuration import NetworkOptions
 
-#: A batch of a cloud: (cloud, circle).
-Batch = tuple[int, int]
+
+def side_by_side(clouds: Sequence[npt.NDArray[np.float64]], spacing: float) -> npt.NDArray[np.float64]:
+    """All clouds as one, moved along x by whole spacings until no batch can hold points of two."""
+    out: list[npt.NDArray[np.float64]] = []
+    right = None
+    for xyz in clouds:
+        if len(xyz):
+            steps = 0.0 if right is None else np.ceil((right - xyz[:, 0].min()) / spacing)
+            xyz = xyz + np.array([steps * spacing, 0.0, 0.0])
+            right = float(xyz[:, 0].max()) + 8.0 * REACH * spacing
+        out.append(xyz)
+    return np.concatenate(out)
 
 
 def spread(histogram: npt.NDArray[Any]) -> float:
@@ -28,59 +38,40 @@ def spread(histogram: npt.NDArray[Any]) -> float:
     return float(np.std(histogram / total) * 100.0) if total else float("inf")
 
 
-def choose(
-    circles: Sequence[Circles], labels: Sequence[npt.NDArray[Any]], n_classes: int, threshold: float
-) -> list[Batch]:
+def choose(circles: Circles, labels: npt.NDArray[Any], n_classes: int, threshold: float) -> list[int]:
     """Batches whose classes are mixed; see ``NetworkOptions.histogram_threshold``.
 
-    Where that leaves a class without any batch, the most mixed one that has it is taken too.
-
-    Parameters
-    ----------
-    circles : one per cloud
-    labels : one (n,) array of class positions per cloud; -1 is not looked at
+    Where that leaves a class without any batch, the most mixed one that has it is taken too. Labels (n,) are class
+    positions; -1 is not looked at.
     """
-    histograms: dict[Batch, npt.NDArray[np.int64]] = {}
-    for cloud, (one, label) in enumerate(zip(circles, labels, strict=True)):
-        for number in range(len(one)):
-            mine = label[one.members(number)]
-            histograms[cloud, number] = np.bincount(mine[mine >= 0], minlength=n_classes)
-    spreads = {batch: spread(histogram) for batch, histogram in histograms.items()}
-    chosen = {batch for batch, value in spreads.items() if value < threshold}
+    mine = (labels[circles.members(number)] for number in range(len(circles)))
+    histograms = [np.bincount(part[part >= 0], minlength=n_classes) for part in mine]
+    spreads = [spread(histogram) for histogram in histograms]
+    chosen = {number for number, value in enumerate(spreads) if value < threshold}
     for position in range(n_classes):
-        having = [batch for batch in histograms if histograms[batch][position]]
+        having = [number for number, histogram in enumerate(histograms) if histogram[position]]
         if having and not chosen.intersection(having):
-            chosen.add(min(having, key=lambda batch: (spreads[batch], batch)))
+            chosen.add(min(having, key=lambda number: spreads[number]))
     return sorted(chosen)
 
 
 def hold_out(
-    clouds: Sequence[npt.NDArray[np.float64]],
-    labels: Sequence[npt.NDArray[Any]],
-    share: float,
-    block_size: float,
-) -> list[npt.NDArray[np.bool_]]:
-    """Which points lie in the blocks held out for validation, one mask per cloud."""
+    xyz: npt.NDArray[np.float64], labels: npt.NDArray[Any], share: float, block_size: float
+) -> npt.NDArray[np.bool_]:
+    """Which labeled points (not -1) lie in the blocks held out for validation."""
+    out, use = np.zeros(len(xyz), bool), np.flatnonzero(labels >= 0)
     if share == 0.0:
-        return [np.zeros(len(xyz), bool) for xyz in clouds]
-    use = [np.flatnonzero(label >= 0) for label in labels]
-    xy = np.concatenate([xyz[rows, :2] for xyz, rows in zip(clouds, use, strict=True)])
-    label = np.concatenate([one[rows] for one, rows in zip(labels, use, strict=True)])
+        return out
     folds = max(2, round(1.0 / share))
     try:
-        fold = Folds.of_blocks(xy, label, np.ones(len(xy)), folds, block_size).points(xy)
+        made = Folds.of_blocks(xyz[use, :2], labels[use], np.ones(len(use)), folds, block_size)
+        out[use] = made.points(xyz[use, :2]) == 0
     except OptionError as error:
         raise OptionError(
             error.what,
             found=f"validation {share:g}, block_size {block_size:g}",
             cure="Make block_size smaller, or set validation to 0 and choose the number of epochs yourself",
         ) from None
-    out, start = [], 0
-    for xyz, rows in zip(clouds, use, strict=True):
-        mask = np.zeros(len(xyz), bool)
-        mask[rows] = fold[start : start + len(rows)] == 0
-        out.append(mask)
-        start += len(rows)
     return out
 
 

@@ -82,7 +82,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     names = inputs(options)
     xyz = [check_xyz(np.asarray(cloud.xyz), cloud.name) for cloud in clouds]
     known = label_classes(clouds, options)
-    classes, positions = known.classes, [np.asarray(position) for _, position in known]
+    dimensions = [name for name in names if name not in COORDINATES]
     values: list[dict[str, npt.NDArray[Any]]] = []
     missing: dict[str, int] = {}
     for cloud, places in zip(clouds, xyz, strict=True):
@@ -91,17 +91,20 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
         values.append(found)
         for name, number in counted.items():
             missing[name] = missing.get(name, 0) + number
+    position = np.concatenate([np.asarray(one) for _, one in known])
+    joined = {
+        name: np.concatenate([np.asarray(own[name], np.float64) for own in values]) for name in dimensions
+    }
     threads = resolve_threads(options.threads)
     before = torch.get_num_threads()
-    session = _Session(xyz, positions, values, names, classes, options.alsnet, options.seed, threads)
+    session = _Session(xyz, position, joined, names, known.classes, options.alsnet, options.seed, threads)
     try:
         torch.set_num_threads(threads)
         with torch.random.fork_rng(devices=[torch.cuda.current_device()] if session.device == "cuda" else []):
             net = session.run(progress)
     finally:
         torch.set_num_threads(before)
-    used = np.concatenate(positions)
-    count = np.bincount(used[used >= 0], minlength=len(classes.codes))
+    count = np.bincount(position[position >= 0], minlength=len(known.classes.codes))
     info: dict[str, Any] = {
         **known.described(
             options, ({"available": int(m), "samples": int(m), "duplicates": 0} for m in count)
@@ -125,22 +128,23 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
             "torch": str(torch.__version__),
         },
     }
+    classes = list(zip(known.classes.codes, known.classes.names, strict=True))
     seconds = {"whole": round(time.perf_counter() - started, 3)}
-    return Model((net,), list(zip(classes.codes, classes.names, strict=True)), info, seconds)
+    return Model((net,), classes, info, seconds)
 
 
 class _Session:
     """One training: its data, the network, the optimizer, what has been reached.
 
-    `positions` are (n,) places of the points' classes, -1 for those that are only neighbors; `values` the inputs that are
-    dimensions.
+    Of all clouds, one after the other: `position` (n,) is the place of each point's class, -1 for those that are only
+    neighbors; `values` (n,) are those of the inputs that are dimensions.
     """
 
     def __init__(
         self,
-        xyz: Sequence[npt.NDArray[np.float64]],
-        positions: Sequence[npt.NDArray[Any]],
-        values: Sequence[dict[str, npt.NDArray[Any]]],
+        clouds: Sequence[npt.NDArray[np.float64]],
+        position: npt.NDArray[Any],
+        values: dict[str, npt.NDArray[np.float64]],
         names: tuple[str, ...],
         classes: ClassMap,
         options: NetworkOptions,
@@ -149,13 +153,8 @@ class _Session:
     ) -> None:
         from .network import Network, torch
 
-        self.torch, self.xyz, self.positions, self.inputs, self.options = (
-            torch,
-            xyz,
-            positions,
-            names,
-            options,
-        )
+        self.torch, self.clouds, self.position = torch, clouds, position
+        self.inputs, self.options = names, options
         self.classes, self.seed, self.threads, self.n_classes = classes, seed, threads, len(classes.codes)
         there = torch.cuda.is_available()
         if options.device == "cuda" and not there:
@@ -165,38 +164,33 @@ class _Session:
             )
         self.device = "cuda" if there and options.device != "cpu" else "cpu"
         source = None if options.start_from is None else _source(options, names)
+        self.mean: tuple[float, ...]
+        self.scale: tuple[float, ...]
         if source is None:
-            self.mean, self.scale = _statistics(values, positions, names)
+            # Mean and standard deviation over the labeled points; 0 and 1 for coordinates.
+            told = [values.get(name, np.zeros(len(position)))[position >= 0] for name in names]
+            self.mean = tuple(float(column.mean()) for column in told)
+            self.scale = tuple(float(s) if (s := column.std()) > 1e-6 else 1.0 for column in told)
         else:
             self.mean, self.scale = source.algorithm.mean, source.algorithm.scale
         points = options.configuration.points
-        self.spacing = options.spacing or spacing_for(points, density(xyz))
-        self.columns = [
-            scaled(places, own, names, self.mean, self.scale) for places, own in zip(xyz, values, strict=True)
-        ]
-        self.circles = [
-            Circles(places, points, self.spacing, columns)
-            for places, columns in zip(xyz, self.columns, strict=True)
-        ]
-        held = batches.hold_out(xyz, positions, options.validation, options.block_size)
-        pairs = list(zip(positions, held, strict=True))
-        self.train_labels = [np.where(h, -1, p).astype(np.int64) for p, h in pairs]
-        self.held_labels = [np.where(h, p, -1).astype(np.int64) for p, h in pairs]
-        count = np.bincount(np.concatenate([p[p >= 0] for p in self.train_labels]), minlength=self.n_classes)
+        self.spacing = options.spacing or spacing_for(points, density(clouds))
+        self.xyz = batches.side_by_side(clouds, self.spacing)
+        self.columns = scaled(self.xyz, values, names, self.mean, self.scale)
+        self.circles = Circles(self.xyz, points, self.spacing, self.columns)
+        held = batches.hold_out(np.concatenate(clouds), position, options.validation, options.block_size)
+        self.train_labels = np.where(held, -1, position).astype(np.int64)
+        self.held_labels = np.where(held, position, -1).astype(np.int64)
+        count = np.bincount(self.train_labels[self.train_labels >= 0], minlength=self.n_classes)
         if not count.all():
             k = int(np.argmin(count))
             raise OptionError(
                 f"class {classes.codes[k]} ({classes.names[k]}) has no points outside the ground held out",
                 cure="Make block_size smaller, set validation to 0, or give more training data",
             )
-        self.chosen = batches.choose(
-            self.circles, self.train_labels, self.n_classes, options.histogram_threshold
-        )
-        self.held_batches = [
-            (k, number)
-            for k, (one, label) in enumerate(zip(self.circles, self.held_labels, strict=True))
-            for number in batches.covering(one, label >= 0)
-        ]
+        threshold = options.histogram_threshold
+        self.chosen = batches.choose(self.circles, self.train_labels, self.n_classes, threshold)
+        self.held_batches = batches.covering(self.circles, self.held_labels >= 0)
         start = fresh(options.configuration, len(names), self.n_classes, seed)
         if source is not None:
             start = _transfer(source, start, classes)
@@ -254,7 +248,7 @@ class _Session:
         total, weight = 0.0, 0
 
         def prepare(numbers: list[int]):
-            made = [self._augmented(*self.chosen[k], epoch) for k in numbers]
+            made = [self._augmented(self.chosen[k], epoch) for k in numbers]
             return stack([pyramid for pyramid, _ in made]), np.concatenate([labels for _, labels in made])
 
         for numbers, (pyramid, labels) in zip(steps, map_blocks(prepare, steps, self.threads), strict=True):
@@ -265,22 +259,23 @@ class _Session:
             bar.update(len(numbers))
         return total / weight if weight else 0.0
 
-    def _augmented(self, cloud: int, number: int, epoch: int):
+    def _augmented(self, number: int, epoch: int):
         """(pyramid, labels) of a batch, changed as the options say."""
-        random = np.random.default_rng([self.seed, epoch, 2, cloud, number])
-        circles, shift = self.circles[cloud], self.options.shift * self.spacing
-        center = circles.centers[number] + random.uniform(-1.0, 1.0, 2) * shift
-        members = circles.around(float(center[0]), float(center[1]))
-        if not len(members):  # moved off the cloud's edge
-            center, members = circles.centers[number], circles.members(number)
-        order, pyramid = self._pyramid(
-            cloud, members, center, lambda xyz: batches.augmented(xyz, self.options, random)
+        random = np.random.default_rng([self.seed, epoch, 2, number])
+        center = (
+            self.circles.centers[number] + random.uniform(-1.0, 1.0, 2) * self.options.shift * self.spacing
         )
-        return pyramid, self.train_labels[cloud][members[order]]
+        members = self.circles.around(float(center[0]), float(center[1]))
+        if not len(members):  # moved off the cloud's edge
+            center, members = self.circles.centers[number], self.circles.members(number)
+        order, pyramid = self._pyramid(
+            members, center, lambda xyz: batches.augmented(xyz, self.options, random)
+        )
+        return pyramid, self.train_labels[members[order]]
 
-    def _pyramid(self, cloud: int, members, center, change: Any = None):
-        xyz, columns, configuration = self.xyz[cloud], self.columns[cloud], self.options.configuration
-        return make_pyramid(xyz, columns, members, center, self.inputs, configuration, change)
+    def _pyramid(self, members, center, change: Any = None):
+        configuration = self.options.configuration
+        return make_pyramid(self.xyz, self.columns, members, center, self.inputs, configuration, change)
 
     def _step(self, pyramid, labels: npt.NDArray[np.int64]) -> float:
         from .network import tensors
@@ -306,23 +301,21 @@ class _Session:
         from .network import tensors
 
         self.network.eval()
-        sums = [np.zeros((len(xyz), self.n_classes), np.float32) for xyz in self.xyz]
+        sums = np.zeros((len(self.xyz), self.n_classes), np.float32)
 
-        def prepare(batch):
-            cloud, number = batch
-            members = self.circles[cloud].members(number)
-            order, pyramid = self._pyramid(cloud, members, self.circles[cloud].centers[number])
-            return cloud, members[order], pyramid
+        def prepare(number: int):
+            members = self.circles.members(number)
+            order, pyramid = self._pyramid(members, self.circles.centers[number])
+            return members[order], pyramid
 
         with self.torch.no_grad():
-            for cloud, rows, pyramid in map_blocks(prepare, self.held_batches, self.threads):
+            for rows, pyramid in map_blocks(prepare, self.held_batches, self.threads):
                 scores = self.network(tensors(pyramid, self.device))
-                sums[cloud][rows] += self.torch.softmax(scores, dim=1).cpu().numpy()
+                sums[rows] += self.torch.softmax(scores, dim=1).cpu().numpy()
                 bar.update(1)
         matrix = np.zeros((self.n_classes, self.n_classes), np.int64)
-        for p, label in zip(sums, self.held_labels, strict=True):
-            rows = np.flatnonzero(label >= 0)
-            np.add.at(matrix, (label[rows], p[rows].argmax(axis=1)), 1)
+        rows = np.flatnonzero(self.held_labels >= 0)
+        np.add.at(matrix, (self.held_labels[rows], sums[rows].argmax(axis=1)), 1)
         return figures(matrix, self.classes.codes)
 
     def _identity(self) -> str:
@@ -332,10 +325,8 @@ class _Session:
             options.pop(free)
         options["start_from"] = options["start_from"] and os.path.basename(options["start_from"])
         labels = [list(self.classes.codes), [list(part) for part in self.classes.labels]]
-        data = [
-            [len(xyz), str(coordinate_hash(xyz, 0).sum()), int(position.astype(np.int64).sum())]
-            for xyz, position in zip(self.xyz, self.positions, strict=True)
-        ]
+        data = [[len(xyz), str(coordinate_hash(xyz, 0).sum())] for xyz in self.clouds]
+        data.append([int(self.position.astype(np.int64).sum())])
         return json.dumps([options, self.seed, self.inputs, labels, data])
 
     def _save(self, path: str) -> None:
@@ -408,10 +399,10 @@ class _Session:
         start, best = self.options.start_from, self._best_row()
         return {
             "network": {**options, "spacing": self.spacing, "start_from": start and os.path.basename(start)},
-            "batches": {"all": sum(map(len, self.circles)), "chosen": len(self.chosen)},
+            "batches": {"all": len(self.circles), "chosen": len(self.chosen)},
             "epochs": len(self.curve),
             "best_epoch": self.best_epoch,
-            "points_held_out": int(sum(np.count_nonzero(label >= 0) for label in self.held_labels)),
+            "points_held_out": int(np.count_nonzero(self.held_labels >= 0)),
             "held_out": {k: v for k, v in best.items() if k not in ("epoch", "loss")} or None,
             "curve": self.curve,
         }
@@ -419,22 +410,6 @@ class _Session:
 
 def _score(row: dict[str, Any]) -> float:
     return float(row["mean_f1"] or 0.0)
-
-
-def _statistics(values, positions, names: tuple[str, ...]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Mean and standard deviation of each input over the labeled points; 0 and 1 for coordinates."""
-    mean, scale = [], []
-    for name in names:
-        middle, deviation = 0.0, 1.0
-        if name not in COORDINATES:
-            parts = [
-                np.asarray(own[name], np.float64)[p >= 0] for own, p in zip(values, positions, strict=True)
-            ]
-            every = np.concatenate(parts)
-            middle, deviation = float(every.mean()), float(every.std())
-        mean.append(middle)
-        scale.append(deviation if deviation > 1e-6 else 1.0)
-    return tuple(mean), tuple(scale)
 
 
 def _source(options: NetworkOptions, names: tuple[str, ...]) -> Model:
