@@ -43,7 +43,7 @@ COLUMNS = (
         (
             ("With --tile: put the tiles' results", "into the points of each file", "tiling/file_task.py"),
             ("Writer, under a hidden name", "", "PDAL"),
-            ("Check that the file is complete,", "then give it its name", "base/complete.py"),
+            ("Check that the file is complete,", "then give it its name", "base/lascheck.py"),
             ("Compare with a reference", "", "accuracy/measures.py"),
             ("Pages and pictures", "", "reports/accuracypage.py"),
         ),

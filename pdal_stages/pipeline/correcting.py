@@ -249,9 +249,12 @@ def partners(
         ordered = named[orders[-1]]
         # The first of a place is paired with the first of the same place, and so on.
         keys.append(ordered * max(n, m) + np.arange(len(ordered)) - np.searchsorted(ordered, ordered))
-    _, mine, theirs = np.intersect1d(keys[0], keys[1], assume_unique=True, return_indices=True)
-    out[orders[0][mine]] = orders[1][theirs]
-    lost, free = np.flatnonzero(out < 0), np.setdiff1d(np.arange(m), out)
+    at = np.searchsorted(keys[1], keys[0]).clip(None, m - 1)  # both ascend
+    there = keys[1][at] == keys[0]
+    out[orders[0][there]] = orders[1][at[there]]
+    left = np.ones(m, bool)
+    left[out[out >= 0]] = False
+    lost, free = np.flatnonzero(out < 0), np.flatnonzero(left)
     if apart > 0 and len(lost) and len(free):
         far, near = cKDTree(after[free]).query(before[lost], distance_upper_bound=apart)
         good = np.flatnonzero(np.isfinite(far))
@@ -267,5 +270,8 @@ def near_any(xyz: NDArray[np.float64], chosen: NDArray[np.bool_], within: float)
 
     if within <= 0 or not chosen.any():
         return chosen.copy()
-    far, _ = cKDTree(xyz[chosen]).query(xyz, distance_upper_bound=np.nextafter(within, np.inf))
-    return np.isfinite(far)
+    low, high = xyz[chosen].min(axis=0) - within, xyz[chosen].max(axis=0) + within
+    out, maybe = chosen.copy(), np.flatnonzero(((xyz >= low) & (xyz <= high)).all(axis=1))
+    far, _ = cKDTree(xyz[chosen]).query(xyz[maybe], distance_upper_bound=np.nextafter(within, np.inf))
+    out[maybe[np.isfinite(far)]] = True
+    return out
