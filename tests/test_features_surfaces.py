@@ -10,7 +10,7 @@ from test_features_adaptive import CLOUDS, some, town
 from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.features import FeatureEngine, FeaturePlan, compute_features
-from pdal_stages.features.eigen import normal3
+from pdal_stages.features.eigen import eigen3
 from pdal_stages.features.names import SURFACES
 
 TOKENS = "k3,k20"
@@ -116,7 +116,7 @@ def test_rigid_motions(seed, axes, shift):
 def test_the_normal_is_the_eigenvector(values):
     a = np.array(values).reshape(3, 3)
     c = a @ a.T
-    l1, l2, l3, *normal = normal3(c[0, 0], c[0, 1], c[0, 2], c[1, 1], c[1, 2], c[2, 2])
+    l1, l2, l3, *normal = eigen3(c[0, 0], c[0, 1], c[0, 2], c[1, 1], c[1, 2], c[2, 2])
     expected = np.linalg.eigvalsh(c)[::-1]
     assert np.allclose((l1, l2, l3), np.maximum(expected, 0), atol=1e-13)
     if l2 > 1e-9 and l2 - l3 > 1e-6 * l1:

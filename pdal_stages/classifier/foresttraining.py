@@ -16,7 +16,7 @@ from ..base.memory import free_memory
 from ..base.outputs import Output
 from ..base.progress import Progress
 from ..base.version import __version__
-from ..features.fitting import fit_clouds
+from ..features.engine import fit_clouds
 from ..features.returns import SOURCES
 from .algorithms import PredictRequest
 from .clouds import TrainingCloud, densities, label_classes, listed

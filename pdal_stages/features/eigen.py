@@ -88,93 +88,17 @@ def _rotation(app, aqq, apq):
 
 
 @device(forceinline=True)
-def eigenvalues3(xx, xy, xz, yy, yz, zz):
-    """Eigenvalues l1 >= l2 >= l3 >= 0 of a symmetric positive semidefinite matrix.
-
-    Four cyclic Jacobi sweeps; absolute error about 1e-15 of l1 (tests compare with
-    ``numpy.linalg.eigvalsh``). Negative rounding leftovers become 0.
-    """
-    for _ in range(4):
-        c, s, t = _rotation(xx, yy, xy)
-        xx, yy = xx - t * xy, yy + t * xy
-        xy = 0.0
-        xz, yz = c * xz - s * yz, s * xz + c * yz
-        c, s, t = _rotation(xx, zz, xz)
-        xx, zz = xx - t * xz, zz + t * xz
-        xz = 0.0
-        xy, yz = c * xy - s * yz, s * xy + c * yz
-        c, s, t = _rotation(yy, zz, yz)
-        yy, zz = yy - t * yz, zz + t * yz
-        yz = 0.0
-        xy, xz = c * xy - s * xz, s * xy + c * xz
-    xx, yy, zz = max(xx, 0.0), max(yy, 0.0), max(zz, 0.0)
-    high, low = max(xx, yy), min(xx, yy)
-    return max(high, zz), max(low, min(high, zz)), min(low, zz)
-
-
-@device(forceinline=True)
-def rotate_columns(m, count):
-    """Make the matrices in the first `count` columns of `m` diagonal, turning the z components of their eigenvectors along.
-
-    Rows of `m` are xx, yy, zz, xy, xz, yz and the z components of the three vectors (0, 0, 1 at first). Four sweeps as in
-    :func:`eigenvalues3`, each rotation over all columns before the next: a rotation waits for two roots and two
-    divisions one after the other, and so the processor has others to work at meanwhile.
-    """
-    for _ in range(4):
-        for j in range(count):
-            c, s, t = _rotation(m[0, j], m[1, j], m[3, j])
-            m[0, j], m[1, j] = m[0, j] - t * m[3, j], m[1, j] + t * m[3, j]
-            m[3, j] = 0.0
-            m[4, j], m[5, j] = c * m[4, j] - s * m[5, j], s * m[4, j] + c * m[5, j]
-            m[6, j], m[7, j] = c * m[6, j] - s * m[7, j], s * m[6, j] + c * m[7, j]
-        for j in range(count):
-            c, s, t = _rotation(m[0, j], m[2, j], m[4, j])
-            m[0, j], m[2, j] = m[0, j] - t * m[4, j], m[2, j] + t * m[4, j]
-            m[4, j] = 0.0
-            m[3, j], m[5, j] = c * m[3, j] - s * m[5, j], s * m[3, j] + c * m[5, j]
-            m[6, j], m[8, j] = c * m[6, j] - s * m[8, j], s * m[6, j] + c * m[8, j]
-        for j in range(count):
-            c, s, t = _rotation(m[1, j], m[2, j], m[5, j])
-            m[1, j], m[2, j] = m[1, j] - t * m[5, j], m[2, j] + t * m[5, j]
-            m[5, j] = 0.0
-            m[3, j], m[4, j] = c * m[3, j] - s * m[4, j], s * m[3, j] + c * m[4, j]
-            m[7, j], m[8, j] = c * m[7, j] - s * m[8, j], s * m[7, j] + c * m[8, j]
-
-
-@device(forceinline=True)
-def steepness(xx, yy, zz, vx, vy, vz):
-    """Eigenvalues l1 >= l2 >= l3 >= 0 and abs(nz) of the unit eigenvector of l3, from :func:`rotate_columns`.
-
-    For points on a line (l2 below 1e-12 of l1) every perpendicular is a normal; the steepest is taken, so a
-    horizontal line has verticality 0 and a vertical line 1.
-    """
-    xx, yy, zz = max(xx, 0.0), max(yy, 0.0), max(zz, 0.0)
-    # Sort downwards, the vector components with their values.
-    swap = xx < yy
-    xx, yy = (yy if swap else xx), (xx if swap else yy)
-    vx, vy = (vy if swap else vx), (vx if swap else vy)
-    swap = yy < zz
-    yy, zz = (zz if swap else yy), (yy if swap else zz)
-    vy, vz = (vz if swap else vy), (vy if swap else vz)
-    swap = xx < yy
-    xx, yy = (yy if swap else xx), (xx if swap else yy)
-    vx, vy = (vy if swap else vx), (vx if swap else vy)
-    steepest = math.sqrt(max(0.0, 1.0 - vx * vx))
-    nz = steepest if yy <= LINE * xx else abs(vz)
-    return xx, yy, zz, min(nz, 1.0)
-
-
-@device(forceinline=True)
 def _turn(c, s, a, b):
     return c * a - s * b, s * a + c * b
 
 
 @device(forceinline=True)
-def normal3(xx, xy, xz, yy, yz, zz):
-    """Eigenvalues as :func:`eigenvalues3`, and the unit eigenvector of l3, of either sign.
+def eigen3(xx, xy, xz, yy, yz, zz):
+    """Eigenvalues l1 >= l2 >= l3 >= 0 of a symmetric positive semidefinite matrix and the unit eigenvector of l3.
 
-    Of points on a line (l2 below 1e-12 of l1) the steepest perpendicular, as in :func:`steepness`; (1, 0, 0) where the line
-    is vertical.
+    Four cyclic Jacobi sweeps; absolute error about 1e-15 of l1, negative rounding leftovers become 0. The eigenvector is of
+    either sign; of points on a line (l2 below 1e-12 of l1) it is the steepest perpendicular, so that a horizontal line has
+    verticality 0 and a vertical one 1: (1, 0, 0) where the line is vertical.
     """
     ax, ay, az = 1.0, 0.0, 0.0
     bx, by, bz = 0.0, 1.0, 0.0

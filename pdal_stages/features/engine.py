@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -15,13 +15,13 @@ from ..base.errors import OptionError, StageError, optional_import, suggest
 from ..base.progress import Progress
 from ..base.report import Report
 from ..base.threads import resolve_threads
+from .bins import SAMPLES, ShapeBins, smallest_hashes
 from .blocks import Given, Run, Tally
 from .index import CellGrid, build_grid, check_xyz
 from .plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS, FeaturePlan
 
 if TYPE_CHECKING:
     from .adaptive import AdaptiveNeighborhoods
-    from .bins import ShapeBins
     from .fixed import FixedRadius
 
 
@@ -101,7 +101,7 @@ class FeatureEngine:
 
         Samples are the 500 points with the smallest hash of (seed, coordinates), so they do not depend on the
         order of the points. Called by :meth:`blocks` when needed; a second call does nothing. For several clouds see
-        :func:`fitting.fit_clouds`.
+        :func:`fit_clouds`.
 
         Raises
         ------
@@ -118,8 +118,6 @@ class FeatureEngine:
 
                 self.copt_threshold = curvature_threshold(self.curvatures())
             if needs_bins:
-                from .bins import ShapeBins, smallest_hashes
-
                 self.bins = ShapeBins.fit(self.shape_values(smallest_hashes(self.cloud, self.seed)[1]))
         return self
 
@@ -347,6 +345,47 @@ def compute_features(
     plan = FeaturePlan.parse(neighborhoods, feature_set, names)
     engine = FeatureEngine(xyz, plan, bins=bins, copt_threshold=copt_threshold, seed=seed, threads=threads)
     return engine.table(queries, dimensions=dimensions, memory_mb=memory_mb, progress=progress)
+
+
+def fit_clouds(
+    clouds: Sequence[npt.ArrayLike], plan: FeaturePlan, *, seed: int = 0, threads: int | None = None
+) -> tuple[ShapeBins | None, float | None]:
+    """Shape thresholds and the threshold of copt, fitted to several clouds as if to one.
+
+    Curvatures of all points of all clouds are parted together [H17 eq. 3], and the 500 sample neighborhoods
+    [B16 3.2.2] are those round the points with the smallest hashes of all. A neighborhood lies within its own cloud. Of
+    one cloud the result is :meth:`FeatureEngine.fit`'s; the order of the clouds (n, 3), in meters, does not matter. None
+    where the plan has no shapes, or no copt.
+    """
+    if not (plan.shapes or plan.copt):
+        return None, None
+    if len(clouds) == 1:
+        engine = FeatureEngine(clouds[0], plan, seed=seed, threads=threads).fit()
+        return engine.bins, engine.copt_threshold
+    threshold = None
+    if plan.copt:
+        from .adaptive import curvature_threshold
+
+        each = [FeatureEngine(cloud, plan, threads=threads).curvatures() for cloud in clouds]
+        threshold = curvature_threshold(np.concatenate(each))
+    if not plan.shapes:
+        return None, threshold
+    values: dict[str, list[np.ndarray]] = {}
+    for cloud, rows in zip(clouds, _samples(clouds, seed), strict=True):
+        if len(rows):
+            engine = FeatureEngine(cloud, plan, copt_threshold=threshold, seed=seed, threads=threads)
+            for token, some in engine.shape_values(rows).items():
+                values.setdefault(token, []).append(some)
+            del engine  # one index at a time
+    return ShapeBins.fit({token: np.concatenate(parts) for token, parts in values.items()}), threshold
+
+
+def _samples(clouds: Sequence[npt.ArrayLike], seed: int) -> list[np.ndarray]:
+    """Rows of each cloud that are among the points with the smallest hashes; a thinned copy's points tie, and all stay."""
+    each = [smallest_hashes(np.asarray(cloud), seed) for cloud in clouds]
+    hashes = np.sort(np.concatenate([found for found, _ in each]))
+    last = hashes[min(SAMPLES, len(hashes)) - 1]
+    return [rows[found <= last] for found, rows in each]
 
 
 def warmup() -> None:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..base.jit import FAST, device
-from .eigen import eigenentropy, eigenvalues3, log_fast
+from .eigen import eigen3, eigenentropy, log_fast
 from .moments import COINCIDENT, HIGH, LOW, SX, SXX, SXY, SXZ, SY, SYY, SYZ, SZ, SZZ, N
 
 #: Estimated entropies are off by less than half of this.
@@ -144,7 +144,7 @@ def eigenvalues_of(s, j):
     w = 1.0 / s.n[j]
     x, y, z = s.x[j] * w, s.y[j] * w, s.z[j] * w
     xx, yy, zz = s.xx[j] * w, s.yy[j] * w, s.zz[j] * w
-    l1, l2, l3 = eigenvalues3(
+    l1, l2, l3, _, _, _ = eigen3(
         xx - x * x, s.xy[j] * w - x * y, s.xz[j] * w - x * z, yy - y * y, s.yz[j] * w - y * z, zz - z * z
     )
     return l1, l2, l3, xx + yy + zz

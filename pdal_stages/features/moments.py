@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from ..base.jit import FAST, device, njit
-from .eigen import bits_of, covariance_features, from_bits, rotate_columns, steepness
+from .eigen import bits_of, covariance_features, eigen3, from_bits
 from .neighborhoods import LEAST_RADIUS
 
 #: Rows of a table of moments about the queries: count, sums, products, lowest and highest height; and, where it is chosen
@@ -100,7 +100,7 @@ def finish(table, volume, heights, few, copies, columns, out):
         Where in `out` (m, F) float32 each feature of ``names.MOMENT_FEATURES`` goes, and the radius; -1: nowhere.
     """
     # Of constant shapes: rows known not to overlap let the loops be vectorized.
-    made, m = np.empty((FEATURES, WIDTH)), np.empty((9, WIDTH))
+    made, m = np.empty((FEATURES, WIDTH)), np.empty((6, WIDTH))
     for start in range(0, len(heights), BATCH):
         count = min(BATCH, len(heights) - start)
         moments = table[:, start : start + count]
@@ -115,7 +115,6 @@ def finish(table, volume, heights, few, copies, columns, out):
             m[3, j] = moments[SXY, j] * inverse - mx * my
             m[4, j] = moments[SXZ, j] * inverse - mx * mz
             m[5, j] = moments[SYZ, j] * inverse - my * mz
-            m[6, j], m[7, j], m[8, j] = 0.0, 0.0, 1.0
             made[9, j] = 1.0 if apart else 0.0
             made[10, j] = moments[HIGH, j] - moments[LOW, j] if n > 0.0 else 0.0
             made[11, j] = math.sqrt(max(zz, 0.0)) if apart else 0.0
@@ -123,10 +122,9 @@ def finish(table, volume, heights, few, copies, columns, out):
         for j in range(count):
             r = max(moments[RADIUS, j], LEAST_RADIUS) if volume == 0.0 else 1.0
             made[8, j] = moments[N, j] / (4.0 / 3.0 * math.pi * r * r * r if volume == 0.0 else volume)
-        rotate_columns(m, count)
         for j in range(count):
             n = moments[N, j] * made[9, j]  # 0 where the points coincide
-            l1, l2, l3, nz = steepness(m[0, j], m[1, j], m[2, j], m[6, j], m[7, j], m[8, j])
+            l1, l2, l3, _, _, nz = eigen3(m[0, j], m[3, j], m[4, j], m[1, j], m[5, j], m[2, j])
             f = covariance_features(n, l1, l2, l3)
             made[0, j] = f[0]
             made[1, j] = f[1]
@@ -136,7 +134,7 @@ def finish(table, volume, heights, few, copies, columns, out):
             made[5, j] = f[5]
             made[6, j] = f[6]
             made[7, j] = f[7]
-            made[9, j] = 1.0 - nz if n >= 3.0 else 0.0
+            made[9, j] = max(1.0 - abs(nz), 0.0) if n >= 3.0 else 0.0
         for j in range(count):
             if moments[N, j] < 3.0:
                 few[0] += copies[start + j]

@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from ..base.jit import device
-from .eigen import covariance_features, normal3
+from .eigen import covariance_features, eigen3
 from .moments import COINCIDENT
 from .names import SURFACES
 
@@ -41,7 +41,7 @@ def write_surface(s, j, reach, out):
     xx, yy, zz = ax - mx * mx, ay - my * my, az - mz * mz
     xy, xz, yz = s.xy[j] * w - mx * my, s.xz[j] * w - mx * mz, s.yz[j] * w - my * mz
     apart = xx + yy + zz > COINCIDENT * (ax + ay + az)
-    l1, l2, l3, nx, ny, nz = normal3(xx, xy, xz, yy, yz, zz)
+    l1, l2, l3, nx, ny, nz = eigen3(xx, xy, xz, yy, yz, zz)
     real = n >= 3.0 and apart
     out[NX], out[NY], out[NZ] = (nx if real else 0.0), (ny if real else 0.0), (nz if real else 0.0)
     out[VARIATION] = covariance_features(n if apart else 0.0, l1, l2, l3)[7]
