@@ -12,8 +12,8 @@ import pdal_stages as ps
 from pdal_stages.base.errors import StageError
 from pdal_stages.objects import Cells, ObjectSettings, find_objects
 from pdal_stages.objects.cells import CLASSES, Kind, cell_keys, kind_of_code, object_id, unpack
-from pdal_stages.objects.rasters import fill_gaps
 from pdal_stages.objects.roofs import connected
+from pdal_stages.objects.view import fill_gaps
 from pdal_stages.synthetic import TownOptions
 
 
@@ -49,10 +49,9 @@ def same(a, b):
         assert list(one.columns) == list(other.columns)
         for name in one.columns:
             np.testing.assert_array_equal(one.columns[name], other.columns[name])
-        for name in ("start", "row", "column", "z"):
-            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-        for path, twin in zip(one.paths, other.paths, strict=True):
-            np.testing.assert_array_equal(path, twin)
+        for mine, theirs in ((one.cells, other.cells), (one.paths, other.paths)):
+            for own, twin in zip(mine, theirs, strict=True):
+                np.testing.assert_array_equal(own, twin)
     np.testing.assert_array_equal(a.key, b.key)
     np.testing.assert_array_equal(a.owner, b.owner)
 
@@ -122,7 +121,7 @@ def test_gaps_of_the_ground_continue_a_slope():
 def test_connected_against_flooding(seed):
     rng = np.random.default_rng(seed)
     mask, z = rng.random((9, 11)) < 0.7, rng.uniform(0, 3, (9, 11))
-    part = connected(mask, z, 1.0)
+    part = connected(mask, 1.0, z)
     twin = np.full(mask.shape, -1)
     for start in range(mask.size):
         todo = [divmod(start, 11)]
@@ -301,7 +300,8 @@ def test_a_shift_by_whole_cells_shifts_the_objects(town):
     for kind in (Kind.BUILDING, Kind.TREE, Kind.DECK):
         a, b = one.tables[kind], two.tables[kind]
         assert len(a) == len(b) > 0
-        np.testing.assert_array_equal(a.row - 1024, b.row)
+        for own, twin in zip(a.cells, b.cells, strict=True):
+            np.testing.assert_array_equal(own[:, 0] - 1024, twin[:, 0])
         np.testing.assert_array_equal(a.columns["area"], b.columns["area"])
 
 
@@ -385,17 +385,6 @@ def test_boundaries_of_cells_against_their_union(seed, share):
         parts = [shapely.Polygon(p.exterior, [h for h in p.interiors if shapely.Polygon(h).area >= 3])
                  for p in shapely.get_parts(whole)]  # fmt: skip
         assert _of_cells(shapely, row, column, 3.0).equals(shapely.MultiPolygon(parts))
-
-
-def test_lone_wires_are_not_looked_at_twice(monkeypatch):
-    from pdal_stages.objects.view import CellView
-
-    at = np.arange(60) * 3.0
-    x, y = (v.ravel() for v in np.meshgrid(at, at))
-    xyz = np.concatenate([np.column_stack([x, y, 0 * x + 8]), np.column_stack([x + 1, y, 0 * x])])
-    codes = np.repeat([14, 2], x.size).astype(np.uint8)
-    monkeypatch.setattr(CellView, "wider", None)
-    assert len(find_objects(Cells.of(*xyz.T, codes, 0.5), block=64, progress=False).tables[Kind.SPAN]) == 0
 
 
 def test_what_is_nowhere_two_meters_wide_is_to_be_checked():

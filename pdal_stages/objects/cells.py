@@ -69,7 +69,7 @@ def unpack(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64
     return keys >> _KIND, ((keys >> _ROW) & low) - _HALF, (keys & low) - _HALF
 
 
-def object_id(kind: NDArray | int, row: NDArray, column: NDArray) -> NDArray[np.int64]:
+def object_id(kind: NDArray | int, row: NDArray | int, column: NDArray | int) -> NDArray[np.int64]:
     """Ids of objects, from the cell that stands for each: below 2**53, so exact in JSON and as a double, too.
 
     Rows and columns are taken modulo 2**25: at 0.5 m, two places with the same id lie 16,777 km apart.

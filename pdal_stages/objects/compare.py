@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from .outlines import vector
@@ -21,24 +22,10 @@ HEIGHTS = (0.0, 5.0, 10.0, 20.0, np.inf)
 #: Boundaries are compared at places so far apart, meters.
 EVERY = 0.5
 
-
-def _scores(true: int, found: int, matched: int) -> dict[str, float]:
-    complete = matched / true if true else float("nan")
-    correct = matched / found if found else float("nan")
-    total = true + found
-    return {
-        "reference": true,
-        "found": found,
-        "matched": matched,
-        "completeness": complete,
-        "correctness": correct,
-        "f1": 2 * matched / total if total else float("nan"),
-    }
+Pairs = list[tuple[int, int]]
 
 
-def matched_by_overlap(
-    found: Sequence[Any], true: Sequence[Any], least: float = 0.5
-) -> list[tuple[int, int]]:
+def matched_by_overlap(found: Sequence[Any], true: Sequence[Any], least: float = 0.5) -> Pairs:
     """Pairs (found, true) whose intersection over union is at least `least`, the most alike first, each once."""
     shapely = vector("shapely")
     if not len(found) or not len(true):
@@ -57,34 +44,30 @@ def matched_by_place(
     true_height: NDArray,
     away: float = 4.0,
     share: float = 0.3,
-) -> list[tuple[int, int]]:
+) -> Pairs:
     """Pairs (found, true) of trees within `away` meters whose heights differ by at most a `share` of the true one.
 
     The nearest first, each once. Where the true height is not known (NaN) the place alone decides.
     """
-    from scipy.spatial import cKDTree
-
     if not len(found) or not len(true):
         return []
-    near = cKDTree(true).query_ball_point(found, away)
-    a = np.repeat(np.arange(len(found)), [len(n) for n in near])
-    b = np.array([m for n in near for m in n], np.int64)
-    distance = np.hypot(*(found[a] - true[b]).T)
+    near = scipy.spatial.cKDTree(found).sparse_distance_matrix(
+        scipy.spatial.cKDTree(true), away, output_type="ndarray"
+    )
+    a, b = near["i"], near["j"]
     with np.errstate(invalid="ignore"):
         unlike = np.abs(found_height[a] - true_height[b]) > share * true_height[b]
-    return _each_once(a, b, distance, ~unlike)
+    return _each_once(a, b, near["v"], ~unlike)
 
 
-def _each_once(a: NDArray, b: NDArray, cost: NDArray, allowed: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    pairs: list[tuple[int, int]] = []
-    one: set[int] = set()
+def _each_once(a: NDArray, b: NDArray, cost: NDArray, allowed: NDArray[np.bool_]) -> Pairs:
+    one: dict[int, int] = {}
     other: set[int] = set()
     for n in np.lexsort((b, a, np.round(cost, 9))).tolist():
         if allowed[n] and a[n] not in one and b[n] not in other:
-            one.add(int(a[n]))
+            one[int(a[n])] = int(b[n])
             other.add(int(b[n]))
-            pairs.append((int(a[n]), int(b[n])))
-    return pairs
+    return list(one.items())
 
 
 def compare_buildings(found: Sequence[Any], true: Sequence[Any]) -> dict[str, Any]:
@@ -96,55 +79,36 @@ def compare_buildings(found: Sequence[Any], true: Sequence[Any]) -> dict[str, An
         ``objects`` (matched at an intersection over union of 0.5), ``sizes`` (the same by area), ``area`` (completeness,
         correctness and intersection over union of all area), ``covered`` (the share of true outlines of which found ones
         cover at least 80 %), ``boundary`` (how far places along the true boundary lie from the found one, of blocks that
-        match: median and 95th percentile, meters), and which were matched.
+        match: median and 95th percentile, meters), and which were ``matched``.
     """
     shapely = vector("shapely")
-    found, true = [shapely.make_valid(s) for s in found], [shapely.make_valid(s) for s in true]
-    pairs = matched_by_overlap(found, true)
+    found, true = list(shapely.make_valid(list(found))), list(shapely.make_valid(list(true)))
     whole_found, whole_true = shapely.union_all(found), shapely.union_all(true)
     shared = whole_found.intersection(whole_true).area
-    union = whole_found.area + whole_true.area - shared
     parts = shapely.area(shapely.intersection(true, whole_found)) / np.maximum(shapely.area(true), 1e-12)
-    sizes = {}
-    for low, high in itertools.pairwise(AREAS):
-        of_true = [n for n, s in enumerate(true) if low <= s.area < high]
-        of_found = [n for n, s in enumerate(found) if low <= s.area < high]
-        sizes[_range(low, high, "m2")] = {
-            "reference": len(of_true),
-            "found": len(of_found),
-            "completeness": _share(of_true, {b for _, b in pairs}),
-            "correctness": _share(of_found, {a for a, _ in pairs}),
-        }
-    offsets = boundary_offsets(list(shapely.get_parts(whole_found)), list(shapely.get_parts(whole_true)))
+    blocks, true_blocks = shapely.get_parts(whole_found), shapely.get_parts(whole_true)
+    offsets = [np.empty(0)]
+    for a, b in matched_by_overlap(blocks, true_blocks):
+        edge = true_blocks[b].boundary
+        places = shapely.line_interpolate_point(edge, np.arange(0.0, edge.length, EVERY))
+        offsets.append(shapely.distance(places, blocks[a].boundary))
+    away = np.concatenate(offsets)
     return {
-        "objects": _scores(len(true), len(found), len(pairs)),
-        "sizes": sizes,
+        **_scores(matched_by_overlap(found, true), shapely.area(found), shapely.area(true), AREAS, "m2"),
         "area": {
             "reference": whole_true.area,
             "found": whole_found.area,
-            "completeness": shared / whole_true.area if whole_true.area else float("nan"),
-            "correctness": shared / whole_found.area if whole_found.area else float("nan"),
-            "iou": shared / union if union else float("nan"),
+            "completeness": _share(shared, whole_true.area),
+            "correctness": _share(shared, whole_found.area),
+            "iou": _share(shared, whole_found.area + whole_true.area - shared),
         },
-        "covered": float(np.mean(parts >= 0.8)) if len(true) else float("nan"),
+        "covered": _mean(parts >= 0.8),
         "boundary": {
-            "places": len(offsets),
-            "median": float(np.median(offsets)) if len(offsets) else float("nan"),
-            "p95": float(np.percentile(offsets, 95)) if len(offsets) else float("nan"),
+            "places": len(away),
+            "median": float(np.median(away)) if len(away) else np.nan,
+            "p95": float(np.percentile(away, 95)) if len(away) else np.nan,
         },
-        "matched": pairs,
     }
-
-
-def boundary_offsets(found: Sequence[Any], true: Sequence[Any]) -> NDArray[np.float64]:
-    """How far places along the boundaries of true blocks lie from those of the blocks that match them, meters."""
-    shapely = vector("shapely")
-    out = [np.empty(0)]
-    for a, b in matched_by_overlap(found, true):
-        edge = true[b].boundary
-        places = shapely.line_interpolate_point(edge, np.arange(0.0, edge.length, EVERY))
-        out.append(shapely.distance(places, found[a].boundary))
-    return np.concatenate(out)
 
 
 def compare_trees(
@@ -152,34 +116,45 @@ def compare_trees(
 ) -> dict[str, Any]:
     """Figures of trees, (n, 2) places and (n,) heights in meters, against true ones; heights may be NaN."""
     pairs = matched_by_place(found, found_height, true, true_height)
-    a, b = (np.array([p[k] for p in pairs], np.int64) for k in (0, 1))
-    away = np.hypot(*(found[a] - true[b]).T) if pairs else np.empty(0)
-    higher = (found_height[a] - true_height[b])[~np.isnan(true_height[b])] if pairs else np.empty(0)
-    sizes = {}
-    for low, high in itertools.pairwise(HEIGHTS):
-        of_true = np.flatnonzero((true_height >= low) & (true_height < high)).tolist()
-        of_found = np.flatnonzero((found_height >= low) & (found_height < high)).tolist()
-        sizes[_range(low, high, "m")] = {
-            "reference": len(of_true),
-            "found": len(of_found),
-            "completeness": _share(of_true, set(b.tolist())),
-            "correctness": _share(of_found, set(a.tolist())),
-        }
+    a, b = np.array(pairs, np.int64).reshape(-1, 2).T
+    away, higher = np.hypot(*(found[a] - true[b]).T), found_height[a] - true_height[b]
+    higher = higher[~np.isnan(higher)]
     return {
-        "objects": _scores(len(true), len(found), len(pairs)),
-        "sizes": sizes,
-        "place": {"median": float(np.median(away)) if len(away) else float("nan")},
-        "height": {
-            "bias": float(higher.mean()) if len(higher) else float("nan"),
-            "rmse": float(np.sqrt((higher**2).mean())) if len(higher) else float("nan"),
-        },
-        "matched": pairs,
+        **_scores(pairs, found_height, true_height, HEIGHTS, "m"),
+        "place": {"median": float(np.median(away)) if len(away) else np.nan},
+        "height": {"bias": _mean(higher), "rmse": float(np.sqrt(_mean(higher**2)))},
     }
 
 
-def _share(these: list[int], hit: set[int]) -> float:
-    return len(hit.intersection(these)) / len(these) if these else float("nan")
+def _scores(
+    pairs: Pairs, found: NDArray, true: NDArray, limits: Sequence[float], unit: str
+) -> dict[str, Any]:
+    """Scores of all objects and of those of a size, and which were matched; `found` and `true` are sizes."""
+    hit_found, hit_true = np.zeros(len(found), bool), np.zeros(len(true), bool)
+    a, b = np.array(pairs, np.int64).reshape(-1, 2).T
+    hit_found[a], hit_true[b] = True, True
+
+    def score(which_found: Any, which_true: Any) -> dict[str, float]:
+        right, hit = hit_found[which_found], hit_true[which_true]
+        return {
+            "reference": len(hit),
+            "found": len(right),
+            "completeness": _mean(hit),
+            "correctness": _mean(right),
+        }
+
+    sizes = {}
+    for low, high in itertools.pairwise(limits):
+        name = f"{low:g} to {high:g} {unit}" if np.isfinite(high) else f"{low:g} {unit} and more"
+        sizes[name] = score((found >= low) & (found < high), (true >= low) & (true < high))
+    objects = {**score(slice(None), slice(None)), "matched": len(pairs)}
+    objects["f1"] = _share(2 * len(pairs), len(found) + len(true))
+    return {"objects": objects, "sizes": sizes, "matched": pairs}
 
 
-def _range(low: float, high: float, unit: str) -> str:
-    return f"{low:g} to {high:g} {unit}" if np.isfinite(high) else f"{low:g} {unit} and more"
+def _share(part: float, whole: float) -> float:
+    return part / whole if whole else np.nan
+
+
+def _mean(values: NDArray) -> float:
+    return float(np.mean(values)) if len(values) else np.nan

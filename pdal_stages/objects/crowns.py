@@ -10,16 +10,20 @@ a tile with that much around it has the crowns of the whole forest.
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
 
 #: Farthest that a cell lies from the top of its tree, meters.
 REACH = 15.0
+_RING = np.array([[True, True, True], [True, False, True], [True, True, True]])
 
 
 def canopy(high: NDArray, ground: NDArray) -> NDArray[np.float64]:
     """Height of the canopy above the ground, 0 where there is none; pits and empty cells inside crowns filled.
+
+    Cells are raised to the fourth highest of their eight neighbors where they lie more than half below it.
 
     Parameters
     ----------
@@ -27,66 +31,15 @@ def canopy(high: NDArray, ground: NDArray) -> NDArray[np.float64]:
         Height of the highest point of vegetation in each cell, meters; NaN where there is none.
     ground : (r, c) float64
     """
-    height = high - ground
-    height = np.where(np.isnan(height), 0.0, np.maximum(height, 0.0))
-    return _without_pits(height)
+    height = np.maximum(np.nan_to_num(high - ground), 0.0)
+    fourth = scipy.ndimage.rank_filter(height, -4, footprint=_RING, mode="constant")
+    return np.where(height < 0.5 * fourth, fourth, height)
 
 
-@njit
-def _without_pits(height: NDArray) -> NDArray:
-    """Cells raised to the fourth highest of their eight neighbors where they lie more than half below it."""
-    rows, columns = height.shape
-    out = height.copy()
-    around = np.empty(8)
-    for r in range(1, rows - 1):
-        for c in range(1, columns - 1):
-            higher, n = 0, 0
-            for i in range(-1, 2):
-                for j in range(-1, 2):
-                    higher += height[r, c] < 0.5 * height[r + i, c + j]
-            if higher < 4:
-                continue
-            for i in range(-1, 2):
-                for j in range(-1, 2):
-                    if i != 0 or j != 0:
-                        around[n] = height[r + i, c + j]
-                        n += 1
-            around.sort()
-            out[r, c] = around[4]
-    return out
-
-
-@njit
-def smoothed(height: NDArray, weights: NDArray) -> NDArray:
-    """Heights averaged with weights (2k + 1,) along rows and columns; beyond the array there is no canopy."""
-    rows, columns = height.shape
-    k = weights.size // 2
-    along, out = np.zeros(height.shape), np.zeros(height.shape)
-    for r in range(rows):
-        for c in range(columns):
-            total = 0.0
-            for i in range(-k, k + 1):
-                if 0 <= c + i < columns:
-                    total += weights[i + k] * height[r, c + i]
-            along[r, c] = total
-    for r in range(rows):
-        for c in range(columns):
-            if height[r, c] > 0.0:
-                total = 0.0
-                for i in range(-k, k + 1):
-                    if 0 <= r + i < rows:
-                        total += weights[i + k] * along[r + i, c]
-                out[r, c] = total
-    return out
-
-
-def bell(sigma: float) -> NDArray[np.float64]:
-    """Weights of a Gaussian, of `sigma` cells; one alone where it is 0."""
-    if sigma <= 0:
-        return np.ones(1)
-    k = int(np.ceil(2.5 * sigma))
-    weights = np.exp(-0.5 * (np.arange(-k, k + 1) / sigma) ** 2)
-    return weights / weights.sum()
+def smoothed(height: NDArray, sigma: float) -> NDArray:
+    """Heights averaged by a Gaussian of `sigma` cells; beyond the array there is no canopy."""
+    out = scipy.ndimage.gaussian_filter(height, sigma, mode="constant", radius=int(np.ceil(2.5 * sigma)))
+    return np.where(height > 0.0, out, 0.0)
 
 
 @device

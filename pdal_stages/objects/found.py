@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass, field, fields
+from itertools import chain, compress
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base import checks
-from . import measure
 from .cells import Kind, point_keys
 from .measure import Body
 
@@ -68,11 +69,8 @@ class Table:
 
     ids: NDArray[np.int64]
     columns: dict[str, NDArray]
-    #: Cells of object n are those from start[n] on: row, column and height (of a path: see `paths`).
-    start: NDArray[np.int64]
-    row: NDArray[np.int64]
-    column: NDArray[np.int64]
-    z: NDArray[np.float64]
+    #: Of each object its cells: row, column and height (n, 3).
+    cells: list[NDArray[np.float64]]
     #: Of spans: the line (k, 3) along each.
     paths: list[NDArray[np.float64]]
 
@@ -81,25 +79,22 @@ class Table:
 
     def cells_of(self, number: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
         """Rows, columns and heights of an object's cells."""
-        part = slice(self.start[number], self.start[number + 1])
-        return self.row[part], self.column[part], self.z[part]
+        row, column, z = self.cells[number].T
+        return row.astype(np.int64), column.astype(np.int64), z
+
+    def reasons(self) -> list[list[str]]:
+        """Why each object is to be checked."""
+        return [str(text).split(", ") if text else [] for text in self.columns.get("reason", ())]
 
     def having(self, reasons: Collection[str]) -> NDArray[np.bool_]:
         """Which objects are to be checked for one of the reasons."""
-        texts = self.columns["reason"].tolist() if len(self) else []
-        return np.array([any(one in reasons for one in str(text).split(", ")) for text in texts], bool)
+        return np.array([not set(reasons).isdisjoint(own) for own in self.reasons()], bool)
 
     def only(self, kept: NDArray[np.bool_]) -> Table:
         """Some of the objects."""
-        cells = np.repeat(kept, np.diff(self.start))
+        columns = {name: values[kept] for name, values in self.columns.items()}
         return Table(
-            self.ids[kept],
-            {name: values[kept] for name, values in self.columns.items()},
-            np.r_[0, np.cumsum(np.diff(self.start)[kept])].astype(np.int64),
-            self.row[cells],
-            self.column[cells],
-            self.z[cells],
-            [path for path, stays in zip(self.paths, kept, strict=True) if stays] if self.paths else [],
+            self.ids[kept], columns, list(compress(self.cells, kept)), list(compress(self.paths, kept))
         )
 
 
@@ -116,35 +111,27 @@ class Objects:
         """The objects that are not to be checked for one of the reasons; how many are left out."""
         left = {kind: table.having(reasons) for kind, table in self.tables.items()}
         gone = np.concatenate([table.ids[left[kind]] for kind, table in self.tables.items()])
-        if not gone.size:
-            return self, 0
         stays = ~np.isin(self.owner, gone)
         tables = {kind: table.only(~left[kind]) for kind, table in self.tables.items()}
         return Objects(self.settings, tables, self.key[stays], self.owner[stays]), gone.size
 
     def ids_at(self, x: NDArray, y: NDArray, kinds: NDArray) -> NDArray[np.int64]:
         """The id of each point's object, 0 where it is of none; `kinds` are numbers of :class:`Kind`, or -1."""
-        out = np.zeros(len(x), np.int64)
-        rows = np.flatnonzero(kinds >= 0)
-        if rows.size == 0 or self.key.size == 0:
-            return out
-        key = point_keys(x[rows], y[rows], kinds[rows], self.settings.cell)
+        if self.key.size == 0:
+            return np.zeros(len(x), np.int64)
+        key = point_keys(x, y, kinds, self.settings.cell)
         at = np.minimum(np.searchsorted(self.key, key), len(self.key) - 1)
-        out[rows] = np.where(self.key[at] == key, self.owner[at], 0)
-        return out
+        return np.where(self.key[at] == key, self.owner[at], 0)
 
     def summary(self) -> dict[str, dict[str, Any]]:
         """Of each kind (``buildings``): how many objects, how many are to be checked, and why."""
         out = {}
         for kind, table in self.tables.items():
-            texts = table.columns["reason"].tolist() if len(table) else []
-            reasons = [reason for text in texts for reason in text.split(", ") if reason]
+            reasons = table.reasons()
             out[kind.name.lower() + "s"] = {
                 "objects": len(table),
-                "to_be_checked": int(np.count_nonzero(table.columns["verdict"] == measure.CHECK))
-                if len(table)
-                else 0,
-                "reasons": {reason: reasons.count(reason) for reason in sorted(set(reasons))},
+                "to_be_checked": sum(map(bool, reasons)),
+                "reasons": dict(sorted(Counter(chain.from_iterable(reasons)).items())),
             }
         return out
 
@@ -153,33 +140,23 @@ class Found:
     """What blocks found so far."""
 
     def __init__(self) -> None:
-        self.ids: list[int] = []
-        self.records: list[dict[str, object]] = []
-        self.cells: list[tuple[NDArray, NDArray, NDArray]] = []
-        self.paths: list[NDArray] = []
+        self._objects: list[tuple[int, dict[str, object], NDArray]] = []
         self.keys: list[NDArray] = []
         self.owners: list[NDArray] = []
 
     def table(self) -> Table:
-        order = np.argsort(np.array(self.ids, np.int64), kind="stable")
-        cells = [self.cells[n] for n in order]
-        names = list(self.records[0]) if self.records else []
-        columns = {name: np.array([self.records[n][name] for n in order]) for name in names}
-        empty = np.empty(0)
-        return Table(
-            np.array(self.ids, np.int64)[order],
-            columns,
-            np.r_[0, np.cumsum([len(row) for row, _, _ in cells])].astype(np.int64),
-            np.concatenate([row for row, _, _ in cells] or [empty]).astype(np.int64),
-            np.concatenate([column for _, column, _ in cells] or [empty]).astype(np.int64),
-            np.concatenate([z for _, _, z in cells] or [empty]),
-            [self.paths[n] for n in order] if self.paths else [],
-        )
+        objects = sorted(self._objects, key=lambda one: one[0])
+        columns = {
+            name: np.array([record[name] for _, record, _ in objects])
+            for name in (objects[0][1] if objects else ())
+            if name != "path"
+        }
+        paths = [np.asarray(record["path"]) for _, record, _ in objects if "path" in record]
+        ids = np.array([identity for identity, *_ in objects], np.int64)
+        return Table(ids, columns, [cells for *_, cells in objects], paths)
 
     def add(self, identity: int, record: dict[str, object], body: Body) -> None:
-        self.ids.append(identity)
-        self.records.append(record)
-        self.cells.append((body.row, body.column, body.z))
+        self._objects.append((identity, record, np.column_stack([body.row, body.column, body.z])))
 
     def own(self, key: NDArray[np.int64], identity: int) -> None:
         """The points of these cells are the object's."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -11,13 +11,15 @@ import scipy
 from numpy.typing import NDArray
 
 from .cells import MM
-from .planes import roof_planes
+from .roofs import roof_planes
 
 SURE, CHECK = "sure", "check"
 #: The reason of an object that is larger than what is looked at in one piece.
 CUT = "cut off"
 #: A building holds a square of this side, meters; wires that were taken for one do not.
 WIDE = 2.0
+#: Less than such a mean reliability of its points is unsure.
+RELIABLE = 0.7
 #: What stands about and is no building, by reason: its width, length and height, meters, as cells show them, up to two
 #: cells wider; how many times as long as wide it is at least; and how much its top slopes at most, degrees.
 BOXES = {
@@ -46,78 +48,66 @@ class Body(NamedTuple):
     sure: NDArray[np.float64]  # sum of reliabilities, thousandths
     told: NDArray[np.int64]  # points that have one
 
+    @property
+    def place(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        return self.row - self.row.min(), self.column - self.column.min()
+
     def image(self, values: NDArray) -> NDArray:
         """Values of the cells as an array (rows, columns), NaN outside."""
         out = np.full((int(np.ptp(self.row)) + 1, int(np.ptp(self.column)) + 1), np.nan)
-        out[self.row - self.row.min(), self.column - self.column.min()] = values
+        out[self.place] = values
         return out
-
-    def edge(self) -> NDArray[np.bool_]:
-        """Whether each cell lies at the object's edge."""
-        inside = ~np.isnan(self.image(np.zeros(len(self.row))))
-        inner = scipy.ndimage.binary_erosion(inside)
-        return ~inner[self.row - self.row.min(), self.column - self.column.min()]
-
-    def holds_square(self, side: int) -> bool:
-        """Whether a square of so many cells a side lies inside."""
-        inside = ~np.isnan(self.image(np.zeros(len(self.row))))
-        return bool(scipy.ndimage.binary_erosion(inside, np.ones((side, side), bool)).any())
-
-    @property
-    def reliability(self) -> float:
-        """Mean reliability of the points, NaN where they have none."""
-        told = int(self.told.sum())
-        return float(self.sure.sum()) / told / MM if told else math.nan
 
     @property
     def ground_height(self) -> float:
         """The middle one of the ground's heights, NaN where there is none."""
-        known = self.ground[~np.isnan(self.ground)]
-        return float(np.median(known)) if known.size else math.nan
+        return float(np.nanmedian(self.ground)) if not np.isnan(self.ground).all() else math.nan
+
+    def record(self, measures: dict[str, object], reasons: dict[str, bool]) -> dict[str, object]:
+        """Measures, points and their mean reliability (NaN where they have none), and the verdict that follows."""
+        told = int(self.told.sum())
+        reliability = float(self.sure.sum()) / told / MM if told else math.nan
+        reasons["unsure points"] = reliability < RELIABLE
+        return {**measures, "points": int(self.points.sum()), "reliab": reliability, **judged(reasons)}
 
 
-def judged(reasons: Sequence[object]) -> dict[str, object]:
-    """The verdict that follows from reasons to check."""
-    return {"verdict": CHECK if reasons else SURE, "reason": ", ".join(map(str, reasons))}
+def judged(reasons: Mapping[str, bool]) -> dict[str, object]:
+    """The verdict that follows from reasons to check, those that hold."""
+    text = ", ".join(reason for reason, holds in reasons.items() if holds)
+    return {"verdict": CHECK if text else SURE, "reason": text}
 
 
 def building(body: Body, size: float) -> dict[str, object]:
     """Heights, roof and verdict of a building."""
-    area, ground, edge = len(body.row) * size * size, body.ground_height, body.edge()
-    above = body.z - (ground if not math.isnan(ground) else np.nanmin(body.low))
-    planes, slope, planar = roof_planes(body.image(body.z), size)
-    depth = body.z[edge] - body.low[edge]
-    facade = float(np.mean(np.nan_to_num(depth) >= 1.5))
+    image, ground = body.image(body.z), body.ground_height
+    inside, area = ~np.isnan(image), len(body.row) * size * size
+    above = body.z - (np.nanmin(body.low) if math.isnan(ground) else ground)
+    edge = ~scipy.ndimage.binary_erosion(inside)[body.place]
+    square = np.ones((math.ceil(WIDE / size),) * 2, bool)
+    planes, slope, planar = roof_planes(image, size)
+    facade = np.mean(np.nan_to_num(body.z[edge] - body.low[edge]) >= 1.5)
     ridge = float(np.percentile(above, 98))
-    reasons = []
-    if math.isnan(ground):
-        reasons.append("no ground near")
-    if area < 10:
-        reasons.append("small")
-    if not body.holds_square(math.ceil(WIDE / size)):
-        reasons.append("narrow")
-    if area < 45 and (like := _box_like(body, ridge, slope, size)):
-        reasons.append(like)
-    if ridge < 2.2:
-        reasons.append("low")
-    if planar < 0.3 and area >= 30:
-        reasons.append("rough roof")
-    if body.reliability < 0.7:
-        reasons.append("unsure points")
-    if facade == 0 and area < 50:
-        reasons.append("no facade")
-    return {
-        "area": area,
-        "h_eave": float(np.percentile(above[edge], 25)),
-        "h_ridge": ridge,
-        "ground": ground,
-        "slope": slope,
-        "planes": planes,
-        "planar": planar,
-        "points": int(body.points.sum()),
-        "reliab": body.reliability,
-        **judged(reasons),
-    }
+    like = _box_like(body, ridge, slope, size) if area < 45 else ""
+    return body.record(
+        {
+            "area": area,
+            "h_eave": float(np.percentile(above[edge], 25)),
+            "h_ridge": ridge,
+            "ground": ground,
+            "slope": slope,
+            "planes": planes,
+            "planar": planar,
+        },
+        {
+            "no ground near": math.isnan(ground),
+            "small": area < 10,
+            "narrow": not scipy.ndimage.binary_erosion(inside, square).any(),
+            like: bool(like),
+            "low": ridge < 2.2,
+            "rough roof": planar < 0.3 and area >= 30,
+            "no facade": facade == 0 and area < 50,
+        },
+    )
 
 
 def _box_like(body: Body, height: float, slope: float, size: float) -> str:
@@ -125,9 +115,8 @@ def _box_like(body: Body, height: float, slope: float, size: float) -> str:
     turns = np.radians(np.arange(0.0, 90.0, 3.0))[:, None]
     u = body.column * np.cos(turns) + body.row * np.sin(turns)
     v = body.row * np.cos(turns) - body.column * np.sin(turns)
-    sides = (np.ptp(u, axis=1) + 1.0) * size, (np.ptp(v, axis=1) + 1.0) * size
-    best = int(np.argmin(np.round(sides[0] * sides[1], 6)))
-    width, length = sorted((float(sides[0][best]), float(sides[1][best])))
+    sides = np.array([np.ptp(u, axis=1) + 1.0, np.ptp(v, axis=1) + 1.0]) * size
+    width, length = sorted(sides[:, np.argmin(np.round(sides.prod(axis=0), 6))].tolist())
     for name, (wide, long, high, ratio, flat) in BOXES.items():
         fits = wide[0] <= width <= wide[1] and long[0] <= length <= long[1] and high[0] <= height <= high[1]
         if fits and length >= ratio * width and slope <= flat:
@@ -141,112 +130,70 @@ def tree(body: Body, top_row: int, top_column: int, size: float) -> dict[str, ob
     above = body.z - body.ground
     highest = int(np.argmax(np.where(np.isnan(above), -np.inf, above)))
     height, diameter = float(above[highest]), 2.0 * math.sqrt(area / math.pi)
-    points = int(body.points.sum())
-    reasons = []
-    if points < 10:
-        reasons.append("few points")
-    if diameter < 0.12 * height:
-        reasons.append("thin crown")
-    if diameter > 1.6 * height:
-        reasons.append("wide crown")
-    if height <= POLE and diameter < SLIM * height:
-        deep = np.nan_to_num(body.z - body.low) > DEEP
-        if np.mean(deep) < CROWN:
-            reasons.append("pole")
-    if body.reliability < 0.7:
-        reasons.append("unsure points")
-    return {
-        "x": (top_column + 0.5) * size,
-        "y": (top_row + 0.5) * size,
-        "height": height,
-        "area": area,
-        "diam": diameter,
-        "ground": float(body.ground[highest]),
-        "points": points,
-        "reliab": body.reliability,
-        **judged(reasons),
-    }
+    deep = np.mean(np.nan_to_num(body.z - body.low) > DEEP)
+    return body.record(
+        {
+            "x": (top_column + 0.5) * size,
+            "y": (top_row + 0.5) * size,
+            "height": height,
+            "area": area,
+            "diam": diameter,
+            "ground": float(body.ground[highest]),
+        },
+        {
+            "few points": body.points.sum() < 10,
+            "thin crown": diameter < 0.12 * height,
+            "wide crown": diameter > 1.6 * height,
+            "pole": height <= POLE and diameter < SLIM * height and bool(deep < CROWN),
+        },
+    )
 
 
 def span(body: Body, size: float) -> dict[str, object]:
-    """Length and clearance of the wires between two masts, and the verdict."""
+    """Length and clearance of the wires between two masts, the path (k, 3) along them, and the verdict."""
     path = path_of(body, size)
-    length = float(np.hypot(*np.diff(path[:, :2], axis=0).T).sum())
-    clearance = body.low - body.ground
-    known = clearance[~np.isnan(clearance)]
-    ends = np.hypot(*(path[-1, :2] - path[0, :2]))
-    reasons = []
-    if length < 8:
-        reasons.append("short")
-    if ends < 0.9 * length:
-        reasons.append("not straight")
-    if body.reliability < 0.7:
-        reasons.append("unsure points")
-    return {
-        "length": length,
-        "h_low": float(known.min()) if known.size else math.nan,
-        "z_high": float(body.z.max()),
-        "sag": float(max(0.0, np.max(_chord(path) - path[:, 2]))),
-        "points": int(body.points.sum()),
-        "reliab": body.reliability,
-        **judged(reasons),
-    }
-
-
-def _chord(path: NDArray) -> NDArray:
-    """Heights of a straight line between the ends at the places of a path."""
     along = np.r_[0.0, np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))]
-    share = along / along[-1] if along[-1] > 0 else along
-    return path[0, 2] + share * (path[-1, 2] - path[0, 2])
+    length, clearance = float(along[-1]), body.low - body.ground
+    chord = np.interp(along, along[[0, -1]], path[[0, -1], 2])
+    return body.record(
+        {
+            "length": length,
+            "h_low": float(np.nanmin(clearance)) if not np.isnan(clearance).all() else math.nan,
+            "z_high": float(body.z.max()),
+            "sag": float(max(0.0, np.max(chord - path[:, 2]))),
+            "path": path,
+        },
+        {
+            "short": length < 8,
+            "not straight": bool(np.hypot(*(path[-1, :2] - path[0, :2])) < 0.9 * length),
+        },
+    )
 
 
 def path_of(body: Body, size: float) -> NDArray[np.float64]:
     """A line along wires (n, 3), meters: the middle of each piece of 2 m along their main direction."""
     x, y = (body.column + 0.5) * size, (body.row + 0.5) * size
-    origin = np.array([x.min(), y.min()])
-    u, v = x - origin[0], y - origin[1]
+    u, v = x - x.min(), y - y.min()
     du, dv = u - u.mean(), v - v.mean()
     angle = 0.5 * math.atan2(2.0 * float(du @ dv), float(du @ du - dv @ dv))
-    along = u * math.cos(angle) + v * math.sin(angle)
-    piece = np.floor((along - along.min()) / 2.0).astype(np.int64)
-    _, piece = np.unique(piece, return_inverse=True)
+    c, s = math.cos(angle), math.sin(angle)
+    along, aside = u * c + v * s, v * c - u * s
+    _, piece = np.unique(np.floor((along - along.min()) / 2.0), return_inverse=True)
     many = np.bincount(piece)
-    aside = v * math.cos(angle) - u * math.sin(angle)
+    if len(many) == 1:  # a wire seen in one place
+        ends = [np.argmin(along), np.argmax(along)]
+        return np.column_stack([x, y, body.z])[ends]
     if np.ptp(aside) < 4.0:  # wires side by side: one straight line between them
         aside = np.full(len(aside), aside.mean())
-    middle = [np.bincount(piece, weights=values) / many for values in (along, aside, body.z)]
-    if len(many) > 1:  # from one end to the other
-        middle[0][[0, -1]] = along.min(), along.max()
-    path = np.column_stack(
-        [
-            origin[0] + middle[0] * math.cos(angle) - middle[1] * math.sin(angle),
-            origin[1] + middle[0] * math.sin(angle) + middle[1] * math.cos(angle),
-            middle[2],
-        ]
-    )
-    if len(path) == 1:  # a wire seen in one place
-        first, last = np.argmin(along), np.argmax(along)
-        path = np.array([[x[first], y[first], body.z[first]], [x[last], y[last], body.z[last]]])
-    return path
+    u, v, z = (np.bincount(piece, weights=values) / many for values in (along, aside, body.z))
+    u[[0, -1]] = along.min(), along.max()  # from one end to the other
+    return np.column_stack([x.min() + u * c - v * s, y.min() + u * s + v * c, z])
 
 
 def deck(body: Body, size: float) -> dict[str, object]:
     """Area, height and clearance of a bridge deck, and the verdict."""
-    area, ground = len(body.row) * size * size, body.ground_height
-    height = float(np.median(body.z))
-    reasons = []
-    if area < 20:
-        reasons.append("small")
-    if not math.isnan(ground) and height - ground < 0.5:
-        reasons.append("low")
-    if body.reliability < 0.7:
-        reasons.append("unsure points")
-    return {
-        "area": area,
-        "z": height,
-        "clear": height - ground,
-        "ground": ground,
-        "points": int(body.points.sum()),
-        "reliab": body.reliability,
-        **judged(reasons),
-    }
+    area, ground, height = len(body.row) * size * size, body.ground_height, float(np.median(body.z))
+    return body.record(
+        {"area": area, "z": height, "clear": height - ground, "ground": ground},
+        {"small": area < 20, "low": height - ground < 0.5},
+    )

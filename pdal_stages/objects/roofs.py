@@ -7,7 +7,6 @@ import scipy
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from .planes import plane_around
 
 #: Scatter of a roof's plane that is gone on from, and how near to it vegetation is of the roof, meters.
 PLANE, NEAR = 0.12, 0.2
@@ -17,8 +16,46 @@ SURFACE = 0.5
 INSIDE = 2
 #: Within how many meters the rim of a hole in a roof is at one height, and how much of the rim.
 LEVEL, RIM = 1.0, 0.65
+#: Cells of a roof's plane: how far those around scatter from it, meters; how much its gradient changes from one cell to the
+#: next; and the smallest plane that counts, m2.
+SMOOTH, TILT, SMALLEST = 0.25, 0.2, 3.0
 #: The share of the border of two roofs along which their heights meet where they are of one building.
 _SHARE = 0.34
+
+
+@device
+def plane_around(z, r, c, size, level, reach, flat):
+    """The plane through the five by five cells around a cell that lie within `reach` of a level, by least squares.
+
+    Returns how many they are, the rise per meter east and north, the height above `level` at the cell, and the mean
+    square of how far they lie from it; NaN where they are fewer than six, or in a row (a determinant below `flat`).
+    """
+    n, x, y, h, xx, yy, xy, xh, yh, hh = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(max(r - 2, 0), min(r + 3, z.shape[0])):
+        for j in range(max(c - 2, 0), min(c + 3, z.shape[1])):
+            d = z[i, j] - level
+            if not abs(d) <= reach:
+                continue
+            u, v = (j - c) * size, (i - r) * size
+            n += 1
+            x += u
+            y += v
+            h += d
+            xx += u * u
+            yy += v * v
+            xy += u * v
+            xh += u * d
+            yh += v * d
+            hh += d * d
+    if n < 6:
+        return n, np.nan, np.nan, np.nan, np.nan
+    xx, yy, xy = xx - x * x / n, yy - y * y / n, xy - x * y / n
+    xh, yh, hh = xh - x * h / n, yh - y * h / n, hh - h * h / n
+    det = xx * yy - xy * xy
+    if det < max(1e-9, flat * n * n * size**4):
+        return n, np.nan, np.nan, np.nan, np.nan
+    a, b = (xh * yy - yh * xy) / det, (yh * xx - xh * xy) / det
+    return n, a, b, (h - a * x - b * y) / n, (hh - a * xh - b * yh) / n
 
 
 def roof_cells(
@@ -107,34 +144,23 @@ def covered(high: NDArray, seen: NDArray, reach: int) -> NDArray:
         Whether points of the ground or of vegetation lie in the cell.
     reach : int
     """
-    roof = ~np.isnan(high)
-    holes, _ = scipy.ndimage.label(~roof & ~seen)
-    out, rows, columns = high.copy(), *high.shape
-    boxes, beside = scipy.ndimage.find_objects(holes), np.unique(holes[scipy.ndimage.binary_dilation(roof)])
-    for number in beside[beside > 0].tolist():
-        box = boxes[number - 1]
-        (top, bottom), (left, right) = ((part.start - 1, part.stop + 1) for part in box)
-        if (
-            top < 0
-            or left < 0
-            or bottom > rows
-            or right > columns
-            or max(bottom - top, right - left) > 12 * reach
-        ):
+    out = high.copy()
+    holes, _ = scipy.ndimage.label(np.isnan(high) & ~seen)
+    boxes = scipy.ndimage.find_objects(holes)
+    for number in np.unique(holes[scipy.ndimage.binary_dilation(~np.isnan(high))]).tolist():
+        if number == 0:
             continue
-        part = slice(top, bottom), slice(left, right)
-        hole = holes[part] == number
-        rim = scipy.ndimage.binary_dilation(hole) & ~hole
-        levels = high[part][rim & roof[part]]
-        if len(levels) < RIM * np.count_nonzero(rim):
-            continue
-        level = np.median(levels)
-        if (
-            np.mean(np.abs(levels - level) <= LEVEL) < RIM
-            or scipy.ndimage.distance_transform_cdt(hole).max() > reach
-        ):
-            continue
-        out[part][hole] = level
+        rows, columns = boxes[number - 1]
+        top, left = rows.start - 1, columns.start - 1
+        box = np.s_[top : rows.stop + 1, left : columns.stop + 1]
+        hole = holes[box] == number if top >= 0 and left >= 0 else np.empty((0, 0), bool)
+        if hole.shape != (rows.stop - rows.start + 2, columns.stop - columns.start + 2):
+            continue  # at the edge of what is seen
+        levels = high[box][scipy.ndimage.binary_dilation(hole) & ~hole]
+        level = np.nanmedian(levels) if not np.isnan(levels).all() else np.nan
+        rim = np.mean(np.abs(levels - level) <= LEVEL) >= RIM and max(hole.shape) <= 12 * reach
+        if rim and scipy.ndimage.distance_transform_cdt(hole).max() <= reach:
+            out[box][hole] = level
     return out
 
 
@@ -152,10 +178,10 @@ def opened(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return scipy.ndimage.binary_opening(mask, np.ones((2, 2), bool))
 
 
-def connected(mask: NDArray, z: NDArray, step: float) -> NDArray[np.int64]:
+def connected(mask: NDArray, step: float, *values: NDArray) -> NDArray[np.int64]:
     """Number of each cell's part, from 0 in the order of their first cells; -1 outside the mask.
 
-    Two cells side by side are of one part where their heights differ by at most `step`.
+    Two cells side by side are of one part where their values, in sum, differ by at most `step`.
     """
     number = np.full(mask.shape, -1, np.int64)
     count = int(np.count_nonzero(mask))
@@ -163,7 +189,7 @@ def connected(mask: NDArray, z: NDArray, step: float) -> NDArray[np.int64]:
     pairs = []
     for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         with np.errstate(invalid="ignore"):
-            joined = mask[a] & mask[b] & ~(np.abs(z[a] - z[b]) > step)
+            joined = mask[a] & mask[b] & ~(sum(np.abs(v[a] - v[b]) for v in values) > step)
         pairs.append((number[a][joined], number[b][joined]))
     number[mask] = _sets(np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs]), count)
     return number
@@ -200,7 +226,7 @@ def _roof_level(part, z, r, c, dr, dc):
 
 
 @njit
-def borders(part: NDArray, z: NDArray, step: float) -> NDArray:
+def _borders(part: NDArray, z: NDArray, step: float) -> NDArray:
     """Every pair of cells side by side in different parts: (n, 3), the numbers of both, the lower first, and whether
     their roofs lie within `step` there."""
     rows, columns = part.shape
@@ -236,12 +262,12 @@ def building_parts(mask: NDArray[np.bool_], z: NDArray, *, step: float, smallest
     of 0 parts nothing.
     """
     if step <= 0:
-        return connected(mask, z, np.inf)
-    number = absorbed(connected(mask, z, min(1.0, step)), z, smallest)
-    return joined(number, z, step)
+        return connected(mask, np.inf, z)
+    number = _absorbed(connected(mask, min(1.0, step), z), z, smallest)
+    return _joined(number, z, step)
 
 
-def absorbed(number: NDArray[np.int64], z: NDArray, smallest: int) -> NDArray[np.int64]:
+def _absorbed(number: NDArray[np.int64], z: NDArray, smallest: int) -> NDArray[np.int64]:
     """Parts without the small ones that have a neighbor."""
     while True:
         a, b, length, _ = _shared(number, z, np.inf)
@@ -255,7 +281,7 @@ def absorbed(number: NDArray[np.int64], z: NDArray, smallest: int) -> NDArray[np
         number = _renamed(number, _sets(small, b[order][first], len(size)))
 
 
-def joined(number: NDArray[np.int64], z: NDArray, step: float) -> NDArray[np.int64]:
+def _joined(number: NDArray[np.int64], z: NDArray, step: float) -> NDArray[np.int64]:
     """Parts with those put together whose heights meet along enough of their border."""
     while True:
         a, b, length, near = _shared(number, z, step)
@@ -267,7 +293,7 @@ def joined(number: NDArray[np.int64], z: NDArray, step: float) -> NDArray[np.int
 
 def _shared(number: NDArray[np.int64], z: NDArray, step: float) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Neighboring parts, the lower number first; how long their border is, in cells, and how much of it is within step."""
-    pairs = borders(number, z, step)
+    pairs = _borders(number, z, step)
     both, which, length = np.unique(pairs[:, :2], axis=0, return_inverse=True, return_counts=True)
     return (
         both[:, 0],
@@ -279,3 +305,40 @@ def _shared(number: NDArray[np.int64], z: NDArray, step: float) -> tuple[NDArray
 
 def _renamed(number: NDArray[np.int64], name: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.where(number >= 0, name[number], -1)
+
+
+@njit
+def _gradients(z: NDArray, size: float) -> tuple[NDArray, NDArray, NDArray]:
+    """Rise per meter east and north of the plane through each cell and its neighbors, and how far they lie from it."""
+    rows, columns = z.shape
+    east, north = np.full(z.shape, np.nan), np.full(z.shape, np.nan)
+    off = np.full(z.shape, np.inf)
+    for r in range(rows):
+        for c in range(columns):
+            if np.isnan(z[r, c]):
+                continue
+            _, a, b, _, scatter = plane_around(z, r, c, size, z[r, c], 1.5, 0.0)
+            if not np.isnan(a):
+                east[r, c], north[r, c], off[r, c] = a, b, np.sqrt(max(scatter, 0.0))
+    return east, north, off
+
+
+def roof_planes(z: NDArray[np.float64], size: float) -> tuple[int, float, float]:
+    """How many planes a roof has, their mean slope in degrees, and the share of its cells that lie in one.
+
+    Parameters
+    ----------
+    z : (r, c) float64
+        Heights of the roof's cells, NaN elsewhere; meters.
+    size : float
+        Side of a cell, meters.
+    """
+    east, north, off = _gradients(z, size)
+    part = connected(off < SMOOTH, TILT, east, north)
+    cells = np.bincount(part.ravel() + 1)[1:]
+    large = np.append(cells * size * size >= SMALLEST, False)
+    taken = large[part]
+    if not taken.any():
+        return 0, 0.0, 0.0
+    slope = np.degrees(np.arctan(np.hypot(east[taken], north[taken])))
+    return int(large.sum()), float(slope.mean()), float(taken.sum() / np.count_nonzero(~np.isnan(z)))

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
+from functools import cache, cached_property
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from ..base.jit import njit
 from . import crowns, roofs
 from .cells import GROUND_CELLS, MM, Cells, Kind, unpack
 from .found import ObjectSettings
 from .measure import Body
-from .rasters import GROUND_REACH, Window
 
+#: How far the ground is looked for, meters: half the width of the largest building.
+GROUND_REACH = 120.0
 #: Meters around a place that decide about it, but for the extent of buildings, spans and decks.
 MARGIN = GROUND_REACH + 2 * crowns.REACH
 #: How far a roof goes on into what a classifier took for leaves, meters.
@@ -27,9 +30,38 @@ AROUND = np.ones((3, 3), bool)
 MOST_CELLS = 64_000_000
 
 
-def widened(core: Window, margin: int) -> Window:
-    margin += margin % GROUND_CELLS
-    return Window(core.row - margin, core.column - margin, core.rows + 2 * margin, core.columns + 2 * margin)
+class Window(NamedTuple):
+    """A rectangle of cells; all numbers are even, so it holds whole cells of the ground."""
+
+    row: int
+    column: int
+    rows: int
+    columns: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.rows, self.columns
+
+    def widened(self, margin: int) -> Window:
+        margin += margin % GROUND_CELLS
+        return Window(
+            self.row - margin, self.column - margin, self.rows + 2 * margin, self.columns + 2 * margin
+        )
+
+    def common(self, other: Window) -> Window:
+        row, column = max(self.row, other.row), max(self.column, other.column)
+        rows = min(self.row + self.rows, other.row + other.rows) - row
+        columns = min(self.column + self.columns, other.column + other.columns) - column
+        return Window(row, column, max(rows, 0), max(columns, 0))
+
+    def part(self, other: Window) -> tuple[slice, slice]:
+        """Where in this window's arrays another lies."""
+        both = self.common(other)
+        row, column = both.row - self.row, both.column - self.column
+        return slice(row, row + both.rows), slice(column, column + both.columns)
+
+    def holds(self, row: int, column: int) -> bool:
+        return self.row <= row < self.row + self.rows and self.column <= column < self.column + self.columns
 
 
 def extent_of(cells: Cells) -> Window:
@@ -42,39 +74,31 @@ def extent_of(cells: Cells) -> Window:
     return Window(*lows, *(n + n % GROUND_CELLS for n in sizes))
 
 
-def _common(a: Window, b: Window) -> Window:
-    row, column = max(a.row, b.row), max(a.column, b.column)
-    rows = min(a.row + a.rows, b.row + b.rows) - row
-    return Window(row, column, rows, min(a.column + a.columns, b.column + b.columns) - column)
-
-
 class CellView:
     """What the cells of a window hold, as arrays of the part of it that has any; what several kinds need is made once."""
 
     def __init__(self, cells: Cells, window: Window, extent: Window, chosen: ObjectSettings) -> None:
         self.cells, self.seen, self.extent, self.chosen = cells, window, extent, chosen
-        self.window = _common(window, extent)
-        self._held: dict[Kind, tuple[Cells, NDArray, NDArray]] = {}
-        self._places: dict[Kind, NDArray[np.int32]] = {}
+        self.window = window.common(extent)
+        self.held, self.surface = cache(self._held), cache(self._surface)
 
-    def wider(self, margin: int) -> CellView:
-        """The same with more around it."""
-        return CellView(self.cells, widened(self.seen, margin), self.extent, self.chosen)
+    def _held(self, kind: Kind) -> tuple[Cells, NDArray[np.int32]]:
+        """The cells of a kind, and where among them each of the window is, -1 for those that are not.
 
-    def held(self, kind: Kind) -> tuple[Cells, NDArray[np.int64], NDArray[np.int64]]:
-        """The cells of a kind, and their rows and columns in the window."""
-        if kind not in self._held:
-            inside = self.window.of(self.cells, kind)
-            _, row, column = unpack(inside.key)
-            self._held[kind] = inside, row - self.window.row, column - self.window.column
-        return self._held[kind]
+        Those of the ground in a window of its own, wider cells.
+        """
+        wide = GROUND_CELLS if kind == Kind.GROUND else 1
+        first_row, first_column, *shape = (n // wide for n in self.window)
+        inside = self.cells.within(kind, first_row, first_column, *shape)
+        _, row, column = unpack(inside.key)
+        place = np.full(shape, -1, np.int32)
+        place[row - first_row, column - first_column] = np.arange(len(inside))
+        return inside, place
 
     def column(self, kind: Kind, name: str, empty: float) -> NDArray[np.float64]:
         """What cells of a kind hold, `empty` where there is none."""
-        inside, row, column = self.held(kind)
-        out = np.full((self.window.rows, self.window.columns), empty)
-        out[row, column] = inside.columns[name]
-        return out
+        inside, place = self.held(kind)
+        return np.append(inside.columns[name].astype(np.float64), empty)[place]
 
     def high(self, kind: Kind) -> NDArray[np.float64]:
         """Height of the highest point of a kind, meters; NaN where there is none."""
@@ -82,16 +106,17 @@ class CellView:
 
     @cached_property
     def ground(self) -> NDArray[np.float64]:
-        """Height of the ground, meters; NaN where it is not known."""
-        return self.window.ground(self.cells)
+        """Height of the ground, meters; NaN where none is within reach."""
+        mean = self.column(Kind.GROUND, "sum", np.nan) / self.column(Kind.GROUND, "count", np.nan) / MM
+        return _wide(fill_gaps(mean, round(GROUND_REACH / (self.cells.size * GROUND_CELLS))))
 
-    @cached_property
-    def roofs(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """Cells of roofs, gone on into vegetation in their planes and over gaps of sparse ones, and their heights."""
-        chosen = self.chosen
-        leaves = self.high(Kind.TREE)
-        seen = self.window.has_ground(self.cells)
-        seen |= ~np.isnan(leaves) | (self.column(Kind.OTHER, "count", 0.0) > 0)
+    def _surface(self, kind: Kind) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+        """Cells of decks and their heights; or of roofs, gone on into vegetation in their planes and over gaps."""
+        if kind != Kind.BUILDING:
+            high = self.high(kind)
+            return roofs.roof_cells(high, np.full(high.shape, np.nan), 0.0)
+        chosen, leaves = self.chosen, self.high(Kind.TREE)
+        seen = _wide(self.held(Kind.GROUND)[1] >= 0) | ~np.isnan(leaves) | (self.held(Kind.OTHER)[1] >= 0)
         with np.errstate(invalid="ignore"):
             leaves[leaves - self.ground < chosen.building_height] = np.nan
         thick = leaves - self.column(Kind.TREE, "low", np.nan) / MM
@@ -101,21 +126,13 @@ class CellView:
         high = roofs.covered(high, seen, round(DARK / chosen.cell))
         return roofs.roof_cells(high, self.ground, chosen.building_height)
 
-    def _place(self, kind: Kind) -> NDArray[np.int32]:
-        """Where among the cells of a kind each of the window is, -1 for those that are not."""
-        if kind not in self._places:
-            inside, row, column = self.held(kind)
-            self._places[kind] = np.full((self.window.rows, self.window.columns), -1, np.int32)
-            self._places[kind][row, column] = np.arange(len(inside))
-        return self._places[kind]
-
     def body(self, kind: Kind, r: NDArray, c: NDArray, z: NDArray) -> Body:
         """An object's cells, of which rows and columns in the window are given, with heights `z` of the window."""
-        known, at = self.held(kind)[0], self._place(kind)[r, c]
-        there = at >= 0
+        known, place = self.held(kind)
+        at = place[r, c]
 
         def held(name: str, empty: float) -> NDArray:
-            return np.where(there, known.columns[name][at], empty)
+            return np.where(at >= 0, known.columns[name][at], empty)
 
         return Body(
             r + self.window.row,
@@ -128,33 +145,62 @@ class CellView:
             held("told", 0).astype(np.int64),
         )
 
+    def whole(
+        self, core: Window, masked: Callable[[CellView], NDArray[np.bool_]], beside: bool = True
+    ) -> tuple[CellView, NDArray[np.bool_], Window]:
+        """The view with as much around a block as it takes for all that reaches into the block to be whole; its mask.
 
-def _part(window: Window, part: Window) -> tuple[slice, slice]:
-    """Where in a window's arrays another lies."""
-    common = _common(window, part)
-    row, column = common.row - window.row, common.column - window.column
-    return slice(row, row + max(common.rows, 0)), slice(column, column + max(common.columns, 0))
+        The last is the window within which they are: only objects larger than a window may be go beyond it. `beside`:
+        cells beside an object are looked at, too, so objects a cell apart reach as far as both.
+        """
+        margin, view = round(MARGIN / self.chosen.cell), self
+        around = self.seen.rows - core.rows >> 1
+        while True:
+            mask = masked(view)
+            part, _ = scipy.ndimage.label(scipy.ndimage.binary_dilation(mask, AROUND) if beside else mask)
+            sure = view.seen.widened(-margin)
+            reached = np.zeros(int(part.max(initial=0)) + 1, bool)
+            reached[part[view.window.part(core)]] = True
+            reached[0] = False
+            part[view.window.part(sure)] = 0
+            if not reached[part].any() or mask.size > MOST_CELLS:
+                return view, mask, sure
+            more = max(margin, around // 2)
+            view, around = (
+                CellView(self.cells, view.seen.widened(more), self.extent, self.chosen),
+                around + more,
+            )
 
 
-def whole(
-    near: CellView, core: Window, masked: Callable[[CellView], NDArray[np.bool_]], beside: bool = True
-) -> tuple[CellView, NDArray[np.bool_], Window]:
-    """A block's view with as much around it as it takes for all that reaches into the block to be whole.
+def _wide(values: NDArray) -> NDArray:
+    """Values of cells of the ground for the cells in them."""
+    return np.repeat(np.repeat(values, GROUND_CELLS, axis=0), GROUND_CELLS, axis=1)
 
-    The last is the window within which they are: only objects larger than a window may be go beyond it. `beside`: cells
-    beside an object are looked at, too, so objects a cell apart reach as far as both.
+
+@njit
+def fill_gaps(z: NDArray, reach: int) -> NDArray:
+    """Values where there are none (NaN), from the nearest in eight directions, weighed by one over the distance.
+
+    Two that lie opposite give what a line between them does, so a slope goes on below a building. What lies farther
+    than `reach` cells does not count: the surroundings of a place decide, whatever the extent of the array.
     """
-    margin = round(MARGIN / near.chosen.cell)
-    view, around = near, near.seen.rows - core.rows >> 1
-    while True:
-        mask = masked(view)
-        first, _ = scipy.ndimage.label(scipy.ndimage.binary_dilation(mask, AROUND) if beside else mask)
-        first -= 1
-        sure = widened(view.seen, -margin)
-        reached = np.zeros(mask.size + 1, bool)  # the last: no part
-        reached[first[_part(view.window, core)]] = True
-        first[_part(view.window, sure)] = -1
-        if not reached[first[first >= 0]].any() or mask.size > MOST_CELLS:
-            return view, mask, sure
-        more = max(margin, around // 2)
-        view, around = view.wider(more), around + more
+    rows, columns = z.shape
+    total, weight = np.zeros((rows, columns)), np.zeros((rows, columns))
+    for way in range(8):
+        dr, dc = (0, 0, 1, -1, 1, -1, 1, -1)[way], (1, -1, 0, 0, 1, -1, -1, 1)[way]
+        last, steps = z.copy(), np.zeros((rows, columns), np.int32)
+        length = np.sqrt(2.0) if dr != 0 and dc != 0 else 1.0
+        for i in range(rows):
+            r = i if dr >= 0 else rows - 1 - i
+            for j in range(columns):
+                c = j if dc >= 0 else columns - 1 - j
+                before_r, before_c = r - dr, c - dc
+                inside = 0 <= before_r < rows and 0 <= before_c < columns
+                if not np.isnan(z[r, c]) or not inside or np.isnan(last[before_r, before_c]):
+                    continue
+                away = steps[before_r, before_c] + 1
+                if away * length <= reach:
+                    last[r, c], steps[r, c] = last[before_r, before_c], away
+                    total[r, c] += last[r, c] / (away * length)
+                    weight[r, c] += 1.0 / (away * length)
+    return np.where(np.isnan(z) & (weight > 0.0), total / weight, z)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +11,21 @@ import numpy as np
 from ..base.errors import StageError
 from ..objects.compare import compare_buildings, compare_trees
 from ..objects.outlines import reading, vector
+from .objectmap import draw_map
 from .page import render
+from .runpage import embedded
 
 #: What columns of tree heights are called.
 HEIGHT_NAMES = ("height", "h", "height_m", "hoehe", "hauteur", "hoogte", "z_height")
 #: Layers that hold buildings and trees, in files of more than one.
 _LAYERS = {"buildings": "Polygon", "trees": "Point"}
-_MOST_DRAWN = 5000
+#: Fill and edge of what is in the reference and was found, what was missed, what was found there, and what is wrong.
+_INKS = {
+    "true": (None, "#3c84d6"),
+    "missed": ("#e8b4b4", "#c42d2d"),
+    "hit": ("#b4dcc0", "#2f8f4a"),
+    "wrong": ("#fad9a0", "#d07a00"),
+}
 
 
 class Things:
@@ -65,13 +72,17 @@ class Things:
                 cure="Give a layer of polygons, or of points; of several layers 'buildings' and 'trees' are read",
             )
 
+    def spots(self) -> list[Any]:
+        """Points of the trees."""
+        return list(vector("shapely").points(self.trees[0])) if self.trees else []
+
     def within(self, area: Any) -> None:
         """Keep what lies in an area: buildings by most of theirs, trees by their place."""
         shapely = vector("shapely")
         if self.buildings is not None:
             shapes = shapely.make_valid(self.buildings)
             inside = shapely.area(shapely.intersection(shapes, area)) >= 0.5 * shapely.area(shapes)
-            self.buildings = [s for s, i in zip(shapes, inside, strict=True) if i]
+            self.buildings = list(shapes[inside])
         if self.trees is not None:
             inside = shapely.contains_xy(area, *self.trees[0].T)
             self.trees = self.trees[0][inside], self.trees[1][inside]
@@ -93,18 +104,11 @@ def _heights(path: str, name: str, values: Any) -> np.ndarray:
     return out
 
 
-def area_of(path: str) -> Any:
-    """The union of a file's polygons."""
-    things = Things(path)
-    if not things.buildings:
-        raise StageError("the area must be of polygons", found=path)
-    return vector("shapely").union_all(vector("shapely").make_valid(things.buildings))
-
-
 def compare_objects(
     found: str, reference: str, area: str | None = None
 ) -> tuple[dict[str, Any], Things, Things]:
     """Figures of ``buildings`` and ``trees``, as far as both files have them, and what was read."""
+    shapely = vector("shapely")
     one, two = Things(found), Things(reference)
     for what in one.crs.keys() & two.crs.keys():
         a, b = one.crs[what], two.crs[what]
@@ -115,9 +119,11 @@ def compare_objects(
                 cure=f"Reproject it first: ogr2ogr -t_srs {a if a.startswith('EPSG') else 'EPSG:CODE'} new.gpkg {reference}",
             )
     if area:
-        place = area_of(area)
-        one.within(place)
-        two.within(place)
+        polygons = Things(area).buildings
+        if not polygons:
+            raise StageError("the area must be of polygons", found=area)
+        for things in (one, two):
+            things.within(shapely.union_all(shapely.make_valid(polygons)))
     out: dict[str, Any] = {}
     if one.buildings is not None and two.buildings is not None:
         out["buildings"] = compare_buildings(one.buildings, two.buildings)
@@ -134,9 +140,12 @@ def compare_objects(
 def remarks(found: Things, reference: Things) -> list[str]:
     """What a user should know of two files before he believes their figures: that they lie apart, or heights are missing."""
     out = []
-    boxes = [box for one in (found, reference) if (box := _box(one)) is not None]
-    if len(boxes) == 2 and (boxes[0][2:] < boxes[1][:2]).any() | (boxes[1][2:] < boxes[0][:2]).any():
-        places = [f"{w:.0f} to {e:.0f}, {s:.0f} to {n:.0f}" for w, s, e, n in boxes]
+    one, two = (
+        vector("shapely").total_bounds([*(things.buildings or ()), *things.spots()])
+        for things in (found, reference)
+    )
+    if (one[2:] < two[:2]).any() or (two[2:] < one[:2]).any():
+        places = [f"{w:.0f} to {e:.0f}, {s:.0f} to {n:.0f}" for w, s, e, n in (one, two)]
         out.append(
             f"objects and reference lie apart, so nothing matches: {found.path} is at {places[0]}, "
             f"{reference.path} at {places[1]}. See whether both have the system that they say, and its order of axes"
@@ -149,58 +158,52 @@ def remarks(found: Things, reference: Things) -> list[str]:
     return out
 
 
-def _box(things: Things) -> np.ndarray | None:
-    """Where a file's objects lie: west, south, east, north."""
-    shapely = vector("shapely")
-    shapes = list(things.buildings or ())
-    shapes += (
-        [] if things.trees is None or not len(things.trees[0]) else [shapely.MultiPoint(things.trees[0])]
-    )
-    return shapely.total_bounds(shapes) if shapes else None
-
-
 def _axes(crs: str) -> str:
     """Of a compound system the name of the plane one."""
     return crs.split('"')[3] if crs.startswith(("COMPD_CS", "COMPOUNDCRS")) and crs.count('"') > 3 else crs
+
+
+def _rows(of: dict[str, Any]) -> list[tuple[str, Any, Any, str, str]]:
+    """Name, numbers in the reference and found, completeness and correctness of all objects and of those of a size."""
+    rows = [("all", of["objects"]), *((n, v) for n, v in of["sizes"].items() if v["reference"] or v["found"])]
+    return [
+        (n, v["reference"], v["found"], _percent(v["completeness"]), _percent(v["correctness"]))
+        for n, v in rows
+    ]
+
+
+def _more(what: str, of: dict[str, Any]) -> list[tuple[str, str]]:
+    f1 = "F1, matched at " + ("IoU 0.5" if what == "buildings" else "4 m, 30 % of height")
+    out = [(f1, _percent(of["objects"]["f1"]))]
+    if what == "trees":
+        return [
+            *out,
+            ("distance, median", f"{of['place']['median']:.2f} m"),
+            ("height, bias and RMSE", f"{of['height']['bias']:+.2f} m, {of['height']['rmse']:.2f} m"),
+        ]
+    area, edge = of["area"], of["boundary"]
+    return [
+        *out,
+        ("area, complete and correct", f"{_percent(area['completeness'])}, {_percent(area['correctness'])}"),
+        ("area, intersection over union", _percent(area["iou"])),
+        ("covered by at least 80 %", f"{_percent(of['covered'])} of the reference"),
+        ("boundary offset, median and 95 %", f"{edge['median']:.2f} m, {edge['p95']:.2f} m"),
+    ]
 
 
 def table(figures: dict[str, Any]) -> str:
     """The figures as text."""
     lines: list[str] = []
     for what, of in figures.items():
-        rule = "IoU 0.5" if what == "buildings" else "4 m, 30 % of height"
+        objects = of["objects"]
         lines += [
-            f"{what}: {of['objects']['found']:,} found, {of['objects']['reference']:,} in the reference",
-            f"{'':24s}{'reference':>10s}{'found':>10s}{'complete':>10s}{'correct':>10s}{'F1':>8s}",
+            f"{what}: {objects['found']:,} found, {objects['reference']:,} in the reference",
+            f"{'':24s}{'reference':>10s}{'found':>10s}{'complete':>10s}{'correct':>10s}",
+            *(f"{n:24s}{true:10,}{found:10,}{a:>10s}{b:>10s}" for n, true, found, a, b in _rows(of)),
+            *(f"{name}: {text}" for name, text in _more(what, of)),
+            "",
         ]
-        rows = [(f"matched at {rule}", {**of["objects"]})]
-        rows += [(name, one) for name, one in of["sizes"].items() if one["reference"] or one["found"]]
-        for name, one in rows:
-            lines.append(
-                f"{name:24s}{one['reference']:10,}{one['found']:10,}{_percent(one['completeness']):>10s}"
-                f"{_percent(one['correctness']):>10s}{_percent(one.get('f1', math.nan)):>8s}"
-            )
-        lines += [f"{name}: {text}" for name, text in _more(what, of)]
-        lines.append("")
     return "\n".join(lines)
-
-
-def _more(what: str, of: dict[str, Any]) -> list[tuple[str, str]]:
-    if what == "trees":
-        return [
-            ("distance, median", f"{of['place']['median']:.2f} m"),
-            ("height, bias and RMSE", f"{of['height']['bias']:+.2f} m, {of['height']['rmse']:.2f} m"),
-        ]
-    area = of["area"]
-    return [
-        ("area, complete and correct", f"{_percent(area['completeness'])}, {_percent(area['correctness'])}"),
-        ("area, intersection over union", f"{_percent(area['iou'])}"),
-        ("covered by at least 80 %", f"{_percent(of['covered'])} of the reference"),
-        (
-            "boundary offset, median and 95 %",
-            f"{of['boundary']['median']:.2f} m, {of['boundary']['p95']:.2f} m",
-        ),
-    ]
 
 
 def _percent(value: float) -> str:
@@ -220,63 +223,19 @@ def to_json(figures: dict[str, Any]) -> dict[str, Any]:
 
 def page(figures: dict[str, Any], found: Things, reference: Things, title: str) -> str:
     """The page: tables, and a map of what was found, missed, and found where nothing is."""
-    tables = []
+    drawn: list[tuple[Any, str | None, str]] = []
     for what, of in figures.items():
-        rows = [("all", of["objects"])] + [
-            (k, v) for k, v in of["sizes"].items() if v["reference"] or v["found"]
-        ]
-        shown = [
-            (n, v["reference"], v["found"], _percent(v["completeness"]), _percent(v["correctness"]))
-            for n, v in rows
-        ]
-        tables.append({"what": what, "rows": shown, "more": _more(what, of)})
+        hits = [{pair[k] for pair in of["matched"]} for k in (0, 1)]
+        for things, hit, right, wrong in (
+            (reference, hits[1], "true", "missed"),
+            (found, hits[0], "hit", "wrong"),
+        ):
+            shapes = things.buildings if what == "buildings" else things.spots()
+            drawn += [(s, *_INKS[right if n in hit else wrong]) for n, s in enumerate(shapes or ())]
     return render(
         "objects.html",
         title=title,
         subtitle=f"{Path(found.path).name} against {Path(reference.path).name}",
-        tables=tables,
-        map=_map(figures, found, reference),
+        tables=[{"what": what, "rows": _rows(of), "more": _more(what, of)} for what, of in figures.items()],
+        map=embedded(draw_map(drawn)) if drawn else None,
     )
-
-
-def _map(figures: dict[str, Any], found: Things, reference: Things) -> dict[str, Any]:
-    """Shapes to be drawn, in a frame 1000 wide."""
-    shapely = vector("shapely")
-    rings: list[tuple[str, Any]] = []
-    spots: list[tuple[str, float, float]] = []
-    if "buildings" in figures:
-        pairs = figures["buildings"]["matched"]
-        hit_found, hit_true = {a for a, _ in pairs}, {b for _, b in pairs}
-        rings += [("true" if n in hit_true else "missed", s) for n, s in enumerate(reference.buildings or [])]
-        rings += [("hit" if n in hit_found else "wrong", s) for n, s in enumerate(found.buildings or [])]
-    if "trees" in figures and found.trees and reference.trees:
-        pairs = figures["trees"]["matched"]
-        hit_found, hit_true = {a for a, _ in pairs}, {b for _, b in pairs}
-        spots += [("hit" if n in hit_found else "wrong", *p) for n, p in enumerate(found.trees[0].tolist())]
-        spots += [("missed", *p) for n, p in enumerate(reference.trees[0].tolist()) if n not in hit_true]
-    drawn = len(rings) + len(spots)
-    rings, spots = rings[:_MOST_DRAWN], spots[:_MOST_DRAWN]
-    places = [shapely.get_coordinates(s) for _, s in rings] + [np.array([[x, y]]) for _, x, y in spots]
-    if not places:
-        return {"wide": 0, "high": 0, "paths": [], "spots": [], "left_out": 0}
-    low, high = np.min([p.min(0) for p in places], axis=0), np.max([p.max(0) for p in places], axis=0)
-    scale = 1000.0 / max(float(high[0] - low[0]), 1e-9)
-
-    def shown(xy: Any) -> Sequence[tuple[float, float]]:
-        return [((x - low[0]) * scale, (high[1] - y) * scale) for x, y in xy]
-
-    paths = []
-    for kind, shape in rings:
-        text = ""
-        for part in shapely.get_parts(shape):
-            if part.geom_type == "Polygon":
-                for ring in (part.exterior, *part.interiors):
-                    text += "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in shown(ring.coords)) + "Z"
-        paths.append((kind, text))
-    return {
-        "wide": 1000,
-        "high": round(float(high[1] - low[1]) * scale, 1),
-        "paths": paths,
-        "spots": [(kind, *shown([(x, y)])[0]) for kind, x, y in spots],
-        "left_out": drawn - len(rings) - len(spots),
-    }

@@ -1,8 +1,8 @@
-"""A map of objects: buildings, crowns and tops, spans and decks; what is to be checked in another color."""
+"""Maps of objects as pictures, north up."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,65 +13,55 @@ from ..objects.measure import CHECK
 from ..objects.outlines import vector
 from .objectlayers import Layer
 
-_Color = tuple[int, int, int]
-#: Fill and edge of each layer, in the order they are drawn.
-_INKS: dict[str, tuple[_Color, _Color]] = {
-    "decks": ((150, 196, 204), (60, 120, 130)),
-    "crowns": ((186, 219, 160), (84, 148, 72)),
-    "buildings": ((226, 138, 120), (140, 40, 30)),
-    "spans": ((150, 110, 0), (150, 110, 0)),
-    "trees": ((24, 92, 40), (24, 92, 40)),
+#: Fill and edge of each layer, in the order they are drawn; of what is to be checked.
+_INKS = {
+    "decks": ("#96c4cc", "#3c7882"),
+    "crowns": ("#badba0", "#549448"),
+    "buildings": ("#e28a78", "#8c281e"),
+    "spans": ("#966e00", "#966e00"),
+    "trees": ("#185c28", "#185c28"),
 }
-_CHECK: tuple[_Color, _Color] = ((250, 205, 90), (170, 110, 0))
-
-
+_CHECK = ("#facd5a", "#aa6e00")
 #: Pixels across the map.
 _WIDTH = 900
 
 
 def object_map(layers: Mapping[str, Layer]) -> npt.NDArray[np.uint8]:
-    """A map of layers, by :func:`~pdal_stages.reports.objectlayers.object_layers`; north is up.
+    """A map (height, width, 3) of layers, by :func:`~pdal_stages.reports.objectlayers.object_layers`."""
+    return draw_map(
+        [
+            (shape, *(_CHECK if verdict == CHECK else inks))
+            for name, inks in _INKS.items()
+            if name in layers
+            for shape, verdict in zip(layers[name].shapes, layers[name].columns["verdict"], strict=True)
+        ]
+    )
 
-    Parameters
-    ----------
-    layers : mapping of str to Layer
 
-    Returns
-    -------
-    (height, width, 3) uint8
-    """
+def draw_map(drawn: Sequence[tuple[Any, str | None, str]]) -> npt.NDArray[np.uint8]:
+    """A map (height, width, 3) of shapes (shapely), each with the colors of its fill, maybe none, and of its edge."""
     shapely = vector("shapely")
-    shapes = [shape for layer in layers.values() for shape in layer.shapes]
-    if not shapes:
+    if not drawn:
         return np.full((_WIDTH, _WIDTH, 3), 255, np.uint8)
-    bounds = shapely.bounds(shapes)
-    low, high = bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)
-    extent = np.maximum(high - low, 1e-9)
-    fine = 2 * _WIDTH / extent[0]  # drawn twice as large: no jagged edges
-    size = 2 * _WIDTH, max(2, 2 * min(round(fine * extent[1] / 2), 4 * _WIDTH))
-    image = Image.new("RGB", size, (255, 255, 255))
+    west, south, east, north = shapely.total_bounds([shape for shape, _, _ in drawn])
+    fine = 2 * _WIDTH / max(east - west, 1e-9)  # drawn twice as large: no jagged edges
+    size = 2 * _WIDTH, max(2, 2 * min(round(fine * (north - south) / 2), 4 * _WIDTH))
+    image = Image.new("RGB", size, "white")
     draw = ImageDraw.Draw(image)
 
     def placed(ring: Any) -> list[tuple[float, float]]:
-        xy = shapely.get_coordinates(ring)
-        return [(x, y) for x, y in np.column_stack([xy[:, 0] - low[0], high[1] - xy[:, 1]]) * fine]
+        return [tuple(at) for at in (shapely.get_coordinates(ring) - (west, north)) * (fine, -fine)]
 
-    for name, inks in _INKS.items():
-        layer = layers.get(name)
-        if layer is None:
-            continue
-        for shape, verdict in zip(layer.shapes, layer.columns["verdict"], strict=True):
-            fill, edge = _CHECK if verdict == CHECK else inks
-            if layer.kind == "Point":
-                (x, y) = placed(shape)[0]
-                draw.ellipse((x - 3, y - 3, x + 3, y + 3), fill=fill)
-            elif layer.kind == "LineString Z":
-                draw.line(placed(shape), fill=edge, width=3)
-            else:
-                for part in shapely.get_parts(shape):
-                    draw.polygon(placed(part.exterior), fill=fill)
-                    for hole in part.interiors:
-                        draw.polygon(placed(hole), fill=(255, 255, 255))
-                    for ring in (part.exterior, *part.interiors):
-                        draw.line(placed(ring), fill=edge, width=3)
+    for shape, fill, edge in drawn:
+        for part in shapely.get_parts(shape):
+            if part.geom_type == "Point":
+                x, y = placed(part)[0]
+                draw.ellipse((x - 4, y - 4, x + 4, y + 4), fill=edge)
+                continue
+            rings = [part] if part.geom_type == "LineString" else [part.exterior, *part.interiors]
+            if fill and part.geom_type == "Polygon":
+                for number, ring in enumerate(rings):
+                    draw.polygon(placed(ring), fill="white" if number else fill)
+            for ring in rings:
+                draw.line(placed(ring), fill=edge, width=3)
     return np.asarray(image.resize((size[0] // 2, size[1] // 2), Image.Resampling.LANCZOS))

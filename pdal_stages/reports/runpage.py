@@ -60,11 +60,11 @@ def run_page(run: Mapping[str, Any], objects: NDArray[np.uint8] | None = None) -
         slowest=[(t, _corner(t["tile"], run["tile"])) for t in done[:ROWS]],
         done=len(done),
         objects={k: one for k, one in (run.get("objects") or {}).items() if k != "files" and one["objects"]},
-        object_map=None if objects is None else _embedded(objects),
+        object_map=None if objects is None else embedded(objects),
     )
 
 
-def _embedded(picture: NDArray[np.uint8]) -> dict[str, Any]:
+def embedded(picture: NDArray[np.uint8]) -> dict[str, Any]:
     from .views import png
 
     data = base64.b64encode(png(picture)).decode("ascii")

@@ -157,12 +157,13 @@ class _Rims:
         good &= (walled <= WALLS * down) & (outward.sum(axis=1) <= most * drops.sum(axis=1))
         for k in np.flatnonzero(good):
             ends = _opposite_ends(outward[k] + cut[k])
-            good[k] = ends is not None and _is_free(ends[0], outward[k], drops[k])
-            if good[k]:
-                leading = (part == k) & self._leads
-                at_land = [self._lead_to_land(leading & end[sector]) for end in ends]
-                cut_off = [cut[k][end].sum() >= CUT for end in ends]
-                good[k] = any(at_land) and all(a or b for a, b in zip(at_land, cut_off, strict=True))
+            if ends is None or not _is_free(ends[0], outward[k], drops[k]):
+                good[k] = False
+                continue
+            leading = (part == k) & self._leads
+            at_land = [self._lead_to_land(leading & end[sector]) for end in ends]
+            cut_off = [cut[k][end].sum() >= CUT for end in ends]
+            good[k] = any(at_land) and all(a or b for a, b in zip(at_land, cut_off, strict=True))
         return np.append(good, False)[self._parts]
 
     def stretches(self, left, bottom) -> NDArray[np.bool_]:
