@@ -83,10 +83,12 @@ def test_an_l_keeps_its_corner():
 
 
 def test_the_main_direction_is_that_of_long_walls():
-    along = np.arange(40.0)[:, None] * [np.cos(0.4), np.sin(0.4)]
-    slant = np.arange(15.0)[:, None] * [np.cos(1.0), np.sin(1.0)]
-    across = np.arange(20.0)[:, None] * [-np.sin(0.4), np.cos(0.4)]
-    assert main_direction([slant, along, across]) == pytest.approx(0.4, abs=0.01)
+    walls = [
+        [15 * np.cos(1.0), 15 * np.sin(1.0)],
+        [40 * np.cos(0.4), 40 * np.sin(0.4)],
+        [-20 * np.sin(0.4), 20 * np.cos(0.4)],
+    ]
+    assert main_direction(np.array(walls)) == pytest.approx(0.4, abs=0.01)
 
 
 def test_holes_stay_and_small_ones_close():

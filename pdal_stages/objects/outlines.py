@@ -1,15 +1,14 @@
 """Outlines of objects: along their cells, or straight along walls; in shapely's geometries (extra ``vector``).
 
-Straight outlines follow the main direction of what stands wall to wall. All boundaries of a group of buildings, of which
-neighbors share one, are simplified (Douglas, Peucker 1973). Then the corners are adjusted: walls that run nearly along or
-across the main direction get the same coordinate at both ends, the median of what their cells show.
+Straight outlines follow the main direction of what stands wall to wall. All outlines of a group of buildings are simplified
+together, so that neighbors share their wall. Then the corners are adjusted: walls that run nearly along or across the main
+direction get the same coordinate at both ends, the median of what their cells show.
 """
 
 from __future__ import annotations
 
 import ctypes
 import importlib
-import itertools
 import math
 import sys
 from collections.abc import Callable, Iterator
@@ -146,90 +145,67 @@ def _good(shapely: Any, made: NDArray, shapes: NDArray) -> bool:
 
 
 def _straight(shapely: Any, shapes: NDArray) -> NDArray:
-    """Straight outlines of shapes that stand wall to wall; None where nothing is left of one."""
-    edges = shapely.line_merge(shapely.union_all(shapely.boundary(shapes)))
-    numbers: dict[tuple[float, ...], int] = {}
-    walls, lines = [], []
-    for edge in shapely.get_parts(edges):
-        xy = shapely.get_coordinates(edge)
-        if (xy[0] == xy[-1]).all():  # a ring begins at the corner farthest from its middle
-            far = int(np.argmax(np.round(np.hypot(*(xy[:-1] - xy[:-1].mean(axis=0)).T), 6)))
-            xy = np.roll(xy[:-1], -far, axis=0)
-            xy = np.vstack([xy, xy[:1]])
-        kept = shapely.get_coordinates(
-            shapely.simplify(shapely.LineString(xy), _TOLERANCE, preserve_topology=False)
-        )
-        at = 0
-        ends: list[int] = []
-        for place in kept:
-            at += (
-                int(np.flatnonzero((xy[at:] == place).all(axis=1))[0])
-                if not ends
-                else (1 + int(np.flatnonzero((xy[at + 1 :] == place).all(axis=1))[0]))
-            )
-            ends.append(at)
-        line = [numbers.setdefault(tuple(place), len(numbers)) for place in kept.tolist()]
-        lines.append(line)
-        walls += [
-            (a, b, _middles(xy[i : j + 1]))
-            for (a, b), (i, j) in zip(itertools.pairwise(line), itertools.pairwise(ends), strict=True)
-        ]
-    angle = main_direction([places for *_, places in walls])
-    corners = _adjusted(_turned(np.array(list(numbers)), angle), walls, angle)
-    corners = _turned(corners, -angle)
-    drawn = shapely.union_all([shapely.LineString(corners[line]) for line in lines], grid_size=_GRID)
-    faces = shapely.get_parts(shapely.polygonize(shapely.get_parts(drawn)))
-    out = np.full(len(shapes), None, object)
-    if not len(faces):
-        return out
-    shared = shapely.area(shapely.intersection(faces[:, None], shapes[None]))
-    owner = np.where(2 * shared.sum(axis=1) >= shapely.area(faces), shared.argmax(axis=1), -1)
-    for n in np.unique(owner[owner >= 0]):
-        out[n] = shapely.union_all(faces[owner == n])
-    if shapely.is_missing(out).any():
-        return out
-    return shapely.coverage_simplify(out, 0.1)  # no corners on straight walls
+    """Straight outlines of shapes that stand wall to wall: corners that neighbors share move together; None where it fails."""
+    fine = shapely.segmentize(shapes, 1.0)  # so that neighbors have all corners in common
+    edges = shapely.get_parts(shapely.line_merge(shapely.union_all(shapely.boundary(fine))))
+    kept = shapely.get_coordinates(shapely.simplify(edges, _TOLERANCE, preserve_topology=False))
+    rings, of_shape = shapely.get_rings(fine, return_index=True)
+    xy, ring = shapely.get_coordinates(rings, return_index=True)
+    stays = np.isin(xy @ [1, 1j], kept @ [1, 1j])
+    if np.bincount(ring[stays], minlength=len(rings)).min() < 4 or len(np.unique(of_shape)) < len(shapes):
+        return np.full(len(shapes), None, object)
+    rings = shapely.linearrings(xy[stays], indices=ring[stays])
+    corners, number = np.unique(shapely.get_coordinates(rings), axis=0, return_inverse=True)
+    number = number.ravel()
+    walls = np.unique(np.sort(_steps(shapely, rings, number), axis=1), axis=0)
+    steps = _steps(shapely, shapely.get_rings(fine), xy).mean(axis=1)
+    nearest = shapely.STRtree(shapely.linestrings(corners[walls])).nearest(shapely.points(steps))
+    angle = main_direction(np.diff(corners[walls], axis=1)[:, 0])
+    order = np.argsort(nearest, kind="stable")
+    of_wall = np.split(
+        _turned(steps, angle)[order], np.searchsorted(nearest[order], np.arange(1, len(walls)))
+    )
+    moved = _turned(_adjusted(_turned(corners, angle), walls, of_wall), -angle)
+    rings = shapely.set_coordinates(rings, np.round(moved[number] / _GRID) * _GRID)
+    out = shapely.polygons(rings, indices=of_shape)
+    return shapely.coverage_simplify(out, 0.1) if shapely.is_valid(out).all() else out  # no corners on walls
 
 
-def _adjusted(corners: NDArray, walls: list[tuple[int, int, NDArray]], angle: float) -> NDArray[np.float64]:
-    """Corners (n, 2), in the frame of the main direction, with those walls along its axes that nearly are; longest first."""
+def _steps(shapely: Any, rings: NDArray, values: NDArray) -> NDArray:
+    """Values (n, 2, ...) at both ends of all pieces of rings; `values` (m, ...) are of their coordinates."""
+    ring = shapely.get_coordinates(rings, return_index=True)[1]
+    return np.stack([values[:-1], values[1:]], axis=1)[ring[1:] == ring[:-1]]
+
+
+def _adjusted(corners: NDArray, walls: NDArray[np.int64], of_wall: list[NDArray]) -> NDArray[np.float64]:
+    """Corners (n, 2), in the frame of the main direction, with those walls (n, 2: corners) along its axes that nearly are.
+
+    Longest first; `of_wall`: places of the cells' boundary along each.
+    """
     same = np.tile(np.arange(len(corners)), (2, 1))  # by axis: corners that have a coordinate in common
     value, weight = corners.T.copy(), np.zeros((2, len(corners)))
-    lengths = np.array([np.hypot(*(corners[b] - corners[a])) for a, b, _ in walls])
+    lengths = np.hypot(*(corners[walls[:, 1]] - corners[walls[:, 0]]).T)
     for n in np.argsort(-np.round(lengths, 6), kind="stable"):
-        a, b, places = walls[n]
+        (a, b), places = walls[n], of_wall[n]
         off = np.abs(corners[b] - corners[a])
-        across = int(off[0] >= off[1])
-        short = lengths[n] < _SHORT
-        if off[across] > _SLACK and not short:
+        across, short = int(off[0] >= off[1]), lengths[n] < _SHORT
+        if (off[across] > _SLACK and not short) or not len(places):
             continue  # a wall on a slant
-        inner = _turned(places[1:-1] if len(places) > 4 else places, angle)
         for axis in (across, 1 - across) if short else (across,):
             one, other = same[axis, a], same[axis, b]
             heavy = weight[axis, one] > 0 and weight[axis, other] > 0
             if heavy and abs(value[axis, one] - value[axis, other]) > _TOLERANCE:
                 continue  # it would move a longer wall
-            both = {int(one), int(other)}
-            parts = [(weight[axis, k], value[axis, k]) for k in both] + [
-                (lengths[n], float(np.median(inner[:, axis])))
-            ]
-            if axis != across:
-                parts[-1] = 1e-3, float(inner[:, axis].mean())
+            parts = [(weight[axis, k], value[axis, k]) for k in {int(one), int(other)}]
+            if axis == across:
+                parts.append((lengths[n], float(np.median(places[:, axis]))))
+            else:
+                parts.append((1e-3, float(places[:, axis].mean())))
             total = sum(w for w, _ in parts)
             same[axis][same[axis] == other] = one
-            value[axis, one] = sum(w * v for w, v in parts) / total
-            weight[axis, one] = total
+            value[axis, one], weight[axis, one] = sum(w * v for w, v in parts) / total, total
             break
     return np.column_stack([value[axis][same[axis]] for axis in (0, 1)])
-
-
-def _middles(corners: NDArray) -> NDArray[np.float64]:
-    """Middles (m, 2) of the unit steps of a boundary along cells, of which corners (n, 2) are given."""
-    away = np.diff(corners, axis=0)
-    many = np.maximum(np.rint(np.abs(away).max(axis=1)).astype(np.int64), 1)
-    step = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
-    share = (step + 0.5) / np.repeat(many, many)
-    return np.repeat(corners[:-1], many, axis=0) + share[:, None] * np.repeat(away, many, axis=0)
 
 
 def _turned(xy: NDArray, angle: float) -> NDArray[np.float64]:
@@ -237,23 +213,16 @@ def _turned(xy: NDArray, angle: float) -> NDArray[np.float64]:
     return np.column_stack([xy[:, 0] * c + xy[:, 1] * s, xy[:, 1] * c - xy[:, 0] * s])
 
 
-def main_direction(walls: list[NDArray]) -> float:
-    """The angle, radians in [0, pi/2), along and across which walls run; each is given by places (n, 2) along it.
+def main_direction(walls: NDArray) -> float:
+    """The angle, radians in [0, pi/2), along and across which walls (n, 2), as vectors, run.
 
     The one in which all walls together, long ones more, extend least along both axes.
     """
-    ways = np.array([_way(places) for places in walls if len(places) > 2] or np.zeros((1, 2)))
+    x, y = (walls * np.hypot(*walls.T)[:, None]).T
     angles = np.radians(np.arange(0.0, 90.0, 0.2))[:, None]
     c, s = np.cos(angles), np.sin(angles)
-    extents = (np.abs(c * ways[:, 0] + s * ways[:, 1]) + np.abs(c * ways[:, 1] - s * ways[:, 0])).sum(axis=1)
+    extents = (np.abs(c * x + s * y) + np.abs(c * y - s * x)).sum(axis=1)
     return float(angles[np.argmin(np.round(extents, 6)), 0])
-
-
-def _way(places: NDArray) -> tuple[float, float]:
-    """The main axis of places, as long as the square of how many they are."""
-    x, y = (places - places.mean(axis=0)).T
-    angle = 0.5 * math.atan2(2.0 * float(x @ y), float(x @ x - y @ y))
-    return len(places) ** 2 * math.cos(angle), len(places) ** 2 * math.sin(angle)
 
 
 def crown_outlines(raw: list[Any]) -> list[Any]:
@@ -262,5 +231,5 @@ def crown_outlines(raw: list[Any]) -> list[Any]:
     if not raw:
         return []
     fine = [shapely.segmentize(shape, 1.0) for shape in raw]
-    made = shapely.coverage_simplify(fine, 1.2)
+    made = shapely.coverage_simplify(fine, 3.0)
     return [m if m.is_valid and not m.is_empty else r for m, r in zip(made, raw, strict=True)]
