@@ -145,7 +145,7 @@ def _good(shapely: Any, made: NDArray, shapes: NDArray) -> bool:
 
 
 def _straight(shapely: Any, shapes: NDArray) -> NDArray:
-    """Straight outlines of shapes that stand wall to wall: corners that neighbors share move together; None where it fails."""
+    """Straight outlines of shapes that stand wall to wall: corners that neighbors share move together; or None."""
     fine = shapely.segmentize(shapes, 1.0)  # so that neighbors have all corners in common
     edges = shapely.get_parts(shapely.line_merge(shapely.union_all(shapely.boundary(fine))))
     kept = shapely.get_coordinates(shapely.simplify(edges, _TOLERANCE, preserve_topology=False))

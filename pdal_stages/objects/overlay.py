@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import DependencyError, OptionError, StageError
+from ..base.errors import OptionError, StageError
 from .outlines import reading, vector
 
 #: Between a file and a layer of it, as QGIS writes them.
 _LAYER = "|layername="
+#: Types of layers that may hold polygons.
+_POLYGONS = re.compile("Polygon|Surface|^Unknown$|^GeometryCollection$")
+#: West, south, east, north.
+Box = tuple[float, float, float, float]
 #: What surfaces are made of: the class that a polygon changes unless told otherwise.
 GROUND = 2
 
@@ -36,21 +41,12 @@ class Overlay:
         OptionError
             If it is not written so, or a code is not 0 to 255.
         """
-        source, found, codes = text.rpartition("=")
-        code, told, over = codes.partition(":")
+        source, _, codes = text.rpartition("=")
         file, _, layer = source.partition(_LAYER)
-        given = (
-            []
-            if over.strip() == "all"
-            else [one.strip() for one in over.split(",")]
-            if told
-            else [str(GROUND)]
-        )
-        if not (
-            found
-            and file.strip()
-            and all(one.strip().isdecimal() and int(one) <= 255 for one in [code, *given])
-        ):
+        code, told, over = codes.partition(":")
+        given = [one.strip() for one in over.split(",")] if told else [str(GROUND)]
+        given = [] if given == ["all"] else given
+        if not file.strip() or not all(c.strip().isdecimal() and int(c) <= 255 for c in [code, *given]):
             raise OptionError(
                 "polygons are written FILE=CODE",
                 found=text,
@@ -69,14 +65,11 @@ class Overlay:
         """
         if "://" not in self.file and not Path(self.file).exists():
             raise StageError("the file of polygons does not exist", where=self.file, cure="Check the path")
+        pyogrio = vector("pyogrio")
         try:
             layers = [
-                str(name)
-                for name, kind in vector("pyogrio").list_layers(self.file)
-                if _may_hold_polygons(kind)
+                str(name) for name, kind in pyogrio.list_layers(self.file) if _POLYGONS.search(str(kind))
             ]
-        except DependencyError:
-            raise
         except Exception as error:  # pyogrio's own
             raise StageError("the polygons cannot be read", where=self.file, found=str(error)) from None
         layer = self.layer or (layers[0] if len(layers) == 1 else "")
@@ -92,25 +85,15 @@ class Overlay:
         return layer
 
 
-def _may_hold_polygons(kind: str | None) -> bool:
-    return kind is not None and (
-        "Polygon" in kind or "Surface" in kind or kind in ("Unknown", "GeometryCollection")
-    )
-
-
 def inside_of(
-    overlay: Overlay,
-    wkt: str,
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    box: tuple[float, float, float, float],
+    overlay: Overlay, wkt: str, x: NDArray[np.float64], y: NDArray[np.float64], box: Box
 ) -> tuple[NDArray[np.bool_], int, str]:
     """Which points (n,) lie inside an overlay's polygons near a box, how many these are, and what the user should know."""
     shapes, note = polygons_of(overlay, wkt, box)
     return points_inside(x, y, shapes), len(shapes), note
 
 
-def lies_elsewhere(overlay: Overlay, wkt: str, box: tuple[float, float, float, float]) -> str:
+def lies_elsewhere(overlay: Overlay, wkt: str, box: Box) -> str:
     """Where a file's polygons lie and where the points do, each in its own reference system, in words."""
     pyogrio = vector("pyogrio")
     with reading(overlay.file):
@@ -121,16 +104,14 @@ def lies_elsewhere(overlay: Overlay, wkt: str, box: tuple[float, float, float, f
     return f"they lie at {_extent(bounds, info['crs'])}, the points at {_extent(box, wkt)}"
 
 
-def _extent(box: tuple[float, float, float, float], crs: str | None) -> str:
+def _extent(box: Box, crs: str | None) -> str:
     name = vector("pyproj").CRS.from_user_input(crs).name if crs else "no reference system"
     digits = 5 if max(map(abs, box)) <= 360 else 0
     west, south, east, north = (f"{value:.{digits}f}" for value in box)
     return f"{west} to {east}, {south} to {north} ({name})"
 
 
-def polygons_of(
-    overlay: Overlay, wkt: str, box: tuple[float, float, float, float], where: str = ""
-) -> tuple[list[Any], str]:
+def polygons_of(overlay: Overlay, wkt: str, box: Box, where: str = "") -> tuple[list[Any], str]:
     """Polygons near a box, in the reference system of `wkt`, as the box is; and what the user should know.
 
     `where`: a condition on the file's columns, in SQL.
@@ -153,17 +134,14 @@ def polygons_of(
         _, _, geometry, _ = pyogrio.raw.read(
             overlay.file, layer=layer, columns=[], bbox=box, where=where or None
         )
-        shapes = shapely.from_wkb(geometry) if len(geometry) else np.empty(0, object)
-        shapes = shapely.force_2d(shapes[~shapely.is_missing(shapes)]) if len(shapes) else shapes
-        flat = [s for s in shapely.get_parts(shapely.get_parts(shapes)) if s.geom_type == "Polygon"]
+        shapes = shapely.force_2d(shapely.get_parts(shapely.get_parts(shapely.from_wkb(geometry))))
+        shapes = shapes[shapely.get_type_id(shapes) == shapely.GeometryType.POLYGON]
         if forward is not None:
-            flat = list(
-                shapely.transform(np.array(flat, object), lambda x, y: forward(x, y), interleaved=False)
-            )
-        return [s if shapely.is_valid(s) else shapely.make_valid(s) for s in flat], note
+            shapes = shapely.transform(shapes, forward, interleaved=False)
+        return list(shapely.make_valid(shapes)), note
 
 
-def _transform(file: str, crs: str, wkt: str, box: tuple[float, float, float, float]) -> tuple[Any, Any]:
+def _transform(file: str, crs: str, wkt: str, box: Box) -> tuple[Any, Any]:
     """How to get from the file's reference system to the points', and their box in the file's; None where they are one."""
     pyproj = vector("pyproj")
     try:
@@ -171,8 +149,7 @@ def _transform(file: str, crs: str, wkt: str, box: tuple[float, float, float, fl
         if mine.equals(theirs, ignore_axis_order=True):
             return None, box
         forward = pyproj.Transformer.from_crs(theirs, mine, always_xy=True)
-        back = pyproj.Transformer.from_crs(mine, theirs, always_xy=True)
-        west, south, east, north = back.transform_bounds(*box)
+        west, south, east, north = forward.transform_bounds(*box, direction="INVERSE")
     except Exception as error:  # pyproj's own
         raise StageError(
             "the polygons' reference system cannot be made the points'",
@@ -181,7 +158,7 @@ def _transform(file: str, crs: str, wkt: str, box: tuple[float, float, float, fl
             cure="Reproject the file first: ogr2ogr -t_srs",
         ) from None
     aside = 0.01 * max(east - west, north - south)
-    return forward.transform, (west - aside, south - aside, east + aside, north + aside)
+    return lambda x, y: forward.transform(x, y), (west - aside, south - aside, east + aside, north + aside)
 
 
 def _flat(crs: Any) -> Any:
@@ -194,16 +171,12 @@ def points_inside(x: NDArray[np.float64], y: NDArray[np.float64], polygons: list
     shapely = vector("shapely")
     order = np.argsort(x, kind="stable")
     x, y = x[order], y[order]
-    inside = np.zeros(len(x), bool)
+    inside, out = np.zeros(len(x), bool), np.empty(len(x), bool)
     for shape in polygons:
         west, south, east, north = shape.bounds
-        first, last = np.searchsorted(x, west, "left"), np.searchsorted(x, east, "right")
-        near = first + np.flatnonzero(
-            (y[first:last] >= south) & (y[first:last] <= north) & ~inside[first:last]
-        )
-        if len(near):
-            shapely.prepare(shape)
-            inside[near] = shapely.intersects_xy(shape, x[near], y[near])
-    out = np.empty(len(x), bool)
+        near = np.arange(np.searchsorted(x, west, "left"), np.searchsorted(x, east, "right"))
+        near = near[(y[near] >= south) & (y[near] <= north) & ~inside[near]]
+        shapely.prepare(shape)
+        inside[near] = shapely.intersects_xy(shape, x[near], y[near])
     out[order] = inside
     return out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,6 +17,7 @@ from ..base.files import check_writable, whole_files
 from ..base.units import Units
 from ..objects import Cells, Objects, ObjectSettings, find_objects
 from ..objects.cells import CLASSES, Kind, refuse_unclassified
+from ..objects.found import Table
 from ..objects.measure import CHECK
 from ..objects.outlines import crown_outlines, raw_outlines, straight_outlines, vector
 
@@ -61,40 +63,40 @@ def object_layers(objects: Objects, *, straight: bool = True, units: Units | Non
         Of the coordinates; measures are in meters whatever these are.
     """
     shapely = vector("shapely")
-    across = units.horizontal if units else 1.0
-    up = units.vertical if units else 1.0
-    size = objects.settings.cell
+    across, up = (units.horizontal, units.vertical) if units else (1.0, 1.0)
+    size, tables = objects.settings.cell, objects.tables
+    columns = {kind: _columns(table, kind) for kind, table in tables.items()}
 
-    def placed(shapes: list[Any]) -> list[Any]:
+    def polygons(shapes: list[Any], kind: Kind) -> Layer:
         """In the coordinates' unit, to a thousandth of it where that leaves them valid."""
         exact = [shapely.transform(shape, lambda xy: xy * (size / across)) for shape in shapes]
         rounded = [shapely.transform(shape, lambda xy: np.round(xy, 3)) for shape in exact]
-        return [r if r.is_valid else e for e, r in zip(exact, rounded, strict=True)]
+        placed = [r if r.is_valid else e for e, r in zip(exact, rounded, strict=True)]
+        many = [s if s.geom_type == "MultiPolygon" else shapely.MultiPolygon([s]) for s in placed]
+        return Layer(many, "MultiPolygon", columns[kind])
 
     layers = {}
     for kind, name in ((Kind.BUILDING, "buildings"), (Kind.DECK, "decks")):
-        table = objects.tables[kind]
-        shapes = raw_outlines(table, size)
-        if straight:
-            shapes = straight_outlines(shapes, size)
-        columns = _columns(objects, kind)
-        columns["area"] = np.array([shape.area * size**2 for shape in shapes], np.float64)
-        many = [s if s.geom_type == "MultiPolygon" else shapely.MultiPolygon([s]) for s in placed(shapes)]
-        layers[name] = Layer(many, "MultiPolygon", columns)
-    trees, columns = objects.tables[Kind.TREE], _columns(objects, Kind.TREE)
-    tops = [
-        shapely.Point(x / across, y / across)
-        for x, y in zip(trees.columns.get("x", ()), trees.columns.get("y", ()), strict=True)
-    ]
-    layers["trees"] = Layer(tops, "Point", columns)
+        shapes = raw_outlines(tables[kind], size)
+        shapes = straight_outlines(shapes, size) if straight else shapes
+        columns[kind]["area"] = np.round(np.array([shape.area * size**2 for shape in shapes]), 3)
+        layers[name] = polygons(shapes, kind)
+    trees = tables[Kind.TREE]
     crowns = raw_outlines(trees, size, hole=1.0)
-    crowns = crown_outlines(crowns) if straight else crowns
-    many = [s if s.geom_type == "MultiPolygon" else shapely.MultiPolygon([s]) for s in placed(crowns)]
-    layers["crowns"] = Layer(many, "MultiPolygon", columns)
-    scale = np.array([across, across, up])
-    lines = [shapely.LineString(path / scale) for path in objects.tables[Kind.SPAN].paths]
-    layers["spans"] = Layer(lines, "LineString Z", _columns(objects, Kind.SPAN))
+    layers["crowns"] = polygons(crown_outlines(crowns) if straight else crowns, Kind.TREE)
+    x, y = (trees.columns.get(axis, np.empty(0)) / across for axis in "xy")
+    layers["trees"] = Layer(list(shapely.points(x, y)), "Point", columns[Kind.TREE])
+    lines = [shapely.LineString(path / [across, across, up]) for path in tables[Kind.SPAN].paths]
+    layers["spans"] = Layer(lines, "LineString Z", columns[Kind.SPAN])
     return {name: layers[name] for name in LAYERS}
+
+
+def _columns(table: Table, kind: Kind) -> dict[str, NDArray]:
+    out: dict[str, NDArray] = {"object_id": table.ids}
+    for name, of in COLUMNS[kind].items():
+        values = table.columns.get(name, np.empty(0, of))
+        out[name] = np.round(values.astype(of), 3) if of is _F else values.astype(object if of is _S else of)
+    return out
 
 
 def object_frames(
@@ -140,9 +142,8 @@ def object_frames(
         ) from None
     xyz, codes = np.asarray(xyz, np.float64), np.asarray(classification)
     told = None if reliability is None else np.asarray(reliability)
-    shapes = [xyz.shape, codes.shape, *([] if told is None else [told.shape])]
-    if xyz.shape != (len(codes), 3) or any(shape != codes.shape for shape in shapes[1:]):
-        raise StageError("arrays must have one row per point", found=shapes)
+    if xyz.shape != (len(codes), 3) or (told is not None and told.shape != codes.shape):
+        raise StageError("arrays must have one row per point", found=f"{xyz.shape}, {codes.shape}")
     if codes.size and not (codes.min() >= 0 and codes.max() <= 255):
         raise StageError("class codes are 0 to 255", found=f"{codes.min()} to {codes.max()}")
     if not np.isfinite(xyz).all():
@@ -156,18 +157,6 @@ def object_frames(
         name: geopandas.GeoDataFrame(layer.columns, geometry=layer.shapes, crs=crs)
         for name, layer in layers.items()
     }
-
-
-def _columns(objects: Objects, kind: Kind) -> dict[str, NDArray]:
-    table = objects.tables[kind]
-    out: dict[str, NDArray] = {"object_id": table.ids}
-    for name, of in COLUMNS[kind].items():
-        out[name] = table.columns[name] if len(table) else np.empty(0, of)
-        if of is np.float64:
-            out[name] = np.round(out[name].astype(np.float64), 3)
-        elif of is np.str_:
-            out[name] = out[name].astype(object)
-    return out
 
 
 def check_target(path: str | Path, layers: Sequence[str] = LAYERS) -> None:
@@ -205,19 +194,16 @@ def write_layers(
     driver, many = DRIVERS[Path(path).suffix.lower()]
     files = target_files(path, list(layers))
     styles = styles if styles is not None else {name: qml(layer.kind, name) for name, layer in layers.items()}
-    if many:
-        with whole_files(*files, what="objects") as (part,):
-            for name, layer in layers.items():
-                _write(part, name, layer, driver, wkt)
-            _write_styles(part, styles)
-            _check_whole(part, layers, driver)
-        return files
-    beside = [file.with_suffix(".qml") for file in files]
+    beside = [] if many else [file.with_suffix(".qml") for file in files]
     with whole_files(*files, *beside, what="objects") as parts:
-        for number, name in enumerate(layers):
-            _write(parts[number], name, layers[name], driver, wkt)
-            parts[number + len(files)].write_text(styles[name], encoding="utf-8")
-            _check_whole(parts[number], {name: layers[name]}, driver)
+        for number, (name, layer) in enumerate(layers.items()):
+            _write(parts[0 if many else number], name, layer, driver, wkt)
+            if not many:
+                parts[number + len(files)].write_text(styles[name], encoding="utf-8")
+        if many:
+            _write_styles(parts[0], styles)
+        for number, (name, layer) in enumerate(layers.items()):
+            _check_whole(parts[0 if many else number], name if many else None, layer)
     return files
 
 
@@ -232,37 +218,30 @@ def write_objects(
 
 def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
     pyogrio, shapely = vector("pyogrio"), vector("shapely")
-    options = {"layer": name} if driver == "GPKG" else {}
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "'crs' was not provided")  # as the points have none
             warnings.filterwarnings("ignore", "Passed SRS uses EPSG")
             pyogrio.raw.write(
                 path,
-                np.array([shapely.to_wkb(shape) for shape in layer.shapes], object),
+                shapely.to_wkb(np.array([*layer.shapes, None], object)[:-1]),
                 list(layer.columns.values()),
                 list(layer.columns),
                 driver=driver,
                 geometry_type=layer.kind,
                 crs=wkt or None,
-                promote_to_multi=False,
-                append=False,
-                **options,
+                layer=name if driver == "GPKG" else None,
             )
     except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, pyogrio.errors.CRSError) as error:
         raise StageError("objects could not be written", found=str(error)) from None
 
 
-def _check_whole(path: Path, layers: dict[str, Layer], driver: str) -> None:
+def _check_whole(path: Path, name: str | None, layer: Layer) -> None:
     """Read back what was written: GDAL goes on after some writes that fail."""
     pyogrio = vector("pyogrio")
-    lost = ""
     try:
-        for name, layer in layers.items():
-            which = {"layer": name} if driver == "GPKG" else {}
-            found = pyogrio.read_info(path, force_feature_count=True, **which)["features"]
-            if found != len(layer.shapes):
-                lost = f"{found:,} of {len(layer.shapes):,} {name}"
+        found = pyogrio.read_info(path, layer=name, force_feature_count=True)["features"]
+        lost = f"{found:,} of {len(layer.shapes):,} {name or ''}" if found != len(layer.shapes) else ""
     except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
         lost = str(error)
     if lost:
@@ -278,25 +257,27 @@ _CLASSES = {
     "decks": (17, 140),
 }
 _TO_CHECK = "255,225,0,200"
+#: Symbol, its layer and the name of its color, for each type of geometry.
+_SYMBOLS = {
+    "Point": ("marker", "SimpleMarker", "color"),
+    "LineString Z": ("line", "SimpleLine", "line_color"),
+    "MultiPolygon": ("fill", "SimpleFill", "color"),
+}
 
 
 def qml(kind: str, name: str) -> str:
     """A style for QGIS that tells what is sure from what is to be checked."""
     code, opacity = _CLASSES[name]
-    fills = {"sure": ",".join(map(str, (*class_color(code), opacity))), CHECK: _TO_CHECK}
-    symbol, layer, fill = {
-        "Point": ("marker", "SimpleMarker", "color"),
-        "LineString Z": ("line", "SimpleLine", "line_color"),
-    }.get(kind, ("fill", "SimpleFill", "color"))
-    categories = "".join(
-        f'<category value="{value}" symbol="{n}" label="{value}" render="true"/>'
-        for n, value in enumerate(fills)
-    )
-    symbols = "".join(
-        f'<symbol type="{symbol}" name="{n}" alpha="1"><layer class="{layer}" enabled="1" pass="0">'
-        f'<Option type="Map"><Option type="QString" name="{fill}" value="{color}"/></Option></layer></symbol>'
-        for n, color in enumerate(fills.values())
-    )
+    symbol, layer, fill = _SYMBOLS[kind]
+    categories = symbols = ""
+    for n, (value, color) in enumerate(
+        (("sure", ",".join(map(str, (*class_color(code), opacity)))), (CHECK, _TO_CHECK))
+    ):
+        categories += f'<category value="{value}" symbol="{n}" label="{value}" render="true"/>'
+        symbols += (
+            f'<symbol type="{symbol}" name="{n}" alpha="1"><layer class="{layer}" enabled="1" pass="0"><Option type="Map">'
+            f'<Option type="QString" name="{fill}" value="{color}"/></Option></layer></symbol>'
+        )
     return (
         "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
         '<qgis version="3.22" styleCategories="Symbology"><renderer-v2 type="categorizedSymbol" attr="verdict">'
@@ -308,24 +289,19 @@ def _write_styles(path: Path, styles: Mapping[str, str]) -> None:
     """The table of styles that QGIS looks for in a GeoPackage."""
     import sqlite3
 
-    base = sqlite3.connect(path)
-    try:
-        with base:
-            base.execute(
-                "CREATE TABLE layer_styles (id INTEGER PRIMARY KEY AUTOINCREMENT, f_table_catalog TEXT, "
-                "f_table_schema TEXT, f_table_name TEXT, f_geometry_column TEXT, styleName TEXT, styleQML TEXT, "
-                "styleSLD TEXT, useAsDefault BOOLEAN, description TEXT, owner TEXT, ui TEXT, "
-                "update_time DATETIME DEFAULT '2020-01-01T00:00:00.000Z')"
-            )
-            base.execute(
-                "INSERT INTO gpkg_contents (table_name, data_type, identifier, description, last_change, srs_id) "
-                "VALUES ('layer_styles', 'attributes', 'layer_styles', '', '2020-01-01T00:00:00.000Z', 0)"
-            )
-            base.executemany(
-                "INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, "
-                "styleName, styleQML, styleSLD, useAsDefault, description, owner) "
-                "VALUES ('', '', ?, 'geom', ?, ?, '', 1, '', '')",
-                [(name, name, style) for name, style in styles.items()],
-            )
-    finally:
-        base.close()
+    names = "f_table_catalog, f_table_schema, f_table_name, f_geometry_column, styleName, styleQML, styleSLD"
+    with contextlib.closing(sqlite3.connect(path)) as base, base:
+        base.execute(
+            "CREATE TABLE layer_styles (id INTEGER PRIMARY KEY AUTOINCREMENT, f_table_catalog TEXT, f_table_schema TEXT, "
+            "f_table_name TEXT, f_geometry_column TEXT, styleName TEXT, styleQML TEXT, styleSLD TEXT, useAsDefault BOOLEAN, "
+            "description TEXT, owner TEXT, ui TEXT, update_time DATETIME DEFAULT '2020-01-01T00:00:00.000Z')"
+        )
+        base.execute(
+            "INSERT INTO gpkg_contents (table_name, data_type, identifier, description, last_change, srs_id) "
+            "VALUES ('layer_styles', 'attributes', 'layer_styles', '', '2020-01-01T00:00:00.000Z', 0)"
+        )
+        base.executemany(
+            f"INSERT INTO layer_styles ({names}, useAsDefault, description, owner) "
+            "VALUES ('', '', ?, 'geom', ?, ?, '', 1, '', '')",
+            [(name, name, style) for name, style in styles.items()],
+        )
