@@ -302,21 +302,6 @@ def test_radii():
     assert radii_of(1.0, 1.0, 0.5).tolist() == [1.0]
 
 
-def test_features_of_ropt():
-    xyz = CLOUDS["town"]
-    at = np.arange(0, len(xyz), 60)
-    got = compute_features(xyz, at, "ropt(0.4,2,0.1)", ["covariance", *oracle.GEOMETRIC, "Radius"])
-    for i, q in enumerate(xyz[at]):
-        r = oracle_ropt(xyz, q, radii_of(0.4, 2, 0.1))[0]
-        expected = oracle.of_sphere(xyz, q, r)
-        assert got["Radius_ropt0_4_2_0_1"][i] == np.float32(r)
-        for name in CHECKED:
-            if name == "Verticality" and oracle.normal_gap(oracle.sphere(xyz, q, r)) < 1e-7:
-                continue
-            column = got.names.index(f"{name}_ropt0_4_2_0_1")
-            assert got.values[i, column] == pytest.approx(expected[name], rel=1e-5, abs=3e-5), (name, i)
-
-
 # ---- copt --------------------------------------------------------------------------------------------------
 
 
@@ -387,39 +372,6 @@ def reference():
     xyz = CLOUDS["utm"]
     engine = FeatureEngine(xyz, FeaturePlan.parse(ADAPTIVE), seed=4)
     return xyz, engine.fit(), engine.table()
-
-
-def again(xyz, engine, **options):
-    return FeatureEngine(
-        xyz, engine.plan, bins=engine.bins, copt_threshold=engine.copt_threshold, seed=engine.seed, **options
-    )
-
-
-def test_any_order_gives_the_same_bits_fits_included(reference):
-    xyz, engine, table = reference
-    order = np.random.default_rng(0).permutation(len(xyz))
-    other = FeatureEngine(xyz[order], engine.plan, seed=4).fit()
-    assert other.bins == engine.bins and other.copt_threshold == engine.copt_threshold
-    assert np.array_equal(other.table().values, table.values[order])
-
-
-@pytest.mark.parametrize("threads", [1, 2, 5])
-def test_any_threads_queries_and_blocks_give_the_same_bits(reference, threads):
-    xyz, engine, table = reference
-    some_ = np.random.default_rng(1).permutation(len(xyz))[: 40 * threads]
-    assert np.array_equal(again(xyz, engine, threads=threads).table(some_).values, table.values[some_])
-    assert np.array_equal(again(xyz, engine, threads=threads).table(memory_mb=16).values, table.values)
-
-
-def test_a_tile_gives_the_same_bits(reference):
-    xyz, engine, table = reference
-    x = xyz[:, 0] - xyz[:, 0].min()
-    inside = np.flatnonzero(x < 6)
-    tile = np.flatnonzero(x < 15)
-    part = again(xyz[tile], engine)
-    got = part.table(np.searchsorted(tile, inside))
-    assert part.report.beyond_halo == {}
-    assert np.array_equal(got.values, table.values[inside])
 
 
 def test_what_reaches_beyond_the_halo_is_counted():

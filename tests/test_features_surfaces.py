@@ -86,15 +86,6 @@ def test_points_on_a_line_agree(along):
     assert table["SurfaceVariationStd_k5"].max() < 1e-12
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 3, 5])
-def test_few_points(count):
-    xyz = np.random.default_rng(1).uniform(0, 2, (count, 3))
-    table = compute_features(xyz, None, "k20", "surfaces")
-    assert table.shape == (count, 4) and np.isfinite(table.values).all()
-    if 0 < count < 3:  # no surface at all: it agrees with none
-        assert np.array_equal(table.values[0], np.array([0, 1 / 3, 1 / 3, 0], np.float32))
-
-
 def test_copies_of_one_point_have_no_surface():
     values = compute_features(CLOUDS["all copies"], None, "k20", "surfaces").values
     assert (values == np.array([0, 1 / 3, 1 / 3, 0], np.float32)).all()

@@ -98,19 +98,6 @@ def test_disk():
     assert v["D4"].max() < 0.01
 
 
-def test_segment():
-    n = 60_000
-    v = pulls(np.c_[np.zeros((n, 2)), np.random.default_rng(1).uniform(-3, 3, n)])
-    close(v["D2"], 6 / 3)
-    close(v["D1"], 6 / 4)
-    for t in (0.1, 0.4, 0.7):
-        assert np.mean(v["D2"] / 6 <= t) == pytest.approx(2 * t - t * t, abs=0.006)
-    # On a line the angle is 0 (both to one side, two cases of three) or pi.
-    assert np.mean(v["A3"] < 1e-3) == pytest.approx(2 / 3, abs=0.006)
-    assert np.mean(v["A3"] > math.pi - 1e-3) == pytest.approx(1 / 3, abs=0.006)
-    assert v["D3"].max() < 0.1
-
-
 def test_equilateral_triangle_and_regular_tetrahedron():
     triangle = np.array([[0, 0, 0], [1, 0, 0], [0.5, math.sqrt(0.75), 0]])
     v = pulls(triangle, 3)
@@ -157,13 +144,6 @@ def test_every_ordered_choice_is_equally_likely(n):
         chi2 = ((off - expected) ** 2 / expected).sum()
         freedom = len(off) - 1
         assert abs(chi2 - freedom) < 6 * math.sqrt(2 * freedom)
-
-
-def test_all_of_a_large_neighborhood_is_reached_evenly():
-    at = drawn(1_000_000, 400)
-    for row in at:
-        share = np.bincount((row // 100_000).astype(int), minlength=10) / at.shape[1]
-        assert share == pytest.approx(0.1, abs=0.006)
 
 
 def test_draws_of_different_seeds_and_pulls_are_independent():
