@@ -27,9 +27,8 @@ from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.classify_request import ClassifyRequest
 from pdal_stages.pipeline.inputs_outputs import input_files
 from pdal_stages.pipeline.overrides import parse_overrides
-from pdal_stages.pipeline.run import Pipeline
-from pdal_stages.pipeline.training import train_pipeline
 from pdal_stages.reports.views import triptych, write_png
+from pdal_stages.tiling.training import TrainTask
 
 CLOUDS = {
     "montpellier": {
@@ -47,8 +46,7 @@ PEER = {"montpellier": (85.1, 79.2, 75.6, 90.7), "delft": (94.4, None, 93.5, Non
 def train(sources: str, model: Path, classes: str, more: list[str]) -> None:
     """A model of these files."""
     overrides, _ = parse_overrides(f"--writers.classifiermodel.{option}" for option in more)
-    stages = train_pipeline(input_files([sources]), str(model), overrides, classes=classes)
-    Pipeline(stages, overrides).execute(arrays=False)
+    TrainTask(input_files([sources]), str(model), overrides, {"classes": classes}).run()
 
 
 def job(name: str, options: argparse.Namespace, work: Path) -> dict:

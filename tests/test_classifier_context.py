@@ -46,7 +46,7 @@ def cloud(seed, n, kind="even"):
     return xyz, shares
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     st.integers(0, 10**6),
     st.sampled_from([1, 2, 7, 300]),
@@ -73,7 +73,7 @@ class Said:
         return PredictResult(Block(rows, finish(p)) for rows, p in self.blocks)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from(["even", "corners", "far"]), st.integers(1, 300))
 def test_band_by_band_is_the_same(seed, kind, size):
     xyz, shares = cloud(seed, 300, kind)
@@ -88,7 +88,7 @@ def test_band_by_band_is_the_same(seed, kind, size):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(passes, "BAND", size)
         for rows, columns in PassRun([Said(blocks=blocks), Said(context)], (3, 3), request).blocks(
-            lambda values, rows, columns: columns
+            lambda columns, rows: columns
         ):
             seen[rows] += 1
             got[rows] = columns
@@ -105,10 +105,10 @@ def test_bands_are_all_strips_once(seed, size):
         patch.setattr(passes, "BAND", size)
         bands = strips.bands()
     assert sorted(np.concatenate([strips.rows(band) for band in bands])) == list(range(200))
-    assert all(strips.count(band) <= size or band[1] - band[0] == 1 for band in bands)
+    assert all(len(strips.rows(band)) <= size or band[1] - band[0] == 1 for band in bands)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from(["even", "corners", "far"]))
 def test_what_is_around_is_all_that_matters(seed, kind):
     xyz, shares = cloud(seed, 400, kind)

@@ -123,15 +123,6 @@ def test_where_and_tiles_change_nothing(name, other, request):
     assert none.classified == 0 and not none.classification.any()
 
 
-def test_features_that_are_not_kept_are_computed_again(two, other, monkeypatch):
-    xyz, _, dimensions = other
-    kept = everything(two, xyz, dimensions)
-    monkeypatch.setattr(passes, "_HELD", 0.0)
-    again = everything(two, xyz, dimensions)
-    same(kept, again)
-    assert kept.report == again.report
-
-
 def test_rejection_and_empty_clouds(two, other):
     xyz, _, dimensions = other
     whole = everything(two, xyz, dimensions)

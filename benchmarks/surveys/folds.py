@@ -24,7 +24,6 @@ from pdal_stages.classifier.context import Context, count_shares
 from pdal_stages.classifier.featureforest import CloudFeatures, Features
 from pdal_stages.classifier.forest import TreeOptions, grow_forest
 from pdal_stages.classifier.foresttraining import FOLD_TREES, feature_plan
-from pdal_stages.classifier.passes import joined
 from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.stages.loading import load_model
 
@@ -91,7 +90,7 @@ class LeaveOneOut:
         for number in range(OPTIONS.passes):
             if number:
                 votes = self._votes(left, values, votes)
-                values = joined(self.values, self._around(votes))
+                values = np.concatenate([self.values, self._around(votes)], axis=1)
             forest = self._grow(values, kept, self.trees)
             passes.append(FeatureForest(FEATURES, forest, CONTEXT if number else None))
         # What is known of the shipped model, which is of the same make, but for what is known of its samples.
@@ -117,7 +116,8 @@ class LeaveOneOut:
                     continue
                 read = np.ascontiguousarray(table)
                 if before:
-                    read = joined(read, self._context(cloud, before[number], np.arange(len(cloud.xyz))))
+                    around = self._context(cloud, before[number], np.arange(len(cloud.xyz)))
+                    read = np.concatenate([read, around], axis=1)
                 found[number] = count_shares(forest.predict_proba(read))
         return found
 

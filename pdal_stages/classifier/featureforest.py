@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -189,13 +188,9 @@ class CloudFeatures:
         rows: npt.NDArray[np.int64] | None,
         apply: Callable[[npt.NDArray[np.float32], npt.NDArray[np.int64]], Any],
         memory_share: float = 1.0,
-        counted: bool = True,
         progress: Any = None,
     ) -> Iterator[tuple[npt.NDArray[np.int64], Any]]:
-        """Yield (rows, ``apply(values, rows)``) for some rows (None: all points); `apply` runs in workers' threads.
-
-        Where not `counted`, the report does not change.
-        """
+        """Yield (rows, ``apply(values, rows)``) for some rows (None: all points); `apply` runs in workers' threads."""
         asked = self._request
         if not (len(asked.xyz) if rows is None else len(rows)):
             return
@@ -203,7 +198,6 @@ class CloudFeatures:
             self._engine = self.features.engine(asked.xyz, asked.threads, asked.grid)
         engine = self._engine
         names, known, n = self.features.plan.dimensions, self._dimensions, len(asked.xyz)
-        before = copy.deepcopy(engine.report)
         yield from engine.blocks(
             queries=rows,
             dimensions=lambda some: gather(names, known, n, some)[0],
@@ -212,9 +206,6 @@ class CloudFeatures:
             progress=progress,
             apply=apply,
         )
-        if not counted:
-            engine.report = before
-            return
         few = engine.report.figures["fewer_than_three"]
         if any(few.values()):
             self.report.figures["fewer_than_three"] = {

@@ -207,6 +207,6 @@ def sample_context(
     padded = (*factors, *[None] * (len(passes) - len(factors) + 1))
     members: list[Any] = [*passes, _ContextOnly(context)]
     run = PassRun(members, [*classes, classes[-1]], request, padded)
-    for rows, columns in run.blocks(lambda values, rows, columns: columns):
+    for rows, columns in run.blocks(lambda columns, rows: columns):
         out[np.searchsorted(asked, rows)] = columns
     return out

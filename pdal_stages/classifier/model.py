@@ -56,12 +56,7 @@ class Model:
         """What classifies clouds: the only pass, or all of them as one."""
         if len(self.passes) == 1:
             return self.passes[0]
-        factors = (one.get("factors") for one in self.info["passes"])
-        return Passes(
-            self.passes,
-            tuple(map(len, self.codes_of)),
-            tuple(None if one is None else np.array(one) for one in factors),
-        )
+        return Passes(self.passes, tuple(map(len, self.codes_of)), (*self.factors_between, None))
 
     @property
     def plan(self) -> FeaturePlan | InputPlan:
@@ -84,6 +79,12 @@ class Model:
         """What each class's probability is multiplied by for being frequent (``prior_weight``), or None."""
         priors = self.info.get("priors")
         return None if priors is None else np.array(priors["factors"])
+
+    @property
+    def factors_between(self) -> tuple[npt.NDArray[np.float64] | None, ...]:
+        """The same of each pass but the last, before the next one reads them: of a base's last."""
+        given = (one.get("factors") for one in self.info["passes"][:-1])
+        return tuple(None if one is None else np.array(one) for one in given)
 
     @property
     def required_dimensions(self) -> tuple[str, ...]:

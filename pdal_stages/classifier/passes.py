@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,34 +19,11 @@ from ..base.runs import begins_run
 from ..base.threads import map_blocks
 from ..features.index import cell_numbers
 from .algorithms import Block, InputPlan, PredictRequest, PredictResult
-from .context import Context, around, count_shares
-from .featureforest import CloudFeatures, Features
+from .context import around, count_shares
+from .featureforest import CloudFeatures
 
 #: Points of a band at most, but for a band of one strip.
 BAND = 150_000
-#: Features of a band are held for the next pass where they take no more than this share of the memory; else they are
-#: computed once more.
-_HELD = 0.5
-
-#: Rows of the cloud and their features; None for a pass that reads none.
-Values = tuple[npt.NDArray[np.int64], Any]
-
-
-class Pass(Protocol):
-    """One of several passes, as it reads the points of a block."""
-
-    @property
-    def features(self) -> Features | None:
-        """What it computes of the points; None where it reads context alone, or is a whole algorithm that comes first."""
-
-    @property
-    def context(self) -> Context | None:
-        """What it reads of the pass before; None for the first."""
-
-    def probabilities(
-        self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64]
-    ) -> npt.NDArray[np.float64]:
-        """(b, classes) of the points `rows`, by their features and then their context, side by side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,83 +63,79 @@ class Passes:
     ) -> PredictResult:
         """Classify; see ``Algorithm.predict``."""
         run = PassRun(self.members, self.classes, request, self.factors)
-
-        def last(values, rows, context):
-            return finish(self.members[-1].probabilities(joined(values, context), rows))
-
-        return PredictResult((Block(rows, result) for rows, result in run.blocks(last)), run.report)
+        blocks = run.blocks(lambda read, rows: finish(self.members[-1].probabilities(read, rows)))
+        return PredictResult((Block(rows, result) for rows, result in blocks), run.report)
 
 
 class PassRun:
-    """Passes at work on one cloud. Of the last only `features` and `context` are looked at here; a first one without
-    features is asked for its probabilities as the algorithm it is.
+    """Passes at work on one cloud; `report` has what was counted, complete when all blocks are read.
 
-    `report` has what was counted, complete when all blocks are read.
+    Parameters
+    ----------
+    members : sequence
+        Each has `features` (None where it reads context alone), `context` (None for the first), and
+        ``probabilities(read, rows)``, (b, classes) of points by their features and then their context, side by side; of
+        the last only the former two are looked at. A first one without features is asked as the algorithm it is.
+    classes, factors
+        See :class:`Passes`.
+    request : PredictRequest
     """
 
     def __init__(
         self,
-        members: Sequence[Pass],
+        members: Sequence[Any],
         classes: Sequence[int],
         request: PredictRequest,
         factors: Sequence[npt.NDArray[np.float64] | None] = (),
     ) -> None:
-        self._members, self._classes, self._request = members, classes, request
+        self._members, self._request = members, request
         self._factors = tuple(factors) or (None,) * len(members)
         self.report = Report()
         wanted = [request.rows]  # of each pass
         for one in members[:0:-1]:
-            wanted.insert(0, around(request.xyz, wanted[0], _context_of(one)))
+            wanted.insert(0, around(request.xyz, wanted[0], one.context))
         self._wanted = [_mask(rows, len(request.xyz)) for rows in wanted]
-        width = max(_context_of(one).strip for one in members[1:])
-        self._strips = Strips(request.xyz, wanted[0], width)
+        self._strips = Strips(request.xyz, wanted[0], max(one.context.strip for one in members[1:]))
+        self._shares = [np.zeros((len(self._strips), n), np.uint16) for n in classes[:-1]]
         self._features: list[CloudFeatures | None] = []
         for one in members:
-            self._features.append(None if one.features is None else self._features_of(one.features))
-
-    def _features_of(self, features: Features) -> CloudFeatures:
-        """One for passes that read the same features, so that these are computed once."""
-        for one in self._features:
-            if one is not None and one.features.to_dict() == features.to_dict():
-                return one
-        made = CloudFeatures(features, self._request)
-        self.report.merge(made.report)
-        return made
+            # One for passes that read the same features, so that these are computed once.
+            same = (
+                f for f in self._features if f is not None and f.features.to_dict() == one.features.to_dict()
+            )
+            found = None if one.features is None else next(same, None)
+            if found is None and one.features is not None:
+                found = CloudFeatures(one.features, request)
+                self.report.merge(found.report)
+            self._features.append(found)
 
     def blocks(
-        self, last: Callable[[Any, npt.NDArray[np.int64], npt.NDArray[np.float32]], Any]
+        self, last: Callable[[npt.NDArray[np.float32], npt.NDArray[np.int64]], Any]
     ) -> Iterator[tuple[npt.NDArray[np.int64], Any]]:
-        """Yield (rows, ``last(values, rows, context)``) for all points asked for; called in workers' threads."""
+        """Yield (rows, ``last(read, rows)``) for all points asked for; called in workers' threads."""
         if not self._request.count:
             return
-        strips, number = self._strips, len(self._members)
-        self._shares = [np.zeros((len(strips), n), np.uint16) for n in self._classes[:-1]]
+        strips, number, progress = self._strips, len(self._members), self._request.progress
         bands = strips.bands()
-        longest = max(map(strips.count, bands))
-        width = sum(len(one.features.plan.names) for one in set(self._features) if one is not None)
-        limit = _HELD * self._request.memory_mb * 2**20
-        self._hold = 4.0 * width * longest * min(number, len(bands)) <= limit
         first = 0
         if self._features[0] is None:
             self._ask_algorithm()
             first = 1
-        held: dict[int, dict[int, list[Values]]] = {}  # band -> pass that computed features first -> these
-        progress = self._request.progress
+        held: dict[int, dict[Any, list[Any]]] = {}  # band -> features -> (rows, values) of its blocks
         for step in range(len(bands) + number):
             for place in range(first, number):
                 if not 0 <= step - place < len(bands):
                     continue
-                band = bands[step - place]
                 there = held.setdefault(step - place, {})
-                if place < number - 1:
-                    for rows, shares in self._work(place, band, there, self._handing_on(place)):
-                        self._shares[place][strips.places(rows)] = shares
-                    continue
-                for rows, result in self._work(place, band, there, last):
+                finish = last if place == number - 1 else self._handing_on(place)
+                for rows, result in self._work(place, bands[step - place], there, finish):
+                    if place < number - 1:
+                        self._shares[place][strips.places(rows)] = result
+                        continue
                     if progress is not None:
                         progress.update(len(rows))
                     yield rows, result
-                del held[step - place]
+            held.pop(step - number + 1, None)
         for features in dict.fromkeys(reversed(self._features)):
             if features is not None:
                 self.report.merge(features.report)
@@ -172,8 +145,7 @@ class PassRun:
         asked, factors = self._request, self._factors[0]
         rows = None if self._wanted[0] is None else np.flatnonzero(self._wanted[0])
         inner = PredictRequest(asked.xyz, asked.dimensions, rows, asked.threads, asked.memory_mb)
-        algorithm: Any = self._members[0]
-        predicted = algorithm.predict(inner, lambda p: count_shares(weighed(p, factors)))
+        predicted = self._members[0].predict(inner, lambda p: count_shares(weighed(p, factors)))
         every = np.arange(len(asked.xyz))
         for block in predicted.blocks:
             self._shares[0][self._strips.places(every[block.rows])] = block.result
@@ -182,60 +154,47 @@ class PassRun:
     def _handing_on(self, place: int) -> Callable[..., npt.NDArray[np.uint16]]:
         """What a pass makes of a block for the next one."""
         one, factors = self._members[place], self._factors[place]
-
-        def shares(values, rows, context=None):
-            read = values if context is None else joined(values, context)
-            return count_shares(weighed(one.probabilities(read, rows), factors))
-
-        return shares
+        return lambda read, rows: count_shares(weighed(one.probabilities(read, rows), factors))
 
     def _work(
-        self, place: int, band: Band, held: dict[int, list[Values]], finish: Callable[..., Any]
+        self, place: int, band: Band, held: dict[Any, list[Any]], finish: Callable[..., Any]
     ) -> Iterator[tuple[npt.NDArray[np.int64], Any]]:
         """Yield (rows, what `finish` makes of them) of a band's points that the pass `place` is to look at."""
-        asked, features = self._request, self._features[place]
+        features, mask = self._features[place], self._wanted[place]
         context = self._context_at(place, band) if place else None
 
-        def apply(values, rows):
-            return values, finish(values, rows, *(() if context is None else (context(rows),)))
+        def apply(values: Any, rows: npt.NDArray[np.int64]) -> tuple[Any, Any]:
+            columns = [
+                part for part in (values, None if context is None else context(rows)) if part is not None
+            ]
+            return values, finish(columns[0] if len(columns) == 1 else np.concatenate(columns, axis=1), rows)
 
-        if features is None:
-            rows = self._chosen(place, self._strips.rows(band))
-            if len(rows):
-                yield rows, apply(None, rows)[1]
-            return
-        first = self._features.index(features)
-        before = held.get(first)
-        if before is None:
-            rows = self._chosen(place, self._strips.rows(band))
-            kept: list[Values] = []
-            counted = self._hold or place == first
-            for some, (values, result) in features.blocks(rows, apply, 1.0 - _HELD, counted):
-                if self._hold and features in self._features[place + 1 :]:
-                    kept.append((some, values))
-                yield some, result
-            if kept:
-                held[first] = kept
-            return
-
-        def again(block: Values):
+        def again(block: Any) -> tuple[npt.NDArray[np.int64], Any]:
             rows, values = block
-            mask = self._wanted[place]
             if mask is not None and not (mine := mask[rows]).all():
                 rows, values = rows[mine], values[mine]
             return rows, apply(values, rows)[1] if len(rows) else None
 
-        for some, result in map_blocks(again, before, asked.threads):
-            if len(some):
-                yield some, result
-
-    def _chosen(self, place: int, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        mask = self._wanted[place]
-        return rows if mask is None else rows[mask[rows]]
+        if features in held:
+            for rows, result in map_blocks(again, held[features], self._request.threads):
+                if len(rows):
+                    yield rows, result
+            return
+        rows = self._strips.rows(band)
+        rows = rows if mask is None else rows[mask[rows]]
+        if features is None:
+            if len(rows):
+                yield rows, apply(None, rows)[1]
+            return
+        kept = held[features] = []
+        for some, (values, result) in features.blocks(rows, apply, memory_share=0.5):
+            if features in self._features[place + 1 :]:
+                kept.append((some, values))
+            yield some, result
 
     def _context_at(self, place: int, band: Band) -> Callable[..., npt.NDArray[np.float32]]:
         """What gives the context of rows of a band, by what the pass before said of it and the strips beside it."""
-        context, shares = _context_of(self._members[place]), self._shares[place - 1]
+        context, shares = self._members[place].context, self._shares[place - 1]
         window = self._strips.window(band)
         xyz = self._request.xyz[self._strips.rows_at(window)]
         tables = context.tables(xyz, shares[window], self._request.threads)
@@ -290,10 +249,6 @@ class Strips:
             first = out[-1][1]
         return out
 
-    def count(self, band: Band) -> int:
-        """How many points a band has."""
-        return int(self._start[band[1]] - self._start[band[0]])
-
     def rows(self, band: Band) -> npt.NDArray[np.int64]:
         """The points of a band."""
         return self.rows_at(slice(self._start[band[0]], self._start[band[1]]))
@@ -319,12 +274,6 @@ def _mask(rows: npt.NDArray[np.int64] | None, n: int) -> npt.NDArray[np.bool_] |
     return mask
 
 
-def _context_of(one: Pass) -> Context:
-    """Of a pass after the first, which has one."""
-    assert one.context is not None
-    return one.context
-
-
 def weighed(p: npt.NDArray[np.float64], factors: npt.NDArray[np.float64] | None) -> npt.NDArray[np.float64]:
     """Probabilities (b, classes), each class's multiplied by its factor; None leaves them as they are."""
     if factors is None:
@@ -332,8 +281,3 @@ def weighed(p: npt.NDArray[np.float64], factors: npt.NDArray[np.float64] | None)
     p = p * factors
     p /= p.sum(axis=1, keepdims=True)
     return p
-
-
-def joined(values: npt.NDArray[np.float32], context: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Features and context side by side."""
-    return np.concatenate([values, context], axis=1)

@@ -103,33 +103,20 @@ class RefinedForest(FeatureForest):
     ) -> RefinedForest:
         """Made from what a model file says of a pass, everything checked."""
         said = entry["parameters"]
-        before, labeled = _codes(said.get("before")), _codes(said.get("labeled"))
-        trusted, target, factors = said.get("trusted"), said.get("target"), said.get("factors")
-        if type(trusted) is not float or not 0.0 <= trusted <= 1.0:
-            raise ModelError(
-                "'trusted' of a refined forest must be a number from 0 to 1", found=str(trusted)[:20]
-            )
-        if target is not None and (target not in labeled or len(labeled) != 2):
-            raise ModelError(
-                "'target' of a refined forest must be one of its two classes", found=str(target)[:20]
-            )
-        if factors is not None and not _good_factors(factors, len(labeled)):
-            raise ModelError(
-                "'factors' of a refined forest must be positive numbers, one of each class",
-                found=str(factors)[:60],
-            )
+        before, labeled = tuple(said["before"]), tuple(said["labeled"])
+        target, factors = said.get("target"), said.get("factors")
         features, context = Features.from_dict(entry), Context(tuple(entry["context"]))
         if OWN not in context.tokens:
             raise ModelError(f"a refined forest must read '{OWN}'", found=entry["context"][:10])
         check_names(features.plan, context.names(before), entry)
         forest = Forest.from_arrays(arrays, len(entry["feature_names"]), len(labeled))
-        weights = None if factors is None else tuple(map(float, factors))
         first = own_column(len(features.plan.names), context, len(before))
-        blend = Blend(before, labeled, trusted, target, first, weights)
-        if blend.codes != list(codes):
-            raise ModelError(
-                "the classes of a refined forest do not add up to the model's", found=blend.codes[:10]
-            )
+        weights = None if factors is None else tuple(map(float, factors))
+        blend = Blend(before, labeled, float(said["trusted"]), target, first, weights)
+        good = blend.codes == list(codes) and len(weights or labeled) == len(labeled)
+        good &= all(sorted(set(one)) == list(one) for one in (before, labeled))
+        if not good or (target is not None and (target not in labeled or len(labeled) != 2)):
+            raise ModelError("a refined forest's classes do not fit each other", found=str(said)[:100])
         return cls(features, forest, context, blend)
 
     def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
@@ -189,36 +176,18 @@ def blended(
         mine = grown[:, list(labeled).index(target)]
         if target in before:
             mine = trusted * mine + (1.0 - trusted) * out[:, at[0]]
-        out[:, at[0]] = 0.0
+        out[:, at] = 0.0
         rest = out.sum(axis=1)
-        # Where the base knows of nothing else it stays the target
-        something = rest > NOTHING
-        out *= np.where(something, (1.0 - mine) / np.maximum(rest, NOTHING), 0.0)[:, None]
-        out[:, at[0]] = np.where(something, mine, 1.0)
+        mine = np.where(rest > NOTHING, mine, 1.0)  # where the base knows of nothing else it stays the target
+        out *= ((1.0 - mine) / np.maximum(rest, NOTHING))[:, None]
+        out[:, at[0]] = mine
         return out
     theirs = out[:, at]
     share = theirs.sum(axis=1, keepdims=True)
-    known = np.where(share > 0, theirs / np.maximum(share, 1e-300), grown)
+    known = np.where(share > 0, theirs / np.maximum(share, NOTHING), grown)
     kept = np.delete(out, at, axis=1).sum(axis=1, keepdims=True)
     out[:, at] = np.maximum(1.0 - kept, 0.0) * (trusted * grown + (1.0 - trusted) * known)
     return out
-
-
-def _good_factors(given: Any, classes: int) -> bool:
-    return (
-        isinstance(given, list)
-        and len(given) == classes
-        and all(type(one) in (int, float) and 0.0 < one < float("inf") for one in given)
-    )
-
-
-def _codes(given: Any) -> tuple[int, ...]:
-    good = isinstance(given, list) and all(type(one) is int and 0 <= one <= 255 for one in given)
-    if not good or sorted(set(given)) != given or len(given) < 2:
-        raise ModelError(
-            "a refined forest's classes must be codes, ascending, each once", found=str(given)[:60]
-        )
-    return tuple(given)
 
 
 # ---- training on top of a model ----------------------------------------------------------------------
@@ -247,7 +216,7 @@ class Below:
         self.options, self._progress = options, progress
         self.context = Context((OWN,) if options.passes > 1 else tuple(options.context))
         self.passes, self.classes = base.passes, tuple(map(len, base.codes_of))
-        self.factors = (*(_array(one.get("factors")) for one in base.info["passes"][:-1]), base.factors)
+        self.factors = (*base.factors_between, base.factors)
         self.trusted = trust(int(np.bincount(samples.label).min()))
 
     @cached_property
@@ -336,11 +305,6 @@ def held_by_base(below: Below, codes: Sequence[int]) -> dict[str, Any]:
         if code not in before and held and below.options.target is None:
             out[str(code)] = [int(np.count_nonzero(mine)), held]
     return {"held_by_base": out} if out else {}
-
-
-def _array(given: Any) -> npt.NDArray[np.float64] | None:
-    """Numbers of a manifest, or None."""
-    return None if given is None else np.array(given)
 
 
 def _spanned(one: Any, other: Any) -> Any:

@@ -12,7 +12,6 @@ from ..base.outputs import Output, check_outputs
 from ..base.plain import print_messages
 from ..tiling.command import add_tile_arguments
 from .parser import INPUTS, OVERRIDES, Parser
-from .pipelines import executed
 
 
 def add_commands(parser: Parser) -> None:
@@ -116,8 +115,7 @@ def _models(options: argparse.Namespace) -> None:
 
 def _train(options: argparse.Namespace) -> None:
     from ..pipeline.inputs_outputs import input_files, overlooked
-    from ..pipeline.run import Pipeline
-    from ..pipeline.training import surveys_of, train_pipeline, train_surveys
+    from ..pipeline.training import surveys_of
     from ..stages.loading import load_model
     from ..tiling.command import options_of, run_training
     from ..tiling.training import TrainTask
@@ -129,13 +127,7 @@ def _train(options: argparse.Namespace) -> None:
     if options.surveys is not None:
         surveys = surveys_of(files, options.surveys)
     task = TrainTask(files, options.model, options.overrides, extra, options_of(options), surveys)
-    if not task.in_one_piece():
-        said = run_training(task)
-    elif surveys:
-        said = train_surveys(surveys, options.model, options.overrides, **extra)
-    else:
-        stages = train_pipeline(files, options.model, options.overrides, **extra)
-        said = executed(options, Pipeline(stages, options.overrides))
+    said = run_training(task)
     # Nothing is said of one written into a pipe or device
     text = str(load_model(options.model)) if Path(options.model).is_file() else ""
     score = text.partition("\n")[0]

@@ -20,8 +20,6 @@ from ..base.errors import StageError
 from ..base.outputs import Output, check_outputs
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_las, outputs_of
-from ..pipeline.run import Pipeline
-from ..pipeline.training import train_pipeline
 from ..stages.loading import digest_of, load_model
 from .classify import ClassifyTask
 from .settings import TilingOptions
@@ -93,11 +91,7 @@ class AdaptTask:
                 "folds": 0,  # a score by the teacher's own answers would be none
             }
             made = str(Path(folder) / "adapted.model")
-            task = TrainTask(classified, made, (), given, self.options)
-            if task.in_one_piece():
-                Pipeline(train_pipeline(classified, made, **given)).execute(arrays=False)
-            else:
-                told += task.run()
+            TrainTask(classified, made, (), given, self.options).run()
             new, name = load_model(made), Path(self.teacher).stem
             of = {"name": name, "sha256": digest_of(self.teacher), "sure": sure}
             replace(new, info={**new.info, "teacher": of}).save(self.model)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,10 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import StageError
+from ..base.errors import OptionError, StageError
 from ..base.las import extra_dimensions
+from ..base.outputs import check_outputs
 from ..base.report import Report
-from ..classifier import TrainingCloud
+from ..classifier import Model, TrainingCloud, train
 from ..classifier.clouds import TiledCloud
 from ..classifier.dimensions import CHECKED
 from ..classifier.summary import FILE_NUMBER
@@ -27,7 +29,7 @@ from ..pipeline.callbacks import Callbacks
 from ..pipeline.inputs_outputs import is_ept, is_las, overridden
 from ..pipeline.overrides import Override
 from ..pipeline.run import Pipeline
-from ..pipeline.training import check_surveys, heights_for, lowered_writer, numbered, points_in
+from ..pipeline.training import heights_for, lowered_writer, points_in, read_points
 from ..stages.checked import CheckedChoice, Looked
 from ..stages.classifiermodel import ClassifierModel
 from ..stages.points import HOLDS_NOWHERE
@@ -79,15 +81,21 @@ class TrainTask:
 
     @cached_property
     def _writer(self) -> dict[str, Any]:
-        """As it stands in a pipeline, with what the stages before it tell it."""
+        """As it stands in a pipeline; of several files the score is by file, unless told otherwise."""
         files = list(self.files)
         writer = {"type": ClassifierModel.type, "filename": self.model, "files": files, **self.given}
         writer = overridden(writer, self.overrides)
-        if self.surveys or self.survey:
-            check_surveys(writer)
-            return writer
-        by_file = numbered(lowered_writer(writer), len(files))
-        return {**writer, "groups": FILE_NUMBER} if by_file else writer
+        stage = lowered_writer(writer)
+        told = {name: value for name in ("survey", "groups") if (value := getattr(stage, name))}
+        if told and (self.surveys or self.survey):
+            raise OptionError(
+                "surveys are told by files or by a dimension, not both",
+                found=", ".join(f"{name}={value}" for name, value in told.items()),
+            )
+        by_file = len(files) > 1 and stage.algorithm == "random_forest"
+        if by_file and not (told or self.surveys or self.survey):
+            writer["groups"] = FILE_NUMBER
+        return writer
 
     def _each(self) -> list[TrainTask]:
         """The same for each survey; this one where there are none."""
@@ -130,36 +138,63 @@ class TrainTask:
         except StageError:
             return True  # said when it is read
 
-    # ---- in tiles ----------------------------------------------------------------------------------------
-
     def run(self) -> list[str]:
-        """Train in tiles and write the model; what is to be told."""
+        """Train and write the model; what is to be told."""
         stage = self.stage
         heights = [overridden(one, self.overrides) for one in heights_for(stage)]
         told = [said] if (said := stage.follows(heights)) is not None else []
         pdal_env.bindings()  # says what is wrong with PDAL before any work
         stage.check()
+        check_outputs(stage.outputs(), list(self.files))
+        report = Report()
+        made = (self._whole if self.in_one_piece() else self._tiled)(heights, report)
+        stage.finish(made, report)
+        return [*told, *report.messages]
+
+    def _whole(self, heights: Sequence[Mapping[str, Any]], report: Report) -> Model:
+        """Trained on all points of a survey at once, one survey after the other."""
+        each = self._each()
+        training: Any = None
+
+        def clouds() -> Iterator[TrainingCloud]:
+            nonlocal training
+            for task in each:
+                points = read_points(task.files, heights, self.overrides, self.stage)
+                found = self.stage.training_on(points)
+                training = training or found
+                _check_same(found.dimensions, training.dimensions)
+                cloud = self.stage.cloud_of(points, found)
+                report.merge(points.report)
+                if task.survey:
+                    yield replace(cloud, name=task.survey, survey=task.survey)
+                else:
+                    yield from (one for _, one in self.stage.surveys(cloud, points))
+
+        made = clouds()
+        first = next(made)  # what is trained on follows from its dimensions
+        return train([first, *made] if len(each) == 1 else chain([first], made), training)
+
+    # ---- in tiles ----------------------------------------------------------------------------------------
+
+    def _tiled(self, heights: Sequence[Mapping[str, Any]], report: Report) -> Model:
         model = Path(self.model).absolute()
         place = model.parent if model.is_file() or not model.exists() else None  # not beside a device
         clouds: list[TiledCloud] = []
-        report, dimensions = Report(), None
+        dimensions: list[str] | None = None
         with TemporaryDirectory(prefix=".pdal-stages-train-", dir=place) as folder:
             self._check_room(Path(folder))
             for number, task in enumerate(self._each()):
                 made = Path(folder) / f"survey{number}"
                 made.mkdir()
                 found, parts, names = task._in_tiles(made, heights)
-                if dimensions not in (None, names):
-                    raise _not_the_same(names, dimensions)
+                _check_same(names, dimensions or names)
                 dimensions = names
                 report.merge(found)
                 clouds += parts
             training = self.stage.training
             if self.stage.automatic:
                 training = replace(training, dimensions=tuple(dimensions or ()))
-            trained = train_tiles(clouds, training, Path(folder))
-        stage.finish(trained, report)
-        return [*told, *report.messages]
+            return train_tiles(clouds, training, Path(folder))
 
     def _check_room(self, folder: Path) -> None:
         points = sum(one._points() for one in self._each())
@@ -221,8 +256,7 @@ class TrainTask:
         choice = self._choice(run.tiles, report)
         for job in run.tiles:
             for number, cloud in enumerate(job.record.get("clouds", ())):
-                if dimensions not in (None, cloud["dimensions"]):
-                    raise _not_the_same(cloud["dimensions"], dimensions)
+                _check_same(cloud["dimensions"], dimensions or cloud["dimensions"])
                 dimensions = cloud["dimensions"]
                 if cloud["value"] not in clouds:
                     clouds[cloud["value"]] = TiledCloud(folder / f"cloud{len(clouds)}", side)
@@ -236,12 +270,13 @@ class TrainTask:
         return report, [clouds[value] for value in sorted(clouds)], dimensions
 
 
-def _not_the_same(found: Sequence[str], before: Sequence[str] | None) -> StageError:
-    return StageError(
-        "the files do not have the same dimensions",
-        found=f"{', '.join(found)}; before: {', '.join(before or ())}",
-        cure="Name those that all have: --writers.classifiermodel.dimensions=HeightAboveGround",
-    )
+def _check_same(found: Sequence[str], before: Sequence[str]) -> None:
+    if list(found) != list(before):
+        raise StageError(
+            "the files do not have the same dimensions",
+            found=f"{', '.join(found)}; before: {', '.join(before)}",
+            cure="Name those that all have: --writers.classifiermodel.dimensions=HeightAboveGround",
+        )
 
 
 def _say(report: Report, run: TiledRun) -> None:
