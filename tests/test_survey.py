@@ -17,19 +17,8 @@ from pdal_stages.cli import main
 from pdal_stages.stages.base import Blocks
 from pdal_stages.synthetic.townfile import WKT
 from pdal_stages.tiling import TilingOptions
-from pdal_stages.tiling.classify import ClassifyTask
-from pdal_stages.tiling.sizing import (
-    BASE,
-    PARENT,
-    Density,
-    block_bytes,
-    room_of_worker,
-    settled,
-    widened,
-    worker_bytes,
-)
+from pdal_stages.tiling.settings import PARENT, Density, block_bytes, settled, worker_bytes
 from pdal_stages.tiling.sources import Extent
-from pdal_stages.tiling.survey import Survey
 
 pytestmark = pytest.mark.pdal
 OPTIONS = ("--filters.hag_minima.cell=5", "--no-progress")
@@ -180,9 +169,9 @@ def test_a_cloud_beyond_the_memory_is_cut(survey, classify, tmp_path):
 
 
 def test_ctrl_c_says_what_is_done_and_how_to_go_on(survey, classify, tmp_path, monkeypatch):
-    from pdal_stages.tiling import tile_task
+    from pdal_stages.tiling.tile import TileTask
 
-    run, calls = tile_task.TileTask.run, []
+    run, calls = TileTask.run, []
 
     def some(self):
         calls.append(self.tile)
@@ -190,7 +179,7 @@ def test_ctrl_c_says_what_is_done_and_how_to_go_on(survey, classify, tmp_path, m
             raise KeyboardInterrupt
         return run(self)
 
-    monkeypatch.setattr(tile_task.TileTask, "run", some)
+    monkeypatch.setattr(TileTask, "run", some)
     code, out, err = classify(survey / "in", tmp_path / "out/", "--tile", 30, "--workers", 0)
     assert (
         code == 130 and "4 of 11 tiles done" in err and "--resume" in err and "pdal-stages classify" in err
@@ -292,41 +281,3 @@ def test_a_worker_has_room_for_the_blocks_before_the_tiles():
     assert worker_bytes(1000, 0, whole) - worker_bytes(1000, 0) == pytest.approx(
         whole - (512 << 20) - 285_000
     )
-
-
-def test_blocks_are_as_large_as_the_memory_allows():
-    blocks = Blocks(1024.0, 494.0, 100.0, 2.0)
-    twice, again = (blocks._replace(side=side) for side in (2048.0, 4096.0))
-    least = BASE + block_bytes(twice, 1e9)
-    assert widened(blocks, 1e9, least, 4) == twice and widened(blocks, 1e9, least - 1, 4) == blocks
-    assert widened(blocks, 1e9, 1e10, 4) == again
-    assert widened(blocks, 1e9, 1e10, 4, 2048.0) == twice  # which an earlier run has begun with
-    # One for each worker.
-    assert widened(blocks, 1e7, 1e10, 4) == blocks and widened(blocks, 1e7, 1e10, 2) == twice
-
-
-@pytest.mark.pdal
-def test_blocks_of_a_survey(tmp_path, write_las):
-    """30 x 30 km, as the header says: as large as this machine's workers have room for, and as a cluster's are said to."""
-    points = {axis: np.array([0.0, 30_000.0]) for axis in "XYZ"}
-    path = write_las(tmp_path / "wide.las", points, point_format=6)
-    plan = ClassifyTask((str(path),), str(tmp_path / "out.las")).plan()
-
-    def side(block=None, **options):
-        survey = Survey(plan, TilingOptions(500.0, **options), block)
-        assert survey.plan.first is not None
-        return survey.plan.first.blocks.side
-
-    assert side(memory=64 << 30, workers=1) == 4096.0 and side(2048.0, memory=64 << 30, workers=1) == 2048.0
-    assert side(memory=2 << 30, workers=1) == 1024.0
-    assert side(workers=1) == 1024.0  # without a word about memory, no more than tiles take
-    assert side(scheduler="tcp://host:1") == 1024.0
-    assert side(scheduler="tcp://host:1", memory=16 << 30) == 2048.0  # one each for 64 workers
-
-
-def test_each_worker_has_its_share_of_the_memory():
-    def room(**options):
-        return room_of_worker(TilingOptions(100.0, memory=8 << 30, **options))
-
-    assert room(workers=1) == (8 << 30) - PARENT and room(workers=0) == 8 << 30
-    assert room(scheduler="tcp://one:1") == 8 << 30  # of each worker there

@@ -20,12 +20,11 @@ from pdal_stages.synthetic.townfile import WKT
 from pdal_stages.terrain.minima import terrain_reach
 from pdal_stages.tiling import TilingOptions, run_tiled
 from pdal_stages.tiling.classify import ClassifyTask
-from pdal_stages.tiling.cut import cut_all
 from pdal_stages.tiling.grid import TileGrid, inside, touching
-from pdal_stages.tiling.index import sort_points
-from pdal_stages.tiling.oneformat import one_format
+from pdal_stages.tiling.pieces import CloudIndex, cut_all, sort_points
+from pdal_stages.tiling.plan import make_plan
 from pdal_stages.tiling.sources import InputSource, find_sources, las_extent
-from pdal_stages.tiling.tileplan import make_plan
+from pdal_stages.tiling.writeroptions import one_format
 
 pytestmark = pytest.mark.pdal
 
@@ -102,7 +101,7 @@ def test_a_cut_is_the_files_own_bytes(tmp_path, random_cloud, write_las, suffix,
         tmp_path / f"cloud{suffix}", arrays, point_format=point_format, wkt=WKT if point_format == 6 else None
     )
     grid = TileGrid(25.0)
-    index = sort_points(str(path), grid, str(tmp_path / "copy"))
+    index = CloudIndex.of(sort_points(str(path), grid, str(tmp_path / "copy")), str(tmp_path / "copy"))
     assert index.count == len(xyz) and sum(n for _, _, n in index.tiles) == len(xyz)
     (piece,) = cut_all(grid, (1, 2), [(InputSource(str(path), {}, "las"), index)], 3.0, str(tmp_path), True)
     las, all_ = laspy.read(piece.path), laspy.read(path)
@@ -170,9 +169,9 @@ def test_two_worker_processes_give_the_same(tmp_path, town_file, model_file, who
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
 def test_large_files_are_written_in_parts(tmp_path, town_file, model_file, whole, suffix, monkeypatch):
-    from pdal_stages.tiling import sizing
+    from pdal_stages.tiling import outputs
 
-    monkeypatch.setattr(sizing, "MOST_AT_ONCE", 11_000)
+    monkeypatch.setattr(outputs, "MOST_AT_ONCE", 11_000)
     out = tmp_path / f"out.{suffix}"
     assert not run_tiled(clouds.stages([town_file], out, model_file), 60, workers=0).failures
     clouds.same_points(whole, out)
@@ -612,11 +611,11 @@ def test_reports(tmp_path, town_file, model_file):
 
 def test_a_failed_tile_is_crossed_out():
     from pdal_stages.reports.runpage import run_page
-    from pdal_stages.tiling.outcome import TiledRun, TileJob
+    from pdal_stages.tiling.report import Job, TiledRun
 
     report = {"points": 5, "read": 9, "halo_m": 1.0, "seconds": 2.0}
-    jobs = [TileJob((0, 0), "0_0", 5, [], state="done", record=report)]
-    jobs.append(TileJob((1, 0), "10_0", 5, [], state="failed", reason="<odd> & broken"))
+    jobs = [Job("0_0", 5, (0, 0), state="done", record=report)]
+    jobs.append(Job("10_0", 5, (1, 0), state="failed", reason="<odd> & broken"))
     summary = {"tile": 10.0, "points": 5, "states": {"done": 1, "kept": 0, "failed": 1}, "classes": {}}
     text = run_page(TiledRun(jobs, [], {}, [], [], summary).to_dict())
     assert text.count("<rect") == 2 and text.count('d="M1.2') == 1

@@ -8,15 +8,16 @@ import pytest
 from test_terrain_morphological import town
 
 import pdal_stages as ps
-from pdal_stages.stages.hag_morphological import HagMorphological
 from pdal_stages.terrain import filtered_ground, groundblocks
 from pdal_stages.terrain.decks import level_points
 from pdal_stages.terrain.groundblocks import by_block, cells_of_block, reach_of_block
 from pdal_stages.terrain.groundcells import BLOCK_SIDE, FilterOptions, GroundCells
 from pdal_stages.terrain.lowpoints import lowest_of_cells
 from pdal_stages.terrain.morphological import reach_of_cells
-from pdal_stages.tiling import run_tiled
-from pdal_stages.tiling.firstround import BlockTask
+from pdal_stages.tiling import run_tiled, tile
+from pdal_stages.tiling.ground import FirstRoundTask
+from pdal_stages.tiling.outputs import FileTask
+from pdal_stages.tiling.store import Store
 
 HEIGHTS = {"type": "filters.hag_morphological", "window": 8, "ground": True, "openings": [5, 9]}
 MADE = ("HeightAboveGround", "Ground", "HeightAboveOpening_5", "HeightAboveOpening_9")
@@ -38,11 +39,6 @@ def test_the_lowest_points_of_cells(cell):
     assert {(z[n], x[n], y[n]) for n in found} == set(best.values())
     assert len(found) == len(best)
     assert lowest_of_cells(x, y, z, np.zeros(3000, bool), cell).size == 0
-
-
-def test_a_stage_is_given_what_it_left(write_las):
-    stage = HagMorphological({"openings": "5"})
-    assert stage.near_halo_m() == 0.0 < stage.halo_m() and stage.from_blocks is None
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +81,7 @@ def test_tiles_are_the_same_bits_and_read_few_points(tmp_path, survey, before):
     steps = run.summary["cpu_seconds_by_step"]
     assert set(steps) == {"index", "first_rounds", "tiles", "outputs"} and min(steps.values()) > 0
     assert run.summary["cpu_seconds"] == pytest.approx(sum(steps.values()))
-    assert not list((tmp_path / "out" / ".pdal-stages" / "tiles").glob("*.np[yz]"))
+    assert not list((tmp_path / "out" / ".pdal-stages" / "kept").glob("*.np[yz]"))
 
 
 @pytest.mark.pdal
@@ -97,51 +93,49 @@ def test_where_and_units_reach_the_first_round(tmp_path, survey):
         assert np.array_equal(of_files(tmp_path / "out", name), whole[name]), name
 
 
+def break_a_tile(patch):
+    """One tile fails in its own turn, when the rounds before are done."""
+    real = tile.run_head
+
+    def failing(context, at, *rest):
+        if at == (1, 1):
+            raise ps.StageError("no luck")
+        return real(context, at, *rest)
+
+    patch.setattr(tile, "run_head", failing)
+
+
 @pytest.mark.pdal
 def test_resume_makes_what_is_missing_alone(tmp_path, survey, monkeypatch):
-    from pdal_stages.tiling import tile_task
-    from pdal_stages.tiling.firstround import FirstRoundTask
-
-    made, real, refused = [], FirstRoundTask.run, tile_task.run_head
+    """And removes what is left of tiles that have no points any more; a damaged file is made again."""
+    made, real = [], FirstRoundTask.run
 
     def noted(self):
         made.append(self.tile)
         return real(self)
 
-    def failing(context, tile, *rest):
-        if tile == (1, 1):
-            raise ps.StageError("no luck")
-        return refused(context, tile, *rest)
-
     monkeypatch.setattr(FirstRoundTask, "run", noted)
-    monkeypatch.setattr(tile_task, "run_head", failing)
     folder = tmp_path / "out"
-    assert len(in_tiles(survey, [HEIGHTS], folder).failures) >= 1
+    with monkeypatch.context() as patch:
+        break_a_tile(patch)
+        assert len(in_tiles(survey, [HEIGHTS], folder).failures) >= 1
     assert len(made) == len(set(made)) == 16
-    left = folder / ".pdal-stages" / "tiles"
+    left = folder / ".pdal-stages" / "kept"
     assert len(list(left.glob("*.first.npz"))) == 16
-    monkeypatch.setattr(tile_task, "run_head", refused)
     (left / "0_0.first.npz").unlink()
+    np.savez(left / "-200_0.first.npz", around=np.array([[-1.0, 100.0, -500.0]]))
+    with open(left / "400_400.first.npz", "r+b") as file:
+        file.truncate(100)
     made.clear()
     assert not in_tiles(survey, [HEIGHTS], folder, resume=True).failures
-    assert made == [(0, 0)]
+    assert made == [(0, 0), (2, 2)]
     whole = np.concatenate(ps.run_pipeline([*survey, HEIGHTS]).arrays)
     assert np.array_equal(of_files(folder, "HeightAboveGround"), whole["HeightAboveGround"])
 
 
-def note_of(path):
-    """What a run notes of a file that it keeps: of tiles under their name, of the rounds before under the file's."""
-    before = path.name.endswith((".first.npz", ".cells.npz"))
-    return path.with_name(f"{path.name}.json") if before else path.with_suffix(".json")
-
-
 @pytest.mark.pdal
-@pytest.mark.parametrize("kind", ["first round", "tiles"])
-def test_killed_between_a_file_and_its_note(tmp_path, survey, monkeypatch, kind):
+def test_killed_between_a_file_and_its_note(tmp_path, survey, monkeypatch):
     """A file that a run with other options made is not taken for that of the run before, whatever was noted of that."""
-    from pdal_stages.tiling import tiledrun
-    from pdal_stages.tiling.file_task import FileTask
-    from pdal_stages.tiling.store import Store
 
     def stages(least):
         return [{"type": "filters.range", "limits": f"X[{least}:]"}, HEIGHTS]
@@ -150,22 +144,19 @@ def test_killed_between_a_file_and_its_note(tmp_path, survey, monkeypatch, kind)
         raise KeyboardInterrupt
 
     folder = tmp_path / "out"
-    place, attribute = (tiledrun, "run_all") if kind == "first round" else (FileTask, "run")
     with monkeypatch.context() as patch:
-        patch.setattr(place, attribute, stop)
+        patch.setattr(FileTask, "run", stop)
         with pytest.raises(KeyboardInterrupt):
             in_tiles(survey, stages(2), folder)
-    kept = folder / ".pdal-stages" / "tiles"
-    made = {path: path.read_bytes() for path in kept.glob("*.np?")}
-    assert len(made) >= 16 and all(note_of(path).exists() for path in made)
+    kept = folder / ".pdal-stages" / "kept"
+    made = {path: path.read_bytes() for path in kept.glob("*.npz")}
+    assert len(made) >= 16 and all(path.with_suffix(".json").exists() for path in made)
     with monkeypatch.context() as patch:
-        patch.setattr(Store, "finish", stop)
-        if kind == "tiles":  # of which the first is made, as the first round is left out of the other run
-            patch.setattr(tiledrun, "run_first_round", lambda *_: None)
+        patch.setattr(Store, "finish", lambda _, name, *rest: name.endswith(".first") and stop())
         with pytest.raises(KeyboardInterrupt):
             in_tiles(survey, stages(10), folder, resume=True)
     changed = [path for path in made if path.read_bytes() != made[path]]
-    assert changed and not any(note_of(path).exists() for path in changed)
+    assert changed and not any(path.with_suffix(".json").exists() for path in changed)
     assert not in_tiles(survey, stages(2), folder, resume=True).failures
     whole = np.concatenate(ps.run_pipeline([*survey, *stages(2)]).arrays)
     for name in MADE:
@@ -173,52 +164,7 @@ def test_killed_between_a_file_and_its_note(tmp_path, survey, monkeypatch, kind)
 
 
 @pytest.mark.pdal
-def test_what_is_left_of_an_input_that_is_gone_is_removed(tmp_path, survey, monkeypatch):
-    from pdal_stages.tiling import tile_task
-
-    real = tile_task.run_head
-
-    def failing(context, tile, *rest):
-        if tile == (1, 1):
-            raise ps.StageError("no luck")
-        return real(context, tile, *rest)
-
-    monkeypatch.setattr(tile_task, "run_head", failing)
-    folder = tmp_path / "out"
-    assert in_tiles(survey, [HEIGHTS], folder).failures
-    left = folder / ".pdal-stages" / "tiles"
-    names = {path.name for path in left.glob("*.first.npz")}
-    np.savez(
-        left / "-200_0.first.npz", around=np.array([[-1.0, 100.0, -500.0]])
-    )  # of a tile without points now
-    assert in_tiles(survey, [HEIGHTS], folder, resume=True).failures
-    assert {path.name for path in left.glob("*.first.npz")} == names
-
-
-@pytest.mark.pdal
-def test_a_damaged_file_of_the_first_round_is_made_again(tmp_path, survey, monkeypatch):
-    from pdal_stages.tiling.firstround import FirstRoundTask
-
-    real = FirstRoundTask.run
-
-    def damaged(self):
-        answer = real(self)
-        if self.tile == (2, 2):
-            with open(self.target, "r+b") as file:
-                file.truncate(100)
-        return answer
-
-    monkeypatch.setattr(FirstRoundTask, "run", damaged)
-    run = in_tiles(survey, [HEIGHTS], tmp_path / "out")
-    assert any("first round left" in job.reason for job in run.tiles)
-    monkeypatch.setattr(FirstRoundTask, "run", real)
-    assert not in_tiles(survey, [HEIGHTS], tmp_path / "out", resume=True).failures
-
-
-@pytest.mark.pdal
 def test_what_fails_in_the_first_round_is_said_of_the_tiles_that_need_it(tmp_path, survey, monkeypatch):
-    from pdal_stages.tiling.firstround import FirstRoundTask
-
     real = FirstRoundTask.run
 
     def failing(self):
@@ -232,37 +178,31 @@ def test_what_fails_in_the_first_round_is_said_of_the_tiles_that_need_it(tmp_pat
     failed = {job.tile for job in run.tiles if job.state == "failed"}
     assert (0, 0) in failed and all("no luck" in job.reason for job in run.tiles if job.tile in failed)
     monkeypatch.setattr(FirstRoundTask, "run", lambda self: (_ for _ in ()).throw(ps.StageError("no luck")))
-    with pytest.raises(ps.StageError, match="all tiles failed for one reason"):
+    with pytest.raises(ps.StageError, match="all failed for one reason"):
         in_tiles(survey, [small], tmp_path / "other")
 
 
-def blocks_of(points, options, near, cells=BLOCK_SIDE):
+def blocks_of(points, options, near):
     """The cells of all blocks that points need, each made of the lowest points that it may look at."""
     cell = options.cell
     low = points[:, lowest_of_cells(*points, np.ones(points.shape[1], bool), cell)]
-    side, around = cells * cell, (reach_of_block(options) + 1) * cell
-    inside = by_block(*points, np.ones(points.shape[1], bool), cell, cells)
+    side, around = BLOCK_SIDE * cell, (reach_of_block(options) + 1) * cell
+    inside = by_block(*points, np.ones(points.shape[1], bool), cell)
     found = []
     for i in range(int(near[0] // side), int(near[2] // side) + 1):
         for j in range(int(near[1] // side), int(near[3] // side) + 1):
             box = i * side - around, j * side - around, (i + 1) * side + around, (j + 1) * side + around
             seen = (low[0] >= box[0]) & (low[0] <= box[2]) & (low[1] >= box[1]) & (low[1] <= box[3])
             mine = inside.get((i, j), np.empty((0, 3)))
-            found.append(cells_of_block(*low[:, seen], (i, j), options, [mine[::2], mine[1::2]], cells))
+            found.append(cells_of_block(*low[:, seen], (i, j), options, [mine[::2], mine[1::2]]))
     return GroundCells.joined(found, len(options.openings))
 
 
 @pytest.mark.parametrize(
-    ("origin", "cell", "window", "strays", "side"),
-    [
-        ((0.0, 0.0), 1.0, 8.0, False, BLOCK_SIDE),
-        ((770_500.0, 6_277_550.0), 1.0, 30.0, True, BLOCK_SIDE),
-        ((1000.0, 2000.0), 0.5, 5.0, False, BLOCK_SIDE),
-        ((770_500.0, 6_277_550.0), 1.0, 30.0, True, 2 * BLOCK_SIDE),
-        ((0.0, 0.0), 1.0, 8.0, False, 300),
-    ],
+    ("origin", "cell", "window", "strays"),
+    [((770_500.0, 6_277_550.0), 1.0, 30.0, True), ((1000.0, 2000.0), 0.5, 5.0, False)],
 )
-def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, strays, side):
+def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, strays):
     x, y, z, _ = town(4, side=900, density=0.5, origin=origin)
     if strays:  # far from all else, and a hole in the middle
         away = np.random.default_rng(1).uniform(0, 60, (2, 400))
@@ -283,36 +223,13 @@ def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, 
         wide = 3.0 + reach_of_cells(cell)
         around = [box[0] - wide, box[1] - wide, box[2] + wide, box[3] + wide]
         around = [edge + origin[n % 2] for n, edge in enumerate(around)]
-        blocks = blocks_of(np.array([x, y, z]), made, around, side)
+        blocks = blocks_of(np.array([x, y, z]), made, around)
         cells = blocks.within(*(int(edge // cell) for edge in around))
         some = filtered_ground(x[near], y[near], z[near], cells=cells, **options)
         core = away[near] < 0
         assert core.any()
         for name, values in some.items():
             assert np.array_equal(values[core], whole[name][near][core]), (box, name)
-
-
-@pytest.mark.pdal
-def test_larger_blocks_give_the_same(tmp_path, survey, monkeypatch):
-    stages = [{"type": "filters.detachednoise"}, HEIGHTS]
-    sides, usual = [], BlockTask.run
-
-    def run(task):
-        sides.append((task.plan.first.blocks.side, task.block))
-        return usual(task)
-
-    monkeypatch.setattr(BlockTask, "run", run)
-    for name, factor in (("usual", 1), ("larger", 2), ("smaller", 0.25)):
-        monkeypatch.setattr(
-            "pdal_stages.tiling.survey.widened",
-            lambda blocks, *_, by=factor: blocks._replace(side=by * blocks.side),
-        )
-        assert not in_tiles(survey, stages, tmp_path / name).failures
-    found = {side: {block for of, block in sides if of == side} for side, _ in sides}
-    assert set(found) == {1024.0, 2048.0, 256.0} and len(found[256.0]) >= 9
-    for name in ("larger", "smaller"):
-        for file in ("west.las", "east.las"):
-            assert (tmp_path / name / file).read_bytes() == (tmp_path / "usual" / file).read_bytes()
 
 
 @pytest.mark.parametrize("cell", [1.0, 0.7])
@@ -333,8 +250,7 @@ def test_points_by_block_are_by_the_cells_of_blocks(cell):
     assert by_block(*np.empty((3, 0)), use[:0], cell) == {}
 
 
-@pytest.mark.parametrize("side", [1024, 4096])
-def test_decks_of_a_block_are_looked_for_in_one_piece(side, monkeypatch):
+def test_decks_of_a_block_are_looked_for_in_one_piece(monkeypatch):
     """In squares each would be looked at with as much around as the whole, four times the work."""
     found = []
 
@@ -345,10 +261,10 @@ def test_decks_of_a_block_are_looked_for_in_one_piece(side, monkeypatch):
     monkeypatch.setattr(groundblocks, "levels_near_decks", levels)
     options = FilterOptions(decks=True)
     away = reach_of_block(options) + 40
-    axes = np.meshgrid(*[np.arange(-away, side + away, 8) + 0.5] * 2)
-    cells_of_block(*(axis.ravel() for axis in axes), np.zeros(axes[0].size), (0, 0), options, side=side)
+    axes = np.meshgrid(*[np.arange(-away, BLOCK_SIDE + away, 8) + 0.5] * 2)
+    cells_of_block(*(axis.ravel() for axis in axes), np.zeros(axes[0].size), (0, 0), options)
     ((across, along, largest),) = found
-    assert side < across * along <= largest
+    assert BLOCK_SIDE < across * along <= largest
 
 
 def test_a_block_without_points_has_no_cells():

@@ -7,7 +7,7 @@ import pytest
 
 import pdal_stages as ps
 from pdal_stages.tiling import run_tiled
-from pdal_stages.tiling.rasters import on_one_grid, remarks
+from pdal_stages.tiling.writeroptions import on_one_grid
 
 WRITER = {"type": "writers.gdal", "filename": "r_#.tif", "resolution": 0.2}
 
@@ -38,10 +38,6 @@ def test_what_is_placed_or_moved_stays():
     moving = [{"type": "filters.reprojection", "out_srs": "EPSG:4326"}, WRITER]
     assert on_one_grid([placed], (0, 0, 1, 1), half_open=True) == [placed]
     assert on_one_grid(moving, (0, 0, 1, 1), half_open=True) == moving
-    assert remarks([placed], 10.0) == []
-    assert "grids of their own" in remarks(moving, 10.0)[0]
-    assert any("take tiles of 10" in line for line in remarks([{**WRITER, "resolution": 2.5}], 9.0))
-    assert len(remarks([WRITER], 10.0)) == 1
 
 
 @pytest.mark.pdal

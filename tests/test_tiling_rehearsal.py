@@ -9,7 +9,7 @@ import pytest
 
 import pdal_stages as ps
 from pdal_stages.tiling import run_tiled
-from pdal_stages.tiling.tile_task import TileTask
+from pdal_stages.tiling.tile import TileTask
 
 pytestmark = pytest.mark.pdal
 

@@ -117,7 +117,7 @@ def _train(options: argparse.Namespace) -> None:
     from ..pipeline.inputs_outputs import input_files, overlooked
     from ..pipeline.training import surveys_of
     from ..stages.loading import load_model
-    from ..tiling.command import options_of, run_training
+    from ..tiling.command import interruptible, options_of
     from ..tiling.training import TrainTask
 
     named = ("classes", "neighborhoods", "feature_set", "count", "trees", "base", "passes")
@@ -127,7 +127,8 @@ def _train(options: argparse.Namespace) -> None:
     if options.surveys is not None:
         surveys = surveys_of(files, options.surveys)
     task = TrainTask(files, options.model, options.overrides, extra, options_of(options), surveys)
-    said = run_training(task)
+    with interruptible():
+        said = task.run()
     # Nothing is said of one written into a pipe or device
     text = str(load_model(options.model)) if Path(options.model).is_file() else ""
     score = text.partition("\n")[0]

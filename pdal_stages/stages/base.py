@@ -121,8 +121,6 @@ class Stage(ABC):
 
     #: In tiles: what :meth:`made_of_blocks` gave.
     from_blocks: Any = None
-    #: Side of the blocks, meters, where it is another than :meth:`blocks` says.
-    block_side: float | None = None
     #: In tiles: a dimension below zero for points whose results are used; only they are counted in reports.
     own_points: str = ""
     #: Whether stages before it in the pipeline make what it makes too.

@@ -167,10 +167,6 @@ of Z.
             self.decks,
         )
 
-    @property
-    def _block_cells(self) -> int:
-        return BLOCK_SIDE if self.block_side is None else round(self.block_side / self.cell)
-
     def left_of(self, points: Points) -> Left:
         x, y, z = points.axes
         usable = points.usable(self.ignore)
@@ -181,14 +177,14 @@ of Z.
         left = np.flatnonzero(chosen)
         return Left(
             np.column_stack([x[left], y[left], z[left]]),
-            by_block(x, y, z, usable, self.cell, self._block_cells),
+            by_block(x, y, z, usable, self.cell),
         )
 
     def block_of(
         self, around: NDArray[np.float64], inside: Iterable[NDArray[np.float64]], block: tuple[int, int]
     ) -> dict[str, NDArray]:
         x, y, z = around.T
-        return cells_of_block(x, y, z, block, self._filter, inside, self._block_cells).in_parts(_PART)
+        return cells_of_block(x, y, z, block, self._filter, inside).in_parts(_PART)
 
     def needed_of_blocks(self, box: Sequence[float]) -> set[str]:
         return GroundCells.names_within(_PART, *self._cells_in(box))

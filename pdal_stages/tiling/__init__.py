@@ -4,12 +4,12 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from .outcome import TiledRun
+    from .report import TiledRun
+    from .run import run_tiled
     from .settings import TilingOptions
-    from .tiledrun import run_tiled
 
 __all__ = ["TiledRun", "TilingOptions", "run_tiled"]
-_WHERE = {"TiledRun": "outcome", "TilingOptions": "settings", "run_tiled": "tiledrun"}
+_WHERE = {"TiledRun": "report", "TilingOptions": "settings", "run_tiled": "run"}
 
 
 def __getattr__(name: str):

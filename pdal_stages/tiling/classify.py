@@ -18,12 +18,11 @@ from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of
 from ..pipeline.run import Pipeline
 from ..pipeline.workers import each_file
-from .oneformat import one_format
-from .outcome import FileJob, TiledRun, TileJob, left_alone
-from .settings import TilingOptions
-from .sizing import fits_whole
-from .tiledrun import run_plan
-from .tileplan import TilePlan, make_plan
+from .plan import TilePlan, make_plan
+from .report import Job, TiledRun, left_alone
+from .run import run_plan
+from .settings import TilingOptions, fits_whole
+from .writeroptions import one_format
 
 
 @dataclass
@@ -73,8 +72,9 @@ class ClassifyTask:
 
     def in_one_piece(self) -> bool:
         """Whether the only input is a file that fits into memory, and nothing asks for tiles."""
-        asked = self.options.tile is not None or self.options.per != "auto" or self.options.scheduler
-        if len(self.files) > 1 or asked or self.options.resume:
+        options = self.options
+        asked = options.tile is not None or options.per != "auto" or options.scheduler or options.resume
+        if len(self.files) > 1 or asked:
             return False
         if not is_las(self.files[0]):
             return not is_ept(self.files[0])
@@ -82,18 +82,12 @@ class ClassifyTask:
             header = las.read_header(self.files[0])
         except OSError:
             header = None  # said when it is read
-        return header is None or fits_whole(header.count, self.options.memory)
+        return header is None or fits_whole(header.count, options.memory)
 
     # ---- in one piece ------------------------------------------------------------------------------------
 
-    def outputs(self) -> list[str]:
-        """An output for each input.
-
-        Raises
-        ------
-        StageError
-            If one cannot be written, or is an input.
-        """
+    def _checked_outputs(self) -> list[str]:
+        """An output for each input, in folders that are made; StageError where one cannot be written, or is an input."""
         outputs = outputs_of(self.files, self.output)
         self._make_folders(outputs)
         check_outputs([Output(name) for name in outputs], self.files)
@@ -101,7 +95,7 @@ class ClassifyTask:
 
     def _make_folders(self, outputs: list[str]) -> None:
         """Make the output folder, and those in it that outputs lie in."""
-        if not self._in_folder:
+        if not is_folder(self.output):
             return
         for folder in sorted({Path(self.output), *(Path(name).parent for name in outputs)}):
             try:
@@ -113,7 +107,7 @@ class ClassifyTask:
 
     def run_whole(self) -> Written:
         """Classify the only input in one piece."""
-        (source,), (target,) = self.files, self.outputs()
+        (source,), (target,) = self.files, self._checked_outputs()
         return classify_file(replace(self.request), source, target, self.metadata, self.log)
 
     def run_each(self, apart: bool = False) -> Iterator[tuple[str, Written | str]]:
@@ -121,25 +115,30 @@ class ClassifyTask:
 
         `apart`: in processes of their own, so that one may crash, and Ctrl-C is heard here.
         """
-        outputs = self.outputs()
-        work = [(replace(self.request), *pair, "", "") for pair in zip(self.files, outputs, strict=True)]
+        outputs = self._checked_outputs()
+        work = [(replace(self.request), *pair) for pair in zip(self.files, outputs, strict=True)]
         workers = max(1, self.options.local_workers)
-        for (_, source, *_), answer in each_file(classify_file, work, workers, apart=apart):
+        for (_, source, _), answer in each_file(classify_file, work, workers, apart=apart):
             yield source, answer.reason or answer.result
 
     # ---- in tiles ----------------------------------------------------------------------------------------
 
+    @property
+    def _per_tile(self) -> bool:
+        return self.options.per == "tile" or any(map(is_ept, self.files))
+
     @cached_property
     def _pipeline(self) -> Pipeline:
         """What is done, of one input of each kind."""
-        readers = {("readers.ept" if is_ept(name) else "readers.las"): name for name in reversed(self.files)}
-        heads: list[dict[str, Any]] = [
-            {"type": kind, "filename": name, "tag": "input"} for kind, name in readers.items()
-        ]
-        for head in heads:
-            if head["type"] == "readers.las":  # of LAS 1.0-1.3 PDAL leaves extra dimensions out unless told
-                head["use_eb_vlr"] = True
-        target = self._target()
+        heads: list[dict[str, Any]] = []
+        for kind, more in (("readers.las", {"use_eb_vlr": True}), ("readers.ept", {})):
+            # Of LAS 1.0-1.3 PDAL leaves extra dimensions out unless told.
+            if names := [name for name in self.files if is_ept(name) == (kind == "readers.ept")]:
+                heads.append({"type": kind, "filename": names[0], "tag": "input", **more})
+        target = named = self.output
+        if is_folder(self.output):  # '#' may stand for a name with its suffix: always that of a LAS file
+            target = str(Path(self.output) / ("#.laz" if self._per_tile else "#"))
+            named = "x.laz"
         if target.lower().endswith(".copc.laz"):
             raise OptionError(
                 "outputs of tiles are plain LAS or LAZ",
@@ -147,10 +146,7 @@ class ClassifyTask:
                 cure="Name them .laz and convert them afterwards, pdal translate o.laz o.copc.laz. Tiles are for "
                 "several inputs, clouds too large for the memory, --tile, --per, --resume and --report",
             )
-        # In a folder '#' may stand for a name with its suffix: always that of a LAS file.
-        named = "x.laz" if self._in_folder else target
-        per_tile = self.options.per == "tile" or any(map(is_ept, self.files))
-        alike = one_format(self.files) if per_tile else {}
+        alike = one_format(self.files) if self._per_tile else {}
         writer = {**self.request.writer(named), "filename": target, **alike}
         return Pipeline([*heads, *self.request.stages, writer], self.request.overrides, whole=False)
 
@@ -162,34 +158,18 @@ class ClassifyTask:
         StageError
             For whatever is wrong with model or options, before any point is read.
         """
-        pipeline = self._pipeline
-        plan = make_plan(pipeline, self.options.buffer)
+        plan = make_plan(self._pipeline, self.options.buffer)
         beside = self.request.beside
-        tail_only = len(plan.tail) == 1 and beside is not None
-        kinds_of_readers = {reader["type"] for reader in plan.readers}
-        files = {
-            kind: [n for n in self.files if is_ept(n) == (kind == "readers.ept")] for kind in kinds_of_readers
-        }
+        for reader in plan.readers:
+            reader["filename"] = [n for n in self.files if is_ept(n) == (reader["type"] == "readers.ept")]
         return replace(
             plan,
-            readers=[{**reader, "filename": files[reader["type"]]} for reader in plan.readers],
-            creates=["Classification", *(beside or {})] if tail_only and plan.creates else plan.creates,
-            makes=plan.makes if beside is None else beside,
+            creates=["Classification", *beside] if len(plan.tail) == 1 and plan.creates else plan.creates,
+            makes=beside,
             beside=beside,
-            whole_names=self._in_folder and self.options.per != "tile",
+            whole_names=is_folder(self.output) and self.options.per != "tile",
             name=self.request.model,
         )
-
-    @property
-    def _in_folder(self) -> bool:
-        return is_folder(self.output)
-
-    def _target(self) -> str:
-        """The output with '#' where the input's name goes, or the tile's."""
-        if not self._in_folder:
-            return self.output
-        tiles = self.options.per == "tile" or any(map(is_ept, self.files))
-        return str(Path(self.output) / ("#.laz" if tiles else "#"))
 
     def run_tiles(
         self,
@@ -198,36 +178,26 @@ class ClassifyTask:
         finished: Callable[[Written], None] | None = None,
     ) -> TiledRun:
         """Classify all inputs in tiles; `finished` hears of every output that was written."""
-        outputs: list[str] = []
-        if self.options.per != "tile" and not any(map(is_ept, self.files)):
-            outputs = outputs_of(self.files, self.output)  # which says what is wrong with names
+        outputs = (
+            [] if self._per_tile else outputs_of(self.files, self.output)
+        )  # says what is wrong with names
         plan = self.plan()
         if not dry_run:
             self._make_folders(outputs)
         more = [("metadata", self.metadata, kinds.JSON), ("log", self.log, "")]
         check_outputs([Output(name, what, kind) for what, name, kind in more if name], self.files)
 
-        def finished_one(job: TileJob | FileJob) -> None:
-            if finished is not None:
-                for path in (job.outputs or [])[:1]:
-                    classes = {int(code): n for code, n in job.record.get("classes", {}).items()}
-                    finished(Written(path, job.record.get("written", 0), classes))
+        def finished_one(job: Job) -> None:
+            if finished is not None and job.outputs:
+                classes = {int(code): n for code, n in job.record.get("classes", {}).items()}
+                finished(Written(job.outputs[0], job.record.get("written", 0), classes))
 
-        return run_plan(
-            plan,
-            self.options,
-            dry_run=dry_run,
-            finished=finished_one,
-            source=self._pipeline.source,
-        )
+        source = self._pipeline.source
+        return run_plan(plan, self.options, dry_run=dry_run, finished=finished_one, source=source)
 
 
 def classify_file(
-    request: ClassifyRequest,
-    source: str,
-    target: str,
-    metadata: str = "",
-    log: str = "",
+    request: ClassifyRequest, source: str, target: str, metadata: str = "", log: str = ""
 ) -> Written:
     """Classify a file in one piece; `metadata` and `log` are files that are written beside."""
     pipeline = request.pipeline(source, target)
@@ -236,9 +206,9 @@ def classify_file(
     count = pipeline.execute(arrays=False, loglevel=logging.WARNING)
     if metadata:
         write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
-    reports = [each[-1].figures for _, each in pipeline.reports if each]
-    after = [each[-1].codes for _, each in pipeline.reports if each and each[-1].codes is not None]
-    classes = {int(code): n for code, n in after[-1].items()} if after and after[-1] else {}
-    counts = left_alone(reports)
+    reports = [each[-1] for _, each in pipeline.reports if each]
+    codes = [report.codes for report in reports if report.codes is not None]
+    classes = {int(code): n for code, n in (codes[-1] if codes else {}).items()}
     messages = [*(f"PDAL says: {line}" for line in pipeline.log_lines), *pipeline.messages]
+    counts = left_alone(report.figures for report in reports)
     return Written(target, count, classes, counts, messages, pipeline.metadata)

@@ -8,7 +8,7 @@ import pickle
 import socket
 import time
 from collections.abc import Callable, Iterable
-from concurrent.futures import CancelledError
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import Any
 
 from ..base.errors import StageError, optional_import
@@ -21,27 +21,28 @@ from .settings import TilingOptions
 _WAIT = 120.0
 #: Seconds after which it is asked whether scheduler and workers are still there.
 _ASK = 10.0
+_RESUME = "Once it is there again, --resume goes on"
+_SAME = "Install the same versions of pdal-stages and PDAL on all hosts"
 
 
 class Cluster(contextlib.AbstractContextManager):
     """Tasks on the workers of a scheduler, one at a time on each; they may join and leave."""
 
     def __init__(self, options: TilingOptions, folder: str) -> None:
-        self.address, self.folder = options.scheduler, folder
-        self._out: set[Any] = set()
-        self._slots = 1
+        self.address, self.folder, self.slots = options.scheduler, folder, 1
 
     def __enter__(self) -> Cluster:
-        self._dask: Any = optional_import("distributed", "dask", "a Dask scheduler (--scheduler)")
-        try:
-            self._client = self._dask.Client(self.address, timeout=10, set_as_default=False)
-        except (OSError, ValueError) as error:  # ValueError: an address of another kind
-            raise StageError(
-                "the Dask scheduler cannot be reached",
-                found=f"{self.address}: {error}",
-                cure="Is dask scheduler running there, and is that the address it printed?",
-            ) from None
-        try:
+        dask: Any = optional_import("distributed", "dask", "a Dask scheduler (--scheduler)")
+        with contextlib.ExitStack() as stack:
+            try:
+                self._client = dask.Client(self.address, timeout=10, set_as_default=False)
+            except (OSError, ValueError) as error:  # ValueError: an address of another kind
+                raise StageError(
+                    "the Dask scheduler cannot be reached",
+                    found=f"{self.address}: {error}",
+                    cure="Is dask scheduler running there, and is that the address it printed?",
+                ) from None
+            stack.callback(self._client.close)
             with contextlib.suppress(TimeoutError):
                 self._client.wait_for_workers(1, timeout=_WAIT)
             threads = self._client.nthreads()
@@ -50,24 +51,16 @@ class Cluster(contextlib.AbstractContextManager):
                     "the scheduler has no workers", found=self.address, cure="Start dask worker on some hosts"
                 )
             self._check_workers()
-        except BaseException:
-            self._client.close()
-            raise
-        # One tile at a time in a process; what Dask calls its threads are the cores it may use.
-        self.threads = max(1, min(threads.values()))
+            # One tile at a time in a process; what Dask calls its threads are the cores it may use.
+            self.slots, self.threads = len(threads), max(1, min(threads.values()))
+            self._executor = self._client.get_executor(pure=False)
+            self._leave = stack.pop_all()
         return self
 
     def __exit__(self, *exc: object) -> None:
         with contextlib.suppress(Exception):
-            self._client.cancel(list(self._out), force=True)
-        self._client.close()
-
-    @property
-    def slots(self) -> int:
-        """How many workers there are."""
-        with contextlib.suppress(Exception):  # lost, or closed
-            self._slots = max(1, len(self._client.nthreads()))
-        return self._slots
+            self._executor.shutdown(wait=False)  # which cancels what waits
+        self._leave.close()
 
     def _check_workers(self) -> None:
         """Refuse workers whose results would not be those of this program, or would not get here."""
@@ -78,44 +71,33 @@ class Cluster(contextlib.AbstractContextManager):
         for reason in filter(None, found.values()):
             raise StageError(reason)
 
-    def submit(self, task: Callable[[], Any]) -> Any:
+    def submit(self, task: Callable[[], Any]) -> Future:
         """Send a task; as bytes, because Dask would look for its own keys in all that it holds."""
-        given = _versions(), self.folder, socket.gethostname(), pickle.dumps(task)
-        with self._lost():
-            future = self._client.submit(perform_for, *given, pure=False)
-        self._out.add(future)
-        return future
+        try:
+            return self._executor.submit(
+                perform_for, _versions(), self.folder, socket.gethostname(), pickle.dumps(task)
+            )
+        except (OSError, RuntimeError):
+            raise _lost() from None
 
-    def wait(self, futures: Iterable[Any]) -> set[Any]:
+    def wait(self, futures: Iterable[Future]) -> set[Future]:
         """Those that are done, at least one; StageError where scheduler or workers are lost."""
         gone: float | None = None
         while True:
-            try:
-                with self._lost(), self._client.as_current():
-                    done = self._dask.wait(list(futures), timeout=_ASK, return_when="FIRST_COMPLETED").done
-                self._out -= done
+            done = wait(list(futures), timeout=_ASK, return_when=FIRST_COMPLETED).done
+            if self._client.status != "running" or any(future.cancelled() for future in done):
+                raise _lost()
+            if done:
                 return done
-            except (TimeoutError, self._dask.TimeoutError):
-                pass
-            with self._lost():
-                if self._client.status != "running":
-                    raise OSError
-                gone = None if self._client.nthreads() else gone or time.monotonic()
+            with contextlib.suppress(OSError, TimeoutError):
+                self.slots = len(self._client.nthreads())
+            gone = None if self.slots else gone or time.monotonic()
             if gone is not None and time.monotonic() - gone > _WAIT:
                 raise StageError("all workers of the Dask scheduler are gone", cure=_RESUME)
 
-    @contextlib.contextmanager
-    def _lost(self):
-        try:
-            yield
-        except (TimeoutError, self._dask.TimeoutError):
-            raise
-        except (OSError, RuntimeError, CancelledError):
-            raise StageError("the Dask scheduler cannot be reached any more", cure=_RESUME) from None
 
-
-_RESUME = "Once it is there again, --resume goes on"
-_SAME = "Install the same versions of pdal-stages and PDAL on all hosts"
+def _lost() -> StageError:
+    return StageError("the Dask scheduler cannot be reached any more", cure=_RESUME)
 
 
 def _versions() -> tuple[str, str]:

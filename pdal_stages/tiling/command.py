@@ -8,11 +8,10 @@ import shlex
 import signal
 import threading
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ..base.asprs import class_name
 from ..base.errors import OptionError, StageError
@@ -23,47 +22,38 @@ from ..pipeline.inputs_outputs import is_ept, is_folder, is_las
 from ..pipeline.read import PipelineSource
 from ..pipeline.run import Pipeline
 from .classify import ClassifyTask, Written
-from .outcome import LEFT_ALONE, FoundObjects, InterruptedRun, TiledRun
+from .plan import make_plan
+from .report import LEFT_ALONE, FoundObjects, InterruptedRun, TiledRun
+from .run import run_tiled
 from .settings import PER, TilingOptions
-from .tiledrun import run_tiled
-from .tileplan import make_plan
 
-if TYPE_CHECKING:
-    from .training import TrainTask
+#: Failures printed, and tiles of a dry run.
+_MOST_FAILURES, _MOST_TILES = 20, 50
 
 
 def add_arguments(command: argparse.ArgumentParser, survey: bool = False) -> None:
     """Add the flags to the parser of ``pipeline``, or of ``classify`` (a `survey`)."""
     when = "Several inputs, and files too large for memory, are cut into tiles" if survey else "Run in tiles"
-    group = command.add_argument_group("large areas", f"{when}; see docs/large-areas.md.")
-    takes = group.add_argument
-    _add_sizes(takes)
+    takes = _add_sizes(command, f"{when}; see docs/large-areas.md.")
     takes("--scheduler", default="", metavar="ADDRESS", help="A running Dask scheduler, tcp://HOST:8786")
     takes("--per", choices=PER, default="auto", help="One output per input file or per tile (auto: per file)")
-    takes(
-        "--buffer",
-        type=float,
-        metavar="METERS",
-        help=argparse.SUPPRESS if survey else "Surroundings for PDAL filters that look at neighbors",
-    )
+    surroundings = "Surroundings for PDAL filters that look at neighbors"
+    takes("--buffer", type=float, metavar="METERS", help=argparse.SUPPRESS if survey else surroundings)
     takes("--resume", action="store_true", help="Keep what an earlier run in this folder finished")
     takes("--dry-run", action="store_true", help="Show the tiles and an estimate, then stop")
-    takes(
-        "--report",
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="Write a report, .html or .json; may be repeated",
-    )
+    report = "Write a report, .html or .json; may be repeated"
+    takes("--report", action="append", default=[], metavar="FILE", help=report)
 
 
 def add_tile_arguments(command: argparse.ArgumentParser) -> None:
     """Add the flags of ``train``, whose only output is a model."""
-    what = "Points that do not fit into the memory are worked on in tiles; the model is the same."
-    _add_sizes(command.add_argument_group("large areas", what).add_argument)
+    _add_sizes(
+        command, "Points that do not fit into the memory are worked on in tiles; the model is the same."
+    )
 
 
-def _add_sizes(takes: Callable) -> None:
+def _add_sizes(command: argparse.ArgumentParser, what: str) -> Callable:
+    takes = command.add_argument_group("large areas", what).add_argument
     takes(
         "--tile",
         type=_side,
@@ -81,6 +71,7 @@ def _add_sizes(takes: Callable) -> None:
         metavar="N",
         help="Worker processes; 0 runs everything in this process (default: half the cores)",
     )
+    return takes
 
 
 def _side(text: str) -> float | str:
@@ -99,32 +90,23 @@ def options_of(options: argparse.Namespace) -> TilingOptions:
     return TilingOptions(**chosen)
 
 
+def _refuse(
+    options: argparse.Namespace, names: Iterable[str], needs: str, found: str | None, cure: str
+) -> None:
+    """Refuse flags that mean nothing here."""
+    for name in names:
+        value = getattr(options, name)
+        if (value not in (None, "", "auto", []) and value is not False) or (name == "tile" and value):
+            flag = f"--{name.replace('_', '-')}"
+            raise OptionError(f"{flag} needs {needs}", found=found, cure=cure.replace("FLAG", flag))
+
+
 def wants_tiles(options: argparse.Namespace) -> bool:
-    """Whether a run in tiles is asked for."""
-    if options.tile is not None:
-        return True
-    given = {
-        "--memory": options.memory is not None,
-        "--workers": options.workers is not None,
-        "--scheduler": options.scheduler,
-        "--per": options.per != "auto",
-        "--buffer": options.buffer is not None,
-        "--resume": options.resume,
-        "--dry-run": options.dry_run,
-        "--report": options.report,
-    }
-    for flag, used in given.items():
-        if used:
-            raise OptionError(
-                f"{flag} needs --tile", cure="Give the side of the tiles, e.g. --tile 500, or --tile auto"
-            )
-    return False
-
-
-def run_training(task: TrainTask) -> list[str]:
-    """Train in tiles; what is to be told."""
-    with interruptible():
-        return task.run()
+    """Whether ``pipeline`` is asked for a run in tiles."""
+    if options.tile is None:
+        names = ("memory", "workers", "scheduler", "per", "buffer", "resume", "dry_run", "report")
+        _refuse(options, names, "--tile", None, "Give the side of the tiles, e.g. --tile 500, or --tile auto")
+    return options.tile is not None
 
 
 def run_command(options: argparse.Namespace, source: Path | PipelineSource) -> int:
@@ -136,14 +118,38 @@ def run_command(options: argparse.Namespace, source: Path | PipelineSource) -> i
         make_plan(pipeline, chosen.buffer)
         print(pipeline.validate())
         return 0
-    interrupted = False
-    with interruptible():
-        try:
-            run = run_tiled(pipeline, chosen, dry_run=options.dry_run)
-        except InterruptedRun as stopped:
-            run, interrupted = stopped.run, True
+    run, interrupted = _ran(lambda: run_tiled(pipeline, chosen, dry_run=options.dry_run))
     _print_dry(run) if options.dry_run else _print(run)
     return _end(options, run, "run it again with --resume" if interrupted else "")
+
+
+def _ran(go: Callable[[], TiledRun]) -> tuple[TiledRun, bool]:
+    """What a run did, and whether it was interrupted."""
+    with interruptible():
+        try:
+            return go(), False
+        except InterruptedRun as stopped:
+            return stopped.run, True
+
+
+@contextmanager
+def interruptible():
+    """A run stopped by a service manager or batch system cleans up like one stopped by Ctrl-C."""
+    try:
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    except ValueError:  # not in the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def end_at_once(options: argparse.Namespace) -> None:
+    """Ctrl-C ends the program although PDAL works: Python cannot handle signals meanwhile. The next run sweeps up."""
+    if options.is_program and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _check_reports(options: argparse.Namespace) -> None:
@@ -157,19 +163,25 @@ def _check_reports(options: argparse.Namespace) -> None:
 
 def _end(options: argparse.Namespace, run: TiledRun, again: str) -> int:
     """Write reports; the exit code. `again`: of an interrupted run, how to go on."""
-    if options.metadata:
-        _write_json(options.metadata, run, "--metadata")
-    for name in options.report:
-        _write_report(name, run)
+    reports = [(name, "--report") for name in options.report]
+    for name, flag in [(options.metadata, "--metadata"), *reports] if options.metadata else reports:
+        if Path(name).suffix.lower() == ".json" or flag == "--metadata":
+            try:
+                write_whole(name, (json.dumps(run.to_dict(), indent=1) + "\n").encode())
+            except StageError as error:
+                raise error.at(flag) from None
+        else:
+            from ..reports.runpage import write_run_report
+
+            write_run_report(name, run.to_dict(), run.objects.picture if run.objects else None)
     if not again:
         return 1 if run.failures else 0
     states = run.summary["states"]
-    done = states["done"] + states["kept"]
     files = sum(out.state in ("done", "kept") for out in run.outputs)
     written = f"{files:,} of {_counted(len(run.outputs), 'file')} written, " if run.outputs else ""
     print_messages(
-        f"interrupted; nothing half-written was left. {written}{done:,} of {_counted(len(run.tiles), 'tile')} done. "
-        f"For the rest: {again}"
+        f"interrupted; nothing half-written was left. {written}{states['done'] + states['kept']:,} of "
+        f"{_counted(len(run.tiles), 'tile')} done. For the rest: {again}"
     )
     return 130
 
@@ -183,12 +195,17 @@ def classify(
     """Run ``pdal-stages classify``; the exit code, 1 where anything failed. `then`: what is done with whole outputs."""
     _check_reports(options)
     if not task.can_be_cut:
-        _refuse_tiles(task, options)
+        _refuse(
+            options,
+            ("tile", "memory", "per", "scheduler", "buffer", "resume", "report"),
+            "inputs that can be cut into tiles: LAS, LAZ, COPC or EPT",
+            next(name for name in task.files if not is_las(name) and not is_ept(name)),
+            "Convert them first: pdal translate INPUT input.laz; or leave FLAG out",
+        )
     names = {code: one_line(name) for code, name in task.request.loaded.classes}
     if options.dry_run and (task.in_one_piece() or not task.can_be_cut):
-        task.request.pipeline(
-            task.files[0], str(Path(task.output) / "dry-run.laz") if is_folder(task.output) else task.output
-        )
+        target = str(Path(task.output) / "dry-run.laz") if is_folder(task.output) else task.output
+        task.request.pipeline(task.files[0], target)
         print(f"{_counted(len(task.files), 'input')}, each in one piece")
         return 0
     if task.in_one_piece() and not options.report:
@@ -197,30 +214,33 @@ def classify(
         print_messages(*written.messages)
         print(f"{_counted(written.points, 'point')} written to {written.path}")
         _print_classes([written], names)
-        if then is not None:
-            then()
-        return 0
-    if not task.can_be_cut:
+        code = 0
+    elif not task.can_be_cut:
         code = _classify_each(task, options, names)
-        if then is not None and code == 0:
-            then()
-        return code
+    else:
+        return _classify_tiles(task, options, names, then)
+    if then is not None and code == 0:
+        then()
+    return code
+
+
+def _classify_tiles(
+    task: ClassifyTask,
+    options: argparse.Namespace,
+    names: Mapping[int, str],
+    then: Callable[[], FoundObjects] | None,
+) -> int:
     done: list[Written] = []
 
     def finished(written: Written) -> None:
         done.append(written)
-        print(f"{written.path}: {_counted(written.points, 'point')}{_shares(written, names)}", flush=True)
+        _print_written(written, names)
 
-    interrupted = False
-    with interruptible():
-        try:
-            run = task.run_tiles(dry_run=options.dry_run, finished=finished)
-        except InterruptedRun as stopped:
-            run, interrupted = stopped.run, True
+    run, interrupted = _ran(lambda: task.run_tiles(dry_run=options.dry_run, finished=finished))
     if options.dry_run:
         _print_dry(run)
     else:
-        _print(run, "files" if run.outputs else "")
+        _print(run)
         _print_classes(done, names, run.summary["left_alone"])
         if then is not None and not interrupted and not run.failures:
             try:
@@ -228,109 +248,64 @@ def classify(
             except StageError:
                 _end(options, run, "")
                 raise
-    return _end(options, run, _again(options) if interrupted else "")
-
-
-def _again(options: argparse.Namespace) -> str:
-    """The command that goes on where this one stopped."""
     words = [word for word in options.arguments if word != "--resume"]
     same = shlex.join(["pdal-stages", *words]) if len(words) <= 20 else "the same command with"
-    return f"{same} --resume"
-
-
-def _refuse_tiles(task: ClassifyTask, options: argparse.Namespace) -> None:
-    """Flags that mean nothing for inputs of which parts cannot be read."""
-    asked = {
-        flag: getattr(options, flag) not in (None, False, "", "auto", [])
-        for flag in ("tile", "memory", "per", "scheduler", "buffer", "resume", "report")
-    }
-    asked["tile"] = options.tile is not None  # auto is a wish as well
-    for flag, used in asked.items():
-        if used:
-            raise OptionError(
-                f"--{flag} needs inputs that can be cut into tiles: LAS, LAZ, COPC or EPT",
-                found=next(name for name in task.files if not is_las(name) and not is_ept(name)),
-                cure=f"Convert them first: pdal translate INPUT input.laz; or leave --{flag} out",
-            )
+    return _end(options, run, f"{same} --resume" if interrupted else "")
 
 
 def _classify_each(task: ClassifyTask, options: argparse.Namespace, names: Mapping[int, str]) -> int:
-    """Inputs of which parts cannot be read, one after the other."""
-    messages = _MessagesOnce()
+    """Inputs of which parts cannot be read, one after the other; what is said of several is said of the first."""
     done: dict[str, Written] = {}
     failed: dict[str, str] = {}
+    said: set[str] = set()
     interrupted = False
+    if len(task.files) > 1:
+        print_messages("each file is classified by itself: only LAS, LAZ, COPC and EPT can be cut into tiles")
     try:
         for source, what in task.run_each(apart=options.is_program):
-            if isinstance(what, Written):
-                done[source] = what
-                print(f"{what.path}: {_counted(what.points, 'point')}{_shares(what, names)}", flush=True)
-            else:
+            if isinstance(what, str):
                 failed[source] = what
-            for line in [what] if isinstance(what, str) else what.messages:
-                messages.add(source, line)
+                print_messages(f"{source}: {what.removeprefix(f'{source}: ')}")
+                continue
+            done[source] = what
+            _print_written(what, names)
+            new = [line for line in what.messages if line.removeprefix(f"{source}: ") not in said]
+            said |= {line.removeprefix(f"{source}: ") for line in new}
+            print_messages(*(f"{source}: {line.removeprefix(f'{source}: ')}" for line in new))
     except KeyboardInterrupt:
         interrupted = True
-    messages.end()
-    if len(task.files) > 1:
-        print_messages(
-            "each file was classified by itself: only LAS, LAZ, COPC and EPT inputs can be cut into tiles"
-        )
     _print_classes([done[source] for source in task.files if source in done], names)
     if options.metadata:
         files = [
-            {"input": source}
-            | ({"output": done[source].path, "metadata": done[source].metadata} if source in done else {})
-            | ({} if source in done else {"error": failed.get(source, "not done")})
+            {"input": source, "output": done[source].path, "metadata": done[source].metadata}
+            if source in done
+            else {"input": source, "error": failed.get(source, "not done")}
             for source in task.files
         ]
         text = json.dumps({"files": files}, indent=2, default=str)
         write_whole(options.metadata, (text + "\n").encode())
-    if failed:
-        print_messages(f"{len(failed)} of {_counted(len(task.files), 'file')} failed")
     if interrupted:
-        left = [source for source in task.files if source not in done and source not in failed]
         print_messages(
-            f"interrupted; {len(done)} of {len(task.files)} files are finished and whole, of the others nothing was left. "
-            f"Still to be done: {', '.join(left[:5])}{f' and {len(left) - 5:,} more' * (len(left) > 5)}"
+            f"interrupted; {len(done)} of {len(task.files)} files are finished and whole, of the others nothing was left"
         )
         return 130
+    if failed:
+        print_messages(f"{len(failed)} of {_counted(len(task.files), 'file')} failed")
     return 1 if failed else 0
 
 
-def end_at_once(options: argparse.Namespace) -> None:
-    """Ctrl-C ends the program although PDAL works: Python cannot handle signals meanwhile. The next run sweeps up."""
-    if options.is_program and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
+# ---- what is printed ---------------------------------------------------------------------------------------
 
 
-class _MessagesOnce:
-    """Messages about many files: printed at once for the first, and in the end which others have it."""
-
-    def __init__(self) -> None:
-        self._files: dict[str, list[str]] = {}
-
-    def add(self, file: str, text: str) -> None:
-        text = text.removeprefix(f"{file}: ")
-        if text not in self._files:
-            print_messages(f"{file}: {text}")
-        self._files.setdefault(text, []).append(file)
-
-    def end(self) -> None:
-        for text, (_, *others) in self._files.items():
-            if others:
-                more = f" and {len(others) - 3:,} more" if len(others) > 3 else ""
-                print_messages(f"also {', '.join(others[:3])}{more}: {text}")
-
-
-def _shares(written: Written, names: Mapping[int, str]) -> str:
-    """``; 2 ground 61.3 %, 6 building 12.0 %``"""
+def _print_written(written: Written, names: Mapping[int, str]) -> None:
+    """``out.laz: 500 points; 2 ground 61.3 %, 6 building 12.0 %``"""
     total = sum(written.classes.values())
     shares = [
         f"{code} {names.get(code, class_name(code))} {100.0 * n / total:.1f} %"
         for code, n in sorted(written.classes.items())
     ]
-    return f"; {', '.join(shares)}" if shares else ""
+    said = f"; {', '.join(shares)}" if shares else ""
+    print(f"{written.path}: {_counted(written.points, 'point')}{said}", flush=True)
 
 
 def _print_classes(
@@ -349,83 +324,52 @@ def _print_classes(
             print(f"  {what:32s} {counts[key]:>12,}")
 
 
-@contextmanager
-def interruptible():
-    """A run stopped by a service manager or batch system cleans up like one stopped by Ctrl-C."""
-    try:
-        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    except ValueError:  # not in the main thread
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-def _print(run: TiledRun, unit: str = "") -> None:
+def _print(run: TiledRun) -> None:
     s = run.summary
-    states = s["states"]
-    line = f"{_counted(states['done'], 'tile')} done"
-    if states["kept"]:
-        line += f", {states['kept']} kept from an earlier run"
-    if states["failed"]:
-        line += f", {states['failed']} failed"
-    if unit:
-        files = [sum(out.state == state for out in run.outputs) for state in ("done", "kept", "failed")]
-        more = [
-            f"{n:,} {what}"
-            for n, what in zip(files[1:], ("kept from an earlier run", "failed"), strict=True)
-            if n
-        ]
-        line = f"{_counted(files[0], 'file')} written{''.join(f', {words}' for words in more)}; {line}"
-    print(f"{line}; {s['points']:,} points in {s['seconds']:.1f} s ({s['points_per_second']:,.0f} points/s)")
+    lines = []
+    if run.outputs:
+        files = Counter(out.state for out in run.outputs)
+        lines.append(f"{_counted(files['done'], 'file')} written{_others(files)}")
+    lines.append(f"{_counted(s['states']['done'], 'tile')} done{_others(s['states'])}")
+    lines.append(f"{s['points']:,} points in {s['seconds']:.1f} s ({s['points_per_second']:,.0f} points/s)")
+    print("; ".join(lines))
     if s["dropped"]:
         print(f"{s['dropped']:,} points were dropped by filters of the pipeline")
-    failures = run.failures
-    print_messages(*run.messages, *(f"{what}: {reason}" for what, reason in failures[:20]))
-    if len(failures) > 20:
-        print_messages(f"and {len(failures) - 20} more; see --report")
-    if failures:
+    print_messages(*run.messages)
+    _print_failures(run)
+    if run.failures:
         print_messages("run it again with --resume to try only what failed")
+
+
+def _others(states: Mapping[str, int]) -> str:
+    told = {"kept": "kept from an earlier run", "failed": "failed"}
+    return "".join(f", {states[state]:,} {what}" for state, what in told.items() if states.get(state))
+
+
+def _print_failures(run: TiledRun) -> None:
+    failures = run.failures
+    print_messages(*(f"{what}: {reason}" for what, reason in failures[:_MOST_FAILURES]))
+    if len(failures) > _MOST_FAILURES:
+        print_messages(f"and {len(failures) - _MOST_FAILURES:,} more; see --report")
 
 
 def _print_dry(run: TiledRun) -> None:
     s = run.summary
+    workers = {0: "this process", 1: "the worker"}.get(s["workers"], f"each of {s['workers']} workers")
     print(f"{_counted(len(run.tiles), 'tile')} of {s['tile']:g}, each read with {s['halo_m']:g} m around it")
     print(f"{_counted(s['inputs'], 'input')}, {s['points']:,} points; one output for each {s['per']}")
     print(
-        f"about {s['points_read_by_a_tile']:,} points read for a tile, {s['points_of_largest_tile']:,} its own at most"
+        f"about {s['points_read_by_a_tile']:,} points read for a tile, {s['points_of_largest_tile']:,} its own"
     )
-    memory = s["memory_mb_of_a_worker"]
-    workers = {0: "this process", 1: "the worker"}.get(s["workers"], f"each of {s['workers']} workers")
-    print(f"up to {memory:,.0f} MB for {workers} with {_counted(s['threads_per_worker'], 'thread')}")
-    hours = f"roughly {s['core_hours']:.2f}" if s["core_hours"] >= 0.01 else "less than 0.01"
-    print(f"{hours} core hours, at {s['points_per_core_second']:,.0f} points/s and core; the model decides")
-    if s["disk_gb"] >= 0.01:
-        print(f"{s['disk_gb']:,.2f} GB of disk beside the outputs, until these are written")
-    for job in run.tiles[:50]:
-        print(f"  {job.name:24s} {job.points:>14,} points  {_counted(len(job.sources), 'input')}")
-    if len(run.tiles) > 50:
-        print(f"  and {len(run.tiles) - 50} more")
-    print_messages(*run.messages, *(f"{what}: {reason}" for what, reason in run.failures))
+    print(f"up to {s['memory_mb_of_a_worker']:,.0f} MB for {workers} with {s['threads_per_worker']} threads")
+    print(f"roughly {s['core_hours']:.2f} core hours, {s['disk_gb']:,.2f} GB of disk beside the outputs")
+    for job in run.tiles[:_MOST_TILES]:
+        print(f"  {job.name:24s} {job.points:>14,} points")
+    if len(run.tiles) > _MOST_TILES:
+        print(f"  and {len(run.tiles) - _MOST_TILES} more")
+    print_messages(*run.messages)
+    _print_failures(run)
 
 
 def _counted(count: int, word: str) -> str:
     return f"{count:,} {word}{'s' * (count != 1)}"
-
-
-def _write_report(name: str, run: TiledRun) -> None:
-    if Path(name).suffix.lower() == ".json":
-        _write_json(name, run, "--report")
-        return
-    from ..reports.runpage import write_run_report
-
-    write_run_report(name, run.to_dict(), run.objects.picture if run.objects else None)
-
-
-def _write_json(name: str, run: TiledRun, flag: str) -> None:
-    try:
-        write_whole(name, (json.dumps(run.to_dict(), indent=1) + "\n").encode())
-    except StageError as error:
-        raise error.at(flag) from None

@@ -1,7 +1,6 @@
 """The command ``pdal-stages objects``: classified files in, one vector file out, objects across their borders whole.
 
-Each file is read once, in parts, into records of cells; these are kept until the end, so that a run that was stopped goes
-on with ``--resume``. Then objects are found block by block in the records of all files together.
+Each file is read once into records of cells, which are kept until the end for ``--resume``; then objects are found in all.
 """
 
 from __future__ import annotations
@@ -37,8 +36,8 @@ from ..pipeline.references import check_one_reference, without_reference
 from ..pipeline.workers import each_file
 from ..reports.objectlayers import check_target, object_layers, target_files, write_layers
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter
-from .lasfiles import BLOCK, open_las, read_block
-from .outcome import FoundObjects
+from .pieces import open_las, read_block
+from .report import FoundObjects
 from .store import fingerprint, take_lock
 
 if TYPE_CHECKING:
@@ -47,9 +46,9 @@ if TYPE_CHECKING:
 #: Whose options the commands take for objects.
 OPTIONS_OF = ("writers.objects", "filters.objects")
 #: What is read of LAZ 1.4 (see :func:`open_las`).
-ONLY = ("Z", "CLASSIFICATION", "FLAGS", "ALL_EXTRA_BYTES")
-#: Blocks of points read at a time.
-_BLOCKS = 20
+_ONLY = ("Z", "CLASSIFICATION", "FLAGS", "ALL_EXTRA_BYTES")
+#: Points read at a time.
+_AT_ONCE = 1_000_000
 #: Larger cells are not taken by themselves: they tell no house from the next.
 LARGEST = 4.0
 
@@ -112,12 +111,12 @@ def _write(
 ) -> FoundObjects:
     """Find objects, write them, say what was found; `draw`: also a map."""
     check_target(stage.filename)
-    with _own(stage.filename):
-        found, reference = objects_of_files(inputs, stage, workers=workers, resume=resume)
+    with _own(stage.filename) as kept:
+        found, reference = _objects_of_files(inputs, stage, kept, workers, resume)
         found, refused = found.without(stage.refuse)
         layers = object_layers(found, straight=stage.outlines == STRAIGHT, units=reference[0])
-        files = write_layers(stage.filename, layers, reference[1])
-        shutil.rmtree(_kept(stage.filename), ignore_errors=True)
+        files = [str(file) for file in write_layers(stage.filename, layers, reference[1])]
+        shutil.rmtree(kept, ignore_errors=True)
     summary = found.summary()
     for kind, one in summary.items():
         word = kind if one["objects"] != 1 else kind.removesuffix("s")
@@ -126,12 +125,12 @@ def _write(
             print(f"  {reason:28s} {count:>10,}")
     if stage.refuse:
         print(f"{refused:,} left out (refuse: {', '.join(stage.refuse)})")
-    print("written to " + ", ".join(str(file) for file in files))
+    print("written to " + ", ".join(files))
     if metadata:
         about = {
             "version": __version__,
             "inputs": inputs,
-            "files": [str(f) for f in files],
+            "files": files,
             "settings": {one.name: getattr(found.settings, one.name) for one in fields(ObjectSettings)},
             "objects": summary,
             "refused": {"reasons": list(stage.refuse), "objects": refused},
@@ -142,7 +141,7 @@ def _write(
         from ..reports.objectmap import object_map
 
         picture = object_map(layers)
-    return FoundObjects([str(file) for file in files], summary, picture)
+    return FoundObjects(files, summary, picture)
 
 
 def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> ObjectsWriter:
@@ -158,56 +157,55 @@ def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> Obj
     return stage
 
 
-def objects_of_files(
-    inputs: Sequence[str], stage: ObjectsWriter, *, workers: int = 1, resume: bool = False
+def _objects_of_files(
+    inputs: Sequence[str], stage: ObjectsWriter, folder: Path, workers: int, resume: bool
 ) -> tuple[Objects, tuple[Units, str]]:
-    """The objects of all files together; units of the coordinates and their reference (WKT).
-
-    The folder for what is read (see `_own`) is there, and ours.
-    """
+    """The objects of all files together; units of the coordinates and their reference (WKT)."""
     references = {path: reference_and_wkt(path, stage.horizontal_unit) for path in inputs}
     without = check_one_reference({path: one for path, (one, _) in references.items()})
     print_messages(*without_reference(without))
     units, wkt = references[inputs[0]][0].units, references[inputs[0]][1]
     if not resume:
-        for file in _kept(stage.filename).glob("*.npz"):
+        for file in folder.glob("*.npz"):
             file.unlink()
-    cells = _all_cells(inputs, stage, wkt, workers)
-    before, thin = cells, cells.thin()
+    cells = _all_cells(inputs, stage, wkt, folder, workers)
+    size, thin = cells.size, cells.thin()
     while stage.widens and cells.thin() and cells.size < LARGEST:
         stage, cells = stage.with_cell(2 * cells.size), cells.doubled()
     if thin:
-        too_few = f"cells of {before.size:g} m hold {thin[1]:.1f} points of {thin[0]} on average"
+        too_few = f"cells of {size:g} m hold {thin[1]:.1f} points of {thin[0]} on average"
         print_messages(
-            f"{too_few}, so cells of {cells.size:g} m are taken; --cell {before.size:g} keeps to them"
+            f"{too_few}, so cells of {cells.size:g} m are taken; --cell {size:g} keeps to them"
             if stage.widens
-            else f"{too_few}, so objects may fall apart: try --cell {2 * before.size:g}"
+            else f"{too_few}, so objects may fall apart: try --cell {2 * size:g}"
         )
     return find_objects(cells, stage.settings), (units, wkt)
 
 
-def _all_cells(inputs: Sequence[str], stage: ObjectsWriter, wkt: str, workers: int) -> Cells:
-    """The records of all files; each file's are kept in a file of their own."""
-    folder = _kept(stage.filename)
-    parts, failed, seen = [], [], np.zeros(256, bool)
-    work = [(path, stage, wkt, str(kept_name(folder, path, stage))) for path in inputs]
-    sizes = [max(Path(path).stat().st_size, 1) if Path(path).exists() else 1 for path in inputs]
-    size_of = dict(zip(inputs, sizes, strict=True))
-    with Progress(sum(sizes) // 1000, "reading", "kB") as line:
-        for item, answer in each_file(read_cells, work, workers):
-            if answer.reason:
-                failed.append(answer.reason)
-            else:
-                seen |= np.array(answer.result, bool)
-            line.update(size_of[item[0]] // 1000)
+def _all_cells(inputs: Sequence[str], stage: ObjectsWriter, wkt: str, folder: Path, workers: int) -> Cells:
+    """The records of all files; each file's are kept in a file of their own, another one when anything is another."""
+    work = []
+    for path in inputs:
+        mark = fingerprint(__version__, stage.options, str(Path(path).resolve()), stamp(path))
+        work.append((path, stage, wkt, str(folder / f"{mark}.npz")))
+    failed = []
+    with Progress(len(inputs), "reading", "files") as line:
+        for _, answer in each_file(_keep_cells, work, workers):
+            failed += [answer.reason] if answer.reason else []
+            line.update()
     if failed:
         raise StageError(
             f"{len(failed)} of {len(inputs)} inputs cannot be read",
             found="; ".join(failed[:3]),
             cure="Once they can be read, --resume reads these alone",
         )
+    parts: list[Cells] = []
+    seen = np.zeros(256, np.int64)
     for *_, kept in work:
-        parts.append(_load(kept, stage.settings.cell))
+        with np.load(kept) as held:
+            columns = {name: held[name] for name in held.files}
+        seen += columns.pop("seen")
+        parts.append(Cells(stage.settings.cell, columns.pop("key"), columns))
         if len(parts) == 32:  # so that overlapping files are not held apart
             parts = [Cells.join(parts)]
     cells = Cells.join(parts)
@@ -220,40 +218,20 @@ def _all_cells(inputs: Sequence[str], stage: ObjectsWriter, wkt: str, workers: i
     return cells
 
 
-def kept_name(folder: Path, path: str, stage: ObjectsWriter) -> Path:
-    """The file that keeps a file's cells: another one when the file, the options or the version are others."""
-    mark = fingerprint(__version__, stage.options, str(Path(path).resolve()), stamp(path))
-    return folder / f"{mark}.npz"
-
-
-def keep_cells(target: Path, cells: Cells, seen: NDArray) -> None:
-    """Keep cells, and which class codes were seen ((256,), above 0), in a file."""
-    partial = target.with_name(f"partial-{target.name}")
-    np.savez(partial, key=cells.key, seen=(seen > 0).astype(np.int64), **cells.columns)  # type: ignore[arg-type]
-    partial.replace(target)
-
-
-def read_cells(path: str, stage: ObjectsWriter, wkt: str, kept: str) -> list[int]:
-    """Read a file's records and keep them in a file; which class codes it has (256 of 0 or 1)."""
+def _keep_cells(path: str, stage: ObjectsWriter, wkt: str, kept: str) -> None:
+    """Read a file's records and keep them in a file, with the points of each class code."""
     target = Path(kept)
-    if not target.exists():
-        seen = np.zeros(256, np.int64)
-        parts = [Cells(stage.settings.cell)]
-        for arrays in _points_of(path):
-            points = stage.points(arrays, wkt=wkt)
-            seen += np.bincount(points.class_codes, minlength=256)
-            parts.append(stage.records(points))
-            if len(parts) >= 8:
-                parts = [Cells.join(parts)]
-        keep_cells(target, Cells.join(parts), seen)
-    with np.load(target) as held:
-        return [int(v) for v in held["seen"]]
-
-
-def _load(kept: str, size: float) -> Cells:
-    with np.load(kept) as held:
-        names = [name for name in held.files if name not in ("key", "seen")]
-        return Cells(size, held["key"], {name: held[name] for name in names})
+    if target.exists():
+        return
+    seen = np.zeros(256, np.int64)
+    parts = [Cells(stage.settings.cell)]
+    for arrays in _points_of(path):
+        points = stage.points(arrays, wkt=wkt)
+        seen += np.bincount(points.class_codes, minlength=256)
+        parts = [Cells.join([*parts, stage.records(points)])]
+    partial = target.with_name(f"partial-{target.name}")
+    np.savez(partial, key=parts[0].key, seen=seen, **parts[0].columns)  # type: ignore[arg-type]
+    partial.replace(target)
 
 
 def _points_of(path: str) -> Iterator[dict[str, NDArray]]:
@@ -262,26 +240,13 @@ def _points_of(path: str) -> Iterator[dict[str, NDArray]]:
         for points in pdal_env.execute([{"filename": path}]).arrays:
             yield {name: np.asarray(points[name]) for name in points.dtype.names}
         return
-    with open_las(path, ONLY) as reader:
+    with open_las(path, _ONLY) as reader:
         total = reader.header.point_count
-        extra = [n for n in ("Reliability",) if n in reader.header.point_format.extra_dimension_names]
-        for start in range(0, total, BLOCK * _BLOCKS):
-            blocks = [
-                read_block(reader, path, at, total)
-                for at in range(start, min(start + BLOCK * _BLOCKS, total), BLOCK)
-            ]
-            made: dict[str, list[NDArray]] = {}
-            for points in blocks:
-                for name, values in (
-                    ("X", points.x),
-                    ("Y", points.y),
-                    ("Z", points.z),
-                    ("Classification", points.classification),
-                    ("Withheld", points.withheld),
-                    *((n, points[n]) for n in extra),
-                ):
-                    made.setdefault(name, []).append(np.asarray(values))
-            yield {name: np.concatenate(values) for name, values in made.items()}
+        extra = {"Reliability"} & set(reader.header.point_format.extra_dimension_names)
+        named = {"X": "x", "Y": "y", "Z": "z", "Classification": "classification", "Withheld": "withheld"}
+        for start in range(0, total, _AT_ONCE):
+            points = read_block(reader, path, start, total, _AT_ONCE)
+            yield {name: np.asarray(points[at]) for name, at in (named | {n: n for n in extra}).items()}
 
 
 def _kept(output: str) -> Path:
@@ -291,14 +256,13 @@ def _kept(output: str) -> Path:
 
 
 @contextmanager
-def _own(output: str) -> Iterator[None]:
+def _own(output: str) -> Iterator[Path]:
     """The folder in which a run keeps what it read, for one run at a time."""
-    lock = take_lock(
-        _kept(output), "another run is writing these objects", "Wait for it, or name another output"
-    )
+    folder = _kept(output)
+    lock = take_lock(folder, "another run is writing these objects", "Wait for it, or name another output")
     try:
-        yield
+        yield folder
     finally:
-        if not any(_kept(output).glob("*.npz")):
-            shutil.rmtree(_kept(output), ignore_errors=True)
+        if not any(folder.glob("*.npz")):
+            shutil.rmtree(folder, ignore_errors=True)
         lock.close()

@@ -1,16 +1,34 @@
-"""How a pipeline is run in tiles."""
+"""How a pipeline is run in tiles: what the user asks for, and what the memory allows."""
 
 from __future__ import annotations
 
+import math
 import re
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 from ..base import checks
 from ..base.errors import OptionError
+from ..base.memory import free_memory
 from ..base.threads import available_threads
+from ..stages.base import Blocks
+from .sources import Extent
 
 #: Ways to cut the output.
 PER = ("auto", "file", "tile")
+#: Memory of a worker: programs and model, a point of a tile with its halo, a point of an output file that is put
+#: together, and the `memory` option of our stages. See docs/large-areas.md.
+BASE, TILE_POINT, FILE_POINT, STAGES = 350 << 20, 285, 250, 512 << 20
+#: Of a cell of the raster of which a block is made before the tiles.
+_CELL = 200
+#: Points of a larger file are put together in parts of so many, so that memory does not grow with the file.
+MOST_AT_ONCE = 4_000_000
+#: Of the process that hands out the work.
+PARENT = 350 << 20
+#: Points of a tile at most where its size is chosen here: it is lost when it fails, and progress goes by tiles.
+_MOST_OF_A_TILE = 3_000_000
+#: Sides to choose from, in units of the coordinates: round numbers, from 1 to 800,000.
+_SIDES = [mantissa * 10**power for power in range(6) for mantissa in (1, 1.5, 2, 2.5, 3, 4, 5, 6, 8)]
 
 
 @dataclass(frozen=True)
@@ -89,3 +107,95 @@ class TilingOptions:
     def threads(self) -> int:
         """Threads of each local worker: workers times threads never exceed the cores."""
         return max(1, available_threads() // max(1, self.local_workers))
+
+
+@dataclass(frozen=True)
+class Density:
+    """How many points the inputs have, and how close."""
+
+    points: int
+    largest: int  #: points of the largest input
+    area: float  #: square units of the coordinates, of the inputs' boxes
+    each: float  #: points a square unit, of the inputs that are dense among them
+
+    @classmethod
+    def of(cls, extents: Iterable[Extent]) -> Density:
+        """Of inputs, as their headers tell."""
+        rows = []
+        for one in extents:
+            if one.count:
+                x0, y0, x1, y1 = one.box
+                area = (x1 - x0) * (y1 - y0)
+                rows.append((one.count / max(area, 1e-6), one.count, area))
+        points = sum(row[1] for row in rows)
+        # The density that a twentieth of all points exceed: a single odd file does not decide.
+        dense, beyond = 0.0, 0
+        for each, count, _ in sorted(rows, reverse=True):
+            dense, beyond = each, beyond + count
+            if beyond * 20 > points:
+                break
+        return cls(points, max((row[1] for row in rows), default=0), sum(row[2] for row in rows), dense)
+
+    def read_by(self, side: float, halo_units: float) -> int:
+        """Points of a tile of this side with its surroundings."""
+        return min(self.points, math.ceil(self.each * (side + 2 * halo_units) ** 2))
+
+
+def block_bytes(blocks: Blocks, area_m2: float) -> float:
+    """Memory that a block takes which is made before the tiles, of so many square meters of points at most."""
+    return min((blocks.side + 2 * blocks.reach) ** 2, area_m2) / blocks.cell**2 * _CELL
+
+
+def worker_bytes(points_read: float, largest_file: float, block: float = 0.0) -> float:
+    """Memory of a worker for tiles of so many points and outputs of so many; `block`: see :func:`block_bytes`."""
+    of_file = min(largest_file, MOST_AT_ONCE) * FILE_POINT
+    return BASE + max(points_read * TILE_POINT + STAGES, of_file, block)
+
+
+def fits_whole(points: int, memory: int | None, point: int = TILE_POINT) -> bool:
+    """Whether a cloud can be worked on in one piece, which takes so many bytes a point."""
+    return BASE + STAGES + points * point <= (memory or free_memory() // 2)
+
+
+def settled(
+    options: TilingOptions, density: Density, halo_units: float, per_file: bool, block: float = 0.0
+) -> TilingOptions:
+    """The options with a side of tiles and a number of workers that the memory allows; the halo is in the coordinates' unit.
+
+    Raises
+    ------
+    OptionError
+        Where no tile fits.
+    """
+    whole = options.memory or free_memory() // 2
+    local = 0 if options.scheduler else options.local_workers
+    fixed = options.workers is not None or local <= 1
+    # Tiles with a few points at least, and not too many.
+    fair = [side for side in _SIDES if density.each * side**2 <= _MOST_OF_A_TILE] or _SIDES[:1]
+    sides = fair if options.tile is None else [options.tile]
+
+    def needed(side: float) -> float:
+        largest = density.largest if per_file else 0
+        return worker_bytes(density.read_by(side, halo_units), largest, block)
+
+    for workers in [local] if fixed else range(local, 0, -1):
+        room = (whole - PARENT) / workers if workers else whole
+        fitting = [side for side in sides if needed(side) <= room]
+        if not fitting:
+            continue
+        side = fitting[-1]
+        if options.tile is None and workers > 1:  # some tiles for every worker
+            few = math.sqrt(density.area / (3 * workers))
+            side = max([each for each in fitting if each <= few] or fitting[:1])
+        # Most of a small tile is halo, which costs as much: rather fewer workers.
+        if side >= halo_units or side == sides[-1] or fixed or workers == 1:
+            return replace(options, tile=side, workers=options.workers if options.scheduler else workers)
+    if options.memory is None and options.tile is not None:
+        return options  # as it was asked for
+    least = needed(sides[0]) * max(1, local if fixed else 1) + (PARENT if local else 0)
+    raise OptionError(
+        "the memory does not suffice for tiles" + ("" if options.tile is None else " of this size"),
+        found=f"{whole / 1e9:.1f} GB; about {least / 1e9:.1f} GB are needed",
+        cure="Give more with --memory, or fewer --workers"
+        + (", or a smaller --tile" if options.tile else ""),
+    )

@@ -6,12 +6,14 @@ import glob
 import hashlib
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..base import las, lascheck, strictjson
+from ..base import las, strictjson
 from ..base.errors import PipelineError, StageError
+from ..pipeline import pdal as pdal_env
 from ..pipeline.tindex import locations
 from .grid import Box
 
@@ -49,9 +51,7 @@ class InputSource:
     def plain_name(self) -> str:
         """The file's name, without what says that it is COPC: outputs of tiles are not."""
         name = Path(self.path).name
-        return (
-            name[: -len(".copc.laz")] + name[-len(".laz") :] if name.lower().endswith(".copc.laz") else name
-        )
+        return self.stem + name[-len(".laz") :] if name.lower().endswith(".copc.laz") else name
 
     def within(self, box: Box) -> dict[str, Any]:
         """The reader of an EPT source for a box alone."""
@@ -121,7 +121,6 @@ class Extent:
 
     count: int  #: points
     box: Box
-    point_bytes: int = 0  #: of a point as an uncompressed file holds it, where that is known
 
 
 def read_extent(source: InputSource) -> Extent:
@@ -139,21 +138,6 @@ def read_extent(source: InputSource) -> Extent:
     return Extent(int(described["points"]), (x0, y0, x1, y1))
 
 
-def check_source(source: InputSource) -> str | None:
-    """Refuse an input whose header does not fit its file, or whose name is not text; a warning where it only looks odd.
-
-    Where it lies is known all the same.
-
-    Raises
-    ------
-    StageError
-        If the file is damaged, or PDAL cannot be told its name.
-    """
-    if any("\ud800" <= character <= "\udfff" for character in source.path):
-        raise StageError("the name of the file is not UTF-8", where=source.path, cure="Rename the file")
-    return lascheck.check_readable(source.path) if source.kind == "las" else None
-
-
 def las_extent(path: str) -> Extent:
     """Number of points and bounding box in the header of a LAS or LAZ file."""
     try:
@@ -167,7 +151,7 @@ def las_extent(path: str) -> Extent:
         raise StageError(
             "the header has no bounding box", where=path, found=f"x {x0} to {x1}, y {y0} to {y1}"
         )
-    return Extent(found.count, found.box, found.point_bytes)
+    return Extent(found.count, found.box)
 
 
 def read_ept(path: str) -> dict[str, Any]:
@@ -193,3 +177,26 @@ def read_ept(path: str) -> dict[str, Any]:
         return found
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise StageError("the EPT source cannot be read", where=path, found=str(error)) from None
+
+
+def ept_format(described: Mapping[str, Any]) -> int:
+    """The LAS point format that has the colors of an EPT source."""
+    names = {dimension["name"] for dimension in described["schema"]}
+    return 8 if "Infrared" in names else 7 if "Red" in names else 6
+
+
+def fetch_ept(source: InputSource, box: Box, target: str) -> bool:
+    """Read the points of an EPT source in a box into a LAS file; whether there are any.
+
+    Scales and offsets are the source's, so coordinates stay what they are; other dimensions become extra dimensions.
+    """
+    described = read_ept(source.path)
+    form = {"minor_version": 4, "dataformat_id": ept_format(described), "extra_dims": "all"}
+    for dimension in described["schema"]:
+        if dimension["name"] in ("X", "Y", "Z"):
+            axis = dimension["name"].lower()
+            form[f"scale_{axis}"] = dimension.get("scale", 0.001)
+            form[f"offset_{axis}"] = dimension.get("offset", 0.0)
+    writer = {"type": "writers.las", "filename": target, **form}
+    run = pdal_env.execute([source.within(box), writer], arrays=False)
+    return bool(run.count and las_extent(target).count)

@@ -3,50 +3,38 @@
 from __future__ import annotations
 
 import math
-import os
 import time
-from collections import deque
-from collections.abc import Callable, Collection
-from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ..base import las, lascheck
 from ..base.errors import OptionError, PipelineError, StageError
-from ..base.progress import Progress
 from ..base.stamps import stamp
 from ..base.units import Units
 from ..pipeline.filenames import named_files
 from ..pipeline.inputs_outputs import in_folders
 from ..pipeline.references import Reference, check_one_reference, reference_of, without_reference
-from ..pipeline.workers import run_tasks
 from .grid import Box, TileGrid, check_number, touching, union
-from .index import CloudIndex, sort_points
-from .outcome import Costs
-from .settings import TilingOptions
-from .sizing import Density, block_bytes, room_of_worker, settled, widened, worker_bytes
-from .sources import Extent, InputSource, check_source, find_sources, read_ept, read_extent
-from .store import Store, fingerprint
-from .tileplan import TilePlan
+from .pieces import CloudIndex
+from .plan import TilePlan
+from .settings import Density, TilingOptions, block_bytes, settled
+from .sources import Extent, InputSource, find_sources, read_ept, read_extent
+from .store import fingerprint
 
-#: Workers that a cluster is taken to have at most where it matters before it is asked.
-_OF_A_CLUSTER = 64
 #: Inputs with odd headers that are named.
 _ODD = 5
 
 
 class Survey:
-    """The inputs of a run; `block`: the side of what an earlier run made before the tiles, which goes on with it."""
+    """The inputs of a run, and its options with the tiles' side and the workers settled."""
 
-    def __init__(self, plan: TilePlan, options: TilingOptions, block: float | None = None) -> None:
+    def __init__(self, plan: TilePlan, options: TilingOptions) -> None:
         self.started = time.strftime("%Y-%m-%d %H:%M")
         self.messages = list(plan.messages)
         self._whole_names = plan.whole_names
         self.unreadable: dict[str, str] = {}  #: inputs by path that cannot be read, and why
         self.extents: dict[str, Extent] = {}  #: of inputs by path, where the header can be read
-        self.costs = Costs()  #: of the run's tasks
         self.indexes: dict[str, CloudIndex] = {}  #: of LAS and LAZ files by path, once they were read
         self.sources = find_sources(plan.readers)
         others = named_files([*plan.head, *plan.tail])
@@ -64,39 +52,27 @@ class Survey:
         self.per = options.per if options.per != "auto" else "file" if files else "tile"
         self.unit = self._unit(plan)  #: meters per unit of the coordinates
         self.halo_units = plan.halo_m / self.unit  #: of a tile, in the unit of the coordinates
-        self._place()
-        #: With the tiles' side and the workers settled.
-        density = Density.of(self.extents.values())
+        self.place()
+        self.density = Density.of(self.extents.values())
         #: Memory of a worker for what is made before the tiles.
         self.block_bytes = (
-            0.0 if plan.first is None else block_bytes(plan.first.blocks, density.area * self.unit**2)
+            block_bytes(plan.first.blocks, self.density.area * self.unit**2) if plan.first else 0.0
         )
-        self.options = settled(options, density, self.halo_units, self.per == "file", self.block_bytes)
+        self.options = settled(options, self.density, self.halo_units, self.per == "file", self.block_bytes)
         assert self.options.tile is not None
         self.grid = TileGrid(self.options.tile)
-        #: With blocks as large as there is room for.
-        self.plan = self._widened(plan, density, block or math.inf)
-
-    def _widened(self, plan: TilePlan, density: Density, most: float) -> TilePlan:
-        if plan.first is None:
-            return plan
-        area = density.area * self.unit**2
-        workers, room = max(1, self.options.local_workers), room_of_worker(self.options)
-        if self.options.scheduler:
-            workers = _OF_A_CLUSTER
-        if self.options.memory is None:  # nobody said that there may be more than tiles take
-            of_tile = density.read_by(self.grid.size, self.halo_units)
-            room = min(room, worker_bytes(of_tile, 0, self.block_bytes))
-        blocks = widened(plan.first.blocks, area, room, workers, most)
-        self.block_bytes = block_bytes(blocks, area)
-        return replace(plan, first=replace(plan.first, blocks=blocks))
 
     def _read_headers(self) -> None:
         odd: list[str] = []
         for source in self.sources:
             try:
                 self.extents[source.path] = read_extent(source)
-                odd += filter(None, [check_source(source)])
+                if any("\ud800" <= character <= "\udfff" for character in source.path):
+                    raise StageError(
+                        "the name of the file is not UTF-8", where=source.path, cure="Rename the file"
+                    )
+                if source.kind == "las" and (said := lascheck.check_readable(source.path)):
+                    odd.append(said)
             except StageError as error:
                 self.unreadable[source.path] = str(error)
         self.messages += odd[:_ODD]
@@ -104,13 +80,10 @@ class Survey:
             self.messages.append(f"so it is with {len(odd) - _ODD:,} more inputs: their headers are odd, too")
         if len(self.unreadable) == len(self.sources):
             raise self._none_readable()
-        lost = len(self.sources) - len(self.extents)
-        if lost:
-            which = "1 input has" if lost == 1 else f"{lost} inputs have"
-            its, it = ("its", "it") if lost == 1 else ("their", "them")
+        if lost := len(self.sources) - len(self.extents):
             self.messages.append(
-                f"{which} no readable header, so {its} place is not known: tiles beside {it} may lack neighbors. "
-                f"Once {it if lost == 1 else 'they'} can be read, --resume runs those tiles again"
+                f"{lost:,} of the inputs without a readable header: where they lie is not known, and tiles beside them may "
+                "lack neighbors. Once they can be read, --resume runs those tiles again"
             )
 
     def _none_readable(self) -> StageError:
@@ -124,7 +97,10 @@ class Survey:
         groups: dict[str, list[InputSource]] = {}
         for source in self.sources:
             if source.path not in self.unreadable:
-                groups.setdefault(self._tells(source), []).append(source)
+                own = (
+                    read_ept(source.path).get("srs") if source.kind == "ept" else las.projection(source.path)
+                )
+                groups.setdefault(fingerprint(source.reader, own), []).append(source)
         found: dict[str, Reference] = {}
         for group in groups.values():
             for source in group:
@@ -141,16 +117,12 @@ class Survey:
         if not found:
             raise self._none_readable()
         if needed:
-            without = check_one_reference(found)
+            without = set(check_one_reference(found))
             alike = [[source.path for source in group] for group in groups.values()]
-            told = without_reference([path for group in alike if set(group) & set(without) for path in group])
-            self.messages += told
+            self.messages += without_reference(
+                [path for each in alike if without & set(each) for path in each]
+            )
         return next(iter(found.values())).units.horizontal
-
-    def _tells(self, source: InputSource) -> str:
-        """What tells apart inputs of different spatial references."""
-        own = read_ept(source.path).get("srs") if source.kind == "ept" else las.projection(source.path)
-        return fingerprint(source.reader, own)
 
     def _reference_of(self, source: InputSource, horizontal: str) -> Reference:
         """What PDAL's reader says of an input, with as few points read as it can."""
@@ -159,7 +131,7 @@ class Survey:
         x, y, _, _ = self.extents[source.path].box
         return reference_of(source.within((x, y, x + 1, y + 1)), horizontal)
 
-    def _place(self) -> None:
+    def place(self) -> None:
         """Note where inputs lie, as headers or indexes say; thousands of them are compared at once."""
         self.placed = [s for s in self.sources if s.path in self.extents and self.extents[s.path].count]
         boxes = []
@@ -185,6 +157,10 @@ class Survey:
         """Names and stamps of the files that stages read."""
         return [[path, self.stamps.get(path)] for path in named_files(stages)]
 
+    def seen(self, sources: list[InputSource]) -> list[Any]:
+        """Names, stamps and readers of inputs."""
+        return [[source.path, self.stamps[source.path], source.reader] for source in sources]
+
     def changed(self) -> list[str]:
         """Inputs and other files that are not what they were when the run began."""
         return [path for path, then in self.stamps.items() if stamp(path) != then]
@@ -192,6 +168,10 @@ class Survey:
     def near(self, tile: tuple[int, int], halo_units: float) -> list[InputSource]:
         """Inputs that may hold points of a tile or its halo."""
         return [self.placed[n] for n in touching(self._boxes, self.grid.box(tile, halo_units))]
+
+    def readable(self, sources: list[InputSource]) -> list[tuple[InputSource, CloudIndex | None]]:
+        """Those that can be read, with what tasks need to know of where their points lie."""
+        return [(s, self.indexes.get(s.path)) for s in sources if s.path not in self.unreadable]
 
     def tiles(self) -> dict[tuple[int, int], int]:
         """Every tile that may have points of its own, row by row, and how many where that is known (else 0)."""
@@ -219,49 +199,3 @@ class Survey:
             "inputs": len(self.sources),
             "bounds": list(self.bounds) if math.isfinite(self.bounds[0]) else None,
         }
-
-    def mark_of(self, path: str) -> str:
-        """A name for what is kept of an input, another one when the file changes."""
-        return fingerprint(path, self.stamps[path], self.grid.size)
-
-    def read_inputs(
-        self, store: Store, workers: Any, show: bool | None, needed: Collection[str] | None = None
-    ) -> None:
-        """Read LAS and LAZ files once, sort their points by place, and note where they lie.
-
-        Those that an earlier run read are only read again where their points are `needed` (paths) and not there any more.
-        """
-        waiting: deque[_Reading] = deque()
-        for source in self.sources:
-            if source.kind != "las" or source.path in self.unreadable:
-                continue
-            mark = self.mark_of(source.path)
-            known = self.indexes.get(source.path) or store.index(mark)
-            there = known is not None and (needed is None or source.path not in needed)
-            if known is not None and (there or os.path.exists(known.copy)):
-                self.indexes[source.path] = known
-            else:
-                waiting.append(_Reading(source.path, mark))
-
-        def task_of(reading: _Reading) -> Callable[[], Any]:
-            return partial(sort_points, reading.path, self.grid, str(store.copy(reading.mark)))
-
-        total = sum(self.extents[reading.path].count for reading in waiting)
-        with Progress(total, "reading the inputs", enabled=show) as progress:
-            for reading, answer in run_tasks(workers, waiting, task_of):
-                self.costs.add("index", answer.cost)
-                if answer.reason:
-                    self.unreadable[reading.path] = answer.reason
-                    continue
-                index = self.indexes[reading.path] = answer.result
-                if index.count and (odd := lascheck.beyond_box(reading.path, index.box)):
-                    self.messages.append(odd)
-                store.keep_index(reading.mark, index)
-                progress.update(index.count)
-        self._place()
-
-
-@dataclass
-class _Reading:
-    path: str
-    mark: str

@@ -33,16 +33,16 @@ from ..pipeline.training import heights_for, lowered_writer, points_in, read_poi
 from ..stages.checked import CheckedChoice, Looked
 from ..stages.classifiermodel import ClassifierModel
 from ..stages.points import HOLDS_NOWHERE
-from .kept import load_arrays, save_arrays
-from .outcome import TiledRun, TileJob
-from .results import NewValues, PieceResults, of_own_points
-from .settings import TilingOptions
-from .sizing import TRAIN_POINT, fits_whole
+from .outputs import NewValues, PieceResults, merged, of_own_points
+from .plan import TilePlan, make_plan
+from .report import Job, TiledRun
+from .run import run_plan
+from .settings import TilingOptions, fits_whole
 from .sources import find_sources, read_extent
-from .tail import merged, written
-from .tiledrun import run_plan
-from .tileplan import TilePlan, make_plan
+from .store import load_arrays, save_arrays, written
 
+#: Memory of a point that is trained on in one piece, voxels and samples' surroundings included.
+TRAIN_POINT = 400
 #: Bytes of a point on the disk at most: as read, with heights, prepared.
 _DISK = 200
 #: Of points that a person checked, and of others of which a base is sure: see :mod:`..stages.checked`.
@@ -229,7 +229,7 @@ class TrainTask:
         known = (is_ept(name) or CHECKED in extra_dimensions(name) for name in self.files)
         return self.stage.checked_only and any(known)
 
-    def _choice(self, jobs: Iterable[TileJob], report: Report) -> CheckedChoice | None:
+    def _choice(self, jobs: Iterable[Job], report: Report) -> CheckedChoice | None:
         """What points samples are drawn from, where a person checked any."""
         choice = self.stage.choice(job.record["looked"] for job in jobs if "looked" in job.record)
         if not choice:
@@ -262,6 +262,7 @@ class TrainTask:
                     clouds[cloud["value"]] = TiledCloud(folder / f"cloud{len(clouds)}", side)
                 assert job.outputs is not None
                 points = _read_back(job.outputs[0], number, self.survey or cloud["name"], self.survey, choice)
+                assert job.tile is not None
                 clouds[cloud["value"]].put(job.tile, points)
             for path in job.outputs or ():
                 Path(path).unlink(missing_ok=True)
@@ -343,7 +344,7 @@ class Taking:
         report = points.report
         said = {"said": report.messages, "ignored": int(report.figures.get("ignored", 0)), "clouds": clouds}
         said |= {"looked": looked} if looked else {}
-        return written(outputs, run.count) | said
+        return {"outputs": written(outputs), "written": run.count} | said
 
     def _new_values(self, result: PieceResults) -> NewValues:
         """The results, with the number of each point's file."""

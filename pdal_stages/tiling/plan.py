@@ -30,13 +30,12 @@ _PER_POINT = _filters(
     "reprojection transformation"
 )
 #: Of them, those that move points: tiles are cut before, so they may only come after all stages of ours.
-_MOVING = _filters("reprojection transformation projpipeline")
+MOVING = _filters("reprojection transformation projpipeline")
 #: Filters whose result depends on all points at once.
 _GLOBAL = _filters(
     "chipper colorinterp cpd divider fps georeference gpstimeconvert groupby head hexbin icp iqr locate mad mortonorder "
     "randomize relaxationdartthrowing returns shell sort splitter stats tail teaser"
 )
-
 #: What PDAL takes for bare file names.
 _DRIVERS = {f".{name}": name for name in ("las", "ply", "bpf", "pcd")}
 _DRIVERS |= {".laz": "las", ".txt": "text", ".csv": "text", ".tif": "gdal"}
@@ -44,7 +43,7 @@ _DRIVERS |= {".laz": "las", ".txt": "text", ".csv": "text", ".tif": "gdal"}
 
 @dataclass(frozen=True)
 class FirstRound:
-    """What is made before the tiles for a stage that looks far: see :mod:`.firstround`."""
+    """What is made before the tiles for a stage that looks far: see :mod:`.ground`."""
 
     at: int  #: number of the stage in the head
     halo_m: float  #: halo that the stages before it need
@@ -74,18 +73,12 @@ class TilePlan:
     #: Of the dimensions that stages make, those that LAS files get beside the input's own; None leaves it to the writer.
     beside: dict[str, str] | None = None
     first: FirstRound | None = None  #: what is made of the points before any tile
-    #: What LAS files say of dimensions that stages make.
     #: What takes each tile's own points in place of the tail: called with their results, the outputs and the folder for
     #: temporary files, it gives the record of what it wrote.
     takes: Callable[[list[Any], list[str], str], dict[str, Any]] | None = None
     #: Dimensions that our stages make and outputs hold, with PDAL's types: what a file without points gets, too.
     makes: dict[str, str] = field(default_factory=dict)
     whole_names: bool = False  #: '#' in an output's name is the whole name of the input file, with its suffix
-
-    @property
-    def all_ours(self) -> bool:
-        """Whether PDAL only reads for the head."""
-        return self.creates is not None
 
     @property
     def writers(self) -> list[dict[str, Any]]:
@@ -143,7 +136,7 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
     end = max((n for n, step in enumerate(filters, 1) if step.sees_neighbors), default=0)
     head, tail = filters[:end], filters[end:]
     for step in head:
-        if step.type in _MOVING:
+        if step.type in MOVING:
             raise PipelineError(
                 f"{step.type} moves points before stages that see neighbors, and tiles are cut before it",
                 where=step.where,
@@ -151,12 +144,12 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
             )
     reaches = [step.reach(buffer) for step in head]
     sees_m = sum(reaches)
-    first, wider = _first_round(readers, head, reaches)
+    first = _first_round(readers, head, reaches)
     later = [sum(reaches[n + 1 :]) for n in range(len(head))]
     stages = [step.ours for step in head if step.ours is not None]
     makes = {name: kind for stage in stages for name, kind in stage.creates().items()}
     foreign = any(step.ours is None and step.type != "filters.merge" for step in head)
-    messages = [*pipeline.lowered.warnings, *([wider] if wider else [])]
+    messages = list(pipeline.lowered.warnings)
     if any(step.ours is None and step.sees_neighbors for step in head):
         messages.append(
             "PDAL filters that look at neighbors were given --buffer; the result is seamless only if it is wide enough "
@@ -178,36 +171,21 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
     )
 
 
-def _first_round(
-    readers: list[_Step], head: list[_Step], reaches: list[float]
-) -> tuple[FirstRound | None, str]:
-    """Find the one stage that needs little of points far away; it then reaches less far, and so do the tiles.
-
-    Where tiles are read wider than it would take, the reason is given, too.
-    """
+def _first_round(readers: list[_Step], head: list[_Step], reaches: list[float]) -> FirstRound | None:
+    """Find the one stage that needs little of points far away; it then reaches less far, and so do the tiles."""
     for at, step in enumerate(head):
-        near = None if step.ours is None else step.ours.near_halo_m()
-        if near is not None:
-            assert step.ours is not None
-            before = sum(reaches[:at])
+        if step.ours is None:
+            continue
+        if (near := step.ours.near_halo_m()) is not None:
             kept = _kept(readers, head[:at])
-            found = FirstRound(at, before, sum(reaches[at:]), step.ours.blocks(), kept)
+            found = FirstRound(at, sum(reaches[:at]), sum(reaches[at:]), step.ours.blocks(), kept)
             reaches[at] = min(near, reaches[at])
             if kept is not None:
                 reaches[:at] = [0.0] * at
-                return found, ""
-            blame = next((s.type for s in head[:at] if s.ours is None), "readers.ept")
-            more = f"tiles are read with {before:g} m more of surroundings: {blame} stands before {step.type}"
-            return found, more if before else ""
-        if step.ours is not None and step.ours.open_ended:
-            far = next(
-                (s for s in head[at:] if s.ours is not None and s.ours.near_halo_m() is not None), None
-            )
-            return None, "" if far is None else (
-                f"tiles are read with all the surroundings of {far.type}: {step.type}, which stands before it, may look as "
-                "far as it likes"
-            )
-    return None, ""
+            return found
+        if step.ours.open_ended:
+            return None
+    return None
 
 
 def _kept(readers: list[_Step], before: list[_Step]) -> list[str] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.version import __version__
+from ..stages.points import HOLDS_NOWHERE
+from ..stages.polygons import TOUCH_NONE
 from .sources import InputSource
 
 #: Points that did not get a class from the classifier, or another one, by their names in the reports of stages.
@@ -24,6 +27,12 @@ LEFT_ALONE = {
     "towers": "found to be towers and poles (wires)",
     "changed": "mended by rules (consistency)",
 }
+#: Most different warnings of tiles that a run repeats.
+_MOST_MESSAGES = 20
+_CHANGED = (
+    "it changed while it was worked on, so outputs may hold results from before and after. Once it stays as it is, "
+    "run it again with --resume"
+)
 
 
 def left_alone(reports: Iterable[Mapping[str, Any]]) -> dict[str, int]:
@@ -34,22 +43,18 @@ def left_alone(reports: Iterable[Mapping[str, Any]]) -> dict[str, int]:
 
 
 @dataclass
-class Costs:
-    """What the tasks of a run took, tries that failed too, by step: ``index``, ``first_rounds``, ``tiles``, ``outputs``."""
+class Job:
+    """A tile to run, an output to put together from tiles, or what is made before them, and what became of it."""
 
-    cpu_seconds: dict[str, float] = field(default_factory=dict)
-    peak_mb: float = 0.0  #: the most memory that a process held
-
-    def add(self, step: str, cost: Mapping[str, float]) -> None:
-        """A task was done, or failed."""
-        self.cpu_seconds[step] = self.cpu_seconds.get(step, 0.0) + cost.get("cpu_seconds", 0.0)
-        self.peak_mb = max(self.peak_mb, cost.get("peak_mb", 0.0))
-
-
-@dataclass(kw_only=True)
-class _Work:
-    """What became of a tile or an output."""
-
+    name: str  #: under which it is kept in the work folder
+    points: int = 0  #: its own; 0 where not known before it is read
+    tile: tuple[int, int] | None = None
+    source: InputSource | None = None  #: the input that an output is of
+    outputs: list[str] | None = (
+        None  #: what the writers write; None for a tile whose points go into outputs of files
+    )
+    jobs: list[Job] = field(default_factory=list)  #: the tiles that an output is put together from
+    step: str = "tiles"  #: of the run: ``index``, ``first_rounds``, ``tiles``, ``outputs``
     #: ``waiting``, ``ready`` (an output whose tiles are done), ``done``, ``kept`` (from an earlier run) or ``failed``.
     state: str = "waiting"
     #: What its task says of it, as it is kept in the work folder: counts, messages, outputs, cost, fingerprint.
@@ -57,32 +62,9 @@ class _Work:
     reason: str = ""  #: why it failed
     blocked_by: str = ""  #: the unreadable input that it failed for, where that is the reason
 
-
-@dataclass
-class TileJob(_Work):
-    """A tile to run."""
-
-    tile: tuple[int, int]
-    name: str
-    points: int  #: its own; 0 where not known before it is read
-    sources: list[InputSource]  #: inputs that may hold points of it or its halo
-    outputs: list[str] | None = None  #: what the writers write, where each tile is an output
-
-
-@dataclass
-class FileJob(_Work):
-    """An input file whose output is put together from tiles."""
-
-    source: InputSource
-    outputs: list[str]
-    points: int = 0  #: of the input
-    jobs: list[TileJob] = field(default_factory=list)
-
-
-_CHANGED = (
-    "it changed while it was worked on, so outputs may hold results from before and after. Once it stays as it is, "
-    "run it again with --resume"
-)
+    def fail(self, reason: str, blocked_by: str = "") -> None:
+        """It cannot be done."""
+        self.state, self.reason, self.blocked_by = "failed", reason, blocked_by
 
 
 class InterruptedRun(KeyboardInterrupt):
@@ -108,8 +90,8 @@ class TiledRun:
 
     Attributes
     ----------
-    tiles : list of TileJob
-    outputs : list of FileJob
+    tiles : list of Job
+    outputs : list of Job
         Empty where each tile is an output.
     unreadable : dict of str to str
         Inputs that could not be read, and why.
@@ -123,8 +105,8 @@ class TiledRun:
         Those of the outputs, where they were asked for.
     """
 
-    tiles: list[TileJob]
-    outputs: list[FileJob]
+    tiles: list[Job]
+    outputs: list[Job]
     unreadable: dict[str, str]
     changed: list[str]
     messages: list[str]
@@ -134,20 +116,18 @@ class TiledRun:
     @property
     def failures(self) -> list[tuple[str, str]]:
         """What failed, and why: inputs with all that waits for them, then other tiles and outputs."""
-        found = [
-            (path, reason.removeprefix(f"{path}: ") + self._blocked_by(path))
-            for path, reason in self.unreadable.items()
-        ]
-        failed = [(f"tile {job.name}", job) for job in self.tiles] + [(o.outputs[0], o) for o in self.outputs]
-        found += [(path, _CHANGED) for path in self.changed]
-        return found + [
-            (what, item.reason) for what, item in failed if item.state == "failed" and not item.blocked_by
+        jobs = [(f"tile {job.name}", job) for job in self.tiles]
+        jobs += [(job.outputs[0], job) for job in self.outputs if job.outputs]
+        return [
+            *((p, why.removeprefix(f"{p}: ") + self._blocked_by(p)) for p, why in self.unreadable.items()),
+            *((path, _CHANGED) for path in self.changed),
+            *((what, job.reason) for what, job in jobs if job.state == "failed" and not job.blocked_by),
         ]
 
     def _blocked_by(self, path: str) -> str:
         """What was not made because an input cannot be read, in words."""
         tiles = sum(job.blocked_by == path for job in self.tiles)
-        outputs = [Path(out.outputs[0]).name for out in self.outputs if out.blocked_by == path]
+        outputs = [Path(o.outputs[0]).name for o in self.outputs if o.outputs and o.blocked_by == path]
         parts = [f"{tiles} tile{'s' * (tiles != 1)} there"] if tiles else []
         parts += [*outputs[:5], *([f"{len(outputs) - 5} more outputs"] if len(outputs) > 5 else [])]
         if not parts:
@@ -157,41 +137,39 @@ class TiledRun:
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON-able report."""
+        told = ("written", "classes", "seconds", "cpu_seconds", "peak_mb")
         return {
             "pdal_stages": __version__,
             **self.summary,
             "messages": self.messages,
             "failures": [{"what": what, "reason": reason} for what, reason in self.failures],
             "tiles": [
-                {"name": j.name, "tile": list(j.tile), "state": j.state, "points": j.points}
-                | {k: v for k, v in j.record.items() if k != "fingerprint"}
+                {"name": j.name, "tile": list(j.tile or ()), "state": j.state, "points": j.points}
+                | {k: v for k, v in j.record.items() if k != "fingerprint" and (k != "outputs" or j.outputs)}
                 | ({"reason": j.reason} if j.reason else {})
                 for j in self.tiles
             ],
             "outputs": [
-                {"input": o.source.path, "output": o.outputs, "state": o.state}
+                {"input": o.source and o.source.path, "output": o.outputs, "state": o.state}
                 | ({"reason": o.reason} if o.reason else {})
-                | {
-                    k: o.record[k]
-                    for k in ("written", "classes", "seconds", "cpu_seconds", "peak_mb")
-                    if k in o.record
-                }
+                | {k: o.record[k] for k in told if k in o.record}
                 for o in self.outputs
             ],
             **({"objects": {"files": self.objects.files, **self.objects.kinds}} if self.objects else {}),
         }
 
 
-def summarize(tiles: list[TileJob], costs: Costs, seconds: float) -> dict[str, Any]:
-    """Figures of all tiles and tasks together, for :attr:`TiledRun.summary`."""
-    worked = [job for job in tiles if job.state == "done"]
-    classes: dict[str, int] = {}
+def summarize(tiles: list[Job], cpu_seconds: Mapping[str, float], seconds: float) -> dict[str, Any]:
+    """Figures of all tiles together, and of the processor time by step, for :attr:`TiledRun.summary`."""
+    worked = [job.record for job in tiles if job.state == "done"]
+    classes: Counter[str] = Counter()
+    alone: Counter[str] = Counter()
     for job in tiles:
-        for code, count in (job.record.get("classes") or {}).items():
-            classes[code] = classes.get(code, 0) + count
+        classes.update(job.record.get("classes") or {})
+        alone.update(job.record.get("left_alone") or {})
 
     def total(key: str) -> int:
-        return sum(job.record.get(key, 0) for job in worked)
+        return sum(record.get(key, 0) for record in worked)
 
     return {
         "points": total("points"),
@@ -199,14 +177,31 @@ def summarize(tiles: list[TileJob], costs: Costs, seconds: float) -> dict[str, A
         "dropped": total("dropped"),
         "seconds": seconds,
         "points_per_second": total("points") / seconds if seconds else 0.0,
-        "cpu_seconds": sum(costs.cpu_seconds.values()),
-        "cpu_seconds_by_step": costs.cpu_seconds,
-        "peak_mb_of_a_worker": costs.peak_mb,
+        "cpu_seconds": sum(cpu_seconds.values()),
+        "cpu_seconds_by_step": dict(cpu_seconds),
         "states": {s: sum(job.state == s for job in tiles) for s in ("done", "kept", "failed")},
         "classes": dict(sorted(classes.items(), key=lambda item: int(item[0]))),
-        "left_alone": {
-            key: n
-            for key in LEFT_ALONE
-            if (n := sum(j.record.get("left_alone", {}).get(key, 0) for j in tiles))
-        },
+        "left_alone": {key: alone[key] for key in LEFT_ALONE if alone[key]},
     }
+
+
+def messages_of(tiles: list[Job], before: list[list[str]], most_points: int) -> list[str]:
+    """Warnings and notes of tiles, and of the rounds before them, once each, the most frequent first."""
+    done = [job for job in tiles if job.state == "done"]
+    found: Counter[str] = Counter()
+    for lines in ([j.record.get("messages", []) for j in done if j.record.get("points")], before):
+        for text, n in Counter(text for each in lines for text in set(each)).items():
+            if not text.startswith((HOLDS_NOWHERE, TOUCH_NONE)):
+                found[text] += n
+            elif n == len(lines):  # that there is nothing to do in some tiles is as it should be
+                found[text] = max(found[text], n)
+    told = [f"{text} ({n} tile{'s' * (n != 1)})" for text, n in found.most_common(_MOST_MESSAGES)]
+    if len(found) > _MOST_MESSAGES:
+        told.append(f"and {len(found) - _MOST_MESSAGES} more; see --report")
+    if short := [job.name for job in done if job.record.get("short")]:
+        told.append(
+            f"{len(short)} tile{'s have' if len(short) > 1 else ' has'} points whose neighborhoods or terrain reach farther "
+            f"than could be read within {most_points:,} points; they may differ from an untiled run: "
+            + ", ".join(short[:5])
+        )
+    return told

@@ -1,0 +1,372 @@
+"""The head of a pipeline on a tile and its halo: points numbered, stages run, the tile's own results taken out."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.asprs import LEGACY_LIMIT
+from ..base.errors import PipelineError, StageError
+from ..base.las import holds_flags
+from ..pipeline.callbacks import Callbacks
+from ..pipeline.las_output import check_writers
+from ..pipeline.references import NO_REFERENCE
+from ..pipeline.run import Pipeline
+from ..pipeline.runtime import points_of
+from ..stages import registry
+from ..stages.base import Left, Stage
+from ..stages.points import HOLDS_NOWHERE
+from ..stages.polygons import THE_PLACES, TOUCH_NONE
+from .grid import Box, TileGrid
+from .outputs import PieceResults
+from .pieces import Piece
+from .plan import INPUT, OUTSIDE, ROW, FirstRound, TilePlan
+from .report import left_alone
+
+#: Points whose neighbors are looked at in one go where they lie far apart.
+_AT_ONCE = 100_000
+_MARK_TYPES = {ROW: "uint32_t", INPUT: "uint32_t", OUTSIDE: "double"}
+#: The warning of `Points` in a tile: of the user's `where` with what was added for the tile, or of that alone.
+_NOWHERE = re.compile(rf"{HOLDS_NOWHERE} [\d,]+ points: (?:\((.*)\) && \()?{OUTSIDE} <", re.DOTALL)
+
+Changed = dict[str, tuple[NDArray[np.int64], NDArray]]
+
+
+@dataclass(frozen=True)
+class RunContext:
+    """What all tiles of a run have in common."""
+
+    plan: TilePlan
+    grid: TileGrid
+    unit: float  #: meters per unit of the coordinates
+    bounds: Box  #: of all inputs
+    threads: int
+    most_points: int  #: a tile is not read with a wider halo that holds more
+    scratch: str  #: folder for temporary files
+
+
+@dataclass
+class HeadRun:
+    """What a run of the head gave."""
+
+    results: list[PieceResults]
+    need: float  #: the halo that it took, meters
+    messages: list[str] = field(default_factory=list)  #: warnings and notes
+    left_alone: dict[str, int] = field(default_factory=dict)  #: of the tile's own points, see :mod:`.report`
+
+
+class FromBefore(NamedTuple):
+    """What the rounds before the tiles made for a tile."""
+
+    blocks: Any  #: for the far-reaching stage
+    changed: list[
+        Changed
+    ]  #: of each piece, new values of dimensions that the stages before it gave, and their rows
+
+
+class FirstResults(NamedTuple):
+    """What the first round leaves of a tile's own points."""
+
+    left: list[Left]  #: what the far-reaching stage needs of them
+    #: New values that the stages before it gave: by inputs' keys, the points' numbers and values by dimension.
+    changed: dict[str, tuple[NDArray[np.int64], dict[str, NDArray]]]
+    messages: list[str]
+
+
+def run_head(
+    context: RunContext,
+    tile: tuple[int, int],
+    cuts: list[Piece],
+    everything: bool,
+    before: FromBefore | None = None,
+) -> HeadRun:
+    """Run the head once; `everything`: all inputs were read, so nothing can lie farther away."""
+    plan, first = context.plan, context.plan.first
+    if not plan.head:
+        return HeadRun([PieceResults(piece, piece.own, {}) for piece in cuts], 0.0)
+    marks = _marks(cuts, context)
+    begin = 0
+    if before is not None and first is not None and first.kept is not None:
+        begin = first.at
+        for mark, changed in zip(marks, before.changed, strict=True):
+            mark.changed = changed
+    reaches: dict[int, _Reach] = {}
+    from_afar = None
+    found = _Found(plan.creates)
+    with Callbacks() as callbacks:
+        stages = _marked(callbacks, cuts, marks)
+        for number in range(begin, len(plan.head)):
+            stage = _with_threads(plan.head[number], context.threads)
+            stages.append({**stage, **_after(marks)} if number == begin else stage)
+            if before is not None and first is not None and number == first.at:
+                from_afar = len(stages) - 1
+            kind = registry.stages().get(stage["type"])
+            if kind is not None and kind.open_ended and not everything:
+                reach = reaches[len(stages) - 1] = _Reach(context.grid.box(tile), plan.later[number])
+                stages.append(callbacks.filter(reach))
+        stages.append(callbacks.filter(found))
+        pipeline = Pipeline(stages, whole=False)
+        ours = pipeline.lowered.ours
+        check_writers(
+            [*pipeline.lowered.stages, *plan.tail], [(one.stage, one.place, one.index) for one in ours]
+        )
+        for one in ours:
+            one.stage.own_points = OUTSIDE
+            if before is not None and one.number == from_afar:
+                one.stage.from_blocks = before.blocks
+            if one.number in reaches:
+                reaches[one.number].stage = one.stage
+        most = max((one.stage.most_neighbors() for one in ours), default=0)
+        found.with_places = most > 0
+        pipeline.execute(arrays=False)
+    results = _collect(found.views, cuts, plan.creates, marks)
+    need = max((reach.need for reach in reaches.values()), default=0.0)
+    if not everything and any(report.beyond_halo for _, reports in pipeline.reports for report in reports):
+        second = max(one.stage.second_neighbors() for one in ours)
+        need = max(need, _far_neighbors(found.places, most, second, context, tile))
+    alone = left_alone(each[-1].figures for _, each in pipeline.reports if each)
+    return HeadRun(results, need, _messages(pipeline, context.scratch), alone)
+
+
+def run_first(context: RunContext, cuts: list[Piece], first: FirstRound) -> FirstResults:
+    """Run the stages before the one that looks far, on a tile and the surroundings that they need."""
+    marks = _marks(cuts, context, first.kept or () if first.at else ())
+    with Callbacks() as callbacks:
+        stages = _marked(callbacks, cuts, marks)
+        head = [_with_threads(given, context.threads) for given in context.plan.head[: first.at + 1]]
+        head[0] |= _after(marks)
+        left = _Left(Pipeline([*stages, *head], whole=False).lowered.ours[-1].stage, marks)
+        run = callbacks.filter(left, **(_after(marks) if first.at == 0 else {}))
+        pipeline = Pipeline([*stages, *head[:-1], run], whole=False)
+        pipeline.execute(arrays=False)
+    return FirstResults(left.found, left.changes(), _messages(pipeline, context.scratch))
+
+
+def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
+    """What is said of a tile, in the same words of every tile, as a run says it once; nothing of files in `scratch`."""
+    lines = [f"PDAL says: {line}" for line in pipeline.log_lines]
+    for text in pipeline.messages:
+        if text.startswith(scratch) or NO_REFERENCE in text:  # of a piece, as is said of the input
+            continue
+        if TOUCH_NONE in text:  # the places differ from tile to tile
+            text = text[text.index(TOUCH_NONE) :].partition(THE_PLACES)[0]
+        elif nowhere := _NOWHERE.search(text):
+            if nowhere[1] is None:  # the tile has no point of its own: nothing that the user asked for
+                continue
+            text = f"{HOLDS_NOWHERE} points: {nowhere[1]}"
+        lines.append(text)
+    return lines
+
+
+def _marks(cuts: list[Piece], context: RunContext, keep: Collection[str] = ()) -> list[_Mark]:
+    marks = [_Mark(number, piece, context, keep) for number, piece in enumerate(cuts)]
+    for mark in marks:
+        mark.mixed = len({one.old_format for one in marks}) > 1
+    return marks
+
+
+def _marked(callbacks: Callbacks, cuts: list[Piece], marks: list[_Mark]) -> list[dict[str, Any]]:
+    """Readers of the pieces, whose points are numbered."""
+    stages: list[dict[str, Any]] = []
+    for number, piece in enumerate(cuts):
+        reader = {**piece.reader, "filename": piece.path, "tag": f"in{number}"}
+        marked = callbacks.filter(marks[number], _MARK_TYPES, inputs=[f"in{number}"], tag=f"mark{number}")
+        stages += [reader, marked]
+    return stages
+
+
+def _after(marks: list[_Mark]) -> dict[str, Any]:
+    return {"inputs": [f"mark{number}" for number in range(len(marks))]}
+
+
+def _with_threads(given: dict[str, Any], threads: int) -> dict[str, Any]:
+    if given["type"] not in registry.stages():
+        return dict(given)
+    asked = int(given.get("threads") or 0)
+    return {**given, "threads": min(asked, threads) if asked else threads}
+
+
+class _Mark:
+    """Numbers a reader's points, and keeps what they were where changes are to be found later.
+
+    Old PDAL reads the flags of LAS 1.0 to 1.3 as bits of the class. Beside a file of LAS 1.4, whose flags it reads apart,
+    stages could not tell: the bits then go where those are, and back into the results.
+    """
+
+    def __init__(self, number: int, piece: Piece, context: RunContext, keep: Collection[str] = ()) -> None:
+        self.number, self.piece, self.keep = number, piece, list(keep)
+        self.keep_all = context.plan.creates is None
+        self.changed: Changed = {}  # given by the rounds before
+        self.away = np.where(piece.away < 0, -1.0, piece.away * context.unit)
+        self.old_format = holds_flags(piece.path)
+        self.mixed = False  # whether there are others beside it
+        self.holds_flags = False  # whether class codes of the results hold flags
+        self.original: dict[str, NDArray] = {}  # dimensions of the tile's own points
+        self._flags: NDArray[np.uint8] | None = None
+
+    def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        count, own = len(ins["X"]), self.piece.own
+        if count != len(self.away):
+            raise StageError(f"the reader gave {count:,} points of {len(self.away):,}")
+        outs[ROW] = np.arange(count, dtype=np.uint32)
+        outs[INPUT] = np.full(count, self.number, np.uint32)
+        outs[OUTSIDE] = self.away
+        names = [name for name in ins if name not in _MARK_TYPES] if self.keep_all else self.keep
+        self.original = {name: ins[name][own] for name in names}
+        for name, (rows, values) in self.changed.items():
+            outs[name] = np.array(ins[name])
+            outs[name][rows] = values
+        self.holds_flags = self.old_format and not {"Synthetic", "Withheld"} & set(ins)
+        if self.holds_flags and self.mixed:
+            codes = outs.get("Classification", ins["Classification"])
+            self._flags = codes[own] & ~np.uint8(LEGACY_LIMIT)
+            outs["Classification"] = codes & np.uint8(LEGACY_LIMIT)
+            if "ClassFlags" in ins:
+                outs["ClassFlags"] = codes >> np.uint8(LEGACY_LIMIT.bit_length())
+                if self.keep_all:
+                    self.original["ClassFlags"] = outs["ClassFlags"][own]
+
+    def put_flags_back(self, rows: NDArray[np.int64], values: dict[str, NDArray]) -> None:
+        """Give new class codes of some rows the flags that were taken off."""
+        if self._flags is not None and "Classification" in values:
+            values["Classification"] |= self._flags[np.searchsorted(self.piece.own, rows)]
+
+    def changes(self, name: str, rows: NDArray[np.int64], values: NDArray) -> NDArray[np.bool_]:
+        """Which of some rows' values are not what was read; all where the dimension is new."""
+        if name not in self.original:
+            return np.ones(len(rows), bool)
+        return self.original[name][np.searchsorted(self.piece.own, rows)] != values
+
+
+class _Left:
+    """Keeps what a stage would need of a tile's own points if they were far away, and what the stages before changed."""
+
+    def __init__(self, stage: Stage, marks: list[_Mark]) -> None:
+        self.stage, self.marks = stage, marks
+        self.found: list[Left] = []  # one for each view
+        self._views: list[dict[str, NDArray]] = []
+
+    def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        mine = ins[OUTSIDE] < 0
+        if mine.any():
+            self.found.append(
+                self.stage.left_of(points_of(self.stage, module, {n: ins[n][mine] for n in ins}))
+            )
+        self._views.append({name: ins[name][mine] for name in (ROW, INPUT, *self.marks[0].keep)})
+
+    def changes(self) -> dict[str, tuple[NDArray[np.int64], dict[str, NDArray]]]:
+        """Values that differ from what was read, input by input."""
+        out = {}
+        for mark in self.marks:
+            rows, values = _of_piece(self._views, mark, mark.keep)
+            new = np.zeros(len(rows), bool)
+            for name, column in values.items():
+                new |= mark.changes(name, rows, column)
+            if new.any():
+                chosen = {name: column[new] for name, column in values.items()}
+                out[mark.piece.source.key] = (mark.piece.index[rows[new]], chosen)
+        return out
+
+
+class _Reach:
+    """Finds how far an open-ended stage reached for what is used of its results: up to `later` meters outside the tile."""
+
+    def __init__(self, box: Box, later: float) -> None:
+        self.box, self.later, self.need = box, later, 0.0
+        self.stage: Stage | None = None
+
+    def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        assert self.stage is not None
+        points = points_of(self.stage, module, ins)
+        wanted = ins[OUTSIDE] <= self.later if self.later > 0 else ins[OUTSIDE] < 0
+        box = [side * points.units.horizontal for side in self.box]
+        self.need = max(self.need, self.stage.reach_of(points, wanted, box))
+
+
+class _Found:
+    """Takes what the stages gave the tile's own points, view by view: far less than all arrays of all points.
+
+    `with_places`: where all points are, too: X, Y, Z and how far outside the tile.
+    """
+
+    def __init__(self, creates: list[str] | None) -> None:
+        self.creates, self.with_places = creates, False
+        self.views: list[dict[str, NDArray]] = []
+        self.places: list[NDArray[np.float64]] = []
+
+    def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        wanted = ins if self.creates is None else self.creates
+        names = [name for name in wanted if name in ins and name not in _MARK_TYPES]
+        mine = np.flatnonzero(ins[OUTSIDE] < 0)
+        self.views.append({name: ins[name][mine] for name in (ROW, INPUT, *names)})
+        if self.with_places:
+            self.places.append(np.column_stack([ins[name] for name in ("X", "Y", "Z", OUTSIDE)]))
+
+
+def _of_piece(
+    views: list[dict[str, NDArray]], mark: _Mark, names: Collection[str]
+) -> tuple[NDArray[np.int64], dict[str, NDArray]]:
+    """Rows of a piece that came out, ascending, and their values."""
+    mine = [(view, np.flatnonzero(view[INPUT] == mark.number)) for view in views]
+    rows = np.concatenate([np.empty(0, np.int64), *(view[ROW][at] for view, at in mine)])
+    order = np.argsort(rows, kind="stable")
+    values = {name: np.concatenate([view[name][at] for view, at in mine])[order] for name in names}
+    mark.put_flags_back(rows[order], values)
+    return rows[order], values
+
+
+def _collect(
+    views: list[dict[str, NDArray]],
+    cuts: list[Piece],
+    creates: list[str] | None,
+    marks: list[_Mark],
+) -> list[PieceResults]:
+    """Results of the tile's own points, sorted as their pieces are."""
+    names = [name for view in views[:1] for name in view if name not in _MARK_TYPES]
+    results = []
+    for piece, mark in zip(cuts, marks, strict=True):
+        rows, values = _of_piece(views, mark, names)
+        if (np.diff(rows) == 0).any():
+            raise PipelineError(
+                "a stage makes new points, which have no place in the input files",
+                cure="Run the pipeline without --tile",
+            )
+        results.append(PieceResults(piece, rows, values, mark.holds_flags))
+    for name in names if creates is None else ():  # what no stage changed is as it was read
+        if not any(
+            mark.changes(name, result.rows, result.values[name]).any()
+            for result, mark in zip(results, marks, strict=True)
+        ):
+            for result in results:
+                del result.values[name]
+    return results
+
+
+def _far_neighbors(
+    places: list[NDArray[np.float64]], most: int, second: int, context: RunContext, tile: tuple[int, int]
+) -> float:
+    """Meters around the tile within which the `most` nearest neighbors of all its points lie, and the `second` of these."""
+    from scipy.spatial import cKDTree
+
+    x0, y0, x1, y1 = (side * context.unit for side in context.grid.box(tile))
+    every = np.concatenate(places)
+    xyz = every[:, :3] * context.unit
+    mine = xyz[every[:, 3] < 0]
+    if len(xyz) <= most:
+        return 2 * (x1 - x0)
+    inward = np.min([mine[:, 0] - x0, x1 - mine[:, 0], mine[:, 1] - y0, y1 - mine[:, 1]], axis=0)
+    tree = cKDTree(xyz)
+    beyond = np.zeros(len(xyz))
+    if second:
+        beyond = tree.query(xyz, k=[second + 1], workers=context.threads)[0][:, 0]
+    need = 0.0
+    for start in range(0, len(mine), _AT_ONCE):
+        part = slice(start, start + _AT_ONCE)
+        away, at = tree.query(mine[part], k=most + 1, workers=context.threads)
+        need = max(need, float(((away + beyond[at]).max(axis=1) - inward[part]).max()))
+    return need

@@ -1,0 +1,340 @@
+"""Outputs: points read again, results of tiles put into them, the pipeline's tail with its writers run on them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base import las
+from ..base.asprs import LEGACY_LIMIT
+from ..base.complete import check_complete
+from ..base.errors import StageError
+from ..base.extrabytes import number_type
+from ..base.files import whole_files
+from ..pipeline import las_output
+from ..pipeline import pdal as pdal_env
+from ..pipeline.callbacks import Callbacks
+from .grid import Box
+from .pieces import BLOCK, Piece, header_of, open_las, read_block, record_blocks, write_records
+from .plan import TilePlan
+from .settings import MOST_AT_ONCE
+from .sources import InputSource
+from .store import check_run, load_arrays, save_arrays, written
+from .writeroptions import on_one_grid, with_dimensions
+
+#: PDAL's names of types that are not NumPy's with ``_t``.
+_FLOATS = {"float64": "double", "float32": "float"}
+
+
+# ---- results of tiles ----------------------------------------------------------------------------------------
+
+
+@dataclass
+class PieceResults:
+    """Results of a tile's own points of one piece."""
+
+    piece: Piece
+    rows: NDArray[np.int64]  #: (n,) rows of the piece that came out, ascending
+    values: dict[str, NDArray]  #: (n,) new values of dimensions
+    holds_flags: bool = False  #: whether class codes hold the flag bits of LAS 1.0-1.3
+
+
+@dataclass(frozen=True)
+class NewValues:
+    """What points get that are read again, in the order they are read in."""
+
+    kept: NDArray[np.bool_]  #: (n,) which of the points stay
+    #: New values of dimensions and the rows they belong to; None for all.
+    values: Mapping[str, tuple[NDArray[np.int64] | None, NDArray]]
+
+
+def of_own_points(result: PieceResults) -> NewValues:
+    """The results for a file of the tile's own points alone."""
+    own = result.piece.own
+    rows = np.searchsorted(own, result.rows)
+    kept = np.zeros(len(own), bool)
+    kept[rows] = True
+    at = None if kept.all() else rows
+    return NewValues(kept, {name: (at, values) for name, values in result.values.items()})
+
+
+def class_counts(columns: Iterable[tuple[NDArray, bool]]) -> dict[str, int]:
+    """Number of points of each class code; without the flag bits of LAS 1.0-1.3 where it is said that they are inside."""
+    counts = np.zeros(256, np.int64)
+    for codes, holds_flags in columns:
+        codes = np.asarray(codes, np.uint8)
+        counts += np.bincount(codes & LEGACY_LIMIT if holds_flags else codes, minlength=256)
+    return {str(code): int(counts[code]) for code in np.flatnonzero(counts)}
+
+
+def save_results(path: str | Path, results: Iterable[PieceResults], scratch: str) -> None:
+    """Write a tile's results, for the files that outputs are put together from."""
+    content: dict[str, NDArray] = {}
+    for result in results:
+        piece, key = result.piece, result.piece.source.key
+        if len(piece.own):
+            content[f"{key}/index"] = piece.index[result.rows]
+            content[f"{key}/own"] = np.array(len(piece.own))
+            content |= {f"{key}/dim/{name}": values for name, values in result.values.items()}
+    save_arrays(path, content, scratch)
+
+
+def read_results(tiles: Iterable[str], source: InputSource, count: int, start: int, end: int) -> NewValues:
+    """Results of points `start` to `end` of a file with `count` points, out of the files of its tiles.
+
+    Raises
+    ------
+    StageError
+        If the tiles do not hold each of the file's points once.
+    """
+    kept = np.zeros(end - start, bool)
+    seen = 0
+    columns: dict[str, list[tuple[NDArray, NDArray]]] = {}
+    for name in tiles:
+        arrays = load_arrays(name, under=f"{source.key}/")
+        if "index" not in arrays:
+            continue
+        index = arrays["index"]
+        seen += int(arrays["own"])
+        first, last = np.searchsorted(index, (start, end))
+        mine = index[first:last] - start
+        if (index.size and index[-1] >= count) or kept[mine].any():
+            raise StageError("internal: two tiles hold the same point", where=source.path, found=name)
+        kept[mine] = True
+        for dimension, column in arrays.items():
+            if dimension.startswith("dim/"):
+                columns.setdefault(dimension[4:], []).append((mine, column[first:last].copy()))
+    if seen != count:
+        raise StageError(
+            "the tiles do not hold all points of the file: it changed while it was worked on",
+            where=source.path,
+            found=f"{seen:,} of {count:,} points",
+            cure="Start the run again with --resume",
+        )
+    values: dict[str, tuple[NDArray[np.int64] | None, NDArray]] = {}
+    for name, parts in columns.items():
+        rows, new = (np.concatenate(each) for each in zip(*parts, strict=True))
+        if len(rows) == end - start:
+            full = np.empty_like(new)
+            full[rows] = new
+            values[name] = (None, full)
+        else:
+            values[name] = (rows, new)
+    return NewValues(kept, values)
+
+
+# ---- the tail ------------------------------------------------------------------------------------------------
+
+
+def run_tail(
+    readers: list[dict[str, Any]],
+    new: list[NewValues],
+    tail: list[dict[str, Any]],
+    outputs: Sequence[str],
+    scratch: str,
+) -> dict[str, Any]:
+    """Run readers, the new values of each, and the tail with its writers; the record of what they wrote.
+
+    The files, `outputs`, appear under their names when all are whole, and the run goes on whose folder for temporary files
+    is `scratch`.
+    """
+    writers = [stage for stage in tail if stage["type"].startswith("writers.")]
+
+    def finish(made: Path, final: Path, number: int) -> None:
+        check_run(scratch)
+        check_complete(made, final, writers[number], None if "where" in writers[number] else run.count)
+        las.supersede_copc(made)
+
+    flags = las_output.files_with_flags_to_split([*readers, *tail])
+    with Callbacks() as callbacks, whole_files(*outputs, check=finish) as partials:
+        stages = merged(callbacks, readers, new, flags)
+        waiting = iter(partials)
+        for stage in tail:
+            stage = {k: v for k, v in stage.items() if k != "inputs"}
+            if stage["type"].startswith("writers."):
+                stage = las_output.uncompressed_writer({**stage, "filename": str(next(waiting))}, readers)
+            stages.append(stage)
+        run = pdal_env.execute(stages, arrays=False)
+        las_output.compress(partials)
+    return {"outputs": written(outputs), "written": run.count}
+
+
+def merged(
+    callbacks: Callbacks,
+    readers: list[dict[str, Any]],
+    new: list[NewValues],
+    flags: Sequence[bool],
+) -> list[dict[str, Any]]:
+    """Stages that read points, give them their new values, and merge them."""
+    stages: list[dict[str, Any]] = []
+    inputs = []
+    for number, (reader, values) in enumerate(zip(readers, new, strict=True)):
+        stages += [{**reader, "tag": f"in{number}"}, *_put(callbacks, values, number)]
+        if flags and flags[number]:
+            stages.append(las_output.flag_splitter([True], inputs=[stages[-1]["tag"]], tag=f"split{number}"))
+        inputs.append(stages[-1]["tag"])
+    return [*stages, {"type": "filters.merge", "inputs": inputs}]
+
+
+def _put(callbacks: Callbacks, new: NewValues, number: int) -> Iterator[dict[str, Any]]:
+    """Filters that give a reader's points their new values, and drop some; PDAL wants the two apart."""
+
+    def put(module, ins, outs) -> None:
+        if len(ins["X"]) != len(new.kept):
+            raise StageError(f"the reader gave {len(ins['X']):,} points of {len(new.kept):,}")
+        for name, (rows, values) in new.values.items():
+            if rows is None:
+                outs[name] = np.ascontiguousarray(values, ins[name].dtype)
+            else:
+                outs[name] = np.array(ins[name])
+                outs[name][rows] = values
+
+    def drop(module, ins, outs) -> None:
+        outs["Mask"] = np.ascontiguousarray(new.kept, bool)
+
+    types = {name: values.dtype.name for name, (_, values) in new.values.items()}
+    adds = {name: _FLOATS.get(kind, f"{kind}_t") for name, kind in types.items()}
+    yield callbacks.filter(put, adds, inputs=[f"in{number}"], tag=f"put{number}")
+    if not new.kept.all():
+        yield callbacks.filter(drop, inputs=[f"put{number}"], tag=f"left{number}")
+
+
+# ---- an output for each input file -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class FileTask:
+    """An input file's output, to be put together from tiles."""
+
+    plan: TilePlan
+    source: InputSource
+    count: int  #: points of the input
+    results: list[str]  #: files of tiles
+    outputs: list[str]  #: what each of the writers writes
+    scratch: str  #: folder for temporary files
+
+    def run(self) -> dict[str, Any]:
+        """Write the outputs; the record says what was written, and counts classes."""
+        tail = with_dimensions(self.plan.tail, self.plan.beside, [self.source.path])
+        kinds = {
+            (writer["type"], Path(path).suffix.lower())
+            for writer, path in zip(self.plan.writers, self.outputs, strict=True)
+        }
+        plain = kinds <= {("writers.las", ".las"), ("writers.las", ".laz")}
+        if plain and self.count > MOST_AT_ONCE:
+            with contextlib.suppress(_HeadersDifferError):  # such as automatic offsets: written at once
+                return self._in_parts(tail)
+        header = las.read_header(self.source.path)
+        if header is not None and header.count:
+            tail = on_one_grid(tail, header.box, half_open=False)
+        new = self._new_values(0, self.count)
+        reader = {**self.source.reader, "filename": self.source.path}
+        return run_tail([reader], [new], tail, self.outputs, self.scratch) | self._classes([new])
+
+    def _new_values(self, start: int, end: int) -> NewValues:
+        found = read_results(self.results, self.source, self.count, start, end)
+        if self.count:
+            return found
+        # No tile tells which dimensions its points would have got.
+        types = self.plan.makes.items()
+        return NewValues(found.kept, {name: (None, np.empty(0, number_type(kind))) for name, kind in types})
+
+    def _classes(self, new: Iterable[NewValues]) -> dict[str, Any]:
+        flags = las.holds_flags(self.source.path)
+        codes = (each.values["Classification"][1] for each in new if "Classification" in each.values)
+        return {"classes": class_counts((column, flags) for column in codes)}
+
+    def _in_parts(self, tail: list[dict[str, Any]]) -> dict[str, Any]:
+        """Each part goes through tail and writers into uncompressed files, which are joined under the first one's header."""
+        joined: list[_Joined] = []
+        coded: list[NewValues] = []
+
+        def check(made: Path, final: Path, number: int) -> None:
+            check_run(self.scratch)
+            check_complete(made, final, {"type": "writers.las", "filename": final}, joined[number].count)
+
+        tail = [
+            {k: v for k, v in s.items() if k != "compression"} if s["type"] == "writers.las" else s
+            for s in tail
+        ]
+        with whole_files(*self.outputs, check=check) as partials, contextlib.ExitStack() as stack:
+            joined += [stack.enter_context(contextlib.closing(_Joined(p))) for p in partials]
+            folder = stack.enter_context(TemporaryDirectory(dir=self.scratch, ignore_cleanup_errors=True))
+            for start in range(0, self.count, MOST_AT_ONCE):
+                end = min(self.count, start + MOST_AT_ONCE)
+                piece = os.path.join(folder, "part.las")
+                write_records(piece, header_of(self.source.path), record_blocks(self.source.path, start, end))
+                parts = [os.path.join(folder, f"out{n}.las") for n in range(len(self.outputs))]
+                new = self._new_values(start, end)
+                run_tail([{**self.source.reader, "filename": piece}], [new], tail, parts, self.scratch)
+                codes = {k: v for k, v in new.values.items() if k == "Classification"}
+                coded.append(NewValues(np.empty(0, bool), codes))
+                for one, part in zip(joined, parts, strict=True):
+                    one.add(part)
+        record = {"outputs": written(self.outputs), "written": joined[0].count}
+        return record | self._classes(coded)
+
+
+class _HeadersDifferError(Exception):
+    """Parts cannot be joined: the writer gives them different headers."""
+
+
+class _Joined:
+    """A LAS or LAZ file made of others with one header."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.count = path, 0
+        self._writer: Any = None
+        self._head: Any = None
+
+    def add(self, part: str) -> None:
+        """Append the points of a file, which goes."""
+        import laspy
+
+        with open_las(part) as reader:
+            header = reader.header
+            places = [*header.scales.tolist(), *header.offsets.tolist()]
+            records = [(v.user_id, v.record_id, v.record_data_bytes()) for v in header.vlrs]
+            head = (places, header.point_format, str(header.version), records)
+            if self._writer is None:
+                compress = self.path.suffix.lower() == ".laz"
+                self._head = head
+                self._writer = laspy.open(self.path, mode="w", header=header, do_compress=compress)
+            elif head != self._head:
+                raise _HeadersDifferError
+            total = int(header.point_count)
+            for first in range(0, total, BLOCK):
+                self._writer.write_points(read_block(reader, part, first, total))
+            self.count += total
+        os.unlink(part)
+
+    def close(self) -> None:
+        """Finish the file."""
+        if self._writer is not None:
+            self._writer.close()
+
+
+# ---- an output for each tile ---------------------------------------------------------------------------------
+
+
+def write_tile(
+    results: list[PieceResults], plan: TilePlan, outputs: list[str], box: Box, scratch: str
+) -> dict[str, Any]:
+    """Write one tile's own points, from the files that were cut for it; the record. `box`: where the tile lies."""
+    mine = [result for result in results if result.piece.own.size]
+    if not mine:
+        return {"outputs": []}
+    if plan.takes is not None:
+        return plan.takes(mine, outputs, scratch)
+    tail = with_dimensions(plan.tail, plan.beside, [result.piece.source.path for result in mine])
+    readers = [{**result.piece.reader, "filename": result.piece.core} for result in mine]
+    tail = on_one_grid(tail, box, half_open=True)
+    return run_tail(readers, [of_own_points(result) for result in mine], tail, outputs, scratch)

@@ -1,0 +1,281 @@
+"""Points of inputs: read once and sorted by place into an uncompressed copy, of which each tile cuts out what is near it.
+
+A LAZ file can only be read in chunks of 50,000 points, which often lie in a long strip. Tiles read most points several
+times (for the first round, as surroundings of their neighbors), so they read the copy. It is removed when the run is done.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import StageError
+from ..base.runs import begins_run
+from .grid import Box, TileGrid, check_number
+from .sources import InputSource, fetch_ept
+
+if TYPE_CHECKING:  # its import takes 0.15 CPU seconds, which a single file in one piece need not wait for
+    import laspy
+
+#: Points of a block: LAZ is compressed in pieces of so many.
+BLOCK = 50_000
+#: Points that are sorted together.
+_PART = 1_000_000
+#: The points are sorted by cells; so many of these make up the side of a tile.
+_CELLS = 4
+
+
+# ---- LAS and LAZ files by laspy ------------------------------------------------------------------------------
+
+
+def open_las(path: str, only: Sequence[str] = ()):
+    """The file, for reading; StageError with the reason where it cannot be.
+
+    `only`: the dimensions that are needed beside X, Y and the returns, by laspy's names of its selections (``Z``,
+    ``CLASSIFICATION``, ...): LAZ 1.4 holds them apart, so the others take no time. They hold nothing then.
+    """
+    import laspy
+
+    more = {}
+    if only:
+        wanted = laspy.DecompressionSelection.base()
+        for name in only:
+            wanted |= laspy.DecompressionSelection[name]
+        more["decompression_selection"] = wanted
+    try:
+        return laspy.open(path, **more)
+    except Exception as error:  # laspy and the decompressor raise many types
+        found = error if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
+        raise StageError("the input cannot be read", where=path, found=found) from None
+
+
+def read_block(reader: Any, path: str, start: int, end: int, most: int = BLOCK):
+    """Points from number `start` to `end`, `most` at most; StageError where the file is cut short or damaged."""
+    count = min(most, end - start)
+    try:
+        if reader.points_read != start:  # seeking to where one is costs, and forgets what is wanted
+            reader.seek(start)
+        points = reader.read_points(count)
+    except BaseException as error:  # the decompressor's panics are no Exceptions
+        if isinstance(error, KeyboardInterrupt | MemoryError):
+            raise
+        raise StageError(
+            "the input is damaged", where=path, found=f"{type(error).__name__} at point {start:,}: {error}"
+        ) from None
+    if len(points) != count:
+        raise StageError(
+            "the input is cut short", where=path, found=f"it ends before point {start + count:,}"
+        )
+    return points
+
+
+def record_blocks(path: str, start: int = 0, end: int | None = None, most: int = BLOCK) -> Iterator[NDArray]:
+    """Records of the points from one number to another, in blocks, with laspy's names of their fields."""
+    with open_las(path) as reader:
+        end = int(reader.header.point_count) if end is None else end
+        for first in range(start, end, most):
+            yield read_block(reader, path, first, end, most).array
+
+
+def header_of(path: str) -> laspy.LasHeader:
+    """The header of a file, with its records, but that of an octree: points in another order have none."""
+    with open_las(path) as reader:
+        header = reader.header
+    for records in filter(None, (header.vlrs, header.evlrs)):
+        records[:] = [record for record in records if record.user_id != "copc"]
+    return header
+
+
+def write_records(path: str, header: laspy.LasHeader, records: Iterable[NDArray]) -> None:
+    """Write points uncompressed, with the header of the file that they are from."""
+    import laspy
+
+    try:
+        with laspy.open(path, mode="w", header=copy.deepcopy(header), do_compress=False) as writer:
+            for block in records:
+                writer.write_points(laspy.PackedPointRecord(block, header.point_format))
+    except OSError as error:
+        raise StageError("a temporary file could not be written", where=path, found=error) from error
+
+
+# ---- the copy, sorted by place -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CloudIndex:
+    """Where the points of a file lie."""
+
+    count: int
+    box: Box  #: of all points
+    tiles: list[tuple[int, int, int]]  #: column, row and number of points of each tile
+    cells: NDArray[np.int64]  #: (n, 4): column, row, place of the first point in the copy, number of points
+    copy: str  #: the file with the points
+
+    @classmethod
+    def of(cls, record: dict[str, Any], copy: str) -> CloudIndex:
+        """From what :func:`sort_points` found."""
+        cells = np.array(record["cells"], np.int64).reshape(-1, 4)
+        tiles = [(i, j, n) for i, j, n in record["tiles"]]
+        return cls(int(record["count"]), tuple(record["box"]), tiles, cells, copy)
+
+
+def _copy_type(header: laspy.LasHeader) -> np.dtype:
+    """How the copy of a file holds a point: its number in the file, and its record."""
+    return np.dtype([("number", "<i8"), ("record", header.point_format.dtype())])
+
+
+def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
+    """Read a file once, write its points into a copy, sorted by place, and say where they lie (:class:`CloudIndex`).
+
+    Raises
+    ------
+    StageError
+        If any of it cannot be read, or the copy cannot be written.
+    """
+    header = header_of(path)
+    dtype, cells = _copy_type(header), TileGrid(grid.size / _CELLS)
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    tiles: Counter[tuple[int, int]] = Counter()
+    found = []
+    total = 0
+    try:
+        with open(f"{target}.partial", "wb") as out:
+            for records in record_blocks(path, most=_PART):
+                x, y = coordinates(records, header)
+                low = np.minimum(low, (x.min(), y.min()))
+                high = np.maximum(high, (x.max(), y.max()))
+                column, line = cells.index(x), cells.index(y)
+                order = np.lexsort((column, line))
+                column, line = column[order], line[order]
+                starts = np.flatnonzero(begins_run(column) | begins_run(line))
+                rows = np.empty(len(records), dtype)
+                rows["number"] = total + order
+                rows["record"] = records[order]
+                out.write(rows.tobytes())
+                counts = np.diff([*starts, len(order)])
+                made = np.column_stack([column[starts], line[starts], total + starts, counts]).tolist()
+                for i, j, _, number in made:  # cells divide tiles exactly: powers of two do in floats
+                    tiles[i // _CELLS, j // _CELLS] += number
+                check_number(len(tiles), f"{path}, tiles of {grid.size:g}")
+                found += made
+                total += len(records)
+        os.replace(f"{target}.partial", target)
+    except OSError as error:
+        raise StageError(
+            "the points could not be copied into the run's folder",
+            where=path,
+            found=f"{target}: {error.strerror or error}",
+            cure="Make room on the disk: --dry-run says how much is needed",
+        ) from error
+    box = [*low.tolist(), *high.tolist()]
+    return {"count": total, "box": box, "tiles": [(*t, n) for t, n in sorted(tiles.items())], "cells": found}
+
+
+def coordinates(records: NDArray, header: laspy.LasHeader) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """x and y of records."""
+    x, y = (records[name] * header.scales[k] + header.offsets[k] for k, name in enumerate("XY"))
+    return x, y
+
+
+def points_near(path: str, index: CloudIndex, grid: TileGrid, box: Box) -> tuple[NDArray[np.int64], NDArray]:
+    """Numbers, ascending, and records of the points of a file that lie in a box, edges included."""
+    header = header_of(path)
+    (i0, j0), (i1, j1) = (
+        TileGrid(grid.size / _CELLS).index(np.array(corner)).tolist() for corner in (box[:2], box[2:])
+    )
+    i, j = index.cells[:, 0], index.cells[:, 1]
+    near = index.cells[(i >= i0) & (i <= i1) & (j >= j0) & (j <= j1)]
+    dtype = _copy_type(header)
+    parts = [np.empty(0, dtype)]
+    try:
+        with open(index.copy, "rb") as file:
+            for _, _, first, count in near.tolist():
+                file.seek(first * dtype.itemsize)
+                parts.append(np.fromfile(file, dtype, count))
+    except OSError as error:
+        raise StageError("the copy of an input cannot be read", where=path, found=error) from error
+    rows = np.concatenate(parts)
+    x, y = coordinates(rows["record"], header)
+    rows = rows[(x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])]
+    rows = rows[np.argsort(rows["number"])]
+    return np.ascontiguousarray(rows["number"]), np.ascontiguousarray(rows["record"])
+
+
+# ---- a tile and its surroundings -----------------------------------------------------------------------------
+
+
+@dataclass
+class Piece:
+    """Points of one input in a tile and around it, in their order, as an uncompressed LAS file."""
+
+    source: InputSource
+    path: str
+    core: str  #: another file, with the tile's own points alone; empty where none was asked for
+    index: NDArray[np.int64]  #: (n,) number of each point in its input file
+    #: (n,) how far it lies outside the tile along the farther axis, in the unit of the coordinates; -1 inside
+    away: NDArray[np.float64]
+    tiles: set[tuple[int, int]]  #: that its points belong to
+
+    @cached_property
+    def own(self) -> NDArray[np.int64]:
+        """Rows of the tile's own points."""
+        return np.flatnonzero(self.away < 0)
+
+    @property
+    def reader(self) -> dict[str, Any]:
+        """The reader of its input, without a file's name."""
+        return {**self.source.reader, "type": "readers.las"}
+
+
+def cut_all(
+    grid: TileGrid,
+    tile: tuple[int, int],
+    sources: Sequence[tuple[InputSource, CloudIndex | None]],
+    halo_units: float,
+    folder: str,
+    cores: bool = False,
+) -> list[Piece]:
+    """A tile's points and their surroundings, out of every input that has any there.
+
+    `halo_units` is in the unit of the coordinates; `cores`: the tile's own points come in files of their own, too.
+    """
+    box, own = grid.box(tile, halo_units), grid.box(tile)
+    pieces = []
+    for number, (source, index) in enumerate(sources):
+        path = source.path
+        if source.kind == "ept":
+            path = os.path.join(folder, f"fetched{number}.las")
+            if not fetch_ept(source, box, path):
+                continue
+            records = np.concatenate(list(record_blocks(path)))
+            numbers = np.arange(len(records))
+        elif index is not None:
+            numbers, records = points_near(path, index, grid, box)
+        else:
+            continue
+        if not len(records):
+            continue
+        header = header_of(path)
+        x, y = coordinates(records, header)
+        places = np.column_stack([grid.index(x), grid.index(y)])
+        away = np.maximum(np.maximum(own[0] - x, x - own[2]), np.maximum(own[1] - y, y - own[3]))
+        away = np.where((places == tile).all(axis=1), -1.0, np.maximum(away, 0.0))
+        target = os.path.join(folder, f"piece{number}.las")
+        write_records(target, header, [records])
+        core = ""
+        if cores:
+            core = os.path.join(folder, f"core{number}.las")
+            write_records(core, header, [records[away < 0]])
+        corner = places.min(axis=0)
+        at = np.ravel_multi_index((places - corner).T, wide := tuple(np.ptp(places, axis=0) + 1))
+        there = corner + np.column_stack(np.unravel_index(np.flatnonzero(np.bincount(at)), wide))
+        pieces.append(Piece(source, target, core, numbers, away, {(i, j) for i, j in there.tolist()}))
+    return pieces

@@ -1,0 +1,526 @@
+"""A tiled run: inputs read once, what tiles need of the ground, tiles, outputs that are put together from them."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from ..base import lascheck
+from ..base.errors import DependencyError, StageError
+from ..base.files import sweep
+from ..base.jit import kept_kernels
+from ..base.plain import print_messages
+from ..base.progress import Progress
+from ..base.version import build
+from ..pipeline.las_output import files_with_flags_to_split
+from ..pipeline.overrides import Override
+from ..pipeline.read import PipelineSource
+from ..pipeline.run import Pipeline
+from ..pipeline.workers import run_tasks
+from .cluster import open_workers
+from .grid import Box, TileGrid, touching
+from .ground import BlockTask, FirstRoundTask, block_file, blocks_around, left_file, tiles_around
+from .head import RunContext
+from .outputs import FileTask
+from .pieces import CloudIndex, sort_points
+from .plan import TilePlan, make_plan, outputs_for
+from .report import InterruptedRun, Job, TiledRun, messages_of, summarize
+from .settings import TilingOptions, worker_bytes
+from .store import Store, fingerprint, unchanged
+from .survey import Survey
+from .tile import TileTask
+from .writeroptions import remarks, with_one_format
+
+#: A run stops when so many tiles failed for one reason and none succeeded.
+_HOPELESS = 10
+#: CPU seconds of a core for a point of a tile, for one that is only read around a tile, and for one in all other steps.
+_OWN, _AROUND, _OTHER = 8.0e-6, 1.3e-6, 5.0e-6
+#: Bytes that a run keeps of a point until its output is written; in the rounds before the tiles, and there of a cell.
+_KEPT, _KEPT_BEFORE, _KEPT_OF_CELL = 20, 24, 112
+
+
+def run_tiled(
+    source: str | Path | list | dict | Pipeline,
+    tile: float | TilingOptions,
+    overrides: Iterable[Override] = (),
+    *,
+    dry_run: bool = False,
+    progress: bool | None = None,
+    **options: Any,
+) -> TiledRun:
+    """Run a pipeline in tiles.
+
+    Parameters
+    ----------
+    source : str, Path, list, dict or Pipeline
+        As for :class:`pdal_stages.Pipeline`, or one that was made already.
+    tile : float or TilingOptions
+        Side of the tiles, in the unit of the coordinates; or all options.
+    overrides : iterable of Override
+    dry_run : bool
+        Only find the tiles; nothing is read but headers, nothing written.
+    progress : bool, optional
+        Whether to show progress on stderr.
+    **options
+        The other fields of :class:`TilingOptions`.
+
+    Returns
+    -------
+    TiledRun
+        With the failures of tiles, which do not raise: look at :attr:`TiledRun.failures`.
+
+    Raises
+    ------
+    StageError
+        For what is wrong before any tile, or with every tile.
+    InterruptedRun
+        A KeyboardInterrupt with what was done until then.
+
+    Examples
+    --------
+    >>> from pdal_stages.tiling import run_tiled
+    >>> run = run_tiled("classify.json", 500, workers=2)             # doctest: +SKIP
+    >>> run.failures                                                 # doctest: +SKIP
+    []
+    """
+    chosen = tile if isinstance(tile, TilingOptions) else TilingOptions(tile, **options)
+    pipeline = source if isinstance(source, Pipeline) else Pipeline(source, overrides, whole=False)
+    plan = make_plan(pipeline, chosen.buffer)
+    return run_plan(plan, chosen, dry_run=dry_run, progress=progress, source=pipeline.source)
+
+
+def run_plan(
+    plan: TilePlan,
+    chosen: TilingOptions,
+    *,
+    dry_run: bool = False,
+    progress: bool | None = None,
+    finished: Callable[[Job], None] | None = None,
+    source: PipelineSource | None = None,
+) -> TiledRun:
+    """Run what was planned; see :func:`run_tiled`. `finished` hears of every output that was written.
+
+    `source`: the pipeline as the user gave it, which is tried on an input first.
+    """
+    started = time.monotonic()
+    folder = Path(plan.writers[0]["filename"]).absolute().parent
+    if chosen.resume and chosen.tile is None:  # the free memory may be another today
+        chosen = replace(chosen, tile=(Store(folder).note("run") or {}).get("tile"))
+    survey = Survey(plan, chosen)
+    if survey.per == "tile":  # whose outputs have points of all readers
+        plan = replace(plan, tail=with_one_format(plan.tail, survey.paths))
+        files_with_flags_to_split([*plan.readers, *plan.tail])
+    survey.messages += remarks(plan.tail, survey.per)
+    if source is not None:
+        _try_on_an_input(source, survey, len(plan.readers))
+    if dry_run:
+        return estimate(plan, survey)
+    if not folder.is_dir():
+        raise StageError("the folder of the output does not exist", found=str(folder), cure="Create it first")
+    if plan.makes and progress is not False and not chosen.scheduler and not kept_kernels():
+        print_messages("compiling for this processor first, once: it takes a minute or two")
+    folders = {folder}
+    if survey.per == "file":  # refused now, not after reading all inputs
+        named = outputs_for(plan, survey.names, survey.paths)
+        folders |= {Path(path).parent for paths in named for path in paths}
+    with Store(folder) as store:
+        if not chosen.resume:
+            store.clear()
+        store.finish("run", "", {"tile": survey.grid.size})
+        try:
+            with open_workers(survey.options, str(store.folder)) as workers:
+                run = _Run(plan, survey, store, workers, progress)
+                run.read_inputs()
+                run.find_jobs()
+                if chosen.resume:
+                    run.take_over()
+                    run.read_inputs(run.inputs_of_waiting())
+                interrupted = True
+                with contextlib.suppress(KeyboardInterrupt):
+                    run.make_ground()
+                    run.make_outputs(finished)
+                    run.forget()
+                    interrupted = False
+        finally:
+            for each in folders:
+                sweep(each)  # what workers left that were killed
+    summary = survey.figures(plan) | {"workers": workers.slots, "threads_per_worker": workers.threads}
+    summary |= summarize(run.tiles, run.cpu_seconds, time.monotonic() - started)
+    summary["peak_mb_of_a_worker"] = run.peak_mb
+    messages = survey.messages + messages_of(run.tiles, run.messages_before, chosen.most_points)
+    found = TiledRun(run.tiles, run.outputs, survey.unreadable, survey.changed(), messages, summary)
+    if interrupted:
+        raise InterruptedRun(found)
+    return found
+
+
+def _try_on_an_input(source: PipelineSource, survey: Survey, readers: int) -> None:
+    """Let PDAL prepare the pipeline on one input: stages that lack dimensions and unknown options fail before any tile."""
+    inputs = [s for s in survey.sources if s.path not in survey.unreadable and s.kind == "las"]
+    if not inputs:
+        return
+    reader: dict[str, Any] = {**inputs[0].reader, "type": "readers.las", "filename": inputs[0].path}
+    tags = [stage.get("tag") if isinstance(stage, dict) else None for stage in source.stages[:readers]]
+    stages = [{**reader, "tag": tag} if tag else dict(reader) for tag in tags]
+    with contextlib.suppress(DependencyError):  # the program pdal is not there to ask
+        Pipeline(replace(source, stages=[*stages, *source.stages[readers:]]), whole=False).prepare()
+
+
+class _Run:
+    """What a run has to do, and what it has done."""
+
+    def __init__(self, plan: TilePlan, survey: Survey, store: Store, workers: Any, show: bool | None) -> None:
+        self.plan, self.survey, self.store, self.workers, self.show = plan, survey, store, workers, show
+        self.tiles: list[Job] = []  #: with points of their own, row by row
+        self.outputs: list[Job] = []  #: one for each input file; empty where each tile is an output
+        self.cpu_seconds: dict[str, float] = {}  #: of tasks, tries that failed too, by step
+        self.peak_mb = 0.0  #: the most memory that a process held
+        self.messages_before: list[list[str]] = []  #: warnings and notes of the rounds before the tiles
+        #: How far around a tile, in units of the coordinates, inputs are at hand: it may have to be read wider.
+        self.farthest = max(4 * survey.halo_units, survey.halo_units + survey.grid.size)
+        self._marks: dict[Any, str] = {}
+
+    def _do(
+        self,
+        what: str,
+        waiting: deque[Job],
+        task_of: Callable[[Job], Callable[[], Any]],
+        mark_of: Callable[[Job], str],
+    ) -> Iterator[Job]:
+        """Do jobs as workers are free, note what is done, and yield each; outputs may be put in after every one.
+
+        Raises
+        ------
+        StageError
+            If the first jobs all fail for one reason.
+        """
+        for job in waiting:
+            self.store.forget(job.name)
+        counted = [job for job in waiting if job.step != "outputs"]
+        done, failures = 0, []
+        with Progress(sum(job.points for job in counted), what, enabled=self.show) as progress:
+            for job, answer in run_tasks(self.workers, waiting, task_of):
+                spent = self.cpu_seconds.get(job.step, 0.0)
+                self.cpu_seconds[job.step] = spent + answer.cost.get("cpu_seconds", 0.0)
+                self.peak_mb = max(self.peak_mb, answer.cost.get("peak_mb", 0.0))
+                if answer.reason:
+                    job.fail(answer.reason)
+                else:
+                    job.state, job.record = "done", answer.result | answer.cost
+                    with contextlib.suppress(StageError, OSError):  # no room: a later run does it again
+                        self.store.finish(job.name, mark_of(job), job.record)
+                if job.step != "outputs":
+                    done += not answer.reason
+                    failures += [answer.reason] if answer.reason else []
+                    failed = f", {len(failures)} failed" if failures else ""
+                    progress.label = f"{what}, {done} of {len(counted)}{failed}"
+                    progress.update(job.points)
+                if job.outputs:
+                    progress.clear()  # what is printed of it begins a line
+                yield job
+                if not done and len(failures) >= _HOPELESS and len(set(failures)) == 1:
+                    raise StageError(
+                        f"the first {len(failures)} tiles all failed for one reason, so the run was stopped",
+                        found=failures[0],
+                    )
+
+    # ---- inputs ----------------------------------------------------------------------------------------------
+
+    def read_inputs(self, needed: Collection[str] | None = None) -> None:
+        """Read LAS and LAZ files once, sort their points by place, and note where they lie.
+
+        Those that an earlier run read are only read again where their points are `needed` (paths) and not there any more.
+        """
+        survey, store = self.survey, self.store
+        marks = {
+            s.path: fingerprint(s.path, survey.stamps[s.path], survey.grid.size)
+            for s in survey.sources
+            if s.kind == "las" and s.path not in survey.unreadable
+        }
+        copies = {path: store.path(f"{mark}.points") for path, mark in marks.items()}
+        if needed is None:
+            store.remove(".points", [copy.name for copy in copies.values()])
+        waiting: deque[Job] = deque()
+        for source in survey.sources:
+            if (mark := marks.get(source.path)) is None:
+                continue
+            copy = copies[source.path]
+            known = store.note(mark)
+            if known and (copy.exists() or needed is None or source.path not in needed):
+                survey.indexes[source.path] = CloudIndex.of(known, str(copy))
+            else:
+                waiting.append(Job(mark, survey.extents[source.path].count, source=source, step="index"))
+
+        def task_of(job: Job) -> Callable[[], Any]:
+            assert job.source is not None
+            return partial(sort_points, job.source.path, survey.grid, str(copies[job.source.path]))
+
+        for job in self._do("reading the inputs", waiting, task_of, lambda job: job.name):
+            assert job.source is not None
+            path = job.source.path
+            if job.reason:
+                survey.unreadable[path] = job.reason
+                continue
+            index = survey.indexes[path] = CloudIndex.of(job.record, str(copies[path]))
+            if index.count and (odd := lascheck.beyond_box(path, index.box)):
+                survey.messages.append(odd)
+        survey.place()
+
+    def inputs_of_waiting(self) -> set[str]:
+        """Inputs whose points tiles read that are to be run."""
+        far = self.farthest
+        if first := self.plan.first:
+            far += (first.far_m + first.blocks.side + first.blocks.reach) / self.survey.unit
+            far += self.survey.grid.size
+        waiting = [job.tile for job in self.tiles if job.state == "waiting" and job.tile]
+        return {source.path for tile in waiting for source in self.survey.near(tile, far)}
+
+    # ---- tiles and outputs -----------------------------------------------------------------------------------
+
+    def find_jobs(self) -> None:
+        """All tiles and outputs; those that unreadable inputs are part of fail."""
+        plan, survey = self.plan, self.survey
+        for tile, points in survey.tiles().items():
+            job = Job(survey.grid.name(tile), points, tile)
+            near = survey.near(tile, plan.sees_m / survey.unit)
+            if bad := [s.path for s in near if s.path in survey.unreadable]:
+                job.fail(f"an input here cannot be read: {bad[0]}", bad[0])
+            self.tiles.append(job)
+        if survey.per == "tile":
+            named = outputs_for(plan, [job.name for job in self.tiles], survey.paths)
+            for job, paths in zip(self.tiles, named, strict=True):
+                job.outputs = paths
+            return
+        by_tile = {job.tile: job for job in self.tiles}
+        named = outputs_for(plan, survey.names, survey.paths)
+        for source, paths in zip(survey.sources, named, strict=True):
+            out = Job(f"file-{source.key}", source=source, outputs=paths, step="outputs")
+            if index := survey.indexes.get(source.path):
+                out.points, out.jobs = index.count, [by_tile[i, j] for i, j, _ in index.tiles]
+            if source.path in survey.unreadable:
+                out.fail(f"its input cannot be read: {source.path}", source.path)
+            self.outputs.append(out)
+
+    def mark_of(self, job: Job) -> str:
+        """Fingerprint of all that decides a tile's result or an output.
+
+        Of a tile that is every input that was read for it, too; its record says with how wide surroundings.
+        """
+        plan, survey = self.plan, self.survey
+        tail = [plan.tail, plan.beside, survey.stamps_of(plan.tail)]
+        if job.source is not None:
+            return fingerprint(
+                survey.seen([job.source]), tail, [self.mark_of(j) for j in job.jobs], job.outputs
+            )
+        assert job.tile is not None
+        halo_m = max(float(job.record.get("halo_m", 0.0)), plan.sees_m)
+        if (job.tile, halo_m) not in self._marks:
+            self._marks[job.tile, halo_m] = fingerprint(
+                build(),
+                [plan.head, survey.stamps_of(plan.head), plan.creates],
+                [job.tile, survey.grid.size, plan.halo_m, plan.sees_m, survey.options.most_points],
+                tail if survey.per == "tile" else [],
+                survey.seen(survey.near(job.tile, halo_m / survey.unit)),
+            )
+        return self._marks[job.tile, halo_m]
+
+    def take_over(self) -> None:
+        """Keep what an earlier run finished; tiles that no output waits for need not be done again."""
+        for job in self.tiles:
+            job.record = self.store.note(job.name) or {}
+        for out in self.outputs:
+            known = self.store.finished(out.name, self.mark_of(out))
+            if out.state == "waiting" and known:
+                out.state, out.record = "kept", known
+        needed = {job.name for out in self.outputs if out.state == "waiting" for job in out.jobs}
+        for job in self.tiles:
+            if job.state == "waiting":
+                same = job.record.get("fingerprint") == self.mark_of(job)
+                wanted = job.outputs is not None or job.name in needed
+                if (same and (not wanted or unchanged(job.record))) or not wanted:
+                    job.state = "kept"
+                    if same:
+                        continue
+            job.record = {}
+
+    def _context(self) -> RunContext:
+        """What all tiles have in common."""
+        survey, most = self.survey, self.survey.options.most_points
+        if survey.density.points <= most:
+            most = 1 << 62  # a wider halo never holds more than all there is, however far they reach
+        plan = replace(self.plan, readers=[])  # tasks travel, and there may be thousands
+        threads, scratch = self.workers.threads, str(self.store.scratch)
+        return RunContext(plan, survey.grid, survey.unit, survey.bounds, threads, most, scratch)
+
+    def make_outputs(self, finished: Callable[[Job], None] | None = None) -> None:
+        """Do all waiting tiles, and outputs as soon as the last of their tiles is there. `finished` hears of outputs."""
+        survey, store, context = self.survey, self.store, self._context()
+        before = str(store.kept) if self.plan.first is not None and len(self.tiles) > 1 else ""
+        waiting = deque(job for job in self.tiles if job.state == "waiting")
+        users: dict[str, list[Job]] = {}
+        for out in self.outputs:
+            _make_ready(out, waiting)
+            for job in out.jobs:
+                users.setdefault(job.name, []).append(out)
+
+        def task_of(job: Job) -> Callable[[], Any]:
+            if job.source is not None:
+                results = [str(store.path(f"{each.name}.npz")) for each in job.jobs]
+                assert job.outputs is not None
+                plan, scratch = context.plan, context.scratch
+                return FileTask(plan, job.source, job.points, results, job.outputs, scratch).run
+            assert job.tile is not None
+            sources = survey.near(job.tile, self.farthest)
+            complete = math.inf if len(sources) == len(survey.placed) else self.farthest * survey.unit
+            result = str(store.path(f"{job.name}.npz"))
+            given = survey.readable(sources)
+            return TileTask(context, job.tile, given, complete, result, job.outputs, before).run
+
+        for job in self._do("tiles", waiting, task_of, self.mark_of):
+            if finished is not None and job.state == "done" and job.outputs and job.record["outputs"]:
+                finished(job)
+            for out in users.get(job.name, ()):
+                _make_ready(out, waiting)
+
+    def forget(self) -> None:
+        """Remove what nothing waits for any more."""
+        needed = {f"{job.name}.npz" for out in self.outputs if out.state == "failed" for job in out.jobs}
+        if any(job.state in ("waiting", "failed") for job in self.tiles):
+            needed |= {
+                path.name for end in ("first", "block") for path in self.store.kept.glob(f"*.{end}.npz")
+            }
+        self.store.remove(".npz", needed)
+        self.store.remove(".points")
+
+    # ---- the rounds before the tiles ---------------------------------------------------------------------------
+
+    def make_ground(self) -> None:
+        """Make what waiting tiles need, but what an earlier run left; tiles near what fails fail too."""
+        first, survey, store = self.plan.first, self.survey, self.store
+        if first is None or len(self.tiles) == 1:
+            store.remove(".first.npz")
+            store.remove(".block.npz")
+            return
+        grid, unit, context = survey.grid, survey.unit, self._context()
+        by_tile = {job.tile: job for job in self.tiles if job.tile}
+        spill = first.blocks.spill
+        blocks = {b for tile in by_tile for b in blocks_around(first, grid.box(tile), unit, spill)}
+        # An earlier run may have had other inputs.
+        store.remove(".first.npz", [left_file(job.name) for job in self.tiles])
+        store.remove(".block.npz", [block_file(block) for block in blocks])
+        around = self.farthest * unit + first.blocks.around
+        running = [job for job in self.tiles if job.state == "waiting" and job.tile]
+        boxes = [grid.box(job.tile) for job in running if job.tile]
+        needed = {block for box in boxes for block in blocks_around(first, box, unit, around)} & blocks
+        near = {block: tiles_around(first, grid, unit, block, by_tile) for block in sorted(needed)}
+        head = self.plan.head[: first.at + 1]
+        common = [build(), head, survey.stamps_of(head), grid.size, first.halo_m, unit, first.kept]
+        marks: dict[tuple[int, int], str] = {}
+
+        def fail(box: Box, around_m: float, reason: str) -> None:
+            wide = around_m / unit
+            for n in touching(boxes, (box[0] - wide, box[1] - wide, box[2] + wide, box[3] + wide)):
+                if running[n].state == "waiting":
+                    running[n].fail(reason)
+
+        def first_task(job: Job) -> Callable[[], Any]:
+            assert job.tile is not None
+            sources = survey.readable(survey.near(job.tile, first.halo_m / unit))
+            return FirstRoundTask(context, first, job.tile, sources, str(store.path(f"{job.name}.npz"))).run
+
+        def block_task(job: Job) -> Callable[[], Any]:
+            assert job.tile is not None
+            left = [str(store.path(left_file(by_tile[t].name))) for t in near[job.tile] if t in marks]
+            target = str(store.path(block_file(job.tile)))
+            return BlockTask(context.plan, job.tile, left, target, context.scratch).run
+
+        jobs = []
+        for tile in sorted({tile for found in near.values() for tile in found}):
+            seen = survey.seen([s for s, _ in survey.readable(survey.near(tile, first.halo_m / unit))])
+            marks[tile] = fingerprint(common, tile, seen)
+            name = left_file(by_tile[tile].name).removesuffix(".npz")
+            jobs.append(Job(name, by_tile[tile].points, tile, step="first_rounds"))
+        for job in self._unfinished("lowest points of cells", jobs, first_task, lambda job: marks[job.tile]):
+            if job.reason:
+                del marks[job.tile]
+                fail(grid.box(job.tile), first.far_m, job.reason)
+            else:
+                self.messages_before.append(job.record["messages"])
+
+        def block_mark(job: Job) -> str:
+            assert job.tile is not None
+            return fingerprint(common, job.tile, [marks[tile] for tile in near[job.tile] if tile in marks])
+
+        jobs = [Job(block_file(b).removesuffix(".npz"), 1, b, step="first_rounds") for b in near]
+        for job in self._unfinished("ground by blocks", jobs, block_task, block_mark):
+            if job.reason:
+                x0, y0, x1, y1 = (side / unit for side in TileGrid(first.blocks.side).box(job.tile))
+                fail((x0, y0, x1, y1), self.plan.halo_m + first.blocks.around, job.reason)
+
+    def _unfinished(
+        self,
+        what: str,
+        jobs: Sequence[Job],
+        task_of: Callable[[Job], Callable[[], Any]],
+        mark_of: Callable[[Any], str],
+    ) -> Iterator[Any]:
+        """Do what is not there from an earlier run, and yield it."""
+        waiting = deque(job for job in jobs if self.store.finished(job.name, mark_of(job)) is None)
+        return self._do(what, waiting, task_of, mark_of)
+
+
+def _make_ready(out: Job, waiting: deque[Job]) -> None:
+    """Put an output to work when the last of its tiles is there."""
+    if out.state != "waiting" or any(job.state == "waiting" for job in out.jobs):
+        return
+    failed = [job for job in out.jobs if job.state == "failed"]
+    if failed:
+        others = f", and {len(failed) - 1} more of its tiles" if len(failed) > 1 else ""
+        blocked = failed[0].blocked_by if all(job.blocked_by for job in failed) else ""
+        out.fail(f"tile {failed[0].name} failed{others}", blocked)
+    else:
+        out.state = "ready"
+        waiting.appendleft(out)
+
+
+def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
+    """What a run would do: tiles, points, memory and time, as the headers of the inputs tell (``--dry-run``)."""
+    grid, options, density = survey.grid, survey.options, survey.density
+    jobs = {tile: Job(grid.name(tile), tile=tile) for tile in survey.tiles()}
+    for extent in survey.extents.values():
+        x0, y0, x1, y1 = extent.box
+        for tile in grid.covering(extent.box) if extent.count else ():
+            a = grid.box(tile)
+            wide = max(min(a[2], x1) - max(a[0], x0), 0.0) or (x1 == x0)
+            high = max(min(a[3], y1) - max(a[1], y0), 0.0) or (y1 == y0)
+            share = wide * high / (max(x1 - x0, 1e-9) * max(y1 - y0, 1e-9))
+            jobs[tile].points += round(extent.count * min(1.0, share))
+    tiles = list(jobs.values())
+    outputs_for(plan, survey.names if survey.per == "file" else [job.name for job in tiles], survey.paths)
+    count, read = density.points, density.read_by(grid.size, survey.halo_units)
+    seconds = count * (_OWN + _OTHER) + sum(max(0, read - job.points) for job in tiles) * _AROUND
+    kept = float(count * _KEPT * (survey.per == "file"))
+    if plan.first is not None:
+        cells = density.area * (survey.unit / plan.first.blocks.cell) ** 2
+        kept += count * _KEPT_BEFORE + cells * _KEPT_OF_CELL
+    largest = density.largest if survey.per == "file" else 0
+    summary = survey.figures(plan) | {
+        "workers": options.local_workers,
+        "threads_per_worker": options.threads,
+        "points": count,
+        "points_of_largest_tile": max((job.points for job in tiles), default=0),
+        "points_read_by_a_tile": read,
+        "memory_mb_of_a_worker": worker_bytes(read, largest, survey.block_bytes) / 2**20,
+        "points_per_core_second": count / seconds if seconds else 0.0,
+        "core_hours": seconds / 3600,
+        "disk_gb": kept / 1e9,
+        "states": {"waiting": len(tiles)},
+    }
+    return TiledRun(tiles, [], survey.unreadable, [], survey.messages, summary)
