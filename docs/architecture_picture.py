@@ -41,7 +41,7 @@ COLUMNS = (
     (
         "Afterwards",
         (
-            ("With --tile: put the tiles' results", "into the points of each file", "tiling/file_task.py"),
+            ("With --tile: put the tiles' results", "into the points of each file", "tiling/outputs.py"),
             ("Writer, under a hidden name", "", "PDAL"),
             ("Check that the file is complete,", "then give it its name", "base/lascheck.py"),
             ("Compare with a reference", "", "accuracy/measures.py"),
