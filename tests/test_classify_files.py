@@ -71,8 +71,7 @@ def files_in(folder, pattern="*"):
     ("given", "output", "workers", "names"),
     [
         ("in", "out", 1, ["t0.laz", "t1.laz", "t2.laz"]),
-        ("in/t[12].laz", "out/c_#.las", 1, ["c_t1.las", "c_t2.las"]),
-        ("in", "out", 2, ["t0.laz", "t1.laz", "t2.laz"]),
+        ("in/t[12].laz", "out/c_#.las", 2, ["c_t1.las", "c_t2.las"]),
         ("in/t0.laz", "out", 1, ["t0.laz"]),
     ],
 )
@@ -187,39 +186,26 @@ def test_a_file_that_fails_does_not_stop_the_others(folder, classify, tmp_path):
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_the_same_is_said_once(folder, classify, tmp_path, workers):
-    """Inputs that cannot be cut go one by one; what holds for several is said of the first, then of the others."""
+    """Inputs that cannot be cut go one by one; what holds for several is said of the first."""
     for number in range(3):
         las = laspy.read(folder / "in" / f"t{number}.laz")
         rows = np.column_stack([las.x, las.y, las.z])
         np.savetxt(tmp_path / f"t{number}.txt", rows, delimiter=",", header="X,Y,Z", comments="")
     (tmp_path / "u0.ply").write_bytes(b"ply\n")
-    code, out, err = classify(
-        tmp_path / "*.txt", tmp_path / "*.ply", tmp_path / "o_#.laz", "--workers", workers
-    )
-    lines = err.splitlines()
-    assumed = [line for line in lines if "meters were assumed" in line]
-    assert code == 1 and "1 of 4 files failed" in lines[-1] and "by itself" in err, err
-    assert len(assumed) == 2 and assumed[1].startswith("pdal-stages: also ") and assumed[1].count(".txt") == 2
+    words = (tmp_path / "*.txt", tmp_path / "*.ply", tmp_path / "o_#.laz", "--workers", workers)
+    code, out, err = classify(*words, "--metadata", tmp_path / "m.json")
+    assert code == 1 and "1 of 4 files failed" in err.splitlines()[-1] and "by itself" in err, err
+    assert err.count("meters were assumed") == 1 and "u0.ply" in err
     assert files_in(tmp_path, "o_*") == ["o_t0.laz", "o_t1.laz", "o_t2.laz"]
     assert sum("o_t" in line for line in out.splitlines()) == 3
+    found = json.loads((tmp_path / "m.json").read_text())["files"]
+    assert len(found) == 4 and "error" in found[3] and found[0]["output"].endswith("o_t0.laz")
 
 
-@pytest.mark.parametrize("many", [False, True])
-@pytest.mark.parametrize(
-    "words",
-    [
-        "--resume",
-        "--tile 50",
-        "--tile auto",
-        "--memory 1GB",
-        "--per tile",
-        "--report r.json",
-        "--tile 50 --dry-run",
-    ],
-)
-def test_flags_of_tiles_are_refused_where_nothing_can_be_cut(folder, classify, tmp_path, words, many):
+@pytest.mark.parametrize("words", ["--resume", "--tile auto", "--report r.json"])
+def test_flags_of_tiles_are_refused_where_nothing_can_be_cut(folder, classify, tmp_path, words):
     rows = laspy.read(folder / "in" / "t0.laz").xyz
-    for number in range(1 + many):
+    for number in range(2):
         np.savetxt(tmp_path / f"t{number}.txt", rows, delimiter=",", header="X,Y,Z", comments="")
     code, _, err = classify(tmp_path / "*.txt", tmp_path / "o_#.laz", *words.split())
     assert code == 1 and f"{words.split()[0]} needs inputs that can be cut" in err and "t0.txt" in err
@@ -281,7 +267,7 @@ def test_dimensions_are_chosen(folder, classify, tmp_path, words, made):
 
 
 @pytest.mark.parametrize("suffix", ["txt", "ply"])
-@pytest.mark.parametrize(("words", "made"), [("none", []), ("Margin", ["margin"]), (None, ["reliability"])])
+@pytest.mark.parametrize(("words", "made"), [("none", []), (None, ["reliability"])])
 def test_dimensions_are_chosen_for_text_and_ply(folder, classify, tmp_path, suffix, words, made):
     out = tmp_path / f"o.{suffix}"
     code, _, err = classify(folder / "in" / "t0.laz", out, *(("--dimensions", words) if words else ()))

@@ -236,43 +236,6 @@ def test_the_side_of_tiles_keeps_to_the_memory(density, memory, halo):
     assert used <= memory and chosen.workers >= 1 and chosen.tile > 0
 
 
-# ---- many small inputs -----------------------------------------------------------------------------------
-
-
-def test_many_small_inputs(survey, classify, tmp_path, write_las):
-    """25 files with two offsets: results are those of one run over all."""
-    las = laspy.read(survey / "town.laz")
-    x, y = np.asarray(las.x), np.asarray(las.y)
-    (tmp_path / "in").mkdir()
-    for i in range(5):
-        for j in range(5):
-            mine = (np.floor((x - 500_000) / 18) == i) & (np.floor((y - 5_400_000) / 18) == j)
-            part = {"X": x[mine], "Y": y[mine], "Z": np.asarray(las.z)[mine]}
-            part |= {
-                "Classification": np.asarray(las.classification)[mine],
-                "GpsTime": np.asarray(las.gps_time)[mine],
-            }
-            offset = (499_000.0, 5_399_000.0, 100.0 * (i % 2))
-            write_las(
-                tmp_path / "in" / f"t{i}{j}.laz",
-                part,
-                point_format=6,
-                wkt=WKT,
-                scale=0.001,
-                offset=offset,
-            )
-    code, _, err = classify(tmp_path / "in", tmp_path / "out/", "--tile", 40, "--workers", 0)
-    assert code == 0, err
-    code, _, err = classify(tmp_path / "in", tmp_path / "one/", "--tile", 1000, "--workers", 0)
-    assert code == 0, err
-    assert contents(tmp_path / "out") == contents(tmp_path / "one")
-    paths = sorted((tmp_path / "in").iterdir())
-    for path in paths:
-        before, after = laspy.read(path), laspy.read(tmp_path / "out" / path.name)
-        for axis in ("X", "Y", "Z", "gps_time"):
-            assert np.array_equal(before[axis], after[axis])
-
-
 def test_a_worker_has_room_for_the_blocks_before_the_tiles():
     blocks = Blocks(1024.0, 494.0, 100.0, 2.0)
     whole = block_bytes(blocks, 1e9)
