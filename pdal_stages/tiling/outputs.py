@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from ..base import las
 from ..base.asprs import LEGACY_LIMIT
-from ..base.complete import check_complete
 from ..base.errors import StageError
-from ..base.extrabytes import number_type
 from ..base.files import whole_files
+from ..base.lascheck import check_complete
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
 from ..pipeline.callbacks import Callbacks
@@ -245,7 +244,9 @@ class FileTask:
             return found
         # No tile tells which dimensions its points would have got.
         types = self.plan.makes.items()
-        return NewValues(found.kept, {name: (None, np.empty(0, number_type(kind))) for name, kind in types})
+        return NewValues(
+            found.kept, {name: (None, np.empty(0, las.number_type(kind))) for name, kind in types}
+        )
 
     def _classes(self, new: Iterable[NewValues]) -> dict[str, Any]:
         flags = las.holds_flags(self.source.path)

@@ -20,7 +20,6 @@ import sys
 import tempfile
 import zipfile
 from collections.abc import Callable
-from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -39,10 +38,10 @@ from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
 from pdal_stages.pipeline.pdal import version
 from pdal_stages.pipeline.read import decode, parse_pipeline
 from pdal_stages.stages.where import Expression
-from pdal_stages.tiling import results, sources
+from pdal_stages.tiling import outputs, sources
 from pdal_stages.tiling.grid import TileGrid
-from pdal_stages.tiling.index import sort_points
-from pdal_stages.tiling.store import Store, _sealed
+from pdal_stages.tiling.pieces import sort_points
+from pdal_stages.tiling.store import Store
 
 TESTS = Path(__file__).resolve().parents[1]
 #: Name -> what is called, and good inputs to start from.
@@ -176,7 +175,7 @@ def cloud(data: bytes) -> str:
     las.odd_text(path)
     las.extra_dimensions(path)
     found = sources.las_extent(str(path))
-    assert sort_points(str(path), TileGrid(10.0), str(path.with_suffix(".copy"))).count == found.count
+    assert sort_points(str(path), TileGrid(10.0), str(path.with_suffix(".copy")))["count"] == found.count
     las.supersede_copc(path)
     return "read"
 
@@ -231,35 +230,30 @@ def ept(data: bytes) -> str:
 
 # ---- what a tiled run keeps ---------------------------------------------------------------------------------
 
-_REPORT = {"fingerprint": "f", "outputs": [["/no/such", 1, 2]], "points": 3}
-_INDEX = {"count": 3, "box": [0, 0, 1, 1], "tiles": [[0, 0, 3]], "cells": [[0, 0, 0, 3]]}
+_NOTES = {
+    "a": {"outputs": [["/no/such", 1, 2]], "points": 3, "fingerprint": "f"},
+    "b": {"count": 3, "box": [0, 0, 1, 1], "tiles": [[0, 0, 3]], "cells": [[0, 0, 0, 3]], "fingerprint": "g"},
+}
 
 
-@cache
-def _kept() -> tuple[Store, tuple[Path, ...]]:
-    keeping = Store(folder())
-    for place in (keeping.folder, keeping.tiles, keeping.indexes):
-        place.mkdir(exist_ok=True)
-    return keeping, (keeping.files, keeping.tiles / "a.json", keeping.indexes / "a.json")
+def _notes() -> list[bytes]:
+    with Store(folder()) as keeping:
+        for name, note in _NOTES.items():
+            keeping.finish(name, str(note["fingerprint"]), note)
+        return [keeping.path(f"{name}.json").read_bytes() for name in _NOTES]
 
 
-@target(
-    lambda: [
-        _sealed(p, note).encode()
-        for p, note in zip(_kept()[1], ({"a": _REPORT}, _REPORT, _INDEX), strict=True)
-    ]
-)
+@target(_notes)
 def store(data: bytes) -> str:
     """Notes of a run: what was changed, or belongs elsewhere, is not believed."""
-    keeping, paths = _kept()
-    for path in paths:
-        path.write_bytes(data)
-    with keeping:
-        written, finished, found = keeping.written("a"), keeping.finished("a"), keeping.index("a")
-    assert written is None and finished in (None, _REPORT)
-    if found is not None:
-        assert {n: np.asarray(v).tolist() for n, v in asdict(found).items() if n != "copy"} == _INDEX
-    return "read" if finished or found else "refused"
+    found = []
+    with Store(folder()) as keeping:
+        for name, note in _NOTES.items():
+            keeping.path(f"{name}.json").write_bytes(data)
+            found.append(keeping.note(name))
+            assert found[-1] in (None, note)
+        assert keeping.finished("a", "f") is None  # whose file is not there
+    return "read" if any(found) else "refused"
 
 
 _SOURCE = sources.InputSource("/a.las", {"type": "readers.las"}, "las")
@@ -269,7 +263,7 @@ def _results() -> list[bytes]:
     rows = np.arange(40, dtype=np.int64)
     content = {
         "index": rows,
-        "core": np.array(40),
+        "own": np.array(40),
         "dim/Classification": (rows % 7).astype(np.uint8),
         "dim/H": rows / 7,
     }
@@ -281,7 +275,7 @@ def _results() -> list[bytes]:
 @target(_results)
 def result(data: bytes) -> str:
     """The results of a tile: what was changed is found, whatever it is."""
-    new = results.read_range([str(put("tile.npz", data))], _SOURCE, 40, 0, 40)
+    new = outputs.read_results([str(put("tile.npz", data))], _SOURCE, 40, 0, 40)
     assert new.kept.all() and set(new.values) == {"Classification", "H"}
     assert np.array_equal(new.values["Classification"][1], np.arange(40) % 7)
     assert np.array_equal(new.values["H"][1], np.arange(40) / 7)
