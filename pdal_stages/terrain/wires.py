@@ -10,83 +10,112 @@ are whole numbers and all reaches are bounded (:data:`REACH`), so neither the or
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from ..base.unionfind import root as root_of
 from .minima import cell_numbers
 from .patches import patches
-from .seenbelow import CELL, HALF, SeenBelow
 
-#: How far apart in height the levels of a cell are at least, meters.
-GAP = 1.0
+#: Side of the cells, and how far apart in height the levels of a cell are at least, meters.
+CELL, GAP = 1.0, 1.0
 #: Wires hang higher than that above the ground, are no thicker in a cell, and have no more other levels around, in 5 x 5
 #: cells.
 LOWEST, THICK, CROWD = 4.0, 0.9, 14
-#: Where points are dense, that is in so many of those cells, others may be in such a share of them: wires side by side.
+#: Where points are in so many of those cells, others may be in such a share of them: wires side by side.
 DENSE, SHARE = 24, 0.85
-#: Those are leaves unless what lies about as high, within half a line's length, is scattered so much less across than along
+#: These are leaves unless what lies about as high, within half a line's length, is scattered so much less across than along
 #: (squared).
 ACROSS = 0.3
-#: Pieces of a line, and how far above or below it, and beside it, points may lie; meters.
-PIECE, NEAR, BESIDE = 2.0, 0.35, 1.0
+#: Half the length of the line that is looked for, pieces of it, and how far above or below it, and beside it, points may
+#: lie; meters.
+HALF, PIECE, NEAR, BESIDE = 12.0, 2.0, 0.35, 1.0
 #: The steepest line, rise over run.
 STEEPEST = 0.6
 #: Pieces of the line that must be filled: of all, or of those to one side where it ends.
 FILLED, ONE_SIDED = 8, 5
 #: Around the line, from `CLEAR` meters farther on to `AROUND`, there is at most such a share of what is on it.
 CLEAR, AROUND, MUCH = 0.45, 2.0, 0.34
-#: Unless it is on other lines beside, all of which hold no more than so many times what is on the line.
-MOST = 3.0
-_BIN, _BINS = 0.4, 14
+#: What lies `UNDER` meters below the line is counted up to `STRIP` meters from it, and to each side from `STRIP_FROM` to
+#: `STRIP_TO`: below are so many of all that is not higher on the fuller side, for the same area, and to either side so many
+#: of what is below on the other.
+UNDER, STRIP, STRIP_FROM, STRIP_TO, SEEN, EITHER = 1.0, 0.6, 1.2, 3.6, 0.55, 0.2
 #: Of the lines' levels on a line, so many hide nothing: a tree or a roof may stand close to a wire.
 VOTE = 0.3
-#: Lines are so long, and the gaps in them no longer.
-LONG, HOP = 30.0, 6
-#: How far a wire goes on along its line into what is not clear, such as a tree or its tower.
-ON = 6.0
+#: Lines are so long, and the gaps in them no longer; so far a wire goes on into what is not clear, as a tree or its tower.
+LONG, HOP = 30.0, 6.0
 #: How far away points matter, meters.
-REACH = LONG + 3 * HALF + HOP + ON + 6.0
+REACH = LONG + 3 * HALF + 2 * HOP + 6.0
+#: Cells beside the high points' raster from which the ground near lines may be seen.
+_MARGIN = int((HALF + STRIP_TO) / CELL) + 1
 _PARTS = 1024
 
 
-@njit
-def _levels(x, y, z, column, row, left, bottom, h, w, order):
-    """Levels of cells: mean place (n, 3), thickness, and each point's level; `order` sorts points by cell and height."""
-    level = np.full(len(z), -1, np.int64)
-    sums = np.zeros((len(z), 4), np.int64)
-    thick = np.empty(len(z))
-    cells = np.empty(len(z), np.int64)
-    n, before, low, high = -1, -1, 0.0, 0.0
-    for q in range(len(order)):
-        p = order[q]
-        k = (row[p] - bottom) * w + column[p] - left
-        if k != before or z[p] - high > GAP:
-            n += 1
-            low, cells[n] = z[p], k
-        before, high = k, z[p]
-        thick[n] = high - low
-        level[p] = n
-        sums[n, 0] += 1
-        sums[n, 1] += int(np.rint((x[p] - column[p] * CELL) * _PARTS))
-        sums[n, 2] += int(np.rint((y[p] - row[p] * CELL) * _PARTS))
-        sums[n, 3] += int(np.rint(z[p] * _PARTS))
-    n += 1
-    place = np.empty((n, 3))
-    for m in range(n):
-        for a in range(3):
-            place[m, a] = sums[m, a + 1] / sums[m, 0] / _PARTS
-    start = np.zeros(h * w + 1, np.int64)
-    for m in range(n):
-        start[cells[m] + 1] += 1
-    for k in range(h * w):
-        start[k + 1] += start[k]
-    return place, thick[:n].copy(), cells[:n].copy(), level, start
+def find_wires(
+    xyz: NDArray[np.float64], height: NDArray[np.float64], use: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Points (n,) of wires: coordinates (n, 3) and heights above ground in meters, finite; only points to `use` count."""
+    out = np.zeros(len(xyz), bool)
+    high = np.flatnonzero(use & (height > LOWEST))
+    if not len(high):
+        return out
+    column, row = cell_numbers(xyz[:, 0], CELL), cell_numbers(xyz[:, 1], CELL)
+    for points, own in patches(column[high], row[high], int(REACH), int(LONG)):
+        at = high[points]
+        left, bottom = int(column[at].min()) - _MARGIN, int(row[at].min()) - _MARGIN
+        w, h = int(column[at].max()) + 1 + _MARGIN - left, int(row[at].max()) + 1 + _MARGIN - bottom
+        near = use & (column >= left) & (column < left + w) & (row >= bottom) & (row < bottom + h)
+        found = _find(xyz, (row - bottom) * w + column - left, np.flatnonzero(near), at, h, w)
+        out[at[own]] = found[own]
+    return out
+
+
+def _find(xyz, cell, every, high, h, w) -> NDArray[np.bool_]:
+    """Which of the high points are of wires; `cell` numbers those of a raster, of which `every` has the points there."""
+    order = np.lexsort((xyz[high, 2], cell[high]))
+    z, cells = xyz[high[order], 2], cell[high[order]]
+    begins = np.r_[True, (np.diff(cells) != 0) | (np.diff(z) > GAP)]
+    level = np.empty(len(high), np.int64)
+    level[order] = np.cumsum(begins) - 1
+    first = np.flatnonzero(begins)
+    cells, thick = cells[first], z[np.r_[first[1:], len(z)] - 1] - z[first]
+    # Places are within their own cells and sums of whole numbers, so that neither where the raster begins nor order matters.
+    within = xyz[high] - np.floor(xyz[high] / CELL) * [CELL, CELL, 0.0]
+    sums = [np.bincount(level, np.rint(axis * _PARTS)) for axis in within.T]
+    place = np.column_stack(sums) / np.bincount(level)[:, None] / _PARTS
+    start = np.searchsorted(cells, np.arange(h * w + 1))
+    held = np.bincount(cell[every], minlength=h * w) > 0
+    thin, crowded = _thin(place, thick, cells, start, h, w, held)
+    line = np.zeros((len(thin), 3))
+    good = _lines(place, cells, start, h, w, thin, crowded, line)
+    if not good.any():
+        return np.zeros(len(high), bool)
+    order = every[np.argsort(cell[every], kind="stable")]
+    begin = np.searchsorted(cell[order], np.arange(h * w + 1))
+    on = np.zeros(len(xyz), bool)
+    on[high] = good[level]
+    x, y, z = (xyz[order] - np.floor(xyz[order] / CELL) * [CELL, CELL, 0.0]).T
+    seen = _seen_through(place, cells, w, good, line, x, y, z, begin, on[order])
+    one, other, along = _on_lines(place, cells, start, h, w, good, line)
+    count = len(good)
+    lines = good[other]
+    good &= np.bincount(one[lines], seen[other[lines]], count) >= VOTE * np.bincount(
+        one[lines], minlength=count
+    )
+    near = (along <= HOP) & good[one]
+    linked = near & good[other]
+    pairs = scipy.sparse.coo_array((np.ones(linked.sum()), (one[linked], other[linked])), (count, count))
+    parts, part = scipy.sparse.csgraph.connected_components(pairs, directed=False)
+    low, high_end = scipy.ndimage.minimum, scipy.ndimage.maximum
+    sides = [high_end(at, part, range(parts)) - low(at, part, range(parts)) for at in np.divmod(cells, w)]
+    good &= (np.maximum(*sides) * CELL >= LONG)[part]
+    good[other[near & good[one]]] = True
+    return good[level]
 
 
 @njit
 def _thin(place, thick, cells, start, h, w, held):
-    """Levels that may be of a wire, of cells `held` (h * w) by any point; and those among which leaves may be."""
+    """Levels that may be of a wire: thin ones with few others around; and those among which leaves may be."""
     out, crowded = np.zeros(len(thick), np.bool_), np.zeros(len(thick), np.bool_)
     for n in range(len(thick)):
         if thick[n] > THICK:
@@ -103,38 +132,6 @@ def _thin(place, thick, cells, start, h, w, held):
     return out, crowded
 
 
-@device
-def _clutter(near, count, slim, ux, uy, rise, pieces):
-    """Levels around a line that are on no other line beside it, filled like it."""
-    half, middle = pieces.shape[2] // 2, _BINS // 2 + 1
-    pieces[:] = False
-    for m in range(count):
-        along = near[m, 0] * ux + near[m, 1] * uy
-        a = int(np.floor((near[m, 1] * ux - near[m, 0] * uy) / _BIN)) + middle
-        b = int(np.floor((near[m, 2] - rise * along) / _BIN)) + middle
-        if slim[m] and 0 <= a < _BINS + 2 and 0 <= b < _BINS + 2:
-            pieces[a, b, min(int((along + HALF) / PIECE), 2 * half - 1)] = True
-    beside = 0
-    for m in range(count):
-        along = near[m, 0] * ux + near[m, 1] * uy
-        aside, above = near[m, 1] * ux - near[m, 0] * uy, near[m, 2] - rise * along
-        away = max(max(abs(aside) - BESIDE + NEAR, 0.0), abs(above))
-        if not NEAR + CLEAR < away <= AROUND:
-            continue
-        a, b = int(np.floor(aside / _BIN)) + middle, int(np.floor(above / _BIN)) + middle
-        a, b = min(max(a, 1), _BINS), min(max(b, 1), _BINS)
-        lower = upper = 0
-        for s in range(2 * half):
-            there = False
-            for c in range(a - 1, a + 2):
-                for d in range(b - 1, b + 2):
-                    there |= pieces[c, d, s]
-            lower += there and s < half
-            upper += there and s >= half
-        beside += not slim[m] or (lower + upper < FILLED and max(lower, upper) < ONE_SIDED)
-    return beside
-
-
 @njit
 def _lines(place, cells, start, h, w, thin, crowded, line):
     """Fill `line` (n, 3) with the direction (x, y; rise over run) of the line through each level; returns which have one."""
@@ -144,7 +141,6 @@ def _lines(place, cells, start, h, w, thin, crowded, line):
     near = np.empty((4096, 3))
     slim = np.empty(4096, np.bool_)
     filled = np.zeros(2 * half, np.bool_)
-    pieces = np.zeros((_BINS + 2, _BINS + 2, 2 * half), np.bool_)
     for n in range(len(thin)):
         if not thin[n]:
             continue
@@ -156,11 +152,8 @@ def _lines(place, cells, start, h, w, thin, crowded, line):
                 for m in range(start[b * w + a], start[b * w + a + 1]):
                     if m == n or count == len(near):
                         continue
-                    # Places are within their own cells, so that nothing depends on where the array begins.
-                    dx, dy = (
-                        (a - i) * CELL + place[m, 0] - place[n, 0],
-                        (b - j) * CELL + place[m, 1] - place[n, 1],
-                    )
+                    dx = (a - i) * CELL + place[m, 0] - place[n, 0]
+                    dy = (b - j) * CELL + place[m, 1] - place[n, 1]
                     dz = place[m, 2] - place[n, 2]
                     if abs(dz) > STEEPEST * HALF + AROUND or dx * dx + dy * dy > HALF * HALF:
                         continue
@@ -184,98 +177,78 @@ def _lines(place, cells, start, h, w, thin, crowded, line):
             for m in range(count):
                 along = near[m, 0] * ux + near[m, 1] * uy
                 aside, above = near[m, 1] * ux - near[m, 0] * uy, near[m, 2] - rise * along
-                aside = max(abs(aside) - BESIDE + NEAR, 0.0)
-                away = max(aside, abs(above))
+                away = max(abs(aside) - BESIDE + NEAR, abs(above))
                 if away <= NEAR:
                     on += slim[m]
                     filled[min(int((along + HALF) / PIECE), 2 * half - 1)] |= slim[m]
-                elif NEAR + CLEAR < away <= AROUND:
+                elif NEAR + CLEAR < away <= AROUND and (abs(above) > NEAR + CLEAR or not slim[m]):
                     beside += 1
-            lower, upper = 0, 0
+            lower = upper = 0
             for s in range(half):
                 lower += filled[s]
                 upper += filled[half + s]
             if lower + upper < FILLED and max(lower, upper) < ONE_SIDED:
                 continue
-            score = 2 * (lower + upper)
-            if score < best or (score == best and on <= many):
-                continue
-            if beside > MUCH * on and (
-                beside > MOST * on or _clutter(near, count, slim, ux, uy, rise, pieces) > MUCH * on
-            ):
-                continue
-            best, many = score, on
-            line[n, 0], line[n, 1], line[n, 2] = ux, uy, rise
-            good[n] = True
+            score = lower + upper
+            if beside <= MUCH * on and (score > best or (score == best and on > many)):
+                best, many = score, on
+                line[n, 0], line[n, 1], line[n, 2] = ux, uy, rise
+                good[n] = True
     return good
 
 
-@device
-def _on_line(place, line, n, m, dj, di, along_most):
-    """Whether a level lies on the line through another."""
-    dx, dy = di * CELL + place[m, 0] - place[n, 0], dj * CELL + place[m, 1] - place[n, 1]
-    along = dx * line[n, 0] + dy * line[n, 1]
-    aside = dy * line[n, 0] - dx * line[n, 1]
-    above = place[m, 2] - place[n, 2] - line[n, 2] * along
-    return abs(along) <= along_most and abs(aside) <= BESIDE and abs(above) <= NEAR + 0.02 * abs(along)
-
-
 @njit
-def _voted(place, cells, start, h, w, good, line, seen):
-    """Levels of lines, of whose levels near by most are `seen` through."""
-    out = np.zeros(len(good), np.bool_)
-    reach = int(HALF / CELL)
-    for n in range(len(good)):
-        if not good[n]:
-            continue
-        j, i = cells[n] // w, cells[n] % w
-        all_of, those = 0, 0
-        for b in range(max(j - reach, 0), min(j + reach + 1, h)):
-            for a in range(max(i - reach, 0), min(i + reach + 1, w)):
-                for m in range(start[b * w + a], start[b * w + a + 1]):
-                    if good[m] and _on_line(place, line, n, m, b - j, a - i, HALF):
-                        all_of += 1
-                        those += seen[m]
-        out[n] = those >= VOTE * all_of
-    return out
+def _seen_through(place, cells, w, good, line, x, y, z, begin, on):
+    """Of the levels with lines, those that hide nothing.
 
-
-@njit
-def _joined(place, cells, start, h, w, good, line):
-    """Levels of lines that are long."""
-    parent = np.arange(len(good))
-    for n in range(len(good)):
-        if not good[n]:
-            continue
-        j, i = cells[n] // w, cells[n] % w
-        for b in range(max(j - HOP, 0), min(j + HOP + 1, h)):
-            for a in range(max(i - HOP, 0), min(i + HOP + 1, w)):
-                for m in range(start[b * w + a], start[b * w + a + 1]):
-                    if good[m] and m != n and _on_line(place, line, n, m, b - j, a - i, float(HOP)):
-                        one, other = root_of(parent, n), root_of(parent, m)
-                        parent[max(one, other)] = min(one, other)
-    box = np.empty((len(good), 4), np.int64)
-    for n in range(len(good)):
-        box[n, 0] = box[n, 2] = 1 << 60
-        box[n, 1] = box[n, 3] = -1
-    for n in range(len(good)):
-        if good[n]:
-            own = box[root_of(parent, n)]
-            j, i = cells[n] // w, cells[n] % w
-            own[0], own[1], own[2], own[3] = min(own[0], j), max(own[1], j), min(own[2], i), max(own[3], i)
-    out = np.zeros(len(good), np.bool_)
-    for n in range(len(good)):
-        if good[n]:
-            own = box[root_of(parent, n)]
-            out[n] = max(own[1] - own[0], own[3] - own[2]) * CELL >= LONG
-    return out
-
-
-@njit
-def _extended(place, cells, start, h, w, good, line):
-    """The same, and levels near on their lines."""
+    Of all points in the order of their cells, which begin at `begin`: places in these (x, y), heights, and whether they are
+    `on` such lines.
+    """
     out = good.copy()
-    reach = int(ON / CELL)
+    for n in range(len(good)):
+        if not good[n]:
+            continue
+        j, i = cells[n] // w, cells[n] % w
+        below, sides, under = 0, np.zeros(2, np.int64), np.zeros(2, np.int64)
+        for b in range(j - _MARGIN, j + _MARGIN + 1):
+            # Of the row, the columns near to the line.
+            low, high = i - _MARGIN, i + _MARGIN + 1
+            if abs(line[n, 1]) > 0.1:
+                middle = i + (b - j) * line[n, 0] / line[n, 1]
+                around = (STRIP_TO + 2.0) / abs(line[n, 1]) + 1.0
+                low, high = max(low, int(middle - around)), min(high, int(middle + around) + 2)
+            for a in range(low, high):
+                for p in range(begin[b * w + a], begin[b * w + a + 1]):
+                    dx, dy = (a - i) * CELL + x[p] - place[n, 0], (b - j) * CELL + y[p] - place[n, 1]
+                    along, aside = dx * line[n, 0] + dy * line[n, 1], dy * line[n, 0] - dx * line[n, 1]
+                    if abs(along) > HALF or abs(aside) > STRIP_TO:
+                        continue
+                    above = z[p] - place[n, 2] - line[n, 2] * along
+                    if abs(aside) <= STRIP:
+                        below += above < -UNDER
+                    elif abs(aside) > STRIP_FROM and above < UNDER and not on[p]:
+                        sides[int(aside > 0.0)] += 1
+                        under[int(aside > 0.0)] += above < -UNDER
+        out[n] = below * (STRIP_TO - STRIP_FROM) >= SEEN * 2.0 * STRIP * sides.max()
+        out[n] &= under.min() >= EITHER * under.max()
+    return out
+
+
+@device
+def _distance(place, line, n, m, dj, di):
+    """How far along the line through a level another lies, which is on it; infinite where it is not."""
+    dx, dy = di * CELL + place[m, 0] - place[n, 0], dj * CELL + place[m, 1] - place[n, 1]
+    along = abs(dx * line[n, 0] + dy * line[n, 1])
+    aside = dy * line[n, 0] - dx * line[n, 1]
+    above = place[m, 2] - place[n, 2] - line[n, 2] * (dx * line[n, 0] + dy * line[n, 1])
+    return along if abs(aside) <= BESIDE and abs(above) <= NEAR + 0.02 * along else np.inf
+
+
+@njit
+def _on_lines(place, cells, start, h, w, good, line):
+    """Levels with lines, others on these up to `HALF` meters away, themselves included, and how far away (k,)."""
+    one, other, far = np.empty(1024, np.int64), np.empty(1024, np.int64), np.empty(1024)
+    count, reach = 0, int(HALF / CELL)
     for n in range(len(good)):
         if not good[n]:
             continue
@@ -283,37 +256,12 @@ def _extended(place, cells, start, h, w, good, line):
         for b in range(max(j - reach, 0), min(j + reach + 1, h)):
             for a in range(max(i - reach, 0), min(i + reach + 1, w)):
                 for m in range(start[b * w + a], start[b * w + a + 1]):
-                    if not out[m] and _on_line(place, line, n, m, b - j, a - i, ON):
-                        out[m] = True
-    return out
-
-
-def find_wires(
-    xyz: NDArray[np.float64], height: NDArray[np.float64], use: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
-    """Points (n,) of wires: coordinates (n, 3) and heights above ground in meters, finite; only points to `use` count."""
-    out = np.zeros(len(xyz), bool)
-    high = np.flatnonzero(use & (height > LOWEST))
-    if not len(high):
-        return out
-    x, y, z = (np.ascontiguousarray(axis) for axis in xyz[high].T)
-    column, row = cell_numbers(x, CELL), cell_numbers(y, CELL)
-    below = SeenBelow(xyz, use, high)
-    for points, own in patches(column, row, int(REACH), int(LONG)):
-        at = np.arange(len(high))[points]
-        c, r = column[at], row[at]
-        left, bottom = int(c.min()), int(r.min())
-        h, w = int(r.max()) + 1 - bottom, int(c.max()) + 1 - left
-        order = np.lexsort((z[at], c, r))
-        place, thick, cells, level, start = _levels(x[at], y[at], z[at], c, r, left, bottom, h, w, order)
-        thin, crowded = _thin(place, thick, cells, start, h, w, below.held((left, bottom, h, w)))
-        line = np.zeros((len(thin), 3))
-        good = _lines(place, cells, start, h, w, thin, crowded, line)
-        if not good.any():
-            continue
-        seen = below.seen_through(good, line, place, cells, (left, bottom, h, w), at, level)
-        good = _voted(place, cells, start, h, w, good, line, seen)
-        good = _joined(place, cells, start, h, w, good, line)
-        found = _extended(place, cells, start, h, w, good, line)[level]
-        out[high[at[own]]] = found[own]
-    return out
+                    away = _distance(place, line, n, m, b - j, a - i)
+                    if away > HALF:
+                        continue
+                    if count == len(one):
+                        one, other = np.concatenate((one, one)), np.concatenate((other, other))
+                        far = np.concatenate((far, far))
+                    one[count], other[count], far[count] = n, m, away
+                    count += 1
+    return one[:count], other[:count], far[:count]
