@@ -59,10 +59,3 @@ def test_another_python_is_told(tmp_path, monkeypatch):
 
     assert "another pdal_stages" in doctor._python_of("filters.python", another).found
     assert "did not run" in doctor._python_of("filters.python", lambda stages: None).found
-
-
-def test_extras_are_named(monkeypatch):
-    monkeypatch.setattr(doctor, "_EXTRAS", {"none": ("no-such-package", "nothing")})
-    monkeypatch.setattr(sys, "prefix", "/usr")  # not the environment that scripts/setup made
-    (finding,) = doctor._extras()
-    assert "pdal-stages[none]" in finding.cure and not finding.needed

@@ -115,13 +115,6 @@ def project():
     )
 
 
-def test_conda_environment_has_every_dependency():
-    text = (ROOT / "environment.yml").read_text(encoding="utf-8")
-    conda = {match.lower() for match in re.findall(r"^  - ([\w-]+)", text, re.MULTILINE)}
-    wanted = {re.match(r"[\w-]+", line).group().lower() for line in project()["project"]["dependencies"]}
-    assert wanted | {"pdal", "python-pdal", "lazrs-python"} <= conda
-
-
 def test_every_data_file_is_packaged():
     patterns = project()["tool"]["setuptools"]["package-data"]["pdal_stages"]
     package = ROOT / "pdal_stages"

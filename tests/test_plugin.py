@@ -21,7 +21,7 @@ import pytest
 import pdal_stages as ps
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
-from pdal_stages.plugin import arrival, building, declarations, places
+from pdal_stages.plugin import arrival, building, places
 from pdal_stages.stages import registry
 from pdal_stages.synthetic import TownOptions, write_town
 
@@ -157,14 +157,6 @@ def test_every_stage_is_listed_with_its_options(stock):
         described = stock("--options", name).stdout
         for option in kind.all_options():
             assert f"\n  {option.name}" in described, (name, option.name)
-
-
-def test_what_is_declared_is_what_the_stage_has():
-    text = declarations.header()
-    for kind in registry.stages().values():
-        for option in declarations.native_options(kind):
-            assert f'"{option.name}", Kind::' in text
-    assert declarations._text('ü "a?') == '"\\303\\274 \\042a\\077"'
 
 
 # ---- the same bytes ----------------------------------------------------------------------------------------
@@ -344,25 +336,6 @@ def test_an_empty_list_is_none(pipeline, town, tmp_path):
             stage = {"type": "filters.hag_minima", "ignore": value}
             run([str(town), stage, {"type": "writers.text", "filename": str(file)}])
         assert files[0].read_bytes() == files[1].read_bytes()
-
-
-def test_numbers_are_typed_as_in_json():
-    kind = registry.get("filters.hag_morphological")
-    texts = {
-        "cell": ["2"],
-        "slope": ["0.5"],
-        "ground": ["true"],
-        "openings": ["5", "17"],
-        "terrain_slope": ["invert"],
-    }
-    assert arrival._parsed(kind, texts) == {
-        "cell": 2, "slope": 0.5, "ground": True, "openings": [5, 17], "terrain_slope": True,
-    }  # fmt: skip
-    train = registry.get("writers.classifiermodel")
-    typed = arrival._parsed(
-        train, {"classes": ['{"2": 2}'], "neighborhoods": ["c1,kopt(10,50)"], "label": ["7"]}
-    )
-    assert typed == {"classes": {"2": 2}, "neighborhoods": ["c1", "kopt(10,50)"], "label": "7"}
 
 
 # ---- errors ------------------------------------------------------------------------------------------------

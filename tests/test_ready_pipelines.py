@@ -9,7 +9,7 @@ import laspy
 import numpy as np
 import pytest
 
-from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
+from pdal_stages.pipeline.overrides import parse_overrides
 from pdal_stages.pipeline.run import Pipeline
 from pdal_stages.synthetic import TownOptions, write_town
 from pdal_stages.tiling import run_tiled
@@ -54,31 +54,6 @@ def test_none_is_forgotten():
     assert {f.stem for f in FILES} == tested
     listed = (FOLDER.parent / "docs" / "how-to.md").read_text()
     assert all(f"`{f.name}`" in listed for f in FILES)
-
-
-@pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
-def test_names_say_what_they_are(path):
-    stages = json.loads(path.read_text())
-    assert isinstance(stages, list)
-    assert all("tag" in s for s in stages)
-
-
-@pytest.mark.parametrize(
-    ("name", "dimension"), [("features", "Linearity_kopt"), ("features-for-viewers", "Verticality_s2")]
-)
-def test_features(town, tmp_path, name, dimension):
-    out = tmp_path / "o.laz"
-    run(name, f"--stage.input.filename={town}", f"--stage.output.filename={out}")
-    values = np.asarray(laspy.read(out)[dimension])
-    assert np.isfinite(values).all()
-    assert 0 <= values.min() < values.max() <= 1
-
-
-def test_training_gives_models(models):
-    from pdal_stages.classifier import load_model
-
-    assert {2, 5, 6} <= {code for code, _ in load_model(models / "classes.model").classes}
-    assert [code for code, _ in load_model(models / "buildings.model").classes] == [1, 6]
 
 
 @pytest.mark.parametrize("name", ["classify", "classify-with-rejection", "classify-on-smrf-ground"])
@@ -141,23 +116,6 @@ def test_tiles_to_tiles(town, models, tmp_path):
         assert all(len(found) == 1 for found in cells.values()), cells
         corners.add(tuple(found.pop() for found in cells.values()))
     assert len(corners) == 4
-
-
-def _with(name, *words):
-    return apply_overrides(json.loads((FOLDER / f"{name}.json").read_text()), parse_overrides(words)[0])
-
-
-def _same_points(some, others):
-    """The same points with the same classes and reliabilities, in any order."""
-
-    def table(parts):
-        columns = [
-            np.concatenate([np.asarray(part[name]) for part in parts])
-            for name in ("X", "Y", "Z", "classification", "Reliability")
-        ]
-        return np.column_stack(columns)[np.lexsort(columns)]
-
-    np.testing.assert_array_equal(table(some), table(others))
 
 
 def test_raw_to_footprints(town, tmp_path):

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import subprocess
 
-import numpy as np
 import pytest
 
 from pdal_stages.base.errors import PipelineError
@@ -110,19 +108,3 @@ def test_a_pipeline_without_a_reader_at_its_start(tmp_path, capsys, monkeypatch,
         assert main([words[0], "job.json", *words[1:]]) == 1
         assert "reader" in capsys.readouterr().err
     assert not list(tmp_path.glob("*.las"))
-
-
-def test_random_wirings_have_one_end():
-    """What is run ends in one stage, and all that it takes points from is there."""
-    rng = np.random.default_rng(5)
-    for _ in range(300):
-        stages = [{**FAUX, "tag": "t0"}]
-        for number in range(1, int(rng.integers(2, 9))):
-            tags = [f"t{n}" for n in range(number) if rng.random() < 0.3]
-            stage = {**FAUX} if rng.random() < 0.2 else filter_(*tags)
-            stages.append({**stage, "tag": f"t{number}"})
-        run = run_by_pdal(stages)
-        assert run == sorted(set(run))
-        wired = {number: stages[number].get("inputs") for number in run}
-        named = set(itertools.chain.from_iterable(inputs for inputs in wired.values() if inputs))
-        assert named <= {f"t{number}" for number in run}
