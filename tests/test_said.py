@@ -49,7 +49,9 @@ def test_warnings_of_pdal_are_shown_once(cloud, tmp_path, run, tiles):
 
 def test_a_log_file(cloud, tmp_path, run):
     log = tmp_path / "run.log"
-    assert run([cloud, {"type": "filters.hag_minima"}, tmp_path / "o.las"], "--log", log)[0] == 0
+    out, meta = tmp_path / "o.las", tmp_path / "m.json"
+    assert run([cloud, {"type": "filters.hag_minima"}, out], "--log", log, "--metadata", meta)[0] == 0
+    assert json.loads(meta.read_text())["metadata"]["writers.las"]["filename"] == [str(out)]
     assert run([cloud, {"type": "filters.hag_minima", "cell": -1}, tmp_path / "o.las"], "--log", log)[0] == 1
     lines = log.read_text().splitlines()
     assert "pipeline" in lines[0] and "--log" in lines[0] and lines[0][:4].isdigit()
@@ -73,13 +75,6 @@ def test_the_log_hears_the_workers_of_tiles_and_the_summary(cloud, tmp_path, run
     assert all(line[:2] == "20" and line[10] == " " for line in lines) and "exit code 0" in lines[-1]
 
 
-def test_metadata_names_the_output(cloud, tmp_path, run):
-    out = tmp_path / "o.las"
-    writer = {"type": "writers.las", "filename": str(out)}
-    assert run([cloud, {"type": "filters.hag_minima"}, writer], "--metadata", tmp_path / "m.json")[0] == 0
-    assert json.loads((tmp_path / "m.json").read_text())["metadata"]["writers.las"]["filename"] == [str(out)]
-
-
 def test_extra_dimensions_that_pdal_does_not_read_are_named(cloud, tmp_path, run):
     stages = [
         {"type": "readers.las", "filename": str(cloud)},
@@ -92,7 +87,6 @@ def test_extra_dimensions_that_pdal_does_not_read_are_named(cloud, tmp_path, run
     assert "Amplitude" not in run(stages)[2]
 
 
-@pytest.mark.parametrize("command", ["pipeline", "validate"])
 @pytest.mark.parametrize(
     ("stage", "says"),
     [
@@ -103,19 +97,16 @@ def test_extra_dimensions_that_pdal_does_not_read_are_named(cloud, tmp_path, run
         ("degrees", "degrees"),
     ],
 )
-def test_what_cannot_run_is_not_valid(cloud, tmp_path, run, stage, says, command):
-    before = []
+def test_what_cannot_run_is_not_valid(cloud, tmp_path, run, stage, says):
+    stages = [cloud, stage, tmp_path / "o.las"]
     if stage == "degrees":
-        before = [{"type": "filters.reprojection", "in_srs": "EPSG:32632", "out_srs": "EPSG:4326"}]
-        stage = {"type": "filters.hag_minima"}
-    code, out, err = run(
-        [cloud, *before, stage, tmp_path / "o.las"],
-        *(["--validate"] if command == "pipeline" else []),
-        command=command,
-    )
-    verdict = json.loads(out)
-    assert code == 1 and verdict["valid"] is False and verdict["error_detail"].strip() in err
-    assert any(word in err for word in says.split("|")) and not (tmp_path / "o.las").exists()
+        turned = {"type": "filters.reprojection", "in_srs": "EPSG:32632", "out_srs": "EPSG:4326"}
+        stages[1:2] = [turned, {"type": "filters.hag_minima"}]
+    for command, words in (("pipeline", ["--validate"]), ("validate", [])):
+        code, out, err = run(stages, *words, command=command)
+        verdict = json.loads(out)
+        assert code == 1 and verdict["valid"] is False and verdict["error_detail"].strip() in err
+        assert any(word in err for word in says.split("|")) and not (tmp_path / "o.las").exists()
 
 
 def test_dimensions_that_a_file_or_a_stage_brings_are_valid(tmp_path, run, write_las):
