@@ -143,7 +143,10 @@ class _Voxels:
         return self._sums(voxels, self.counts(kind), 1)[at]
 
     def _sums(self, voxels: NDArray, counts: NDArray, levels: int) -> NDArray[np.int64]:
-        return sum(np.where(at[:, None] >= 0, counts[at], 0) for _, at in self.neighbors(voxels, levels))
+        out = np.zeros((len(voxels), 4), np.int64)
+        for _, at in self.neighbors(voxels, levels):
+            out += np.where(at[:, None] >= 0, counts[at], 0)
+        return out
 
     def vegetation_near(self, points: NDArray, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The commonest class of vegetation around each of these points, the higher of two; where there is none, 5."""

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from ..base import checks
@@ -91,10 +92,8 @@ class Option:
             number = None
         if number is None or (self.kind == "integer" and number != int(number)):
             raise self._wrong(value)
-        what = f"option '{self.name}'"
-        if self.kind == "integer":
-            return checks.whole(what, number, self.minimum, self.maximum, unit=self.unit)
-        return checks.number(what, number, self.minimum, self.maximum, above=self.exclusive, unit=self.unit)
+        check: Any = checks.whole if self.kind == "integer" else partial(checks.number, above=self.exclusive)
+        return check(f"option '{self.name}'", number, self.minimum, self.maximum, unit=self.unit)
 
     _parse_integer = _parse_number
 
