@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -37,7 +37,7 @@ class Columns:
         return any(name in self.at for name in GROUPS["shapes"])
 
 
-def columns_of(chosen: Sequence[Columns], features: Iterable[str]) -> np.ndarray:
+def columns_of(chosen: Sequence[Columns], features: Collection[str]) -> np.ndarray:
     """Where each feature (column) of each neighborhood (row) goes, int64; -1: nowhere."""
     table = [[one.at.get(feature, -1) for feature in features] for one in chosen]
     return np.array(table, np.int64).reshape(len(chosen), len(features))
