@@ -7,14 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
-from test_detached_noise import closed_wood, slow_sheet
-from test_ground_islands import slow_marks
 
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.stages.hag_morphological import HagMorphological
 from pdal_stages.terrain import filtered_ground, groundcells, openings, patches
-from pdal_stages.terrain.lowest import pits
 from pdal_stages.terrain.morphological import reach
 from pdal_stages.terrain.openings import LARGEST_DROP, objects_of, opening_radii
 from pdal_stages.terrain.planes import surface
@@ -88,59 +85,6 @@ def test_openings_and_objects_equal_the_slow_reference(shape):
         before = after
     assert np.array_equal(objects, want) and np.array_equal(wide, want_wide)
     assert np.array_equal(floor, want_floor)
-
-
-def slow_pits(raster, cell):
-    h, w = raster.shape
-    cells = [(j, i) for j in range(h) for i in range(w) if np.isfinite(raster[j, i])]
-    lonely = np.zeros((h, w), bool)
-    for j, i in cells:
-        near = [(raster[b, a], np.hypot(b - j, a - i)) for b, a in cells if 0 < np.hypot(b - j, a - i) <= 20]
-        company = sum(abs(value - raster[j, i]) <= 1.0 + 0.15 * cell * far for value, far in near)
-        lonely[j, i] = company < 4 and len(near) >= 12
-    out = lonely.copy()
-    for j, i in cells:
-        if lonely[j, i]:
-            continue
-        near = [raster[b, a] for b, a in cells if max(abs(b - j), abs(a - i)) <= 4 and not lonely[b, a]]
-        higher = sorted(value for value in near if value >= raster[j, i] + 3.0)
-        n = len(higher)
-        if n >= 10 and len(near) - n <= 0.15 * len(near) and higher[n // 2] - higher[n // 8] <= 0.75:
-            out[j, i] = True
-    out[slow_marks(np.where(out, np.float32(np.inf), raster), cell)] = True
-    base = np.where(out, np.inf, raster)
-    low = np.where(out, raster.astype(float), np.inf)
-    level = np.zeros((h, w), bool)
-    for j, i in zip(*np.nonzero(np.isfinite(base)), strict=True):
-        square = base[max(j - 2, 0) : j + 3, max(i - 2, 0) : i + 3]
-        level[j, i] = (abs(square - base[j, i]) <= 1).sum() > 2 + 0.2 * np.isfinite(square).sum()
-    j, i = np.mgrid[:h, :w]
-    for c in zip(*np.nonzero(out), strict=True):
-        near = (j - c[0]) ** 2 + (i - c[1]) ** 2 <= 20**2
-        closed = level[near].sum() <= np.isfinite(base[near]).sum() / 3
-        out[c] = not (closed and slow_sheet(low, c, cell))
-    return out
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_pits_equal_the_slow_reference(seed):
-    rng = np.random.default_rng(seed)
-    raster = raster_with_holes(seed, (30, 34), 0.2) * np.float32(0.05 + seed)
-    raster[rng.random(raster.shape) < 0.02] -= np.float32(12)
-    found = pits(raster, 1.0)
-    assert np.array_equal(found, slow_pits(raster, 1.0))
-    assert found.any()
-
-
-def test_a_ditch_and_ground_between_trees_are_no_pits():
-    rng = np.random.default_rng(0)
-    ditch = rng.normal(0, 0.05, (40, 40)).astype(np.float32)
-    ditch[:, 18:21] -= 4
-    assert not pits(ditch, 1.0).any()
-    wood = rng.uniform(8, 20, (60, 60)).astype(np.float32)
-    seen = rng.random(wood.shape) < 0.03
-    wood[seen] = 0
-    assert pits(wood, 1.0)[seen].mean() < 0.05
 
 
 def test_a_plane_is_carried_across_a_hole():
@@ -354,14 +298,6 @@ def test_land_above_a_scarp_that_the_rim_cuts_off_is_ground(slope):
     found = filtered_ground(x, y, z)
     assert (found["Ground"][ground] == 0).mean() < 0.03
     assert (np.abs(found["HeightAboveGround"][ground]) > 1).mean() < 0.02
-
-
-@pytest.mark.parametrize("slope", [0.0, 0.3, 0.65])
-def test_rare_ground_under_a_closed_canopy_is_found(slope):
-    xyz, ground = closed_wood(slope, 0.02, 3.0, 200)
-    found = filtered_ground(xyz)
-    assert found["Ground"][ground].mean() > 0.96
-    assert (np.abs(found["HeightAboveGround"][ground]) > 1).mean() < 0.04
 
 
 # ---- what must hold --------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from pdal_stages.terrain import filtered_ground, groundblocks
 from pdal_stages.terrain.decks import level_points
 from pdal_stages.terrain.groundblocks import by_block, cells_of_block, reach_of_block
 from pdal_stages.terrain.groundcells import BLOCK_SIDE, FilterOptions, GroundCells
-from pdal_stages.terrain.lowpoints import lowest_of_cells
+from pdal_stages.terrain.lowest import lowest_of_cells
 from pdal_stages.terrain.morphological import reach_of_cells
 from pdal_stages.tiling import run_tiled, tile
 from pdal_stages.tiling.ground import FirstRoundTask

@@ -13,7 +13,7 @@ from ..base.errors import OptionError
 from ..terrain.decks import level_points
 from ..terrain.groundblocks import by_block, cells_of_block, reach_of_block
 from ..terrain.groundcells import BLOCK_SIDE, FilterOptions, GroundCells
-from ..terrain.lowpoints import lowest_of_cells
+from ..terrain.lowest import lowest_of_cells
 from ..terrain.morphological import check_sizes, filtered_ground, reach, reach_of_cells
 from ..terrain.profile import opening_names
 from . import carried

@@ -9,10 +9,8 @@ extremes, so that no order of points and no tile matters:
    way looked: a tree, or a mast, may be a single point there. What hangs as high as wires near by, or in line with
    others, stays.
 3. A suspect is low noise if it lies below a plane under its surroundings, by more than these scatter about the plane,
-   unless ground as deep is near: then it is a courtyard or a well of light (:mod:`.envelope`).
-4. Echoes from just below the ground are joined to it. Columns whose lowest point lies below the plane, as in 3, show
-   them, where few columns do so side by side.
-5. Some of that is the ground, of which a canopy lets single points through (:mod:`.sheets`).
+   unless ground as deep is near: then it is a courtyard or a well of light (:mod:`.envelope`). Under a
+   closed canopy some of that is the ground, of which it lets single points through (:mod:`.canopy`).
 """
 
 from __future__ import annotations
@@ -26,13 +24,20 @@ from numpy.typing import ArrayLike, NDArray
 from ..base.asprs import NOISE
 from ..base.errors import StageError
 from ..base.jit import device, njit
+from .canopy import more_than_noise, seen_through_canopy
+from .canopy import reach as canopy_reach
 from .clusters import BITS, BLOCK, CLUSTER_REACH, SCALES, SIDE, find, small_clusters, surroundings, voxels
 from .columns import columns
-from .envelope import ENOUGH, FAR, NEAR, WIDER, envelope, has_company, supported_columns
+from .envelope import (
+    ENOUGH,
+    WIDER,
+    has_company,
+    plane_under,
+    reach_of_company,
+    supported_columns,
+)
 from .minima import cell_numbers
 from .patches import patches
-from .sheets import reach as sheets_reach
-from .sheets import take_back
 
 LOW, HIGH = NOISE
 #: The gap in meters grows by this with each point of a cluster, and with the spacing of points beyond DENSE meters.
@@ -41,13 +46,15 @@ GAP_OF_POINT, GAP_GROWTH, DENSE = 0.1, 10.0, 0.55
 ASIDE, SPACINGS_ASIDE = 3, 2.5
 #: Columns within which wires are looked for, so many of which show one, and how high they hang at least, meters.
 IN_LINE, WIRES, HANGING = 14, 4, 5.0
+#: Columns within which others of a line are looked for.
+FAR = 20
 #: A line has others at so many places of three columns each, and such a share of all that is suspect near: two
 #: wires hang side by side, as over pylons.
 STRUNG, STRUNG_SHARE = 4, 0.3
 #: How far below the plane a suspect lies at least, in units of the scatter.
 SCATTERS = 4.0
-#: The same of echoes from just below, the share of `depth` that is enough there, and the most such columns in 5 x 5.
-JUST_SCATTERS, JUST, TOGETHER = 5.0, 0.8, 4
+#: How much higher ground may be that shows that a deep place is ground, per meter of distance.
+ROOM = 0.15
 #: Heights beyond this, in meters, are noise whatever else there is.
 _HIGHEST = 1e6
 
@@ -114,7 +121,7 @@ def detached_noise(
 
 
 #: How far away, in meters, points can change what a point is: the halo a tile needs.
-REACH = (FAR + sheets_reach(SIDE) + 4) * SIDE + CLUSTER_REACH
+REACH = (canopy_reach(SIDE) + max(reach_of_company(SIDE) + 2, FAR) + 2) * SIDE + CLUSTER_REACH
 
 
 def _judge(x, y, z, column, row, cluster, gap, depth):
@@ -136,13 +143,15 @@ def _judge(x, y, z, column, row, cluster, gap, depth):
     _keep_lines(keys, extremes, np.full((h, w), np.inf), verdict)
     supported = np.zeros((h, w), bool)
     supported_columns(base, supported)
-    _low(keys, suspect, extremes, base, supported, depth, verdict)
-    below = np.full((h, w), np.nan)
-    _just_below(base, supported, JUST * depth, below)
-    marks = verdict[voxel]
-    _mark_below(z, column, row, left, bottom, below, marks)
-    take_back(z, column, row, left, bottom, base, supported, SIDE, LOW, marks)
-    return marks
+    _low(keys, suspect, extremes, base, supported, reach_of_company(SIDE), depth, verdict)
+    low, column = verdict == LOW, keys >> BITS
+    if low.any():
+        lowest = np.full((h, w), np.inf)
+        np.minimum.at(lowest.ravel(), column[low], extremes[low, 0])
+        lows, points = (np.bincount(column[of], counts[of], h * w).reshape(h, w) for of in (low, slice(None)))
+        ground = seen_through_canopy(lowest, base, supported, SIDE) | more_than_noise(lows, points)
+        verdict[low & ground.ravel()[column]] = 0
+    return verdict[voxel]
 
 
 @njit
@@ -186,9 +195,7 @@ def _hangs_in_line(hung, j, i, z):
             square = (b - j) ** 2 + (a - i) ** 2
             if square <= IN_LINE * IN_LINE and abs(hung[b, a] - z) <= 1.0 + 0.2 * SIDE * np.sqrt(square):
                 company += 1
-                if company == WIRES:
-                    return True
-    return False
+    return company >= WIRES
 
 
 @njit
@@ -212,11 +219,8 @@ def _high(keys, suspect, size, extremes, top, hung, spacing, gap, verdict):
             if seen >= ENOUGH or r == FAR:
                 break
             r = min(2 * r, FAR)
-        if (
-            seen >= ENOUGH
-            and extremes[k, 0] - highest >= least
-            and not _hangs_in_line(hung, j, i, extremes[k, 0])
-        ):
+        z = extremes[k, 0]
+        if seen >= ENOUGH and z - highest >= least and not _hangs_in_line(hung, j, i, z):
             verdict[k] = HIGH
 
 
@@ -262,7 +266,7 @@ def _keep_lines(keys, extremes, spread, verdict):
 
 
 @njit
-def _low(keys, suspect, extremes, base, supported, depth, verdict):
+def _low(keys, suspect, extremes, base, supported, far, depth, verdict):
     w = base.shape[1]
     size = (2 * WIDER + 1) ** 2
     u, v, zs, weight = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
@@ -271,50 +275,11 @@ def _low(keys, suspect, extremes, base, supported, depth, verdict):
             continue
         place = keys[k] >> BITS
         j, i = place // w, place % w
-        n, height, across, along, scatter = envelope(base, j, i, NEAR, u, v, zs, weight)
-        if n < ENOUGH:
-            n, height, across, along, scatter = envelope(base, j, i, WIDER, u, v, zs, weight)
+        n, height, across, along, scatter = plane_under(base, j, i, u, v, zs, weight)
         z = extremes[k, 1]
         if (
             n >= ENOUGH
             and height - z > depth + SCATTERS * scatter
-            and not has_company(base, supported, j, i, z, height, across, along)
+            and not has_company(base, supported, SIDE, far, ROOM, 0.0, j, i, z, height, across, along)
         ):
             verdict[k] = LOW
-
-
-@njit
-def _just_below(base, supported, least, below):
-    """Fill `below` with the level that points of a column must not lie under; NaN where there is none."""
-    h, w = base.shape
-    size = (2 * WIDER + 1) ** 2
-    u, v, zs, weight = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
-    for j in range(1, h - 1):
-        for i in range(1, w - 1):
-            here = base[j, i]
-            if here == np.inf:
-                continue
-            seen, higher = 0, 0
-            for b in range(j - 1, j + 2):
-                for a in range(i - 1, i + 2):
-                    seen += base[b, a] < np.inf
-                    higher += base[b, a] < np.inf and base[b, a] > here + least
-            if higher < 4 or 2 * higher < seen:
-                continue
-            n, height, across, along, scatter = envelope(base, j, i, NEAR, u, v, zs, weight)
-            if n < ENOUGH or height - here <= least + JUST_SCATTERS * scatter:
-                continue
-            together = 0
-            for b in range(max(j - 2, 0), min(j + 3, h)):
-                for a in range(max(i - 2, 0), min(i + 3, w)):
-                    if base[b, a] < height + across * (a - i) + along * (b - j) - least:
-                        together += 1
-            if together <= TOGETHER and not has_company(base, supported, j, i, here, height, across, along):
-                below[j, i] = height - (least + JUST_SCATTERS * scatter)
-
-
-@njit
-def _mark_below(z, column, row, left, bottom, below, marks):
-    for p in range(len(z)):
-        if marks[p] == 0 and z[p] < below[row[p] - bottom, column[p] - left]:
-            marks[p] = LOW

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from ..base.jit import device, njit
-from .clusters import SIDE
 
 #: Columns within which a plane is fitted through the ground, and if there are too few, within which then.
 NEAR, WIDER = 6, 13
 #: Columns a plane needs.
 ENOUGH = 12
-#: Columns within which other ground is looked for, and so many of them show that a deep place is ground.
-FAR, COMPANY = 20, 4
+#: How far away other ground is looked for, in meters; so many columns of it show that a deep place is ground.
+FAR, COMPANY = 30.0, 4
 #: A column of ground has so many others of its level, in meters, in the 5 x 5 round it, and such a share of those.
 SUPPORT, SUPPORT_SHARE, LEVEL = 2, 0.2, 1.0
 
@@ -94,19 +95,38 @@ def supported_columns(base, out):
             out[j, i] = level > SUPPORT + SUPPORT_SHARE * seen
 
 
+def reach_of_company(side: float) -> int:
+    """How far away other ground is looked for, in columns."""
+    return math.ceil(FAR / side)
+
+
 @device
-def has_company(base, supported, j, i, z, height, across, along):
-    """Whether other columns are as deep as z, and below the plane too."""
+def has_company(base, supported, side, far, room, curve, j, i, z, height, across, along):
+    """Whether other columns within `far` are as deep as z, or by `room` a meter higher, and far enough below the plane.
+
+    That is half as far, and `curve` per meter of distance.
+    """
     h, w = base.shape
     company = 0
     half = 0.5 * (height - z)
-    for b in range(max(j - FAR, 0), min(j + FAR + 1, h)):
-        for a in range(max(i - FAR, 0), min(i + FAR + 1, w)):
-            square = (b - j) ** 2 + (a - i) ** 2
-            if supported[b, a] and square <= FAR * FAR:
-                room = min(half, LEVEL + 0.15 * SIDE * np.sqrt(square))
-                if base[b, a] <= z + room and base[b, a] < height + across * (a - i) + along * (b - j) - half:
+    for b in range(max(j - far, 0), min(j + far + 1, h)):
+        for a in range(max(i - far, 0), min(i + far + 1, w)):
+            if supported[b, a]:
+                away = side * np.sqrt(float((b - j) ** 2 + (a - i) ** 2))
+                below = height + across * (a - i) + along * (b - j) - base[b, a]
+                if (
+                    away <= FAR
+                    and base[b, a] <= z + min(half, LEVEL + room * away)
+                    and below >= max(half, curve * away)
+                ):
                     company += 1
                     if company == COMPANY:
                         return True
     return False
+
+
+@device
+def plane_under(base, j, i, u, v, zs, weight):
+    """:func:`envelope` of what is near, or where that is too little, of what is around."""
+    found = envelope(base, j, i, NEAR, u, v, zs, weight)
+    return found if found[0] >= ENOUGH else envelope(base, j, i, WIDER, u, v, zs, weight)

@@ -22,7 +22,7 @@ from .groundcells import (
     ground_raster,
 )
 from .groundmeans import add_ground, around, heights_above, means_of
-from .lowpoints import HIGHEST
+from .lowest import HIGHEST
 from .minima import cell_numbers
 from .patches import connected
 from .planes import reach as planes_reach

@@ -18,16 +18,15 @@ from ..base.jit import njit
 from ..base.runs import begins_run
 from .decks import BESIDE, CELL
 from .decks import REACH as DECKS_REACH
-from .islands import FAR as ISLANDS_FAR
-from .islands import REACH as ISLANDS_REACH
-from .lowest import COMPANY, SURROUNDINGS, heights_of, lowest_points, pits, places_of
+from .lowest import heights_of, lowest_points, places_of
 from .openings import HOLE, objects_of, opening_radius
 from .patches import SIDE
+from .pits import pits
+from .pits import reach as pits_reach
 from .planes import from_parents, planes_of_blocks
 from .planes import reach as planes_reach
 from .plateaus import reach as plateau_reach
 from .plateaus import remove_plateaus
-from .sheets import reach as sheets_reach
 
 #: Blocks, in meters, from which the surface is made: that for telling ground, and that of the heights.
 NEAR, FAR = 8.0, 32.0
@@ -86,8 +85,7 @@ class FilterOptions:
         fitted through ground between.
         """
         surfaces = ROUNDS * planes_reach(self.levels(NEAR))
-        outliers = COMPANY + SURROUNDINGS + ISLANDS_REACH + sheets_reach(self.cell)
-        found = outliers + 2 * self.largest_radius + plateau_reach(self.cell) + surfaces + 2
+        found = pits_reach(self.cell) + 2 * self.largest_radius + plateau_reach(self.cell) + surfaces + 2
         return max(found, self.reach_of_decks) if self.decks else found
 
     @property
@@ -98,7 +96,7 @@ class FilterOptions:
     @property
     def link(self) -> int:
         """How far one step looks, in cells: no step of the filter sees from a point to another across more empty land."""
-        return max(ISLANDS_FAR, self.largest_radius, planes_reach(self.levels(FAR))) + 2
+        return max(pits_reach(self.cell), self.largest_radius, planes_reach(self.levels(FAR))) + 2
 
 
 #: Which cells (h, w) hold ground points, and where these are on average (h, w, 3), as :attr:`GroundRaster.place`.

@@ -31,7 +31,7 @@ from .columns import columns
 from .decks import decks_of_levels, find_decks
 from .groundcells import FAR, NEAR, CellMeans, FilterOptions, GroundCells, GroundRaster, ground_raster
 from .groundmeans import add_ground, around, heights_above, means_of
-from .lowpoints import HIGHEST
+from .lowest import HIGHEST
 from .minima import cell_numbers
 from .patches import patches
 from .planes import reach as planes_reach

@@ -26,20 +26,11 @@ def opening_radius(window: float, cell: float) -> int:
 
 
 def opening_radii(largest: int) -> list[int]:
-    """Radii in cells: each is larger than the one before by a fifth, by one cell at least."""
+    """Radii in cells: each is larger than the one before by a fifth, by 1 to 3 cells: or slopes would drop as objects do."""
     radii = [1]
-    while (radius := radii[-1] + max(1, radii[-1] // 5)) < largest:
+    while (radius := radii[-1] + min(max(1, radii[-1] // 5), 3)) < largest:
         radii.append(radius)
     return sorted({*radii, largest})
-
-
-def by_distance(reach: int) -> tuple[np.ndarray, np.ndarray]:
-    """Offsets (row, column) within `reach` cells, nearest first, and their distances."""
-    j, i = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    squared = (j * j + i * i).ravel()
-    order = np.lexsort((i.ravel(), j.ravel(), squared))
-    order = order[(squared[order] > 0) & (squared[order] <= reach * reach)]
-    return np.column_stack([j.ravel(), i.ravel()])[order].astype(np.int64), np.sqrt(squared[order])
 
 
 def _steps(radius: int) -> tuple[int, int]:

@@ -10,8 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..base.jit import njit
-from ..base.unionfind import root as root_of
-from .openings import HOLE
+from .linked import linked_cells
 
 #: The widest roof, in meters along either axis.
 WIDEST = 200.0
@@ -32,73 +31,6 @@ DIRECTIONS, SHARE = 14, 0.8
 def reach(cell: float) -> int:
     """How far away cells change what is a plateau, in cells."""
     return int(WIDEST / cell) + 1 + LINK + BEYOND
-
-
-def _ways(cell):
-    """Offsets (row, column) of the cells that one is linked to and that come after it, and across which step."""
-    j, i = np.mgrid[: LINK + 1, -LINK : LINK + 1]
-    after = ((j > 0) | (i > 0)) & (j * j + i * i <= LINK * LINK)
-    steps = np.maximum(STEP, GRADE * cell * np.sqrt((j * j + i * i).astype(float)))
-    return np.column_stack([j[after], i[after]]), steps[after]
-
-
-@njit
-def _linked(raster, offsets, steps, number):
-    """Number the measured cells of each linked set alike; returns how many sets there are."""
-    h, w = raster.shape
-    # With holes beside and below, so that no step has to look where the raster ends.
-    stride = w + 2 * LINK
-    heights = np.full((h + LINK) * stride + LINK, HOLE)
-    for j in range(h):
-        for i in range(w):
-            heights[j * stride + LINK + i] = raster[j, i]
-    parent = np.arange(len(heights))
-    ahead = offsets[:, 0] * stride + offsets[:, 1]
-    for j in range(h):
-        for at in range(j * stride + LINK, j * stride + LINK + w):
-            here = heights[at]
-            if here == HOLE:
-                continue
-            mine = root_of(parent, at)
-            for k in range(len(steps)):
-                other = at + ahead[k]
-                if abs(heights[other] - here) <= steps[k] and parent[other] != mine:  # nor a hole
-                    other = root_of(parent, other)
-                    if other > mine:
-                        parent[other] = mine
-                    elif other < mine:
-                        parent[mine] = other
-                        mine = other
-    count = 0
-    names = np.empty(len(heights), np.int32)  # of those who stand for sets, each the first of its own
-    for j in range(h):
-        for i in range(w):
-            at = j * stride + LINK + i
-            number[j, i] = -1
-            if heights[at] != HOLE:
-                root = root_of(parent, at)
-                if root == at:
-                    names[at] = count
-                    count += 1
-                number[j, i] = names[root]
-    return count
-
-
-@njit
-def _extents(number, ground, box, sums, grounds):
-    """First and last row and column of each set, its rows' and columns' sums and its size, and how many are ground."""
-    h, w = number.shape
-    box[:, 0], box[:, 2] = h, w
-    for j in range(h):
-        for i in range(w):
-            k = number[j, i]
-            if k >= 0:
-                box[k, 0], box[k, 1] = min(box[k, 0], j), max(box[k, 1], j)
-                box[k, 2], box[k, 3] = min(box[k, 2], i), max(box[k, 3], i)
-                sums[k, 0] += j
-                sums[k, 1] += i
-                sums[k, 2] += 1
-                grounds[k] += ground[j, i]
 
 
 @njit
@@ -132,16 +64,6 @@ def _look_around(number, asked, ground, raster, cell, sums, sectors, around, lev
                         around[k, 1] += 1
 
 
-@njit
-def _take(number, plateau, level, ground, floor):
-    h, w = number.shape
-    for j in range(h):
-        for i in range(w):
-            if ground[j, i] and plateau[number[j, i]]:
-                ground[j, i] = False
-                floor[j, i] = level[number[j, i]]
-
-
 def remove_plateaus(
     ground: np.ndarray, floor: np.ndarray, raster: np.ndarray, cell: float, more: np.ndarray
 ) -> None:
@@ -150,12 +72,16 @@ def remove_plateaus(
     `raster` (h, w) holds the heights, in meters like `cell`, a cell's side; ground is measured everywhere. `more` cells,
     numbered row by row, become ground where they are of no plateau, and show none.
     """
-    number = np.empty(ground.shape, np.int64)
-    count = _linked(raster, *_ways(cell), number)
-    box, sums, grounds = (np.zeros((count, *rest), np.int64) for rest in ((4,), (3,), ()))
-    _extents(number, ground, box, sums, grounds)
+    number, size, box = linked_cells(raster, LINK, lambda away: np.maximum(STEP, GRADE * cell * away))
+    rows, columns = np.nonzero(number >= 0)
+    sets = number[rows, columns]
+    count = len(size)
+    sums = np.column_stack([np.bincount(sets, rows, count), np.bincount(sets, columns, count), size]).astype(
+        np.int64
+    )
+    grounds = np.bincount(number[ground], minlength=count)
     widest = int(WIDEST / cell)
-    asked = grounds > FOOTING * sums[:, 2]
+    asked = grounds > FOOTING * size
     asked &= (box[:, 1] - box[:, 0] < widest) & (box[:, 3] - box[:, 2] < widest)
     sectors, around, level = np.zeros((count, 16), bool), np.zeros((count, 2), np.int64), np.zeros(count)
     uphill = np.zeros(count, np.int64)
@@ -164,4 +90,6 @@ def remove_plateaus(
     plateau = (sectors.sum(axis=1) >= DIRECTIONS) & (lower >= SHARE * around.sum(axis=1)) & (uphill <= 0)
     level[plateau] /= lower[plateau]
     ground.ravel()[more] = True
-    _take(number, plateau, level, ground, floor)
+    taken = ground & plateau[number]  # ground has numbers
+    ground[taken] = False
+    floor[taken] = level[number[taken]]
