@@ -26,9 +26,9 @@ def opening_radius(window: float, cell: float) -> int:
 
 
 def opening_radii(largest: int) -> list[int]:
-    """Radii in cells: each is larger than the one before by a fifth, by 1 to 3 cells: or slopes would drop as objects do."""
+    """Radii in cells: each is larger than the one before by a fifth, by 1 or 2 cells: or slopes would drop as objects do."""
     radii = [1]
-    while (radius := radii[-1] + min(max(1, radii[-1] // 5), 3)) < largest:
+    while (radius := radii[-1] + min(max(1, radii[-1] // 5), 2)) < largest:
         radii.append(radius)
     return sorted({*radii, largest})
 

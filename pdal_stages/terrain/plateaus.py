@@ -90,6 +90,6 @@ def remove_plateaus(
     plateau = (sectors.sum(axis=1) >= DIRECTIONS) & (lower >= SHARE * around.sum(axis=1)) & (uphill <= 0)
     level[plateau] /= lower[plateau]
     ground.ravel()[more] = True
-    taken = ground & plateau[number]  # ground has numbers
+    taken = ground & np.append(plateau, False)[number]
     ground[taken] = False
     floor[taken] = level[number[taken]]
