@@ -276,10 +276,7 @@ def test_what_cannot_be(folder, tmp_path, target, text, capsys):
 def test_without_the_extra(monkeypatch):
     from pdal_stages.objects import outlines
 
-    def missing(name):
-        raise ImportError(f"No module named '{name}'")
-
-    monkeypatch.setattr(outlines, "imported", missing)
+    monkeypatch.setitem(sys.modules, "shapely", None)
     monkeypatch.setattr(sys, "prefix", "/usr")  # not the environment that scripts/setup made
     with pytest.raises(
         StageError, match=r"outlines need shapely .* Install the extra: pip install 'pdal-stages\[vector\]'"

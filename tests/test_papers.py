@@ -19,7 +19,6 @@ import clouds  # noqa: E402
 import h17_oakland  # noqa: E402
 import kit  # noqa: E402
 import pts_input  # noqa: E402
-import published  # noqa: E402
 import scenes  # noqa: E402
 import tables  # noqa: E402
 import w18  # noqa: E402
@@ -225,28 +224,6 @@ def test_alsnet_with_the_papers_inputs_through_pdal(folder, tmp_path, monkeypatc
 def scene(folder, tmp_path_factory):
     cache = kit.Cache(tmp_path_factory.mktemp("cache"))
     return scenes.load(folder, "town", cache, classes=(1, 2, 5, 8), neighborhoods="c1,c2,c3,c5,kopt")
-
-
-def test_published_tables_agree_with_each_other():
-    for first in (0, 3):
-        table3 = np.array(published.B16["Overall accuracy"])[:, first : first + 3]
-        np.testing.assert_allclose(published.b16_overall(first), table3, atol=0.03)  # sizes are thousands
-        for word in ("recall", "precision"):
-            low = published.b16_class(word, "low vegetation", first)
-            assert ((low > 0) & (low < 100)).all()
-    assert published.page() == (FOLDER.parents[1] / "docs" / "papers" / "published.md").read_text()
-
-
-def test_published_matrix_beside_ours(tmp_path):
-    order = [8, 0, 1, 2, 3, 4, 5, 6, 7]  # the file has its own order of classes
-    report = {
-        "classes": [{"code": published.VAIHINGEN_CODES[k]} for k in order],
-        "confusion": {"counts": np.array(published.WM19)[np.ix_(order, order)].tolist()},
-    }
-    (tmp_path / "a.json").write_text(json.dumps(report))
-    text = published.beside(tmp_path / "a.json")
-    assert "| Ours | 80.56 | 75.31 | 60.38 |" in text
-    assert text.count("| tree | 5 | 974 | 25 | 2 | 0 | 1,762 |") == 2
 
 
 def test_b16_names():
