@@ -10,8 +10,7 @@ import laspy
 import numpy as np
 import pytest
 
-from pdal_stages.cli import main
-from pdal_stages.cli.parser import parsed
+from pdal_stages.cli import main, parsed
 from pdal_stages.stages import registry
 
 pytestmark = pytest.mark.pdal

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import os
 import sys
@@ -11,6 +12,7 @@ from ..base.errors import StageError
 from ..base.outputs import Output, check_outputs
 from ..base.plain import PlainStream, print_messages
 from ..base.runlog import LoggedStream, RunLog
+from ..base.version import __version__
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -29,8 +31,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     shown = os.environ.get("PDAL_STAGES_PROGRESS")
     code = 1
     try:
-        from .parser import parsed  # here, where an environment that lacks something is told in a sentence
-
         options = parsed(arguments, is_program=argv is None)
         if getattr(options, "progress", None) is not None:
             os.environ["PDAL_STAGES_PROGRESS"] = str(int(options.progress))
@@ -59,6 +59,37 @@ def main(argv: Sequence[str] | None = None) -> int:
         if shown is not None:
             os.environ["PDAL_STAGES_PROGRESS"] = shown
     return code
+
+
+def parsed(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
+    """The command, its arguments, and the stages' options among them; leaves the program where usage is wrong.
+
+    Raises
+    ------
+    StageError
+        Where a stage's option is incomplete, or the command takes none.
+    """
+    # Imported here, so that an environment that lacks something is told in a sentence.
+    from ..pipeline.overrides import parse_overrides
+    from . import files, machine, models, pipelines
+    from .parser import OVERRIDES, Parser, taken, with_levels
+
+    parser = Parser(
+        prog="pdal-stages",
+        description="PDAL pipelines with stages that classify airborne laser scans.",
+        epilog=OVERRIDES + " --debug shows tracebacks.",
+    )
+    parser.add_argument("--version", action="version", version=f"pdal-stages {__version__}")
+    for group in (pipelines, files, models, machine):
+        group.add_commands(parser)
+    overrides, rest = parse_overrides(with_levels(arguments))
+    options, unknown = parser.parse_known_args(rest)
+    if unknown and not taken(options, unknown):
+        parser.refuse(options.command, unknown)
+    if overrides and not options.takes_overrides:
+        raise StageError(f"'{options.command}' takes no stage options", found=overrides[0].flag)
+    options.overrides, options.arguments, options.is_program = overrides, list(arguments), is_program
+    return options
 
 
 def _unforeseen(error: Exception) -> StageError:

@@ -7,9 +7,7 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
-from ..base.errors import StageError, suggest
-from ..base.version import __version__
-from ..pipeline.overrides import parse_overrides
+from ..base.errors import suggest
 
 OVERRIDES = (
     "Options of stages are set as in PDAL: --stage.TAG.option=VALUE for stages with a tag, "
@@ -57,50 +55,19 @@ class Parser(argparse.ArgumentParser):
             takes("--progress", action=argparse.BooleanOptionalAction, help="Show progress")
         return takes
 
+    def refuse(self, command: str, unknown: Sequence[str]) -> NoReturn:
+        """Leave the program: a command's words are unknown."""
+        flags = re.findall(r"(?<!\S)--[\w-]+(?![\w.-])", self.commands[command].format_help())
+        near = suggest(unknown[0].partition("=")[0], flags)
+        self.commands[command].error(f"unrecognized arguments: {' '.join(unknown)}. {near}".rstrip(". "))
+
 
 def switch(takes: Callable, flag: str, default: bool, help: str) -> None:
     """Add ``--flag`` and ``--no-flag``."""
     takes(flag, action=argparse.BooleanOptionalAction, default=default, help=help)
 
 
-def make_parser() -> Parser:
-    """The parser of all commands."""
-    from . import files, machine, models, pipelines
-
-    parser = Parser(
-        prog="pdal-stages",
-        description="PDAL pipelines with stages that classify airborne laser scans.",
-        epilog=OVERRIDES + " --debug shows tracebacks.",
-    )
-    parser.add_argument("--version", action="version", version=f"pdal-stages {__version__}")
-    for group in (pipelines, files, models, machine):
-        group.add_commands(parser)
-    return parser
-
-
-def parsed(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
-    """The command, its arguments, and the stages' options among them; leaves the program where usage is wrong.
-
-    Raises
-    ------
-    StageError
-        Where a stage's option is incomplete, or the command takes none.
-    """
-    overrides, rest = parse_overrides(_levels(arguments))
-    parser = make_parser()
-    options, unknown = parser.parse_known_args(rest)
-    if unknown and not _taken(options, unknown):
-        command = parser.commands[options.command]
-        flags = re.findall(r"(?<!\S)--[\w-]+(?![\w.-])", command.format_help())
-        near = suggest(unknown[0].partition("=")[0], flags)
-        command.error(f"unrecognized arguments: {' '.join(unknown)}. {near}".rstrip(". "))
-    if overrides and not options.takes_overrides:
-        raise StageError(f"'{options.command}' takes no stage options", found=overrides[0].flag)
-    options.overrides, options.arguments, options.is_program = overrides, list(arguments), is_program
-    return options
-
-
-def _levels(arguments: Sequence[str]) -> list[str]:
+def with_levels(arguments: Sequence[str]) -> list[str]:
     """PDAL's ``-v 4``, and ``-v`` alone, in one form."""
     out: list[str] = []
     for before, word, after in zip(["", *arguments], arguments, [*arguments[1:], ""], strict=False):
@@ -111,7 +78,7 @@ def _levels(arguments: Sequence[str]) -> list[str]:
     return out
 
 
-def _taken(options: argparse.Namespace, words: list[str]) -> bool:
+def taken(options: argparse.Namespace, words: list[str]) -> bool:
     """Whether words left over are names of inputs, and of the output, behind a flag, where argparse does not look."""
     inputs = getattr(options, "inputs", None)
     if not isinstance(inputs, list) or any(word.startswith("-") for word in words):
