@@ -1,4 +1,4 @@
-"""The picture of docs/architecture.md: the way of a tile from reader to writer, and the room each step lives in.
+"""The picture of docs/architecture.md: the way of a tile from reader to writer, and the room in which each step is done.
 
 python docs/architecture_picture.py        # writes docs/pictures/architecture.svg
 """
@@ -10,42 +10,42 @@ from pathlib import Path
 
 TARGET = Path(__file__).resolve().parent / "pictures" / "architecture.svg"
 
-#: (heading, steps) of each column; a step is two lines of words and the modules that do it ("PDAL": not ours).
+#: (heading, steps) of each column; a step is two lines of words and the room that does it ("PDAL": not ours).
 COLUMNS = (
     (
         "Before any point",
         (
-            ("Read the pipeline as PDAL does,", "with line numbers for messages", "pipeline/read.py"),
-            ("Apply what the command line", "overrides", "pipeline/overrides.py"),
-            ("Make each of our stages an object:", "checked options, plan, model", "stages/base.py"),
-            ("Turn our stages into filters.python:", "plain PDAL JSON", "pipeline/lowering.py"),
-            ("With --tile: find the inputs, lay", "the grid, hand out the tiles", "tiling/survey.py"),
-            ("With --tile: cut the tile and its", "surroundings out of the files", "tiling/cut.py"),
+            ("Read the pipeline as PDAL does,", "with line numbers for messages", "pipeline/"),
+            ("Apply what the command line", "overrides", "pipeline/"),
+            ("Make each of our stages an object:", "checked options, plan, model", "stages/"),
+            ("Turn our stages into filters.python:", "plain PDAL JSON", "pipeline/"),
+            ("With --tile: find the inputs, lay", "the grid, hand out the tiles", "tiling/"),
+            ("With --tile: cut the tile and its", "surroundings out of the files", "tiling/"),
         ),
     ),
     (
         "In PDAL: whole cloud or tile",
         (
             ("Reader", "", "PDAL"),
-            ("Hand the points to the stage,", "in meters, class codes without flags", "pipeline/runtime.py"),
-            ("Heights above a terrain", "", "terrain/minima.py"),
-            ("Features of many neighborhoods,", "block by block", "features/engine.py"),
+            ("Hand the points to the stage,", "in meters, class codes without flags", "pipeline/"),
+            ("Heights above a terrain", "", "terrain/"),
+            ("Features of many neighborhoods,", "block by block", "features/"),
             (
                 "Forest or network; a second pass",
                 "reads what the first said all around",
-                "classifier/passes.py",
+                "classifier/",
             ),
-            ("Classes, reliability, margin", "", "classifier/deciding.py"),
+            ("Classes, reliability, margin", "", "classifier/"),
         ),
     ),
     (
         "Afterwards",
         (
-            ("With --tile: put the tiles' results", "into the points of each file", "tiling/outputs.py"),
+            ("With --tile: put the tiles' results", "into the points of each file", "tiling/"),
             ("Writer, under a hidden name", "", "PDAL"),
-            ("Check that the file is complete,", "then give it its name", "base/lascheck.py"),
-            ("Compare with a reference", "", "accuracy/measures.py"),
-            ("Pages and pictures", "", "reports/accuracypage.py"),
+            ("Check that the file is complete,", "then give it its name", "base/"),
+            ("Compare with a reference", "", "accuracy/"),
+            ("Pages and pictures", "", "reports/"),
         ),
     ),
 )

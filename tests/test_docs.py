@@ -166,12 +166,10 @@ def test_the_picture_of_the_architecture_is_of_this_code():
     )
     drawn = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(drawn)
-    for _, steps in drawn.COLUMNS:
-        for *_, room in steps:
-            assert room == "PDAL" or (ROOT / "pdal_stages" / room).is_file(), room
     assert drawn.TARGET.read_text(encoding="utf-8") == drawn.picture(), "run docs/architecture_picture.py"
-    rooms = set(
-        re.findall(r"^\| `(\w+(?:/|\.py))` \|", (ROOT / "docs" / "architecture.md").read_text(), re.MULTILINE)
-    )
     there = {f"{p.name}/" for p in (ROOT / "pdal_stages").iterdir() if (p / "__init__.py").exists()}
-    assert rooms == there
+    assert {room for _, steps in drawn.COLUMNS for *_, room in steps} <= there | {"PDAL"}
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"^\| `(\w+/)` \|", page, re.MULTILINE)) == there
+    for module in re.findall(r"`(\w+/\w+\.(?:py|cpp))`", page):
+        assert (ROOT / "pdal_stages" / module).is_file(), module
