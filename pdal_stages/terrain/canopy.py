@@ -10,9 +10,9 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from ..base.jit import device, njit
+from .linked import sums_around
 
 #: A canopy is closed where at most such a share of the columns is level with others, within so many columns.
 CLOSED, AROUND = 1 / 3, 20
@@ -109,18 +109,13 @@ def seen_through_canopy(
     """
     on = np.zeros(base.shape, bool)
     _on_sheets(lowest, _by_distance(reach(side)), side, on)
-    return on & (_around(supported) <= CLOSED * _around(np.isfinite(base))) if on.any() else on
+    if not on.any():
+        return on
+    return on & (sums_around(supported, AROUND) <= CLOSED * sums_around(np.isfinite(base), AROUND))
 
 
 def more_than_noise(low: NDArray[np.int64], points: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Columns (h, w) around which more is low than noise is, of so many low points and points in all (h, w)."""
-    held = _around(low > 0)
-    many = (held >= COLUMNS) & (held > TOO_MANY * _around(points > 0))
-    return many & (_around(low) > TOO_MANY * _around(points))
-
-
-def _around(number: NDArray) -> NDArray[np.float64]:
-    """Sums (h, w) over the square around each column: whole numbers, as they are."""
-    size = 2 * AROUND + 1
-    sums = ndimage.uniform_filter(number.astype(float) * size**2, size, mode="constant")
-    return np.rint(sums)
+    held = sums_around(low > 0, AROUND)
+    many = (held >= COLUMNS) & (held > TOO_MANY * sums_around(points > 0, AROUND))
+    return many & (sums_around(low, AROUND) > TOO_MANY * sums_around(points, AROUND))

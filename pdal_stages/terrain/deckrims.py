@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
 from ..base.unionfind import root as root_of
+from .linked import longest_sides, sums_around
 from .walkable import (
     ACROSS,
     AHEAD,
@@ -112,10 +113,8 @@ class _Rims:
             (end == NOTHING).sum(axis=1),
         )
         self._across, self._walled = (end == ACROSS).sum(axis=1), (end == WALLED).sum(axis=1)
-        self._size, every = np.bincount(self._part), np.arange(self._part.max() + 1)
-        low, high = scipy.ndimage.minimum, scipy.ndimage.maximum
-        sides = (high(at, self._part, every) - low(at, self._part, every) for at in (self._row, self._column))
-        self._length = 1 + np.maximum(*sides)
+        self._size = np.bincount(self._part)
+        self._length = 1 + longest_sides(self._part, self._row, self._column, len(self._size))
         # Where most of a deck shows what lies below, one walks on farther to land.
         shown, within = z[start[cell]] < z[self._level] - DROP, self._down == 0
         many = np.bincount(self._part, within)
@@ -181,21 +180,13 @@ class _Rims:
             return np.bincount(block[long], values[long], shape[0] * shape[1]).astype(int).reshape(shape)
 
         own = [sums(v) for v in (self._down, self._walled, self._down > 0, self._leads)]
-        down, walled, drops, leads = (
-            scipy.ndimage.convolve(v, np.ones((3, 3), int), mode="constant") for v in own
-        )
+        down, walled, drops, leads = (sums_around(v, 1) for v in own)
         good = (down > 0) & (walled <= WALLS * down) & (leads <= OUTWARD * drops)
         ends = np.zeros(shape, bool)
         for k in np.flatnonzero(own[3]):
             ends.flat[k] = self._lead_to_land(long & self._leads & (block == k))
         # Near land, or where it goes on to both sides as far as one looks: no roof is that long.
-        side = 2 * FAR_ENDS + 1
-        near, edge = np.ones((side, side), bool), np.zeros((side, side), bool)
-        edge[0] = True
-        north, west, south, east = (
-            scipy.ndimage.binary_dilation(own[2] > 0, np.rot90(edge, turn)) for turn in range(4)
-        )
-        good &= scipy.ndimage.binary_dilation(ends, near) | (north & south) | (west & east)
+        good &= (sums_around(ends, FAR_ENDS) > 0) | _goes_on(own[2] > 0) | _goes_on(own[2].T > 0).T
         out[self._level[long & good.ravel()[block]]] = True
         return out
 
@@ -207,6 +198,12 @@ class _Rims:
         cells = _spread(*self._raster, self._parts, seeds, self._queue, self._seen, self._stamp, ends)
         self._stamp += 1
         return is_land(cells, ends)
+
+
+def _goes_on(rim: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Blocks with some of the rim FAR_ENDS rows up, and some as many rows down, no more columns to a side."""
+    beside = sliding_window_view(np.pad(rim, FAR_ENDS), 2 * FAR_ENDS + 1, axis=1).any(axis=-1)
+    return beside[: len(rim)] & beside[2 * FAR_ENDS :]
 
 
 #: The sectors of an end in each direction.
@@ -241,15 +238,11 @@ def _without_walls(z, start, h, w, kind, end, deck) -> NDArray[np.bool_]:
     if not deck.any():
         return deck
 
-    def around(values, reach):
-        for axis in (0, 1):
-            values = scipy.ndimage.convolve1d(values, np.ones(2 * reach + 1, int), axis, mode="constant")
-        return values
-
-    count, shown, faces, tall = np.moveaxis(around(_drops(z, start, h, w, kind, end, deck), WINDOW), -1, 0)
+    drops = _drops(z, start, h, w, kind, end, deck)
+    count, shown, faces, tall = np.moveaxis(sums_around(drops, WINDOW), -1, 0)
     walls = (tall >= WALL_RIM) & (faces >= FACED * tall) & (shown <= SHOWN * count)
     low = (count >= WALL_RIM) & (2 * tall < count) & (shown <= SHOWN_LOW * count)
-    walls |= low & (around(walls.astype(np.int32), LOW) > 0)
+    walls |= low & (sums_around(walls, LOW) > 0)
     return deck & ~np.repeat(walls.ravel(), np.diff(start))
 
 

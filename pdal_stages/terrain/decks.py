@@ -19,13 +19,13 @@ Remote Sensing 61(1), 33-46.
 from __future__ import annotations
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
 from .deckrims import REACH as RIMS_REACH
 from .deckrims import deck_levels
 from .levels import levels
+from .linked import sums_around
 from .minima import cell_numbers
 from .patches import patches
 from .walkable import AHEAD, FAR, ROUGH, SOLID, STEP, distance
@@ -97,7 +97,7 @@ def levels_near_decks(
             kind, deck = deck_levels(heights, start, h, w, left, bottom)
             cell = np.repeat(np.arange(h * w), np.diff(start))
             there = np.bincount(cell[deck], minlength=h * w).reshape(h, w) > 0
-            near = scipy.ndimage.binary_dilation(there, np.ones((4 * BESIDE + 1,) * 2, bool)).ravel()[cell]
+            near = (sums_around(there, 2 * BESIDE) > 0).ravel()[cell]
             mine = np.zeros(len(at), bool)
             mine[own] = True
             near &= mine[lowest]

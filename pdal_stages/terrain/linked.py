@@ -1,4 +1,4 @@
-"""Cells of a minimum grid that one can walk between, in numbered sets."""
+"""Cells of a grid that belong together, in numbered sets, and sums over the squares around cells."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def _linked(raster, offsets, steps, reach, number):
 def linked_cells(
     raster: NDArray[np.float32], reach: int, step: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Number of each cell's set (h, w), -1 in holes; sizes of the sets (n,), and first and last row and column (n, 4).
+    """Number of each cell's set (h, w), -1 in holes; sizes of the sets (n,), and their :func:`longest_sides`.
 
     Cells at most `reach` away from each other are linked across a `step` of meters, by the distance in cells.
     """
@@ -68,9 +68,32 @@ def linked_cells(
     count = _linked(raster, offsets, step(away[after]).astype(np.float32), reach, number)
     rows, columns = np.nonzero(number >= 0)
     sets = number[rows, columns]
-    box = np.tile([raster.shape[0], 0, raster.shape[1], 0], (count, 1))
-    for at, (which, values) in enumerate(
-        ((np.minimum, rows), (np.maximum, rows), (np.minimum, columns), (np.maximum, columns))
-    ):
-        which.at(box[:, at], sets, values)
-    return number, np.bincount(sets, minlength=count), box
+    return number, np.bincount(sets, minlength=count), longest_sides(sets, rows, columns, count)
+
+
+def longest_sides(
+    label: NDArray[np.int64], row: NDArray[np.int64], column: NDArray[np.int64], count: int
+) -> NDArray[np.int64]:
+    """Of each of `count` sets of cells, the difference of its last and first row, or column: the larger one."""
+    sides = np.zeros((2, count), np.int64)
+    for side, at in zip(sides, (row, column), strict=True):
+        first = np.full(count, at.max(initial=0))
+        np.minimum.at(first, label, at)
+        np.maximum.at(side, label, at)
+        side -= first
+    return sides.max(axis=0)
+
+
+def sums_around(values: NDArray, reach: int) -> NDArray[np.int64]:
+    """Sums of whole numbers (h, w, ...) over the square that goes `reach` cells to every side of each cell."""
+    sums = np.asarray(values, np.int64)
+    for axis in (0, 1):
+        size = sums.shape[axis]
+        total = np.cumsum(sums, axis)
+        last = np.minimum(np.arange(size) + reach, size - 1)
+        before = np.arange(size) - reach - 1
+        sums = np.take(total, last, axis)
+        inside = [slice(None)] * sums.ndim
+        inside[axis] = before >= 0
+        sums[tuple(inside)] -= np.take(total, before[before >= 0], axis)
+    return sums

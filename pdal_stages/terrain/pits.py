@@ -91,8 +91,8 @@ def _mark_deep(raster, base, few, supported, cell, far, out):
 
 def pits(raster: NDArray[np.float32], cell: float) -> NDArray[np.bool_]:
     """Cells (h, w) of a minimum grid whose lowest point is a low outlier, from float32 heights, holes ``inf``; in meters."""
-    number, size, box = linked_cells(raster, LINK, lambda away: STEP + GRADE * cell * away)
-    small = (size <= MOST) & (box[:, 1] - box[:, 0] < EXTENT) & (box[:, 3] - box[:, 2] < EXTENT)
+    number, size, side = linked_cells(raster, LINK, lambda away: STEP + GRADE * cell * away)
+    small = (size <= MOST) & (side < EXTENT)
     out = np.zeros(raster.shape, bool)
     if small.any():
         base = np.where(small[number] & (number >= 0), HOLE, raster)

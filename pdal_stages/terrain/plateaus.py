@@ -72,7 +72,7 @@ def remove_plateaus(
     `raster` (h, w) holds the heights, in meters like `cell`, a cell's side; ground is measured everywhere. `more` cells,
     numbered row by row, become ground where they are of no plateau, and show none.
     """
-    number, size, box = linked_cells(raster, LINK, lambda away: np.maximum(STEP, GRADE * cell * away))
+    number, size, side = linked_cells(raster, LINK, lambda away: np.maximum(STEP, GRADE * cell * away))
     rows, columns = np.nonzero(number >= 0)
     sets = number[rows, columns]
     count = len(size)
@@ -80,9 +80,7 @@ def remove_plateaus(
         np.int64
     )
     grounds = np.bincount(number[ground], minlength=count)
-    widest = int(WIDEST / cell)
-    asked = grounds > FOOTING * size
-    asked &= (box[:, 1] - box[:, 0] < widest) & (box[:, 3] - box[:, 2] < widest)
+    asked = (grounds > FOOTING * size) & (side < int(WIDEST / cell))
     sectors, around, level = np.zeros((count, 16), bool), np.zeros((count, 2), np.int64), np.zeros(count)
     uphill = np.zeros(count, np.int64)
     _look_around(number, asked, ground, raster, cell, sums, sectors, around, level, uphill)

@@ -14,6 +14,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
+from .linked import longest_sides
 from .minima import cell_numbers
 from .patches import patches
 
@@ -106,9 +107,7 @@ def _find(xyz, cell, every, high, h, w) -> NDArray[np.bool_]:
     linked = near & good[other]
     pairs = scipy.sparse.coo_array((np.ones(linked.sum()), (one[linked], other[linked])), (count, count))
     parts, part = scipy.sparse.csgraph.connected_components(pairs, directed=False)
-    low, high_end = scipy.ndimage.minimum, scipy.ndimage.maximum
-    sides = [high_end(at, part, range(parts)) - low(at, part, range(parts)) for at in np.divmod(cells, w)]
-    good &= (np.maximum(*sides) * CELL >= LONG)[part]
+    good &= (longest_sides(part, *np.divmod(cells, w), parts) * CELL >= LONG)[part]
     good[other[near & good[one]]] = True
     return good[level]
 
