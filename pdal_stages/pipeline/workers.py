@@ -15,13 +15,14 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessP
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context, parent_process, resource_tracker
 from typing import Any
 
 from ..base import checks
 from ..base.errors import InterruptedStage, StageError
 from ..base.files import NO_ROOM
 from ..base.plain import PlainStream
+from ..base.runlog import LoggedStream
 from ..base.threads import CORES, available_threads
 from .interrupts import check, gentle
 
@@ -111,6 +112,7 @@ class WorkerProcesses(AbstractContextManager):
         self.slots, self.threads = slots, threads
         self._idle: list[ProcessPoolExecutor] = []
         self._busy: dict[Future, ProcessPoolExecutor] = {}
+        self._hearers: list[threading.Thread] = []
 
     def __exit__(self, *exc: object) -> None:
         for pool in [*self._idle, *self._busy.values()]:
@@ -119,6 +121,8 @@ class WorkerProcesses(AbstractContextManager):
             for process in processes:
                 process.kill()
                 process.join(10.0)
+        for hearer in self._hearers:
+            hearer.join(1.0)
 
     def submit(self, task: Callable[[], Any]) -> Future:
         """Send a task to a free worker."""
@@ -126,11 +130,29 @@ class WorkerProcesses(AbstractContextManager):
             pool = self._idle.pop()
             future = pool.submit(perform, task)
         else:
-            with _environment(self.threads):
+            with _environment(self.threads), self._heard():
                 pool = ProcessPoolExecutor(1, get_context("spawn"), _begin)
                 future = pool.submit(perform, task)
         self._busy[future] = pool
         return future
+
+    @contextmanager
+    def _heard(self) -> Iterator[None]:
+        """What a process that starts meanwhile prints goes through this one where a log is kept."""
+        if not isinstance(sys.stderr, LoggedStream):
+            yield
+            return
+        resource_tracker.ensure_running()  # whose standard error stays
+        (ours, theirs), before = os.pipe(), os.dup(2)
+        os.dup2(theirs, 2)
+        try:
+            yield
+        finally:
+            os.dup2(before, 2)
+            os.close(theirs)
+            os.close(before)
+        self._hearers.append(threading.Thread(target=_repeat, args=(ours, sys.stderr), daemon=True))
+        self._hearers[-1].start()
 
     def wait(self, futures: Iterable[Future]) -> set[Future]:
         """Those that are done, at least one."""
@@ -140,6 +162,11 @@ class WorkerProcesses(AbstractContextManager):
             if not isinstance(future.exception(), BrokenExecutor):
                 self._idle.append(pool)
         return done
+
+
+def _repeat(pipe: int, stream: LoggedStream) -> None:
+    with open(pipe, errors="backslashreplace") as lines:
+        stream.writelines(lines)
 
 
 def _begin() -> None:
