@@ -33,7 +33,7 @@ import numpy as np
 from pdal_stages.base.version import __version__
 from pdal_stages.classifier import Forest, load_model
 from pdal_stages.classifier import context as contexts
-from pdal_stages.features import blocks as feature_blocks
+from pdal_stages.features import engine as feature_engine
 from pdal_stages.objects.consistency import consistent
 from pdal_stages.synthetic import make_town, write_town
 from pdal_stages.terrain import detached_noise, filtered_ground
@@ -153,15 +153,15 @@ def parts(cloud: Path, model_file: str) -> dict[str, float]:
     model = load_model(model_file)
     with tempfile.TemporaryDirectory() as folder:
         model.predict(xyz[:2000], {k: v[:2000] for k, v in dimensions.items()}, threads=1)  # kernels
-        forest, around, compute = Forest.predict_proba, contexts.cell_means, feature_blocks.Run.compute
+        forest, around, compute = Forest.predict_proba, contexts.cell_means, feature_engine.Run.compute
         Forest.predict_proba = timed("forests", forest)  # type: ignore[method-assign]
         contexts.cell_means = timed("context", around)
-        feature_blocks.Run.compute = timed("features", compute)  # type: ignore[method-assign]
+        feature_engine.Run.compute = timed("features", compute)  # type: ignore[method-assign]
         try:
             found = timed("classification", model.predict)(xyz, dimensions, threads=1)
         finally:
             Forest.predict_proba, contexts.cell_means = forest, around  # type: ignore[method-assign]
-            feature_blocks.Run.compute = compute  # type: ignore[method-assign]
+            feature_engine.Run.compute = compute  # type: ignore[method-assign]
         ground, height = dimensions["Ground"], dimensions["HeightAboveGround"]
         las.classification, _ = timed("consistency", consistent)(
             xyz, found.classification, height=height, ground=ground

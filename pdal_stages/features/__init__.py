@@ -4,7 +4,8 @@ Importing this package is light; numba and the kernels are loaded when an engine
 """
 
 from .bins import ShapeBins
-from .engine import FeatureEngine, FeatureTable, compute_features, warmup
+from .engine import FeatureEngine, compute_features, warmup
 from .plan import FeaturePlan
+from .table import FeatureTable
 
 __all__ = ["FeatureEngine", "FeaturePlan", "FeatureTable", "ShapeBins", "compute_features", "warmup"]

@@ -10,18 +10,11 @@ import numpy as np
 
 from ..base.errors import OptionError
 from .names import SHAPE_BINS, SHAPES
-from .shapes import point_seeds
 
 #: The metrics, in the order of the rows of all threshold arrays.
 METRICS = tuple(SHAPES)
 #: Inner thresholds of the bins.
 INNER = SHAPE_BINS - 1
-
-#: Sample neighborhoods [B16 3.2.2].
-SAMPLES = 500
-
-#: Points hashed at a time.
-CHUNK = 1_000_000
 
 _CURE = "Fit the thresholds again, or take them from the model file as it was written"
 
@@ -159,19 +152,3 @@ def _to_comparable(rows: np.ndarray) -> np.ndarray:
     a3, d1, d2, d3, d4 = rows
     cosine = np.cos(a3)
     return np.array([-cosine * np.abs(cosine), d1**2, d2**2, 4 * d3**4, 6 * d4**3])
-
-
-def smallest_hashes(xyz: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """The SAMPLES points with the smallest hash of (seed, coordinates); copies of a point count once.
-
-    Hashes (m,), ascending, and rows (m,) of the points.
-    """
-    hashes, rows = np.zeros(0, np.uint64), np.zeros(0, np.int64)
-    for start in range(0, len(xyz), CHUNK):
-        part = np.asarray(xyz[start : start + CHUNK])
-        x, y, z = part.T
-        hashes = np.concatenate((hashes, point_seeds(x, y, z, seed, "samples")))
-        rows = np.concatenate((rows, np.arange(start, start + len(part))))
-        hashes, first = np.unique(hashes, return_index=True)
-        hashes, rows = hashes[:SAMPLES], rows[first[:SAMPLES]]
-    return hashes, rows

@@ -27,17 +27,15 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..base.hashing import GOLDEN, finalise
 from ..base.jit import device, njit
+from .bins import ShapeBins
 from .names import SHAPE_FEATURES
 from .plan import Columns, columns_of
-
-if TYPE_CHECKING:
-    from .bins import ShapeBins
 
 #: x, y and z of points, (m,) float64 each.
 Axes = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -49,6 +47,9 @@ PULLS = 255
 ROOM = 256
 
 BINS = 10
+
+#: Sample neighborhoods to which bins are fitted [B16 3.2.2], and points hashed at a time to choose them.
+SAMPLES, _TOGETHER = 500, 1_000_000
 
 #: Product of two squared lengths (m^4) below which an angle is not defined, and 0.
 NO_ANGLE = 1e-30
@@ -120,6 +121,22 @@ def point_seeds(x: np.ndarray, y: np.ndarray, z: np.ndarray, seed: int, token: s
     h = finalise(h + bits[0])
     h = finalise(h + GOLDEN + bits[1])
     return finalise(h + GOLDEN + bits[2])
+
+
+def smallest_hashes(xyz: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """The SAMPLES points with the smallest hash of (seed, coordinates); copies of a point count once.
+
+    Hashes (m,), ascending, and rows (m,) of the points.
+    """
+    hashes, rows = np.zeros(0, np.uint64), np.zeros(0, np.int64)
+    for start in range(0, len(xyz), _TOGETHER):
+        part = np.asarray(xyz[start : start + _TOGETHER])
+        x, y, z = part.T
+        hashes = np.concatenate((hashes, point_seeds(x, y, z, seed, "samples")))
+        rows = np.concatenate((rows, np.arange(start, start + len(part))))
+        hashes, first = np.unique(hashes, return_index=True)
+        hashes, rows = hashes[:SAMPLES], rows[first[:SAMPLES]]
+    return hashes, rows
 
 
 @device

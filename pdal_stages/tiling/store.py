@@ -203,9 +203,15 @@ def take_lock(folder: Path, taken: str, cure: str) -> Any:
         make_own(folder)
         flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0)
         try:
-            file = os.fdopen(os.open(folder / "lock", flags, 0o600), "a+", encoding="utf-8")
+            file = os.fdopen(os.open(folder / "lock", flags, 0o622), "a+", encoding="utf-8")
         except FileNotFoundError:  # the run that had it has just removed its folder
             continue
+        if hasattr(
+            os, "fchmod"
+        ):  # who can read a lock can hold it, so those may who can write, and nobody else
+            writers = os.fstat(file.fileno()).st_mode & 0o022
+            with contextlib.suppress(OSError):  # of another user, whose folder this is
+                os.fchmod(file.fileno(), 0o600 | writers | writers << 1)
         if not try_lock(file):
             file.seek(0)
             who = file.read().strip() or str(folder)

@@ -1,0 +1,70 @@
+"""Features of queries: an array with names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..base.errors import optional_import, suggest
+from ..base.report import Report
+from .bins import ShapeBins
+
+
+@dataclass
+class FeatureTable:
+    """Features of queries: an array with names, which NumPy and scikit-learn take as it is.
+
+    Attributes
+    ----------
+    values : (m, F) float32 array
+    names : tuple of str
+        Of the columns.
+    bins, copt_threshold
+        As given or fitted; hand them to another call to get comparable features.
+    report : Report
+        See :class:`FeatureEngine`.
+    """
+
+    values: np.ndarray
+    names: tuple[str, ...]
+    bins: ShapeBins | None = None
+    copt_threshold: float | None = None
+    report: Report = field(default_factory=Report)
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.values.shape
+
+    def __array__(self, dtype=None, copy=None) -> np.ndarray:
+        return np.array(self.values, dtype) if copy else np.asarray(self.values, dtype)
+
+    def __iter__(self) -> Iterator[str]:
+        """The names, as a data frame iterates."""
+        return iter(self.names)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.names
+
+    def to_dataframe(self):
+        """A pandas.DataFrame with a column for each feature.
+
+        Raises
+        ------
+        DependencyError
+            pandas is not installed.
+        """
+        pandas = optional_import("pandas", "table", "to_dataframe")
+        return pandas.DataFrame(self.values, columns=list(self.names))
+
+    def __getitem__(self, name: str | list[str]) -> np.ndarray:
+        """The column of that name, a view; or those of several names, (m, names)."""
+        if isinstance(name, list):
+            return np.stack([self[one] for one in name], axis=1)
+        if name not in self.names:
+            raise KeyError(f"no feature '{name}' in this table. {suggest(name, self.names)}".strip())
+        return self.values[:, self.names.index(name)]
