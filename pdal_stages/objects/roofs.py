@@ -6,7 +6,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ..base.jit import device, njit
+from ..base.jit import njit
 
 #: Scatter of a roof's plane that is gone on from, and how near to it vegetation is of the roof, meters.
 PLANE, NEAR = 0.12, 0.2
@@ -23,83 +23,58 @@ SMOOTH, TILT, SMALLEST = 0.25, 0.2, 3.0
 _SHARE = 0.34
 
 
-@device
-def plane_around(z, r, c, size, level, reach, flat):
-    """The plane through the five by five cells around a cell that lie within `reach` of a level, by least squares.
+@njit
+def planes(z: NDArray, level: NDArray, size: float, reach: float) -> NDArray:
+    """The plane, by least squares, through the five by five cells around each cell that lie within `reach` of its level.
 
-    Returns how many they are, the rise per meter east and north, the height above `level` at the cell, and the mean
-    square of how far they lie from it; NaN where they are fewer than six, or in a row (a determinant below `flat`).
+    (4, r, c): rise per meter east and north, height above `level` at the cell, and the mean square of how far the cells lie
+    from it; NaN where they are fewer than six, or in a row, and where there is no level.
     """
-    n, x, y, h, xx, yy, xy, xh, yh, hh = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(max(r - 2, 0), min(r + 3, z.shape[0])):
-        for j in range(max(c - 2, 0), min(c + 3, z.shape[1])):
-            d = z[i, j] - level
-            if not abs(d) <= reach:
+    out = np.full((4, *z.shape), np.nan)
+    for r in range(z.shape[0]):
+        for c in range(z.shape[1]):
+            if np.isnan(level[r, c]):
                 continue
-            u, v = (j - c) * size, (i - r) * size
-            n += 1
-            x += u
-            y += v
-            h += d
-            xx += u * u
-            yy += v * v
-            xy += u * v
-            xh += u * d
-            yh += v * d
-            hh += d * d
-    if n < 6:
-        return n, np.nan, np.nan, np.nan, np.nan
-    xx, yy, xy = xx - x * x / n, yy - y * y / n, xy - x * y / n
-    xh, yh, hh = xh - x * h / n, yh - y * h / n, hh - h * h / n
-    det = xx * yy - xy * xy
-    if det < max(1e-9, flat * n * n * size**4):
-        return n, np.nan, np.nan, np.nan, np.nan
-    a, b = (xh * yy - yh * xy) / det, (yh * xx - xh * xy) / det
-    return n, a, b, (h - a * x - b * y) / n, (hh - a * xh - b * yh) / n
+            n, x, y, h, xx, yy, xy, xh, yh, hh = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for i in range(max(r - 2, 0), min(r + 3, z.shape[0])):
+                for j in range(max(c - 2, 0), min(c + 3, z.shape[1])):
+                    d = z[i, j] - level[r, c]
+                    if not abs(d) <= reach:
+                        continue
+                    u, v = (j - c) * size, (i - r) * size
+                    n += 1
+                    x += u
+                    y += v
+                    h += d
+                    xx += u * u
+                    yy += v * v
+                    xy += u * v
+                    xh += u * d
+                    yh += v * d
+                    hh += d * d
+            if n < 6:
+                continue
+            xx, yy, xy = xx - x * x / n, yy - y * y / n, xy - x * y / n
+            xh, yh, hh = xh - x * h / n, yh - y * h / n, hh - h * h / n
+            det = xx * yy - xy * xy
+            if det < 1e-3 * n * n * size**4:
+                continue
+            a, b = (xh * yy - yh * xy) / det, (yh * xx - xh * xy) / det
+            out[:, r, c] = a, b, (h - a * x - b * y) / n, max(hh - a * xh - b * yh, 0.0) / n
+    return out
 
 
-def roof_cells(
-    high: NDArray, ground: NDArray, lowest: float
-) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Cells of roofs and the height of each, meters.
+def roof_cells(high: NDArray) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Cells of roofs and the height of each, meters, from the highest point of a roof in each cell (r, c), NaN for none.
 
-    Cells of which the highest point lies `lowest` above the ground; empty ones with at least seven of eight neighbors are
-    filled, twice, and what is one cell wide, a wall or a stray point, is left out.
-
-    Parameters
-    ----------
-    high : (r, c) float64
-        Height of the highest point of a building in each cell, NaN where there is none.
-    ground : (r, c) float64
-        NaN where it is not known: then every height will do.
-    lowest : float
-        Meters.
+    Empty cells with at least seven of eight neighbors are filled, twice, and what is one cell wide, a wall or a stray point,
+    is left out.
     """
-    with np.errstate(invalid="ignore"):
-        taken = ~np.isnan(high) & ~(high - ground < lowest)
-    high = np.where(taken, high, np.nan)
     for _ in range(2):
         high = _closed(high)
-    return opened(~np.isnan(high)), high
+    return scipy.ndimage.binary_opening(~np.isnan(high), np.ones((2, 2), bool)), high
 
 
-@device
-def _leaning(z, r, c, size, level, thick):
-    """How far `level` lies from the plane through the five by five cells around a cell that lie within a meter of it,
-    meters; NaN where they are too few or scatter, or where the cell's points, `thick` apart, are no surface."""
-    _, a, b, above, scatter = plane_around(z, r, c, size, level, 1.0, 1e-3)
-    if np.isnan(a):
-        return np.nan
-    steep = a * a + b * b
-    # The highest point of a cell lies anywhere in it.
-    if scatter > PLANE * PLANE + steep * (0.3 * size) ** 2 or steep > 4.0:
-        return np.nan
-    if thick > SURFACE + 1.5 * size * np.sqrt(steep):
-        return np.nan
-    return max(0.0, abs(above) - 0.4 * size * np.sqrt(steep))
-
-
-@njit
 def continued(high: NDArray, leaves: NDArray, thick: NDArray, size: float, reach: int) -> NDArray:
     """Heights of roofs, gone on into cells of vegetation that lie in their planes: what a classifier took for leaves.
 
@@ -114,20 +89,16 @@ def continued(high: NDArray, leaves: NDArray, thick: NDArray, size: float, reach
     reach : int
         How many cells far at most.
     """
-    out = high.copy()
-    rows, columns = np.nonzero(np.isnan(high) & ~np.isnan(leaves))
-    added = np.empty(len(rows), np.bool_)
     for _ in range(reach):
-        for n in range(len(rows)):
-            level = leaves[rows[n], columns[n]]
-            off = _leaning(out, rows[n], columns[n], size, level, thick[rows[n], columns[n]])
-            added[n] = off <= NEAR
+        east, north, above, scatter = planes(high, np.where(np.isnan(high), leaves, np.nan), size, 1.0)
+        steep = east**2 + north**2
+        lean = size * np.sqrt(steep)  # the highest point of a cell lies anywhere in it
+        added = (scatter <= PLANE**2 + 0.09 * lean**2) & (steep <= 4.0) & (thick <= SURFACE + 1.5 * lean)
+        added &= np.abs(above) - 0.4 * lean <= NEAR
         if not added.any():
             break
-        for k in np.flatnonzero(added):
-            out[rows[k], columns[k]] = leaves[rows[k], columns[k]]
-        rows, columns, added = rows[~added], columns[~added], added[~added]
-    return out
+        high = np.where(added, leaves, high)
+    return high
 
 
 def covered(high: NDArray, seen: NDArray, reach: int) -> NDArray:
@@ -144,22 +115,21 @@ def covered(high: NDArray, seen: NDArray, reach: int) -> NDArray:
         Whether points of the ground or of vegetation lie in the cell.
     reach : int
     """
-    out = high.copy()
-    holes, _ = scipy.ndimage.label(np.isnan(high) & ~seen)
+    out, empty = high.copy(), np.isnan(high) & ~seen
+    holes, count = scipy.ndimage.label(empty)
+    deepest = scipy.ndimage.maximum(scipy.ndimage.distance_transform_cdt(empty), holes, np.arange(count + 1))
+    near = np.zeros(count + 1, bool)
+    near[holes[scipy.ndimage.binary_dilation(~np.isnan(high))]] = True
+    near[0] = False
+    for edge in (0, -1):  # what is seen ends there
+        near[holes[edge]] = near[holes[:, edge]] = False
     boxes = scipy.ndimage.find_objects(holes)
-    for number in np.unique(holes[scipy.ndimage.binary_dilation(~np.isnan(high))]).tolist():
-        if number == 0:
-            continue
-        rows, columns = boxes[number - 1]
-        top, left = rows.start - 1, columns.start - 1
-        box = np.s_[top : rows.stop + 1, left : columns.stop + 1]
-        hole = holes[box] == number if top >= 0 and left >= 0 else np.empty((0, 0), bool)
-        if hole.shape != (rows.stop - rows.start + 2, columns.stop - columns.start + 2):
-            continue  # at the edge of what is seen
+    for number in np.flatnonzero(near & (deepest <= reach)).tolist():
+        box = tuple(slice(one.start - 1, one.stop + 1) for one in boxes[number - 1])
+        hole = holes[box] == number
         levels = high[box][scipy.ndimage.binary_dilation(hole) & ~hole]
         level = np.nanmedian(levels) if not np.isnan(levels).all() else np.nan
-        rim = np.mean(np.abs(levels - level) <= LEVEL) >= RIM and max(hole.shape) <= 12 * reach
-        if rim and scipy.ndimage.distance_transform_cdt(hole).max() <= reach:
+        if np.mean(np.abs(levels - level) <= LEVEL) >= RIM:
             out[box][hole] = level
     return out
 
@@ -171,11 +141,6 @@ def _closed(high: NDArray) -> NDArray:
     count = scipy.ndimage.correlate(known.astype(np.float64), around, mode="constant")
     total = scipy.ndimage.correlate(np.where(known, high, 0.0), around, mode="constant")
     return np.where(~known & (count >= 7), total / np.maximum(count, 1), high)
-
-
-def opened(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Cells of the mask that lie in a square of two by two of it."""
-    return scipy.ndimage.binary_opening(mask, np.ones((2, 2), bool))
 
 
 def connected(mask: NDArray, step: float, *values: NDArray) -> NDArray[np.int64]:
@@ -205,54 +170,6 @@ def _sets(a: NDArray, b: NDArray, count: int) -> NDArray[np.int64]:
     return rank[at]
 
 
-@device
-def _roof_level(part, z, r, c, dr, dc):
-    """Height of a part's roof at its border: at the outer side of a cell there, whose inner neighbor lies in a direction.
-
-    The cell itself and the next may hold the rim of a flat roof, or the wall of a higher one: so it is the plane through
-    the cells around the `INSIDE`-th beyond it, carried on to the border.
-    """
-    inside = INSIDE
-    while inside > 0:
-        i, j = r + inside * dr, c + inside * dc
-        if 0 <= i < z.shape[0] and 0 <= j < z.shape[1] and part[i, j] == part[r, c]:
-            break
-        inside -= 1
-    level = z[r + inside * dr, c + inside * dc]
-    _, a, b, above, _ = plane_around(z, r + inside * dr, c + inside * dc, 1.0, level, 1.0, 1e-3)
-    if np.isnan(a):
-        return level
-    return level + above - (inside + 0.5) * (a * dc + b * dr)
-
-
-@njit
-def _borders(part: NDArray, z: NDArray, step: float) -> NDArray:
-    """Every pair of cells side by side in different parts: (n, 3), the numbers of both, the lower first, and whether
-    their roofs lie within `step` there."""
-    rows, columns = part.shape
-    count = 0
-    for turn in range(2):
-        out = np.empty((count, 3), np.int64)
-        count = 0
-        for r in range(rows):
-            for c in range(columns):
-                if part[r, c] < 0:
-                    continue
-                for way in range(2):
-                    rr, cc = r + way, c + 1 - way
-                    if rr >= rows or cc >= columns or part[rr, cc] < 0 or part[rr, cc] == part[r, c]:
-                        continue
-                    if turn == 1:
-                        a, b = part[r, c], part[rr, cc]
-                        out[count, 0], out[count, 1], out[count, 2] = min(a, b), max(a, b), 1
-                        if step < np.inf:
-                            one = _roof_level(part, z, r, c, -way, way - 1)
-                            other = _roof_level(part, z, rr, cc, way, 1 - way)
-                            out[count, 2] = 0 if abs(one - other) > step else 1
-                    count += 1
-    return out
-
-
 def building_parts(mask: NDArray[np.bool_], z: NDArray, *, step: float, smallest: int) -> NDArray[np.int64]:
     """Number of each cell's building, from 0 in the order of their first cells; -1 outside.
 
@@ -263,64 +180,66 @@ def building_parts(mask: NDArray[np.bool_], z: NDArray, *, step: float, smallest
     """
     if step <= 0:
         return connected(mask, np.inf, z)
-    number = _absorbed(connected(mask, min(1.0, step), z), z, smallest)
-    return _joined(number, z, step)
-
-
-def _absorbed(number: NDArray[np.int64], z: NDArray, smallest: int) -> NDArray[np.int64]:
-    """Parts without the small ones that have a neighbor."""
+    number = connected(mask, min(1.0, step), z)
     while True:
-        a, b, length, _ = _shared(number, z, np.inf)
+        a, b, length, _ = _borders(number)
         size = np.bincount(number[number >= 0])
         a, b, length = np.r_[a, b], np.r_[b, a], np.r_[length, length]
         order = np.lexsort((b, -length, a))  # the longest border; of equal ones the part that begins first
         order = order[size[a[order]] < smallest]
         small, first = np.unique(a[order], return_index=True)
         if not len(small):
-            return number
-        number = _renamed(number, _sets(small, b[order][first], len(size)))
-
-
-def _joined(number: NDArray[np.int64], z: NDArray, step: float) -> NDArray[np.int64]:
-    """Parts with those put together whose heights meet along enough of their border."""
+            break
+        number = _renamed(number, small, b[order][first])
+    z = np.where(mask, z, np.nan)
+    surface = z, *planes(z, z, 1.0, 1.0)[:3]
     while True:
-        a, b, length, near = _shared(number, z, step)
+        a, b, length, near = _borders(number, surface, step)
         meets = near >= _SHARE * length
         if not meets.any():
             return number
-        number = _renamed(number, _sets(a[meets], b[meets], int(number.max()) + 1))
+        number = _renamed(number, a[meets], b[meets])
 
 
-def _shared(number: NDArray[np.int64], z: NDArray, step: float) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+def _borders(
+    number: NDArray[np.int64], surface: tuple[NDArray, ...] | None = None, step: float = np.inf
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Neighboring parts, the lower number first; how long their border is, in cells, and how much of it is within step."""
-    pairs = _borders(number, z, step)
-    both, which, length = np.unique(pairs[:, :2], axis=0, return_inverse=True, return_counts=True)
-    return (
-        both[:, 0],
-        both[:, 1],
-        length,
-        np.bincount(which.ravel(), weights=pairs[:, 2], minlength=len(both)),
+    pairs, near = [], []
+    for down, right in ((1, 0), (0, 1)):
+        one, other = number[: len(number) - down, : number.shape[1] - right], number[down:, right:]
+        at = np.array(np.nonzero((one >= 0) & (other >= 0) & (one != other)))
+        pairs.append(np.sort([one[tuple(at)], other[tuple(at)]], axis=0))
+        if surface is None:
+            near.append(np.ones(at.shape[1]))
+            continue
+        way = np.array([[down], [right]])
+        levels = [_roof_level(number, surface, at, -way), _roof_level(number, surface, at + way, way)]
+        near.append(np.abs(levels[0] - levels[1]) <= step)
+    both, which, length = np.unique(
+        np.concatenate(pairs, axis=1), axis=1, return_inverse=True, return_counts=True
     )
+    return *both, length, np.bincount(which.ravel(), np.concatenate(near), len(length))
 
 
-def _renamed(number: NDArray[np.int64], name: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.where(number >= 0, name[number], -1)
+def _roof_level(number: NDArray, surface: tuple[NDArray, ...], at: NDArray, way: NDArray) -> NDArray:
+    """Heights of roofs at their border: at the outer side of cells there, whose inner neighbors lie `way`.
+
+    The cell itself and the next may hold the rim of a flat roof, or the wall of a higher one: so it is the plane through
+    the cells around the `INSIDE`-th beyond it, carried on to the border.
+    """
+    shape, inside = np.array(number.shape)[:, None], np.zeros(at.shape[1], np.int64)
+    for far in range(1, INSIDE + 1):
+        there = at + far * way
+        within = ((there >= 0) & (there < shape)).all(axis=0)
+        inside[within & (number[tuple(there % shape)] == number[tuple(at)])] = far
+    z, east, north, above = (values[tuple(at + inside * way)] for values in surface)
+    return z + np.nan_to_num(above - (inside + 0.5) * (north * way[0] + east * way[1]))
 
 
-@njit
-def _gradients(z: NDArray, size: float) -> tuple[NDArray, NDArray, NDArray]:
-    """Rise per meter east and north of the plane through each cell and its neighbors, and how far they lie from it."""
-    rows, columns = z.shape
-    east, north = np.full(z.shape, np.nan), np.full(z.shape, np.nan)
-    off = np.full(z.shape, np.inf)
-    for r in range(rows):
-        for c in range(columns):
-            if np.isnan(z[r, c]):
-                continue
-            _, a, b, _, scatter = plane_around(z, r, c, size, z[r, c], 1.5, 0.0)
-            if not np.isnan(a):
-                east[r, c], north[r, c], off[r, c] = a, b, np.sqrt(max(scatter, 0.0))
-    return east, north, off
+def _renamed(number: NDArray[np.int64], a: NDArray, b: NDArray) -> NDArray[np.int64]:
+    """Numbers of parts after parts `a` and `b` were put together, pair by pair."""
+    return np.where(number >= 0, _sets(a, b, int(number.max()) + 1)[number], -1)
 
 
 def roof_planes(z: NDArray[np.float64], size: float) -> tuple[int, float, float]:
@@ -333,8 +252,8 @@ def roof_planes(z: NDArray[np.float64], size: float) -> tuple[int, float, float]
     size : float
         Side of a cell, meters.
     """
-    east, north, off = _gradients(z, size)
-    part = connected(off < SMOOTH, TILT, east, north)
+    east, north, _, scatter = planes(z, z, size, 1.5)
+    part = connected(scatter < SMOOTH**2, TILT, east, north)
     cells = np.bincount(part.ravel() + 1)[1:]
     large = np.append(cells * size * size >= SMALLEST, False)
     taken = large[part]

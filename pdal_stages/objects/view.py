@@ -113,8 +113,7 @@ class CellView:
     def _surface(self, kind: Kind) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
         """Cells of decks and their heights; or of roofs, gone on into vegetation in their planes and over gaps."""
         if kind != Kind.BUILDING:
-            high = self.high(kind)
-            return roofs.roof_cells(high, np.full(high.shape, np.nan), 0.0)
+            return roofs.roof_cells(self.high(kind))
         chosen, leaves = self.chosen, self.high(Kind.TREE)
         seen = _wide(self.held(Kind.GROUND)[1] >= 0) | ~np.isnan(leaves) | (self.held(Kind.OTHER)[1] >= 0)
         with np.errstate(invalid="ignore"):
@@ -123,8 +122,7 @@ class CellView:
         reach = round(GROWTH / chosen.cell)
         high = roofs.continued(self.high(Kind.BUILDING), leaves, thick, chosen.cell, reach)
         high = np.where(high - self.ground < chosen.building_height, np.nan, high)
-        high = roofs.covered(high, seen, round(DARK / chosen.cell))
-        return roofs.roof_cells(high, self.ground, chosen.building_height)
+        return roofs.roof_cells(roofs.covered(high, seen, round(DARK / chosen.cell)))
 
     def body(self, kind: Kind, r: NDArray, c: NDArray, z: NDArray) -> Body:
         """An object's cells, of which rows and columns in the window are given, with heights `z` of the window."""
