@@ -306,9 +306,9 @@ def test_points_of_several_readers_see_each_other(pipeline, halves, tmp_path):
 
 
 def test_options_of_every_pdal_stage(pipeline, town, tmp_path):
-    file, log = tmp_path / "options.json", tmp_path / "log.txt"
-    file.write_text(json.dumps({"cell": 10, "where": "X > 500030"}))
-    stage = {"type": "filters.hag_minima", "option_file": str(file), "user_data": {"a": [1]}, "log": str(log)}
+    log = tmp_path / "log.txt"
+    stage = {"type": "filters.hag_minima", "cell": 10, "where": "X > 500030"}
+    stage |= {"user_data": {"a": [1]}, "log": str(log)}
     pipeline(las([str(town), stage], tmp_path / "stock.laz"), "--verbose=4")
     ps.Pipeline(las([str(town), {**stage}], tmp_path / "ours.laz")).execute()
     assert_same(tmp_path / "stock.laz", tmp_path / "ours.laz")
@@ -348,8 +348,8 @@ def test_an_empty_list_is_none(pipeline, town, tmp_path):
         ({"sell": 3}, "filters.hag_minima: Unexpected argument 'sell'"),
         ({"cell": -1}, "filters.hag_minima (tag 'h'): option 'cell' must be a number above 0"),
         ({"where": "X >"}, "filters.hag_minima (tag 'h'): the 'where' expression"),
-        ({"where": "X > 1", "where_merge": False}, "cannot be false here"),
-        ({"option_file": "nowhere.json"}, "the option file cannot be read"),
+        ({"where": "X > 1", "where_merge": False}, "there is no option 'where_merge'"),
+        ({"option_file": "nowhere.json"}, "there is no option 'option_file'"),
         ({"horizontal_unit": "furlong"}, "furlong"),
     ],
 )

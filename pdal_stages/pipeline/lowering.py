@@ -7,18 +7,14 @@ inputs work as PDAL makes them work.
 from __future__ import annotations
 
 import copy
-import difflib
 import itertools
-import json
 import re
-import shlex
 import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
-from ..base.errors import DimensionError, OptionError, PipelineError, StageError, suggest
+from ..base.errors import DimensionError, PipelineError, StageError
 from ..base.las import extra_dimensions, read_header
 from ..stages import preparation, registry
 from ..stages.base import Stage
@@ -44,7 +40,7 @@ class LoweredStage:
     label: str  #: the unique `module` label, under which the runtime knows it
     number: int  #: its place in the given list
     index: int  #: its place in the lowered list
-    given: dict[str, Any]  #: the stage as it was written, with the options of its `option_file`
+    given: dict[str, Any]  #: the stage as it was written
     plain: dict[str, Any]  #: the ``filters.python`` that PDAL runs
 
 
@@ -68,15 +64,9 @@ def lower(source: PipelineSource, whole: bool = True) -> Lowered:
     # File names stand for readers and writers; PDAL tells which, so they stay without a type.
     stages = [copy.deepcopy(one) if isinstance(one, dict) else {"filename": one} for one in source.stages]
     places = [source.where(number) for number in range(len(stages))]
-    for stage, where in zip(stages, places, strict=True):
-        _refuse_near_miss(stage, where)
-    out = Lowered([])
-    run = run_by_pdal(stages)
-    if len(run) < len(stages):
-        out.warnings.append(_warning_of_ends(stages, run, places))
-        stages = [stages[number] for number in run]
+    _refuse_several_ends(stages, places)
     check_copc(stages)
-    out.warnings += unread_extra_dimensions(stages)
+    out = Lowered([], warnings=unread_extra_dimensions(stages))
     flags = _flags_to_split(stages) if whole else []
     last_reader = max((n for n in range(len(stages)) if is_reader(stages, n)), default=None)
     reaching = _views_reaching(stages)
@@ -101,9 +91,9 @@ def lower(source: PipelineSource, whole: bool = True) -> Lowered:
                     stage["inputs"] = [merge["tag"]]
                 out.stages.append(merge)
             taken = registry.get(type_name).from_pipeline(stage, stages[:index])
-            lowered = lower_stage({**taken, **stage}, run[index], len(out.stages))
+            lowered = lower_stage({**taken, **stage}, index, len(out.stages))
         except StageError as error:
-            raise error.within(places[run[index]]) from None
+            raise error.within(places[index]) from None
         out.ours.append(lowered)
         out.stages.append(lowered.plain)
     _follow_preparations(out)
@@ -145,19 +135,6 @@ def _wiring(stages: Sequence[dict[str, Any]]) -> list[list[int]] | None:
     return inputs
 
 
-def run_by_pdal(stages: Sequence[dict[str, Any]]) -> list[int]:
-    """The numbers of the stages that lead to the first end of a pipeline; PDAL runs no others."""
-    if (inputs := _wiring(stages)) is None:
-        return list(range(len(stages)))
-    taken = set(itertools.chain(*inputs))
-    found: set[int] = set()
-    left = [next(number for number in range(len(stages)) if number not in taken)]
-    while left:
-        found.add(number := left.pop())
-        left += [one for one in inputs[number] if one not in found]
-    return sorted(found)
-
-
 def _views_reaching(stages: Sequence[dict[str, Any]]) -> list[int]:
     """How many views of points, of readers that are still apart, reach each stage; "several" counts as two."""
     views: list[int] = []
@@ -172,20 +149,20 @@ def _views_reaching(stages: Sequence[dict[str, Any]]) -> list[int]:
     return reaching
 
 
-def _warning_of_ends(stages: Sequence[dict[str, Any]], run: Sequence[int], where: Sequence[str]) -> str:
-    """The warning about stages that PDAL leaves out; an error if no writer would run at all."""
-    left = [number for number in range(len(stages)) if number not in run]
-    names = [" ".join(str(stages[n][key]) for key in ("type", "filename") if key in stages[n]) for n in left]
-    named = ", ".join(f"{name} ({where[n]})" for n, name in list(zip(left, names, strict=True))[:5])
-    what = "a pipeline with several ends: PDAL runs only what leads to the first of them"
-    cure = (
-        "Write one file after the other (a writer hands on what it gets, so leave its 'inputs' out), or put a last "
-        'stage there that has all ends as inputs, e.g. {"type": "filters.merge", "inputs": [...]}'
-    )
-    writing = {n for n, stage in enumerate(stages) if str(stage.get("type", "")).startswith("writers.")}
-    if writing and not writing & set(run):
-        raise PipelineError(what, where=where[run[-1]], found=f"not run: {named}", cure=cure)
-    return f"{what}. Not run: {named}. {cure}"
+def _refuse_several_ends(stages: Sequence[dict[str, Any]], where: Sequence[str]) -> None:
+    """PDAL runs only what leads to the first end of a pipeline, and says nothing of the others."""
+    taken = set(itertools.chain(*(_wiring(stages) or [range(len(stages))])))
+    ends = [number for number in range(len(stages)) if number not in taken]
+    if len(ends) > 1:
+        named = [
+            " ".join(str(stages[n][key]) for key in ("type", "filename") if key in stages[n]) for n in ends
+        ]
+        raise PipelineError(
+            "a pipeline with several ends: PDAL runs only what leads to the first of them",
+            found=", ".join(f"{name} ({where[n]})" for n, name in list(zip(ends, named, strict=True))[:5]),
+            cure="Write one file after the other (a writer hands on what it gets, so leave its 'inputs' out), or put a last "
+            'stage there that has all ends as inputs, e.g. {"type": "filters.merge", "inputs": [...]}',
+        )
 
 
 # ---- what stages read, and whether it will be there ----------------------------------------------
@@ -301,26 +278,10 @@ def unread_extra_dimensions(stages: Sequence[dict[str, Any]]) -> list[str]:
 # ---- one stage -----------------------------------------------------------------------------------
 
 
-def _refuse_near_miss(stage: dict[str, Any], where: str) -> None:
-    """A mistyped type of ours would reach PDAL, whose message cannot name our stages."""
-    type_name, ours = stage.get("type", ""), list(registry.stages())
-    if not type_name or type_name in ours:
-        return
-    # Nearer than another of PDAL's stages, such as filters.hag_nn.
-    misspelt = difflib.get_close_matches(type_name, ours, n=1, cutoff=0.88)
-    if misspelt or type_name.rpartition(".")[2] in {name.partition(".")[2] for name in ours}:
-        cure = suggest(type_name, ours) or None
-        raise PipelineError(f"there is no stage '{type_name}'", where=where, cure=cure)
-
-
 def lower_stage(given: dict[str, Any], number: int = 0, index: int = 0) -> LoweredStage:
     """One stage of ours, checked, and the ``filters.python`` that stands for it."""
     kind = registry.get(given["type"])
     named = place(kind.type, given.get("tag"))
-    try:
-        given = settled(given)
-    except StageError as error:
-        raise error.within(named) from None
     options = {k: v for k, v in given.items() if k not in ("type", *PDAL_OWN)}
     stage = kind(options, named)
     label = f"pdal_stages_{kind.type.replace('.', '_')}_{uuid.uuid4().hex[:12]}"
@@ -331,54 +292,3 @@ def lower_stage(given: dict[str, Any], number: int = 0, index: int = 0) -> Lower
     plain |= {key: given[key] for key in PDAL_OWN if key in given}
     made[label] = stage
     return LoweredStage(stage, named, label, number, index, given, plain)
-
-
-def settled(stage: Mapping[str, Any]) -> dict[str, Any]:
-    """A stage of ours with `option_file` and `where_merge` answered, which every PDAL stage has.
-
-    Options of the pipeline go before those of the file.
-
-    Raises
-    ------
-    OptionError
-        If the file cannot be read, or `where_merge` asks for what cannot be.
-    """
-    options = dict(stage)
-    if "option_file" in options:
-        options = {**_option_file(options.pop("option_file")), **options}
-    word = str(options.pop("where_merge", "auto")).strip().lower()
-    if word not in ("auto", "true", "false"):
-        raise OptionError("option 'where_merge' must be one of 'auto', 'true', 'false'", found=repr(word))
-    if word == "false":
-        raise OptionError(
-            "option 'where_merge' cannot be false here: points outside 'where' stay beside the others, as neighbors",
-            cure='Leave it out, and tell the points apart afterwards, e.g. with {"type": "filters.expression"}',
-        )
-    return options
-
-
-def _option_file(path: Any) -> dict[str, Any]:
-    """An option file as PDAL has them: a JSON object, or words ``--name=value``."""
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig").strip()
-        if not text:
-            raise ValueError("it is empty")
-        found = json.loads(text) if text.startswith("{") else _words(shlex.split(text))
-    except (OSError, ValueError, TypeError, RecursionError) as error:
-        raise OptionError("the option file cannot be read", found=f"{str(path)[:200]!r}: {error}") from None
-    if wired := {"type", "tag", "inputs"} & set(found):
-        what = "an option file sets options, not how stages are joined"
-        raise OptionError(what, found=f"{path}: {', '.join(sorted(wired))}")
-    return found
-
-
-def _words(words: list[str]) -> dict[str, str]:
-    found, waiting = {}, iter(words)
-    for word in waiting:
-        name, equals, value = word.partition("=")
-        if not name.startswith("--"):
-            raise ValueError(f"'{word}' does not begin with --name")
-        if not (value := value if equals else next(waiting, "")):
-            raise ValueError(f"'{word}' has no value")
-        found[name[2:]] = value
-    return found

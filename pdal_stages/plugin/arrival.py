@@ -83,7 +83,7 @@ def _made(question: Mapping[str, Any]) -> tuple[Stage, str | None]:
     for name, value in question["options"]:
         texts.setdefault(name, []).append(value)
     before = [_typed(stage) for stage in _stages(question["pipeline"])][:-1]
-    given = lowering.settled({**kind.from_pipeline(texts, before), **_parsed(kind, texts)})
+    given = {**kind.from_pipeline(texts, before), **_parsed(kind, texts)}
     where = runtime.place(kind.type, question.get("tag"))
     stage = kind({name: value for name, value in given.items() if name not in lowering.PDAL_OWN}, where)
     return stage, lowering.settle_upstream(stage, [(one, _creates(one)) for one in before])[1]
@@ -107,7 +107,7 @@ def _typed(stage: Mapping[str, Any]) -> dict[str, Any]:
         if name not in ("type", "inputs"):
             values = value if isinstance(value, list) else [value]
             own[name] = [one if isinstance(one, str) else json.dumps(one) for one in values]
-    return {"type": kind.type, **lowering.settled(_parsed(kind, own))}
+    return {"type": kind.type, **_parsed(kind, own)}
 
 
 def _creates(stage: Mapping[str, Any]) -> Mapping[str, str]:

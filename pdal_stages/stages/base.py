@@ -255,8 +255,6 @@ class Stage(ABC):
             "type": {"const": cls.type},
             "tag": {"type": "string"},
             "inputs": {"type": ["array", "string"]},
-            "option_file": {"type": "string"},
-            "where_merge": {"enum": ["auto", "true", True]},
         }
         properties.update({option.name: option.schema() for option in cls.all_options()})
         return {

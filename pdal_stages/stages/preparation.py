@@ -33,7 +33,6 @@ _ASIDE = (
     "user_data",
     "log",
     "threads",
-    "where_merge",
     "horizontal_unit",
     "vertical_unit",
 )
