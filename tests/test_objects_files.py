@@ -148,39 +148,6 @@ def test_other_formats_hold_the_same(folder, tmp_path, ending):
 
 
 @pytest.mark.pdal
-def test_a_stopped_run_goes_on(folder, tmp_path, monkeypatch):
-    from pdal_stages.tiling import objects
-
-    bad = tmp_path / "bad.laz"
-    bad.write_bytes((folder / "parts" / "0.laz").read_bytes()[:-3000])
-    target = tmp_path / "town.gpkg"
-    parts = [str(folder / "parts" / f"{n}.laz") for n in (1, 2, 3)]
-    assert cli.main(["objects", *parts, str(bad), str(target)]) == 1
-    assert not target.exists()
-    read = []
-    original = objects._points_of
-    monkeypatch.setattr(objects, "_points_of", lambda path: read.append(path) or original(path))
-    bad.write_bytes((folder / "parts" / "0.laz").read_bytes())
-    assert cli.main(["objects", *parts, str(bad), str(target), "--resume"]) == 0
-    assert str(bad) in read and len(read) <= 4 and target.exists()
-
-
-@pytest.mark.pdal
-def test_two_runs_into_one_file(folder, tmp_path, capsys):
-    from pdal_stages.tiling import objects, store
-
-    target = tmp_path / "town.gpkg"
-    command = ["objects", str(folder / "parts" / "1.laz"), str(target)]
-    with store.take_lock(objects._kept(str(target)), "taken", "wait"):
-        assert cli.main(command) == 1 and not target.exists()
-        assert "another run is writing these objects" in capsys.readouterr().err
-    assert cli.main(command) == 0 and target.exists()
-    assert not objects._kept(str(target)).exists()
-    assert cli.main(["objects", str(tmp_path / "none.laz"), str(tmp_path / "more.gpkg")]) == 1
-    assert not objects._kept(str(tmp_path / "more.gpkg")).exists()
-
-
-@pytest.mark.pdal
 def test_metadata_never_replaces_an_input(folder, tmp_path, capsys):
     cloud = tmp_path / "0.laz"
     cloud.write_bytes((folder / "parts" / "0.laz").read_bytes())
@@ -464,15 +431,3 @@ def test_bad_clouds_give_an_error_or_a_whole_file(tmp_path, codes, epsg, text, c
     else:
         assert code == 0
         assert all(not len(layer(target, name)[1]) for name in ("buildings", "trees", "decks"))
-
-
-@pytest.mark.pdal
-def test_what_a_run_keeps_is_not_kept_where_a_link_leads(folder, tmp_path, capsys):
-    victim = tmp_path / "victim"
-    victim.mkdir()
-    (tmp_path / ".t.gpkg.cells").symlink_to(victim)
-    command = ["objects", str(folder / "parts" / "0.laz"), str(tmp_path / "t.gpkg")]
-    for more in ([], ["--resume"]):
-        assert cli.main([*command, *more]) == 1
-        assert "is a link" in capsys.readouterr().err
-    assert not list(victim.iterdir()) and not (tmp_path / "t.gpkg").exists()

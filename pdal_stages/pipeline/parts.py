@@ -118,24 +118,43 @@ def parts_of(path: str, wkt: str) -> Iterator[Part]:
         yield _part(Points(arrays, wkt=wkt))
 
 
-def las_chunks(path: str) -> Iterator[Any]:
-    """The points of a LAS or LAZ file in parts, as laspy reads them."""
+def las_chunks(
+    path: str, start: int = 0, end: int | None = None, most: int = PART, only: Sequence[str] = ()
+) -> Iterator[Any]:
+    """The points of a LAS or LAZ file from one number to another, `most` at a time, as laspy reads them.
+
+    `only`: the dimensions that are needed beside X, Y and the returns, by laspy's names of its selections (``Z``,
+    ``CLASSIFICATION``, ...): LAZ 1.4 holds them apart, so the others take no time. They hold nothing then.
+
+    Raises
+    ------
+    StageError
+        If it cannot be read, is damaged or cut short.
+    """
     import laspy
 
-    count = 0
+    more = {}
+    if only:
+        wanted = laspy.DecompressionSelection.base()
+        for name in only:
+            wanted |= laspy.DecompressionSelection[name]
+        more["decompression_selection"] = wanted
+    at, what = start, "the input cannot be read"
     try:
-        with laspy.open(path) as reader:
-            for chunk in reader.chunk_iterator(PART):
-                count += len(chunk)
+        with laspy.open(path, **more) as reader:
+            end, what = int(reader.header.point_count) if end is None else end, "the input is damaged"
+            if start:
+                reader.seek(start)
+            while at < end and len(chunk := reader.read_points(min(most, end - at))):
+                at += len(chunk)
                 yield chunk
-            total = reader.header.point_count
-    except StageError:
+    except (GeneratorExit, KeyboardInterrupt, MemoryError):
         raise
-    except Exception as error:  # laspy and the decompressor raise many types
-        found = error if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
-        raise StageError("the input cannot be read", where=path, found=found) from None
-    if count != total:
-        raise StageError("the input is cut short", where=path, found=f"{count:,} of {total:,} points")
+    except BaseException as error:  # the decompressor's panics are no Exceptions
+        found = error if isinstance(error, OSError) else f"{type(error).__name__} at point {at:,}: {error}"
+        raise StageError(what, where=path, found=found) from None
+    if at != end:
+        raise StageError("the input is cut short", where=path, found=f"{at:,} of {end:,} points")
 
 
 def _part(points: Points) -> Part:

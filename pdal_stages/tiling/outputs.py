@@ -22,7 +22,7 @@ from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
 from ..pipeline.callbacks import Callbacks
 from .grid import Box
-from .pieces import BLOCK, Piece, header_of, open_las, read_block, record_blocks, write_records
+from .pieces import BLOCK, Piece, header_of, record_blocks, write_records
 from .plan import TilePlan
 from .settings import MOST_AT_ONCE
 from .sources import InputSource
@@ -300,7 +300,7 @@ class _Joined:
         """Append the points of a file, which goes."""
         import laspy
 
-        with open_las(part) as reader:
+        with laspy.open(part) as reader:
             header = reader.header
             places = [*header.scales.tolist(), *header.offsets.tolist()]
             records = [(v.user_id, v.record_id, v.record_data_bytes()) for v in header.vlrs]
@@ -312,8 +312,8 @@ class _Joined:
             elif head != self._head:
                 raise _HeadersDifferError
             total = int(header.point_count)
-            for first in range(0, total, BLOCK):
-                self._writer.write_points(read_block(reader, part, first, total))
+            for points in reader.chunk_iterator(BLOCK):
+                self._writer.write_points(points)
             self.count += total
         os.unlink(part)
 

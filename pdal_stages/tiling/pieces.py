@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ..base.errors import StageError
 from ..base.runs import begins_run
+from ..pipeline.parts import las_chunks
 from .grid import Box, TileGrid, check_number
 from .sources import InputSource, fetch_ept
 
@@ -36,59 +37,22 @@ _CELLS = 4
 # ---- LAS and LAZ files by laspy ------------------------------------------------------------------------------
 
 
-def open_las(path: str, only: Sequence[str] = ()):
-    """The file, for reading; StageError with the reason where it cannot be.
-
-    `only`: the dimensions that are needed beside X, Y and the returns, by laspy's names of its selections (``Z``,
-    ``CLASSIFICATION``, ...): LAZ 1.4 holds them apart, so the others take no time. They hold nothing then.
-    """
-    import laspy
-
-    more = {}
-    if only:
-        wanted = laspy.DecompressionSelection.base()
-        for name in only:
-            wanted |= laspy.DecompressionSelection[name]
-        more["decompression_selection"] = wanted
-    try:
-        return laspy.open(path, **more)
-    except Exception as error:  # laspy and the decompressor raise many types
-        found = error if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
-        raise StageError("the input cannot be read", where=path, found=found) from None
-
-
-def read_block(reader: Any, path: str, start: int, end: int, most: int = BLOCK):
-    """Points from number `start` to `end`, `most` at most; StageError where the file is cut short or damaged."""
-    count = min(most, end - start)
-    try:
-        if reader.points_read != start:  # seeking to where one is costs, and forgets what is wanted
-            reader.seek(start)
-        points = reader.read_points(count)
-    except BaseException as error:  # the decompressor's panics are no Exceptions
-        if isinstance(error, KeyboardInterrupt | MemoryError):
-            raise
-        raise StageError(
-            "the input is damaged", where=path, found=f"{type(error).__name__} at point {start:,}: {error}"
-        ) from None
-    if len(points) != count:
-        raise StageError(
-            "the input is cut short", where=path, found=f"it ends before point {start + count:,}"
-        )
-    return points
-
-
 def record_blocks(path: str, start: int = 0, end: int | None = None, most: int = BLOCK) -> Iterator[NDArray]:
     """Records of the points from one number to another, in blocks, with laspy's names of their fields."""
-    with open_las(path) as reader:
-        end = int(reader.header.point_count) if end is None else end
-        for first in range(start, end, most):
-            yield read_block(reader, path, first, end, most).array
+    return (points.array for points in las_chunks(path, start, end, most))
 
 
 def header_of(path: str) -> laspy.LasHeader:
     """The header of a file, with its records, but that of an octree: points in another order have none."""
-    with open_las(path) as reader:
-        header = reader.header
+    import laspy
+
+    try:
+        with laspy.open(path) as reader:
+            header = reader.header
+    except Exception as error:  # laspy raises many types
+        raise StageError(
+            "the input cannot be read", where=path, found=f"{type(error).__name__}: {error}"
+        ) from None
     for records in filter(None, (header.vlrs, header.evlrs)):
         records[:] = [record for record in records if record.user_id != "copc"]
     return header
