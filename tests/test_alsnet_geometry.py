@@ -6,7 +6,7 @@ from alsnet_scenes import TINY, coverage, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdal_stages.alsnet import CONFIGURATIONS, Circles, parse_configuration
+from pdal_stages.alsnet import Circles, parse_configuration
 from pdal_stages.alsnet.circles import density, halo_m, spacing_for
 from pdal_stages.alsnet.geometry import ball_query, build, farthest_points, scramble, stack, three_nearest
 from pdal_stages.base.errors import OptionError
@@ -111,12 +111,12 @@ def test_every_point_is_in_a_batch_and_batches_are_the_nearest_points(seed, n, p
 
 
 def test_points_are_in_four_batches_on_average():
-    xyz = np.random.default_rng(0).random((60_000, 3)) * [200.0, 200.0, 10.0]
+    xyz = np.random.default_rng(0).random((15_000, 3)) * [100.0, 100.0, 10.0]
     points = 1000
     circles = Circles(xyz, points, spacing_for(points, density([xyz])))
     assert coverage(circles).min() >= 1
     assert 3.7 < coverage(circles).mean() < 4.3
-    inside = ((xyz[:, :2] > 30) & (xyz[:, :2] < 170)).all(axis=1)
+    inside = ((xyz[:, :2] > 20) & (xyz[:, :2] < 80)).all(axis=1)
     assert 3.8 < coverage(circles)[inside].mean() < 4.2
 
 
@@ -209,22 +209,11 @@ def test_scramble_follows_the_coordinates():
 # ---- configurations -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", sorted(CONFIGURATIONS))
-def test_configurations_survive_json(name):
-    import json
-
-    one = CONFIGURATIONS[name]
-    assert parse_configuration(json.loads(json.dumps(one.to_dict()))) == one
-    assert one.memory_mb(2) > 0
-
-
 @pytest.mark.parametrize(
     "given, text",
     [
         ("smal", "Did you mean 'small'"),
         ({"points": 100}, "needs 'levels'"),
-        ({"points": 100, "levels": []}, "1 to 8 levels"),
-        ({"points": 1e99, "levels": [TINY.to_dict()["levels"][0]]}, "'points'"),
         ({"points": 100, "levels": [{**TINY.to_dict()["levels"][0], "radius": float("nan")}]}, "'radius'"),
         ({"points": 100, "levels": [{**TINY.to_dict()["levels"][0], "mlp": [0]}]}, "'mlp'"),
     ],
@@ -232,15 +221,3 @@ def test_configurations_survive_json(name):
 def test_bad_configurations(given, text):
     with pytest.raises(OptionError, match=text):
         parse_configuration(given)
-
-
-def test_published_configurations_have_the_published_widths():
-    """Of the authors' program: (centers, radius, samples, widths, widths back up) level by level."""
-    four, three = CONFIGURATIONS["alsnet4"], CONFIGURATIONS["alsnet3"]
-    assert [level.mlp for level in three.levels] == [(128, 128, 128), (128, 128, 256), (128, 128, 256)]
-    assert [level.up for level in three.levels] == [(128, 128), (256, 256), (256, 256)]
-    assert [level.mlp for level in four.levels] == [
-        (64, 128, 128), (128, 256, 256), (128, 256, 256), (128, 512, 256)
-    ]  # fmt: skip
-    assert [level.up for level in four.levels] == [(128, 64), (256, 256), (256, 256), (256, 256)]
-    assert (three.points, three.head, four.points, four.head) == (200_000, (128,), 200_000, (128,))

@@ -14,6 +14,7 @@ from alsnet_scenes import TINY, model_of, random_net, scene
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import pdal_stages
 from pdal_stages.alsnet import Circles, Configuration, Level, NetworkOptions
 from pdal_stages.alsnet.batches import (
     augmented,
@@ -28,7 +29,7 @@ from pdal_stages.alsnet.geometry import build
 from pdal_stages.base import kinds
 from pdal_stages.base.errors import ModelError, OptionError
 from pdal_stages.base.kinds import kind_of
-from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, train
+from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 
 needs_torch = pytest.mark.skipif(
     importlib.util.find_spec("torch") is None,
@@ -112,7 +113,7 @@ def test_class_weights():
 
 
 @given(st.integers(0, 2**32), st.integers(1, 300), st.floats(0, 0.95), st.floats(0, 0.1))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_augmentation_turns_shakes_and_thins(seed, n, thin, jitter):
     options = NetworkOptions(thin=thin, jitter=jitter, configuration=TINY)
     xyz = np.random.default_rng(seed).normal(size=(n, 3)) * 10
@@ -164,18 +165,6 @@ def test_a_tiny_network_overfits_a_tiny_scene():
     assert np.mean(found.classification == labels) > 0.97
     curve = model.info["training"]["curve"]
     assert len(curve) == 25 and curve[-1]["loss"] < 0.3 * curve[0]["loss"]
-
-
-@needs_torch
-def test_training_twice_gives_the_same_file(tmp_path):
-    one, other = fit(), fit()
-    one.save(tmp_path / "a")
-    other.save(tmp_path / "b")
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
-    xyz, _, values = scene(seed=7)
-    again = load_model(tmp_path / "a")
-    assert np.array_equal(again.predict(xyz, values).classification, one.predict(xyz, values).classification)
-    assert again.info["training"]["network"]["spacing"] == one.algorithm.spacing
 
 
 @needs_torch
@@ -258,17 +247,9 @@ def test_transfer_from_something_else_is_refused(tmp_path):
         fit(start_from=str(tmp_path / "other.model"))
     with pytest.raises(ModelError, match="another network"):
         fit(start_from=str(tmp_path / "other.model"), configuration="tiny")
-    xyz, labels, values = scene(600, 12.0)
-    forest = train(
-        [TrainingCloud(xyz, labels, values)],
-        TrainingOptions(neighborhoods="c1", count=50, trees=2),
-        progress=False,
-    )
-    forest.save(tmp_path / "forest.model")
+    forest = Path(pdal_stages.__file__).parent / "models" / "standard.model"
     with pytest.raises(ModelError, match="network only"):
-        fit(start_from=str(tmp_path / "forest.model"))
-    with pytest.raises(OptionError, match="only a network"):
-        forest.predict(xyz, values, variance=True)
+        fit(start_from=str(forest))
 
 
 @needs_torch
@@ -347,7 +328,7 @@ def test_checkpoints_that_lie_are_refused(checkpoint, tmp_path):
 
 @needs_torch
 @given(st.data())
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_changed_checkpoints_load_or_are_refused(checkpoint, data):
     """Bytes changed, cut or repeated: what loads is the network's own shape and finite, all else is a ModelError."""
     whole, go_on = checkpoint

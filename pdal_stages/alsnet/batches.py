@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -76,23 +75,14 @@ def hold_out(
 
 
 def covering(circles: Circles, wanted: npt.NDArray[np.bool_]) -> list[int]:
-    """A few circles that hold every wanted point at least once: always the one that adds most."""
-    left = wanted.copy()
-    out: list[int] = []
-    if not left.any():
-        return out
-    numbers = circles.needed(np.flatnonzero(left)).tolist()
-    heap = [(-int(np.count_nonzero(left[circles.members(number)])), number) for number in numbers]
-    heapq.heapify(heap)
-    while left.any():
-        _, number = heapq.heappop(heap)
+    """Circles that hold every wanted point at least once, those with most of them first."""
+    left, out = wanted.copy(), []
+    numbers = circles.needed(np.flatnonzero(wanted)).tolist()
+    for number in sorted(numbers, key=lambda number: -np.count_nonzero(wanted[circles.members(number)])):
         members = circles.members(number)
-        gain = int(np.count_nonzero(left[members]))  # it only shrinks, so an old value is an upper bound
-        if heap and -gain > heap[0][0]:
-            heapq.heappush(heap, (-gain, number))
-            continue
-        left[members] = False
-        out.append(number)
+        if left[members].any():
+            left[members] = False
+            out.append(number)
     return sorted(out)
 
 

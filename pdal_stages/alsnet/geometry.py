@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from ..base.hashing import coordinate_hash
 from ..base.jit import njit
@@ -22,29 +23,15 @@ BUCKET = 64
 def farthest_points(xyz: npt.NDArray[np.float64], count: int, start: int = 0) -> npt.NDArray[np.int64]:
     """Farthest point sampling, exact: each of `count` points is the one farthest from those chosen before, from `start` on.
 
-    Indices come in the order they were chosen, each once (points that coincide included). Points are kept in buckets that
-    follow a space-filling curve; a bucket whose box is farther from the new point than its own farthest point cannot change
-    and is passed over (the idea of QuickFPS, Han et al. 2023).
+    Indices come in the order they were chosen, each once (points that coincide included). Points are kept in buckets, in
+    the order of a tree; one whose box is farther from the new point than its own farthest point cannot change and is passed
+    over (the idea of QuickFPS, Han et al. 2023).
     """
     n = len(xyz)
     if not 0 < count <= n or not 0 <= start < n:
         raise ValueError(f"{count} of {n} points from {start}")
-    low = xyz.min(axis=0)
-    span = float((xyz.max(axis=0) - low).max())
-    cells = ((xyz - low) * (1023.0 / span if span > 0 else 0.0)).astype(np.int64)
-    order = np.argsort(_interleave(cells), kind="stable")
+    order = cKDTree(xyz, leafsize=8).indices
     return _farthest(np.ascontiguousarray(xyz[order]), order, count, int(np.flatnonzero(order == start)[0]))
-
-
-def _interleave(cells: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Morton code of three 10-bit numbers."""
-    out = np.zeros(len(cells), np.int64)
-    for axis in range(3):
-        v = cells[:, axis]
-        for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
-            v = (v | (v << shift)) & mask
-        out |= v << axis
-    return out
 
 
 @njit
@@ -100,46 +87,11 @@ def ball_query(
     A center is within its own ball, so none is empty. A ball with fewer points repeats its first one, which a
     maximum over the ball does not notice (as PointNet++ does).
     """
-    low = xyz[:, :2].min(axis=0)
-    span = float((xyz[:, :2].max(axis=0) - low).max())
-    cell = max(radius, span / 1024.0)
-    column = np.floor((xyz[:, :2] - low) / cell).astype(np.int64)
-    width, height = (int(c) + 1 for c in column.max(axis=0))
-    key = column[:, 1] * width + column[:, 0]
-    order = np.argsort(key, kind="stable")
-    start = np.searchsorted(key[order], np.arange(width * height + 1))
-    return _ball(
-        np.ascontiguousarray(xyz), centers, column, order, start, width, height, float(radius), samples
-    )
-
-
-@njit
-def _ball(p, centers, column, order, start, width, height, radius, samples):
     out = np.empty((len(centers), samples), np.int32)
-    limit = radius * radius
-    for m in range(len(centers)):
-        c = centers[m]
-        count = 0
-        cx, cy = column[c, 0], column[c, 1]
-        row = out[m]
-        for iy in range(max(cy - 1, 0), min(cy + 2, height)):
-            lo, hi = start[iy * width + max(cx - 1, 0)], start[iy * width + min(cx + 1, width - 1) + 1]
-            for j in range(lo, hi):
-                i = order[j]
-                if count == samples and i >= row[count - 1]:
-                    continue
-                dx, dy, dz = p[i, 0] - p[c, 0], p[i, 1] - p[c, 1], p[i, 2] - p[c, 2]
-                if dx * dx + dy * dy + dz * dz > limit:
-                    continue
-                at = count if count < samples else samples - 1
-                while at > 0 and row[at - 1] > i:
-                    row[at] = row[at - 1]
-                    at -= 1
-                row[at] = i
-                if count < samples:
-                    count += 1
-        for k in range(count, samples):
-            row[k] = row[0]
+    balls = cKDTree(xyz).query_ball_point(xyz[centers], radius, return_sorted=True)
+    for row, ball in zip(out, balls, strict=True):
+        row[:] = ball[0]
+        row[: len(ball)] = ball[:samples]
     return out
 
 
@@ -152,8 +104,6 @@ def three_nearest(
     its authors' program, which gave the published figures, takes the squared distances of its search as they are, as
     PointNet++ does; so do we.
     """
-    from scipy.spatial import cKDTree
-
     k = min(3, len(coarse))
     distance, near = cKDTree(coarse).query(xyz, k=[1, 2, 3][:k])
     index = np.zeros((len(xyz), 3), np.int32)
