@@ -184,32 +184,14 @@ def test_a_file_that_fails_does_not_stop_the_others(folder, classify, tmp_path):
     assert files_in(tmp_path / "out") == ["t1.laz"]
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_the_same_is_said_once(folder, classify, tmp_path, workers):
-    """Inputs that cannot be cut go one by one; what holds for several is said of the first."""
-    for number in range(3):
-        las = laspy.read(folder / "in" / f"t{number}.laz")
-        rows = np.column_stack([las.x, las.y, las.z])
-        np.savetxt(tmp_path / f"t{number}.txt", rows, delimiter=",", header="X,Y,Z", comments="")
-    (tmp_path / "u0.ply").write_bytes(b"ply\n")
-    words = (tmp_path / "*.txt", tmp_path / "*.ply", tmp_path / "o_#.laz", "--workers", workers)
-    code, out, err = classify(*words, "--metadata", tmp_path / "m.json")
-    assert code == 1 and "1 of 4 files failed" in err.splitlines()[-1] and "by itself" in err, err
-    assert err.count("meters were assumed") == 1 and "u0.ply" in err
-    assert files_in(tmp_path, "o_*") == ["o_t0.laz", "o_t1.laz", "o_t2.laz"]
-    assert sum("o_t" in line for line in out.splitlines()) == 3
-    found = json.loads((tmp_path / "m.json").read_text())["files"]
-    assert len(found) == 4 and "error" in found[3] and found[0]["output"].endswith("o_t0.laz")
-
-
-@pytest.mark.parametrize("words", ["--resume", "--tile auto", "--report r.json"])
-def test_flags_of_tiles_are_refused_where_nothing_can_be_cut(folder, classify, tmp_path, words):
+def test_tiles_are_refused_where_nothing_can_be_cut(folder, classify, tmp_path):
     rows = laspy.read(folder / "in" / "t0.laz").xyz
     for number in range(2):
         np.savetxt(tmp_path / f"t{number}.txt", rows, delimiter=",", header="X,Y,Z", comments="")
-    code, _, err = classify(tmp_path / "*.txt", tmp_path / "o_#.laz", *words.split())
-    assert code == 1 and f"{words.split()[0]} needs inputs that can be cut" in err and "t0.txt" in err
-    assert "pdal translate" in err and not files_in(tmp_path, "o_*")
+    for given, words in (("*.txt", []), ("t0.txt", ["--resume"]), ("t0.txt", ["--report", "r.json"])):
+        code, _, err = classify(tmp_path / given, tmp_path / "o.txt", *words)
+        assert code == 1 and "t0.txt" in err and "pdal translate" in err and not files_in(tmp_path, "o*")
+    assert classify(tmp_path / "t0.txt", tmp_path / "o.txt")[0] == 0
 
 
 def test_tiles_say_what_was_left_alone_as_one_piece_does(folder, classify, tmp_path, write_las):

@@ -235,15 +235,14 @@ def _answer(future: Any) -> TaskResult:
 
 
 def each_file(
-    function: Callable[..., Any], work: Sequence[tuple], workers: int = 1, *, apart: bool = False
+    function: Callable[..., Any], work: Sequence[tuple], workers: int = 1
 ) -> Iterator[tuple[tuple, TaskResult]]:
     """Each item of work, the function's arguments, with what became of it, as they finish; failures do not stop the rest.
 
-    The function is a module's own, so that other processes find it. They share the cores. A single worker is this process,
-    unless the work is to be `apart`.
+    The function is a module's own, so that other processes find it. They share the cores. A single worker is this process.
     """
     count = min(checks.whole("--workers", workers, 1, 1024), len(work))
-    if count == 1 and not apart:
+    if count == 1:
         yield from ((item, perform(partial(function, *item))) for item in work)
         return
     with WorkerProcesses(count, max(1, available_threads() // count)) as pool:

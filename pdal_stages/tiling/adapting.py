@@ -19,7 +19,7 @@ from ..base import checks, kinds, las
 from ..base.errors import StageError
 from ..base.outputs import Output, check_outputs
 from ..pipeline.classify_request import ClassifyRequest
-from ..pipeline.inputs_outputs import input_files, is_las, outputs_of
+from ..pipeline.inputs_outputs import input_files, is_ept, is_las
 from ..stages.loading import digest_of, load_model
 from .classify import ClassifyTask
 from .settings import TilingOptions
@@ -108,19 +108,16 @@ class AdaptTask:
         task = ClassifyTask(tuple(files), f"{folder}/classified/", request, self.options)
         if task.in_one_piece():
             return [task.run_whole().path]
-        if task.can_be_cut:
-            run = task.run_tiles()
-            if run.failures:
-                raise StageError(
-                    f"{len(run.failures):,} parts of the survey cannot be classified",
-                    found="; ".join(str(one) for one in run.failures[:3]),
-                    cure="Mend or leave out what is named",
-                )
-            return sorted(str(one) for one in (folder / "classified").rglob("*.la[sz]"))
-        for source, answer in task.run_each():
-            if isinstance(answer, str):
-                raise StageError(f"{source} cannot be classified", found=answer)
-        return outputs_of(list(files), task.output)
+        if not all(is_las(name) or is_ept(name) for name in files):
+            return [replace(task, inputs=(name,)).run_whole().path for name in files]
+        run = task.run_tiles()
+        if run.failures:
+            raise StageError(
+                f"{len(run.failures):,} parts of the survey cannot be classified",
+                found="; ".join(str(one) for one in run.failures[:3]),
+                cure="Mend or leave out what is named",
+            )
+        return sorted(str(one) for one in (folder / "classified").rglob("*.la[sz]"))
 
 
 def spread(files: Sequence[str], most: int = MOST) -> tuple[list[str], list[str]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +17,6 @@ from ..base.outputs import Output, check_outputs
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of
 from ..pipeline.run import Pipeline
-from ..pipeline.workers import each_file
 from .plan import TilePlan, make_plan
 from .report import Job, TiledRun, left_alone
 from .run import run_plan
@@ -65,11 +64,6 @@ class ClassifyTask:
         """All inputs."""
         return input_files(self.inputs)
 
-    @property
-    def can_be_cut(self) -> bool:
-        """Whether parts of all inputs can be read."""
-        return all(is_las(name) or is_ept(name) for name in self.files)
-
     def in_one_piece(self) -> bool:
         """Whether the only input is a file that fits into memory, and nothing asks for tiles."""
         options = self.options
@@ -83,15 +77,6 @@ class ClassifyTask:
         except OSError:
             header = None  # said when it is read
         return header is None or fits_whole(header.count, options.memory)
-
-    # ---- in one piece ------------------------------------------------------------------------------------
-
-    def _checked_outputs(self) -> list[str]:
-        """An output for each input, in folders that are made; StageError where one cannot be written, or is an input."""
-        outputs = outputs_of(self.files, self.output)
-        self._make_folders(outputs)
-        check_outputs([Output(name) for name in outputs], self.files)
-        return outputs
 
     def _make_folders(self, outputs: list[str]) -> None:
         """Make the output folder, and those in it that outputs lie in."""
@@ -107,19 +92,9 @@ class ClassifyTask:
 
     def run_whole(self) -> Written:
         """Classify the only input in one piece."""
-        (source,), (target,) = self.files, self._checked_outputs()
-        return classify_file(replace(self.request), source, target, self.metadata, self.log)
-
-    def run_each(self, apart: bool = False) -> Iterator[tuple[str, Written | str]]:
-        """Classify inputs each by itself: yields an input, and what was written or why it failed, as they finish.
-
-        `apart`: in processes of their own, so that one may crash, and Ctrl-C is heard here.
-        """
-        outputs = self._checked_outputs()
-        work = [(replace(self.request), *pair) for pair in zip(self.files, outputs, strict=True)]
-        workers = max(1, self.options.local_workers)
-        for (_, source, _), answer in each_file(classify_file, work, workers, apart=apart):
-            yield source, answer.reason or answer.result
+        (source,), (target,) = self.files, outputs_of(self.files, self.output)
+        self._make_folders([target])
+        return classify_file(self.request, source, target, self.metadata, self.log)
 
     # ---- in tiles ----------------------------------------------------------------------------------------
 

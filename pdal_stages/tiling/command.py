@@ -8,7 +8,7 @@ import shlex
 import signal
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
@@ -90,22 +90,18 @@ def options_of(options: argparse.Namespace) -> TilingOptions:
     return TilingOptions(**chosen)
 
 
-def _refuse(
-    options: argparse.Namespace, names: Iterable[str], needs: str, found: str | None, cure: str
-) -> None:
-    """Refuse flags that mean nothing here."""
-    for name in names:
-        value = getattr(options, name)
-        if (value not in (None, "", "auto", []) and value is not False) or (name == "tile" and value):
-            flag = f"--{name.replace('_', '-')}"
-            raise OptionError(f"{flag} needs {needs}", found=found, cure=cure.replace("FLAG", flag))
-
-
 def wants_tiles(options: argparse.Namespace) -> bool:
-    """Whether ``pipeline`` is asked for a run in tiles."""
+    """Whether ``pipeline`` is asked for a run in tiles; other flags of tiles mean nothing without it."""
     if options.tile is None:
-        names = ("memory", "workers", "scheduler", "per", "buffer", "resume", "dry_run", "report")
-        _refuse(options, names, "--tile", None, "Give the side of the tiles, e.g. --tile 500, or --tile auto")
+        for name in ("memory", "workers", "scheduler", "per", "buffer", "resume", "dry_run", "report"):
+            value = getattr(options, name)
+            if (value is not None and value not in (False, "", "auto", [])) or (
+                value == 0 and name == "workers"
+            ):
+                raise OptionError(
+                    f"--{name.replace('_', '-')} needs --tile",
+                    cure="Give the side of the tiles, e.g. --tile 500, or --tile auto",
+                )
     return options.tile is not None
 
 
@@ -194,34 +190,30 @@ def classify(
 ) -> int:
     """Run ``pdal-stages classify``; the exit code, 1 where anything failed. `then`: what is done with whole outputs."""
     _check_reports(options)
-    if not task.can_be_cut:
-        _refuse(
-            options,
-            ("tile", "memory", "per", "scheduler", "buffer", "resume", "report"),
-            "inputs that can be cut into tiles: LAS, LAZ, COPC or EPT",
-            next(name for name in task.files if not is_las(name) and not is_ept(name)),
-            "Convert them first: pdal translate INPUT input.laz; or leave FLAG out",
+    whole = task.in_one_piece() and not options.report
+    if not whole and (odd := [name for name in task.files if not is_las(name) and not is_ept(name)]):
+        raise OptionError(
+            "several inputs, and the options of tiles, are for LAS, LAZ, COPC and EPT: others cannot be cut into tiles",
+            found=odd[0],
+            cure="Convert them first (pdal translate INPUT input.laz), or classify one after the other without options "
+            "of tiles",
         )
     names = {code: one_line(name) for code, name in task.request.loaded.classes}
-    if options.dry_run and (task.in_one_piece() or not task.can_be_cut):
+    if not whole:
+        return _classify_tiles(task, options, names, then)
+    if options.dry_run:
         target = str(Path(task.output) / "dry-run.laz") if is_folder(task.output) else task.output
         task.request.pipeline(task.files[0], target)
-        print(f"{_counted(len(task.files), 'input')}, each in one piece")
+        print("1 input, in one piece")
         return 0
-    if task.in_one_piece() and not options.report:
-        end_at_once(options)
-        written = task.run_whole()
-        print_messages(*written.messages)
-        print(f"{_counted(written.points, 'point')} written to {written.path}")
-        _print_classes([written], names)
-        code = 0
-    elif not task.can_be_cut:
-        code = _classify_each(task, options, names)
-    else:
-        return _classify_tiles(task, options, names, then)
-    if then is not None and code == 0:
+    end_at_once(options)
+    written = task.run_whole()
+    print_messages(*written.messages)
+    print(f"{_counted(written.points, 'point')} written to {written.path}")
+    _print_classes([written], names)
+    if then is not None:
         then()
-    return code
+    return 0
 
 
 def _classify_tiles(
@@ -251,47 +243,6 @@ def _classify_tiles(
     words = [word for word in options.arguments if word != "--resume"]
     same = shlex.join(["pdal-stages", *words]) if len(words) <= 20 else "the same command with"
     return _end(options, run, f"{same} --resume" if interrupted else "")
-
-
-def _classify_each(task: ClassifyTask, options: argparse.Namespace, names: Mapping[int, str]) -> int:
-    """Inputs of which parts cannot be read, one after the other; what is said of several is said of the first."""
-    done: dict[str, Written] = {}
-    failed: dict[str, str] = {}
-    said: set[str] = set()
-    interrupted = False
-    if len(task.files) > 1:
-        print_messages("each file is classified by itself: only LAS, LAZ, COPC and EPT can be cut into tiles")
-    try:
-        for source, what in task.run_each(apart=options.is_program):
-            if isinstance(what, str):
-                failed[source] = what
-                print_messages(f"{source}: {what.removeprefix(f'{source}: ')}")
-                continue
-            done[source] = what
-            _print_written(what, names)
-            new = [line for line in what.messages if line.removeprefix(f"{source}: ") not in said]
-            said |= {line.removeprefix(f"{source}: ") for line in new}
-            print_messages(*(f"{source}: {line.removeprefix(f'{source}: ')}" for line in new))
-    except KeyboardInterrupt:
-        interrupted = True
-    _print_classes([done[source] for source in task.files if source in done], names)
-    if options.metadata:
-        files = [
-            {"input": source, "output": done[source].path, "metadata": done[source].metadata}
-            if source in done
-            else {"input": source, "error": failed.get(source, "not done")}
-            for source in task.files
-        ]
-        text = json.dumps({"files": files}, indent=2, default=str)
-        write_whole(options.metadata, (text + "\n").encode())
-    if interrupted:
-        print_messages(
-            f"interrupted; {len(done)} of {len(task.files)} files are finished and whole, of the others nothing was left"
-        )
-        return 130
-    if failed:
-        print_messages(f"{len(failed)} of {_counted(len(task.files), 'file')} failed")
-    return 1 if failed else 0
 
 
 # ---- what is printed ---------------------------------------------------------------------------------------
